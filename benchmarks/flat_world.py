@@ -21,14 +21,14 @@ import numpy as np
 from jaxltl.algos import many_tasks, ppo
 from jaxltl.algos.schedules import Linear
 from jaxltl.core.automata.translate import to_automaton
-from jaxltl.core.models.environment import Environment, Finite
-from jaxltl.core.models.sequence_task import (
+from jaxltl.core.environments.environment import Environment, Finite
+from jaxltl.core.environments.sequence_task import (
     proposition_sets,
     sequence_environment,
     sequence_sampler,
 )
-from jaxltl.core.models.task_environment import task_environment
-from jaxltl.core.values.evaluation import evaluate
+from jaxltl.core.environments.task_environment import task_environment
+from jaxltl.core.values.evaluation.evaluation import evaluate
 from jaxltl.envs.flat_world import discs_of, events_around, flat_world
 
 FINITE = (  # the first five are theirs

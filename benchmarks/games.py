@@ -17,7 +17,7 @@ from jaxltl.core.games.winning import winning_region
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.types import check
-from jaxltl.core.values.minimax import minimax_value
+from jaxltl.core.values.discounted.minimax import minimax_value
 from jaxltl.envs.robots import diagonal_reward, robots
 
 

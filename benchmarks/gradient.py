@@ -11,10 +11,10 @@ import jax.numpy as jnp
 
 from benchmarks.timing import compare, once
 from jaxltl.algos import mlirl
-from jaxltl.core.models.operators import action_mean
+from jaxltl.core.models.ops.operators import action_mean
 from jaxltl.core.models.product import product
-from jaxltl.core.values.discounted import action_value
-from jaxltl.core.values.soft import policy_logits
+from jaxltl.core.values.discounted.discounted import action_value
+from jaxltl.core.values.discounted.soft import policy_logits
 from jaxltl.reproduce.mlirl import two_goals
 
 _TASK = "(!r & !y) -> ((!r U y) & (!y U g1) & (!y U g2) & F y)"

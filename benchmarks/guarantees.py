@@ -23,8 +23,8 @@ from jax.tree_util import Partial
 from jaxltl.algos import interval_learning, pac, rmax
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import make_mdp
-from jaxltl.core.values.minimax import minimax_value
-from jaxltl.core.values.satisfaction import optimal_satisfaction
+from jaxltl.core.values.discounted.minimax import minimax_value
+from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction
 from jaxltl.envs.gridworld import gridworld
 from jaxltl.envs.post_offices import patrol_reward, post_offices, surveillance
 

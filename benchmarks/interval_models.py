@@ -21,7 +21,7 @@ import numpy as np
 
 from jaxltl.core.models.interval import IntervalMDP, interval_rows
 from jaxltl.core.types import Status
-from jaxltl.core.values.robust import robust_reachability
+from jaxltl.core.values.interval.robust import robust_reachability
 from jaxltl.io.model_files import read_model, write_model
 
 REPEATS = 2
@@ -211,7 +211,10 @@ def prepared() -> None:
     """Prints the seconds of 1,000 models of 100 states, solved in three ways."""
     import jax
 
-    from jaxltl.core.values.prepared_interval import prepare_interval, solve_prepared_interval
+    from jaxltl.core.values.prepared.prepared_interval import (
+        prepare_interval,
+        solve_prepared_interval,
+    )
 
     jax.config.update("jax_enable_x64", True)
     rng = np.random.default_rng(0)

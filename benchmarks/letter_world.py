@@ -20,11 +20,11 @@ from jax.tree_util import Partial
 
 from jaxltl.algos import many_tasks, ppo
 from jaxltl.core.automata.translate import to_automaton
-from jaxltl.core.models.sequence_task import events_of, sequence_environment, sequence_sampler
-from jaxltl.core.models.tabulate import tabulate
-from jaxltl.core.models.task_environment import task_environment
-from jaxltl.core.values.evaluation import evaluate
-from jaxltl.core.values.optimality_gap import optimality_gap, tabulate_policy
+from jaxltl.core.environments.sequence_task import events_of, sequence_environment, sequence_sampler
+from jaxltl.core.environments.tabulate import tabulate
+from jaxltl.core.environments.task_environment import task_environment
+from jaxltl.core.values.evaluation.evaluation import evaluate
+from jaxltl.core.values.evaluation.optimality_gap import optimality_gap, tabulate_policy
 from jaxltl.envs.letter_world import events_seen, letter_world
 
 TASKS = (

@@ -20,9 +20,9 @@ from benchmarks.models import random_mdp, risky_mdp
 from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.product import Product, letters_of, product
-from jaxltl.core.values.discounted import optimal_value
-from jaxltl.core.values.reachability import reachability_probability
-from jaxltl.core.values.satisfaction import optimal_satisfaction
+from jaxltl.core.values.discounted.discounted import optimal_value
+from jaxltl.core.values.undiscounted.reachability import reachability_probability
+from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction
 
 
 def _settled() -> int:

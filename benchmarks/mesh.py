@@ -25,7 +25,7 @@ import numpy as np
 
 import jaxltl as jl
 from benchmarks.timing import once
-from jaxltl.core.models.lanes import on_host
+from jaxltl.core.models.mesh.lanes import on_host
 
 _DEVICES = (1, 2, 4)
 _ACTIONS, _WIDTH = 2, 5

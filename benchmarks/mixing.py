@@ -18,11 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.memory import large_product
-from jaxltl.core.models.convert import to_padded
+from jaxltl.core.models.build.convert import to_padded
 from jaxltl.core.models.sparse import SparseMDP, make_sparse
-from jaxltl.core.values.reachability import reachability_probability
-from jaxltl.core.values.satisfaction import optimal_satisfaction
-from jaxltl.core.values.total_reward import total_reward
+from jaxltl.core.values.undiscounted.reachability import reachability_probability
+from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction
+from jaxltl.core.values.undiscounted.total_reward import total_reward
 
 
 def random_sparse(num_states: int, seed: int = 0) -> tuple[SparseMDP, np.ndarray, np.ndarray]:

@@ -20,7 +20,7 @@ import numpy as np
 
 from benchmarks.real_models import storm
 from jaxltl.core.models.sparse import SparseMDP, make_sparse, row_reward
-from jaxltl.core.values.prepared import Prepared, prepare, solve_prepared
+from jaxltl.core.values.prepared.prepared import Prepared, prepare, solve_prepared
 from jaxltl.io.model_files import read_model, write_model
 
 REPEATS = 7

@@ -15,9 +15,9 @@ import numpy as np
 from benchmarks.timing import compare
 from jaxltl.algos import maximin_q
 from jaxltl.core.graphs.attractor import attractor
+from jaxltl.core.models.build.restrict import restrict
 from jaxltl.core.models.game import Game
-from jaxltl.core.models.operators import forall_successor
-from jaxltl.core.models.restrict import restrict
+from jaxltl.core.models.ops.operators import forall_successor
 from jaxltl.envs.robots import diagonal_reward, robots
 
 _DISCOUNT = 0.9

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from jaxltl.core.types import Status
-from jaxltl.core.values.answer import solve_property
+from jaxltl.core.values.properties.solve_property import solve_property
 from jaxltl.io.model_files import read_model
 
 LTL = (  # of a label a and another one b: recurrence, persistence, with safety, response

@@ -26,8 +26,8 @@ from jax.tree_util import Partial
 import jaxltl as jl
 from jaxltl.algos import ppo
 from jaxltl.algos.schedules import Linear
-from jaxltl.core.models.environment import Timestep
-from jaxltl.core.models.time_limit import with_time_limit
+from jaxltl.core.environments.environment import Timestep
+from jaxltl.core.environments.time_limit import with_time_limit
 from jaxltl.envs.robots import robots
 
 _SAFE = "G !collision"

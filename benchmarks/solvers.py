@@ -11,8 +11,8 @@ import numpy as np
 from benchmarks import storm
 from benchmarks.models import random_mdp, risky_mdp, slippery_grid
 from benchmarks.timing import once
-from jaxltl.core.values.discounted import optimal_value
-from jaxltl.core.values.reachability import reachability_probability
+from jaxltl.core.values.discounted.discounted import optimal_value
+from jaxltl.core.values.undiscounted.reachability import reachability_probability
 
 _REPEATS = 5
 

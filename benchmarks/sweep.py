@@ -11,7 +11,7 @@ import numpy as np
 
 from benchmarks.models import random_mdp
 from benchmarks.timing import compare
-from jaxltl.core.models.operators import action_max, expectation
+from jaxltl.core.models.ops.operators import action_max, expectation
 
 _SWEEPS = 10
 

@@ -18,11 +18,11 @@ from benchmarks.timing import compare, once
 from jaxltl.algos import todirl
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.translate import to_automaton
-from jaxltl.core.models.batch import stack_products
-from jaxltl.core.models.operators import expectation, transition_matrix
+from jaxltl.core.models.build.batch import stack_products
+from jaxltl.core.models.ops.operators import expectation, transition_matrix
 from jaxltl.core.models.product import Product, product
-from jaxltl.core.values.performance import task_performances
-from jaxltl.core.values.soft import policy_logits, soft_value
+from jaxltl.core.values.discounted.soft import policy_logits, soft_value
+from jaxltl.core.values.undiscounted.performance import task_performances
 from jaxltl.envs import temporal_gridworld as grid
 from jaxltl.envs.cell_kinds import many_objects
 

@@ -15,7 +15,7 @@ def run() -> NoReturn:
     # Here, since processes that draw load this file too.
     import click
 
-    from jaxltl.app.compilation import few_collections
+    from jaxltl.app.programs import few_collections
     from jaxltl.cli import main
 
     few_collections()

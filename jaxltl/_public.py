@@ -12,6 +12,43 @@ from jaxltl.core.automata.language import find_difference, is_equivalent, is_inc
 from jaxltl.core.automata.sequences import Sequences, reach_avoid_sequences
 from jaxltl.core.automata.synchronize import synchronize
 from jaxltl.core.automata.translate import to_automaton
+from jaxltl.core.environments.environment import (
+    Box,
+    Environment,
+    Finite,
+    Timestep,
+    make_box,
+    make_environment,
+)
+from jaxltl.core.environments.episodes import Agent, Episode, agent_of, run_episode, step_or_reset
+from jaxltl.core.environments.finite_task import FiniteTask, Shares, finite_shares, make_finite_task
+from jaxltl.core.environments.monitor import (
+    Monitor,
+    Verdict,
+    make_monitor,
+    monitor_step,
+    monitor_verdict,
+    trace_verdicts,
+    verdict,
+)
+from jaxltl.core.environments.sequence_task import (
+    SequenceSampler,
+    events_of,
+    proposition_sets,
+    sequence_environment,
+    sequence_sampler,
+)
+from jaxltl.core.environments.simulated_model import environment_of
+from jaxltl.core.environments.tabulate import Table, tabulate
+from jaxltl.core.environments.task_environment import (
+    TaskObservation,
+    TaskTables,
+    TaskWorld,
+    stack_tasks,
+    task_environment,
+    what_is_left,
+)
+from jaxltl.core.environments.time_limit import with_time_limit
 from jaxltl.core.games.objective import (
     GR1,
     Parity,
@@ -35,94 +72,73 @@ from jaxltl.core.games.verify import Verification, verify
 from jaxltl.core.games.winning import Winning, almost_sure_buchi, winning_region
 from jaxltl.core.graphs.attractor import Attractor, almost_surely_reaching, attractor, avoidable
 from jaxltl.core.graphs.end_components import EndComponents, end_components
-from jaxltl.core.host.confidence import ConfidenceSets, intervals_from_counts
 from jaxltl.core.logic.ltl import Formula, holds_on_lasso, parse_ltl
 from jaxltl.core.logic.properties import Property, parse_properties, parse_property
-from jaxltl.core.models.batch import lift_memory, stack_products
-from jaxltl.core.models.convert import to_padded, to_sparse
-from jaxltl.core.models.counts import TransitionCounts, counted_model, counts_on, make_counts
-from jaxltl.core.models.environment import (
-    Box,
-    Environment,
-    Finite,
-    Timestep,
-    make_box,
-    make_environment,
-)
-from jaxltl.core.models.episodes import Agent, Episode, agent_of, run_episode, step_or_reset
-from jaxltl.core.models.finite_task import FiniteTask, Shares, finite_shares, make_finite_task
-from jaxltl.core.models.game import Game, make_game
-from jaxltl.core.models.interval import IntervalMDP, interval_rows, make_interval
-from jaxltl.core.models.lanes import on_host, vmap_over_mesh
-from jaxltl.core.models.lifting import (
+from jaxltl.core.models.build.batch import lift_memory, stack_products
+from jaxltl.core.models.build.convert import to_padded, to_sparse
+from jaxltl.core.models.build.counts import TransitionCounts, counted_model, counts_on, make_counts
+from jaxltl.core.models.build.lifting import (
     FiniteMemoryPolicy,
     lift_policy,
     lift_trajectories,
     project_policy,
     project_trajectories,
 )
+from jaxltl.core.models.build.restrict import Restriction, restrict, with_allowed
+from jaxltl.core.models.game import Game, make_game
+from jaxltl.core.models.interval import IntervalMDP, interval_rows, make_interval
 from jaxltl.core.models.mdp import MDP, DenseMDP, from_dense, make_mdp, to_dense
-from jaxltl.core.models.monitor import (
-    Monitor,
-    Verdict,
-    make_monitor,
-    monitor_step,
-    monitor_verdict,
-    trace_verdicts,
-    verdict,
-)
-from jaxltl.core.models.operators import (
+from jaxltl.core.models.mesh.lanes import on_host, vmap_over_mesh
+from jaxltl.core.models.mesh.shard import ModelPart, from_mesh, model_from_parts, shard, to_mesh
+from jaxltl.core.models.mesh.sharded import ShardedMDP
+from jaxltl.core.models.ops.operators import (
     exists_successor,
     expectation,
     forall_successor,
     pushforward,
     sample_successor,
 )
-from jaxltl.core.models.parametric import ParametricMDP, make_parametric
+from jaxltl.core.models.parametric.parametric import ParametricMDP, make_parametric
 from jaxltl.core.models.product import Product, letters_of, product
-from jaxltl.core.models.restrict import Restriction, restrict, with_allowed
-from jaxltl.core.models.sequence_task import (
-    SequenceSampler,
-    events_of,
-    proposition_sets,
-    sequence_environment,
-    sequence_sampler,
-)
-from jaxltl.core.models.shard import ModelPart, from_mesh, model_from_parts, shard, to_mesh
-from jaxltl.core.models.sharded import ShardedMDP
-from jaxltl.core.models.simulated_model import environment_of
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse, row_reward
-from jaxltl.core.models.tabulate import Table, tabulate
-from jaxltl.core.models.task_environment import (
-    TaskObservation,
-    TaskTables,
-    TaskWorld,
-    stack_tasks,
-    task_environment,
-    what_is_left,
-)
-from jaxltl.core.models.time_limit import with_time_limit
 from jaxltl.core.models.trajectories import Trajectories, make_trajectories, rollout
-from jaxltl.core.show import picture
+from jaxltl.core.pretty_print import picture
+from jaxltl.core.statistics.confidence_sets import ConfidenceSets, intervals_from_counts
 from jaxltl.core.types import Method, NotConverged, Solution, Status, check
-from jaxltl.core.values.answer import Answer, PropertyStrategy, solve_property
-from jaxltl.core.values.average_reward import average_reward
-from jaxltl.core.values.boltzmann import boltzmann_fixed_points, boltzmann_value
-from jaxltl.core.values.bounded import (
-    bounded_reachability,
-    cumulative_reward,
-    instantaneous_reward,
-    next_probability,
-    reward_bounded_reachability,
+from jaxltl.core.values.average.average_reward import average_reward
+from jaxltl.core.values.average.mean_payoff import mean_payoff
+from jaxltl.core.values.discounted.boltzmann import boltzmann_fixed_points, boltzmann_value
+from jaxltl.core.values.discounted.discounted import optimal_value, policy_value
+from jaxltl.core.values.discounted.minimax import minimax_value, strategy_value
+from jaxltl.core.values.discounted.occupancy import feature_expectation, occupancy_measure
+from jaxltl.core.values.discounted.soft import soft_value
+from jaxltl.core.values.evaluation.data_guarantee import (
+    DataGuarantee,
+    guarantee_curve,
+    learn_guarantee,
 )
-from jaxltl.core.values.data_guarantee import DataGuarantee, guarantee_curve, learn_guarantee
-from jaxltl.core.values.discounted import optimal_value, policy_value
-from jaxltl.core.values.episode_scores import episode_evaluator
-from jaxltl.core.values.evaluation import EpisodeTotals, Estimate, Evaluation, evaluate
-from jaxltl.core.values.hitting_time import hitting_time
-from jaxltl.core.values.mean_payoff import mean_payoff
-from jaxltl.core.values.minimax import minimax_value, strategy_value
-from jaxltl.core.values.multi_objective import (
+from jaxltl.core.values.evaluation.episode_scores import episode_evaluator
+from jaxltl.core.values.evaluation.evaluation import EpisodeTotals, Estimate, Evaluation, evaluate
+from jaxltl.core.values.evaluation.optimality_gap import (
+    OptimalityGap,
+    optimality_gap,
+    tabulate_policy,
+)
+from jaxltl.core.values.interval.robust import (
+    robust_discounted_value,
+    robust_expectation,
+    robust_reachability,
+    robust_total_reward,
+)
+from jaxltl.core.values.interval.satisfaction import RobustSatisfaction, robust_satisfaction
+from jaxltl.core.values.interval.sensitivity import Sensitivity, robust_sensitivity
+from jaxltl.core.values.interval.step_bounded import (
+    robust_bounded_reachability,
+    robust_cumulative_reward,
+    robust_instantaneous_reward,
+    robust_next_probability,
+)
+from jaxltl.core.values.multi_objective.multi_objective import (
     Achievable,
     ConstrainedOptimum,
     Front,
@@ -132,36 +148,35 @@ from jaxltl.core.values.multi_objective import (
     multi_objective,
     pareto,
 )
-from jaxltl.core.values.objectives import Objective
-from jaxltl.core.values.occupancy import feature_expectation, occupancy_measure
-from jaxltl.core.values.optimal_actions import OptimalActions, optimal_actions
-from jaxltl.core.values.optimality_gap import OptimalityGap, optimality_gap, tabulate_policy
-from jaxltl.core.values.performance import Performance, task_performance, task_performances
-from jaxltl.core.values.prepared import Prepared, prepare, solve_prepared
-from jaxltl.core.values.prepared_interval import (
+from jaxltl.core.values.multi_objective.objectives import Objective
+from jaxltl.core.values.prepared.prepared import Prepared, prepare, solve_prepared
+from jaxltl.core.values.prepared.prepared_interval import (
     PreparedInterval,
     prepare_interval,
     solve_prepared_interval,
 )
-from jaxltl.core.values.reachability import reachability_probability
-from jaxltl.core.values.robust import (
-    robust_discounted_value,
-    robust_expectation,
-    robust_reachability,
-    robust_total_reward,
+from jaxltl.core.values.properties.solve_property import Answer, PropertyStrategy, solve_property
+from jaxltl.core.values.undiscounted.hitting_time import hitting_time
+from jaxltl.core.values.undiscounted.optimal_actions import OptimalActions, optimal_actions
+from jaxltl.core.values.undiscounted.performance import (
+    Performance,
+    task_performance,
+    task_performances,
 )
-from jaxltl.core.values.robust_bounded import (
-    robust_bounded_reachability,
-    robust_cumulative_reward,
-    robust_instantaneous_reward,
-    robust_next_probability,
+from jaxltl.core.values.undiscounted.reachability import reachability_probability
+from jaxltl.core.values.undiscounted.satisfaction import (
+    optimal_satisfaction,
+    satisfaction_probability,
 )
-from jaxltl.core.values.robust_satisfaction import RobustSatisfaction, robust_satisfaction
-from jaxltl.core.values.robust_sensitivity import Sensitivity, robust_sensitivity
-from jaxltl.core.values.satisfaction import optimal_satisfaction, satisfaction_probability
-from jaxltl.core.values.soft import soft_value
-from jaxltl.core.values.sparse_satisfaction import Satisfaction, sparse_satisfaction
-from jaxltl.core.values.total_reward import total_reward
+from jaxltl.core.values.undiscounted.sparse_satisfaction import Satisfaction, sparse_satisfaction
+from jaxltl.core.values.undiscounted.step_bounded import (
+    bounded_reachability,
+    cumulative_reward,
+    instantaneous_reward,
+    next_probability,
+    reward_bounded_reachability,
+)
+from jaxltl.core.values.undiscounted.total_reward import total_reward
 from jaxltl.envs.adapters.brax import from_brax
 from jaxltl.envs.adapters.craftax import from_craftax
 from jaxltl.envs.adapters.gymnax import from_gymnax

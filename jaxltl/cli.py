@@ -21,9 +21,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 import jaxltl
-from jaxltl.app import compilation, run_job
 from jaxltl.app import processes as several
-from jaxltl.app.reports.drawing import artist
+from jaxltl.app import programs, run_job
+from jaxltl.app.drawing import artist
 
 if TYPE_CHECKING:
     from jaxltl.core.automata.automaton import Automaton
@@ -83,10 +83,10 @@ def _compiling(*, soon: bool) -> Callable[[Callable[..., None]], Callable[..., N
         )
         @functools.wraps(command)
         def run(*args: Any, no_cache: bool, **options: Any) -> None:
-            compilation.keep_programs(not no_cache)
+            programs.keep_programs(not no_cache)
             if soon:
-                compilation.compile_soon()
-                compilation.one_thread()
+                programs.compile_soon()
+                programs.one_thread()
             command(*args, **options)
 
         return run
@@ -223,7 +223,7 @@ def learn(
     say = _first_says(launch)
     say(_first_line(f"learning from {task_file}"))
     # Of several processes none has others of its own, which could outlive it.
-    apart = compilation.is_alone() and launch.processes == 1
+    apart = programs.is_alone() and launch.processes == 1
     # Before anything else, so that it can load.
     with artist(apart=apart) as begin, several.taking_part(asked, launch, say) as place:
         job = place.together(lambda: run_job.job_of(task_file))
@@ -530,7 +530,7 @@ def solve(
         if given is not None and (asked.mesh is not None) != with_mesh:
             raise ValueError(f"{option} goes {'with' if with_mesh else 'without'} --mesh alone.")
     if asked.mesh is not None:
-        compilation.keep_programs(True)
+        programs.keep_programs(True)
     from jaxltl.app import solve as solving
 
     questions = solving.asked_for(properties)

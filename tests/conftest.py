@@ -22,7 +22,7 @@ from pathlib import Path
 import jaxlib
 import pytest
 
-from jaxltl.app.compilation import keep_all_programs, known_flags
+from jaxltl.app.programs import keep_all_programs, known_flags
 
 _HASTE = {
     "xla_backend_optimization_level": "0",

@@ -4,9 +4,9 @@ import itertools
 
 import numpy as np
 
-from jaxltl.core.host.interval import HostInterval
-from jaxltl.core.host.sparse import HostMDP
 from jaxltl.core.models.interval import interval_rows
+from jaxltl.core.sparse.interval.uncertainty_set import HostInterval
+from jaxltl.core.sparse.mdp import HostMDP
 
 
 def vertices(lower, upper):

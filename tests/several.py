@@ -121,7 +121,7 @@ def problem_and_state() -> tuple[Any, Any, Any]:
 def run(directory: Path, place: Any) -> None:
     """Steps of the lanes, saved after every 50, and what comes out, printed by the first."""
     from jaxltl.algos.chunks import run_in_chunks
-    from jaxltl.core.models.lanes import on_host
+    from jaxltl.core.models.mesh.lanes import on_host
 
     step, states, goal = problem_and_state()
     path = directory / "run.npz"
@@ -202,12 +202,12 @@ def laws(directory: Path, place: Any) -> None:
     import jax
 
     from jaxltl.core.logic.properties import parse_property
-    from jaxltl.core.models.lanes import on_host
-    from jaxltl.core.models.shard import from_mesh, shard
-    from jaxltl.core.values.answer_on_mesh import first_bounds, question_on_mesh
-    from jaxltl.core.values.discounted import optimal_value
-    from jaxltl.core.values.soft import soft_value
-    from tests.core.values.test_answer_on_mesh import PROPERTIES, gambler
+    from jaxltl.core.models.mesh.lanes import on_host
+    from jaxltl.core.models.mesh.shard import from_mesh, shard
+    from jaxltl.core.values.discounted.discounted import optimal_value
+    from jaxltl.core.values.discounted.soft import soft_value
+    from jaxltl.core.values.properties.solve_on_mesh import first_bounds, question_on_mesh
+    from tests.core.values.properties.test_solve_on_mesh import PROPERTIES, gambler
 
     with jax.enable_x64(True):
         model = shard(gambler(), place.mesh)

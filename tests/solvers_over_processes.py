@@ -13,10 +13,10 @@ def main(names: str, reaches: str, coordinator: str, process: str, processes: st
     jax.config.update("jax_num_cpu_devices", 2)
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
     jax.distributed.initialize(coordinator, int(processes), int(process))
+    from jaxltl.core.models.mesh.shard import from_mesh, shard, to_mesh
     from jaxltl.core.models.product import product
-    from jaxltl.core.models.shard import from_mesh, shard, to_mesh
-    from jaxltl.core.values.satisfaction import optimal_satisfaction
-    from tests.core.models.test_sharded import world
+    from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction
+    from tests.core.models.mesh.test_sharded import world
     from tests.core.values.test_over_mesh import SOLVERS, quantities
 
     mesh = jax.make_mesh((jax.device_count(),), ("states",))

@@ -16,8 +16,8 @@ from click.testing import CliRunner
 
 import jaxltl
 from jaxltl import __main__ as entry
-from jaxltl.app.compilation import SOON, cache_directory, known_flags
-from jaxltl.app.reports.drawing import artist, draw, drawing
+from jaxltl.app.drawing import artist, draw, drawing
+from jaxltl.app.programs import SOON, cache_directory, known_flags
 from jaxltl.cli import main
 from jaxltl.core.automata.language import is_equivalent
 from jaxltl.core.automata.translate import to_automaton
@@ -437,8 +437,8 @@ import sys, click
 from click.testing import CliRunner
 import jaxltl
 from jaxltl import __main__ as entry
-from jaxltl.app.reports.drawing import artist, draw, drawing
-from jaxltl.app.compilation import cache_directory
+from jaxltl.app.drawing import artist, draw, drawing
+from jaxltl.app.programs import cache_directory
 from jaxltl.cli import main
 assert CliRunner().invoke(main, ["--help"]).exit_code == 0
 def echo(text, **_):
@@ -512,12 +512,12 @@ except SystemExit:
 def test_short_work_solves_its_systems_in_one_thread(tmp_path):
     code = """
 import os
-from jaxltl.app import compilation
-compilation.one_thread()
+from jaxltl.app import programs
+programs.one_thread()
 print(os.environ.get("OPENBLAS_NUM_THREADS"))
 import numpy
 del os.environ["OPENBLAS_NUM_THREADS"]
-compilation.one_thread()
+programs.one_thread()
 print(os.environ.get("OPENBLAS_NUM_THREADS"))"""
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("OPENBLAS_NUM_THREADS", raising=False)
@@ -569,7 +569,7 @@ def test_a_dead_process_draws_nothing_and_loses_nothing(monkeypatch):
         def result(self):
             raise BrokenExecutor
 
-    monkeypatch.setattr("jaxltl.app.reports.drawing.ProcessPoolExecutor", Pool)
+    monkeypatch.setattr("jaxltl.app.drawing.ProcessPoolExecutor", Pool)
     task = drawing("automaton", to_automaton("F a"), layout="matplotlib")
     with artist(apart=True) as begin:
         assert begin(task)().endswith(b"</svg>\n")

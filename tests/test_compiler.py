@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxltl.app.compilation import known_flags
+from jaxltl.app.programs import known_flags
 
 # As users get their programs; other tests are compiled in haste.
 DEFAULT = {

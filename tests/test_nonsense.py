@@ -24,19 +24,19 @@ from jaxltl.algos import (
 )
 from jaxltl.algos.exponential_family import diagonal_gaussian
 from jaxltl.core.automata.sequences import reach_avoid_sequences
-from jaxltl.core.host.bounded_mean import bounded_mean
-from jaxltl.core.host.confidence import samples_needed
-from jaxltl.core.host.given import listed, number, one_of, whole
-from jaxltl.core.host.l1_ball import l1_expectation
-from jaxltl.core.models import environment as en
-from jaxltl.core.models import episodes as ep
-from jaxltl.core.models import sequence_task as st
-from jaxltl.core.models import task_environment as te
-from jaxltl.core.models.time_limit import with_time_limit
-from jaxltl.core.values.evaluation import share_estimate
-from jaxltl.core.values.multi_objective import multi_objective
-from jaxltl.core.values.objectives import Objective
-from jaxltl.core.values.robust import robust_reachability, robust_total_reward
+from jaxltl.core.environments import environment as en
+from jaxltl.core.environments import episodes as ep
+from jaxltl.core.environments import sequence_task as st
+from jaxltl.core.environments import task_environment as te
+from jaxltl.core.environments.time_limit import with_time_limit
+from jaxltl.core.sparse.interval.l1_ball import l1_expectation
+from jaxltl.core.statistics.confidence_sets import samples_needed
+from jaxltl.core.statistics.empirical_bernstein import bounded_mean
+from jaxltl.core.validation import listed, number, one_of, whole
+from jaxltl.core.values.evaluation.evaluation import share_estimate
+from jaxltl.core.values.interval.robust import robust_reachability, robust_total_reward
+from jaxltl.core.values.multi_objective.multi_objective import multi_objective
+from jaxltl.core.values.multi_objective.objectives import Objective
 from jaxltl.envs import navigation
 from jaxltl.envs.flat_world import flat_world
 from jaxltl.envs.letter_world import letter_world

@@ -22,12 +22,12 @@ from jaxltl import _public
 PUBLIC = {name: getattr(jaxltl, name) for name in jaxltl.__all__}
 # Types inside of public ones that nobody has to name, in modules whose text tells of them.
 DOCUMENTED = (
-    "jaxltl.core.host.product",
-    "jaxltl.core.host.sparse",
+    "jaxltl.core.sparse.product",
+    "jaxltl.core.sparse.mdp",
     "jaxltl.core.logic.bounded",
     "jaxltl.core.models.product",
-    "jaxltl.core.models.sharded",
-    "jaxltl.core.values.sweeps",
+    "jaxltl.core.models.mesh.sharded",
+    "jaxltl.core.values.engine.block_sweeps",
 )
 
 

@@ -14,7 +14,7 @@ from jaxltl.algos.play import (
     take,
 )
 from jaxltl.core.models.game import Game
-from jaxltl.core.models.operators import action_argmax, sample_successor
+from jaxltl.core.models.ops.operators import action_argmax, sample_successor
 
 # An alias table (Walker 1977) draws from any row with one look-up: 24 bits of a threshold
 # and 8 of the action to take above it.

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 from flax import struct
 
-from jaxltl.core.host.confidence import Method, intervals_from_counts
-from jaxltl.core.host.rows import starts_of
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import interval_rows
 from jaxltl.core.models.sparse import Rewards
-from jaxltl.core.show import brief
-from jaxltl.core.values.robust import robust_discounted_value
+from jaxltl.core.pretty_print import brief
+from jaxltl.core.sparse.rows import starts_of
+from jaxltl.core.statistics.confidence_sets import Method, intervals_from_counts
+from jaxltl.core.values.interval.robust import robust_discounted_value
 
 
 @brief
@@ -56,7 +56,7 @@ def data_evidence(
       counts: ``int[S, A, K]``.
       play: ``float[S, A]``, the system's strategy.
       discount: in ``[0, 1)``.
-      confidence, method: as of :func:`~jaxltl.core.host.confidence.intervals_from_counts`.
+      confidence, method: as of :func:`~jaxltl.core.statistics.confidence_sets.intervals_from_counts`.
     """
     region, mdp = np.asarray(region), game.mdp
     state = np.flatnonzero(region)

@@ -10,7 +10,7 @@ from flax import struct
 from jax import lax
 
 from jaxltl.algos.schedules import SLACK
-from jaxltl.core.show import brief
+from jaxltl.core.pretty_print import brief
 
 
 @brief

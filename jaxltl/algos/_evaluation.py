@@ -10,14 +10,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxltl.core.host import given
-from jaxltl.core.models import lanes
+from jaxltl.core import validation
+from jaxltl.core.models.mesh import lanes
 from jaxltl.core.types import require_shape
 
 
 def per_cost(name: str, value: Any, num_costs: int) -> np.ndarray:
     """One number for each cost, of one for all or of as many."""
-    value = given.numbers(name, value)
+    value = validation.numbers(name, value)
     if value.ndim:
         require_shape(name, value, (num_costs,))
     return np.broadcast_to(value, (num_costs,))

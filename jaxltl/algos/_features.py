@@ -13,18 +13,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxltl.core.host.quickest import until_read
-from jaxltl.core.host.reach import policy_row, steps_until
-from jaxltl.core.models.concrete import namespace, to_jax
-from jaxltl.core.models.lifting import lift_trajectories
+from jaxltl.core.models.build.lifting import lift_trajectories
 from jaxltl.core.models.mdp import MDP, DenseMDP
-from jaxltl.core.models.operators import expectation
+from jaxltl.core.models.ops.array_namespace import namespace, to_jax
+from jaxltl.core.models.ops.operators import expectation
 from jaxltl.core.models.product import Product, expected_reads
 from jaxltl.core.models.trajectories import Trajectories
-from jaxltl.core.show import brief
+from jaxltl.core.pretty_print import brief
+from jaxltl.core.sparse.solvers.dense_reachability import policy_row, steps_until
+from jaxltl.core.sparse.solvers.shortest_path import until_read
 from jaxltl.core.types import Solution
-from jaxltl.core.values.reachability import action_matrices
-from jaxltl.core.values.satisfaction import as_reachability, visiting
+from jaxltl.core.values.undiscounted.reachability import action_matrices
+from jaxltl.core.values.undiscounted.satisfaction import as_reachability, visiting
 
 
 def pair_counts(model: Any, trajectories: Trajectories, kept: Any = None) -> jax.Array:
@@ -86,7 +86,7 @@ def task_features(
       demonstrations: in the world.
       avoid: propositions.
       progress: automaton states; default :func:`progress_states`.
-      best: of :func:`~jaxltl.core.values.satisfaction.optimal_satisfaction`; concrete.
+      best: of :func:`~jaxltl.core.values.undiscounted.satisfaction.optimal_satisfaction`; concrete.
 
     Raises:
       ValueError: a state or proposition does not exist, or `progress` is given for a task that is

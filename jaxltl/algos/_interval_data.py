@@ -15,7 +15,7 @@ from jax import lax
 from jaxltl.algos import learner, splitmix
 from jaxltl.algos.play import draw, successor_slot, take
 from jaxltl.core.models.game import as_game
-from jaxltl.core.models.operators import sample_successor
+from jaxltl.core.models.ops.operators import sample_successor
 
 
 class _Rules(NamedTuple):
@@ -103,7 +103,7 @@ def confident(
 ) -> tuple[jax.Array, jax.Array]:
     """Intervals of all times at once, in closed form.
 
-    The set of :func:`~jaxltl.core.host.binomial.anytime` lies in ``n kl(k / n, p) <= log(2 sqrt(n)
+    The set of :func:`~jaxltl.core.statistics.binomial.anytime` lies in ``n kl(k / n, p) <= log(2 sqrt(n)
     / failure)``, since Jeffreys' mixture is at least ``1 / (2 sqrt(n))`` of any likelihood
     (Willems, Shtarkov and Tjalkens 1995). That is enclosed by ``kl(a, b) >= 2 (a - b)^2`` and
     ``kl(a, b) >= (a - b)^2 / (2 max(a, b))``, of the probabilities and of what is left of one. As

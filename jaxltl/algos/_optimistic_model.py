@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxltl.algos import learner, pac
 from jaxltl.algos._walk import Walk
 from jaxltl.algos.play import take
-from jaxltl.core.values.warm_start import span_iteration
+from jaxltl.core.values.discounted.warm_start import span_iteration
 
 
 def updated(state: Any, walk: Walk, problem: Any, hparams: Any) -> Any:

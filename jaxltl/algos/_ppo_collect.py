@@ -17,9 +17,9 @@ from jaxltl.algos import learner
 from jaxltl.algos.actor_critic import Output, evaluated
 from jaxltl.algos.advantages import generalized_advantages
 from jaxltl.algos.moments import Moments, normalized, scale_of, updated_moments
-from jaxltl.core.models import lanes
-from jaxltl.core.models.environment import Timestep, allowed_in
-from jaxltl.core.show import brief
+from jaxltl.core.environments.environment import Timestep, allowed_in
+from jaxltl.core.models.mesh import lanes
+from jaxltl.core.pretty_print import brief
 
 
 @brief

@@ -16,7 +16,7 @@ from jaxltl.algos import learner
 from jaxltl.algos._ppo_collect import Rows
 from jaxltl.algos.actor_critic import Output, evaluated, has_memory
 from jaxltl.algos.schedules import at
-from jaxltl.core.models import lanes
+from jaxltl.core.models.mesh import lanes
 
 
 class Figures(NamedTuple):

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 
-from jaxltl.core.models.lanes import on_host, vmap_over_mesh
+from jaxltl.core.models.mesh.lanes import on_host, vmap_over_mesh
 
 Run = Callable[..., tuple[Any, Any]]
 

@@ -18,7 +18,7 @@ from jaxltl.algos.play import (
     successor_slot,
     take,
 )
-from jaxltl.core.models.operators import sample_successor
+from jaxltl.core.models.ops.operators import sample_successor
 
 _BEST, _KNOWN = 1, 2
 

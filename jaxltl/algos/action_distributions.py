@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxltl.core.models.environment import Box, Finite, clipped_action
+from jaxltl.core.environments.environment import Box, Finite, clipped_action
 
 Actions = Finite | Box
 SQUASHES = ("clip", "tanh")

@@ -37,9 +37,9 @@ import numpy as np
 from jax import lax
 
 from jaxltl.algos.settings import applied
-from jaxltl.core.host import given
-from jaxltl.core.models.environment import Finite, flat_observation
-from jaxltl.core.show import brief
+from jaxltl.core import validation
+from jaxltl.core.environments.environment import Finite, flat_observation
+from jaxltl.core.pretty_print import brief
 
 
 @brief
@@ -206,8 +206,8 @@ def default_network(actions: Any) -> ActorCritic:
     """An :class:`ActorCritic` for some actions.
 
     Args:
-      actions: :class:`~jaxltl.core.models.environment.Finite`, or a
-        :class:`~jaxltl.core.models.environment.Box`.
+      actions: :class:`~jaxltl.core.environments.environment.Finite`, or a
+        :class:`~jaxltl.core.environments.environment.Box`.
 
     Returns:
       The module, its hidden layers as they are by default.
@@ -237,7 +237,7 @@ def initial_memory(network: nn.Module, memory: Any = None) -> Any:
         found = jax.tree.map(jnp.asarray, memory)
     except (TypeError, ValueError, OverflowError):
         raise ValueError(
-            f"memory is {given.shown(memory)}; give a tree of arrays of numbers."
+            f"memory is {validation.shown(memory)}; give a tree of arrays of numbers."
         ) from None
     own = begin() if hasattr(network, "initial_memory") else found
     if jax.tree.map(jnp.shape, found) != jax.tree.map(jnp.shape, own):

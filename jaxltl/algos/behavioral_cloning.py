@@ -60,10 +60,10 @@ from flax import struct
 
 from jaxltl.algos import learner
 from jaxltl.algos.early_stopping import Best, stop_early
-from jaxltl.core.models.batch import stack_models, stack_observations, training_counts
+from jaxltl.core.models.build.batch import stack_models, stack_observations, training_counts
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.trajectories import Trajectories
-from jaxltl.core.show import brief, history
+from jaxltl.core.pretty_print import brief, history
 from jaxltl.core.types import Status, status_code
 
 # --- policy networks -----------------------------------------------------------------------------

@@ -47,7 +47,7 @@ A run is made of steps, goes on from a state, and may end early:
 
 Many seeds are ``jax.vmap(lambda key: train(key, problem, hparams, num_steps=...))(keys)``; so are
 many settings, by ``vmap`` over the numbers of ``Hparams``. Policies
-of environments are searched with :func:`~jaxltl.core.values.episode_scores.episode_evaluator`.
+of environments are searched with :func:`~jaxltl.core.values.evaluation.episode_scores.episode_evaluator`.
 """
 
 from __future__ import annotations
@@ -71,9 +71,9 @@ from jaxltl.algos._evaluation import evaluate_all, per_cost, scores, split
 from jaxltl.algos.schedules import SLACK, Schedule, at, is_schedule
 from jaxltl.algos.schedules import Polynomial as Polynomial
 from jaxltl.algos.settings import UNBOUNDED, require_numbers
-from jaxltl.core.host import given
-from jaxltl.core.models.environment import as_partial, require_key
-from jaxltl.core.show import brief, history
+from jaxltl.core import validation
+from jaxltl.core.environments.environment import as_partial, require_key
+from jaxltl.core.pretty_print import brief, history
 from jaxltl.core.types import Status, require_shape
 
 WEIGHTINGS = ("until_feasible", "literal", "uniform")
@@ -435,7 +435,7 @@ def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
       ValueError: what is given is not of this search.
     """
     _require_ours(problem, hparams)
-    given.instance("state", state, State, "one of cce.init or cce.train")
+    validation.instance("state", state, State, "one of cce.init or cce.train")
     return families.center(state.family)
 
 
@@ -555,16 +555,16 @@ def assess(
     Raises:
       ValueError: fewer than two evaluations, or what is not of this search.
     """
-    num_evaluations = given.whole("num_evaluations", num_evaluations, most=2**31 - 1)
+    num_evaluations = validation.whole("num_evaluations", num_evaluations, most=2**31 - 1)
     if num_evaluations < 2:
         raise ValueError(
             f"num_evaluations={num_evaluations}; a confidence interval needs at least 2."
         )
-    given.instance("problem", problem, Problem, "one of cce.make_problem")
+    validation.instance("problem", problem, Problem, "one of cce.make_problem")
     shape = families.center(problem.family).shape
     if not hasattr(parameters, "dtype") or jnp.shape(parameters) != shape:
         raise ValueError(
-            f"parameters is {given.shown(parameters)}; give those of one policy, float{[*shape]}, "
+            f"parameters is {validation.shown(parameters)}; give those of one policy, float{[*shape]}, "
             "such as cce.policy(state, problem, hparams). Many are a vmap."
         )
     return _assessed(problem, parameters, require_key(key), num_evaluations)
@@ -627,7 +627,7 @@ def result(
         of this search.
     """
     _require_ours(problem, hparams)
-    given.instance("state", state, State, "one of cce.init or cce.train")
+    validation.instance("state", state, State, "one of cce.init or cce.train")
     require_key(key)
     if jnp.ndim(state.step):
         raise ValueError(
@@ -695,12 +695,12 @@ _OPTIONAL = ("sample_share", "num_samples", "variance_floor", "restart_below")
 
 
 def _require_ours(problem: Problem, hparams: Hparams) -> None:
-    given.instance("problem", problem, Problem, "one of cce.make_problem")
-    given.instance("hparams", hparams, Hparams, "cce.Hparams")
+    validation.instance("problem", problem, Problem, "one of cce.make_problem")
+    validation.instance("hparams", hparams, Hparams, "cce.Hparams")
 
 
 def _require_state(state: State, problem: Problem) -> None:
-    given.instance("state", state, State, "one of cce.init or cce.train")
+    validation.instance("state", state, State, "one of cce.init or cce.train")
     found, own = (families.center(x.family).shape for x in (state, problem))
     if found != own or state.best.cost.shape != problem.limit.shape:
         raise ValueError(
@@ -712,10 +712,10 @@ def _require_state(state: State, problem: Problem) -> None:
 def _check(problem: Problem, hparams: Hparams) -> None:
     _require_ours(problem, hparams)
     for name in ("elite_reuse", "antithetic"):
-        given.truth(name, getattr(hparams, name))
-    given.one_of("weighting", hparams.weighting, WEIGHTINGS)
-    rho = given.number("rho", hparams.rho)
-    population = given.whole("population", hparams.population, least=1, most=2**31 - 1)
+        validation.truth(name, getattr(hparams, name))
+    validation.one_of("weighting", hparams.weighting, WEIGHTINGS)
+    rho = validation.number("rho", hparams.rho)
+    population = validation.whole("population", hparams.population, least=1, most=2**31 - 1)
     if isinstance(hparams.rho, str) or not 0 < rho < 1 or rho * population < 1 - SLACK:
         raise ValueError(
             f"rho={hparams.rho} of population={hparams.population} leaves no elite, or all; give "

@@ -47,7 +47,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxltl.algos import _checkpoint_parts as parts
-from jaxltl.core.models.concrete import to_jax
+from jaxltl.core.models.ops.array_namespace import to_jax
 
 _GIVEN = "given"  # the fingerprint's name in the file
 _PARTS = "parts"  # the name of what is in other files

@@ -44,9 +44,9 @@ from jaxltl.algos.learner import (
     run_blocks,
     strong,
 )
-from jaxltl.core.host.given import truth
-from jaxltl.core.models.concrete import to_jax
-from jaxltl.core.models.lanes import on_host
+from jaxltl.core.models.mesh.lanes import on_host
+from jaxltl.core.models.ops.array_namespace import to_jax
+from jaxltl.core.validation import truth
 
 
 class Chunks(NamedTuple):
@@ -98,7 +98,7 @@ def run_in_chunks(
       report: called with the number of steps and the newest metrics after each chunk.
       checkpoint: a file that holds all of this after every chunk, written atomically. If it
         exists, the run goes on from it, and ends with the same bits.
-      mesh: devices over which the lanes lie (:mod:`~jaxltl.core.models.lanes`). In several
+      mesh: devices over which the lanes lie (:mod:`~jaxltl.core.models.mesh.lanes`). In several
         processes each calls this with the same arguments, and has all of the result but the state,
         which stays where it is. Checkpoints of other devices, or of none, are gone on from too.
 

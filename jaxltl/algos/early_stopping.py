@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxltl.algos.learner import choose
-from jaxltl.core.show import brief
+from jaxltl.core.pretty_print import brief
 
 
 @brief

@@ -52,7 +52,7 @@ from jax import lax
 from jax.scipy.special import digamma, gammaln
 
 from jaxltl.algos import splitmix
-from jaxltl.core.show import brief
+from jaxltl.core.pretty_print import brief
 
 
 @brief

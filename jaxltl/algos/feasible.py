@@ -64,17 +64,17 @@ from jax.tree_util import Partial
 
 from jaxltl.algos import learner
 from jaxltl.algos.schedules import Schedule, at
-from jaxltl.core.host import optimal
-from jaxltl.core.host.given import number, one_of, shown, whole
-from jaxltl.core.models.concrete import to_jax
-from jaxltl.core.models.parametric import Ends, ParametricMDP
+from jaxltl.core.models.ops.array_namespace import to_jax
+from jaxltl.core.models.parametric.parametric import Ends, ParametricMDP
 from jaxltl.core.models.sparse import row_reward
-from jaxltl.core.show import brief, history
+from jaxltl.core.pretty_print import brief, history
+from jaxltl.core.sparse.solvers import reachability as optimal
 from jaxltl.core.types import Status, require_shape
-from jaxltl.core.values.mixture import safe_ends
-from jaxltl.core.values.prepared import Prepared, prepare, solve_prepared
-from jaxltl.core.values.prepared_chain import evaluate_prepared, is_direct
-from jaxltl.core.values.robust import width_asked
+from jaxltl.core.validation import number, one_of, shown, whole
+from jaxltl.core.values.interval.robust import width_asked
+from jaxltl.core.values.prepared.prepared import Prepared, prepare, solve_prepared
+from jaxltl.core.values.prepared.prepared_chain import evaluate_prepared, is_direct
+from jaxltl.core.values.undiscounted.mixture import safe_ends
 
 _FINEST = 1e-12  # the width asked for where the one that was asked for does not tell
 
@@ -123,7 +123,7 @@ class Hparams:
       optimizer: ``"adam"``, ``"rmsprop"``, ``"sgd"``, or ``"sign"``, which takes the signs of the
         gradient alone; static; default ``"adam"``.
       tolerance: of the solves of decision processes, see
-        :func:`~jaxltl.core.values.prepared.solve_prepared`, also for what None stands for; default
+        :func:`~jaxltl.core.values.prepared.prepared.solve_prepared`, also for what None stands for; default
         None.
     """
 
@@ -205,7 +205,7 @@ def make_problem(
     """A checked :class:`Problem`, on the host: for which parameters is a value past a threshold?
 
     Args:
-      model: made by :func:`~jaxltl.core.models.parametric.make_parametric`, or by
+      model: made by :func:`~jaxltl.core.models.parametric.parametric.make_parametric`, or by
         ``read_parametric(path).over(low, high)``.
       target: ``bool[S]``, or a label.
       bound: ``">="`` or ``"<="``: the value shall be at least or at most the threshold.
@@ -260,7 +260,7 @@ def within(problem: Problem, low: Ends, high: Ends) -> Problem:
 
     Args:
       problem: the question.
-      low, high: as of :func:`~jaxltl.core.models.parametric.make_parametric`.
+      low, high: as of :func:`~jaxltl.core.models.parametric.parametric.make_parametric`.
 
     Returns:
       :class:`Problem`.

@@ -74,16 +74,16 @@ from jaxltl.core.automata.translate import Task
 from jaxltl.core.graphs.acceptance import accepting_bottom_components, accepting_end_components
 from jaxltl.core.graphs.attractor import almost_surely_reaching, attractor
 from jaxltl.core.graphs.end_components import bottom_components, end_components
-from jaxltl.core.models.concrete import to_jax
-from jaxltl.core.models.convert import to_padded, to_sparse
+from jaxltl.core.models.build.convert import to_padded, to_sparse
 from jaxltl.core.models.game import as_game
 from jaxltl.core.models.mdp import support
-from jaxltl.core.models.operators import forall_successor
+from jaxltl.core.models.ops.array_namespace import to_jax
+from jaxltl.core.models.ops.operators import forall_successor
 from jaxltl.core.models.product import Product, product
-from jaxltl.core.show import brief, history
+from jaxltl.core.pretty_print import brief, history
 from jaxltl.core.types import Status, status_code
-from jaxltl.core.values.contest import chances
-from jaxltl.core.values.data_guarantee import DataGuarantee, learn_guarantee
+from jaxltl.core.values.evaluation.data_guarantee import DataGuarantee, learn_guarantee
+from jaxltl.core.values.interval.contest import chances
 
 INTERVALS = ("linear", "confidence")
 
@@ -432,10 +432,10 @@ def guarantee(state: State, problem: Problem, confidence: float, **options: Any)
       problem: of it.
       confidence: in (0, 1).
       options: `tolerance` and the like of
-        :func:`~jaxltl.core.values.data_guarantee.learn_guarantee`.
+        :func:`~jaxltl.core.values.evaluation.data_guarantee.learn_guarantee`.
 
     Returns:
-      :class:`~jaxltl.core.values.data_guarantee.DataGuarantee`, by anytime intervals.
+      :class:`~jaxltl.core.values.evaluation.data_guarantee.DataGuarantee`, by anytime intervals.
 
     Raises:
       ValueError: the confidence.

@@ -59,9 +59,9 @@ from jax import lax
 from jax.tree_util import Partial
 
 from jaxltl.algos.settings import require_arrays
-from jaxltl.core.host.given import called, whole
-from jaxltl.core.show import brief
+from jaxltl.core.pretty_print import brief
 from jaxltl.core.types import Status, worst
+from jaxltl.core.validation import called, whole
 
 Init = Callable[..., Any]
 Step = Callable[..., tuple[Any, Any]]

@@ -1,7 +1,7 @@
 """One agent for many formulas: it follows sequences of what to reach and what to avoid.
 
 A network reads the world and the sequence that is still to be done. Trained on sequences that are
-drawn (:func:`~jaxltl.core.models.sequence_task.sequence_environment`), by PPO or another learner,
+drawn (:func:`~jaxltl.core.environments.sequence_task.sequence_environment`), by PPO or another learner,
 it does any formula over the same labels: the automaton of the formula tells, for each of its
 states, the sequences that lead to acceptance, and the network's own value which of them to follow
 (Jackermeier and Abate 2025, "DeepLTL"). Automata are made on the host once a formula; their tables
@@ -60,22 +60,22 @@ from jaxltl.algos import action_distributions
 from jaxltl.algos.actor_critic import dense
 from jaxltl.algos.moments import normalized
 from jaxltl.algos.settings import applied
+from jaxltl.core import validation
 from jaxltl.core.automata import sequences
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.translate import to_automaton
-from jaxltl.core.host import given
-from jaxltl.core.logic.ltl import Formula
-from jaxltl.core.models import sequence_task
-from jaxltl.core.models.environment import (
+from jaxltl.core.environments import sequence_task
+from jaxltl.core.environments.environment import (
     Box,
     Finite,
     as_partial,
     flat_observation,
     require_key,
 )
-from jaxltl.core.models.episodes import Agent
-from jaxltl.core.models.task_environment import TaskObservation
-from jaxltl.core.show import brief
+from jaxltl.core.environments.episodes import Agent
+from jaxltl.core.environments.task_environment import TaskObservation
+from jaxltl.core.logic.ltl import Formula
+from jaxltl.core.pretty_print import brief
 
 
 class SequenceNetwork(nn.Module):
@@ -181,7 +181,7 @@ def make_plan(
     """
     automaton = task if isinstance(task, Automaton) else to_automaton(task)
     found = sequences.reach_avoid_sequences(
-        automaton, events, given.names("propositions", propositions), depth=depth, most=most
+        automaton, events, validation.names("propositions", propositions), depth=depth, most=most
     )
     return Plan(found.reach, found.avoid, found.length)
 
@@ -198,9 +198,9 @@ def stack_plans(plans: Sequence[Plan]) -> Plan:
     Raises:
       ValueError: no plan, or plans of different depths or events.
     """
-    plans = given.listed("plans", plans)
+    plans = validation.listed("plans", plans)
     for plan in plans:
-        given.instance("plans", plan, Plan, "a list of those of make_plan")
+        validation.instance("plans", plan, Plan, "a list of those of make_plan")
     shapes = [np.shape(plan.reach) for plan in plans]
     if not shapes or len({shape[2:] for shape in shapes}) > 1:
         raise ValueError(
@@ -263,20 +263,22 @@ def sequence_agent(
       sampled: whether actions are drawn; else the most likely one is taken.
 
     Returns:
-      An :class:`~jaxltl.core.models.episodes.Agent` for observations
-      :class:`~jaxltl.core.models.task_environment.TaskObservation` of that formula, one-hot in the
+      An :class:`~jaxltl.core.environments.episodes.Agent` for observations
+      :class:`~jaxltl.core.environments.task_environment.TaskObservation` of that formula, one-hot in the
       automaton's state.
 
     Raises:
       ValueError: what is no plan or function, or at the first step Gaussian actions whose box is
         not given.
     """
-    given.instance("plan", plan, Plan, "one of make_plan")
+    validation.instance("plan", plan, Plan, "one of make_plan")
     if actions is not None:
-        given.instance("actions", actions, Finite | Box, "the environment's, environment.actions")
+        validation.instance(
+            "actions", actions, Finite | Box, "the environment's, environment.actions"
+        )
     how = _How(
-        given.one_of("squash", squash, action_distributions.SQUASHES),
-        given.truth("sampled", sampled),
+        validation.one_of("squash", squash, action_distributions.SQUASHES),
+        validation.truth("sampled", sampled),
     )
     begin = Choice(jnp.int32(-1), jnp.int32(0), jnp.asarray(0.0))
     return Agent(Partial(_act, how, actions, as_partial(network, "network"), plan), begin)
@@ -289,7 +291,7 @@ def sequence_policy(
 
     By the world's observation and the automaton's state alone, so that
     ``Partial(sequence_policy, network, plan)`` is a policy for
-    :func:`~jaxltl.core.values.optimality_gap.tabulate_policy`.
+    :func:`~jaxltl.core.values.evaluation.optimality_gap.tabulate_policy`.
 
     Args:
       network, plan: as of :func:`sequence_agent`; of finitely many actions.
@@ -310,11 +312,11 @@ def sequence_policy(
       >>> jax.eval_shape(lambda x: sequence_policy(network, plan, x, 0), jnp.zeros(1)).shape
       (2,)
     """
-    given.instance("plan", plan, Plan, "one of make_plan")
+    validation.instance("plan", plan, Plan, "one of make_plan")
     if not (isinstance(memory, jax.Array) and jnp.issubdtype(memory.dtype, jnp.integer)):
-        memory = given.whole("memory", memory)
+        memory = validation.whole("memory", memory)
     actions, values = _judged(
-        given.called("network", network), plan, observation, jnp.asarray(memory)
+        validation.called("network", network), plan, observation, jnp.asarray(memory)
     )
     _actions_of(actions)
     return jax.nn.softmax(actions[jnp.argmax(values)])
@@ -351,7 +353,7 @@ def trained(network: nn.Module, parameters: Any, moments: Any = None) -> Partial
     Raises:
       ValueError: no module; at the first call parameters that are not this network's.
     """
-    given.instance("network", network, nn.Module, "a flax.linen.Module")
+    validation.instance("network", network, nn.Module, "a flax.linen.Module")
     return Partial(_applied, _Module(network), parameters, moments)
 
 
@@ -400,13 +402,13 @@ def _act(
     key: chex.PRNGKey,
 ) -> tuple[Any, Any]:
     if not (hasattr(observation, "world") and hasattr(observation, "memory")):
-        given.instance(
+        validation.instance(
             "observation",
             observation,
             TaskObservation,
             "that of an environment of task_environment, with the formula of the plan",
         )
-    given.instance("memory", memory, Choice, "the agent's own, agent.memory")
+    validation.instance("memory", memory, Choice, "the agent's own, agent.memory")
     require_key(key)
     seen, state = observation.world, jnp.argmax(observation.memory).astype(jnp.int32)
     actions, values = _judged(network, plan, seen, state)
@@ -478,13 +480,13 @@ def train_in_stages(
     Raises:
       ValueError: no problem, or a number of thresholds that does not fit.
     """
-    problems = given.listed("problems", problems)
+    problems = validation.listed("problems", problems)
     for name, function in (("init", init), ("run", run), ("report", report)):
         if function is not None or name != "report":
-            given.called(name, function)
+            validation.called(name, function)
     count = len(problems)
-    num_chunks = given.whole("num_chunks", num_chunks, least=1)
-    bars = given.numbers("enough", enough)
+    num_chunks = validation.whole("num_chunks", num_chunks, least=1)
+    bars = validation.numbers("enough", enough)
     bars = np.full(max(count - 1, 0), bars) if bars.ndim == 0 else bars
     if count == 0 or bars.shape != (count - 1,) or np.isnan(bars).any():
         raise ValueError(

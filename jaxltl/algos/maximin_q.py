@@ -76,11 +76,11 @@ from jaxltl.algos.play import (
     take,
 )
 from jaxltl.core.graphs.end_components import bottom_components
+from jaxltl.core.models.build.restrict import restrict
 from jaxltl.core.models.game import Game, as_padded_game
 from jaxltl.core.models.mdp import MDP
-from jaxltl.core.models.operators import action_argmax
-from jaxltl.core.models.restrict import restrict
-from jaxltl.core.show import brief, history
+from jaxltl.core.models.ops.operators import action_argmax
+from jaxltl.core.pretty_print import brief, history
 from jaxltl.core.types import Status, require_shape, status_code
 
 

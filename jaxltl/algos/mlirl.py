@@ -63,18 +63,18 @@ from jaxltl.algos._features import pair_counts
 from jaxltl.algos._features import progress_states as progress_states
 from jaxltl.algos._features import task_features as task_features
 from jaxltl.algos._features import world_features as world_features
-from jaxltl.core.models.concrete import to_jax
-from jaxltl.core.models.lifting import allowed_steps, lift_trajectories
+from jaxltl.core.models.build.lifting import allowed_steps, lift_trajectories
+from jaxltl.core.models.build.restrict import with_allowed
 from jaxltl.core.models.mdp import MDP, DenseMDP
+from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.models.product import Product
-from jaxltl.core.models.restrict import with_allowed
 from jaxltl.core.models.trajectories import Trajectories
-from jaxltl.core.show import brief, history
+from jaxltl.core.pretty_print import brief, history
 from jaxltl.core.types import Solution, Status, require_shape, worst
-from jaxltl.core.values.boltzmann import boltzmann_value
-from jaxltl.core.values.iterate import in_turn
-from jaxltl.core.values.satisfaction import satisfaction_probability
-from jaxltl.core.values.soft import policy_logits, soft_value
+from jaxltl.core.values.discounted.boltzmann import boltzmann_value
+from jaxltl.core.values.discounted.soft import policy_logits, soft_value
+from jaxltl.core.values.engine.iterate import in_turn
+from jaxltl.core.values.undiscounted.satisfaction import satisfaction_probability
 
 Reward = Callable[[Any, jax.Array], jax.Array]
 
@@ -223,9 +223,9 @@ def make_problem(
       satisfaction_over: the states over which g sums (2.6): ``"initial"`` (where the model
         starts; the dissertation's prose), ``"all"`` (its formula), or weights ``float[S]``.
       allowed: ``bool[S, A]`` (``[S, Q, A]``), the actions that policies choose from, such as those
-        that lose nothing of the task (:func:`~jaxltl.core.values.optimal_actions.optimal_actions`);
+        that lose nothing of the task (:func:`~jaxltl.core.values.undiscounted.optimal_actions.optimal_actions`);
         default all. Demonstrated steps that take others are left out:
-        :func:`~jaxltl.core.models.lifting.allowed_steps` tells which.
+        :func:`~jaxltl.core.models.build.lifting.allowed_steps` tells which.
 
     Returns:
       :class:`Problem`.

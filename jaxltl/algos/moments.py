@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxltl.core.show import brief
+from jaxltl.core.pretty_print import brief
 
 
 @brief

@@ -32,7 +32,7 @@ import jax.numpy as jnp
 
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import MDP
-from jaxltl.core.models.operators import action_max
+from jaxltl.core.models.ops.operators import action_max
 from jaxltl.core.types import Solution, require_shape
 
 # --- the constants of algorithm 5 -------------------------------------------------------------
@@ -284,8 +284,8 @@ def epsilon_optimal_states(optimal: Solution, value: Solution, epsilon: chex.Num
     True is proved, and a False may only mean that the bounds are too wide.
 
     Args:
-      optimal: of :func:`~jaxltl.core.values.minimax.minimax_value`.
-      value: of :func:`~jaxltl.core.values.minimax.strategy_value`.
+      optimal: of :func:`~jaxltl.core.values.discounted.minimax.minimax_value`.
+      value: of :func:`~jaxltl.core.values.discounted.minimax.strategy_value`.
       epsilon: at least 0.
 
     Returns:

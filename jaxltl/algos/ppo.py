@@ -2,7 +2,7 @@
 
 A step draws T steps of N environments with the policy of that moment, estimates generalised
 advantages, and makes some epochs of minibatches of Adam on the clipped surrogate (Schulman et al.
-2017). Environments are those of :mod:`jaxltl.core.models.environment`; an episode that is cut off
+2017). Environments are those of :mod:`jaxltl.core.environments.environment`; an episode that is cut off
 is worth what the value network expects of the world in which it was cut off, one that is over
 nothing more. Where the environment allows only some actions, no other is ever taken, and the
 entropy is that over those allowed: a network learns inside what a shield leaves.
@@ -82,17 +82,17 @@ from jaxltl.algos.moments import Moments, no_moments, normalized
 from jaxltl.algos.schedules import Schedule
 from jaxltl.algos.schedules import at as _at
 from jaxltl.algos.settings import require_numbers
-from jaxltl.core.host import given
-from jaxltl.core.models import lanes
-from jaxltl.core.models.environment import (
+from jaxltl.core import validation
+from jaxltl.core.environments.environment import (
     Box,
     Environment,
     Finite,
     require_environment,
     require_key,
 )
-from jaxltl.core.models.episodes import Agent
-from jaxltl.core.show import brief, history
+from jaxltl.core.environments.episodes import Agent
+from jaxltl.core.models.mesh import lanes
+from jaxltl.core.pretty_print import brief, history
 from jaxltl.core.types import Status
 
 
@@ -293,7 +293,7 @@ def make_problem(
             f"environment.actions is a box of {actions.dtype}; number what is in it, Finite(n)."
         )
     network = default_network(actions) if network is None else network
-    given.instance("network", network, nn.Module, "a flax.linen.Module")
+    validation.instance("network", network, nn.Module, "a flax.linen.Module")
     memory = learner.strong(initial_memory(network, memory))
     seen = jax.eval_shape(
         lambda key: environment.observe(environment.reset(key)), jax.random.key(0)
@@ -326,20 +326,22 @@ _SCHEDULES = ("learning_rate", "clip", "value_clip")
 
 
 def _require_ours(problem: Problem, hparams: Hparams) -> None:
-    given.instance("problem", problem, Problem, "one of ppo.make_problem")
-    given.instance("hparams", hparams, Hparams, "ppo.Hparams")
+    validation.instance("problem", problem, Problem, "one of ppo.make_problem")
+    validation.instance("hparams", hparams, Hparams, "ppo.Hparams")
 
 
 def _check(problem: Problem, hparams: Hparams) -> None:
     _require_ours(problem, hparams)
     for name in ("num_envs", "num_steps", "num_epochs", "num_minibatches"):
-        given.whole(name, getattr(hparams, name), least=1, most=2**31 - 1)
+        validation.whole(name, getattr(hparams, name), least=1, most=2**31 - 1)
     if hparams.num_resets is not None:
-        given.whole("num_resets", hparams.num_resets, most=2**31 - 1)
-    given.one_of("squash", hparams.squash, actions_of.SQUASHES)
+        validation.whole("num_resets", hparams.num_resets, most=2**31 - 1)
+    validation.one_of("squash", hparams.squash, actions_of.SQUASHES)
     for name in ("normalize_advantage", "normalize_observation", "normalize_reward"):
-        given.truth(name, getattr(hparams, name))
-    given.whole("num_envs times num_steps", hparams.num_envs * hparams.num_steps, most=2**31 - 1)
+        validation.truth(name, getattr(hparams, name))
+    validation.whole(
+        "num_envs times num_steps", hparams.num_envs * hparams.num_steps, most=2**31 - 1
+    )
     recurrent = has_memory(problem)
     size = hparams.num_envs * (1 if recurrent else hparams.num_steps)
     if size % hparams.num_minibatches:
@@ -361,16 +363,16 @@ def _check(problem: Problem, hparams: Hparams) -> None:
 
 
 def policy(state: State, problem: Problem, hparams: Hparams) -> Agent:
-    """What was learned, an :class:`~jaxltl.core.models.episodes.Agent` that draws its actions.
+    """What was learned, an :class:`~jaxltl.core.environments.episodes.Agent` that draws its actions.
 
-    Never one that is not allowed. For :func:`~jaxltl.core.models.episodes.run_episode`.
+    Never one that is not allowed. For :func:`~jaxltl.core.environments.episodes.run_episode`.
 
     Args:
       state: of one run, as of ``train``.
       problem, hparams: of the run.
 
     Returns:
-      :class:`~jaxltl.core.models.episodes.Agent`, a pytree.
+      :class:`~jaxltl.core.environments.episodes.Agent`, a pytree.
 
     Raises:
       ValueError: the state or the problem is none of PPO's.
@@ -386,7 +388,7 @@ def greedy(state: State, problem: Problem, hparams: Hparams) -> Agent:
       problem, hparams: of the run.
 
     Returns:
-      :class:`~jaxltl.core.models.episodes.Agent`, a pytree.
+      :class:`~jaxltl.core.environments.episodes.Agent`, a pytree.
 
     Raises:
       ValueError: the state or the problem is none of PPO's.
@@ -395,7 +397,7 @@ def greedy(state: State, problem: Problem, hparams: Hparams) -> Agent:
 
 
 def _agent(state: State, problem: Problem, hparams: Hparams, sampled: bool) -> Agent:
-    given.instance("state", state, State, "one of ppo.init or ppo.train")
+    validation.instance("state", state, State, "one of ppo.init or ppo.train")
     _require_ours(problem, hparams)
     act = Partial(_actor(sampled, hparams.squash), problem, state.parameters, state.moments)
     return Agent(act, problem.memory)
@@ -487,7 +489,7 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
       The next :class:`State`, and :class:`Metrics`, figures of the step.
     """
     _check(problem, hparams)
-    given.instance("state", state, State, "one of ppo.init or ppo.train")
+    validation.instance("state", state, State, "one of ppo.init or ppo.train")
     collect_key, update_key = jax.random.split(learner.step_key(state))
     after, begun, rows, told = collected(collect_key, state, problem, hparams)
     parameters, optimizer, figures, updates, nonfinite = improved(

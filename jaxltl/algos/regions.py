@@ -34,13 +34,13 @@ from typing import Any
 
 import numpy as np
 
-from jaxltl.core.host import interval_values
-from jaxltl.core.host.given import numbers, shown
-from jaxltl.core.host.given import whole as count
 from jaxltl.core.models.interval import IntervalMDP, make_interval
-from jaxltl.core.models.parametric import box_of
-from jaxltl.core.show import brief
-from jaxltl.core.values.mixture import safe_ends
+from jaxltl.core.models.parametric.parametric import box_of
+from jaxltl.core.pretty_print import brief
+from jaxltl.core.sparse.interval import reachability as interval_values
+from jaxltl.core.validation import numbers, shown
+from jaxltl.core.validation import whole as count
+from jaxltl.core.values.undiscounted.mixture import safe_ends
 
 ACCEPTED, REJECTED, OPEN = 1, -1, 0
 Problem = Any  # as jaxltl.algos.feasible.make_problem makes it

@@ -81,13 +81,13 @@ from jaxltl.core.games.objective import Parity, buchi
 from jaxltl.core.games.winning import solve
 from jaxltl.core.graphs.attractor import attractor
 from jaxltl.core.logic.ltl import Formula
-from jaxltl.core.models.concrete import to_jax
+from jaxltl.core.models.build.restrict import restrict
 from jaxltl.core.models.game import Game, as_padded_game
-from jaxltl.core.models.operators import forall_successor
-from jaxltl.core.models.restrict import restrict
-from jaxltl.core.show import brief, history
+from jaxltl.core.models.ops.array_namespace import to_jax
+from jaxltl.core.models.ops.operators import forall_successor
+from jaxltl.core.pretty_print import brief, history
 from jaxltl.core.types import Solution, Status, require_shape, status_code
-from jaxltl.core.values.minimax import minimax_value, strategy_value
+from jaxltl.core.values.discounted.minimax import minimax_value, strategy_value
 
 UPDATES = ("every", "printed")
 

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxltl.core.show import brief
+from jaxltl.core.pretty_print import brief
 
 # Products such as .07 * 100 come out a little above the integer that they are.
 SLACK = 1e-9

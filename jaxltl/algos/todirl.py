@@ -65,16 +65,16 @@ from jax import lax
 
 from jaxltl.algos import learner
 from jaxltl.algos.early_stopping import Best, stop_early
-from jaxltl.core.models.batch import narrow, stack_models, stack_observations, training_counts
-from jaxltl.core.models.batch import world as lane
+from jaxltl.core.models.build.batch import narrow, stack_models, stack_observations, training_counts
+from jaxltl.core.models.build.batch import world as lane
+from jaxltl.core.models.build.restrict import with_allowed
+from jaxltl.core.models.ops.successor_tables import Predecessors, predecessors
 from jaxltl.core.models.product import Product
-from jaxltl.core.models.restrict import with_allowed
-from jaxltl.core.models.tables import Predecessors, predecessors
 from jaxltl.core.models.trajectories import Trajectories
-from jaxltl.core.show import brief, history
+from jaxltl.core.pretty_print import brief, history
 from jaxltl.core.types import Solution, Status, status_code
-from jaxltl.core.values.satisfaction import satisfaction_probability
-from jaxltl.core.values.soft import policy_logits, soft_policy_adjoint, soft_value
+from jaxltl.core.values.discounted.soft import policy_logits, soft_policy_adjoint, soft_value
+from jaxltl.core.values.undiscounted.satisfaction import satisfaction_probability
 
 # --- reward networks ---------------------------------------------------------------------------
 
@@ -189,7 +189,7 @@ class Hparams:
         default None.
       optimizer: ``"adam"``, ``"sgd"``, ``"rmsprop"`` or ``"lbfgs"``, all optax's; static;
         default ``"adam"``.
-      method: of the soft solver, see :func:`~jaxltl.core.values.soft.soft_value`; static;
+      method: of the soft solver, see :func:`~jaxltl.core.values.discounted.soft.soft_value`; static;
         default ``"value_iteration"``.
       horizon: None, or the number of steps of a run, for a policy of the time left; static;
         default None.
@@ -281,7 +281,7 @@ def make_problem(
       horizon: count pairs by time, for ``Hparams.horizon``.
       allowed: ``bool[S, Q, A]``, or one for each world: the actions that policies choose from, such
         as those that lose nothing of the task
-        (:func:`~jaxltl.core.values.optimal_actions.optimal_actions`); default all. Demonstrated
+        (:func:`~jaxltl.core.values.undiscounted.optimal_actions.optimal_actions`); default all. Demonstrated
         steps that take others are left out.
 
     Returns:

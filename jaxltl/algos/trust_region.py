@@ -12,7 +12,7 @@ mean ``KL(old || new)``, and ``c = J_C - limit``. TRPO (Schulman et al. 2015) fo
 the problem gives in closed form, :func:`cpo_dual`. A line search then makes the step short
 enough for the true divergence, and for the gains as far as the sample tells them.
 
-A trajectory is an episode of an :class:`~jaxltl.core.models.environment.Environment` with a box of
+A trajectory is an episode of an :class:`~jaxltl.core.environments.environment.Environment` with a box of
 actions. It ends where the environment terminates or truncates it, or after ``horizon`` steps. After
 a termination nothing comes, and what would come after the horizon does not count: both are the end
 of a sum of rewards. Where the environment truncates an episode something would come, and what it
@@ -86,8 +86,8 @@ from jaxltl.algos._trust_step import Surrogate, direction, fisher_product, line_
 from jaxltl.algos._value_fit import advantages, fitted, positive, weighted_variance
 from jaxltl.algos.moments import Moments, no_moments, updated_moments
 from jaxltl.algos.settings import UNBOUNDED, require_numbers
-from jaxltl.core.host import given
-from jaxltl.core.models.environment import (
+from jaxltl.core import validation
+from jaxltl.core.environments.environment import (
     Box,
     Environment,
     Timestep,
@@ -97,8 +97,8 @@ from jaxltl.core.models.environment import (
     require_key,
     some_action,
 )
-from jaxltl.core.models.episodes import Agent
-from jaxltl.core.show import brief, history
+from jaxltl.core.environments.episodes import Agent
+from jaxltl.core.pretty_print import brief, history
 from jaxltl.core.types import Status, require_shape, status_code
 
 METHODS = ("trpo", "cpo")
@@ -319,11 +319,11 @@ def make_problem(
             "episodes that never end: neither the environment nor horizon says after how many "
             "steps; give horizon, or with_time_limit(environment, num_steps)."
         )
-    horizon = given.whole("horizon", horizon, least=1, most=2**31 - 1)
+    horizon = validation.whole("horizon", horizon, least=1, most=2**31 - 1)
     if limit is not None:
         known = isinstance(limit, jax.Array)
         limit = jnp.asarray(
-            limit if known else given.numbers("limit", limit), jnp.result_type(float)
+            limit if known else validation.numbers("limit", limit), jnp.result_type(float)
         )
         require_shape("limit", limit, ())
     return Problem(environment=environment, limit=limit, horizon=horizon)
@@ -360,12 +360,12 @@ _RANGES = {
 
 
 def _require_ours(problem: Problem, hparams: Hparams) -> None:
-    given.instance("problem", problem, Problem, "one of trust_region.make_problem")
-    given.instance("hparams", hparams, Hparams, "trust_region.Hparams")
+    validation.instance("problem", problem, Problem, "one of trust_region.make_problem")
+    validation.instance("hparams", hparams, Hparams, "trust_region.Hparams")
 
 
 def _require_state(state: State) -> None:
-    given.instance("state", state, State, "one of trust_region.init or trust_region.train")
+    validation.instance("state", state, State, "one of trust_region.init or trust_region.train")
 
 
 def _require_observed(state: State, observation: jax.Array) -> None:
@@ -373,7 +373,7 @@ def _require_observed(state: State, observation: jax.Array) -> None:
     size = state.moments.mean.shape
     if not hasattr(observation, "dtype") or jnp.shape(observation)[-1:] != size:
         raise ValueError(
-            f"observation is {given.shown(observation)}; the policy was trained on vectors "
+            f"observation is {validation.shown(observation)}; the policy was trained on vectors "
             f"float[..., {size[0]}], as flat_observation makes of an environment's."
         )
 
@@ -381,25 +381,25 @@ def _require_observed(state: State, observation: jax.Array) -> None:
 def _check(problem: Problem, hparams: Hparams) -> None:
     _require_ours(problem, hparams)
     require_numbers(hparams, _RANGES, optional=["penalty"])
-    given.whole("value_epochs", hparams.value_epochs, most=2**31 - 1)
-    given.truth("normalize", hparams.normalize)
-    given.one_of("method", hparams.method, METHODS)
+    validation.whole("value_epochs", hparams.value_epochs, most=2**31 - 1)
+    validation.truth("normalize", hparams.normalize)
+    validation.one_of("method", hparams.method, METHODS)
     if hparams.method == "cpo" and problem.limit is None:
         raise ValueError('method="cpo" needs a limit: pass one to make_problem, or use "trpo".')
     if hparams.method == "cpo" and hparams.penalty is not None:
         raise ValueError('penalty is for method="trpo": CPO finds its own multiplier.')
     for name in ("num_trajectories", "cg_steps", "search_steps", "fisher_stride", "value_batches"):
-        given.whole(name, getattr(hparams, name), least=1, most=2**31 - 1)
+        validation.whole(name, getattr(hparams, name), least=1, most=2**31 - 1)
     for name in ("hidden", "value_hidden"):
-        for width in given.listed(name, getattr(hparams, name)):
-            given.whole(f"{name}: a width", width, least=1, most=2**31 - 1)
+        for width in validation.listed(name, getattr(hparams, name)):
+            validation.whole(f"{name}: a width", width, least=1, most=2**31 - 1)
     samples = hparams.num_trajectories * problem.horizon
     if hparams.value_batches > samples:
         raise ValueError(f"value_batches={hparams.value_batches} of {samples} samples; use fewer.")
 
 
 def policy(state: State, problem: Problem, hparams: Hparams) -> Agent:
-    """What was learned, an :class:`~jaxltl.core.models.episodes.Agent` that draws its actions.
+    """What was learned, an :class:`~jaxltl.core.environments.episodes.Agent` that draws its actions.
 
     :func:`act` tells the distribution that they are drawn from.
 
@@ -408,7 +408,7 @@ def policy(state: State, problem: Problem, hparams: Hparams) -> Agent:
       problem, hparams: of the run.
 
     Returns:
-      :class:`~jaxltl.core.models.episodes.Agent`, a pytree.
+      :class:`~jaxltl.core.environments.episodes.Agent`, a pytree.
     """
     return _agent(_drawn, state, problem, hparams)
 
@@ -421,7 +421,7 @@ def greedy(state: State, problem: Problem, hparams: Hparams) -> Agent:
       problem, hparams: of the run.
 
     Returns:
-      :class:`~jaxltl.core.models.episodes.Agent`, a pytree.
+      :class:`~jaxltl.core.environments.episodes.Agent`, a pytree.
     """
     return _agent(_mean, state, problem, hparams)
 
@@ -473,7 +473,7 @@ def act(state: State, hparams: Hparams, observation: jax.Array) -> tuple[jax.Arr
     Raises:
       ValueError: what is not of this learner, or an observation of another size.
     """
-    given.instance("hparams", hparams, Hparams, "trust_region.Hparams")
+    validation.instance("hparams", hparams, Hparams, "trust_region.Hparams")
     _require_state(state)
     _require_observed(state, observation)
     return gaussian(state.parameters, hparams, normalized(state.moments, hparams, observation))
@@ -507,9 +507,9 @@ def rollout(
     """
     _require_ours(problem, hparams)
     _require_state(state)
-    number = given.whole("num_trajectories", num_trajectories, least=1, most=2**31 - 1)
+    number = validation.whole("num_trajectories", num_trajectories, least=1, most=2**31 - 1)
     return _rollout(
-        require_key(key), state, problem, hparams, number, given.truth("sampled", sampled)
+        require_key(key), state, problem, hparams, number, validation.truth("sampled", sampled)
     )
 
 

@@ -13,11 +13,15 @@ from typing import Any
 
 import numpy as np
 
-from jaxltl.core.host.confidence import check_confidence
-from jaxltl.core.models.counts import TransitionCounts, counted_model, counts_on
+from jaxltl.core.models.build.counts import TransitionCounts, counted_model, counts_on
 from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.statistics.confidence_sets import check_confidence
 from jaxltl.core.types import Status
-from jaxltl.core.values.data_guarantee import DataGuarantee, guarantee_curve, learn_guarantee
+from jaxltl.core.values.evaluation.data_guarantee import (
+    DataGuarantee,
+    guarantee_curve,
+    learn_guarantee,
+)
 
 SHOWN = 5  # choices where more samples help
 DIGITS = 5  # of bounds: solvers find them within 1e-6
@@ -72,7 +76,7 @@ def read_evidence(
     Args:
       log, labels, model: files.
       initial, terminal: names of states.
-      graph: what is known of successors; see :func:`~jaxltl.core.models.counts.counted_model`.
+      graph: what is known of successors; see :func:`~jaxltl.core.models.build.counts.counted_model`.
       option: how an option stands where it was given, for messages.
 
     Returns:
@@ -132,14 +136,14 @@ def _named(model: SparseMDP, counts: np.ndarray) -> Evidence:
 
 
 def certify(evidence: Evidence, asked: Asked) -> DataGuarantee:
-    """What the log guarantees, by :func:`~jaxltl.core.values.data_guarantee.learn_guarantee`.
+    """What the log guarantees, by :func:`~jaxltl.core.values.evaluation.data_guarantee.learn_guarantee`.
 
     Args:
       evidence: of :func:`read_evidence`.
       asked: the formula, and with which confidence.
 
     Returns:
-      :class:`~jaxltl.core.values.data_guarantee.DataGuarantee`.
+      :class:`~jaxltl.core.values.evaluation.data_guarantee.DataGuarantee`.
 
     Raises:
       ValueError: an unknown label, or a confidence that is none.

@@ -14,8 +14,8 @@ from typing import Any
 
 from jaxltl.app.files.tables import errors_in
 from jaxltl.app.files.task_environment import EnvironmentTask
-from jaxltl.core.models.environment import Environment, make_environment
-from jaxltl.core.models.time_limit import with_time_limit
+from jaxltl.core.environments.environment import Environment, make_environment
+from jaxltl.core.environments.time_limit import with_time_limit
 
 OWN = {
     "flat_world": "jaxltl.envs.flat_world:flat_world",

@@ -10,20 +10,20 @@ import numpy as np
 
 from jaxltl.app.files.task import World
 from jaxltl.core.automata.automaton import Automaton
-from jaxltl.core.models.lifting import memory_along
-from jaxltl.core.models.monitor import Verdict, verdicts
+from jaxltl.core.environments.monitor import Verdict, verdicts
+from jaxltl.core.models.build.lifting import memory_along
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.types import Solution
-from jaxltl.core.values.mixture import (
+from jaxltl.core.values.undiscounted.mixture import (
     WINDOW,
     at_starts,
     attained,
     least_mixture,
     require_attainable,
 )
-from jaxltl.core.values.optimal_actions import OptimalActions, optimal_actions
-from jaxltl.core.values.reachability import action_matrices
+from jaxltl.core.values.undiscounted.optimal_actions import OptimalActions, optimal_actions
+from jaxltl.core.values.undiscounted.reachability import action_matrices
 
 _AIM = WINDOW / 4  # how far above an asked probability the certified one is aimed to be
 _WEIGHTS = 10.0 ** np.arange(-1, 5.5, 0.5)  # of the task's probability, tried in this order

@@ -20,10 +20,10 @@ from jax.sharding import Mesh
 import jaxltl
 from jaxltl.algos.checkpoint import atomic_write
 from jaxltl.algos.chunks import Chunks, run_in_chunks, trace_lanes
+from jaxltl.app.drawing import Picture, drawing
 from jaxltl.app.files.task import Task
-from jaxltl.app.reports.drawing import Picture, drawing
 from jaxltl.core.automata.automaton import Automaton
-from jaxltl.core.models.lanes import on_host, vmap_over_mesh
+from jaxltl.core.models.mesh.lanes import on_host, vmap_over_mesh
 from jaxltl.core.models.product import Product
 
 Report = Callable[[int, Mapping[str, np.ndarray]], None]

@@ -15,6 +15,9 @@ import numpy as np
 from jax.sharding import Mesh
 
 from jaxltl.algos import learner, mlirl
+from jaxltl.app._learn_pictures import live as live
+from jaxltl.app._learn_pictures import pictures as pictures
+from jaxltl.app._learn_pictures import task_pictures as task_pictures
 from jaxltl.app.files.tables import errors_in
 from jaxltl.app.files.task import (
     Task,
@@ -48,18 +51,18 @@ from jaxltl.app.job import (
 )
 from jaxltl.app.job import fingerprint as fingerprint
 from jaxltl.app.job import postfix as postfix
-from jaxltl.app.reports.learn_pictures import live as live
-from jaxltl.app.reports.learn_pictures import pictures as pictures
-from jaxltl.app.reports.learn_pictures import task_pictures as task_pictures
-from jaxltl.core.models.concrete import to_jax
-from jaxltl.core.models.lifting import lift_policy
+from jaxltl.core.models.build.lifting import lift_policy
+from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.models.product import Product, product
 from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.types import Solution, Status
-from jaxltl.core.values.hitting_time import hitting_time
-from jaxltl.core.values.mixture import at_starts, from_starts
-from jaxltl.core.values.satisfaction import optimal_satisfaction, satisfaction_probability
-from jaxltl.core.values.soft import softmax_policy
+from jaxltl.core.values.discounted.soft import softmax_policy
+from jaxltl.core.values.undiscounted.hitting_time import hitting_time
+from jaxltl.core.values.undiscounted.mixture import at_starts, from_starts
+from jaxltl.core.values.undiscounted.satisfaction import (
+    optimal_satisfaction,
+    satisfaction_probability,
+)
 
 DOUBLE = True  # the precision of its figures
 STEPS = 500  # at most, unless the task says otherwise

@@ -18,8 +18,10 @@ import numpy as np
 from jax.sharding import Mesh
 
 from jaxltl.algos.checkpoint import atomic_write, read_arrays
-from jaxltl.app.environment_learners import Method, make_method
+from jaxltl.app._environment_learners import Method, make_method
+from jaxltl.app.drawing import Picture, drawing
 from jaxltl.app.environment_source import load_environment
+from jaxltl.app.explorer import Curves, curves
 from jaxltl.app.files.tables import errors_in, read_bytes
 from jaxltl.app.files.task import many
 from jaxltl.app.files.task_environment import EnvironmentTask, named_files
@@ -36,16 +38,14 @@ from jaxltl.app.job import (
     took,
 )
 from jaxltl.app.job import fingerprint as fingerprint
-from jaxltl.app.reports.drawing import Picture, drawing
-from jaxltl.app.reports.explorer import Curves, curves
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.translate import to_automaton
+from jaxltl.core.environments.environment import Environment, Finite, require_environment
+from jaxltl.core.environments.episodes import Agent, Episode, run_episode
+from jaxltl.core.environments.monitor import Verdict
+from jaxltl.core.environments.task_environment import task_environment
 from jaxltl.core.logic.labels import require_known
-from jaxltl.core.models.environment import Environment, Finite, require_environment
-from jaxltl.core.models.episodes import Agent, Episode, run_episode
-from jaxltl.core.models.monitor import Verdict
-from jaxltl.core.models.task_environment import task_environment
-from jaxltl.core.values.evaluation import (
+from jaxltl.core.values.evaluation.evaluation import (
     ESTIMATES,
     Estimate,
     Evaluation,
@@ -459,8 +459,8 @@ def load_policy(
       task_file: in place of what was kept of it.
 
     Returns:
-      What :func:`~jaxltl.core.values.evaluation.evaluate` and
-      :func:`~jaxltl.core.models.episodes.run_episode` take.
+      What :func:`~jaxltl.core.values.evaluation.evaluation.evaluate` and
+      :func:`~jaxltl.core.environments.episodes.run_episode` take.
 
     Raises:
       ValueError: no such file, or none of a policy; a mistake in the task, or functions that are

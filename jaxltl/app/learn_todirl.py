@@ -20,6 +20,20 @@ from jax import lax
 from jax.sharding import Mesh
 
 from jaxltl.algos import learner, todirl
+from jaxltl.app._todirl_guarantee import check_attainable, hold, is_weighable, likeliest
+from jaxltl.app._todirl_parts import (
+    LENGTH,
+    Judged,
+    Learned,
+    Outcome,
+    Setup,
+    Worlds,
+    counted_worlds,
+    part_of,
+)
+from jaxltl.app._todirl_pictures import live as live
+from jaxltl.app._todirl_pictures import pictures as pictures
+from jaxltl.app._todirl_pictures import task_pictures as task_pictures
 from jaxltl.app.files.tables import errors_in
 from jaxltl.app.files.task import require_end, synthetic_demonstrations
 from jaxltl.app.files.task_todirl import (
@@ -47,37 +61,23 @@ from jaxltl.app.job import (
 )
 from jaxltl.app.job import fingerprint as fingerprint
 from jaxltl.app.job import postfix as postfix
-from jaxltl.app.reports.todirl_pictures import live as live
-from jaxltl.app.reports.todirl_pictures import pictures as pictures
-from jaxltl.app.reports.todirl_pictures import task_pictures as task_pictures
-from jaxltl.app.todirl_guarantee import check_attainable, hold, is_weighable, likeliest
-from jaxltl.app.todirl_results import (
-    LENGTH,
-    Judged,
-    Learned,
-    Outcome,
-    Setup,
-    Worlds,
-    counted_worlds,
-    part_of,
-)
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.synchronize import synchronize
-from jaxltl.core.models.batch import lift_memory, narrow, stack_products
-from jaxltl.core.models.lifting import allowed_steps
-from jaxltl.core.models.operators import action_mean, expectation
+from jaxltl.core.models.build.batch import lift_memory, narrow, stack_products
+from jaxltl.core.models.build.lifting import allowed_steps
+from jaxltl.core.models.build.restrict import with_allowed
+from jaxltl.core.models.ops.operators import action_mean, expectation
 from jaxltl.core.models.product import Product, product
-from jaxltl.core.models.restrict import with_allowed
 from jaxltl.core.types import Solution, Status, status_code
-from jaxltl.core.values.optimal_actions import optimal_actions
-from jaxltl.core.values.performance import (
+from jaxltl.core.values.discounted.soft import soft_value
+from jaxltl.core.values.undiscounted.optimal_actions import optimal_actions
+from jaxltl.core.values.undiscounted.performance import (
     Performance,
     infeasible_starts,
     summarize,
     task_performances,
 )
-from jaxltl.core.values.satisfaction import optimal_satisfaction
-from jaxltl.core.values.soft import soft_value
+from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction
 from jaxltl.envs import temporal_gridworld
 from jaxltl.envs.cell_kinds import COLORS
 from jaxltl.envs.gridworld import ACTIONS

@@ -14,8 +14,8 @@ from jaxltl.app.files.models import padded
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.product import Product, product
 from jaxltl.core.types import Status
-from jaxltl.core.values.mixture import from_starts, safe_mean
-from jaxltl.core.values.satisfaction import satisfaction_probability
+from jaxltl.core.values.undiscounted.mixture import from_starts, safe_mean
+from jaxltl.core.values.undiscounted.satisfaction import satisfaction_probability
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     import numpy as np
 
+    from jaxltl.app.drawing import Artist, Picture
     from jaxltl.app.processes import Place
-    from jaxltl.app.reports.drawing import Artist, Picture
 
 
 def job_of(task_file: Path) -> Any:

@@ -13,15 +13,19 @@ from typing import Any
 
 import numpy as np
 
-from jaxltl.core.host.sparse import HostMDP
 from jaxltl.core.logic.properties import Property, parse_properties
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.types import NotConverged, Status
-from jaxltl.core.values.answer import Answer, PropertyStrategy, solve_property
-from jaxltl.core.values.answer_several import answer_several
-from jaxltl.core.values.multi_objective import Achievable, ConstrainedOptimum, Pareto
+from jaxltl.core.values.multi_objective.multi_objective import (
+    Achievable,
+    ConstrainedOptimum,
+    Pareto,
+)
+from jaxltl.core.values.properties.multi import answer_several
+from jaxltl.core.values.properties.solve_property import Answer, PropertyStrategy, solve_property
 
 Found = Answer | Achievable | ConstrainedOptimum | Pareto
 

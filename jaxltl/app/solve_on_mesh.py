@@ -20,15 +20,20 @@ from jaxltl.app.run_job import make_directory
 from jaxltl.app.solve import MISTAKEN, NOT_CONVERGED, Asked, Result, load
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.logic.properties import Property
+from jaxltl.core.models.build.state_formulas import BUILT_IN, label_columns
 from jaxltl.core.models.interval import IntervalMDP
-from jaxltl.core.models.lanes import on_host
-from jaxltl.core.models.shard import shard, to_mesh
-from jaxltl.core.models.sharded import ShardedMDP
+from jaxltl.core.models.mesh.lanes import on_host
+from jaxltl.core.models.mesh.shard import shard, to_mesh
+from jaxltl.core.models.mesh.sharded import ShardedMDP
 from jaxltl.core.models.sparse import SparseMDP
-from jaxltl.core.models.state_formulas import BUILT_IN, label_columns
 from jaxltl.core.types import NotConverged
-from jaxltl.core.values.answer import FINER, Answer
-from jaxltl.core.values.answer_on_mesh import Bounds, Question, first_bounds, question_on_mesh
+from jaxltl.core.values.properties.solve_on_mesh import (
+    Bounds,
+    Question,
+    first_bounds,
+    question_on_mesh,
+)
+from jaxltl.core.values.properties.solve_property import FINER, Answer
 from jaxltl.io.umb_sharded import read_sharded
 
 _WORK = 1e9  # transitions that are gone over before bounds are saved

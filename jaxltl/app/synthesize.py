@@ -12,14 +12,14 @@ import numpy as np
 from jaxltl.app.files.game import GameFile, World, automaton_of, load_game, load_objective
 from jaxltl.app.files.tables import errors_in
 from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.environments.monitor import Verdict, make_monitor
 from jaxltl.core.games.objective import GR1, Parity
 from jaxltl.core.games.permissive import Permissive, apply_strategy, permissive_strategy
 from jaxltl.core.games.verify import Verification, verify
 from jaxltl.core.games.winning import Winning, adversarial_chance, objective_at, winning_region
 from jaxltl.core.graphs.attractor import attractor
+from jaxltl.core.models.build.restrict import Restriction, restrict
 from jaxltl.core.models.game import Game
-from jaxltl.core.models.monitor import Verdict, make_monitor
-from jaxltl.core.models.restrict import Restriction, restrict
 
 Progress = Callable[[str], None]
 STAGES = ("reading", "solving", "checking", "strategy", "writing")

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from jaxltl.core.show import apart, array, brief, coded, is_array, lanes, span, told
+from jaxltl.core.pretty_print import apart, array, brief, coded, is_array, lanes, span, told
 
 SolutionT = TypeVar("SolutionT", bound="Solution")
 

@@ -22,10 +22,10 @@ from flax import struct
 from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 
-from jaxltl.core.host import given
-from jaxltl.core.models.environment import Environment, Timestep, make_box, make_environment
-from jaxltl.core.models.time_limit import with_time_limit, without_time_limit
-from jaxltl.core.show import brief
+from jaxltl.core import validation
+from jaxltl.core.environments.environment import Environment, Timestep, make_box, make_environment
+from jaxltl.core.environments.time_limit import with_time_limit, without_time_limit
+from jaxltl.core.pretty_print import brief
 
 # Colour, place and radius of each disc.
 DISCS = (
@@ -107,7 +107,7 @@ def flat_world(
       num_starts, seed: how many places are drawn for that, and from what.
 
     Returns:
-      :class:`~jaxltl.core.models.environment.Environment`, whose worlds are :class:`FlatState`,
+      :class:`~jaxltl.core.environments.environment.Environment`, whose worlds are :class:`FlatState`,
       or with a horizon pairs of one and the time. Observations are ``float32[2]``.
 
     Raises:
@@ -122,24 +122,32 @@ def flat_world(
       >>> world.labels(here).tolist()
       [False, False, False, False, False, False, False]
     """
-    rows = [tuple(given.listed("discs", row)) for row in given.listed("discs", discs)]
+    rows = [tuple(validation.listed("discs", row)) for row in validation.listed("discs", discs)]
     if not all(len(row) == 4 and isinstance(row[0], str) for row in rows):
-        raise ValueError(f"discs is {given.shown(discs)}; give (colour, x, y, radius) of each.")
+        raise ValueError(
+            f"discs is {validation.shown(discs)}; give (colour, x, y, radius) of each."
+        )
     names = tuple(sorted({name for name, *_ in rows}))
-    numbers = given.numbers("discs", [row[1:] for row in rows]).astype(np.float32).reshape(-1, 3)
+    numbers = (
+        validation.numbers("discs", [row[1:] for row in rows]).astype(np.float32).reshape(-1, 3)
+    )
     if not len(numbers) or not np.isfinite(numbers).all() or not (numbers[:, 2] > 0).all():
         raise ValueError(
             "flat_world: discs are (colour, x, y, radius), at least one, with radii above zero."
         )
-    extent, time_step = given.number("extent", extent), given.number("time_step", time_step)
-    num_starts = given.whole("num_starts", num_starts, least=1, most=2**26)
-    seed, discrete = given.whole("seed", seed), given.truth("discrete", discrete)
+    extent, time_step = (
+        validation.number("extent", extent),
+        validation.number("time_step", time_step),
+    )
+    num_starts = validation.whole("num_starts", num_starts, least=1, most=2**26)
+    seed, discrete = validation.whole("seed", seed), validation.truth("discrete", discrete)
     if not (0 < extent < 1e6 and 0 < time_step < 1e6):
         raise ValueError(
             f"extent={extent}, time_step={time_step}; both must be positive, and below a million."
         )
     if start is not None and not (
-        np.shape(place := given.numbers("start", start)) == (2,) and np.abs(place).max() <= extent
+        np.shape(place := validation.numbers("start", start)) == (2,)
+        and np.abs(place).max() <= extent
     ):
         raise ValueError(f"start={start!r}; give a place (x, y) within {extent} of the middle.")
     color = np.array([[name == one for one in names] for name, *_ in rows])
@@ -244,13 +252,13 @@ def events_around(
       >>> look(jnp.array([-1.0, -1.2])).astype(int).sum(0).tolist()  # in the yellow disc
       [0, 0, 0, 0, 0, 0, 1]
     """
-    scene, rows = discs_of(environment), given.numbers("events", events).astype(bool)
+    scene, rows = discs_of(environment), validation.numbers("events", events).astype(bool)
     if rows.ndim != 2 or not len(rows) or rows.shape[1] != len(environment.propositions):
         raise ValueError(
             f"events has shape {list(rows.shape)}; give Booleans "
             f"[E, {len(environment.propositions)}], a column for each colour."
         )
-    far = given.numbers("radii", radii)
+    far = validation.numbers("radii", radii)
     if far.ndim != 1 or not ((far > 0) & np.isfinite(far)).all():
         raise ValueError(f"radii={far.tolist()}; give distances, all positive.")
     discs = [
@@ -267,7 +275,7 @@ def events_around(
         tuple(discs),
         float(scene.extent),
         tuple(far.tolist()),
-        given.whole("directions", directions, least=1, most=2**10),
+        validation.whole("directions", directions, least=1, most=2**10),
     )
 
 

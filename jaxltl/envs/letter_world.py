@@ -24,15 +24,15 @@ import numpy as np
 from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 
-from jaxltl.core.host import given
-from jaxltl.core.models.environment import (
+from jaxltl.core import validation
+from jaxltl.core.environments.environment import (
     Environment,
     Timestep,
     make_box,
     make_environment,
 )
-from jaxltl.core.models.time_limit import with_time_limit
-from jaxltl.core.show import brief
+from jaxltl.core.environments.time_limit import with_time_limit
+from jaxltl.core.pretty_print import brief
 from jaxltl.envs.text_map import parse_map
 
 ACTIONS = ("up", "down", "left", "right")
@@ -94,7 +94,7 @@ def letter_world(
       seed: of that drawing.
 
     Returns:
-      :class:`~jaxltl.core.models.environment.Environment`, whose worlds are :class:`LetterState`,
+      :class:`~jaxltl.core.environments.environment.Environment`, whose worlds are :class:`LetterState`,
       or with a horizon pairs of one and the time.
 
     Raises:
@@ -107,10 +107,15 @@ def letter_world(
       (('a', 'b', 'c'), (7, 7, 13), 75)
     """
     names, starts = _names(letters), None
-    connected, flat = given.truth("connected", connected), given.truth("flat", flat)
-    copies, num_maps = given.whole("copies", copies), given.whole("num_maps", num_maps, most=2**24)
-    size, seed = given.whole("size", size, most=2**10), given.whole("seed", seed)
-    num_maps = max(num_maps, 1) if not connected else given.whole("num_maps", num_maps, least=1)
+    connected, flat = validation.truth("connected", connected), validation.truth("flat", flat)
+    copies, num_maps = (
+        validation.whole("copies", copies),
+        validation.whole("num_maps", num_maps, most=2**24),
+    )
+    size, seed = validation.whole("size", size, most=2**10), validation.whole("seed", seed)
+    num_maps = (
+        max(num_maps, 1) if not connected else validation.whole("num_maps", num_maps, least=1)
+    )
     if layout is None:
         if start is not None:
             raise ValueError(f"start={start} is for a given layout; leave it out.")
@@ -131,7 +136,7 @@ def letter_world(
         if start is None and not len(empty):
             raise ValueError("layout: no cell is empty; say where to begin, start=0.")
         if start is not None:
-            start = given.whole("start", start, most=size * size - 1)
+            start = validation.whole("start", start, most=size * size - 1)
         places = (empty if start is None else np.array([start])).astype(np.int32)
         reset, starts = Partial(_begin, letter, places), Partial(_starts, letter, places)
     views, count = _views(size), len(names)
@@ -151,7 +156,7 @@ def letter_world(
 
 def _names(letters: int | Sequence[str]) -> tuple[str, ...]:
     if not isinstance(letters, int | np.integer):
-        return given.names("letters", letters)
+        return validation.names("letters", letters)
     if not 1 <= letters <= len(_NAMES):
         raise ValueError(f"letters={letters}; it must be 1 to {len(_NAMES)}, or their names.")
     return tuple(_NAMES[:letters])
@@ -338,7 +343,7 @@ def _labels(numbers: chex.Array, world: LetterState) -> jax.Array:
 
 def events_seen(observation: jax.Array) -> jax.Array:
     """``float[size, size, letters + 1]``: which event each cell of an observation is, that without
-    a letter first, as :func:`~jaxltl.core.models.sequence_task.events_of` numbers them.
+    a letter first, as :func:`~jaxltl.core.environments.sequence_task.events_of` numbers them.
 
     Example:
       >>> world = letter_world(size=2, letters=["x"], copies=1, connected=False)

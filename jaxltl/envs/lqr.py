@@ -20,8 +20,8 @@ from flax import struct
 from jax import lax
 from numpy.typing import ArrayLike
 
-from jaxltl.core.models.environment import Environment, Timestep, make_box, make_environment
-from jaxltl.core.show import brief
+from jaxltl.core.environments.environment import Environment, Timestep, make_box, make_environment
+from jaxltl.core.pretty_print import brief
 from jaxltl.envs.networks import Network, apply_lanes, make_network, weighted
 
 

@@ -38,8 +38,8 @@ from flax import struct
 from jax import lax
 from numpy.typing import ArrayLike
 
-from jaxltl.core.host import given
-from jaxltl.core.show import brief
+from jaxltl.core import validation
+from jaxltl.core.pretty_print import brief
 from jaxltl.envs.networks import Network, apply_layers, layers, make_network, padded
 
 TASKS = (1, 2, 3, 4)
@@ -454,7 +454,7 @@ def simulate(
       ((10, 30), (10, 30, 2))
     """
     _check_fits(world, network)
-    settings = _Static((num_trajectories, given.truth("absorbing", absorbing)))
+    settings = _Static((num_trajectories, validation.truth("absorbing", absorbing)))
     return _simulate(network, settings, world, jnp.asarray(parameters), key)
 
 
@@ -530,7 +530,7 @@ def evaluator(
         score = jax.tree_util.Partial(_table_4, _Static(int(task)))
     else:
         score = task if isinstance(task, jax.tree_util.Partial) else jax.tree_util.Partial(task)
-    absorbing = absorbing is not None and given.truth("absorbing", absorbing)
+    absorbing = absorbing is not None and validation.truth("absorbing", absorbing)
     settings = _Static((int(num_trajectories), absorbing))
     return jax.tree_util.Partial(_evaluate, network, settings, world, score)
 

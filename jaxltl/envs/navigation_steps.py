@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from jaxltl.core.host import given
-from jaxltl.core.models.environment import Environment, Timestep, make_box, make_environment
+from jaxltl.core import validation
+from jaxltl.core.environments.environment import Environment, Timestep, make_box, make_environment
 from jaxltl.envs import navigation as nav
 from jaxltl.envs.navigation import Navigation, State
 
@@ -90,7 +90,7 @@ def as_environment(
     """
     if np.ndim(task) or task not in nav.TASKS:
         raise ValueError(f"task={task!r}; choose 1, 2, 3 or 4.")
-    stays = task == 1 if absorbing is None else given.truth("absorbing", absorbing)
+    stays = task == 1 if absorbing is None else validation.truth("absorbing", absorbing)
     settings = _Settings(
         jnp.int32(task), jnp.bool_(stays), np.dtype(dtype or jnp.result_type(float))
     )

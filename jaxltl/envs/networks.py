@@ -19,16 +19,16 @@ import jax.numpy as jnp
 from flax import struct
 from jax.tree_util import Partial
 
-from jaxltl.core.host import given
-from jaxltl.core.models.environment import (
+from jaxltl.core import validation
+from jaxltl.core.environments.environment import (
     Box,
     Environment,
     Finite,
     clipped_action,
     flat_observation,
 )
-from jaxltl.core.models.episodes import Agent
-from jaxltl.core.show import brief
+from jaxltl.core.environments.episodes import Agent
+from jaxltl.core.pretty_print import brief
 
 ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {
     "relu": lambda x: jnp.maximum(x, 0),
@@ -96,7 +96,7 @@ def make_network(
     for place, name in (("hidden", hidden), ("output", output)):
         if name not in ACTIVATIONS:
             raise ValueError(f"{place}={name!r}; choose among {', '.join(ACTIVATIONS)}.")
-    return Network(numbers, hidden, output, given.truth("biases", biases))
+    return Network(numbers, hidden, output, validation.truth("biases", biases))
 
 
 def num_parameters(sizes: Sequence[int], biases: bool = True) -> int:
@@ -321,7 +321,7 @@ def network_agent(network: Network, environment: Environment) -> Partial:
 
     Returns:
       A function of parameters, a pytree, that gives an
-      :class:`~jaxltl.core.models.episodes.Agent`.
+      :class:`~jaxltl.core.environments.episodes.Agent`.
 
     Raises:
       ValueError: other inputs than the environment observes, or outputs than it has actions.

@@ -15,11 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxltl.core.automata.automaton import Automaton, make_automaton
+from jaxltl.core.models.build.restrict import restrict
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.mdp import make_mdp
 from jaxltl.core.models.product import product
-from jaxltl.core.models.restrict import restrict
-from jaxltl.core.show import brief
+from jaxltl.core.pretty_print import brief
 from jaxltl.envs import gridworld as grid
 
 ACTIONS = (*grid.ACTIONS, "off", "on")

@@ -14,12 +14,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxltl.core import validation
 from jaxltl.core.games.objective import States, states_where
-from jaxltl.core.host import given
 from jaxltl.core.logic.labels import satisfying
-from jaxltl.core.models import operators
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.mdp import MDP, make_mdp
+from jaxltl.core.models.ops import operators
 from jaxltl.envs import gridworld as grid
 
 ACTIONS = (*grid.ACTIONS, "stay")
@@ -134,8 +134,8 @@ def grid_game(
       ['system_turn', 'environment_b', 'system_a']
     """
     world = grid.gridworld(text, slip=slip, legend=legend, wall=wall)
-    system_stays = given.truth("system_stays", system_stays)
-    environment_stays = given.truth("environment_stays", environment_stays)
+    system_stays = validation.truth("system_stays", system_stays)
+    environment_stays = validation.truth("environment_stays", environment_stays)
     position = places(text, wall=wall)
     rows_columns = grid.parse_map(text).shape
     cells = np.ravel_multi_index(tuple(position.T), rows_columns)

@@ -27,15 +27,15 @@ from jaxltl.core.automata.automaton import Automaton, letter_index
 from jaxltl.core.automata.translate import Task, to_automaton
 from jaxltl.core.logic.labels import require_known
 from jaxltl.core.logic.ltl import Formula, parse_ltl
-from jaxltl.core.models import operators
-from jaxltl.core.models.concrete import to_jax
-from jaxltl.core.models.lifting import project_trajectories
+from jaxltl.core.models.build.lifting import project_trajectories
 from jaxltl.core.models.mdp import MDP
+from jaxltl.core.models.ops import operators
+from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.models.product import Product, product
 from jaxltl.core.models.trajectories import Trajectories, rollout
-from jaxltl.core.show import brief
-from jaxltl.core.values.performance import infeasible_starts
-from jaxltl.core.values.soft import soft_value
+from jaxltl.core.pretty_print import brief
+from jaxltl.core.values.discounted.soft import soft_value
+from jaxltl.core.values.undiscounted.performance import infeasible_starts
 from jaxltl.envs.cell_kinds import (
     COLORS,
     OBJECTS,
@@ -505,7 +505,7 @@ def expert_policy(
       model: the product.
       discount: scalar in [0, 1).
       reward: ``float[S, Q, A]``; default :func:`expert_reward`.
-      method, tolerance: see :func:`jaxltl.core.values.soft.soft_value`. Sweeps suit the discount of
+      method, tolerance: see :func:`jaxltl.core.values.discounted.soft.soft_value`. Sweeps suit the discount of
         the dissertation, and many worlds at once under ``vmap``; nearer to 1, use ``"newton"``.
 
     Returns:

@@ -25,10 +25,10 @@ import numpy as np
 from flax import struct
 from jax.tree_util import Partial
 
-from jaxltl.core.host import given
-from jaxltl.core.models.environment import Environment, Timestep, make_box, make_environment
-from jaxltl.core.models.time_limit import with_time_limit
-from jaxltl.core.show import brief
+from jaxltl.core import validation
+from jaxltl.core.environments.environment import Environment, Timestep, make_box, make_environment
+from jaxltl.core.environments.time_limit import with_time_limit
+from jaxltl.core.pretty_print import brief
 
 COLORS = ("green", "yellow", "blue", "magenta")
 _MASS = 4 / 3 * np.pi * 0.1**3 + 0.1**3
@@ -107,7 +107,7 @@ def zone_world(
       seed: of that drawing.
 
     Returns:
-      :class:`~jaxltl.core.models.environment.Environment`, whose worlds are :class:`ZoneState`, or
+      :class:`~jaxltl.core.environments.environment.Environment`, whose worlds are :class:`ZoneState`, or
       with a horizon pairs of one and the time.
 
     Raises:
@@ -119,9 +119,12 @@ def zone_world(
       >>> world.propositions, world.observations.shape, world.actions.shape
       (('green', 'yellow', 'blue', 'magenta'), (75,), (2,))
     """
-    names = given.names("colors", colors)
-    zones, num_maps = given.whole("zones", zones), given.whole("num_maps", num_maps, most=2**20)
-    seed = given.whole("seed", seed)
+    names = validation.names("colors", colors)
+    zones, num_maps = (
+        validation.whole("zones", zones),
+        validation.whole("num_maps", num_maps, most=2**20),
+    )
+    seed = validation.whole("seed", seed)
     for name, number in (
         ("radius", radius),
         ("extent", extent),
@@ -130,7 +133,7 @@ def zone_world(
         ("num_maps", num_maps),
         ("colors", len(names)),
     ):
-        if not 0 < given.number(name, number) < 1e7:
+        if not 0 < validation.number(name, number) < 1e7:
             raise ValueError(
                 f"zone_world: {name}={number}; it must be positive, and below ten million."
             )

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
 from jaxltl.algos.checkpoint import atomic_write
-from jaxltl.core.host.given import shown
+from jaxltl.core.validation import shown
 
 Compression = Literal["gzip", "xz"]
 

@@ -15,7 +15,7 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxltl.core.host.rows import spans
+from jaxltl.core.sparse.rows import spans
 
 Integers = NDArray[np.integer[Any]]
 Floats = NDArray[np.float64]

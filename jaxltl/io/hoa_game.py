@@ -21,7 +21,7 @@ from jaxltl.core.logic.diagram import FALSE, TRUE, Diagrams, prime_cubes
 from jaxltl.core.logic.ltl import Formula, parse_ltl, proposition_text, subformulas
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.sparse import SparseMDP, make_sparse
-from jaxltl.core.show import brief
+from jaxltl.core.pretty_print import brief
 from jaxltl.io._files import read_text
 from jaxltl.io._hoa_acceptance import condition_given, decisive_sets, edge_priority
 from jaxltl.io._hoa_grammar import Edge, State, error_at, parse_tokens, split_texts

@@ -41,8 +41,8 @@ from jaxltl.core.automata.text import from_dict, to_dict
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.product import Product, product
 from jaxltl.core.types import Solution, worst
-from jaxltl.core.values.mixture import reaching, require_attainable
-from jaxltl.core.values.optimal_actions import optimal_actions
+from jaxltl.core.values.undiscounted.mixture import reaching, require_attainable
+from jaxltl.core.values.undiscounted.optimal_actions import optimal_actions
 
 
 @dataclass(frozen=True)

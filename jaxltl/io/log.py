@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxltl.core.host import given
-from jaxltl.core.models.convert import to_sparse
-from jaxltl.core.models.counts import (
+from jaxltl.core import validation
+from jaxltl.core.models.build.convert import to_sparse
+from jaxltl.core.models.build.counts import (
     Places,
     TransitionCounts,
     in_order,
@@ -65,9 +65,9 @@ def read_log(
         the log, by number if all are integers, else by alphabet.
 
     Returns:
-      :class:`~jaxltl.core.models.counts.TransitionCounts`.
-      :func:`~jaxltl.core.models.counts.counts_on` puts it beside the probabilities of a model, and
-      :func:`~jaxltl.core.models.counts.counted_model` makes a model of it.
+      :class:`~jaxltl.core.models.build.counts.TransitionCounts`.
+      :func:`~jaxltl.core.models.build.counts.counts_on` puts it beside the probabilities of a model, and
+      :func:`~jaxltl.core.models.build.counts.counted_model` makes a model of it.
 
     Raises:
       ValueError: naming the file and the line: the file cannot be read, is no such table, has an
@@ -91,7 +91,7 @@ def read_log(
         known = places(to_sparse(model) if isinstance(model, MDP | DenseMDP) else model)
         states, actions = known.states, known.actions
     if not isinstance(count, str):
-        raise ValueError(f"count={given.shown(count)}; give the name of a column.")
+        raise ValueError(f"count={validation.shown(count)}; give the name of a column.")
     numbers = _names("states", states), _names("actions", actions)
     name, total, size = str(path), 0, 0
     held = [np.zeros((4, 0), np.int64)]
@@ -131,7 +131,7 @@ def read_labels(
 
     Returns:
       The states of each label, in the order of the file, as
-      :func:`~jaxltl.core.models.counts.counted_model` takes them.
+      :func:`~jaxltl.core.models.build.counts.counted_model` takes them.
 
     Raises:
       ValueError: naming the file and the line, as :func:`read_log`.
@@ -144,7 +144,7 @@ def read_labels(
       {'goal': ('bay', 'hall'), 'warm': ('bay',)}
     """
     _check_columns(columns, 2)
-    known = set() if states is None else set(map(str, given.listed("states", states)))
+    known = set() if states is None else set(map(str, validation.listed("states", states)))
     found: dict[str, dict[str, bool]] = {}
     for lines in read_columns(path, columns):
         for fields in lines.times:
@@ -158,10 +158,12 @@ def read_labels(
 
 
 def _check_columns(columns: Sequence[str], number: int) -> None:
-    names = given.listed("columns", columns)
+    names = validation.listed("columns", columns)
     different = all(isinstance(x, str) for x in names) and len(set(names)) == number
     if isinstance(columns, str) or len(names) != number or not different:
-        raise ValueError(f"columns={given.shown(columns)}; give {number} names, all different.")
+        raise ValueError(
+            f"columns={validation.shown(columns)}; give {number} names, all different."
+        )
 
 
 @dataclass
@@ -173,7 +175,7 @@ class _Names:
 
 
 def _names(what: str, names: Sequence[str] | None) -> _Names:
-    every = [] if names is None else list(map(str, given.listed(what, names)))
+    every = [] if names is None else list(map(str, validation.listed(what, names)))
     number = {x: i for i, x in enumerate(every)}
     if len(number) < len(every):
         twice = next(x for i, x in enumerate(every) if number[x] != i)

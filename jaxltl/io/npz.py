@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.algos.checkpoint import atomic_write, read_arrays
-from jaxltl.core.host.rows import starts_of
-from jaxltl.core.models.convert import to_sparse
+from jaxltl.core.models.build.convert import to_sparse
+from jaxltl.core.models.build.padded import to_padded
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.interval import IntervalMDP, interval_rows
 from jaxltl.core.models.mdp import MDP, DenseMDP, from_dense, make_mdp
-from jaxltl.core.models.padded import to_padded
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
+from jaxltl.core.sparse.rows import starts_of
 from jaxltl.io._files import ALWAYS_ALLOWED, MAX_RATIO, raw_bytes
 from jaxltl.io._intervals import exact_part
 
@@ -318,7 +318,7 @@ def write_npz(path: str | os.PathLike[str], model: Any) -> None:
 
     Args:
       path: the file.
-      model: a model that :func:`~jaxltl.core.models.convert.to_sparse` takes, a game over one, or
+      model: a model that :func:`~jaxltl.core.models.build.convert.to_sparse` takes, a game over one, or
         an interval model.
 
     Raises:

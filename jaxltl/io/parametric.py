@@ -16,13 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from jaxltl.core.host.given import number, shown
-from jaxltl.core.models.parametric import Ends, ParametricMDP, box_of, point_inside
-from jaxltl.core.models.ranges import Ends as Ranges
-from jaxltl.core.models.ranges import ranges
-from jaxltl.core.models.rational import Rationals, make_rationals
+from jaxltl.core.models.parametric.parametric import Ends, ParametricMDP, box_of, point_inside
+from jaxltl.core.models.parametric.ranges import Ends as Ranges
+from jaxltl.core.models.parametric.ranges import ranges
+from jaxltl.core.models.parametric.rational import Rationals, make_rationals
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
-from jaxltl.core.show import brief
+from jaxltl.core.pretty_print import brief
+from jaxltl.core.validation import number, shown
 from jaxltl.io._drn_body import names_of, read_body, read_header, rewards_of
 from jaxltl.io._files import read_bytes
 from jaxltl.io._tokens import Block, Integers, Text, as_fraction, numbered, refuse

@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core.games.objective import Parity
-from jaxltl.core.models.concrete import to_jax
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.mdp import support
+from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.models.sparse import SparseMDP, make_sparse
-from jaxltl.core.show import brief
+from jaxltl.core.pretty_print import brief
 from jaxltl.io._files import read_text, write_bytes
 
 MAX_NUMBER = 2**31 - 1  # of vertices and of priorities

@@ -16,10 +16,10 @@ import numpy as np
 from jax.sharding import Mesh
 from numpy.typing import NDArray
 
+from jaxltl.core.models.build.padded import action_of
 from jaxltl.core.models.mdp import refuse_negative
-from jaxltl.core.models.padded import action_of
-from jaxltl.core.models.shard import ModelPart, model_from_parts, ranges_of
-from jaxltl.core.models.sharded import ShardedMDP
+from jaxltl.core.models.mesh.shard import ModelPart, model_from_parts, ranges_of
+from jaxltl.core.models.mesh.sharded import ShardedMDP
 from jaxltl.core.models.sparse import row_reward, sparse_part
 from jaxltl.io._files import FileBytes, compression_of, opened, pieces
 from jaxltl.io._umb_index import ACTIONS, INITIAL, Index, Items
@@ -64,13 +64,13 @@ def read_sharded(
 
     Args:
       path: the file, of a chain or a decision process; plain, or compressed by gzip or xz.
-      mesh, axis: as for :func:`~jaxltl.core.models.shard.shard`.
+      mesh, axis: as for :func:`~jaxltl.core.models.mesh.shard.shard`.
 
     Returns:
-      :class:`~jaxltl.core.models.sharded.ShardedMDP`.
+      :class:`~jaxltl.core.models.mesh.sharded.ShardedMDP`.
 
     Raises:
-      ValueError: as of :func:`~jaxltl.core.models.shard.shard` for the mesh, and as of
+      ValueError: as of :func:`~jaxltl.core.models.mesh.shard.shard` for the mesh, and as of
         :func:`~jaxltl.io.model_files.read_model` for the file, as far as this process reads it; or
         it holds a game or probabilities that are intervals.
 

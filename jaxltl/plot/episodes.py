@@ -78,7 +78,7 @@ def draw_episode(environment: Any, episode: Any, *, title: str | None = None) ->
 
     Args:
       environment: the world, with or without a time limit, or a task's environment of it.
-      episode: of :func:`~jaxltl.core.models.episodes.run_episode`, of one trajectory.
+      episode: of :func:`~jaxltl.core.environments.episodes.run_episode`, of one trajectory.
       title: default what held on the way, in order.
 
     Returns:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.runs import live_states
-from jaxltl.core.host.components import strong_components
+from jaxltl.core.sparse.graph.components import strong_components
 
 RADIUS = 0.24
 FONT_SIZE = 9.5

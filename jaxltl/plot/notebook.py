@@ -19,7 +19,7 @@ from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.sparse import SparseMDP
-from jaxltl.core.show import picture, readable
+from jaxltl.core.pretty_print import picture, readable
 from jaxltl.core.types import Solution
 from jaxltl.plot.automata import automaton
 from jaxltl.plot.games import game_region

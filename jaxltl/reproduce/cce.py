@@ -17,7 +17,7 @@ from jaxltl.algos import cce
 from jaxltl.algos import exponential_family as families
 from jaxltl.algos import trust_region as tr
 from jaxltl.app.job import plain
-from jaxltl.core.models.environment import Environment, Timestep
+from jaxltl.core.environments.environment import Environment, Timestep
 from jaxltl.envs import lqr
 from jaxltl.envs import navigation as nav
 from jaxltl.envs.navigation_steps import as_environment

@@ -16,14 +16,14 @@ from jaxltl.algos import learner
 from jaxltl.algos import mlirl as irl
 from jaxltl.algos.chunks import run_in_chunks
 from jaxltl.app.job import plain
-from jaxltl.core.models.lifting import lift_policy
+from jaxltl.core.models.build.lifting import lift_policy
+from jaxltl.core.models.build.restrict import restrict
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.product import Product, product
-from jaxltl.core.models.restrict import restrict
 from jaxltl.core.models.trajectories import Trajectories, make_trajectories
 from jaxltl.core.types import NotConverged, Status, check
-from jaxltl.core.values.mixture import from_starts
-from jaxltl.core.values.satisfaction import satisfaction_probability
+from jaxltl.core.values.undiscounted.mixture import from_starts
+from jaxltl.core.values.undiscounted.satisfaction import satisfaction_probability
 from jaxltl.envs.gridworld import ACTIONS, gridworld
 
 MAP = """

@@ -17,10 +17,10 @@ from jaxltl.algos import learner, pac, rmax
 from jaxltl.app.job import plain
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.games.winning import almost_sure_buchi
-from jaxltl.core.models.operators import expectation
-from jaxltl.core.models.restrict import restrict
+from jaxltl.core.models.build.restrict import restrict
+from jaxltl.core.models.ops.operators import expectation
 from jaxltl.core.types import check
-from jaxltl.core.values.minimax import minimax_value, strategy_value
+from jaxltl.core.values.discounted.minimax import minimax_value, strategy_value
 from jaxltl.envs import gridworld as grid
 from jaxltl.envs.post_offices import Patrol, patrol, surveillance
 

@@ -18,8 +18,8 @@ from jaxltl.core.games.permissive import apply_strategy, permissive_strategy
 from jaxltl.core.games.winning import solve, task_game
 from jaxltl.core.models.game import Game
 from jaxltl.core.types import NotConverged, check
-from jaxltl.core.values.discounted import optimal_value
-from jaxltl.core.values.minimax import minimax_value
+from jaxltl.core.values.discounted.discounted import optimal_value
+from jaxltl.core.values.discounted.minimax import minimax_value
 from jaxltl.envs.robots import diagonal_reward, reward_against_task, robots
 
 SIZES = (3, 4, 5, 6, 8, 10)

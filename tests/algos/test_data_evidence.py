@@ -8,7 +8,7 @@ from jaxltl.algos import rmax
 from jaxltl.algos._data_evidence import data_evidence
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import make_mdp
-from jaxltl.core.values.minimax import minimax_value, strategy_value
+from jaxltl.core.values.discounted.minimax import minimax_value, strategy_value
 
 
 def random_game(rng):

@@ -10,12 +10,15 @@ from scipy.sparse.csgraph import connected_components
 import jaxltl as jl
 from jaxltl.algos import _interval_data, learner
 from jaxltl.algos import interval_learning as learning
-from jaxltl.core.host.confidence import intervals_from_counts
 from jaxltl.core.models.game import make_game
 from jaxltl.core.models.interval import make_interval
+from jaxltl.core.statistics.confidence_sets import intervals_from_counts
 from jaxltl.core.types import Status
-from jaxltl.core.values.robust_satisfaction import robust_satisfaction
-from jaxltl.core.values.satisfaction import optimal_satisfaction, satisfaction_probability
+from jaxltl.core.values.interval.satisfaction import robust_satisfaction
+from jaxltl.core.values.undiscounted.satisfaction import (
+    optimal_satisfaction,
+    satisfaction_probability,
+)
 from tests import reference
 from tests.support import as_mdp, counted_traces, lane
 

@@ -36,10 +36,10 @@ from jaxltl.algos import (
 )
 from jaxltl.algos.chunks import run_in_chunks
 from jaxltl.algos.exponential_family import diagonal_gaussian
-from jaxltl.core.models.environment import Timestep, make_box, make_environment
+from jaxltl.core.environments.environment import Timestep, make_box, make_environment
 from jaxltl.core.models.game import make_game
 from jaxltl.core.models.mdp import MDP
-from jaxltl.core.models.parametric import make_parametric
+from jaxltl.core.models.parametric.parametric import make_parametric
 from jaxltl.core.types import Status
 from tests.support import counted_traces, lane
 

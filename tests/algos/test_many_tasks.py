@@ -10,13 +10,13 @@ import pytest
 
 from jaxltl.algos import many_tasks, ppo
 from jaxltl.core.automata.translate import to_automaton
-from jaxltl.core.models.environment import Timestep, make_box, make_environment
-from jaxltl.core.models.episodes import run_episode
-from jaxltl.core.models.monitor import Verdict
-from jaxltl.core.models.sequence_task import Sequence, SequenceObservation, events_of
-from jaxltl.core.models.tabulate import tabulate
-from jaxltl.core.models.task_environment import stack_tasks, task_environment
-from jaxltl.core.values.optimality_gap import optimality_gap, tabulate_policy
+from jaxltl.core.environments.environment import Timestep, make_box, make_environment
+from jaxltl.core.environments.episodes import run_episode
+from jaxltl.core.environments.monitor import Verdict
+from jaxltl.core.environments.sequence_task import Sequence, SequenceObservation, events_of
+from jaxltl.core.environments.tabulate import tabulate
+from jaxltl.core.environments.task_environment import stack_tasks, task_environment
+from jaxltl.core.values.evaluation.optimality_gap import optimality_gap, tabulate_policy
 from jaxltl.envs.flat_world import flat_world
 from jaxltl.envs.letter_world import events_seen, letter_world
 

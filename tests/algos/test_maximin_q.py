@@ -14,10 +14,10 @@ import pytest
 from jaxltl.algos import maximin_q
 from jaxltl.algos._chains import alias_table
 from jaxltl.core.graphs.attractor import attractor
+from jaxltl.core.models.build.restrict import restrict
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.mdp import make_mdp, to_dense
-from jaxltl.core.models.operators import forall_successor
-from jaxltl.core.models.restrict import restrict
+from jaxltl.core.models.ops.operators import forall_successor
 from jaxltl.core.types import NotConverged, Status, check
 from jaxltl.envs.robots import diagonal_reward, robots
 from tests.support import counted_traces

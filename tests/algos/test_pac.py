@@ -11,10 +11,10 @@ import pytest
 
 import jaxltl as jl
 from jaxltl.algos import pac
-from jaxltl.core.models import operators
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import MDP, from_dense, to_dense
-from jaxltl.core.models.operators import expectation
+from jaxltl.core.models.ops import operators
+from jaxltl.core.models.ops.operators import expectation
 from tests.reference_games import buchi, random_game
 from tests.support import as_mdp, counted_traces
 

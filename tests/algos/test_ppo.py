@@ -20,8 +20,8 @@ from jaxltl.algos import learner, ppo
 from jaxltl.algos.actor_critic import orthogonal
 from jaxltl.algos.moments import scale_of, updated_moments
 from jaxltl.algos.schedules import Linear
-from jaxltl.core.models.environment import Finite, Timestep, make_box, make_environment
-from jaxltl.core.models.episodes import run_episode
+from jaxltl.core.environments.environment import Finite, Timestep, make_box, make_environment
+from jaxltl.core.environments.episodes import run_episode
 from jaxltl.core.types import Status
 
 

@@ -11,7 +11,7 @@ import jaxltl as jl
 from jaxltl.algos import _optimistic_model, pac, rmax
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.types import Status
-from jaxltl.core.values.minimax import minimax_value
+from jaxltl.core.values.discounted.minimax import minimax_value
 from jaxltl.envs.post_offices import patrol, post_offices
 from tests import reference_games
 from tests.support import as_mdp, counted_traces, lane, stack

@@ -12,8 +12,8 @@ from jax.flatten_util import ravel_pytree
 
 import jaxltl as jl
 from jaxltl.algos import todirl
-from jaxltl.core.models.operators import expectation, pushforward
-from jaxltl.core.models.tables import predecessors, successors
+from jaxltl.core.models.ops.operators import expectation, pushforward
+from jaxltl.core.models.ops.successor_tables import predecessors, successors
 from tests import reference
 from tests.algos.test_guaranteed import evaluate as probability
 from tests.support import random_representation, stack

@@ -20,9 +20,9 @@ from jaxltl.algos._trust_step import fisher_product, surrogate
 from jaxltl.algos._value_fit import advantages
 from jaxltl.algos.moments import Moments, scale_of, updated_moments
 from jaxltl.algos.trust_region import Hparams
-from jaxltl.core.models.environment import Timestep, make_box, make_environment
-from jaxltl.core.models.episodes import run_episode
-from jaxltl.core.models.time_limit import with_time_limit
+from jaxltl.core.environments.environment import Timestep, make_box, make_environment
+from jaxltl.core.environments.episodes import run_episode
+from jaxltl.core.environments.time_limit import with_time_limit
 from jaxltl.core.types import Status
 from tests.support import counted_traces
 

@@ -10,7 +10,7 @@ import pytest
 import jaxltl as jl
 from jaxltl.app import learn as job
 from jaxltl.app.reports.learn import _nearly_best, remarks
-from jaxltl.core.values.mixture import WINDOW, at_starts
+from jaxltl.core.values.undiscounted.mixture import WINDOW, at_starts
 from tests.algos.test_guaranteed import bottoms, evaluate
 from tests.app.test_task import write  # noqa: F401
 

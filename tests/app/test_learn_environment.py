@@ -14,7 +14,7 @@ from jaxltl.app import learn_environment as job
 from jaxltl.app.environment_source import load_environment
 from jaxltl.app.files.task_environment import is_environment_task, read_task
 from jaxltl.cli import main
-from jaxltl.core.values.evaluation import evaluate
+from jaxltl.core.values.evaluation.evaluation import evaluate
 from tests.app.test_report import browser  # noqa: F401
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

@@ -8,10 +8,10 @@ import pytest
 from jaxltl.app.files.task import load_demonstrations, load_world, read_task
 from jaxltl.app.logged import guaranteed
 from jaxltl.app.reports.learn import remarks
-from jaxltl.core.models.counts import counted_model
+from jaxltl.core.models.build.counts import counted_model
 from jaxltl.core.models.product import product
-from jaxltl.core.values.data_guarantee import learn_guarantee
-from jaxltl.core.values.satisfaction import optimal_satisfaction
+from jaxltl.core.values.evaluation.data_guarantee import learn_guarantee
+from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction
 from jaxltl.io.log import read_labels, read_log
 from tests.support import replaced
 from tests.test_cli import failure, run

@@ -12,7 +12,7 @@ from jaxltl.app.files.task import load_world, read_task
 from jaxltl.core.models.game import make_game
 from jaxltl.core.models.product import product
 from jaxltl.core.models.sparse import make_sparse
-from jaxltl.core.values.satisfaction import optimal_satisfaction
+from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction
 from jaxltl.io.model_files import write_model
 from tests.io.test_hoa_game import ARBITER
 from tests.io.test_pgsolver import EXAMPLE

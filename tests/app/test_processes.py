@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from jaxltl.algos import checkpoint
-from jaxltl.app.exit_message import told
+from jaxltl.app._teller import told
 from jaxltl.app.processes import Asked, Launch, Place, launched
-from jaxltl.core.values.answer import solve_property
-from jaxltl.core.values.discounted import optimal_value
-from jaxltl.core.values.soft import soft_value
+from jaxltl.core.values.discounted.discounted import optimal_value
+from jaxltl.core.values.discounted.soft import soft_value
+from jaxltl.core.values.properties.solve_property import solve_property
 from tests import several
-from tests.core.values.test_answer_on_mesh import PROPERTIES, gambler
+from tests.core.values.properties.test_solve_on_mesh import PROPERTIES, gambler
 
 SLURM = {
     "SLURM_NTASKS": "3",

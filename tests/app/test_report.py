@@ -12,18 +12,11 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from jaxltl.app.reports import explorer as exploring
-from jaxltl.app.reports.drawing import Picture, draw, drawing
-from jaxltl.app.reports.explorer import (
-    START,
-    Layer,
-    TooLarge,
-    curves,
-    demonstrated_runs,
-    learned_runs,
-)
+from jaxltl.app import explorer as exploring
+from jaxltl.app.drawing import Picture, draw, drawing
+from jaxltl.app.explorer import START, Layer, TooLarge, curves, demonstrated_runs, learned_runs
 from jaxltl.app.reports.live import Said, live_page
-from jaxltl.core.models.lifting import lift_trajectories
+from jaxltl.core.models.build.lifting import lift_trajectories
 from jaxltl.core.models.product import product
 from jaxltl.core.models.trajectories import make_trajectories
 from jaxltl.envs.gridworld import ACTIONS, gridworld

@@ -15,7 +15,7 @@ from jaxltl.app.files.task import (
     synthetic_demonstrations,
 )
 from jaxltl.core.models.product import product
-from jaxltl.core.values.satisfaction import optimal_satisfaction
+from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction
 from tests.support import replaced
 
 TASK = """

@@ -9,13 +9,13 @@ import pytest
 
 import jaxltl as jl
 from jaxltl.app import learn_todirl as job
+from jaxltl.app._todirl_parts import part_of
 from jaxltl.app.files.task_todirl import read_task
 from jaxltl.app.reports.learn_todirl import remarks
-from jaxltl.app.todirl_results import part_of
-from jaxltl.core.models.batch import stack_products
+from jaxltl.core.models.build.batch import stack_products
 from jaxltl.core.models.mdp import from_dense
-from jaxltl.core.values.mixture import WINDOW, at_starts
-from jaxltl.core.values.performance import infeasible_starts
+from jaxltl.core.values.undiscounted.mixture import WINDOW, at_starts
+from jaxltl.core.values.undiscounted.performance import infeasible_starts
 from jaxltl.io.learned_reward import load_reward, plan_in, save_reward
 from tests.algos.test_guaranteed import evaluate
 from tests.support import replaced

@@ -5,10 +5,10 @@ import re
 import numpy as np
 import pytest
 
-from jaxltl.core.models.convert import to_padded
+from jaxltl.core.models.build.convert import to_padded
 from jaxltl.core.models.sparse import row_reward
-from jaxltl.core.values.discounted import optimal_value
-from jaxltl.core.values.reachability import reachability_probability
+from jaxltl.core.values.discounted.discounted import optimal_value
+from jaxltl.core.values.undiscounted.reachability import reachability_probability
 from jaxltl.envs.gymnasium_tables import from_gymnasium
 
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxltl.core.models.episodes import step_or_reset
+from jaxltl.core.environments.episodes import step_or_reset
 from jaxltl.envs.letter_world import ACTIONS, connected_cells, is_connected, letter_world
 
 MOVES = {"up": (-1, 0), "down": (1, 0), "left": (0, -1), "right": (0, 1)}

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxltl.core.models.environment import Timestep, make_box, make_environment
+from jaxltl.core.environments.environment import Timestep, make_box, make_environment
 from jaxltl.envs.networks import (
     ACTIVATIONS,
     apply,

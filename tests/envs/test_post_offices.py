@@ -12,7 +12,7 @@ from jaxltl.algos import pac
 from jaxltl.core.games.objective import buchi
 from jaxltl.core.games.winning import solve
 from jaxltl.core.models.game import is_deterministic
-from jaxltl.core.models.operators import expectation
+from jaxltl.core.models.ops.operators import expectation
 from jaxltl.envs.post_offices import ACTIONS, patrol, patrol_reward, post_offices, surveillance
 
 DISCOUNT = 0.6

@@ -7,9 +7,9 @@ import pytest
 
 import jaxltl as jl
 from jaxltl.core.graphs.attractor import attractor
-from jaxltl.core.models import operators
+from jaxltl.core.models.build.restrict import restrict
 from jaxltl.core.models.game import is_deterministic
-from jaxltl.core.models.restrict import restrict
+from jaxltl.core.models.ops import operators
 from jaxltl.envs.robots import (
     ACTIONS,
     CORNERS,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxltl as jl
-from jaxltl.core.values.performance import infeasible_starts
+from jaxltl.core.values.undiscounted.performance import infeasible_starts
 from jaxltl.envs import temporal_gridworld as tg
 from jaxltl.envs.cell_kinds import many_objects
 from jaxltl.io.colored_world import load_world, read_world, save_world

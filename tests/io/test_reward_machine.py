@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from jaxltl.core.automata.automaton import letter_index
-from jaxltl.core.models.convert import to_sparse
+from jaxltl.core.models.build.convert import to_sparse
 from jaxltl.core.models.mdp import make_mdp
 from jaxltl.core.models.product import product
 from jaxltl.core.models.sparse import Rewards, row_reward
-from jaxltl.core.values.discounted import optimal_value
+from jaxltl.core.values.discounted.discounted import optimal_value
 from jaxltl.io.reward_machine import machine_reward, read_reward_machine
 
 OFFICE = """0 # initial state

@@ -5,10 +5,10 @@ import sys
 import numpy as np
 import pytest
 
-from jaxltl.core.models.convert import to_padded
+from jaxltl.core.models.build.convert import to_padded
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.sparse import Rewards, make_sparse, row_reward
-from jaxltl.core.values.reachability import reachability_probability
+from jaxltl.core.values.undiscounted.reachability import reachability_probability
 from jaxltl.io.storm import from_stormpy, to_stormpy
 from tests.storm_oracle import storm_values
 

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from jaxltl.core.models.game import make_game
-from jaxltl.core.models.lanes import on_host
-from jaxltl.core.models.shard import shard, to_mesh
+from jaxltl.core.models.mesh.lanes import on_host
+from jaxltl.core.models.mesh.shard import shard, to_mesh
 from jaxltl.io import _files, umb_sharded
 from jaxltl.io.model_files import read_model, write_model
 from jaxltl.io.umb import write_umb
 from jaxltl.io.umb_sharded import read_sharded
-from tests.core.models.test_sharded import mesh_of
+from tests.core.models.mesh.test_sharded import mesh_of
 from tests.io.archives import classes_example, example, f64, members_of, tar, u32, u64
 from tests.io.archives import umb as archive
 from tests.io.same import full_interval, full_model

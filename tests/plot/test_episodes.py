@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxltl.core.models.environment import Timestep as Step
-from jaxltl.core.models.environment import make_environment
-from jaxltl.core.models.episodes import Agent, agent_of, run_episode
-from jaxltl.core.models.task_environment import task_environment
+from jaxltl.core.environments.environment import Timestep as Step
+from jaxltl.core.environments.environment import make_environment
+from jaxltl.core.environments.episodes import Agent, agent_of, run_episode
+from jaxltl.core.environments.task_environment import task_environment
 from jaxltl.envs.flat_world import flat_world
 from jaxltl.envs.letter_world import letter_world
 from jaxltl.envs.zone_world import zone_world

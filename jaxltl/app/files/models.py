@@ -11,10 +11,10 @@ import numpy as np
 
 from jaxltl.app.files import tables
 from jaxltl.core.games.objective import Parity
+from jaxltl.core.models.build.padded import action_of, to_padded
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.mdp import MDP
-from jaxltl.core.models.padded import action_of, to_padded
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.io.model_files import read_model
 from jaxltl.io.npz import model_of, parse_arrays

@@ -20,8 +20,8 @@ from jaxltl.app.files import tables
 from jaxltl.app.files.tables import COUNT, NAMES, TEXT, Rule, choice, is_list, is_number, number_in
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.logic.labels import satisfying
-from jaxltl.core.models.counts import listed
-from jaxltl.core.models.lifting import project_trajectories
+from jaxltl.core.models.build.counts import listed
+from jaxltl.core.models.build.lifting import project_trajectories
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.trajectories import Trajectories, make_trajectories
@@ -511,7 +511,7 @@ def synthetic_demonstrations(
       task: its ``[demonstrations]`` gives the number, length (default 200) and discount.
       model: the product of the world and the task.
       key: a PRNG key, consumed.
-      best: of :func:`~jaxltl.core.values.satisfaction.optimal_satisfaction`.
+      best: of :func:`~jaxltl.core.values.undiscounted.satisfaction.optimal_satisfaction`.
 
     Returns:
       :class:`~jaxltl.core.models.trajectories.Trajectories` of the world, and how many were
@@ -563,8 +563,8 @@ def _demonstrator(task: Task, model: Product, best: Solution) -> jax.Array:
     if discount is None:
         return best.policy
     require_end(task, model.automaton)
-    from jaxltl.core.models.operators import expectation
-    from jaxltl.core.values.discounted import optimal_value
+    from jaxltl.core.models.ops.operators import expectation
+    from jaxltl.core.values.discounted.discounted import optimal_value
 
     arriving = expectation(model, model.final.astype(model.dtype))
     reward = jax.numpy.where(model.final[..., None], 0, arriving)

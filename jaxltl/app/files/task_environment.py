@@ -13,9 +13,9 @@ from typing import Any
 
 from jaxltl.app.files import tables
 from jaxltl.app.files.tables import COUNT, NUMBER, TEXT, TRUTH, Rule, choice, is_list, number_in
-from jaxltl.core.models.task_environment import ENDINGS
-from jaxltl.core.models.task_reward import REWARDS
-from jaxltl.core.values.episode_scores import OF_TASKS, SUMS
+from jaxltl.core.environments.task_environment import ENDINGS
+from jaxltl.core.environments.task_reward import REWARDS
+from jaxltl.core.values.evaluation.episode_scores import OF_TASKS, SUMS
 
 METHODS = ("ppo", "cce", "cpo")
 

@@ -16,13 +16,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxltl.app.drawing import Picture
+from jaxltl.app.explorer import START, Curves, Explorer, TooLarge
 from jaxltl.app.files.task import place, where
-from jaxltl.app.reports.drawing import Picture
-from jaxltl.app.reports.explorer import START, Curves, Explorer, TooLarge
 from jaxltl.app.reports.page import Remark, number, probability, rows
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.text import edge_guards
-from jaxltl.core.models.monitor import Verdict, verdicts
+from jaxltl.core.environments.monitor import Verdict, verdicts
 
 _NARROW = 24  # columns of a map that shares the width with the automaton
 _MOST_ROWS = 12  # of a table of curves

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxltl.app.reports.drawing import Picture, draw
-from jaxltl.app.reports.explorer import Explorer, Run, TooLarge, explorer
+from jaxltl.app.drawing import Picture, draw
+from jaxltl.app.explorer import Explorer, Run, TooLarge, explorer
 from jaxltl.app.reports.live import Said, live_page
 from jaxltl.app.reports.page import Remark, rows, tiles
 from jaxltl.app.reports.synthesize import describe_play, is_confirmed, verdict

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxltl.core.logic.ltl import Letter, as_letters
-from jaxltl.core.show import brief, cut, lanes, over, readable
+from jaxltl.core.pretty_print import brief, cut, lanes, over, readable
 
 ACCEPTANCES = ("cosafe", "safety", "buchi", "parity")
 

@@ -18,7 +18,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxltl.core.host.components import strong_components
+from jaxltl.core.sparse.graph.components import strong_components
 
 Integers: TypeAlias = NDArray[np.integer[Any]]
 Condition: TypeAlias = tuple[Any, ...]  # see `holds`

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core.automata.automaton import Automaton
-from jaxltl.core.host.components import reached, strong_components
+from jaxltl.core.sparse.graph.components import reached, strong_components
 
 Lasso = tuple[list[frozenset[str]], list[frozenset[str]]]
 

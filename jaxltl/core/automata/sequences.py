@@ -16,12 +16,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jaxltl.core import validation
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.runs import live_states, universal_states
-from jaxltl.core.host import given
-from jaxltl.core.host.components import strong_components
 from jaxltl.core.logic.labels import require_known
-from jaxltl.core.show import brief
+from jaxltl.core.pretty_print import brief
+from jaxltl.core.sparse.graph.components import strong_components
 
 _MOST_PATHS = 20_000  # looked at from each state
 
@@ -104,11 +104,11 @@ def reach_avoid_sequences(
       [[0, 1, 0, 0], [0, 0, 0, 0]]
     """
     depth, most = (
-        given.whole(name, number, least=1, most=2**16)
+        validation.whole(name, number, least=1, most=2**16)
         for name, number in (("depth", depth), ("most", most))
     )
-    given.instance("automaton", automaton, Automaton, "one of to_automaton")
-    propositions = given.names("propositions", propositions)
+    validation.instance("automaton", automaton, Automaton, "one of to_automaton")
+    propositions = validation.names("propositions", propositions)
     delta, priority = _on_events(automaton, events, propositions)
     live, done = live_states(automaton), universal_states(automaton)
     tables = _Tables(delta, priority, live, _distances(delta, priority, live, done))
@@ -160,7 +160,7 @@ def _on_events(
     automaton: Automaton, events: ArrayLike, propositions: tuple[str, ...]
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """The automaton's tables with a column for each event: int32 `[Q, E]`, twice."""
-    rows = given.numbers("events", events).astype(bool)
+    rows = validation.numbers("events", events).astype(bool)
     if rows.ndim != 2 or rows.shape[1] != len(propositions) or not len(rows):
         raise ValueError(
             f"events has shape {list(rows.shape)}; give Booleans [E, {len(propositions)}], a "

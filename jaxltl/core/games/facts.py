@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxltl.core.show import array, count, head, readable, span, told
+from jaxltl.core.pretty_print import array, count, head, readable, span, told
 
 _INNER = 92
 

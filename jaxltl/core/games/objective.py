@@ -18,9 +18,9 @@ from flax import struct
 from jaxltl.core.games import facts
 from jaxltl.core.logic.labels import satisfying
 from jaxltl.core.logic.ltl import Formula
-from jaxltl.core.models.concrete import is_traced, namespace, to_jax
+from jaxltl.core.models.ops.array_namespace import is_traced, namespace, to_jax
 from jaxltl.core.models.product import label_rows, shown_by
-from jaxltl.core.show import brief
+from jaxltl.core.pretty_print import brief
 
 States: TypeAlias = chex.Array | Formula | str  # a set of states
 

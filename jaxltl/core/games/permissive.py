@@ -21,16 +21,16 @@ from jaxltl.core.games.objective import GR1, Parity
 from jaxltl.core.games.winning import objective_at, on_states, solve_parity
 from jaxltl.core.graphs.attractor import attract
 from jaxltl.core.graphs.graph import graph_of
-from jaxltl.core.host.graph import HostGraph
-from jaxltl.core.host.rows import first_action
 from jaxltl.core.logic.ltl import Formula
-from jaxltl.core.models import operators
-from jaxltl.core.models.concrete import namespace, to_jax
+from jaxltl.core.models.build.restrict import Restriction, restrict
 from jaxltl.core.models.game import Game, as_padded_game
+from jaxltl.core.models.mesh.sharded import refuse_sharded
+from jaxltl.core.models.ops import operators
+from jaxltl.core.models.ops.array_namespace import namespace, to_jax
 from jaxltl.core.models.product import Product
-from jaxltl.core.models.restrict import Restriction, restrict
-from jaxltl.core.models.sharded import refuse_sharded
-from jaxltl.core.show import brief
+from jaxltl.core.pretty_print import brief
+from jaxltl.core.sparse.graph.product_graph import HostGraph
+from jaxltl.core.sparse.rows import first_action
 
 METHODS = ("auto", "stay", "rank", "counter", "parity")
 
@@ -169,11 +169,11 @@ def apply_strategy(strategy: Permissive) -> Restriction:
       strategy: of :func:`permissive_strategy`, winning from some initial state.
 
     Returns:
-      A :class:`~jaxltl.core.models.restrict.Restriction`; ``base_state`` and ``memory`` number the
+      A :class:`~jaxltl.core.models.build.restrict.Restriction`; ``base_state`` and ``memory`` number the
       states of ``strategy.game``.
 
     Raises:
-      ValueError: as of :func:`~jaxltl.core.models.restrict.restrict`.
+      ValueError: as of :func:`~jaxltl.core.models.build.restrict.restrict`.
 
     Example:
       >>> import jaxltl as jl

@@ -19,11 +19,7 @@ from flax import struct
 from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 
-from jaxltl.core.games.permissive import Permissive, apply_strategy, staying
-from jaxltl.core.games.winning import Winning
-from jaxltl.core.graphs.graph import graph_of
-from jaxltl.core.host.graph import HostGraph
-from jaxltl.core.models.environment import (
+from jaxltl.core.environments.environment import (
     Environment,
     Finite,
     Timestep,
@@ -31,8 +27,12 @@ from jaxltl.core.models.environment import (
     make_environment,
     require_environment,
 )
+from jaxltl.core.games.permissive import Permissive, apply_strategy, staying
+from jaxltl.core.games.winning import Winning
+from jaxltl.core.graphs.graph import graph_of
 from jaxltl.core.models.mdp import MDP
-from jaxltl.core.show import brief
+from jaxltl.core.pretty_print import brief
+from jaxltl.core.sparse.graph.product_graph import HostGraph
 
 
 @brief
@@ -94,7 +94,7 @@ def shield_environment(
         ``bool[S, A]``, or ``bool[S, Q, A]``.
       state_of: ``world -> int``, the model's state of a world; of a mask with more axes a tuple of
         them. Default: the world itself, as for
-        :func:`~jaxltl.core.models.simulated_model.environment_of`.
+        :func:`~jaxltl.core.environments.simulated_model.environment_of`.
 
     Returns:
       The environment.

@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core.games.objective import GR1, Parity
-from jaxltl.core.host.components import reached, strong_components
-from jaxltl.core.models.compiled import compiled_form
+from jaxltl.core.models.compiled.compiled import compiled_form
 from jaxltl.core.models.game import as_game
 from jaxltl.core.models.mdp import DenseMDP, support
 from jaxltl.core.models.sparse import SparseMDP
-from jaxltl.core.show import brief
+from jaxltl.core.pretty_print import brief
+from jaxltl.core.sparse.graph.components import reached, strong_components
 
 Booleans = NDArray[np.bool_]
 Integers = NDArray[np.integer[Any]]

@@ -14,7 +14,7 @@ import numpy as np
 from jaxltl.core.graphs.attractor import attract
 from jaxltl.core.graphs.end_components import closed_components, components_within
 from jaxltl.core.graphs.graph import graph_of, take
-from jaxltl.core.models.concrete import to_jax
+from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.models.product import Product
 
 

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxltl.core.models import operators
+from jaxltl.core.models.ops import operators
 
 
 def components_by_sweeps(

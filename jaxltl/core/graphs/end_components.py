@@ -8,8 +8,8 @@ import jax
 
 from jaxltl.core.graphs.attractor import avoid
 from jaxltl.core.graphs.graph import Graph, graph_of, take
-from jaxltl.core.models.concrete import to_jax
-from jaxltl.core.show import brief
+from jaxltl.core.models.ops.array_namespace import to_jax
+from jaxltl.core.pretty_print import brief
 
 
 @brief

@@ -1,7 +1,7 @@
 """What the fixpoints ask of a model, answered by the host or inside ``jit``.
 
 An algorithm is written once, on a graph. On concrete arrays that is a
-:class:`~jaxltl.core.host.graph.HostGraph`, which compiles nothing; where anything is traced it
+:class:`~jaxltl.core.sparse.graph.product_graph.HostGraph`, which compiles nothing; where anything is traced it
 is a :class:`TracedGraph`, made of the primitives. Both give the same answers, bit for bit.
 """
 
@@ -17,18 +17,18 @@ import numpy as np
 from jax import lax
 
 from jaxltl.core.graphs.colouring import components_by_sweeps
-from jaxltl.core.host.graph import HostGraph
-from jaxltl.core.host.row_graph import RowGraph
-from jaxltl.core.host.rows import rows_of, rows_of_matrix
-from jaxltl.core.models import kernels, operators
-from jaxltl.core.models.choices import choice_shape, choices
-from jaxltl.core.models.compiled import compiled_form
-from jaxltl.core.models.concrete import is_traced
+from jaxltl.core.models.compiled.compiled import compiled_form
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import MDP, DenseMDP, support
+from jaxltl.core.models.mesh.sharded import is_sharded
+from jaxltl.core.models.ops import kernels, operators
+from jaxltl.core.models.ops.array_namespace import is_traced
+from jaxltl.core.models.ops.choices import choice_shape, choices
 from jaxltl.core.models.product import Product, reads
-from jaxltl.core.models.sharded import is_sharded
 from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.sparse.graph.product_graph import HostGraph
+from jaxltl.core.sparse.graph.row_graph import RowGraph
+from jaxltl.core.sparse.rows import rows_of, rows_of_matrix
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from typing import Literal, NamedTuple
 from jaxltl.core.logic.bounded import Bounded, Earned, unfolded
 from jaxltl.core.logic.labels import is_boolean
 from jaxltl.core.logic.ltl import FALSE, TRUE, Formula, pointed
-from jaxltl.core.show import brief
+from jaxltl.core.pretty_print import brief
 
 Relation = Literal["<", "<=", ">", ">="]
 

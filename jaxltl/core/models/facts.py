@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxltl.core.show import (
+from jaxltl.core.pretty_print import (
     array,
     coded,
     count,

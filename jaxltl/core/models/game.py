@@ -12,15 +12,16 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from jaxltl.core.host.given import no_model
-from jaxltl.core.models import facts, operators
-from jaxltl.core.models.choices import choice_shape, choices
-from jaxltl.core.models.concrete import namespace, to_jax
+from jaxltl.core.models import facts
+from jaxltl.core.models.build.padded import to_padded
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.mdp import support
-from jaxltl.core.models.padded import to_padded
+from jaxltl.core.models.ops import operators
+from jaxltl.core.models.ops.array_namespace import namespace, to_jax
+from jaxltl.core.models.ops.choices import choice_shape, choices
 from jaxltl.core.models.sparse import SparseMDP
-from jaxltl.core.show import brief
+from jaxltl.core.pretty_print import brief
+from jaxltl.core.validation import no_model
 
 
 @brief(facts=facts.game, drawn=True)
@@ -168,7 +169,7 @@ def as_game(model: Any) -> Game:
 
 
 def as_padded_game(model: Any) -> Game:
-    """The same, where sparse models are padded (:func:`~jaxltl.core.models.padded.to_padded`)."""
+    """The same, where sparse models are padded (:func:`~jaxltl.core.models.build.padded.to_padded`)."""
     game = as_game(model)
     if isinstance(game.mdp, SparseMDP):
         game = replace(game, mdp=to_padded(game.mdp))

@@ -10,12 +10,6 @@ from typing import Any
 import numpy as np
 from flax import struct
 
-from jaxltl.core.host.ball import Ball
-from jaxltl.core.host.given import numbers, shown
-from jaxltl.core.host.interval import HostInterval
-from jaxltl.core.host.interval_table import row_sums
-from jaxltl.core.host.rows import starts_of
-from jaxltl.core.host.sparse import HostMDP
 from jaxltl.core.models import facts
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.sparse import (
@@ -27,7 +21,13 @@ from jaxltl.core.models.sparse import (
     make_sparse,
     placed,
 )
-from jaxltl.core.show import brief
+from jaxltl.core.pretty_print import brief
+from jaxltl.core.sparse.interval.l1_distance import Ball
+from jaxltl.core.sparse.interval.row_table import row_sums
+from jaxltl.core.sparse.interval.uncertainty_set import HostInterval
+from jaxltl.core.sparse.mdp import HostMDP
+from jaxltl.core.sparse.rows import starts_of
+from jaxltl.core.validation import numbers, shown
 
 NEAR = 1e-6  # how far a row may miss a distribution and still be scaled to one
 # Names under which numbers of entries travel with the entries, and radii with the rows.

@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from jaxltl.core.host.given import listed, no_model, numbers, shown
 from jaxltl.core.models import facts
-from jaxltl.core.models.concrete import is_traced, to_jax
-from jaxltl.core.show import brief
+from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
+from jaxltl.core.pretty_print import brief
+from jaxltl.core.validation import listed, no_model, numbers, shown
 
 
 @brief(facts=facts.padded, drawn=True)

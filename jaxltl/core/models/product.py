@@ -18,14 +18,15 @@ from flax import struct
 
 from jaxltl.core.automata.automaton import Automaton, letter_index
 from jaxltl.core.automata.translate import to_automaton
-from jaxltl.core.host.given import shown
 from jaxltl.core.logic.labels import distinct_rows, require_known
 from jaxltl.core.logic.ltl import Formula, parse_ltl
-from jaxltl.core.models import facts, kernels, operators
-from jaxltl.core.models.concrete import namespace, to_jax
+from jaxltl.core.models import facts
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import MDP, DenseMDP
-from jaxltl.core.show import brief
+from jaxltl.core.models.ops import kernels, operators
+from jaxltl.core.models.ops.array_namespace import namespace, to_jax
+from jaxltl.core.pretty_print import brief
+from jaxltl.core.validation import shown
 
 
 class Names:
@@ -87,7 +88,7 @@ class Product:
       letter: ``int32[S]``, the automaton's letter that each world state shows.
       label_on: which label a step reads; static.
       allowed: ``bool[S, Q, A]``, the actions to which the world's are narrowed, or None; see
-        :func:`~jaxltl.core.models.restrict.with_allowed`.
+        :func:`~jaxltl.core.models.build.restrict.with_allowed`.
 
     Example:
       >>> import jaxltl as jl

@@ -13,14 +13,14 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from jaxltl.core.host.given import listed, numbers, shown
-from jaxltl.core.host.rows import LARGE
-from jaxltl.core.host.sparse import HostMDP
 from jaxltl.core.models import facts
-from jaxltl.core.models.concrete import is_traced
-from jaxltl.core.models.kernels import gather, owners, segment
 from jaxltl.core.models.mdp import checked_initial, checked_label
-from jaxltl.core.show import brief
+from jaxltl.core.models.ops.array_namespace import is_traced
+from jaxltl.core.models.ops.kernels import gather, owners, segment
+from jaxltl.core.pretty_print import brief
+from jaxltl.core.sparse.mdp import HostMDP
+from jaxltl.core.sparse.rows import LARGE
+from jaxltl.core.validation import listed, numbers, shown
 
 _PADDED = (
     "this takes models that are padded: give to_padded(model). Sparse models have choices "

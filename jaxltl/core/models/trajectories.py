@@ -13,10 +13,10 @@ import numpy as np
 from flax import struct
 
 from jaxltl.core.models import facts
-from jaxltl.core.models.concrete import is_traced, namespace, to_jax
 from jaxltl.core.models.mdp import MDP, DenseMDP
-from jaxltl.core.models.operators import policy_distribution, sample_successor
-from jaxltl.core.show import brief
+from jaxltl.core.models.ops.array_namespace import is_traced, namespace, to_jax
+from jaxltl.core.models.ops.operators import policy_distribution, sample_successor
+from jaxltl.core.pretty_print import brief
 
 
 @brief(facts=facts.trajectories)

@@ -5,7 +5,18 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from jaxltl.core.show import apart, array, coded, count, cut, head, number, readable, span, told
+from jaxltl.core.pretty_print import (
+    apart,
+    array,
+    coded,
+    count,
+    cut,
+    head,
+    number,
+    readable,
+    span,
+    told,
+)
 from jaxltl.core.types import Status
 
 _INNER = 92

@@ -1,1 +1,1 @@
-"""Environments of other packages as :class:`~jaxltl.core.models.environment.Environment`."""
+"""Environments of other packages as :class:`~jaxltl.core.environments.environment.Environment`."""

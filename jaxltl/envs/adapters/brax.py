@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
 
-from jaxltl.core.models.environment import Environment, Timestep, make_box, make_environment
+from jaxltl.core.environments.environment import Environment, Timestep, make_box, make_environment
 from jaxltl.envs.adapters.common import (
     Held,
     arrays,
@@ -43,7 +43,7 @@ def from_brax(
       propositions: the names of the labels.
 
     Returns:
-      :class:`~jaxltl.core.models.environment.Environment`.
+      :class:`~jaxltl.core.environments.environment.Environment`.
 
     Raises:
       ValueError: no environment of Brax, one that starts anew by itself, or a batch; labels that

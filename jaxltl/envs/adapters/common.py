@@ -13,9 +13,9 @@ import jax.numpy as jnp
 from jax import lax
 from jax.tree_util import Partial
 
-from jaxltl.core.host import given
-from jaxltl.core.models.environment import Timestep, as_partial
-from jaxltl.core.show import brief
+from jaxltl.core import validation
+from jaxltl.core.environments.environment import Timestep, as_partial
+from jaxltl.core.pretty_print import brief
 
 
 @jax.tree_util.register_static
@@ -83,7 +83,7 @@ def params_of(root: str, params: Any, own: Any) -> Any:
         return own
     if not isinstance(params, type(own)):
         raise ValueError(
-            f"from_{root}: params is {given.shown(params)}; give a {type(own).__qualname__}, such "
+            f"from_{root}: params is {validation.shown(params)}; give a {type(own).__qualname__}, such "
             "as the environment's own with params.replace(...), or None for its own."
         )
     return params

@@ -9,7 +9,7 @@ import chex
 import jax
 from jax.tree_util import Partial
 
-from jaxltl.core.models.environment import (
+from jaxltl.core.environments.environment import (
     Box,
     Environment,
     Finite,
@@ -50,7 +50,7 @@ def from_gymnax(
       propositions: the names of the labels.
 
     Returns:
-      :class:`~jaxltl.core.models.environment.Environment`.
+      :class:`~jaxltl.core.environments.environment.Environment`.
 
     Raises:
       ValueError: no environment of gymnax, or one in a wrapper; actions that are neither finite

@@ -15,8 +15,8 @@ import jax.numpy as jnp
 from jax import lax
 from jax.tree_util import Partial
 
-from jaxltl.core.models.environment import Environment, Timestep, make_environment
-from jaxltl.core.show import brief
+from jaxltl.core.environments.environment import Environment, Timestep, make_environment
+from jaxltl.core.pretty_print import brief
 from jaxltl.envs.adapters.common import Held
 
 
@@ -73,7 +73,7 @@ def in_turn(
       horizon: of the inner world.
 
     Returns:
-      :class:`~jaxltl.core.models.environment.Environment`.
+      :class:`~jaxltl.core.environments.environment.Environment`.
     """
     held = Held(tuple(counts))
     return make_environment(

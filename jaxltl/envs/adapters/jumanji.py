@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
 
-from jaxltl.core.host import given
-from jaxltl.core.models.environment import (
+from jaxltl.core import validation
+from jaxltl.core.environments.environment import (
     Box,
     Environment,
     Finite,
@@ -68,7 +68,7 @@ def from_jumanji(
       propositions: the names of the labels.
 
     Returns:
-      :class:`~jaxltl.core.models.environment.Environment`.
+      :class:`~jaxltl.core.environments.environment.Environment`.
 
     Raises:
       ValueError: no environment of Jumanji, one that starts anew by itself, or a batch; a reward
@@ -99,7 +99,7 @@ def from_jumanji(
     held, endless, parts = Held(env), Held(_without_limit(env)), _parts(env)
     limit = next((x.time_limit for x in layers(env, "_env") if "time_limit" in vars(x)), None)
     limit = None if limit is None else int(limit)
-    if given.truth("in_turn", in_turn):
+    if validation.truth("in_turn", in_turn):
         if not parts:
             raise ValueError(
                 f"from_jumanji: in_turn=True, but an action of {type(env).__name__} has no parts "

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax.tree_util import Partial
 
-from jaxltl.core.models.environment import Environment, Timestep, make_environment
+from jaxltl.core.environments.environment import Environment, Timestep, make_environment
 from jaxltl.envs.adapters.common import (
     Held,
     arrays,
@@ -43,7 +43,7 @@ def from_navix(
       propositions: the names of the labels.
 
     Returns:
-      :class:`~jaxltl.core.models.environment.Environment`.
+      :class:`~jaxltl.core.environments.environment.Environment`.
 
     Raises:
       ValueError: no environment of Navix; labels that are not ``bool[P]``.

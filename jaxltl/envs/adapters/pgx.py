@@ -12,8 +12,8 @@ import numpy as np
 from jax import lax
 from jax.tree_util import Partial
 
-from jaxltl.core.models.environment import Environment, Timestep, as_partial, make_environment
-from jaxltl.core.show import brief
+from jaxltl.core.environments.environment import Environment, Timestep, as_partial, make_environment
+from jaxltl.core.pretty_print import brief
 from jaxltl.envs.adapters.common import (
     Held,
     arrays,
@@ -64,7 +64,7 @@ def from_pgx(
       propositions: the names of the labels.
 
     Returns:
-      :class:`~jaxltl.core.models.environment.Environment`; its worlds are pairs of Pgx's ``state``
+      :class:`~jaxltl.core.environments.environment.Environment`; its worlds are pairs of Pgx's ``state``
       and what is ``owed`` for moves before the player's first.
 
     Raises:

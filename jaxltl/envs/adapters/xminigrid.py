@@ -9,7 +9,7 @@ import chex
 import jax
 from jax.tree_util import Partial
 
-from jaxltl.core.models.environment import Environment, Timestep, make_environment
+from jaxltl.core.environments.environment import Environment, Timestep, make_environment
 from jaxltl.envs.adapters.common import (
     Held,
     arrays,
@@ -43,7 +43,7 @@ def from_xminigrid(
       propositions: the names of the labels.
 
     Returns:
-      :class:`~jaxltl.core.models.environment.Environment`.
+      :class:`~jaxltl.core.environments.environment.Environment`.
 
     Raises:
       ValueError: no environment of xminigrid, or one that starts anew by itself; no limit of steps

@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 from jax.tree_util import Partial
 
+from jaxltl.core.environments.environment import Timestep, make_box, make_environment, random_action
+from jaxltl.core.environments.episodes import Agent, run_episode
+from jaxltl.core.environments.monitor import Verdict
+from jaxltl.core.environments.simulated_model import environment_of
+from jaxltl.core.environments.tabulate import tabulate
+from jaxltl.core.environments.task_environment import task_environment
 from jaxltl.core.games.permissive import permissive_strategy
 from jaxltl.core.games.shielded_environment import ShieldedWorld, shield_environment
 from jaxltl.core.games.winning import winning_region
-from jaxltl.core.models.convert import to_sparse
-from jaxltl.core.models.environment import Timestep, make_box, make_environment, random_action
-from jaxltl.core.models.episodes import Agent, run_episode
+from jaxltl.core.models.build.convert import to_sparse
 from jaxltl.core.models.mdp import from_dense
-from jaxltl.core.models.monitor import Verdict
 from jaxltl.core.models.product import product
-from jaxltl.core.models.simulated_model import environment_of
-from jaxltl.core.models.tabulate import tabulate
-from jaxltl.core.models.task_environment import task_environment
-from jaxltl.core.values.satisfaction import optimal_satisfaction
+from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction
 from jaxltl.envs.robots import grid_game
 from tests import reference
 from tests.support import as_mdp

@@ -21,10 +21,10 @@ from jaxltl.core.games.objective import (
 from jaxltl.core.games.verify import verify
 from jaxltl.core.games.winning import almost_sure_buchi, winning_region
 from jaxltl.core.graphs.attractor import attractor
-from jaxltl.core.host import attract as host_attract
 from jaxltl.core.models.game import Game, make_game, swap_players
 from jaxltl.core.models.mdp import to_dense
 from jaxltl.core.models.product import product
+from jaxltl.core.sparse.graph import attractor as host_attract
 from tests import reference, reference_games
 from tests.support import as_mdp, bit_labels, counts, random_product
 

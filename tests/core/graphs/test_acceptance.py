@@ -13,7 +13,10 @@ from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.graphs.acceptance import accepting_bottom_components, accepting_end_components
 from jaxltl.core.models.mdp import make_mdp
 from jaxltl.core.models.product import product
-from jaxltl.core.values.satisfaction import optimal_satisfaction, satisfaction_probability
+from jaxltl.core.values.undiscounted.satisfaction import (
+    optimal_satisfaction,
+    satisfaction_probability,
+)
 
 S, A, K, Q, L = 3, 2, 2, 2, 4
 LETTERS = [[bool(n & 1), bool(n >> 1)] for n in range(L)]

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import jaxltl as jl
-from jaxltl.core.host import attract as host_attract
+from jaxltl.core.sparse.graph import attractor as host_attract
 from tests import reference
 from tests.support import as_mdp, random_representation
 

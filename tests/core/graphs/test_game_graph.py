@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from jaxltl.core.graphs.attractor import attractor
-from jaxltl.core.host import attract as host_attract
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import to_dense
+from jaxltl.core.sparse.graph import attractor as host_attract
 from tests import reference, reference_games
 from tests.support import as_mdp, random_product
 

@@ -5,26 +5,29 @@ import itertools
 import numpy as np
 import pytest
 
-from jaxltl.core.host.confidence import intervals_from_counts
+from jaxltl.core.models.build.restrict import restrict, with_allowed
 from jaxltl.core.models.game import make_game
 from jaxltl.core.models.interval import interval_rows, make_interval
 from jaxltl.core.models.mdp import from_dense
 from jaxltl.core.models.product import product
-from jaxltl.core.models.restrict import restrict, with_allowed
 from jaxltl.core.models.sparse import make_sparse
-from jaxltl.core.values.data_guarantee import learn_guarantee
-from jaxltl.core.values.prepared_interval import prepare_interval
-from jaxltl.core.values.robust import (
+from jaxltl.core.statistics.confidence_sets import intervals_from_counts
+from jaxltl.core.values.evaluation.data_guarantee import learn_guarantee
+from jaxltl.core.values.interval.robust import (
     robust_discounted_value,
     robust_expectation,
     robust_reachability,
 )
-from jaxltl.core.values.robust_satisfaction import robust_satisfaction
-from jaxltl.core.values.robust_sensitivity import robust_sensitivity
-from jaxltl.core.values.satisfaction import optimal_satisfaction, satisfaction_probability
+from jaxltl.core.values.interval.satisfaction import robust_satisfaction
+from jaxltl.core.values.interval.sensitivity import robust_sensitivity
+from jaxltl.core.values.prepared.prepared_interval import prepare_interval
+from jaxltl.core.values.undiscounted.satisfaction import (
+    optimal_satisfaction,
+    satisfaction_probability,
+)
 from jaxltl.io.model_files import read_model, write_model
-from tests.core.host.test_ball import within_ball
-from tests.core.values.test_data_guarantee import drawn, labelled
+from tests.core.sparse.interval.test_l1_distance import within_ball
+from tests.core.values.evaluation.test_data_guarantee import drawn, labelled
 
 TASKS = ["F a", "!b U a", "G F a", "F G a | F b", "G !b"]
 DIRECTIONS = list(itertools.product(("max", "min"), repeat=2))

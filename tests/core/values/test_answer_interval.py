@@ -9,10 +9,10 @@ import pytest
 from jaxltl.core.models.interval import interval_rows
 from jaxltl.core.models.sparse import Rewards, make_sparse
 from jaxltl.core.types import Status
-from jaxltl.core.values.answer import solve_property
+from jaxltl.core.values.properties.solve_property import solve_property
 from jaxltl.io.drn import read_drn
 from jaxltl.io.storm import to_stormpy
-from tests.core.host.test_interval_bounded import random_interval, vertices
+from tests.core.sparse.interval.test_step_bounded import random_interval, vertices
 
 BOTH = ("maxmin", "maxmax", "minmin", "minmax")
 

@@ -15,18 +15,21 @@ from jaxltl.core.graphs.end_components import bottom_components, end_components
 from jaxltl.core.graphs.graph import TracedGraph, graph_of
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import make_mdp
+from jaxltl.core.models.mesh.shard import from_mesh, shard, to_mesh
+from jaxltl.core.models.ops.successor_tables import SpreadSuccessors, table
 from jaxltl.core.models.product import product
-from jaxltl.core.models.shard import from_mesh, shard, to_mesh
-from jaxltl.core.models.tables import SpreadSuccessors, table
 from jaxltl.core.types import Status
-from jaxltl.core.values.boltzmann import boltzmann_value
-from jaxltl.core.values.discounted import optimal_value, policy_value
-from jaxltl.core.values.minimax import minimax_value
-from jaxltl.core.values.occupancy import occupancy_measure
-from jaxltl.core.values.reachability import reachability_probability
-from jaxltl.core.values.satisfaction import optimal_satisfaction, satisfaction_probability
-from jaxltl.core.values.soft import soft_value
-from tests.core.models.test_sharded import A, S, mesh_of, world
+from jaxltl.core.values.discounted.boltzmann import boltzmann_value
+from jaxltl.core.values.discounted.discounted import optimal_value, policy_value
+from jaxltl.core.values.discounted.minimax import minimax_value
+from jaxltl.core.values.discounted.occupancy import occupancy_measure
+from jaxltl.core.values.discounted.soft import soft_value
+from jaxltl.core.values.undiscounted.reachability import reachability_probability
+from jaxltl.core.values.undiscounted.satisfaction import (
+    optimal_satisfaction,
+    satisfaction_probability,
+)
+from tests.core.models.mesh.test_sharded import A, S, mesh_of, world
 
 MESHES = [
     (4, 2),

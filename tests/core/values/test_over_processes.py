@@ -8,9 +8,9 @@ import pytest
 
 from jaxltl.core.models.product import product
 from jaxltl.core.types import Status
-from jaxltl.core.values.satisfaction import optimal_satisfaction
+from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction
 from tests import several
-from tests.core.models.test_sharded import world
+from tests.core.models.mesh.test_sharded import world
 from tests.core.values.test_over_mesh import FORMULAS, SOLVERS, quantities
 
 

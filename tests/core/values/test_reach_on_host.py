@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import jaxltl as jl
-from jaxltl.core.host import reach as host
 from jaxltl.core.models.mdp import make_mdp
-from jaxltl.core.models.operators import induced_chain
+from jaxltl.core.models.ops.operators import induced_chain
+from jaxltl.core.sparse.solvers import dense_reachability as host
 from jaxltl.core.types import Status
-from jaxltl.core.values.reachability import reachability_probability
+from jaxltl.core.values.undiscounted.reachability import reachability_probability
 from tests.core.graphs.test_engines import counted_programs
 
 RARE = 1e-3

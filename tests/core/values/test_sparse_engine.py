@@ -5,17 +5,20 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from jaxltl.core.models.convert import to_padded, to_sparse
+from jaxltl.core.models.build.convert import to_padded, to_sparse
+from jaxltl.core.models.build.restrict import restrict, with_allowed
 from jaxltl.core.models.mdp import to_dense
 from jaxltl.core.models.product import product
-from jaxltl.core.models.restrict import restrict, with_allowed
 from jaxltl.core.models.sparse import make_sparse
 from jaxltl.core.types import Status
-from jaxltl.core.values.discounted import optimal_value, policy_value
-from jaxltl.core.values.reachability import reachability_probability
-from jaxltl.core.values.satisfaction import optimal_satisfaction, satisfaction_probability
-from jaxltl.core.values.sparse_satisfaction import sparse_satisfaction
-from jaxltl.core.values.total_reward import total_reward
+from jaxltl.core.values.discounted.discounted import optimal_value, policy_value
+from jaxltl.core.values.undiscounted.reachability import reachability_probability
+from jaxltl.core.values.undiscounted.satisfaction import (
+    optimal_satisfaction,
+    satisfaction_probability,
+)
+from jaxltl.core.values.undiscounted.sparse_satisfaction import sparse_satisfaction
+from jaxltl.core.values.undiscounted.total_reward import total_reward
 from tests.core.models.test_sparse import random_padded
 from tests.support import counts
 

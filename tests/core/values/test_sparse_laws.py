@@ -18,8 +18,8 @@ import pytest
 
 import jaxltl as jl
 from jaxltl.core.types import Status
-from jaxltl.core.values.boltzmann import boltzmann_expansion
-from jaxltl.core.values.soft import soft_policy_adjoint
+from jaxltl.core.values.discounted.boltzmann import boltzmann_expansion
+from jaxltl.core.values.discounted.soft import soft_policy_adjoint
 from tests.sparse_models import exact_solve, random_sparse
 from tests.support import (
     assert_encloses,

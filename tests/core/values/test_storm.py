@@ -10,7 +10,10 @@ from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.logic.ltl import Formula, negation_normal_form, subformulas
 from jaxltl.core.models.mdp import make_mdp
 from jaxltl.core.models.product import product
-from jaxltl.core.values.satisfaction import optimal_satisfaction, satisfaction_probability
+from jaxltl.core.values.undiscounted.satisfaction import (
+    optimal_satisfaction,
+    satisfaction_probability,
+)
 from tests.reference_logic import random_formula
 
 pytest.importorskip("stormpy")

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from jax import lax
 
-from jaxltl.core.models.environment import allowed_in, random_action
-from jaxltl.core.models.episodes import step_or_reset
+from jaxltl.core.environments.environment import allowed_in, random_action
+from jaxltl.core.environments.episodes import step_or_reset
 
 
 def load(name):

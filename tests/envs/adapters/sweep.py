@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxltl as jl
-from jaxltl.core.models.environment import random_action
-from jaxltl.core.models.episodes import step_or_reset
+from jaxltl.core.environments.environment import random_action
+from jaxltl.core.environments.episodes import step_or_reset
 from tests.envs.adapters.harness import keys_of, own_walk, walk
 
 LIMIT, STEPS, WALKS = 20, 50, 3  # an episode's steps, a walk's, and how many walks are one vmap

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from jaxltl import from_brax
-from jaxltl.core.models.episodes import agent_of, run_episode
-from jaxltl.core.models.time_limit import with_time_limit
+from jaxltl.core.environments.episodes import agent_of, run_episode
+from jaxltl.core.environments.time_limit import with_time_limit
 from tests.envs.adapters.harness import (  # noqa: F401
     both_ends,
     load,

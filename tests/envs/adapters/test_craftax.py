@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxltl import from_craftax
-from jaxltl.core.models.environment import Finite
+from jaxltl.core.environments.environment import Finite
 from tests.envs.adapters.harness import load, single_precision, walk  # noqa: F401
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from jaxltl import from_gymnax
-from jaxltl.core.models.environment import Box, Finite
-from jaxltl.core.models.episodes import agent_of, run_episode
+from jaxltl.core.environments.environment import Box, Finite
+from jaxltl.core.environments.episodes import agent_of, run_episode
 from tests.envs.adapters.harness import (  # noqa: F401
     both_ends,
     load,

@@ -10,7 +10,7 @@ import pytest
 
 from jaxltl import from_jumanji
 from jaxltl.app.environment_source import load_environment
-from jaxltl.core.models.environment import Finite
+from jaxltl.core.environments.environment import Finite
 from tests.envs.adapters.harness import (  # noqa: F401
     both_ends,
     load,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxltl import from_navix
-from jaxltl.core.models.environment import Finite
+from jaxltl.core.environments.environment import Finite
 from tests.envs.adapters.harness import (  # noqa: F401
     both_ends,
     load,

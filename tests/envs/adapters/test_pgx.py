@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxltl import from_pgx
-from jaxltl.core.models.environment import Finite, random_action
+from jaxltl.core.environments.environment import Finite, random_action
 from tests.envs.adapters.harness import load, same_as_own, single_precision, walk  # noqa: F401
 
 

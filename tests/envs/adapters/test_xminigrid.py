@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import pytest
 
 from jaxltl import from_xminigrid
-from jaxltl.core.models.environment import Finite
+from jaxltl.core.environments.environment import Finite
 from tests.envs.adapters.harness import (  # noqa: F401
     both_ends,
     load,

@@ -1,0 +1,1 @@
+"""Environments: the protocol, task environments, monitors, episodes, tabulation."""

@@ -1,0 +1,188 @@
+"""Temporal logic on finite trajectories, as objectives and constraints of a search.
+
+A trajectory of N states says of a formula what all its continuations agree on: it is satisfied,
+violated, or not decided yet (see ``monitor``). The shares of the three among sampled
+trajectories are numbers to maximise or to bound: reaching a goal while avoiding an obstacle with
+probability .9 is ``-shares.satisfied <= -.9``, and leaving a corridor at most once in a hundred
+times is ``shares.violated <= .01``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.automata.translate import to_automaton
+from jaxltl.core.environments.monitor import Monitor, Verdict, make_monitor, trace_verdicts
+from jaxltl.core.logic.labels import require_known
+from jaxltl.core.logic.ltl import Formula
+from jaxltl.core.pretty_print import brief
+
+
+@brief
+@struct.dataclass
+class FiniteTask:
+    """A formula to be read on rows of labels; made by :func:`make_finite_task`.
+
+    Attributes:
+      monitor: of the formula.
+      letter: ``int32[2^n]``, the monitor's letter in which exactly the propositions of a binary
+        number hold; bit i is that of the i-th of `columns`.
+      columns: where the formula's n propositions are in a row of labels; static.
+      num_columns: P, the length of a row; static.
+
+    Example:
+      >>> task = make_finite_task("!wet U dry", ["wet", "dry"])
+      >>> task.num_columns, task.letter.tolist()
+      (2, [0, 1, 2, 3])
+    """
+
+    monitor: Monitor
+    letter: jax.Array
+    columns: tuple[int, ...] = struct.field(pytree_node=False)
+    num_columns: int = struct.field(pytree_node=False)
+
+
+@brief
+class Shares(NamedTuple):
+    """What part of some trajectories satisfies, violates or leaves undecided; the sum is 1.
+
+    Attributes:
+      satisfied, violated, undecided: ``float[...]``.
+
+    Example:
+      >>> shares = Shares(satisfied=0.5, violated=0.25, undecided=0.25)
+      >>> shares.satisfied + shares.undecided  # at most that many satisfy it in the end
+      0.75
+    """
+
+    satisfied: jax.Array
+    violated: jax.Array
+    undecided: jax.Array
+
+
+def make_finite_task(formula: Formula | str | Automaton, propositions: Sequence[str]) -> FiniteTask:
+    """A formula over the columns of a world's labels; made on the host.
+
+    Args:
+      formula: a formula, its text, or an automaton that reads every subset of its propositions.
+      propositions: the names of the P columns, in order; the formula need not use all.
+
+    Returns:
+      :class:`FiniteTask`.
+
+    Raises:
+      ValueError: a proposition without a column, a name twice, an automaton that cannot read
+        every subset, or a formula that no automaton is made of.
+
+    Example:
+      >>> task = make_finite_task("!wet U dry", ["wet", "dry"])
+      >>> task.columns, task.monitor.delta.shape[1]
+      ((1, 0), 4)
+    """
+    names = list(propositions)
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"propositions: {name!r} is given twice; give each column its name.")
+    automaton = formula if isinstance(formula, Automaton) else to_automaton(formula)
+    text = "the automaton" if isinstance(formula, Automaton) else f"the formula {str(formula)!r}"
+    require_known(automaton.propositions, names, text)
+    count = len(automaton.propositions)
+    code = np.asarray(automaton.letters) @ (1 << np.arange(count))
+    missing = np.setdiff1d(np.arange(1 << count), code)
+    if missing.size:
+        holds = [p for i, p in enumerate(automaton.propositions) if missing[0] >> i & 1]
+        raise ValueError(
+            f"{text} does not read the letter {{{', '.join(holds)}}}. Trajectories may have any "
+            "labels: make it with all letters, as to_automaton does by default."
+        )
+    letter = np.empty(1 << count, np.int32)
+    letter[code] = np.arange(len(code))
+    columns = tuple(names.index(p) for p in automaton.propositions)
+    return FiniteTask(make_monitor(automaton), jnp.asarray(letter), columns, len(names))
+
+
+def finite_verdicts(
+    task: FiniteTask, label: chex.Array, length: chex.Array | None = None
+) -> jax.Array:
+    """The verdict of each trajectory at its end.
+
+    Args:
+      task: from :func:`make_finite_task`.
+      label: ``bool[..., T, P]``, what holds in each state, the first included.
+      length: ``int[...]``, how many states of each trajectory count; default all.
+
+    Returns:
+      ``int32[...]``, of :class:`~jaxltl.core.environments.monitor.Verdict`. Under ``jit`` and ``vmap``.
+
+    Raises:
+      ValueError: labels that are not Boolean, or have not P columns.
+
+    Example:
+      >>> task = make_finite_task("!wet U dry", ["wet", "dry"])
+      >>> dries, swims, waits = [[0, 0], [0, 1]], [[1, 0], [0, 1]], [[0, 0], [0, 0]]
+      >>> label = jnp.array([dries, swims, waits], bool)
+      >>> [Verdict(v).name for v in finite_verdicts(task, label).tolist()]
+      ['SATISFIED', 'VIOLATED', 'UNDECIDED']
+    """
+    label = jnp.asarray(label)
+    if label.dtype != bool or label.ndim < 2 or label.shape[-1] != task.num_columns:
+        raise ValueError(
+            f"labels have shape {list(label.shape)} and type {label.dtype}; give booleans "
+            f"[..., T, {task.num_columns}], a column for each proposition of the task."
+        )
+    code = jnp.zeros(label.shape[:-1], jnp.int32)
+    for i, column in enumerate(task.columns):
+        code |= label[..., column].astype(jnp.int32) << i
+    return trace_verdicts(task.monitor, task.letter[code], length)[..., -1]
+
+
+def verdict_shares(verdict: chex.Array, axis: int | tuple[int, ...] | None = -1) -> Shares:
+    """The shares of the three verdicts among trajectories.
+
+    Args:
+      verdict: ``int[..., M]``, from :func:`finite_verdicts`.
+      axis: of the trajectories.
+
+    Returns:
+      Arrays ``float[...]``.
+
+    Example:
+      >>> [float(x) for x in verdict_shares(jnp.array([1, 1, 0, 2]))]
+      [0.5, 0.25, 0.25]
+    """
+    verdict = jnp.asarray(verdict)
+    order = (Verdict.SATISFIED, Verdict.VIOLATED, Verdict.UNDECIDED)
+    return Shares(*(jnp.mean(verdict == v, axis=axis, dtype=float) for v in order))
+
+
+def finite_shares(task: FiniteTask, label: chex.Array, length: chex.Array | None = None) -> Shares:
+    """:func:`verdict_shares` of the M trajectories of a batch.
+
+    Args:
+      task, label, length: as for :func:`finite_verdicts`, with ``bool[..., M, T, P]``.
+
+    Returns:
+      Arrays ``float[...]``.
+
+    Raises:
+      ValueError: as :func:`finite_verdicts`, or labels without an axis of trajectories.
+
+    Example:
+      >>> task = make_finite_task("F dry", ["wet", "dry"])
+      >>> float(finite_shares(task, jnp.array([[[0, 1]], [[1, 0]]], bool)).satisfied)
+      0.5
+    """
+    if jnp.ndim(label) < 3:
+        raise ValueError(
+            f"labels have shape {list(jnp.shape(label))}; give [..., M, T, P], with an axis of "
+            "trajectories."
+        )
+    return verdict_shares(finite_verdicts(task, label, length))

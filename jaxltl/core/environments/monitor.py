@@ -1,0 +1,277 @@
+"""Verdicts on finite traces: satisfied, violated, or not decided yet, and never a guess.
+
+Linear temporal logic speaks of infinite words. What a finite trace decides is what all its
+continuations agree on (Bauer, Leucker & Schallhart 2011, "Runtime verification for LTL and
+TLTL"). A world that terminates is modelled by an absorbing last state, whose letter repeats
+for ever; then `accepts_lasso` decides its trace. A trace that was merely cut off stays undecided:
+an unmet "eventually" is no violation, and an "always" kept so far is not satisfied.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Iterable
+from functools import partial
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from jaxltl.core.automata.automaton import Automaton, run
+from jaxltl.core.automata.runs import live_states, universal_states
+from jaxltl.core.logic.ltl import Letter
+from jaxltl.core.models import facts
+from jaxltl.core.pretty_print import brief
+
+
+class Verdict(enum.IntEnum):
+    """What a finite word says of its infinite continuations.
+
+    - ``UNDECIDED``: some are accepted, and some are not.
+    - ``SATISFIED``: every one is accepted.
+    - ``VIOLATED``: none is.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> jl.verdict(jl.to_automaton("G a"), [{"a"}, set()]).name
+      'VIOLATED'
+    """
+
+    UNDECIDED = 0
+    SATISFIED = 1  # every continuation is accepted
+    VIOLATED = 2  # none is
+
+
+@brief(facts=partial(facts.monitor, codes=Verdict))
+@struct.dataclass
+class Monitor:
+    """An automaton that tells its verdict in every state.
+
+    Attributes:
+      delta: ``int32[Q, L]``, the state after reading a letter. Letters are indices into the
+        automaton's, such as ``Product.letter`` holds for each state of a world.
+      initial: ``int32``, the state before anything is read.
+      verdict: ``int32[Q]``, the :class:`Verdict` in each state.
+
+    Example:
+      >>> from jaxltl import to_automaton
+      >>> monitor = make_monitor(to_automaton("F a"))
+      >>> monitor.delta.tolist(), monitor.verdict.tolist()
+      ([[0, 1], [1, 1]], [0, 1])
+    """
+
+    delta: jax.Array
+    initial: jax.Array
+    verdict: jax.Array
+
+
+def verdict(automaton: Automaton, word: Iterable[Letter]) -> Verdict:
+    """The verdict after a finite word, on the host.
+
+    For many words, or words of a model, make a monitor once and use :func:`trace_verdicts`.
+
+    Args:
+      automaton: the task, with any acceptance.
+      word: T letters, each the collection of the propositions that hold.
+
+    Returns:
+      :class:`Verdict`: whether every, none or some of the word's continuations satisfy the task.
+
+    Raises:
+      ValueError: a letter is not among the automaton's.
+
+    Example:
+      >>> from jaxltl import to_automaton
+      >>> verdict(to_automaton("F a"), [set(), {"a"}]).name, verdict(to_automaton("F a"), []).name
+      ('SATISFIED', 'UNDECIDED')
+    """
+    return Verdict(int(verdicts(automaton)[run(automaton, word)[-1]]))
+
+
+def verdicts(automaton: Automaton) -> np.ndarray:
+    """``int32[Q]``: the verdict in each state of an automaton, on the host."""
+    table = np.full(len(automaton.delta), Verdict.UNDECIDED, np.int32)
+    table[universal_states(automaton)] = Verdict.SATISFIED
+    table[~live_states(automaton)] = Verdict.VIOLATED
+    return table
+
+
+def lasting_verdicts(automaton: Automaton) -> np.ndarray:
+    """``int32[Q, L]``: the verdict on a word that led to a state, if one letter repeats for ever.
+
+    Of a world that terminates: the state after its last label, and the letter of that label. It is
+    never undecided. On the host.
+
+    Example:
+      >>> from jaxltl import to_automaton
+      >>> lasting_verdicts(to_automaton("G F a"))[0].tolist()
+      [2, 1]
+    """
+    delta, least = np.asarray(automaton.delta), np.asarray(automaton.priority)
+    # The state after 2^n readings of one letter, and the least priority among them. After as many
+    # as there are states the run is on its cycle, and as many more read all of it.
+    letter = np.arange(delta.shape[1])
+    for _ in range(len(delta).bit_length()):
+        least = np.minimum(least, least[delta, letter])
+        delta = delta[delta, letter]
+    even = least[delta, letter] % 2 == 0
+    return np.where(even, Verdict.SATISFIED, Verdict.VIOLATED).astype(np.int32)
+
+
+def make_monitor(automaton: Automaton) -> Monitor:
+    """The monitor of an automaton, with any acceptance; made on the host.
+
+    Args:
+      automaton: the task.
+
+    Returns:
+      :class:`Monitor`, for :func:`monitor_step`.
+
+    Example:
+      >>> from jaxltl import to_automaton
+      >>> make_monitor(to_automaton("G a")).verdict.tolist()
+      [0, 2]
+    """
+    return Monitor(
+        delta=jnp.asarray(automaton.delta, jnp.int32),
+        initial=jnp.asarray(automaton.initial, jnp.int32),
+        verdict=jnp.asarray(verdicts(automaton)),
+    )
+
+
+def monitor_step(monitor: Monitor, state: chex.Array, letter: chex.Array) -> jax.Array:
+    """The state after reading one letter, for ``jit``, ``vmap`` and ``scan``.
+
+    Args:
+      monitor: from :func:`make_monitor`.
+      state: ``int32[...]``; start with ``monitor.initial``.
+      letter: ``int[...]`` in 0..L-1, of a shape that broadcasts with the state's.
+
+    Returns:
+      ``int32[...]``; its verdict is ``monitor.verdict[state]``. Integers: there is no derivative.
+
+    Raises:
+      TypeError: letters that are not integers, such as a row of booleans.
+
+    Example:
+      >>> from jaxltl import to_automaton
+      >>> monitor = make_monitor(to_automaton("F a"))
+      >>> monitor_step(monitor, monitor.initial, jnp.array([0, 1])).tolist()
+      [0, 1]
+    """
+    _check_integers(letter, "monitor_step: letter")
+    return monitor.delta[state, letter]
+
+
+def monitor_verdict(monitor: Monitor, state: chex.Array) -> jax.Array:
+    """The verdict in each of the given states of a monitor, for ``jit``, ``vmap`` and ``scan``.
+
+    Args:
+      monitor: from :func:`make_monitor`.
+      state: ``int32[...]``, of :func:`monitor_step`.
+
+    Returns:
+      ``int32[...]``, of :class:`Verdict`. Integers: there is no derivative.
+
+    Example:
+      >>> from jaxltl import to_automaton
+      >>> Verdict(int(monitor_verdict(make_monitor(to_automaton("true")), 0))).name
+      'SATISFIED'
+    """
+    return monitor.verdict[state]
+
+
+def trace_verdicts(
+    monitor: Monitor, letters: chex.Array, length: chex.Array | None = None
+) -> jax.Array:
+    """The verdict after each prefix of traces, the empty one first.
+
+    A verdict other than undecided never changes. After `length` letters it stays what it was,
+    whatever the padding says: a trace that is cut off gets no verdict for that.
+
+    Args:
+      monitor: from :func:`make_monitor`.
+      letters: ``int[..., T]`` in 0..L-1 as far as `length` reaches.
+      length: ``int[...]``, how many letters of each trace count; default all T.
+
+    Returns:
+      ``int32[..., T + 1]``. Integers: there is no derivative.
+
+    Raises:
+      TypeError: letters or lengths that are not integers.
+      ValueError: a letter or a length that does not exist (on concrete arrays; a traced
+        letter is not looked at).
+
+    Example:
+      >>> from jaxltl import to_automaton
+      >>> trace_verdicts(make_monitor(to_automaton("F a")), [[0, 1, 0], [0, 1, 1]], [3, 1]).tolist()
+      [[0, 0, 1, 1], [0, 0, 0, 0]]
+    """
+    letters = jnp.asarray(letters)
+    if letters.ndim == 0:
+        raise ValueError("trace_verdicts: letters is one number. Pass an array [..., T].")
+    steps = letters.shape[-1]
+    if letters.size == 0:  # an empty list says nothing of its type
+        letters = letters.astype(jnp.int32)
+    length = jnp.asarray(steps if length is None else length)
+    _check_integers(letters, "trace_verdicts: letters")
+    _check_integers(length, "trace_verdicts: length")
+    _check_shape(letters, length)
+    counts = jnp.broadcast_to(jnp.arange(steps) < length[..., None], letters.shape)
+    _check_range(monitor, letters, length, counts)
+    return _scan(monitor, letters, counts)
+
+
+@jax.jit  # so that calls outside of jit share one compilation
+def _scan(monitor: Monitor, letters: jax.Array, counts: jax.Array) -> jax.Array:
+    def step(state: jax.Array, read: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        letter, inside = read
+        state = jnp.where(inside, monitor_step(monitor, state, letter), state)
+        return state, monitor_verdict(monitor, state)
+
+    start = jnp.broadcast_to(monitor.initial, letters.shape[:-1])
+    reads = (jnp.moveaxis(letters, -1, 0), jnp.moveaxis(counts, -1, 0))
+    _, rest = jax.lax.scan(step, start, reads)
+    first = monitor_verdict(monitor, start)[..., None]
+    return jnp.concatenate([first, jnp.moveaxis(rest, 0, -1)], axis=-1)
+
+
+def _check_integers(array: chex.Array, place: str) -> None:
+    dtype = jnp.asarray(array).dtype
+    if not jnp.issubdtype(dtype, jnp.integer):
+        raise TypeError(
+            f"{place} has type {dtype}. Pass integers; letters are indices into the automaton's "
+            "letters (letter_index gives one, Product.letter those of a world)."
+        )
+
+
+def _check_shape(letters: jax.Array, length: jax.Array) -> None:
+    if length.shape not in ((), letters.shape[:-1]):
+        raise ValueError(
+            f"trace_verdicts: length has shape {length.shape} for letters of shape "
+            f"{letters.shape}. Pass one number, or shape {letters.shape[:-1]}."
+        )
+
+
+def _check_range(
+    monitor: Monitor, letters: jax.Array, length: jax.Array, counts: jax.Array
+) -> None:
+    """Refuses what does not exist, which indexing would silently clip to what does."""
+    traced = (jax.core.Tracer,)
+    if any(isinstance(x, traced) for x in (monitor.delta, letters, length, counts)):
+        return
+    steps, width = letters.shape[-1], monitor.delta.shape[-1]
+    lengths = np.asarray(length)
+    for wrong in lengths[(lengths < 0) | (lengths > steps)][:1]:
+        raise ValueError(
+            f"trace_verdicts: length {wrong} with {steps} letters. Pass one of 0..{steps}."
+        )
+    read = np.asarray(letters)
+    bad = ((read < 0) | (read >= width)) & np.asarray(counts)
+    for place in np.argwhere(bad)[:1].tolist():
+        raise ValueError(
+            f"trace_verdicts: letters{place} = {read[tuple(place)]} is no letter. "
+            f"The automaton has the letters 0..{width - 1}."
+        )

@@ -1,0 +1,188 @@
+"""Finite models and games as worlds that are simulated: their states are the worlds."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.tree_util import Partial
+from numpy.typing import ArrayLike
+
+from jaxltl.core import validation
+from jaxltl.core.environments.environment import Environment, Timestep, make_box, make_environment
+from jaxltl.core.models.build.convert import to_padded
+from jaxltl.core.models.game import Game
+from jaxltl.core.models.mdp import MDP, DenseMDP
+from jaxltl.core.models.ops.operators import sample_successor
+from jaxltl.core.models.sparse import SparseMDP
+
+
+def environment_of(
+    model: MDP | DenseMDP | SparseMDP | Game,
+    *,
+    reward: ArrayLike | None = None,
+    observe: Any = None,
+    opponent: ArrayLike | None = None,
+) -> Environment:
+    """The world that a finite Markov decision process is, or a game against a given opponent.
+
+    Worlds are states, ``int32[]``; labels are the model's; the actions that may be taken are the
+    available ones. Nothing ends an episode. In a game every move is a step; where it is the
+    opponent's turn, what it draws is done instead of the action.
+
+    Args:
+      model: an MDP, a DenseMDP, a SparseMDP, which is padded, or a Game on one of them.
+      reward: ``float[S]``, of the state that a step enters, or ``float[S, A]``, of an action;
+        default zero.
+      observe: ``state -> observation``; default one-hot, ``float[S]``.
+      opponent: ``float[S, A]``, the policy of a game's environment; default uniform among its
+        moves.
+
+    Returns:
+      An :class:`~jaxltl.core.environments.environment.Environment`.
+
+    Raises:
+      ValueError: rewards or an opponent of another shape, a product (simulate its world, and give
+        the task to ``task_environment``), or an opponent without a game.
+
+    Example:
+      >>> from jaxltl import from_dense
+      >>> coin = environment_of(from_dense(
+      ...     [[[.5, .5]], [[0, 1]]], label=[[0], [1]], propositions=["heads"]))
+      >>> coin.actions.num, coin.observations.shape, coin.labels(1).tolist()
+      (1, (2,), [True])
+    """
+    owner = model.system if isinstance(model, Game) else None
+    model = model.mdp if isinstance(model, Game) else model
+    if isinstance(model, SparseMDP):
+        model = to_padded(model)
+    if not isinstance(model, MDP | DenseMDP):
+        raise ValueError(
+            f"environment_of: {type(model).__name__} is no world; simulate the MDP under it, and "
+            "give the task to task_environment."
+        )
+    size, num_actions = model.num_states, model.num_actions
+    table = np.zeros(size) if reward is None else np.asarray(reward)
+    if table.shape not in ((size,), (size, num_actions)) or table.dtype.kind not in "biuf":
+        raise ValueError(
+            f"reward has shape {list(table.shape)} and type {table.dtype}; give numbers [{size}], "
+            f"of states, or [{size}, {num_actions}], of their actions."
+        )
+    table = table.astype(jnp.result_type(float))
+    step, outcomes = Partial(_step, model, table), Partial(_outcomes, model, table)
+    if owner is not None:
+        other = _opponent(model, np.asarray(owner), opponent)
+        step = Partial(_step_of_two, other, owner, step)
+        outcomes = Partial(_outcomes_of_two, other, owner, outcomes)
+    elif opponent is not None:
+        raise ValueError("opponent is for games; make_game tells whose turn it is in a state.")
+    spaces = make_box(0, 1, (size,)) if observe is None else None
+    return make_environment(
+        Partial(_reset, model.initial),
+        step,
+        Partial(_one_hot, model.initial) if observe is None else observe,
+        actions=num_actions,
+        labels=Partial(_labels, model.label),
+        propositions=model.propositions,
+        allowed=Partial(_available, model.available),
+        observations=spaces,
+        starts=Partial(_starts, model.initial),
+        outcomes=outcomes,
+    )
+
+
+def _starts(initial: jax.Array) -> tuple[jax.Array, jax.Array]:
+    return jnp.arange(len(initial), dtype=jnp.int32), jnp.asarray(initial)
+
+
+def _reset(initial: jax.Array, key: chex.PRNGKey) -> jax.Array:
+    return jax.random.choice(key, len(initial), p=jnp.asarray(initial)).astype(jnp.int32)
+
+
+def _step(
+    model: MDP | DenseMDP,
+    reward: jax.Array,
+    state: jax.Array,
+    action: jax.Array,
+    key: chex.PRNGKey,
+) -> Timestep:
+    after = sample_successor(model, key, state, action).astype(jnp.int32)
+    return Timestep(after, _earned(reward, state, action, after), terminated=jnp.bool_(False))
+
+
+def _outcomes(
+    model: MDP | DenseMDP, reward: jax.Array, state: jax.Array, action: jax.Array
+) -> tuple[Timestep, jax.Array]:
+    probability = model.successor_probability[state, action]
+    if isinstance(model, MDP):
+        after = jnp.asarray(model.successor)[state, action].astype(jnp.int32)
+    else:
+        after = jnp.arange(model.num_states, dtype=jnp.int32)
+    earned = jax.vmap(lambda t: _earned(reward, state, action, t))(after)
+    return Timestep(after, earned, terminated=jnp.bool_(False)), probability
+
+
+def _earned(reward: jax.Array, state: jax.Array, action: jax.Array, after: jax.Array) -> jax.Array:
+    table = jnp.asarray(reward)
+    return table[after] if table.ndim == 1 else table[state, action]
+
+
+def _opponent(model: MDP | DenseMDP, system: np.ndarray, policy: ArrayLike | None) -> np.ndarray:
+    """The logarithm of what it plays."""
+    available = np.asarray(model.available)
+    plays = available.astype(float) if policy is None else validation.numbers("opponent", policy)
+    if plays.shape != available.shape or not np.isfinite(plays).all() or (plays < 0).any():
+        raise ValueError(
+            f"opponent has shape {list(plays.shape)}; give weights "
+            f"{list(available.shape)}, of each action in each state."
+        )
+    weight = np.where(available, plays, 0)
+    for state in np.flatnonzero(~system & ~weight.any(1))[:1]:
+        raise ValueError(
+            f"opponent: it moves in state {state}, but has no weight on what is "
+            "available there; give some."
+        )
+    with np.errstate(divide="ignore"):
+        weight[system] = 1
+        return np.log(weight).astype(jnp.result_type(float))
+
+
+def _step_of_two(
+    opponent: jax.Array,
+    system: jax.Array,
+    step: Any,
+    state: jax.Array,
+    action: jax.Array,
+    key: chex.PRNGKey,
+) -> Timestep:
+    key, other = jax.random.split(key)
+    reply = jax.random.categorical(other, jnp.asarray(opponent)[state])
+    mine = jnp.asarray(system)[state]
+    found: Timestep = step(state, jnp.where(mine, action, reply).astype(jnp.int32), key)
+    return found
+
+
+def _outcomes_of_two(
+    opponent: jax.Array, system: jax.Array, outcomes: Any, state: jax.Array, action: jax.Array
+) -> tuple[Timestep, jax.Array]:
+    weight = jax.nn.softmax(jnp.asarray(opponent)[state])
+    mine = jnp.arange(len(weight)) == action
+    weight = jnp.where(jnp.asarray(system)[state], mine, weight)
+    found, probability = jax.vmap(lambda a: outcomes(state, a))(jnp.arange(len(weight)))
+    found = Timestep(found.world.ravel(), found.reward.ravel(), terminated=jnp.bool_(False))
+    return found, (weight[:, None] * probability).ravel()
+
+
+def _one_hot(initial: jax.Array, state: jax.Array) -> jax.Array:
+    return jax.nn.one_hot(state, len(initial))
+
+
+def _labels(label: jax.Array, state: jax.Array) -> jax.Array:
+    return jnp.asarray(label)[state]
+
+
+def _available(available: jax.Array, state: jax.Array) -> jax.Array:
+    return jnp.asarray(available)[state]

@@ -1,0 +1,636 @@
+"""Simulated worlds that are finite, listed as models that the exact solvers take."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from jaxltl.core import validation
+from jaxltl.core.environments.environment import (
+    Environment,
+    Finite,
+    Timestep,
+    allowed_in,
+    as_partial,
+    require_key,
+)
+from jaxltl.core.environments.time_limit import without_time_limit
+from jaxltl.core.models import facts
+from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
+from jaxltl.core.pretty_print import brief
+from jaxltl.core.sparse.rows import starts_of
+
+_BATCH = 1024  # worlds that are stepped at once, and fewer
+_BYTES = 2**26  # if what they lead to takes more than this
+_LIVE, _TERMINATED, _TRUNCATED = range(3)
+
+
+@brief(facts=facts.table)
+@struct.dataclass
+class Table:
+    """A world that was listed by :func:`tabulate`.
+
+    Attributes:
+      model: S states, one for each world that is reached; of a world in which an episode may end or
+        not, one for each. What has ended is absorbing. Row actions are the environment's, and the
+        rewards ``"reward"`` and ``"cost"`` its own; its discounts are left out.
+      world: which world each state is, a tree with a first axis of S.
+      start: ``int32[N]``, the states of the worlds from which the listing began.
+      terminated, truncated: ``bool[S]``, where an episode is over, and where it was cut off. The
+        model is absorbing in the latter too, though more would come: ask it for what happens
+        before, as :func:`~jaxltl.core.values.evaluation.optimality_gap.optimality_gap` does.
+      num_steps: the limit of :func:`~jaxltl.core.environments.time_limit.with_time_limit`, which is no
+        part of the states; None: there is none; static.
+      evidence: why the probabilities are the environment's; static. ``"keyless"``: nothing depends
+        on a key, read off the program; ``"told"``: by its `starts` and `outcomes`, which agreed
+        with what was drawn; ``"keys"``: all keys that were tried led to the same; ``"distinct"``:
+        the caller says so, as the program does not rule out that something depends on what
+        `distinct` leaves out. Where several hold, the last of them in this order.
+
+    Example:
+      >>> over = Table(
+      ...     make_sparse(None, [0, 1], [0], [1.0]), world=np.array([7]), start=np.array([0]),
+      ...     terminated=np.array([True]), truncated=np.array([False]), evidence="told")
+      >>> over.model.num_states, over.world[over.start].tolist(), over.num_steps
+      (1, [7], None)
+    """
+
+    model: SparseMDP
+    world: Any
+    start: Any
+    terminated: Any
+    truncated: Any
+    num_steps: int | None = struct.field(pytree_node=False, default=None)
+    evidence: str = struct.field(pytree_node=False, default="keys")
+
+
+def tabulate(
+    environment: Environment,
+    *,
+    worlds: Any = None,
+    max_states: int = 100_000,
+    num_keys: int = 4,
+    key: chex.PRNGKey | None = None,
+    distinct: Callable[[Any], Any] | None = None,
+) -> Table:
+    """All worlds that are reached, and how likely each follows from each: a model.
+
+    A breadth-first search, whose steps are a vmapped program over batches of worlds. Two worlds are
+    one if all of their bytes agree. A time limit is taken off and told (`num_steps`), so that time
+    is no part of the states. Where chance has a part, the environment must tell it by its fields
+    `starts` and `outcomes`; otherwise its functions must be of one outcome. That is known if no
+    result depends on the key; else several keys are tried, and what differs is refused. (A
+    difference that is rare enough is then not seen: `evidence` of the table says which it was.)
+
+    Args:
+      environment: with finitely many actions.
+      worlds: what to begin from instead, equally likely: a tree with a first axis, such as
+        ``vmap(environment.reset)(keys)``. Worlds that stay apart, like those on different maps,
+        are listed side by side in one model.
+      max_states: how many states there may be.
+      num_keys: how many keys are tried.
+      key: of the keys; default ``jax.random.key(0)``.
+      distinct: ``world -> tree``, what tells worlds apart; default everything. Leave out only what
+        has no part in what follows, like a counter, or a key from which nothing is drawn. The rest
+        as it is, and the program shows that; else it is your word, and `evidence` says so.
+
+    Returns:
+      :class:`Table`.
+
+    Raises:
+      ValueError: a box of actions, a reset or a step that is random and not told, or told
+        otherwise than it is drawn, more states than `max_states`, or a world without any action.
+
+    Example:
+      >>> from jaxltl import make_environment
+      >>> def step(place, action, key):
+      ...     place = jnp.clip(place + 2 * action - 1, 0, 4)
+      ...     return Timestep(place, reward=1.0, terminated=place == 4)
+      >>> corridor = make_environment(
+      ...     lambda key: jnp.int32(2), step, lambda place: place[None], actions=2,
+      ...     labels=lambda place: jnp.array([place == 4]), propositions=["goal"])
+      >>> table = tabulate(corridor)
+      >>> table.world.tolist(), table.model.num_rows, table.evidence
+      ([2, 1, 3, 0, 4], 9, 'keyless')
+      >>> table.terminated.tolist()
+      [False, False, False, False, True]
+    """
+    inner, limit = without_time_limit(environment)
+    max_states = validation.whole("max_states", max_states, least=1)
+    num_keys = validation.whole("num_keys", num_keys, least=1, most=2**20)
+    if not isinstance(inner.actions, Finite):
+        raise ValueError("tabulate: the actions are a box; only finitely many can be listed.")
+    key = jax.random.key(0) if key is None else require_key(key)
+    keys = jax.random.split(key, max(num_keys, 2))
+    apart = as_partial(_itself if distinct is None else distinct, "distinct")
+    kind = _Kind(inner, apart, keys, inner.reset(keys[0]))
+    begun, probability, evidence = _begin(kind, environment, worlds)
+    listed = _search(kind, begun, max_states)
+    if evidence == "keys" or listed.evidence == "keys":
+        evidence = "keys"
+    elif "told" in (evidence, listed.evidence):
+        evidence = "told"
+    if not _left_out_is_idle(kind):
+        evidence = "distinct"
+    initial = np.zeros(len(listed.ended))
+    np.add.at(initial, listed.start, probability)
+    world = _joined(listed.world)
+    label = _labels(kind, world, listed.ended.size)
+    model = _model(kind, listed, initial, label)
+    return Table(
+        model,
+        _typed(kind, world),
+        listed.start,
+        listed.ended == _TERMINATED,
+        listed.ended == _TRUNCATED,
+        limit,
+        evidence,
+    )
+
+
+def _itself(world: Any) -> Any:
+    return world
+
+
+class _Kind(NamedTuple):
+    """What is listed: the environment, what tells its worlds apart, keys to try, and a world."""
+
+    environment: Environment
+    distinct: Callable[[Any], Any]
+    keys: Any
+    like: Any
+
+
+# --- worlds as bytes ------------------------------------------------------------------------------
+
+
+def _is_key(x: Any) -> bool:
+    return jax.dtypes.issubdtype(
+        jnp.asarray(x).dtype if not hasattr(x, "dtype") else x.dtype, jax.dtypes.prng_key
+    )
+
+
+def _plain(world: Any) -> Any:
+    """The same with keys as numbers, so that the host can hold it."""
+    return jax.tree.map(lambda x: jax.random.key_data(x) if _is_key(x) else jnp.asarray(x), world)
+
+
+def _typed(kind: _Kind, plain: Any) -> Any:
+    """What :func:`_plain` was made of."""
+
+    def back(x: Any, y: Any) -> Any:
+        return (
+            jax.random.wrap_key_data(jnp.asarray(x), impl=jax.random.key_impl(y))
+            if (_is_key(y))
+            else x
+        )
+
+    return jax.tree.map(back, plain, kind.like)
+
+
+def _bytes(world: Any) -> jax.Array:
+    """``uint8[W]``, the same for worlds whose numbers are equal."""
+
+    def of(x: Any) -> jax.Array:
+        if jnp.issubdtype(x.dtype, jnp.inexact):
+            x = jnp.where(x == 0, jnp.zeros_like(x), x)  # minus zero is zero
+        if jnp.issubdtype(x.dtype, jnp.complexfloating):
+            x = jnp.stack([x.real, x.imag])
+        if x.dtype == bool:
+            return x.astype(jnp.uint8).ravel()
+        return jax.lax.bitcast_convert_type(x, jnp.uint8).ravel()
+
+    parts = [of(x) for x in jax.tree.leaves(_plain(world))]
+    return jnp.concatenate(parts) if parts else jnp.zeros(0, jnp.uint8)
+
+
+def _rows(table: np.ndarray) -> np.ndarray:
+    """Rows of bytes as single values that can be compared."""
+    table = np.ascontiguousarray(table)
+    return table.view(np.dtype((np.void, table.shape[-1])))[..., 0]
+
+
+# --- where it begins ------------------------------------------------------------------------------
+
+
+def _begin(kind: _Kind, environment: Environment, worlds: Any) -> tuple[Any, np.ndarray, str]:
+    """The worlds to begin from, the probability of each, and why it is so."""
+    inner = kind.environment
+    shape = jax.eval_shape(inner.reset, kind.keys[0])
+    if worlds is not None:
+        timed = jax.eval_shape(environment.reset, kind.keys[0])
+        if environment is not inner and _fits(worlds, timed):
+            worlds = worlds[0]
+        count = _count("worlds", worlds, shape)
+        return _plain(worlds), np.full(count, 1 / count), "keyless"
+    drawn = jax.tree.map(np.asarray, _resets(kind))
+    seen = _rows(_told_apart(kind, drawn))
+    if inner.starts is not None:
+        worlds, probability = inner.starts()
+        count = _count("starts", worlds, shape)
+        probability = np.asarray(probability, np.float64)
+        if (
+            probability.shape != (count,)
+            or not (probability >= 0).all()
+            or not np.isclose(probability.sum(), 1, rtol=0, atol=1e-5)
+        ):
+            raise ValueError(
+                f"starts: the probabilities have shape {list(probability.shape)} and sum to "
+                f"{probability.sum():.9g}; give one for each of the {count} worlds, and 1 in sum."
+            )
+        told = _rows(_told_apart(kind, _plain(worlds)))
+        if not np.isin(seen, told[probability > 0]).all():
+            raise ValueError("reset draws a world that starts does not tell; give all of them.")
+        possible = probability > 0
+        worlds = jax.tree.map(lambda x: jnp.asarray(x)[np.flatnonzero(possible)], worlds)
+        return _plain(worlds), probability[possible] / probability.sum(), "told"
+    if len(np.unique(seen)) > 1:
+        raise ValueError(
+            f"tabulate: reset is random, {len(np.unique(seen))} worlds from {len(seen)} keys, and "
+            "the environment does not tell how. Give worlds to begin from, or "
+            "make_environment(starts=...)."
+        )
+    one = jax.tree.map(lambda x: x[:1], drawn)
+    return one, np.ones(1), "keys" if reads_key(inner.reset, kind.keys[0]) else "keyless"
+
+
+@jax.jit
+def _resets(kind: _Kind) -> Any:
+    return jax.vmap(lambda key: _plain(kind.environment.reset(key)))(kind.keys)
+
+
+def _seen(kind: _Kind, world: Any) -> jax.Array:
+    return _bytes(kind.distinct(world))
+
+
+@jax.jit
+def _codes(kind: _Kind, plain: Any) -> jax.Array:
+    return jax.vmap(lambda x: _seen(kind, _typed(kind, x)))(plain)
+
+
+def _told_apart(kind: _Kind, plain: Any) -> np.ndarray:
+    """``uint8[N, W]``, the bytes of worlds."""
+    plain = jax.tree.map(np.asarray, plain)
+    count = len(jax.tree.leaves(plain)[0])
+    return np.concatenate(
+        [np.asarray(_codes(kind, batch))[:rows] for rows, batch in _batches(plain, count, _BATCH)]
+    )
+
+
+def _fits(worlds: Any, shape: Any) -> bool:
+    same: Any = jax.tree.structure(shape)
+    return same == jax.tree.structure(worlds) and all(
+        np.shape(x)[1:] == y.shape and _same_type(x, y)
+        for x, y in zip(jax.tree.leaves(worlds), jax.tree.leaves(shape), strict=True)
+    )
+
+
+def _same_type(x: Any, like: Any) -> bool:
+    """In single precision also of NumPy's numbers of double precision."""
+    kind = getattr(x, "dtype", None)
+    return kind == like.dtype or (
+        isinstance(kind, np.dtype)
+        and kind.kind in "biufc"
+        and jax.dtypes.canonicalize_dtype(kind) == like.dtype
+    )
+
+
+def _count(name: str, worlds: Any, shape: Any) -> int:
+    lengths = {np.shape(x)[:1] for x in jax.tree.leaves(worlds)}
+    if not _fits(worlds, shape) or len(lengths) != 1 or lengths & {(), (0,)}:
+        raise ValueError(
+            f"{name}: give worlds as reset returns them, each array of its type, with a first axis "
+            "more, of the same length."
+        )
+    return int(lengths.pop()[0])
+
+
+def reads_key(function: Callable[..., Any], *arguments: Any) -> bool:
+    """Whether any result may depend on the last argument, by the function's program.
+
+    False is a proof; what calls of other compiled programs do is looked into.
+
+    Example:
+      >>> reads_key(lambda x, key: x + 1, 0.0, jax.random.key(0))
+      False
+      >>> reads_key(lambda x, key: x + jax.random.normal(key), 0.0, jax.random.key(0))
+      True
+    """
+    program = jax.make_jaxpr(function)(*arguments).jaxpr
+    count = len(jax.tree.leaves(arguments[-1]))
+    marked = [False] * (len(program.invars) - count) + [True] * count
+    return any(_marked(program, marked))
+
+
+def _marked(program: Any, given: list[bool]) -> list[bool]:
+    """Which results depend on the arguments that are marked, or may do so."""
+    marks = {id(x) for x, mark in zip(program.invars, given, strict=True) if mark}
+    for line in program.eqns:
+        reads = [id(x) in marks for x in line.invars]
+        if not any(reads):
+            continue
+        written = [True] * len(line.outvars)
+        part = line.params.get("jaxpr") if line.primitive.name in ("pjit", "jit") else None
+        if part is not None:
+            written = _marked(part.jaxpr, reads)
+        marks |= {id(x) for x, mark in zip(line.outvars, written, strict=True) if mark}
+    return [id(x) in marks for x in program.outvars]
+
+
+def _left_out_is_idle(kind: _Kind) -> bool:
+    """Whether nothing that is listed depends on what `distinct` leaves out; True is a proof."""
+    environment = kind.environment
+
+    def listed(world: Any, action: Any, key: Any) -> Any:
+        found = Timestep(*environment.step(world, action, key))
+        told = None
+        if environment.outcomes is not None:
+            each, probability = environment.outcomes(world, action)
+            told = jax.vmap(kind.distinct)(each[0]), tuple(each)[1:5], probability
+        mask = allowed_in(environment, world)
+        return kind.distinct(found.world), found[1:5], told, mask, environment.labels(world)
+
+    shown = jax.make_jaxpr(kind.distinct)(kind.like).jaxpr
+    kept = {id(x) for x in shown.outvars}  # as they are; of a part of an array nothing is known
+    left = [id(x) not in kept for x in shown.invars]
+    if not any(left):
+        return True
+    action = jax.ShapeDtypeStruct((), jnp.int32)
+    program = jax.make_jaxpr(listed)(kind.like, action, kind.keys[0]).jaxpr
+    return not any(_marked(program, left + [False] * (len(program.invars) - len(left))))
+
+
+# --- the search -----------------------------------------------------------------------------------
+
+
+class _Followers(NamedTuple):
+    """What follows from a batch of B worlds: the axes are B, A and K outcomes.
+
+    Attributes:
+      world: which worlds.
+      seen: ``uint8[B, A, K, W + 1]``, their bytes, and whether the episode goes on.
+      probability, reward, cost: ``float[B, A, K]``.
+      allowed: ``bool[B, A]``.
+      drawn: ``uint8[B, A, N, W']``, the bytes of what was drawn by the keys; where outcomes are
+        not told also of what was earned.
+    """
+
+    world: Any
+    seen: Any
+    probability: Any
+    reward: Any
+    cost: Any
+    allowed: Any
+    drawn: Any
+
+
+class _Listed(NamedTuple):
+    """All that a search found, as parts to be joined; `world` and `ended` are of states."""
+
+    world: list[Any]
+    ended: np.ndarray
+    start: np.ndarray
+    successor: list[np.ndarray]
+    parts: list[_Followers]
+    evidence: str
+
+
+def _ended(found: Timestep) -> jax.Array:
+    cut = jnp.where(jnp.asarray(found.truncated, bool), _TRUNCATED, _LIVE)
+    return jnp.where(jnp.asarray(found.terminated, bool), _TERMINATED, cut).astype(jnp.uint8)
+
+
+def _follow(kind: _Kind, draws: int, world: Any) -> _Followers:
+    """What follows from one world, by each action."""
+    environment = kind.environment
+
+    def seen(found: Timestep) -> jax.Array:
+        return jnp.append(_seen(kind, found.world), _ended(found))
+
+    def drawn(action: Any) -> Timestep:
+        def one(key: Any) -> Timestep:
+            found = Timestep(*environment.step(world, action, key))
+            return Timestep(*jax.tree.map(jnp.asarray, tuple(found)))
+
+        return jax.vmap(one)(kind.keys[:draws])
+
+    def one(action: Any) -> _Followers:
+        tries = drawn(action)
+        found, probability = jax.tree.map(lambda x: x[:1], tries), jnp.ones(1)
+        if environment.outcomes is not None:
+            told, probability = environment.outcomes(world, action)
+            probability = jnp.asarray(probability)
+            told = Timestep(*told)
+            rest = [jnp.broadcast_to(jnp.asarray(x), probability.shape) for x in told[1:]]
+            found = Timestep(told.world, *rest)
+        mask = jnp.bool_(True)
+        drawn_again = jax.vmap(seen)(tries)
+        if environment.outcomes is None:  # else what is earned is what they tell
+            paid = jax.vmap(lambda x: _bytes((x.reward, x.cost)))(tries)
+            drawn_again = jnp.concatenate([drawn_again, paid], axis=-1)
+        return _Followers(
+            _plain(found.world),
+            jax.vmap(seen)(found),
+            probability,
+            found.reward,
+            found.cost,
+            mask,
+            drawn_again,
+        )
+
+    every = jax.vmap(one)(jnp.arange(environment.actions.num, dtype=jnp.int32))  # type: ignore[union-attr]
+    mask = allowed_in(environment, world)
+    return every if mask is None else every._replace(allowed=mask)
+
+
+@partial(jax.jit, static_argnums=0)  # so that worlds of one shape share one compilation
+def _followers(draws: int, kind: _Kind, plain: Any) -> _Followers:
+    return jax.vmap(lambda x: _follow(kind, draws, _typed(kind, x)))(plain)
+
+
+def _search(kind: _Kind, begun: Any, max_states: int) -> _Listed:
+    """Breadth first, batch after batch."""
+    environment = kind.environment
+    shape = kind.like
+    action = jax.ShapeDtypeStruct((), jnp.int32)
+    told = environment.outcomes is not None
+    if environment.outcomes is not None:
+        _count("outcomes", jax.eval_shape(environment.outcomes, shape, action)[0][0], shape)
+    keyless = not told and not reads_key(environment.step, shape, action, kind.keys[0])
+    draws = 1 if keyless else len(kind.keys)
+    width = sum(
+        x.size * x.dtype.itemsize
+        for x in jax.tree.leaves(
+            jax.eval_shape(partial(_followers, draws), kind, jax.tree.map(lambda x: x[:1], begun))
+        )
+    )
+    size = int(np.clip(_BYTES // max(width, 1), 1, _BATCH))
+
+    number: dict[bytes, int] = {}
+    ended: list[int] = []
+    codes = _told_apart(kind, begun)
+    live = np.full((len(codes), 1), _LIVE, np.uint8)
+    start, first = _numbered(_rows(np.concatenate([codes, live], axis=1)), number, ended)
+    frontier = jax.tree.map(lambda x: np.asarray(x)[first], begun)
+    listed, successor = [frontier], []
+    parts: list[_Followers] = []
+    while (count := len(jax.tree.leaves(frontier)[0])) > 0:
+        new = []
+        for rows, batch in _batches(frontier, count, size):
+            found = jax.tree.map(
+                lambda x, n=rows: np.asarray(x)[:n], _followers(draws, kind, batch)
+            )
+            _check(found, sum(len(x.allowed) for x in parts), told)
+            real = found.allowed[..., None] & (found.probability > 0)
+            after, before = _rows(found.seen), len(ended)
+            places, first = np.zeros(real.shape, np.int64), np.flatnonzero(real)
+            places[real], new_ones = _numbered(after[real], number, ended)
+            first = first[new_ones]
+            if len(ended) > max_states:
+                raise ValueError(
+                    f"tabulate: there are more than max_states={max_states} worlds. Allow more, "
+                    "take less into a world, or say by distinct= what of it matters."
+                )
+            successor.append(places)
+            parts.append(found._replace(world=None, seen=None, drawn=None))
+            listed.append(
+                jax.tree.map(
+                    lambda x, n=after.shape, f=first: x.reshape(-1, *x.shape[len(n) :])[f],
+                    found.world,
+                )
+            )
+            going = np.array(ended[before:], int) == _LIVE
+            new.append(jax.tree.map(lambda x, g=going: x[g], listed[-1]))
+        frontier = _joined(new)
+    evidence = "told" if told else "keyless" if keyless else "keys"
+    return _Listed(
+        listed, np.array(ended, np.uint8), start.astype(np.int32), successor, parts, evidence
+    )
+
+
+def _batches(frontier: Any, count: int, size: int) -> Iterator[tuple[int, Any]]:
+    """Batches of one size, the last one filled up, and how many are meant."""
+    for begin in range(0, count, size):
+        place = np.minimum(np.arange(begin, begin + size), count - 1)
+        yield (
+            min(size, count - begin),
+            jax.tree.map(partial(np.take, indices=place, axis=0), frontier),
+        )
+
+
+def _numbered(
+    rows: np.ndarray, number: dict[bytes, int], ended: list[int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """The number of each row's state, ``int[N]``, and the rows that were not seen before."""
+    unique, first, inverse = np.unique(rows, return_index=True, return_inverse=True)
+    order = np.argsort(first)  # numbers in the order in which worlds are met
+    place, new = np.empty(len(unique), np.int64), []
+    for i in order:
+        code = unique[i].tobytes()
+        if (found := number.get(code)) is None:
+            found = number[code] = len(ended)
+            ended.append(code[-1])
+            new.append(first[i])
+        place[i] = found
+    return place[inverse.reshape(-1)], np.array(new, np.int64)
+
+
+def _check(found: _Followers, base: int, told: bool) -> None:
+    """Refuses what is random and not told, or is drawn but not told, and dead ends."""
+    stuck = np.flatnonzero(~found.allowed.any(axis=1))
+    if stuck.size:
+        raise ValueError(
+            f"tabulate: no action is allowed in world {base + stuck[0]}, counted in "
+            "the order of the search; end the episode there."
+        )
+    drawn = _rows(found.drawn)  # [B, A, N]
+    if told:
+        sums = found.probability.sum(axis=-1, dtype=np.float64)
+        bad = ((np.abs(sums - 1) > 1e-5) | (found.probability < 0).any(axis=-1)) & found.allowed
+        for b, a in np.argwhere(bad)[:1]:
+            raise ValueError(
+                f"outcomes: of action {a} in world {base + b} the probabilities are "
+                f"{found.probability[b, a].tolist()}; they must be a distribution."
+            )
+        seen = _rows(found.seen)
+        known = (drawn[..., None] == seen[:, :, None]) & (found.probability > 0)[:, :, None]
+        fails = ~known.any(axis=-1).all(axis=-1) & found.allowed
+        for b, a in np.argwhere(fails)[:1]:
+            raise ValueError(
+                f"outcomes: action {a} in world {base + b} leads to a world that they do not tell; "
+                "give every world to which the step may lead, with how the episode ends there."
+            )
+        return
+    differ = (drawn != drawn[..., :1]).any(axis=-1) & found.allowed
+    for b, a in np.argwhere(differ)[:1]:
+        raise ValueError(
+            f"tabulate: step is random: action {a} in world {base + b} leads to "
+            f"{len(np.unique(drawn[b, a]))} outcomes from {drawn.shape[-1]} keys, and the "
+            "environment does not tell how. Give make_environment(outcomes=...), which tells the "
+            "worlds and their probabilities."
+        )
+
+
+# --- as a model -----------------------------------------------------------------------------------
+
+
+def _joined(parts: list[Any]) -> Any:
+    return jax.tree.map(lambda *x: np.concatenate(x), *parts)
+
+
+@jax.jit
+def _labeled(kind: _Kind, plain: Any) -> jax.Array:
+    return jax.vmap(lambda x: kind.environment.labels(_typed(kind, x)))(plain)
+
+
+def _labels(kind: _Kind, plain: Any, count: int) -> np.ndarray:
+    """``bool[S, P]``."""
+    return np.concatenate(
+        [np.asarray(_labeled(kind, batch))[:rows] for rows, batch in _batches(plain, count, _BATCH)]
+    )
+
+
+def _model(kind: _Kind, listed: _Listed, initial: np.ndarray, label: np.ndarray) -> SparseMDP:
+    environment = kind.environment
+    num_states, live = len(listed.ended), np.flatnonzero(listed.ended == _LIVE)
+    followers = _joined(listed.parts)
+    state, action = np.nonzero(followers.allowed)
+    successor = np.concatenate(listed.successor)[state, action]
+    columns = [
+        np.asarray(x, np.float64)[state, action]
+        for x in (followers.probability, followers.reward, followers.cost)
+    ]
+    # Each state that has ended gets a row of its own, a loop without reward.
+    over = np.flatnonzero(listed.ended != _LIVE)
+    owner = np.concatenate([live[state], over])
+    order = np.argsort(owner, kind="stable")
+    width = successor.shape[1]
+    loop = np.tile(over[:, None], (1, width))
+    successor = np.concatenate([successor, loop])[order].ravel()
+    single = np.tile(np.arange(width) == 0, (len(over), 1)).astype(float)
+    probability, reward, cost = (
+        np.concatenate([x, y])[order].ravel()
+        for x, y in zip(columns, (single, 0 * single, 0 * single), strict=True)
+    )
+    rewards = {"reward": Rewards(transition=reward)}
+    if cost.any():
+        rewards["cost"] = Rewards(transition=cost)
+    number = np.concatenate([action, np.zeros(len(over), np.int64)])[order]
+    return make_sparse(
+        starts_of(np.bincount(owner, minlength=num_states)),
+        np.arange(len(owner) + 1) * width,
+        successor,
+        probability,
+        initial=initial,
+        label=label,
+        propositions=environment.propositions,
+        rewards=rewards,
+        action=number,
+    )

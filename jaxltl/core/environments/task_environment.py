@@ -1,0 +1,637 @@
+"""A simulated world and a task in linear temporal logic, as one world that is simulated.
+
+:func:`task_environment` steps a world and the automaton of a formula together. What it returns is
+an :class:`~jaxltl.core.environments.environment.Environment` again: its observations carry the
+automaton's state, its episodes end as soon as every continuation agrees on the formula (see
+``monitor``), and its rewards are those of the task. The label of the world that ``reset`` returns
+is read first, then that of each world that a step enters.
+
+All tables of the task are arrays: new ones do not recompile, and tasks of different formulas,
+padded to one shape by :func:`stack_tasks`, run in one vmapped program.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax.tree_util import Partial
+from numpy.typing import ArrayLike
+
+from jaxltl.core import validation
+from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.automata.translate import to_automaton
+from jaxltl.core.environments.environment import (
+    Environment,
+    Timestep,
+    make_box,
+    make_environment,
+    require_environment,
+)
+from jaxltl.core.environments.finite_task import make_finite_task
+from jaxltl.core.environments.monitor import Verdict, lasting_verdicts, verdicts
+from jaxltl.core.environments.task_reward import Pay, pay_of
+from jaxltl.core.logic.labels import require_known
+from jaxltl.core.logic.ltl import Formula
+from jaxltl.core.models.product import Names
+from jaxltl.core.pretty_print import brief
+
+ENDINGS = ("repeat", "violated", "undecided")
+
+
+@brief(codes={"verdict": Verdict})
+class TaskWorld(NamedTuple):
+    """A world beside the automaton of a task.
+
+    Attributes:
+      world: the inner one.
+      memory: ``int32[]``, the automaton's state after reading the label of `world`.
+      verdict: ``int32[]``, a :class:`~jaxltl.core.environments.monitor.Verdict`: what all continuations
+        agree on; where the world ended by itself without that, what the task's `ending` says.
+      accepted: ``bool[]``, whether the last reading was accepting: of even priority; of a co-safe
+        or safety task, whether the state that it led to is final.
+      visits: ``int32[]``, how many readings were accepting so far, that of the first label
+        included.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> coin = jl.make_environment(
+      ...     lambda key: jnp.int32(0), lambda world, action, key: jl.Timestep(action, 0.0, False),
+      ...     lambda world: world[None], actions=2,
+      ...     labels=lambda world: world == jnp.array([1]), propositions=["a"])
+      >>> begun = jax.eval_shape(jl.task_environment(coin, "F a").reset, jax.random.key(0))
+      >>> begun.world.dtype.name, begun.memory.shape, begun.visits.dtype.name
+      ('int32', (), 'int32')
+    """
+
+    world: Any
+    memory: jax.Array
+    verdict: jax.Array
+    accepted: jax.Array
+    visits: jax.Array
+
+
+@brief
+class TaskObservation(NamedTuple):
+    """What is seen of a :class:`TaskWorld`.
+
+    Attributes:
+      world: the observation of the inner world.
+      memory: ``float[Q]``, one-hot, the automaton's state; or its row of an embedding.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> coin = jl.make_environment(
+      ...     lambda key: jnp.int32(0), lambda world, action, key: jl.Timestep(action, 0.0, False),
+      ...     lambda world: world[None], actions=2,
+      ...     labels=lambda world: world == jnp.array([1]), propositions=["a"])
+      >>> task = jl.task_environment(coin, "F a")
+      >>> task.observations.world.shape, task.observations.memory.shape  # of two states
+      ((1,), (2,))
+    """
+
+    world: Any
+    memory: jax.Array
+
+
+@brief
+@struct.dataclass
+class TaskTables:
+    """A task over the labels of a world, as arrays; made by :func:`make_task_tables`.
+
+    Attributes:
+      weight: ``int32[P]``, what each proposition that holds adds to the code of a label.
+      letter: ``int32[C]``, the automaton's letter of each code.
+      delta: ``int32[Q, L]``, the state after reading.
+      initial: ``int32[]``, the state before anything is read.
+      verdict: ``int32[Q]``, in each state.
+      repeated: ``int32[Q, L]``, the verdict of a world that ends in a state in which the letter was
+        the last one.
+      accepting: ``bool[Q, L]``, of reading a letter in a state.
+      reward, discount: ``float[Q, L]``, of the same reading.
+      decided: ``float[3]``, the reward at each verdict, which at a decided one is all there is.
+      potential: ``float[Q]``, of shaping; zero for none.
+      learner_discount: ``float[]``, with which shaping reckons.
+      embedding: ``float[Q, ...]``, how a state is shown, or None: one-hot.
+      text: what is left of the formula in each state; static.
+
+    Example:
+      >>> tables = make_task_tables("F goal", ["wall", "goal"])
+      >>> tables.delta.tolist(), tables.verdict.tolist(), tables.decided.tolist()
+      ([[0, 1], [1, 1]], [0, 1], [0.0, 1.0, 0.0])
+    """
+
+    weight: Any
+    letter: Any
+    delta: Any
+    initial: Any
+    verdict: Any
+    repeated: Any
+    accepting: Any
+    reward: Any
+    discount: Any
+    decided: Any
+    potential: Any
+    learner_discount: Any
+    embedding: Any
+    text: Names = struct.field(pytree_node=False)
+
+
+def make_task_tables(
+    formula: Formula | str | Automaton,
+    propositions: Sequence[str],
+    *,
+    reward: str = "auto",
+    discount: float | None = None,
+    ratio: float | None = None,
+    shaping: str | ArrayLike | None = None,
+    learner_discount: float = 1.0,
+    ending: str = "repeat",
+    embedding: ArrayLike | None = None,
+) -> TaskTables:
+    """The tables of a task, on the host; see :func:`task_environment`, which makes them itself.
+
+    Args:
+      formula: a formula, its text, or an automaton that reads every subset of its propositions.
+      propositions: the names of the world's P labels.
+      reward, discount, ratio, shaping, learner_discount: see
+        :func:`~jaxltl.core.environments.task_reward.pay_of`.
+      ending: see :func:`task_environment`.
+      embedding: ``float[Q, ...]``, or None.
+
+    Raises:
+      ValueError: as :func:`task_environment`.
+
+    Example:
+      >>> make_task_tables("F goal", ["wall", "goal"]).weight.tolist()
+      [0, 1]
+    """
+    validation.one_of("ending", ending, ENDINGS)
+    propositions = validation.names("propositions", propositions)
+    automaton = formula if isinstance(formula, Automaton) else to_automaton(formula)
+    if not isinstance(formula, Automaton):
+        require_known(automaton.propositions, propositions, f"the formula {str(formula)!r}")
+    with jax.ensure_compile_time_eval():  # tables are made on the host wherever it is called
+        reading = make_finite_task(automaton, propositions)
+    decisions = verdicts(automaton)
+    pay: Pay = pay_of(
+        automaton,
+        decisions,
+        reward=reward,
+        discount=discount,
+        ratio=ratio,
+        shaping=shaping,
+        learner_discount=learner_discount,
+    )
+    weight = np.zeros(len(propositions), np.int32)
+    weight[list(reading.columns)] = 1 << np.arange(len(reading.columns))
+    shown = None if embedding is None else validation.numbers("embedding", embedding)
+    if shown is not None and (
+        shown.ndim < 2 or len(shown) != len(decisions) or shown.dtype.kind not in "biuf"
+    ):
+        raise ValueError(
+            f"embedding has shape {list(shown.shape)} and type {shown.dtype}; give numbers "
+            f"[{len(decisions)}, ...], a row for each state of the automaton."
+        )
+    number = jnp.result_type(float)
+    return TaskTables(
+        weight=weight,
+        letter=np.asarray(reading.letter),
+        delta=np.asarray(automaton.delta, np.int32),
+        initial=np.int32(automaton.initial),
+        verdict=decisions,
+        repeated=_at_the_end(automaton, ending),
+        accepting=pay.accepting,
+        reward=pay.reward.astype(number),
+        discount=pay.discount.astype(number),
+        decided=pay.decided.astype(number),
+        potential=pay.potential.astype(number),
+        learner_discount=np.asarray(learner_discount, number),
+        embedding=None if shown is None else shown.astype(number),
+        text=Names(automaton.state_names),
+    )
+
+
+def task_environment(
+    environment: Environment,
+    formula: Formula | str | Automaton | TaskTables,
+    *,
+    labels: Callable[..., jax.Array] | None = None,
+    propositions: Sequence[str] | None = None,
+    reward: str = "auto",
+    discount: float | None = None,
+    ratio: float | None = None,
+    shaping: str | ArrayLike | None = None,
+    learner_discount: float = 1.0,
+    ending: str = "repeat",
+    embedding: ArrayLike | None = None,
+) -> Environment:
+    """A world with a task, as one :class:`~jaxltl.core.environments.environment.Environment`.
+
+    Its worlds are :class:`TaskWorld`, its observations :class:`TaskObservation`. The world's own
+    rewards are not used; its costs, discounts, actions and masks are as they were. An episode
+    terminates where the world's does, and as soon as the task is decided; a task that the first
+    label decides ends with the first step. What is truncated stays undecided.
+
+    What a world that terminates by itself means for a task that is not decided then, `ending`
+    tells:
+
+    - ``"repeat"``: its last label repeats for ever, as in an absorbing state. "Always" was kept,
+      "eventually" is missed, and "infinitely often" is what the last label says.
+    - ``"violated"``: what is not satisfied by then is violated.
+    - ``"undecided"``: nothing; no continuation is known.
+
+    The rewards of the task are chosen by name. ``"auto"`` takes ``"reach"`` for co-safe tasks,
+    ``"keep"`` for safety, ``"eventual"`` for Buchi and ``"parity"`` for the others;
+    ``"two-discount"`` is the fifth. :func:`~jaxltl.core.environments.task_reward.pay_of` tells their
+    equations, their theorems and what these ask for. All their discounts come with the steps, as
+    ``Timestep.discount``: let the learner's own discount be 1.
+
+    Args:
+      environment: the inner world.
+      formula: a formula, its text, an automaton that reads every subset of its propositions, or
+        the tables of :func:`make_task_tables`, which then say all that follows.
+      labels: ``world -> bool[P]``, instead of the environment's own.
+      propositions: their names; default the environment's.
+      reward: see above.
+      discount: of the reward; default 1 for ``"reach"`` and ``"keep"`` (.99 with shaping), else
+        .99.
+      ratio: of ``"two-discount"`` and ``"parity"``: how much less a reading discounts than one of
+        the priority before; default ``1 - discount``.
+      shaping: None, ``"distance"`` (in the automaton), or a potential ``float[Q]``.
+      learner_discount: the learner's own discount, with which shaping reckons.
+      ending: see above.
+      embedding: ``float[Q, ...]``, what is seen of each state of the automaton; default one-hot.
+
+    Returns:
+      The environment; its numbers are arrays, so that another task of the same shape does not
+      recompile.
+
+    Raises:
+      ValueError: functions that are not pure or of other shapes, labels that are not ``bool[P]``,
+        a formula over labels that the world does not have, a reward that does not fit the task, a
+        discount outside its range, a potential or an embedding of another shape.
+
+    Example:
+      >>> def reset(key):
+      ...     return jnp.int32(0)
+      >>> def step(place, action, key):
+      ...     place = jnp.clip(place + 2 * action - 1, 0, 2)
+      ...     return Timestep(place, reward=0.0, terminated=False)
+      >>> corridor = make_environment(reset, step, lambda place: place[None], actions=2,
+      ...     labels=lambda place: place == jnp.array([0, 2]), propositions=["home", "goal"])
+      >>> task = task_environment(corridor, "F (goal & F home)")
+      >>> world = task.reset(jax.random.key(0))
+      >>> for action in (1, 1, 0, 0):
+      ...     print(what_is_left(task, world.memory))
+      ...     found = task.step(world, action, jax.random.key(0))
+      ...     world = found.world
+      F (goal & F home)
+      F (goal & F home)
+      F home | F (goal & F home)
+      F home | F (goal & F home)
+      >>> float(found.reward), bool(found.terminated), Verdict(int(world.verdict)).name
+      (1.0, True, 'SATISFIED')
+    """
+    environment = require_environment(environment)
+    names = environment.propositions if propositions is None else propositions
+    inner = make_environment(
+        environment.reset,
+        environment.step,
+        environment.observe,
+        actions=environment.actions,
+        labels=environment.labels if labels is None else labels,
+        propositions=names,
+        allowed=environment.allowed,
+        observations=environment.observations,
+        horizon=environment.horizon,
+        starts=environment.starts,
+        outcomes=environment.outcomes,
+    )
+    tables = (
+        formula
+        if isinstance(formula, TaskTables)
+        else make_task_tables(
+            formula,
+            inner.propositions,
+            reward=reward,
+            discount=discount,
+            ratio=ratio,
+            shaping=shaping,
+            learner_discount=learner_discount,
+            ending=ending,
+            embedding=embedding,
+        )
+    )
+    names = inner.propositions
+    if tables.weight.shape != (len(names),):
+        raise ValueError(
+            f"the tables are of {tables.weight.shape[-1]} propositions, and the world has "
+            f"{len(names)}: {', '.join(names) or '(none)'}. Make them with the world's own."
+        )
+    return _beside(inner, tables)
+
+
+def with_tables(environment: Environment, tables: TaskTables) -> Environment:
+    """The environment of a task with another task in its place, also under ``jit`` and ``vmap``.
+
+    Args:
+      environment: from :func:`task_environment`.
+      tables: of the other task, over the same propositions.
+    """
+    task_tables(environment)
+    validation.instance("tables", tables, TaskTables, "those of make_task_tables")
+    made: Any = environment
+    parts: Any = {
+        name: None if (part := getattr(made, name)) is None else part.args[-1]
+        for name in ("reset", "step", "observe", "labels", "allowed", "starts", "outcomes")
+    }
+    return _beside(replace(environment, **parts, observations=made.observations.world), tables)
+
+
+def task_tables(environment: Environment) -> TaskTables:
+    """The tables of a task's environment.
+
+    Raises:
+      ValueError: it was not made by :func:`task_environment`.
+    """
+    arguments = getattr(getattr(environment, "reset", None), "args", ())
+    if not arguments or not isinstance(arguments[0], TaskTables):
+        raise ValueError("this environment has no task; make it with task_environment.")
+    return arguments[0]
+
+
+def stack_tables(tables: Sequence[TaskTables]) -> TaskTables:
+    """Tasks of different formulas, padded to one shape, with a first axis of N.
+
+    States of padding are violated, and no run enters them. For ``vmap`` of a function that calls
+    :func:`with_tables`.
+
+    Args:
+      tables: N of them, over the same P propositions.
+
+    Raises:
+      ValueError: none, or tasks over different propositions or with embeddings of different width.
+    """
+    tables = validation.listed("tables", tables)
+    if not tables:
+        raise ValueError("there is no task; give at least one.")
+    for one in tables:
+        validation.instance("tables", one, TaskTables, "a list of those of make_task_tables")
+    return _stacked(_padded(tables))
+
+
+def stack_tasks(environments: Sequence[Environment]) -> Environment:
+    """Environments of one world with different tasks, padded to one shape, with a first axis of N.
+
+    One compiled program runs all of them: ``vmap(run_episode, in_axes=(0, 0, None))(keys, stacked,
+    agent)``.
+
+    Args:
+      environments: N of them, from :func:`task_environment`, of worlds of one structure.
+
+    Returns:
+      An environment whose arrays have a first axis of N.
+
+    Raises:
+      ValueError: none, or worlds of different structure.
+
+    Example:
+      >>> from jaxltl import environment_of, from_dense
+      >>> walk = environment_of(from_dense(
+      ...     [[[.5, .5]], [[.5, .5]]], label=[[0], [1]], propositions=["a"]))
+      >>> both = stack_tasks([task_environment(walk, "F a"), task_environment(walk, "G F a")])
+      >>> jax.vmap(lambda e, key: e.reset(key).memory, (0, None))(both, jax.random.key(0)).shape
+      (2,)
+    """
+    environments = validation.listed("environments", environments)
+    if not environments:
+        raise ValueError("there is no environment; give at least one.")
+    padded = _padded([task_tables(e) for e in environments])
+    made = [with_tables(e, t) for e, t in zip(environments, padded, strict=True)]
+    shapes = [_structure(e) for e in made]
+    for number, shape in enumerate(shapes):
+        if shape != shapes[0]:
+            raise ValueError(
+                f"environments 0 and {number} are worlds of different structure: their functions, "
+                "spaces, propositions, horizons and shapes of arrays must be the same."
+            )
+    return _stacked(made)
+
+
+def what_is_left(task: Environment | TaskTables | Automaton, memory: Any) -> str:
+    """What is left of a formula in a state of its automaton, as text, on the host.
+
+    The formula that the rest of the word must satisfy. Of a state without a name (automata from
+    files, or with very many states) its number is told.
+
+    Args:
+      task: an environment of :func:`task_environment`, its tables, or an automaton. Of a stack,
+        ask the single environments.
+      memory: the state, such as ``world.memory`` of a :class:`TaskWorld`.
+
+    Returns:
+      The formula's text.
+
+    Raises:
+      ValueError: there is no such state.
+
+    Example:
+      >>> what_is_left(to_automaton("F (a & X b)"), 0)
+      'F (a & X b)'
+    """
+    if isinstance(task, Automaton):
+        names, count = task.state_names, len(task.delta)
+    else:
+        tables = task if isinstance(task, TaskTables) else task_tables(task)
+        (names,), count = tables.text.texts, tables.delta.shape[-2]
+    state = validation.whole("memory", memory)
+    if not 0 <= state < count:
+        raise ValueError(f"memory={state}; the automaton has the states 0..{count - 1}.")
+    return names[state] if state < len(names) else f"state {state} of {count}"
+
+
+# --- the functions of the joint world -------------------------------------------------------------
+
+
+def _beside(inner: Environment, tables: TaskTables) -> Environment:
+    if tables.embedding is None:
+        memory = make_box(0, 1, tables.delta.shape[-2:-1])
+    else:
+        memory = make_box(-np.inf, np.inf, tables.embedding.shape[1:])
+    spaces: Any = TaskObservation(inner.observations, memory)  # type: ignore[arg-type]
+    return replace(
+        inner,
+        reset=Partial(_reset, tables, inner.labels, inner.reset),
+        step=Partial(_step, tables, inner.labels, inner.step),
+        observe=Partial(_observe, tables, inner.observe),
+        labels=Partial(_of_world, inner.labels),
+        allowed=None if inner.allowed is None else Partial(_of_world, inner.allowed),
+        starts=None
+        if inner.starts is None
+        else Partial(_starts, tables, inner.labels, inner.starts),
+        outcomes=None
+        if inner.outcomes is None
+        else Partial(_outcomes, tables, inner.labels, inner.outcomes),
+        observations=spaces,
+    )
+
+
+def _read(tables: TaskTables, label: jax.Array) -> jax.Array:
+    """The letter of a label."""
+    code = jnp.sum(jnp.where(label, tables.weight, 0), dtype=jnp.int32)
+    return jnp.asarray(tables.letter)[code]
+
+
+def _reset(
+    tables: TaskTables, labels: Callable[..., Any], reset: Callable[..., Any], key: chex.PRNGKey
+) -> TaskWorld:
+    return _begin(tables, labels, reset(key))
+
+
+def _starts(
+    tables: TaskTables, labels: Callable[..., Any], starts: Callable[..., Any]
+) -> tuple[TaskWorld, jax.Array]:
+    worlds, probability = starts()
+    return jax.vmap(lambda world: _begin(tables, labels, world))(worlds), probability
+
+
+def _begin(tables: TaskTables, labels: Callable[..., Any], world: Any) -> TaskWorld:
+    """Before the first step: one label is read."""
+    tables = jax.tree.map(jnp.asarray, tables)
+    letter = _read(tables, labels(world))
+    memory = tables.delta[tables.initial, letter]
+    accepted = tables.accepting[tables.initial, letter]
+    return TaskWorld(world, memory, tables.verdict[memory], accepted, accepted.astype(jnp.int32))
+
+
+def _step(
+    tables: TaskTables,
+    labels: Callable[..., Any],
+    step: Callable[..., Timestep],
+    before: TaskWorld,
+    action: Any,
+    key: chex.PRNGKey,
+) -> Timestep:
+    return _read_on(tables, labels, before, Timestep(*step(before.world, action, key)))
+
+
+def _outcomes(
+    tables: TaskTables,
+    labels: Callable[..., Any],
+    outcomes: Callable[..., Any],
+    before: TaskWorld,
+    action: Any,
+) -> tuple[Timestep, jax.Array]:
+    told, probability = outcomes(before.world, action)
+    told = Timestep(*told)
+    rest = (jnp.broadcast_to(jnp.asarray(x), jnp.shape(probability)) for x in told[1:])
+    return jax.vmap(lambda found: _read_on(tables, labels, before, found))(
+        Timestep(told.world, *rest)
+    ), probability
+
+
+def _read_on(
+    tables: TaskTables, labels: Callable[..., Any], before: TaskWorld, found: Timestep
+) -> Timestep:
+    """A step of the joint world, from that of the inner one."""
+    tables = jax.tree.map(jnp.asarray, tables)
+    reading = before.memory, _read(tables, labels(found.world))
+    memory, accepted = tables.delta[reading], tables.accepting[reading]
+    over, verdict = jnp.asarray(found.terminated, bool), tables.verdict[memory]
+    at_end = tables.repeated[memory, reading[1]]
+    verdict = jnp.where(over & (verdict == Verdict.UNDECIDED), at_end, verdict)
+    decided = verdict != Verdict.UNDECIDED
+    terminated = over | decided
+    discount = found.discount * tables.discount[reading]
+    # Ng, Harada & Russell 1999; what comes after the end has the potential zero.
+    after = jnp.where(terminated, 0, tables.learner_discount * discount * tables.potential[memory])
+    reward = jnp.where(decided, tables.decided[verdict], tables.reward[reading])
+    world = TaskWorld(found.world, memory, verdict, accepted, before.visits + accepted)
+    return found._replace(
+        world=world,
+        reward=reward + after - tables.potential[before.memory],
+        terminated=terminated,
+        discount=discount,
+    )
+
+
+def _observe(tables: TaskTables, observe: Callable[..., Any], joint: TaskWorld) -> TaskObservation:
+    if tables.embedding is None:
+        memory = jax.nn.one_hot(joint.memory, tables.delta.shape[-2])
+    else:
+        memory = jnp.asarray(tables.embedding)[joint.memory]
+    return TaskObservation(observe(joint.world), memory)
+
+
+def _of_world(function: Callable[..., Any], joint: TaskWorld) -> Any:
+    return function(joint.world)
+
+
+# --- tables ---------------------------------------------------------------------------------------
+
+
+def _at_the_end(automaton: Automaton, ending: str) -> np.ndarray:
+    """``int32[Q, L]``: the verdict of a world that ends in a state after a letter."""
+    if ending == "repeat":
+        return lasting_verdicts(automaton)
+    verdict = Verdict.VIOLATED if ending == "violated" else Verdict.UNDECIDED
+    return np.full(np.shape(automaton.delta), verdict, np.int32)
+
+
+def _padded(tables: Sequence[TaskTables]) -> list[TaskTables]:
+    """The same tasks, with as many states, letters and codes as the largest."""
+    num_memory = max(t.delta.shape[0] for t in tables)
+    num_letters = max(t.delta.shape[1] for t in tables)
+    num_codes = max(len(t.letter) for t in tables)
+    for number, t in enumerate(tables):
+        if t.weight.shape != tables[0].weight.shape:
+            raise ValueError(
+                f"tasks 0 and {number} are over {len(tables[0].weight)} and {len(t.weight)} "
+                "propositions; make all of them over those of the one world."
+            )
+        shapes = [None if x.embedding is None else x.embedding.shape[1:] for x in (tables[0], t)]
+        if shapes[0] != shapes[1]:
+            raise ValueError(
+                f"tasks 0 and {number} have embeddings of shapes {shapes[0]} and "
+                f"{shapes[1]} a state; give them one width."
+            )
+
+    def grow(array: Any, rows: int, columns: int | None = None, fill: Any = 0) -> np.ndarray:
+        array = np.asarray(array)
+        wide = [(0, rows - array.shape[0])]
+        wide += [] if array.ndim == 1 else [(0, 0 if columns is None else columns - array.shape[1])]
+        wide += [(0, 0)] * (array.ndim - 2)
+        return np.pad(array, wide, constant_values=fill)
+
+    sizes = num_memory, num_letters
+    return [
+        replace(
+            t,
+            letter=grow(t.letter, num_codes),
+            delta=grow(t.delta, *sizes),
+            verdict=grow(t.verdict, num_memory, fill=Verdict.VIOLATED),
+            repeated=grow(t.repeated, *sizes, fill=Verdict.VIOLATED),
+            accepting=grow(t.accepting, *sizes),
+            reward=grow(t.reward, *sizes),
+            discount=grow(t.discount, *sizes),
+            potential=grow(t.potential, num_memory),
+            embedding=None if t.embedding is None else grow(t.embedding, num_memory),
+        )
+        for t in tables
+    ]
+
+
+def _stacked(trees: Sequence[Any]) -> Any:
+    return jax.tree.map(lambda *rows: jnp.stack([jnp.asarray(row) for row in rows]), *trees)
+
+
+def _structure(tree: Any) -> Any:
+    leaves, shape = jax.tree.flatten(tree)
+    return [np.shape(leaf) for leaf in leaves], shape

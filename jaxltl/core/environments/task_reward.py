@@ -1,0 +1,238 @@
+"""Rewards of tasks in linear temporal logic, as tables of their automata, each with its theory.
+
+All are of one form. A reading of a letter in an undecided state of the automaton earns a reward
+and discounts what comes after it; a decided verdict earns its own reward and ends the episode.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike
+
+from jaxltl.core import validation
+from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.environments.monitor import Verdict
+from jaxltl.core.pretty_print import brief
+
+REWARDS = ("auto", "reach", "keep", "eventual", "two-discount", "parity")
+_BY_KIND = {"cosafe": "reach", "safety": "keep", "buchi": "eventual", "parity": "parity"}
+_DEFAULT = 0.99
+
+
+@brief
+class Pay(NamedTuple):
+    """What the readings of an automaton earn.
+
+    Attributes:
+      name: of the reward; ``"auto"`` is resolved.
+      accepting: ``bool[Q, L]``, whether reading the letter in the state is accepting: of even
+        priority; of a co-safe or safety task, whether it leads to a final state.
+      reward, discount: ``float[Q, L]``.
+      decided: ``float[3]``, the reward at each :class:`~jaxltl.core.environments.monitor.Verdict`.
+      potential: ``float[Q]``.
+    """
+
+    name: str
+    accepting: np.ndarray
+    reward: np.ndarray
+    discount: np.ndarray
+    decided: np.ndarray
+    potential: np.ndarray
+
+
+def pay_of(
+    automaton: Automaton,
+    decisions: np.ndarray,
+    *,
+    reward: str = "auto",
+    discount: float | None = None,
+    ratio: float | None = None,
+    shaping: str | ArrayLike | None = None,
+    learner_discount: float = 1.0,
+) -> Pay:
+    """The reward of a task by its name, on the host.
+
+    The learner maximises ``E[sum_t (d_0 ... d_{t-1}) r_t]`` of the rewards r and discounts d below;
+    its own discount is 1. Write g for `discount` and P for the probability that the task is
+    satisfied. Limits are those of finite worlds, whose optimal policies are then optimal for P from
+    some g below 1 on.
+
+    - ``"reach"``, for co-safe tasks: 1 where the verdict becomes satisfied, d = g. With g = 1 the
+      value is P. With g < 1 it is ``E[g^(T - 1)]``, T the number of steps until then: what is
+      reached sooner counts more, and P is the limit.
+    - ``"keep"``, for safety: -1 where the verdict becomes violated, d = g. With g = 1 the value is
+      P - 1; with g < 1 later violations count less, and that is the limit.
+    - ``"eventual"``, for two priorities (Voloshin, Verma & Yue 2023, "Eventual discounting temporal
+      logic counterfactual experience replay"): r = 1 - g and d = g at accepting readings, r = 0 and
+      d = 1 at others; how long it takes from one to the next does not matter. With K accepting
+      readings the return is ``1 - g^K``, hence ``P <= value <= P + (1 - g) E[K; K finite]``, and
+      the optimal policy loses at most ``(1 - g) max E[K; K finite]``.
+    - ``"two-discount"``, for two priorities (Bozkurt, Wang, Zavlanos & Pajic 2020, "Control
+      synthesis from linear temporal logic specifications using model-free reinforcement
+      learning"): r = 1 - g and d = g at accepting readings, r = 0 and d = h at others. The value
+      has the limit P as g goes to 1 with ``(1 - h) / (1 - g)``, the argument `ratio`, to 0. All
+      steps discount, so that values are bounded in any world and shaping is sound.
+    - ``"parity"``, for any automaton: reading priority p stops with probability
+      ``e_p = (1 - g) ratio^(p - p_0)``, p_0 the least, which wins if p is even (Hahn, Perez,
+      Schewe, Somenzi, Trivedi & Wojtczak 2020, "Model-free reinforcement learning for stochastic
+      parity games"). In expectation: r = e_p at even priorities and 0 at odd ones, d = 1 - e_p;
+      with two priorities that is ``"two-discount"``. The value has the limit P as g goes to 1 and
+      `ratio` to 0: among the priorities that recur the least one then stops first. Neighbouring
+      priorities of one parity are taken as one.
+
+    The last three earn 1 and end where the verdict becomes satisfied, and 0 where violated, which
+    is what P is there.
+
+    A potential f of the automaton's states q adds ``d f(q') - f(q)``, with the learner's own
+    discount as a factor of d and f = 0 after the end (Ng, Harada & Russell 1999, "Policy invariance
+    under reward transformations"). The sum of these telescopes to ``-f(q_0)`` whatever is done, so
+    that no order of policies changes, provided that all discounts are below 1: otherwise a run that
+    never ends keeps f of where it stays. That is refused. ``"distance"`` is the potential
+    ``1 - n(q) / max n``, with n the least number of readings to a satisfied verdict (``"reach"``)
+    or an accepting reading, and ``n(q) / max n`` to a violated verdict with ``"keep"``.
+
+    Args:
+      automaton: of the task.
+      decisions: ``int32[Q]``, its verdicts.
+      reward: see above; ``"auto"`` by the kind of the automaton.
+      discount: g; default 1 for ``"reach"`` and ``"keep"`` (.99 with shaping), else .99.
+      ratio: default 1 - g.
+      shaping: None, ``"distance"``, or ``float[Q]``.
+      learner_discount: its own, if it is not 1; only shaping reckons with it.
+
+    Raises:
+      ValueError: a reward that does not fit the automaton, or numbers outside their ranges.
+    """
+    reward = validation.one_of("reward", reward, REWARDS)
+    name = _BY_KIND[automaton.acceptance] if reward == "auto" else reward
+    _require_fit(automaton, name)
+    shaped = shaping is not None
+    final = name in ("reach", "keep")
+    if discount is None:
+        discount = 1.0 if final and not shaped else _DEFAULT
+    discount = validation.number("discount", discount)
+    if not 0 < discount <= 1 or (discount == 1 and not final):
+        raise ValueError(
+            f"discount={discount}; the reward {name!r} needs one above 0 and "
+            f"{'at most' if final else 'below'} 1."
+        )
+    learner_discount = validation.share("learner_discount", learner_discount, ends=(False, True))
+    rank = _ranks(automaton)
+    accepting = rank % 2 == 0
+    if final:
+        payment = np.zeros(rank.shape)
+        factor = np.full(rank.shape, float(discount))
+    else:
+        payment, factor = _stopping(rank, name, discount, ratio)
+    if ratio is not None and name not in ("two-discount", "parity"):
+        raise ValueError(f"ratio={ratio} is of 'two-discount' and 'parity', not of {name!r}.")
+    decided = np.array([0.0, 0, -1] if name == "keep" else [0.0, 1, 0])
+    potential = np.zeros(len(rank))
+    if shaping is not None:
+        potential = _potential(automaton, decisions, accepting, name, shaping)
+        _require_discounted(factor, decisions, learner_discount, name)
+    return Pay(name, accepting, payment, factor, decided, potential)
+
+
+def _require_fit(automaton: Automaton, name: str) -> None:
+    kind = automaton.acceptance
+    needed = {"reach": "cosafe", "keep": "safety"}.get(name, kind)
+    if kind != needed:
+        raise ValueError(
+            f"reward={name!r} is for {needed} tasks, and this one has {kind} acceptance; "
+            f"its own is {_BY_KIND[kind]!r}, and 'auto' takes it."
+        )
+    if name in ("eventual", "two-discount") and np.max(_ranks(automaton)) > 1:
+        raise ValueError(
+            f"reward={name!r} knows accepting readings and others, and the automaton has more than "
+            "two priorities; take 'parity'."
+        )
+
+
+def _ranks(automaton: Automaton) -> np.ndarray:
+    """``int[Q, L]``: the priority of each reading, with neighbours of one parity taken as one."""
+    if automaton.acceptance in ("cosafe", "safety"):  # known as soon as the state is entered
+        return (~automaton.final[np.asarray(automaton.delta)]).astype(int)
+    values, place = np.unique(automaton.priority, return_inverse=True)
+    rank = np.cumsum(np.diff(values % 2, prepend=0) != 0)
+    return rank[place].reshape(automaton.priority.shape)
+
+
+def _stopping(
+    rank: np.ndarray, name: str, discount: float, ratio: float | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """What a reading earns and by what it discounts, if it stops as often as its rank says."""
+    ratio = 1 - discount if ratio is None else ratio
+    ratio = validation.share("ratio", ratio, ends=(False, False))
+    stops = (1 - discount) * ratio ** (rank - rank.min())
+    if name == "eventual":
+        stops = np.where(rank == 0, stops, 0)
+    number = jnp.dtype(jnp.result_type(float))
+    lost = (rank % 2 == 0) & ((1 - stops).astype(number) == 1)
+    if lost.any():
+        raise ValueError(
+            f"discount={discount} and ratio={ratio}: reading rank {rank[lost].min()} would stop "
+            f"with probability {stops[lost].max():.0e}, which {number.name} does not tell from "
+            "none; give a greater ratio, a smaller discount, or compute in float64."
+        )
+    return np.where(rank % 2 == 0, stops, 0), 1 - stops
+
+
+def _potential(
+    automaton: Automaton,
+    decisions: np.ndarray,
+    accepting: np.ndarray,
+    name: str,
+    shaping: str | ArrayLike,
+) -> np.ndarray:
+    if isinstance(shaping, str):
+        if shaping != "distance":
+            raise ValueError(f"shaping={shaping!r}; give None, 'distance' or an array.")
+        delta = np.asarray(automaton.delta)
+        if name in ("reach", "keep"):
+            goal = Verdict.SATISFIED if name == "reach" else Verdict.VIOLATED
+            steps = _distance(delta, np.where(decisions == goal, 0, np.inf), np.inf)
+        else:
+            steps = _distance(delta, np.full(len(delta), np.inf), np.where(accepting, 1, np.inf))
+        known = np.isfinite(steps)
+        most = max(steps[known].max(initial=0), 1)
+        share = np.where(known, steps, most) / most
+        return share if name == "keep" else 1 - share
+    table = np.asarray(shaping)
+    if (
+        table.shape != decisions.shape
+        or table.dtype.kind not in "biuf"
+        or not (np.isfinite(table).all())
+    ):
+        raise ValueError(
+            f"shaping has shape {list(table.shape)} and type {table.dtype}; give finite numbers "
+            f"[{len(decisions)}], a potential of each state of the automaton."
+        )
+    return table.astype(float)
+
+
+def _distance(delta: np.ndarray, start: np.ndarray, by_reading: np.ndarray | float) -> np.ndarray:
+    """The least numbers n with ``n = min(start, min over letters of by_reading and 1 + n')``."""
+    steps = start
+    while True:
+        nearer = np.minimum(steps, np.minimum(by_reading, 1 + steps[delta]).min(axis=1))
+        if (nearer == steps).all():
+            return steps
+        steps = nearer
+
+
+def _require_discounted(
+    factor: np.ndarray, decisions: np.ndarray, learner_discount: float, name: str
+) -> None:
+    number = jnp.dtype(jnp.result_type(float))
+    open_ = factor[decisions == Verdict.UNDECIDED].astype(number)
+    if (open_ * number.type(learner_discount)).max(initial=0) >= 1:
+        raise ValueError(
+            f"shaping with the reward {name!r}: some step is not discounted, and a run that never "
+            "ends would keep the potential of where it stays, which may change what is best. Give "
+            + ("discount below 1" if name in ("reach", "keep") else "the reward 'two-discount'")
+            + ", or the learner_discount below 1 that the learner has."
+        )

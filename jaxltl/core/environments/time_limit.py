@@ -1,0 +1,103 @@
+"""Worlds whose episodes are cut off after so many steps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.tree_util import Partial
+
+from jaxltl.core import validation
+from jaxltl.core.environments.environment import Environment, Timestep, require_environment
+
+
+def with_time_limit(environment: Environment, num_steps: int) -> Environment:
+    """The same world, whose episodes are truncated after so many steps.
+
+    Its worlds are pairs ``(world, time)``. What is observed is as before: where the best thing to
+    do depends on the time that is left, tell it in `observe`.
+
+    Args:
+      environment: the world.
+      num_steps: after how many of them an episode is cut off, if it has not ended.
+
+    Returns:
+      The environment; `num_steps` is its horizon, or what was before if that is less.
+
+    Raises:
+      ValueError: a number below 1.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> coin = jl.make_environment(
+      ...     lambda key: jnp.int32(0), lambda world, action, key: jl.Timestep(action, 0.0, False),
+      ...     lambda world: world[None], actions=2)
+      >>> with_time_limit(coin, 10).horizon
+      10
+    """
+    num_steps = validation.whole("num_steps", num_steps, least=1, most=2**31 - 1)
+    inner = require_environment(environment)
+    return replace(
+        inner,
+        reset=Partial(_reset_clock, inner.reset),
+        step=Partial(_step_clock, inner.step, np.int32(num_steps)),
+        observe=Partial(_of_first, inner.observe),
+        labels=Partial(_of_first, inner.labels),
+        allowed=None if inner.allowed is None else Partial(_of_first, inner.allowed),
+        horizon=min(num_steps, inner.horizon or num_steps),
+        starts=None if inner.starts is None else Partial(_start_clock, inner.starts),
+        outcomes=None
+        if inner.outcomes is None
+        else Partial(_clocked, inner.outcomes, np.int32(num_steps)),
+    )
+
+
+def without_time_limit(environment: Environment) -> tuple[Environment, int | None]:
+    """The world inside :func:`with_time_limit`, and the limit; any other as it is, and None."""
+    timed: Any = require_environment(environment)
+    if timed.step.func is not _step_clock:
+        return environment, None
+    parts = {
+        name: part and part.args[0]
+        for name in ("reset", "step", "observe", "labels", "allowed", "starts", "outcomes")
+        for part in [getattr(timed, name)]
+    }
+    return replace(environment, horizon=None, **parts), int(timed.step.args[1])
+
+
+def _reset_clock(reset: Callable[..., Any], key: chex.PRNGKey) -> Any:
+    return reset(key), jnp.int32(0)
+
+
+def _step_clock(
+    step: Callable[..., Timestep], limit: jax.Array, timed: Any, action: Any, key: chex.PRNGKey
+) -> Timestep:
+    found, time = Timestep(*step(timed[0], action, key)), timed[1] + 1
+    return found._replace(
+        world=(found.world, time), truncated=jnp.asarray(found.truncated, bool) | (time >= limit)
+    )
+
+
+def _start_clock(starts: Callable[..., Any]) -> Any:
+    worlds, probability = starts()
+    return (worlds, jnp.zeros(jnp.shape(probability), jnp.int32)), probability
+
+
+def _clocked(
+    outcomes: Callable[..., Any], limit: jax.Array, timed: Any, action: Any
+) -> tuple[Timestep, jax.Array]:
+    found, probability = outcomes(timed[0], action)
+    found, time = Timestep(*found), timed[1] + 1
+    times = jnp.full(jnp.shape(probability), time)
+    return found._replace(
+        world=(found.world, times), truncated=jnp.asarray(found.truncated, bool) | (time >= limit)
+    ), probability
+
+
+def _of_first(function: Callable[..., Any], timed: Any) -> Any:
+    return function(timed[0])

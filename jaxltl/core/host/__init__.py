@@ -1,1 +1,0 @@
-"""Exact work on concrete arrays, by NumPy and SciPy: sparse rows, components, worklists."""

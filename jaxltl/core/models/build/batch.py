@@ -1,0 +1,432 @@
+"""Several worlds as one batch, and a task judged beside another automaton's memory.
+
+Worlds of one kind become one product whose arrays have a leading axis W, so that one
+``vmap`` plans, learns or evaluates in all of them. All share the task's automaton over
+one alphabet: the letters that occur in any of the worlds.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.automata.translate import Task, to_automaton
+from jaxltl.core.logic.ltl import Formula, parse_ltl
+from jaxltl.core.models.ops.array_namespace import is_traced, namespace, to_jax
+from jaxltl.core.models.build.lifting import allowed_steps, memory_along
+from jaxltl.core.models.mdp import MDP
+from jaxltl.core.models.product import Product, letters_of, product
+from jaxltl.core.models.build.restrict import with_allowed
+from jaxltl.core.models.trajectories import Trajectories, make_trajectories, require_states
+
+
+def stack_products(worlds: Sequence[MDP], task: Task, *, label_on: str = "exit") -> Product:
+    """The products of several worlds with one task, as one with a leading axis of worlds.
+
+    Smaller worlds are padded (:func:`pad_states`), and so are the successor lists. A
+    formula is translated over all letters that occur in some world.
+
+    Args:
+      worlds: W models with the same actions and the same propositions, in any order.
+      task: an automaton, a formula, or a formula's text.
+      label_on: ``"exit"`` or ``"entry"``, see :class:`~jaxltl.core.models.product.Product`.
+
+    Returns:
+      A :class:`Product` each of whose arrays has the leading axis ``[W]``, for ``vmap``.
+
+    Raises:
+      ValueError: there is no world, or one is no MDP, has other actions or propositions
+        than the first, or shows a letter that the automaton was not built for. The
+        message names the world, counted from 0.
+
+    Example:
+      >>> from jaxltl import from_dense
+      >>> one = from_dense([[[0, 1.0]], [[0, 1.0]]], label=[[0], [1]], propositions=["goal"])
+      >>> two = from_dense([[[1.0]]], label=[[1]], propositions=["goal"])
+      >>> stack_products([one, two], "F goal").letter.tolist()
+      [[0, 1], [1, 1]]
+    """
+    worlds = [_like_first(world, i, worlds[0]) for i, world in enumerate(worlds)]
+    if not worlds:
+        raise ValueError("there are no worlds to stack; give at least one.")
+    if isinstance(task, str | Formula):
+        formula = parse_ltl(task) if isinstance(task, str) else task
+        known = set(formula.propositions)
+        shown = {x for world in worlds for x in letters_of(world, known & set(world.propositions))}
+        task = to_automaton(formula, letters=sorted(shown, key=sorted))
+    num_states = max(world.num_states for world in worlds)
+    width = max(world.num_successors for world in worlds)
+    products = []
+    for i, world in enumerate(worlds):
+        try:
+            lane = product(world, task, label_on=label_on)
+        except ValueError as error:
+            raise ValueError(f"world {i}: {error}") from error
+        extra = num_states - world.num_states
+        # A padded state shows what state 0 does, so that it adds no letter.
+        shown_here = np.asarray(lane.letter)
+        letter = np.concatenate([shown_here, np.repeat(shown_here[:1], extra)])
+        padded = _pad_successors(pad_states(world, num_states), width)
+        products.append(replace(lane, mdp=jax.tree.map(np.asarray, padded), letter=letter))
+    return to_jax(jax.tree.map(lambda *x: np.stack([np.asarray(y) for y in x]), *products))
+
+
+def _like_first(world: Any, number: int, first: Any) -> MDP:
+    """The world with its labels in the order of the first one's propositions."""
+    if not isinstance(world, MDP):
+        raise ValueError(
+            f"world {number} is a {type(world).__name__}; give MDPs, for example by from_dense."
+        )
+    if world.num_actions != first.num_actions:
+        raise ValueError(
+            f"world {number} has {world.num_actions} actions and world 0 has "
+            f"{first.num_actions}; make the missing ones unavailable."
+        )
+    if world.propositions == first.propositions:
+        return world
+    if set(world.propositions) != set(first.propositions):
+        missing = sorted(set(first.propositions) - set(world.propositions))
+        added = sorted(set(world.propositions) - set(first.propositions))
+        what = f"lacks {', '.join(missing)}" if missing else f"has {', '.join(added)} besides"
+        raise ValueError(
+            f"world {number} does not have the propositions of world 0: it {what}. Give "
+            "every world the same ones, with labels that are false where nothing shows them."
+        )
+    column = [world.propositions.index(p) for p in first.propositions]
+    label = to_jax(np.asarray(world.label)[:, column])
+    return replace(world, label=label, propositions=first.propositions)
+
+
+def pad_states(mdp: MDP, num_states: int) -> MDP:
+    """The world with unreachable states at the end, which never leave themselves.
+
+    They are no starts, offer every action, and are labelled as state 0 is.
+
+    Args:
+      mdp: S states.
+      num_states: how many there shall be.
+
+    Returns:
+      A model whose first S states are those of `mdp`.
+
+    Raises:
+      ValueError: there are more states already.
+
+    Example:
+      >>> from jaxltl import from_dense
+      >>> pad_states(from_dense([[[1.0]]]), 3).successor[:, 0, 0].tolist()
+      [0, 1, 2]
+    """
+    extra = num_states - mdp.num_states
+    if extra < 0:
+        raise ValueError(
+            f"the world has {mdp.num_states} states, more than {num_states}; pad to the most."
+        )
+    if extra == 0:
+        return mdp
+    shape = (extra, mdp.num_actions, mdp.num_successors)
+    own = np.zeros(shape, np.int32)
+    own[..., 0] = np.arange(mdp.num_states, num_states)[:, None]
+    stays = np.zeros(shape, mdp.dtype)
+    stays[..., 0] = 1
+
+    def below(array: Any, rows: np.ndarray) -> jax.Array:
+        return to_jax(np.concatenate([np.asarray(array), rows]))
+
+    return replace(
+        mdp,
+        successor=below(mdp.successor, own),
+        probability=below(mdp.probability, stays),
+        available=below(mdp.available, np.ones(shape[:2], bool)),
+        initial=below(mdp.initial, np.zeros(extra, mdp.dtype)),
+        label=below(mdp.label, np.repeat(np.asarray(mdp.label)[:1], extra, axis=0)),
+    )
+
+
+def _pad_successors(mdp: MDP, width: int) -> MDP:
+    if width == mdp.num_successors:
+        return mdp
+    extra = ((0, 0), (0, 0), (0, width - mdp.num_successors))
+    return replace(
+        mdp,
+        successor=to_jax(np.pad(np.asarray(mdp.successor), extra)),
+        probability=to_jax(np.pad(np.asarray(mdp.probability), extra)),
+    )
+
+
+def is_stacked(model: Product) -> bool:
+    """Whether a product's arrays have a leading axis of worlds."""
+    return jnp.ndim(model.letter) == 2
+
+
+def as_stacked(model: Product) -> Product:
+    """The product with a leading axis of worlds: itself, or a single one as W = 1."""
+    return model if is_stacked(model) else _stacked([model])
+
+
+def _stacked(models: Sequence[Product]) -> Product:
+    xp, *models = namespace(*models)
+    return to_jax(jax.tree.map(lambda *x: xp.stack(x), *models))
+
+
+def num_worlds(model: Product) -> int:
+    """W, how many worlds are stacked; 1 for a single one."""
+    return model.letter.shape[0] if is_stacked(model) else 1
+
+
+def world(model: Product, number: int) -> Product:
+    """The product of one of the stacked worlds, padding included.
+
+    Example:
+      >>> from jaxltl import from_dense
+      >>> one = from_dense([[[0, 1.0]], [[0, 1.0]]], label=[[0], [1]], propositions=["goal"])
+      >>> world(stack_products([one, one], "F goal"), 1).state_shape
+      (2, 2)
+    """
+    if is_traced((model, number)):
+        return jax.tree.map(lambda x: x[number], model)
+    return to_jax(jax.tree.map(lambda x: np.asarray(x)[number], model))
+
+
+def narrow(models: Product, allowed: Any) -> Product:
+    """Stacked products in each of which only some of the actions are left.
+
+    Args:
+      models: W stacked products.
+      allowed: ``bool[S, Q, A]`` for a single one, ``bool[W, S, Q, A]``, or a mask for each.
+
+    Raises:
+      ValueError: a mask that does not fit, or another number; the message names the world.
+    """
+    masks = allowed if isinstance(allowed, list | tuple) or np.ndim(allowed) > 3 else [allowed]
+    if len(masks) != num_worlds(models):
+        raise ValueError(f"there are {len(masks)} masks for {num_worlds(models)} worlds.")
+    for w, mask in enumerate(masks):
+        try:
+            with_allowed(world(models, w), np.asarray(mask))
+        except ValueError as error:
+            raise ValueError(f"world {w}: {error}") from error
+    return replace(models, allowed=to_jax(np.stack([np.asarray(x) for x in masks])))
+
+
+def lift_memory(policy: jax.Array, task: Automaton | int) -> jax.Array:
+    """A policy with the memory of one automaton, in the product with a synchronized one.
+
+    Args:
+      policy: ``[S, Q1, ...]``, or with leading axes before S if it is ``float[..., S, Q1, A]``.
+      task: the second automaton of :func:`synchronize`, or its number Q2 of states.
+
+    Returns:
+      ``[S, Q1 * Q2, ...]``: the policy does not see the task's state. Differentiable in
+      the policy.
+
+    Example:
+      >>> lift_memory(jnp.array([[[0.0, 1.0], [1.0, 0.0]]]), 2)[0, :, 1].tolist()
+      [1.0, 1.0, 0.0, 0.0]
+    """
+    num2 = task if isinstance(task, int) else len(task.delta)
+    stochastic = jnp.issubdtype(jnp.result_type(policy), jnp.floating)
+    return jnp.repeat(policy, num2, axis=-2 if stochastic else -1)
+
+
+# --- demonstrations in several worlds --------------------------------------------------------
+
+
+def stack_models(models: Product | Sequence[Product]) -> Product:
+    """Products of equal shapes with one automaton along a leading axis of worlds.
+
+    Args:
+      models: one product, several, or stacked ones, which are returned as they are.
+
+    Raises:
+      ValueError: there is none, or one has other propositions, shapes or another automaton
+        than the first. The message names the world.
+    """
+    if isinstance(models, Product):
+        return as_stacked(models)
+    if not models or not all(isinstance(x, Product) for x in models):
+        raise ValueError("give a product, or several; product(world, task) makes one.")
+    first = models[0]
+    for i, other in enumerate(models):
+        if other.mdp.propositions != first.mdp.propositions:
+            _like_first(other.mdp, i, first.mdp)
+        same = _equal(other.automaton, first.automaton)
+        if not same or other.label_on != first.label_on:
+            raise ValueError(
+                f"world {i} has another automaton than world 0, so that memory would mean "
+                "another thing; build the products with one, or by stack_products."
+            )
+        if _shapes(other.mdp) != _shapes(first.mdp):
+            raise ValueError(
+                f"world {i} does not have the shapes of world 0; stack_products(worlds, task) "
+                "pads worlds."
+            )
+    return _stacked(models)
+
+
+def _equal(one: Automaton, other: Automaton) -> bool:
+    if one.propositions != other.propositions:
+        return False
+    kinds: list[Any] = [jax.tree.structure(x) for x in (one, other)]
+    pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=False)
+    return bool(kinds[0] == kinds[1]) and all(np.array_equal(x, y) for x, y in pairs)
+
+
+def _shapes(tree: Any) -> list[tuple[int, ...]]:
+    return [np.shape(x) for x in jax.tree.leaves(tree)]
+
+
+Demonstrations = Trajectories | Sequence[Trajectories]
+
+
+def _of_each_world(trajectories: Demonstrations) -> list[Trajectories]:
+    """Those of one world, of several, or with a first axis of worlds, without empty ones."""
+    if isinstance(trajectories, Trajectories):
+        stacked = np.ndim(trajectories.length) == 2
+        lanes = range(len(trajectories.length)) if stacked else ()
+        split = [jax.tree.map(lambda x, w=w: x[w], trajectories) for w in lanes]
+        trajectories = split if stacked else [trajectories]
+    found = []
+    for one in trajectories:
+        rows = np.flatnonzero(np.asarray(one.length))
+        found.append(jax.tree.map(lambda x, rows=rows: np.asarray(x)[rows], one))
+    return found
+
+
+def split_trajectories(
+    trajectories: Demonstrations, share: float
+) -> tuple[list[Trajectories], list[Trajectories]]:
+    """Each world's trajectories in two: the last `share` of them is held out.
+
+    Raises:
+      ValueError: the share is not in [0, 1).
+    """
+    if not 0 <= share < 1:
+        raise ValueError(f"held_out={share}; it must be a share in [0, 1).")
+    given = _of_each_world(trajectories)
+    kept = [len(x.length) - round(share * len(x.length)) for x in given]
+    first = [jax.tree.map(lambda x, n=n: x[:n], t) for t, n in zip(given, kept, strict=True)]
+    second = [jax.tree.map(lambda x, n=n: x[n:], t) for t, n in zip(given, kept, strict=True)]
+    return first, second
+
+
+def demonstrated_counts(
+    models: Product,
+    trajectories: Demonstrations,
+    *,
+    horizon: int | None = None,
+) -> jax.Array:
+    """How often each allowed pair of the products occurs in trajectories of their worlds.
+
+    Args:
+      models: stacked products.
+      trajectories: of the world (not of the product), or one for each of the W worlds, in a
+        list or along a first axis; empty ones do not count.
+      horizon: count by time up to so many steps.
+
+    Returns:
+      ``float[W, S, Q, A]``; with a horizon ``float[W, T, S, Q, A]``.
+
+    Raises:
+      ValueError: another number of worlds, a trajectory that its world cannot make, that exceeds
+        the horizon, or of which no step takes an allowed action. The message names the world, the
+        trajectory and the step.
+    """
+    given, count = _of_each_world(trajectories), num_worlds(models)
+    if len(given) != count:
+        raise ValueError(f"there are demonstrations in {len(given)} worlds; expected {count}.")
+    found = []
+    for w, one in enumerate(given):
+        model = world(models, w)
+        shape: tuple[int, ...] = (*model.state_shape, model.num_actions)
+        state, action, length = (np.asarray(x) for x in (one.state, one.action, one.length))
+        if horizon is not None:
+            if length.max(initial=0) > horizon:
+                raise ValueError(
+                    f"demonstrations in world {w}: one has {length.max()} steps; "
+                    f"horizon={horizon} is shorter."
+                )
+            shape = (horizon, *shape)
+        rows = [
+            list(zip(s[:n].tolist(), a[:n].tolist(), strict=True))
+            for s, a, n in zip(state, action, length, strict=True)
+        ]
+        size = math.prod(shape)
+        counts = np.zeros(size, int)
+        if rows:
+            try:
+                if len(one.state_shape or ()) > 1:  # smaller worlds than the stack's are no mistake
+                    require_states(one, model.mdp)
+                checked = make_trajectories(model.mdp, rows)
+                inside = allowed_steps(model, checked)
+            except ValueError as error:
+                raise ValueError(f"demonstrations in world {w}: {error}") from error
+            state, action = np.asarray(checked.state), np.asarray(checked.action)
+            lifted = state * model.num_memory + memory_along(model, state)
+            pair = lifted * model.num_actions + action
+            if horizon is not None:
+                pair = pair + np.arange(pair.shape[1]) * (model.num_states * model.num_actions)
+            counts = np.bincount(pair[inside], minlength=size)
+        found.append(counts.reshape(shape))
+    return to_jax(np.stack(found).astype(models.dtype))
+
+
+def stack_observations(models: Product, observation: Any) -> jax.Array:
+    """What is seen in each state of each of the W worlds, checked: ``float[W, S, O]``.
+
+    Args:
+      models: stacked products.
+      observation: ``float[S, O]``, ``float[W, S, O]``, or a list with one for each world.
+
+    Raises:
+      ValueError: another shape, or a number that is not finite.
+    """
+    if isinstance(observation, list | tuple):
+        observation = np.stack([np.asarray(x) for x in observation])
+    observation = jnp.asarray(observation, models.dtype)
+    if observation.ndim == 2:
+        observation = observation[None]
+    rows = models.letter.shape
+    if observation.ndim != 3 or observation.shape[:2] != rows:
+        raise ValueError(f"observation has shape {observation.shape}; expected {(*rows, 'O')}.")
+    if not np.isfinite(np.asarray(observation)).all():
+        w, s, _ = np.argwhere(~np.isfinite(np.asarray(observation)))[0].tolist()
+        raise ValueError(f"world {w}: the observation in state {s} is not finite.")
+    return observation
+
+
+def training_counts(
+    models: Product,
+    demonstrations: Demonstrations,
+    held_out: float | Demonstrations | None,
+    *,
+    horizon: int | None = None,
+) -> tuple[jax.Array, jax.Array]:
+    """:func:`demonstrated_counts` of what is learned from and of what is held out.
+
+    Args:
+      models: stacked products.
+      demonstrations: of the worlds.
+      held_out: the share of each world's trajectories, its last ones; or such trajectories;
+        None or 0: none.
+      horizon: count by time up to so many steps.
+
+    Raises:
+      ValueError: demonstrations that do not fit their world, or of which none is left.
+    """
+    test: Any = held_out
+    if held_out is None or isinstance(held_out, int | float):
+        demonstrations, test = split_trajectories(demonstrations, held_out or 0.0)
+    counts = demonstrated_counts(models, demonstrations, horizon=horizon)
+    if not (np.asarray(counts) > 0).any():
+        raise ValueError(
+            "demonstrations: no pair is left to learn from; give more, or a smaller held_out."
+        )
+    return counts, demonstrated_counts(models, test, horizon=horizon)

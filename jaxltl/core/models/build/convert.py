@@ -1,0 +1,116 @@
+"""One model written in several ways: sparse, padded, and products written out."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from jaxltl.core.validation import no_model
+from jaxltl.core.sparse.rows import spans, starts_of
+from jaxltl.core.models.mdp import MDP, DenseMDP, support
+from jaxltl.core.models.build.padded import to_padded as to_padded  # for whoever converts
+from jaxltl.core.models.product import Product, flat_successor
+from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
+
+
+def to_sparse(model: Any) -> SparseMDP:
+    """Any concrete MDP, DenseMDP, product of one, or sparse model, as a :class:`SparseMDP`.
+
+    Unavailable actions and padding are left out. Row i of a state takes the i-th of its available
+    actions, whose number is ``action[i]``. A product's states are numbered ``s * Q + q``, and
+    labels are the world's.
+
+    Args:
+      model: the model.
+
+    Returns:
+      :class:`SparseMDP`; what is sparse already comes back as it is.
+
+    Raises:
+      ValueError: the model is none of these.
+
+    Example:
+      >>> from jaxltl import make_mdp
+      >>> mdp = make_mdp([[[0, 1], [1, 0]], [[1, 0], [0, 0]]],
+      ...                [[[0.5, 0.5], [1, 0]], [[1, 0], [0, 0]]])
+      >>> sparse = to_sparse(mdp)
+      >>> sparse.row_start.tolist(), sparse.action.tolist(), sparse.successor.tolist()
+      ([0, 2, 3], [0, 1, 0], [0, 1, 1, 1])
+    """
+    if isinstance(model, SparseMDP):
+        return model
+    if isinstance(model, Product):
+        return _product(model)
+    if not isinstance(model, MDP | DenseMDP):
+        raise ValueError(no_model(model))
+    used, available = support(model), np.asarray(model.available)
+    s, a, k = np.nonzero(used)
+    if isinstance(model, DenseMDP):
+        weight, target = np.asarray(model.transition), k
+    else:
+        weight, target = np.asarray(model.probability), np.asarray(model.successor)[s, a, k]
+    state, action = np.nonzero(available)
+    count = used.sum(-1)[state, action]
+    return make_sparse(
+        starts_of(available.sum(-1)),
+        starts_of(count),
+        target,
+        weight[s, a, k].astype(np.float64),
+        initial=_distribution(model.initial),
+        label=np.asarray(model.label),
+        propositions=model.propositions,
+        action=action,
+    )
+
+
+def _distribution(initial: Any) -> np.ndarray:
+    initial = np.asarray(initial, np.float64)
+    return initial / initial.sum()
+
+
+def _product(model: Product) -> SparseMDP:
+    world = to_sparse(model.mdp)
+    host, step = world.host, np.asarray(model.next_memory)
+    num_memory = step.shape[1]
+    shape = (host.num_states, num_memory)
+    kept = np.ones((host.num_rows, num_memory), bool)
+    if model.allowed is not None:
+        action = world.action
+        if action is None:
+            action = np.arange(host.num_rows) - host.row_start[host.state]
+        kept = np.asarray(model.allowed)[host.state, :, action]
+    # Rows of (s, q) are those of s, in order: state first, memory next, choice last.
+    state, memory = np.divmod(np.arange(shape[0] * shape[1]), num_memory)
+    choices = np.diff(host.row_start)[state]
+    row = spans(host.row_start[state], choices)
+    q = np.repeat(memory, choices)
+    chosen = kept[row, q]
+    per_state = np.bincount(
+        np.repeat(state * num_memory + memory, choices)[chosen], minlength=state.size
+    )
+    row, q = row[chosen], q[chosen]
+    width = np.diff(host.entry_start)[row]
+    entry = spans(host.entry_start[row], width)
+    s_of, q_of = np.repeat(host.state[row], width), np.repeat(q, width)
+    target = flat_successor(host.successor[entry], step, s_of, q_of, model.label_on)
+    rewards = {
+        name: Rewards(
+            None if x.state is None else np.asarray(x.state)[state],
+            None if x.choice is None else np.asarray(x.choice)[row],
+            None if x.transition is None else np.asarray(x.transition)[entry],
+        )
+        for name, x in world.rewards.items()
+    }
+    return make_sparse(
+        starts_of(per_state),
+        starts_of(width),
+        target,
+        host.probability[entry],
+        initial=_distribution(model.initial).ravel(),
+        label=np.asarray(world.label)[state],
+        propositions=world.propositions,
+        rewards=rewards,
+        action=None if world.action is None else np.asarray(world.action)[row],
+        action_names=world.action_names,
+    )

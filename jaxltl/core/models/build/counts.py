@@ -1,0 +1,524 @@
+"""Counted transitions by name: beside the entries of a model, or as a model of their own."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxltl.core.validation import listed as listed_items
+from jaxltl.core.validation import numbers, one_of, shown
+from jaxltl.core.sparse.rows import starts_of
+from jaxltl.core.array_types import Integers
+from jaxltl.core.models import facts
+from jaxltl.core.models.mdp import MDP, DenseMDP, support
+from jaxltl.core.models.sparse import SparseMDP, make_sparse
+from jaxltl.core.pretty_print import brief
+
+_INTEGER = re.compile(r"-?[1-9][0-9]{0,17}|0")
+MOST_SAMPLES = 2**53  # up to which doubles count
+_MOST_ENTRIES = 10**8
+_ANY = "any"  # the only action of a state in which nothing was tried
+
+
+@brief(facts=facts.counts)
+@dataclass(frozen=True)
+class TransitionCounts:
+    """How often an action in a state led to a successor.
+
+    Transitions stand once each, in the order of state, action and successor.
+
+    Attributes:
+      state, action, successor: ``int32[N]``, numbers of names.
+      count: ``int64[N]``, from 0; with 0, a transition that is possible and never came.
+      states, actions: the names.
+
+    Example:
+      >>> counts = make_counts([0, 0, 1], [0, 0, 0], [1, 0, 1], states=["dock", "bay"])
+      >>> counts.num_samples, counts.states, counts.count.tolist()
+      (3, ('dock', 'bay'), [1, 1, 1])
+    """
+
+    state: Integers
+    action: Integers
+    successor: Integers
+    count: Integers
+    states: tuple[str, ...]
+    actions: tuple[str, ...]
+
+    @property
+    def num_samples(self) -> int:
+        """How many transitions were counted in all."""
+        return int(self.count.sum())
+
+
+def make_counts(
+    state: Any,
+    action: Any,
+    successor: Any,
+    count: Any = None,
+    *,
+    states: Sequence[str] | None = None,
+    actions: Sequence[str] | None = None,
+) -> TransitionCounts:
+    """Counts from arrays of transitions, in any order and as often as they came.
+
+    Args:
+      state, action, successor: ``int[N]``.
+      count: ``int[N]``, how often each line came; default: once.
+      states, actions: the names; default: the numbers from 0 to the largest.
+
+    Returns:
+      :class:`TransitionCounts`.
+
+    Raises:
+      ValueError: naming the entry: shapes differ, a number has no name, a count is negative, names
+        are not distinct, or there is nothing.
+
+    Example:
+      >>> counts = make_counts([0, 1, 0, 0], [0, 0, 0, 0], [1, 1, 1, 0])
+      >>> counts.successor.tolist(), counts.count.tolist(), counts.states
+      ([0, 1, 1], [1, 2, 1], ('0', '1'))
+    """
+    columns = {"state": state, "action": action, "successor": successor}
+    if count is not None:
+        columns["count"] = count
+    arrays = {name: np.asarray(x) for name, x in columns.items()}
+    size = arrays["state"].size
+    for name, x in arrays.items():
+        if x.shape != (size,) or not size or not np.issubdtype(x.dtype, np.integer):
+            raise ValueError(
+                f"{name} is {x.dtype}{list(x.shape)}; expected integers [N], one for each "
+                "transition, of which there is at least one."
+            )
+        if (x < 0).any():
+            raise ValueError(f"{name}[{int(np.argmax(x < 0))}] is {x.min()}; none is negative.")
+    if count is not None and sum(arrays["count"].tolist()) > MOST_SAMPLES:
+        raise ValueError(
+            f"count adds up to {sum(arrays['count'].tolist())}; at most 2^53 "
+            "transitions are counted."
+        )
+    most = {"state": max(arrays["state"].max(), arrays["successor"].max()) + 1}
+    most |= {"action": arrays["action"].max() + 1}
+    state_names = _checked_names("states", states, int(most["state"]))
+    action_names = _checked_names("actions", actions, int(most["action"]))
+    count = arrays.get("count", np.ones(size, np.int64))
+    rows = [arrays[name] for name in ("state", "action", "successor")]
+    s, a, t, number = merged(np.stack([x.astype(np.int64) for x in (*rows, count)]))
+    return TransitionCounts(
+        s.astype(np.int32),
+        a.astype(np.int32),
+        t.astype(np.int32),
+        number,
+        state_names,
+        action_names,
+    )
+
+
+def merged(table: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Columns of state, action, successor and count, in order, with those alike as one.
+
+    >>> merged(np.array([[1, 0, 1], [0, 0, 0], [2, 1, 2], [5, 6, 7]])).tolist()
+    [[0, 1], [0, 0], [1, 2], [6, 12]]
+    """
+    table = table[:, np.lexsort(table[2::-1])]
+    new = np.append(True, (table[:3, 1:] != table[:3, :-1]).any(0))
+    table[3, new] = np.add.reduceat(table[3], np.flatnonzero(new))
+    return table[:, new]
+
+
+def _checked_names(what: str, names: Sequence[str] | None, least: int) -> tuple[str, ...]:
+    if names is None:
+        if least > _MOST_ENTRIES:
+            raise ValueError(f"{what} go up to {least - 1}; number them from 0, without gaps.")
+        return tuple(map(str, range(least)))
+    names = tuple(map(str, listed_items(what, names)))
+    if len(names) < least:
+        raise ValueError(f"there are {len(names)} names of {what}; number {least - 1} has none.")
+    if len(set(names)) < len(names):
+        twice = next(x for i, x in enumerate(names) if x in names[:i])
+        raise ValueError(f"{what}: the name {twice!r} stands twice.")
+    return names
+
+
+def in_order(names: Iterable[str]) -> tuple[str, ...]:
+    """Names by number if all are integers, by alphabet if not.
+
+    >>> in_order(["10", "9"]), in_order(["10", "9", "a"])
+    (('9', '10'), ('10', '9', 'a'))
+    """
+    names = list(names)
+    if all(map(_INTEGER.fullmatch, names)):
+        return tuple(sorted(names, key=int))
+    return tuple(sorted(names))
+
+
+# --- beside the entries of a model ------------------------------------------------------------
+
+
+def state_names(model: MDP | DenseMDP | SparseMDP) -> tuple[str, ...]:
+    """What the states of a model are called: by its variable `state`, if it tells all apart.
+
+    Args:
+      model: concrete.
+
+    Returns:
+      S names; the numbers from 0 where there is no such variable.
+    """
+    if isinstance(model, SparseMDP) and "state" in model.valuation:
+        names = tuple(map(str, np.asarray(model.valuation["state"]).tolist()))
+        if len(set(names)) == len(names):
+            return names
+    return tuple(map(str, range(model.num_states)))
+
+
+def action_names(model: MDP | DenseMDP | SparseMDP) -> tuple[str, ...]:
+    """What the actions of a model are called: by name if they have some, by number if not.
+
+    Args:
+      model: concrete. The actions of a sparse model without numbers are the ranks of choices.
+    """
+    if isinstance(model, SparseMDP):
+        if model.action_names:
+            return model.action_names
+        number = _row_action(model)
+        return tuple(map(str, range(int(number.max()) + 1)))
+    return tuple(map(str, range(model.num_actions)))
+
+
+def _row_action(model: SparseMDP) -> Integers:
+    if model.action is not None:
+        return np.asarray(model.action)
+    host = model.host
+    return np.arange(host.num_rows) - host.row_start[host.state]
+
+
+@brief
+@dataclass(frozen=True)
+class Places:
+    """Where the transitions of a model stand, by numbers.
+
+    Attributes:
+      states, actions: the names.
+      row_state, row_action: ``int[R]``, of each choice.
+      entry_start: ``int[R + 1]``.
+      successor: ``int[T]``.
+      place: ``int[T]``, of each entry in the array of probabilities, flat.
+      shape: of that array.
+    """
+
+    states: tuple[str, ...]
+    actions: tuple[str, ...]
+    row_state: Integers
+    row_action: Integers
+    entry_start: Integers
+    successor: Integers
+    place: Integers
+    shape: tuple[int, ...]
+
+    @cached_property
+    def _rows(self) -> tuple[Integers, Integers]:
+        return _sorted_keys(self.row_state, self.row_action, len(self.actions))
+
+    @cached_property
+    def _entries(self) -> tuple[Integers, Integers]:
+        row = np.repeat(np.arange(self.row_state.size), np.diff(self.entry_start))
+        return _sorted_keys(row, self.successor, len(self.states))
+
+    def ambiguous(self) -> str | None:
+        """What of the model has the same names twice."""
+        for (key, order), what in ((self._rows, "choice"), (self._entries, "successor")):
+            same = np.flatnonzero(key[1:] == key[:-1])
+            if same.size:
+                return f"{what}s {order[same[0]]} and {order[same[0] + 1]}"
+        return None
+
+    def rows(self, state: Integers, action: Integers) -> Integers:
+        """The choices, -1 where there is none."""
+        return _found(self._rows, np.asarray(state, np.int64) * len(self.actions) + action)
+
+    def entries(self, row: Integers, successor: Integers) -> Integers:
+        """The entries of rows, -1 where there is none."""
+        return _found(self._entries, np.asarray(row, np.int64) * len(self.states) + successor)
+
+
+def places(model: MDP | DenseMDP | SparseMDP) -> Places:
+    """Where the transitions of a concrete model stand.
+
+    Raises:
+      ValueError: the model is of another kind, or has choices or successors that are named alike.
+    """
+    if isinstance(model, SparseMDP):
+        host = model.host
+        entry = np.arange(host.num_transitions)
+        parts = host.state, _row_action(model), host.entry_start, host.successor, entry
+        shape: tuple[int, ...] = entry.shape
+    elif isinstance(model, MDP | DenseMDP):
+        used = support(model)
+        state, action = np.nonzero(np.asarray(model.available))
+        shape = used.shape
+        successor = np.nonzero(used)[2]
+        if isinstance(model, MDP):
+            successor = np.asarray(model.successor)[used]
+        start = starts_of(used.sum(-1)[state, action])
+        parts = state, action, start, successor, np.flatnonzero(used)
+    else:
+        raise ValueError(
+            f"{type(model).__name__} has no transitions to count; give an MDP, a DenseMDP or a "
+            "SparseMDP (of a game, its mdp; of an interval model, its nominal one)."
+        )
+    found = Places(state_names(model), action_names(model), *parts, shape)
+    if twice := found.ambiguous():
+        raise ValueError(
+            f"{twice} of the model have the same names, so that no count says which it is of; give "
+            "each choice of a state an action of its own, and convert a model whose rows repeat a "
+            "successor by to_sparse."
+        )
+    return found
+
+
+def _sorted_keys(first: Integers, second: Integers, size: int) -> tuple[Integers, Integers]:
+    key = first.astype(np.int64) * size + second
+    order = np.argsort(key, kind="stable")
+    return key[order], order
+
+
+def _found(keys: tuple[Integers, Integers], wanted: Integers) -> Integers:
+    key, order = keys
+    at = np.minimum(np.searchsorted(key, wanted), key.size - 1)
+    return np.where(key[at] == wanted, order[at], -1)
+
+
+def counts_on(model: MDP | DenseMDP | SparseMDP, counts: TransitionCounts) -> NDArray[np.int64]:
+    """Counts in the place of a model's probabilities; states and actions are matched by name.
+
+    Args:
+      model: concrete.
+      counts: of some of its transitions.
+
+    Returns:
+      ``int64``, of the shape of the model's probabilities; 0 where nothing was counted.
+
+    Raises:
+      ValueError: naming the transition: the model does not have it; or as :func:`places`.
+
+    Example:
+      >>> from jaxltl import make_sparse
+      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
+      >>> counts_on(coin, make_counts([0, 0, 0], [0, 0, 0], [2, 1, 2])).tolist()
+      [1, 2, 0, 0]
+    """
+    _require_counts(counts)
+    known = places(model)
+    state, action, successor = (
+        _renumbered(what, names, of[number], to)
+        for what, names, to, of, number in (
+            ("state", counts.states, known.states, counts.state, slice(None)),
+            ("action", counts.actions, known.actions, counts.action, slice(None)),
+            ("state", counts.states, known.states, counts.successor, slice(None)),
+        )
+    )
+    place, wrong = place_of(known, state, action, successor)
+    if wrong:
+        raise ValueError(f"the counts do not fit the model: {wrong[1]}.")
+    found = np.zeros(known.shape, np.int64)
+    found.reshape(-1)[place] = counts.count
+    return found
+
+
+def _renumbered(
+    what: str, names: tuple[str, ...], number: Integers, to: tuple[str, ...]
+) -> Integers:
+    """Numbers of names as the numbers that they have among others."""
+    if names == to:
+        return number
+    of = {name: i for i, name in enumerate(to)}
+    found = np.array([of.get(name, -1) for name in names], np.int64)[number]
+    if (found < 0).any():
+        name = names[number[int(np.argmin(found >= 0))]]
+        raise ValueError(f"the model has no {what} {name!r}; it has {listed(to)}.")
+    return found
+
+
+def listed(names: Sequence[str], most: int = 8) -> str:
+    """Names for a message, not too many.
+
+    >>> listed("abcd", 2)
+    "4: 'a', 'b', ..."
+    """
+    shown = ", ".join(map(repr, names[:most]))
+    return f"{len(names)}: {shown}{', ...' if len(names) > most else ''}"
+
+
+def place_of(
+    known: Places, state: Integers, action: Integers, successor: Integers
+) -> tuple[Integers, tuple[int, str] | None]:
+    """Where transitions stand, and the first that stands nowhere, with what is wrong with it.
+
+    Args:
+      known: of a model.
+      state, action, successor: ``int[N]``, its numbers.
+
+    Returns:
+      ``int[N]``, and None or a pair of number and reason.
+    """
+    row = known.rows(state, action)
+    entry = np.where(row >= 0, known.entries(row, successor), -1)
+    if (entry >= 0).all():
+        return known.place[entry], None
+    i = int(np.argmin(entry >= 0))
+    s, a, t = known.states[state[i]], known.actions[action[i]], known.states[successor[i]]
+    if row[i] < 0:
+        return entry, (i, f"state {s!r} has no action {a!r}")
+    return entry, (i, f"action {a!r} in state {s!r} cannot lead to {t!r}")
+
+
+# --- a model of their own ---------------------------------------------------------------------
+
+
+def counted_model(
+    counts: TransitionCounts,
+    *,
+    initial: str | int | Mapping[Any, float] | Sequence[Any],
+    labels: Mapping[str, Iterable[Any]] | None = None,
+    terminal: Iterable[Any] = (),
+    graph: Literal["seen", "complete"] = "seen",
+) -> tuple[SparseMDP, NDArray[np.int64]]:
+    """A model whose choices are those that were counted, and the counts of its entries.
+
+    With ``graph="seen"`` it is taken for granted that a choice leads to no state but those that it
+    was counted to lead to (with a count of 0, perhaps); with ``"complete"`` it may lead to every
+    state there is. A state in which nothing was tried and that is not terminal has one choice,
+    `any`, of which nothing is known: it may lead to every state. The model's probabilities are the
+    frequencies, or, of rows with counts of zero, those after one more of each; what is known of
+    them is what :func:`~jaxltl.core.statistics.confidence_sets.intervals_from_counts` makes of the counts with
+    the model's `entry_start`.
+
+    Args:
+      counts: what was counted.
+      initial: the state in which runs start, several that are equally likely, or the probabilities
+        of some, by name.
+      labels: the states where each proposition holds, by name.
+      terminal: states in which runs stay.
+      graph: what is known of the successors.
+
+    Returns:
+      The model, which keeps the names of states as its variable `state`, and ``int64[T]``.
+
+    Raises:
+      ValueError: naming the state: it is not among the counted ones, or is terminal and was left;
+        a complete graph of more than 1e8 entries.
+
+    Example:
+      >>> counts = make_counts([0, 0, 1], [0, 0, 0], [0, 1, 1], [7, 3, 9], states=["a", "b"])
+      >>> model, count = counted_model(counts, initial="a", labels={"done": ["b"]})
+      >>> model.probability.tolist(), count.tolist(), model.states_where("done").tolist()
+      ([0.7, 0.3, 1.0], [7, 3, 9], [False, True])
+    """
+    _require_counts(counts)
+    one_of("graph", graph, ("seen", "complete"))
+    if labels is not None and not isinstance(labels, Mapping):
+        raise ValueError(f"labels is {shown(labels)}; give the states of each label, in a dict.")
+    number = {name: i for i, name in enumerate(counts.states)}
+    stays = np.zeros(len(number), bool)
+    stays[_numbers(terminal, number, "terminal")] = True
+    left = np.flatnonzero(stays[counts.state] & (counts.state != counts.successor))
+    if left.size:
+        name, to = (counts.states[x[left[0]]] for x in (counts.state, counts.successor))
+        raise ValueError(f"the terminal state {name!r} was left to {to!r}; it is not terminal.")
+    untried = np.setdiff1d(np.arange(len(number)), counts.state)
+    names = counts.actions
+    if untried.size and _ANY not in names:
+        names = (*names, _ANY)
+    tried = counts.state.astype(np.int64) * len(names) + counts.action
+    lone = untried * len(names) + (names.index(_ANY) if untried.size else 0)
+    choice = np.unique(np.concatenate([tried, lone]))
+    state, action = np.divmod(choice, len(names))
+    is_open = ~stays[state] & ((graph == "complete") | np.isin(choice, lone))
+    entries = _entries(counts, np.searchsorted(choice, tried), state, is_open)
+    start, successor, count = entries
+    labels = {
+        name: _numbers(some, number, f"label {name!r}") for name, some in (labels or {}).items()
+    }
+    model = make_sparse(
+        starts_of(np.bincount(state)),
+        start,
+        successor,
+        _nominal(count, start),
+        initial=_initial(initial, number),
+        label=labels or None,
+        action=action,
+        action_names=names,
+        valuation={"state": _variable(counts.states)},
+    )
+    return model, count
+
+
+def _entries(
+    counts: TransitionCounts, counted_row: Integers, state: Integers, is_open: NDArray[np.bool_]
+) -> tuple[Integers, Integers, NDArray[np.int64]]:
+    """Starts of rows, successors and counts: what was counted, and all that open rows may do."""
+    size, num_open = len(counts.states), int(is_open.sum())
+    if num_open * size > _MOST_ENTRIES:
+        raise ValueError(
+            f"{num_open} choices that may lead to each of {size} states are {num_open * size} "
+            f"entries of 28 bytes; at most {_MOST_ENTRIES} are built. Say which states are "
+            "terminal, or what is possible, with a count of 0."
+        )
+    counted = np.zeros(state.size, bool)
+    counted[counted_row] = True
+    loop = np.flatnonzero(~counted & ~is_open)
+    every = np.tile(np.arange(size), num_open)
+    row = np.concatenate([counted_row, loop, np.repeat(np.flatnonzero(is_open), size)])
+    successor = np.concatenate([counts.successor, state[loop], every])
+    count = np.concatenate([counts.count, np.zeros(loop.size + every.size, np.int64)])
+    order = np.lexsort((successor, row))
+    row, successor = row[order], successor[order]
+    first = np.append(True, (np.diff(row) != 0) | (np.diff(successor) != 0))
+    start = starts_of(np.bincount(row[first]))
+    return start, successor[first], np.add.reduceat(count[order], np.flatnonzero(first))
+
+
+def _nominal(count: Integers, start: Integers) -> NDArray[np.float64]:
+    """Frequencies; of rows with zeros, after one more of each."""
+    width = np.diff(start)
+    more = np.repeat(np.minimum.reduceat(count, start[:-1]) == 0, width) + count.astype(np.float64)
+    return more / np.repeat(np.add.reduceat(more, start[:-1]), width)
+
+
+def _require_counts(counts: Any) -> None:
+    if not isinstance(counts, TransitionCounts):
+        raise ValueError(
+            f"counts is {shown(counts)}; give TransitionCounts, as make_counts and "
+            "read_log return them."
+        )
+
+
+def _variable(names: tuple[str, ...]) -> NDArray[Any]:
+    if all(map(_INTEGER.fullmatch, names)):
+        return np.array([int(name) for name in names], np.int64)
+    return np.array(names, object)
+
+
+def _numbers(names: Iterable[Any], number: Mapping[str, int], what: str) -> list[int]:
+    """Of states, by name."""
+    found = []
+    for name in [names] if isinstance(names, str | int) else listed_items(what, names):
+        if str(name) not in number:
+            raise ValueError(
+                f"{what}: there is no state {str(name)!r}; there are {listed(tuple(number))}."
+            )
+        found.append(number[str(name)])
+    return found
+
+
+def _initial(initial: Any, number: Mapping[str, int]) -> NDArray[np.float64]:
+    found = np.zeros(len(number))
+    weight = numbers("initial", list(initial.values())) if isinstance(initial, Mapping) else 1.0
+    found[_numbers(initial, number, "initial")] = weight
+    return found if isinstance(initial, Mapping) else found / max(found.sum(), 1)

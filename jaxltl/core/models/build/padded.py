@@ -1,0 +1,78 @@
+"""A sparse model with padded successor lists."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jaxltl.core.validation import no_model
+from jaxltl.core.models.mdp import MDP, make_mdp
+from jaxltl.core.models.sparse import SparseMDP
+
+_LARGEST = 8 * 2**30  # bytes of the largest model that is padded
+
+
+def action_of(model: SparseMDP) -> np.ndarray:
+    """The action that each row of a sparse model becomes when it is padded, ``int[R]``."""
+    if not isinstance(model, SparseMDP):
+        raise ValueError(no_model(model))
+    host = model.host
+    if model.action is not None and not model.action_names:
+        return np.asarray(model.action)
+    return np.arange(host.num_rows) - host.row_start[host.state]
+
+
+def to_padded(model: SparseMDP) -> MDP:
+    """The same process with padded successor lists, for batches and the compiled solvers.
+
+    An action of the padded model is the number of a choice's action where actions have numbers
+    without names, as :func:`to_sparse` gives them, else its rank among the choices of its state.
+
+    Args:
+      model: the sparse model.
+
+    Returns:
+      :class:`MDP`, with A the largest number of choices and K that of successors.
+
+    Raises:
+      ValueError: padding would take more than 8 GB, with the size; or two choices of a state have
+        one number.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> model = jl.make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
+      >>> to_padded(model).successor.tolist()
+      [[[1, 2]], [[1, 0]], [[2, 0]]]
+    """
+    column, host = action_of(model), model.host
+    width = int(np.diff(host.entry_start).max())
+    num_actions = int(column.max()) + 1
+    shape = (host.num_states, num_actions, width)
+    if 12 * np.prod(shape, dtype=float) > _LARGEST:
+        raise ValueError(
+            f"padded to {shape[1]} actions of {width} successors, {shape[0]} states would take "
+            f"{12 * np.prod(shape, dtype=float) / 2**30:.0f} GB; solve the sparse model instead."
+        )
+    available = np.zeros(shape[:2], bool)
+    available[host.state, column] = True
+    if available.sum() != host.num_rows:
+        raise ValueError("two choices of a state have the same action; number them apart.")
+    successor, probability = np.zeros(shape, np.int32), np.zeros(shape)
+    rank = np.arange(host.num_transitions) - host.entry_start[host.row]
+    place = host.state[host.row], column[host.row], rank
+    successor[place], probability[place] = host.successor, host.probability
+    return make_mdp(
+        successor,
+        probability,
+        available=available,
+        initial=np.asarray(model.initial),
+        label=np.asarray(model.label),
+        propositions=model.propositions,
+    )
+
+
+def padded_rows(model: SparseMDP, quantity: np.ndarray) -> np.ndarray:
+    """A quantity on rows ``[R]`` as one of the padded model, ``[S, A]``; zero where unavailable."""
+    action = action_of(model)
+    found = np.zeros((model.num_states, int(action.max()) + 1), quantity.dtype)
+    found[model.host.state, action] = quantity
+    return found

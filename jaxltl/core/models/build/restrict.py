@@ -1,0 +1,230 @@
+"""Parts of a model: fewer actions, or the reachable states as an ordinary model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import numpy as np
+
+from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
+from jaxltl.core.models.build.convert import to_sparse
+from jaxltl.core.models.game import Game
+from jaxltl.core.models.interval import IntervalMDP
+from jaxltl.core.models.mdp import MDP, make_mdp, support
+from jaxltl.core.models.build.part import part_of, reachable
+from jaxltl.core.models.product import Product, flat_successor
+from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.pretty_print import brief
+
+
+def with_allowed(model: Any, allowed: chex.Array) -> Any:
+    """The same model in which only some of the actions are left.
+
+    Args:
+      model: an MDP, a DenseMDP, a SparseMDP, an IntervalMDP, a Product or a Game.
+      allowed: ``bool[S, A]``, in a product ``bool[S, Q, A]``, of a sparse model ``bool[R]``,
+        such as the actions that lose nothing or a permissive strategy's mask.
+
+    Returns:
+      A model of the same kind and states, whose `available` is the mask.
+
+    Raises:
+      ValueError: the mask has another shape or dtype, holds an action that is not available, or
+        leaves a state without any (the latter two unless something is traced).
+
+    Example:
+      >>> from jaxltl import from_dense
+      >>> mdp = from_dense([[[1.0], [1.0]]])
+      >>> with_allowed(mdp, np.array([[False, True]])).available.tolist()
+      [[False, True]]
+    """
+    if isinstance(model, IntervalMDP):
+        return model.changed(lambda nominal: _with_rows(nominal, allowed))
+    if isinstance(model, SparseMDP):
+        return _with_rows(model, allowed)
+    shape = (*model.state_shape, model.num_actions)
+    if np.shape(allowed) != shape or allowed.dtype != bool:
+        raise ValueError(
+            f"allowed is {allowed.dtype}{list(np.shape(allowed))}; expected bool{list(shape)}."
+        )
+    if not is_traced((model, allowed)):
+        mask, available = np.asarray(allowed), np.asarray(model.available)
+        if (wrong := np.argwhere(mask & ~available)).size:
+            *state, action = wrong[0].tolist()
+            raise ValueError(f"allowed: action {action} is not available in state {_named(state)}.")
+        if (stuck := np.argwhere(available.any(-1) & ~mask.any(-1))).size:
+            raise ValueError(
+                f"allowed: no action is left in state {_named(stuck[0].tolist())}; allow one."
+            )
+    if isinstance(model, Game):
+        return replace(model, mdp=with_allowed(model.mdp, allowed))
+    if isinstance(model, Product):
+        return replace(model, allowed=allowed)
+    return replace(model, available=allowed)
+
+
+def _with_rows(model: SparseMDP, allowed: chex.Array) -> SparseMDP:
+    mask = np.asarray(allowed)
+    if mask.shape != (model.num_rows,) or mask.dtype != bool:
+        raise ValueError(
+            f"allowed is {mask.dtype}{list(mask.shape)}; expected "
+            f"bool[{model.num_rows}], one for each choice of the sparse model."
+        )
+    return part_of(model, np.ones(model.num_states, bool), mask)
+
+
+def _named(state: list[int]) -> str:
+    return f"{state[0]}" + "".join(f" with memory {q}" for q in state[1:])
+
+
+@brief
+class Restriction(NamedTuple):
+    """The reachable part of a model as an ordinary one.
+
+    Attributes:
+      model: S' states, with labels and propositions of the world.
+      base_state: ``int32[S']``, the state of the world that each is.
+      memory: ``int32[S']``, in a product its memory, zero otherwise.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> path = jl.make_sparse(None, [0, 1, 2, 3], [1, 1, 0], [1, 1, 1], initial=[1, 0, 0])
+      >>> part = jl.restrict(path)
+      >>> part.model.num_states, part.base_state.tolist()
+      (2, [0, 1])
+    """
+
+    model: Any
+    base_state: jax.Array
+    memory: jax.Array
+
+
+def restrict(
+    model: Any, initial: chex.Array | None = None, *, allowed: chex.Array | None = None
+) -> Restriction:
+    """The states that are reachable from initial ones by allowed actions, on the host.
+
+    Args:
+      model: an MDP, a SparseMDP, a Product over one, a Game on either, or an IntervalMDP.
+      initial: ``float[S]`` or ``[S, Q]``, a distribution to start from; default the model's.
+      allowed: ``bool[S, A]`` or ``[S, Q, A]``, the actions to keep, such as a permissive
+        strategy's mask; default the available ones. Of a sparse model ``bool[R]``.
+
+    Returns:
+      A :class:`Restriction` to an MDP or SparseMDP, or to a Game on one; labels and propositions
+      are the world's.
+
+    Raises:
+      ValueError: the world has no successor lists, or a reachable state keeps no action.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> path = jl.make_sparse(None, [0, 1, 2, 3], [1, 1, 0], [1, 1, 1])
+      >>> restrict(path, np.array([0, 1, 0])).base_state.tolist()
+      [1]
+    """
+    if isinstance(model, IntervalMDP):
+        found = restrict(model.nominal, initial, allowed=allowed)
+        part = model.changed(lambda x: restrict(x, initial, allowed=allowed).model)
+        return found._replace(model=part)
+    lazy = model.mdp if isinstance(model, Game) else model
+    world = lazy.mdp if isinstance(lazy, Product) else lazy
+    if isinstance(world, SparseMDP):
+        return _restrict_sparse(model, lazy, initial, allowed)
+    if not isinstance(world, MDP):
+        raise ValueError("restrict needs successor lists; convert the world by from_dense.")
+    initial = _start(model, initial)
+    available = np.asarray(model.available)
+    allowed = available if allowed is None else available & np.asarray(allowed)
+    allowed = allowed.reshape(-1, model.num_actions)
+    successor, used = np.asarray(world.successor), support(world)
+    step, label_on = np.zeros((world.num_states, 1), np.int32), "entry"
+    if isinstance(lazy, Product):
+        step, label_on = np.asarray(lazy.next_memory), lazy.label_on
+    num_memory = step.shape[1]
+
+    def targets(states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        s, q = np.divmod(states, num_memory)
+        flat = flat_successor(successor[s], step, *_columns(s, q), label_on)
+        return flat, used[s] & allowed[states][:, :, None]
+
+    states = _reached(initial > 0, targets)
+    stuck = states[~allowed[states].any(-1)]
+    if stuck.size:
+        place = list(divmod(int(stuck[0]), num_memory))[: 2 if num_memory > 1 else 1]
+        raise ValueError(
+            f"no action is allowed in state {_named(place)}, which is reachable; the mask is empty "
+            "there. Start inside the winning region, or allow an action."
+        )
+    number = np.full(len(allowed), -1)
+    number[states] = np.arange(states.size)
+    (flat, real), s = targets(states), states // num_memory
+    mdp = make_mdp(
+        np.where(real, number[flat], 0),
+        np.where(real, np.asarray(world.probability)[s], 0),
+        available=allowed[states],
+        initial=initial[states],
+        label=np.asarray(world.label)[s],
+        propositions=world.propositions,
+    )
+    return _restriction(model, mdp, states, num_memory)
+
+
+def _start(model: Any, initial: chex.Array | None) -> np.ndarray:
+    start = np.asarray(model.initial if initial is None else initial).ravel()
+    if not (start > 0).any():
+        raise ValueError("the initial distribution is zero; give a state to start from.")
+    return start
+
+
+def _reached(
+    seen: np.ndarray, targets: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+) -> np.ndarray:
+    """The numbers of the states that are seen at first, or reached from those, ascending."""
+    number = np.empty(seen.size, int)
+    frontier = np.flatnonzero(seen)
+    while frontier.size:
+        flat, real = targets(frontier)
+        new = flat[real]
+        new = new[~seen[new]]
+        # One of each without sorting: of equal entries, the one that `number` has kept.
+        number[new] = np.arange(new.size)
+        frontier = new[number[new] == np.arange(new.size)]
+        seen[frontier] = True
+    return np.flatnonzero(seen)
+
+
+def _restriction(model: Any, part: Any, states: np.ndarray, num_memory: int) -> Restriction:
+    """A model of some of the states, and what these are in the model."""
+    base, memory = to_jax(tuple(x.astype(np.int32) for x in np.divmod(states, num_memory)))
+    if isinstance(model, Game):
+        part = Game(part, to_jax(np.asarray(model.system).ravel()[states]))
+    return Restriction(part, base, memory)
+
+
+def _restrict_sparse(
+    model: Any, lazy: Any, initial: chex.Array | None, allowed: chex.Array | None
+) -> Restriction:
+    """The same of a sparse model, or of a product of one, which is written out for it."""
+    sparse = to_sparse(lazy)
+    start = _start(model, initial)
+    rows = np.ones(sparse.num_rows, bool)
+    if allowed is not None:
+        rows = np.asarray(allowed)
+        if rows.shape != (sparse.num_rows,):
+            raise ValueError(
+                f"allowed has shape {rows.shape}; expected ({sparse.num_rows},), the "
+                "choices of to_sparse(model)."
+            )
+    states = reachable(sparse, start > 0, rows)
+    found = part_of(replace(sparse, initial=start / start.sum()), states, rows)
+    num_memory = lazy.num_memory if isinstance(lazy, Product) else 1
+    return _restriction(model, found, np.flatnonzero(states), num_memory)
+
+
+def _columns(s: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return s[:, None, None], q[:, None, None]

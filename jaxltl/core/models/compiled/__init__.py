@@ -1,0 +1,1 @@
+"""Access of compiled programs to sparse models."""

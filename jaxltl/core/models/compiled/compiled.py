@@ -1,0 +1,151 @@
+"""What compiled programs read of a sparse model, and answers in the shape of what was asked."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxltl.core.models.build.convert import to_sparse
+from jaxltl.core.models.game import Game
+from jaxltl.core.models.mesh.sharded import ShardedMDP, is_sharded
+from jaxltl.core.models.ops.array_namespace import is_traced
+from jaxltl.core.models.ops.kernels import gather, owners
+from jaxltl.core.models.ops.operators import is_deterministic
+from jaxltl.core.models.product import Product, flat_successor
+from jaxltl.core.models.sparse import Rewards, SparseMDP, reward_parts
+from jaxltl.core.types import Solution
+
+
+def is_sparse(model: Any) -> bool:
+    """Whether a model's choices are rows: a SparseMDP, or a product of one."""
+    return isinstance(model.mdp if isinstance(model, Product) else model, SparseMDP)
+
+
+def compiled_form(model: Any, reward: Any = None) -> tuple[Any, Any]:
+    """A model and a reward for solvers that are compiled; all but sparse ones as they are.
+
+    A product of a sparse model is written out: its states are numbered ``s * Q + q``, and its rows
+    are those of :func:`~jaxltl.core.models.build.convert.to_sparse`, inside ``jit`` too.
+
+    Args:
+      model: a model or a game.
+      reward: as of :func:`~jaxltl.core.models.sparse.row_reward`, or None.
+
+    Returns:
+      A sparse model without names, rewards and variables, which programs would only be compiled
+      anew for, or a game on one; and the reward, of a sparse model a structure.
+    """
+    if isinstance(model, Game):
+        form, reward = compiled_form(model.mdp, reward)
+        system = jnp.asarray(model.system).reshape(form.state_shape)
+        return (model if form is model.mdp else Game(form, system)), reward
+    if is_sharded(model):
+        return _named_reward(model, reward)
+    if not is_sparse(model):
+        return model, reward
+    if isinstance(model, Product):
+        model = _written_out(model) if is_traced(model) else to_sparse(model)
+    if reward is not None:
+        reward = reward_parts(model, reward)
+    none = np.zeros((model.num_states, 0), bool)
+    return replace(
+        model, label=none, propositions=(), rewards={}, valuation={}, action=None, action_names=()
+    ), reward
+
+
+def _named_reward(model: Any, reward: Any) -> tuple[Any, Any]:
+    if isinstance(reward, str):
+        rewards = getattr(model, "rewards", {})
+        if reward not in rewards:
+            names = ", ".join(map(repr, rewards)) or "none"
+            raise ValueError(f"there is no reward {reward!r}; the model has {names}.")
+        reward = rewards[reward]
+    if isinstance(model, ShardedMDP):
+        model = replace(model, rewards={}, propositions=())
+    return model, reward
+
+
+def in_shape_of(model: Any, solution: Solution) -> Solution:
+    """A solution of a model's compiled form, with the model's states."""
+    lazy = model.mdp if isinstance(model, Game) else model
+    if not (is_sparse(lazy) and isinstance(lazy, Product)):
+        return solution
+    shape, policy = model.state_shape, solution.policy
+
+    def one(x: jax.Array) -> jax.Array:
+        return x.reshape(shape)
+
+    return replace(
+        solution,
+        value=one(solution.value),
+        lower=one(solution.lower),
+        upper=one(solution.upper),
+        policy=one(policy) if is_deterministic(policy) else policy,
+    )
+
+
+def flat_policy(model: Any, policy: Any) -> Any:
+    """A policy for the compiled form: of a product of a sparse model rows ``int32[S * Q]``."""
+    if is_sparse(model) and isinstance(model, Product) and np.ndim(policy) == 2:
+        return policy.reshape(-1)
+    return policy
+
+
+def _written_out(model: Product) -> SparseMDP:
+    world: Any = model.mdp
+    num_memory = model.num_memory
+    row_start, entry_start = jnp.asarray(world.row_start), jnp.asarray(world.entry_start)
+    # Rows of (s, q) are those of s, in order: state first, memory next, choice last.
+    number = np.arange(model.num_states, dtype=np.int32)
+    state, memory = number // num_memory, number % num_memory
+    starts = _repeated(row_start, num_memory)
+    of = owners(starts, world.num_rows * num_memory)
+    row = gather(row_start[state], of) + jnp.arange(of.size, dtype=jnp.int32) - starts[of]
+    first = entry_start[row_start]  # of each state's entries
+    begins = gather(_repeated(first, num_memory), of) + entry_start[row] - gather(first[state], of)
+    begins = jnp.append(begins, world.num_transitions * num_memory).astype(entry_start.dtype)
+    of_entry = owners(begins, world.num_transitions * num_memory)
+    entry = gather(entry_start[row], of_entry) + (
+        jnp.arange(of_entry.size, dtype=jnp.int32) - begins[of_entry]
+    )
+    place = gather(of, of_entry)
+    target = flat_successor(
+        gather(world.successor, entry),
+        model.next_memory,
+        gather(state, place),
+        gather(memory, place),
+        model.label_on,
+    )
+
+    def of_product(reward: Rewards) -> Rewards:
+        return Rewards(
+            *(
+                None if x is None else gather(x, index)
+                for x, index in (
+                    (reward.state, state),
+                    (reward.choice, row),
+                    (reward.transition, entry),
+                )
+            )
+        )
+
+    return SparseMDP(
+        row_start=starts,
+        entry_start=begins,
+        successor=target.astype(jnp.int32),
+        probability=gather(world.probability, entry),
+        initial=model.initial.ravel(),
+        label=world.label,
+        rewards={n: of_product(x) for n, x in world.rewards.items()},
+    )
+
+
+def _repeated(start: jax.Array, times: int) -> jax.Array:
+    """The starts of spans, of which each is repeated so often: ``[S * times + 1]``."""
+    width = jnp.diff(start)
+    begins = start[:-1, None] * times + jnp.arange(times, dtype=start.dtype) * width[:, None]
+    return jnp.append(begins.ravel(), start[-1] * times)

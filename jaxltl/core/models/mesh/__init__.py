@@ -1,0 +1,1 @@
+"""Models and batches over the devices of a mesh."""

@@ -1,0 +1,392 @@
+"""Lanes of one function over the devices of a mesh: seeds, settings, instances, whole populations.
+
+What ``vmap`` does side by side on one device is done by several, each with a share of the lanes.
+No lane reads another, so that nothing goes from device to device, and a loop whose length depends
+on the data goes on for as long as the device's own lanes need.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+
+from jaxltl.core import validation
+
+
+def vmap_over_mesh(
+    function: Callable[..., Any],
+    mesh: Mesh,
+    axis: str | Sequence[str] | None = None,
+    *,
+    in_axes: Any = 0,
+) -> Callable[..., Any]:
+    """``jax.vmap(function, in_axes)`` with its lanes over the devices of a mesh.
+
+    Lane i lies on the device that holds it by ``PartitionSpec(axis)``: of N lanes over D devices
+    each makes N / D in a row, under ``vmap``. What comes out are arrays of all N lanes that stay
+    where they were made, and that go in again without being moved: seeds are trained with
+    ``train``, and go on with ``run``. It works under ``jit``, and over the devices of several
+    processes (``jax.distributed``), each of which makes the same call; :func:`on_host` then brings
+    results to each.
+
+    Where D does not divide N, lanes are repeated up to the next multiple, and cut off again; the
+    results are then on every device, for JAX splits arrays evenly.
+
+    Arithmetic is that of ``vmap`` of N / D lanes: another number of devices may round differently
+    where the compiler makes other instructions for another number of lanes.
+
+    Args:
+      function: of one lane, such as a learner's ``train`` or ``run``; compiled once for it, the
+        mesh and the shapes.
+      mesh: of devices, such as ``jax.make_mesh((jax.device_count(),), ("lanes",))``.
+      axis: the mesh axis, or several, over which the lanes lie; the devices along others do the
+        same, or share in a lane's work where `function` says so. Default: all.
+      in_axes: as of ``vmap``, each 0 or None: which arguments, or parts of them, have lanes along
+        their first axis; others are the same for all, and on every device.
+
+    Returns:
+      A function of the arguments, with lanes. Keywords are static, and given to `function` as they
+      are.
+
+    Raises:
+      ValueError: no such axis, other `in_axes`, or arguments whose numbers of lanes differ.
+
+    Example:
+      >>> import jax.numpy as jnp
+      >>> mesh = jax.make_mesh((jax.device_count(),), ("seeds",))
+      >>> def walk(key, length, steps):
+      ...     return length * jax.random.normal(key, (steps,)).sum()
+      >>> keys = jax.random.split(jax.random.key(0), 6)
+      >>> ends = vmap_over_mesh(walk, mesh, in_axes=(0, None))(keys, 0.1, steps=20)
+      >>> alone = jax.vmap(lambda key: walk(key, 0.1, 20))(keys)
+      >>> ends.shape, bool(jnp.allclose(ends, alone))
+      ((6,), True)
+    """
+    validation.instance("mesh", mesh, Mesh, "a jax.sharding.Mesh, such as jax.make_mesh makes")
+    names = axes_of(mesh, axis)
+
+    def over(*arguments: Any, **options: Any) -> Any:
+        lanes = tuple(_spread(in_axes, arguments))
+        number = _number(lanes, arguments)
+        if not any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(arguments)):
+            arguments = _placed(arguments, lanes, number, mesh, names)
+        return _mapped(function, mesh, names, lanes, tuple(sorted(options.items())), arguments)
+
+    return over
+
+
+def on_host(tree: Any) -> Any:
+    """NumPy arrays of a tree's arrays, the same in every process; keys stay keys.
+
+    Arrays that lie on the devices of several processes are sent to all, so that each is to call.
+
+    Args:
+      tree: of arrays, NumPy's or JAX's, and of numbers.
+
+    Returns:
+      The same tree of NumPy arrays.
+
+    Example:
+      >>> on_host({"a": jnp.arange(3), "b": 2.5})["a"].tolist()
+      [0, 1, 2]
+    """
+
+    def one(x: Any) -> Any:
+        if not isinstance(x, jax.Array):
+            return np.asarray(x)
+        if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
+            found = one(jax.random.key_data(x))
+            return jax.random.wrap_key_data(found, impl=jax.random.key_impl(x))
+        sharding: Any = x.sharding
+        if not x.is_fully_addressable and not x.is_fully_replicated:
+            x = _copied(x, sharding.mesh)
+        return np.asarray(x)
+
+    return jax.tree.map(one, tree)
+
+
+def axes_of(mesh: Mesh, axis: str | Sequence[str] | None) -> tuple[str, ...]:
+    """Names of mesh axes: the one given, those given, or all.
+
+    Raises:
+      ValueError: a name that the mesh does not have, or one twice.
+    """
+    names = mesh.axis_names if axis is None else (axis,) if isinstance(axis, str) else tuple(axis)
+    if not names or len(set(names)) < len(names) or not set(names) <= set(mesh.axis_names):
+        raise ValueError(
+            f"axis={axis!r}; the mesh has the axes {', '.join(map(repr, mesh.axis_names))}: name "
+            "one of them, or several, each once."
+        )
+    return names
+
+
+def automatic(mesh: Mesh) -> Mesh:
+    """The mesh whose arrays JAX splits by itself: the types of others say where each must lie."""
+    return Mesh(mesh.devices, mesh.axis_names, axis_types=(AxisType.Auto,) * len(mesh.axis_names))
+
+
+def _first_axes(sharding: NamedSharding) -> tuple[str, ...]:
+    """Names of the mesh axes that the first entry of a spec splits over."""
+    first = (*sharding.spec, None)[0]
+    return () if first is None else (first,) if isinstance(first, str) else tuple(first)
+
+
+def _here(mesh: Any) -> Any:
+    """The mesh that holds where this is traced: of a mesh that was set, or of a lane on it."""
+    ambient = jax.sharding.get_abstract_mesh()
+    return automatic(mesh) if ambient.empty else ambient
+
+
+def _count(mesh: Any, axes: Sequence[str]) -> int:
+    return math.prod(mesh.shape[name] for name in axes)
+
+
+# --- within a lane --------------------------------------------------------------------------------
+
+
+def require_split(name: str, sharding: Any, **sizes: int) -> None:
+    """Raises unless a sharding is None, or one that splits axes of these lengths evenly.
+
+    Raises:
+      ValueError: it is something else, or does not.
+    """
+    if sharding is None:
+        return
+    validation.instance(name, sharding, NamedSharding, "a jax.sharding.NamedSharding")
+    axes = _first_axes(sharding)
+    if not axes:
+        raise ValueError(
+            f"{name} has the spec {sharding.spec}, which splits nothing; name a mesh axis, "
+            f"PartitionSpec({sharding.mesh.axis_names[0]!r})."
+        )
+    devices = _count(sharding.mesh, axes)
+    for what, size in sizes.items():
+        if size % devices:
+            more = devices - size % devices
+            raise ValueError(
+                f"{name} splits over {devices} devices, but {what} is {size}; choose a multiple, "
+                f"such as {size + more}."
+            )
+
+
+def split(tree: Any, sharding: NamedSharding | None, axis: int = 0) -> Any:
+    """A tree whose arrays have one axis split over the devices that a sharding's spec names.
+
+    Within a lane, under ``jit``; None: as it is.
+    """
+    if sharding is None:
+        return tree
+    spec = PartitionSpec(*[None] * axis, _first_axes(sharding))
+    return jax.tree.map(lambda x: _constrained(x, _here(sharding.mesh), spec), tree)
+
+
+def whole(tree: Any, sharding: NamedSharding | None) -> Any:
+    """A tree whose arrays are on all devices of a sharding; None: as it is."""
+    if sharding is None:
+        return tree
+    mesh = _here(sharding.mesh)
+    return jax.tree.map(lambda x: _constrained(x, mesh, PartitionSpec()), tree)
+
+
+def apart(
+    function: Callable[..., Any],
+    sharding: NamedSharding | None,
+    axes: Sequence[int | None],
+    out_axes: Any,
+) -> Callable[..., Any]:
+    """A function that each device calls with its own part of the arguments; under ``jit``.
+
+    Args:
+      function: of parts; it may say what goes from device to device.
+      sharding: whose spec names the devices; None: the function itself.
+      axes: of each argument the axis that is split, or None: each device has all of it.
+      out_axes: the same of what it returns, a tree prefix.
+    """
+    if sharding is None:
+        return function
+    names, mesh = _first_axes(sharding), _here(sharding.mesh)
+
+    def spec(axis: int | None) -> PartitionSpec:
+        return PartitionSpec() if axis is None else PartitionSpec(*[None] * axis, names)
+
+    return jax.shard_map(
+        function,
+        mesh=mesh,
+        in_specs=tuple(map(spec, axes)),
+        out_specs=jax.tree.map(spec, out_axes, is_leaf=lambda x: x is None),
+        axis_names=set(names),
+        check_vma=False,
+    )
+
+
+def vmap_split(function: Callable[..., Any], sharding: NamedSharding | None, in_axes: Any) -> Any:
+    """:func:`vmap_over_mesh` over the devices that a sharding's spec names; None: ``vmap``."""
+    if sharding is None:
+        return jax.vmap(function, in_axes)
+    mesh: Any = sharding.mesh
+    return vmap_over_mesh(function, mesh, _first_axes(sharding), in_axes=in_axes)
+
+
+def ranks(sharding: NamedSharding | None) -> jax.Array:
+    """``int32[D]``, the numbers of a sharding's devices, each of which :func:`apart` gives one."""
+    devices = 1 if sharding is None else _count(sharding.mesh, _first_axes(sharding))
+    return jnp.arange(devices, dtype=jnp.int32)
+
+
+def running_sum(
+    counted: jax.Array, rank: jax.Array, sharding: NamedSharding | None
+) -> tuple[jax.Array, jax.Array]:
+    """How many of all devices' ``bool[N]`` are True up to each of one's own, ``int32``; and in all.
+
+    In a function that :func:`apart` calls, with its part of :func:`ranks`.
+    """
+    number = jnp.cumsum(counted, dtype=jnp.int32)
+    if sharding is None:
+        return number, number[-1]
+    every = lax.all_gather(number[-1], _first_axes(sharding))
+    before = jnp.where(jnp.arange(len(every)) < rank, every, 0)
+    return number + before.sum(dtype=jnp.int32), every.sum(dtype=jnp.int32)
+
+
+# --- arguments ------------------------------------------------------------------------------------
+
+
+def _spread(in_axes: Any, arguments: tuple[Any, ...]) -> list[bool]:
+    """For each array of the arguments whether it has lanes."""
+
+    def is_none(x: Any) -> bool:
+        return x is None
+
+    axes = list(in_axes) if isinstance(in_axes, list | tuple) else [in_axes] * len(arguments)
+    if len(axes) != len(arguments):
+        raise ValueError(
+            f"in_axes={in_axes} has {len(axes)} entries for {len(arguments)} arguments; give one "
+            "for each."
+        )
+    lanes: list[bool] = []
+    for entry, argument in zip(axes, arguments, strict=True):
+        for axis in jax.tree.leaves(entry, is_leaf=is_none):
+            if axis is not None and (isinstance(axis, bool) or axis != 0):
+                raise ValueError(
+                    f"in_axes has an entry {axis!r}; lanes lie along the first axis of an "
+                    "argument, 0, or it has none, None."
+                )
+        jax.tree.map(
+            lambda axis, part: lanes.extend([axis == 0] * len(jax.tree.leaves(part))),
+            entry,
+            argument,
+            is_leaf=is_none,
+        )
+    return lanes
+
+
+def _number(lanes: tuple[bool, ...], arguments: Any) -> int:
+    """How many lanes there are."""
+    shapes = [np.shape(x) for x, has in zip(jax.tree.leaves(arguments), lanes, strict=True) if has]
+    numbers = sorted({shape[:1] for shape in shapes})
+    if len(numbers) != 1 or not numbers[0] or numbers[0][0] < 1:
+        raise ValueError(
+            f"arguments with lanes have the first axes {[list(x) for x in numbers]}; give one "
+            "number of lanes, at least 1, along the first axis of each, and in_axes of None for "
+            "what all lanes share."
+        )
+    return numbers[0][0]
+
+
+def _placed(
+    arguments: Any, lanes: tuple[bool, ...], number: int, mesh: Mesh, axes: tuple[str, ...]
+) -> Any:
+    """Arguments where they are needed, so that none lies on a device outside of the mesh."""
+    if jax.sharding.get_abstract_mesh().empty:
+        mesh = automatic(mesh)
+    even = number % _count(mesh, axes) == 0
+    own, all_ = (NamedSharding(mesh, PartitionSpec(*x)) for x in ((axes,), ()))
+
+    def one(x: Any, sharding: NamedSharding) -> Any:
+        if not isinstance(x, jax.Array | np.ndarray):
+            return x  # a number, whose type gives way to others'
+        if not isinstance(x, jax.Array) or x.is_fully_addressable:
+            if not sharding.is_fully_addressable:
+                return _from_each(x, sharding)
+        elif x.sharding.is_equivalent_to(sharding, x.ndim):
+            return x
+        return jax.device_put(x, sharding)
+
+    leaves, tree = jax.tree.flatten(arguments)
+    return jax.tree.unflatten(
+        tree, [one(x, own if has and even else all_) for x, has in zip(leaves, lanes, strict=True)]
+    )
+
+
+def _from_each(x: Any, sharding: NamedSharding) -> jax.Array:
+    """An array over the devices of several processes, of which each gives its part."""
+    if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
+        return jax.random.wrap_key_data(
+            _from_each(jax.random.key_data(x), sharding), impl=jax.random.key_impl(x)
+        )
+    numbers = np.asarray(x)
+    return jax.make_array_from_callback(numbers.shape, sharding, lambda part: numbers[part])
+
+
+@partial(jax.jit, static_argnames="mesh")
+def _copied(x: jax.Array, mesh: Mesh) -> jax.Array:
+    return _constrained(x, mesh, PartitionSpec())
+
+
+def _constrained(x: jax.Array, mesh: Any, spec: PartitionSpec) -> jax.Array:
+    sharding = NamedSharding(mesh, spec)
+    if AxisType.Explicit in mesh.axis_types:
+        return jax.sharding.reshard(x, sharding)
+    return lax.with_sharding_constraint(x, sharding)
+
+
+# --- lanes ----------------------------------------------------------------------------------------
+
+
+@partial(jax.jit, static_argnames=("function", "mesh", "axes", "lanes", "options"))
+def _mapped(
+    function: Callable[..., Any],
+    mesh: Mesh,
+    axes: tuple[str, ...],
+    lanes: tuple[bool, ...],
+    options: tuple[tuple[str, Any], ...],
+    arguments: Any,
+) -> Any:
+    here = _here(mesh)
+    leaves, tree = jax.tree.flatten(arguments)
+    number = _number(lanes, arguments)
+    devices = _count(mesh, axes)
+    specs = [PartitionSpec(axes) if has else PartitionSpec() for has in lanes]
+    uneven = number % devices
+    if uneven:
+        repeated = np.arange(number + devices - uneven) % number
+        leaves = [x[repeated] if has else x for x, has in zip(leaves, lanes, strict=True)]
+    if AxisType.Explicit in here.axis_types:
+        leaves = [
+            jax.sharding.reshard(x, NamedSharding(here, spec))
+            for x, spec in zip(leaves, specs, strict=True)
+        ]
+    side_by_side = jax.vmap(
+        partial(function, **dict(options)),
+        jax.tree.unflatten(tree, [0 if has else None for has in lanes]),
+    )
+    # Loops begin with constants, which are not marked as different on each device: no check.
+    found = jax.shard_map(
+        side_by_side,
+        mesh=here,
+        in_specs=jax.tree.unflatten(tree, specs),
+        out_specs=PartitionSpec(axes),
+        axis_names=set(axes),
+        check_vma=False,
+    )(*jax.tree.unflatten(tree, leaves))
+    if uneven:
+        found = jax.tree.map(lambda x: _constrained(x, here, PartitionSpec())[:number], found)
+    return found

@@ -1,0 +1,649 @@
+"""Putting a model onto the devices of a mesh, whole or part by part, and quantities there and back.
+
+Each process makes the parts of its own devices. What the parts have to know of one another (how
+many rows there are of each width, which states are asked for) is exchanged once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from jaxltl.core import validation
+from jaxltl.core.models import facts
+from jaxltl.core.models.build.convert import to_sparse
+from jaxltl.core.models.build.padded import action_of
+from jaxltl.core.models.mesh.lanes import automatic, axes_of, on_host
+from jaxltl.core.models.mesh.sharded import RowTable, ShardedMDP
+from jaxltl.core.models.sparse import SparseMDP, check_entries, checked_starts, row_reward, scaled
+from jaxltl.core.pretty_print import brief
+from jaxltl.core.sparse.rows import spans, starts_of
+from jaxltl.core.validation import shown
+
+_WIDTHS = np.array(sorted({int(m * 2**e) for e in range(26) for m in (1, 1.5)} | {3}))
+_PADDED = 1.25  # times the transitions that one table of all rows may hold
+_HALO = 0.6  # share of the others' values from which on all of them are sent
+
+
+@brief(facts=facts.part)
+@dataclass(frozen=True)
+class ModelPart:
+    """The states of a range, with their choices and where those lead.
+
+    Attributes:
+      entry_start: ``int[r + 1]``.
+      successor: ``int[t]``, numbers among all states.
+      probability: ``float[t]``; rows sum to one.
+      row_start: ``int[n + 1]``; None: one row a state.
+      action: ``int[r]``, the numbers of the rows' actions; default their rank in the state.
+      initial: ``float[n]``; default: runs start anywhere with the same probability.
+      label: ``bool[n, P]``.
+      rewards: expected rewards of rows by name, ``float[r]``.
+      row: ``int[r]``, the numbers of the rows among all rows of the model, so that quantities on
+        them can be put onto the mesh; default: none are.
+
+    Example:
+      >>> part = ModelPart(np.arange(3), np.array([1, 0]), np.ones(2))  # of two states in a circle
+      >>> part.successor.tolist(), part.row_start is None
+      ([1, 0], True)
+    """
+
+    entry_start: np.ndarray
+    successor: np.ndarray
+    probability: np.ndarray
+    row_start: np.ndarray | None = None
+    action: np.ndarray | None = None
+    initial: np.ndarray | None = None
+    label: np.ndarray | None = None
+    rewards: Mapping[str, np.ndarray] = field(default_factory=dict)
+    row: np.ndarray | None = None
+
+
+def shard(
+    model: Any, mesh: Mesh, *, axis: str | None = None, order: str | np.ndarray = "given"
+) -> ShardedMDP:
+    """A model whose states lie on the devices of a mesh.
+
+    Solvers take it like any other: discounted, soft, reachability, satisfaction, total rewards,
+    their gradients and the graph's fixpoints, inside ``jit`` too. Every process gives the same
+    model; if it is too large for one, see :func:`model_from_parts`.
+
+    Args:
+      model: a concrete MDP, DenseMDP or SparseMDP.
+      mesh: the devices, such as ``jax.make_mesh((4,), ("states",))``.
+      axis: over which axis of the mesh; default its only one.
+      order: ``"given"``: neighbouring devices get neighbouring numbers; ``"near"``: states are put
+        into an order in which most successors are near (Cuthill and McKee 1969, reversed), so that
+        less is exchanged; or ``int[S]``, the states in the order that is wanted.
+
+    Returns:
+      :class:`~jaxltl.core.models.mesh.sharded.ShardedMDP`. An action of it is an action of the model,
+      of a sparse one what it is in :func:`~jaxltl.core.models.build.padded.to_padded`.
+
+    Raises:
+      ValueError: the model, the axis or the order is none.
+
+    Example:
+      >>> from jaxltl import from_dense
+      >>> mesh = jax.make_mesh((1,), ("states",))
+      >>> sharded = shard(from_dense([[[0.5, 0.5]], [[0.0, 1.0]]]), mesh)
+      >>> from_mesh(sharded, to_mesh(sharded, np.array([1.0, 2.0]))).tolist()
+      [1.0, 2.0]
+    """
+    sparse = to_sparse(model)
+    host, column = sparse.host, action_of(sparse)
+    ordered = _order(sparse, order)
+    place = np.empty(ordered.size, np.int64)
+    place[ordered] = np.arange(ordered.size)
+    rewards = {name: row_reward(sparse, name) for name in sparse.rewards}
+    initial, label = np.asarray(sparse.initial, np.float64), np.asarray(sparse.label)
+
+    def part(start: int, stop: int) -> ModelPart:
+        state = ordered[start:stop]
+        choices = np.diff(host.row_start)[state]
+        row = spans(host.row_start[state], choices)
+        width = np.diff(host.entry_start)[row]
+        entry = spans(host.entry_start[row], width)
+        return ModelPart(
+            row_start=starts_of(choices),
+            entry_start=starts_of(width),
+            successor=place[host.successor[entry]],
+            probability=host.probability[entry],
+            action=column[row],
+            initial=initial[state],
+            label=label[state],
+            rewards={name: x[row] for name, x in rewards.items()},
+            row=row,
+        )
+
+    return _assembled(part, ordered, host.num_states, mesh, axis, sparse.propositions)
+
+
+def model_from_parts(
+    part: Callable[[int, int], ModelPart],
+    num_states: int,
+    mesh: Mesh,
+    *,
+    axis: str | None = None,
+    propositions: tuple[str, ...] = (),
+) -> ShardedMDP:
+    """A model on a mesh that is too large for one process, made where its parts are to be.
+
+    Args:
+      part: from the range of states of a device, ``(start, stop)``, its :class:`ModelPart`. Called
+        in each process for the devices of that process only.
+      num_states: S.
+      mesh, axis: as for :func:`shard`.
+      propositions: the names of the labels.
+
+    Returns:
+      :class:`~jaxltl.core.models.mesh.sharded.ShardedMDP`.
+
+    Raises:
+      ValueError: naming the state and the value: what is wrong with a part.
+
+    Example:
+      >>> def cycle(start, stop):  # from each state to the next
+      ...     state = np.arange(start, stop)
+      ...     return ModelPart(np.arange(state.size + 1), (state + 1) % 10, np.ones(state.size))
+      >>> model = model_from_parts(cycle, 10, jax.make_mesh((1,), ("states",)))
+      >>> model.num_states, model.num_successors
+      (10, 1)
+    """
+    if not isinstance(num_states, int | np.integer) or num_states < 1:
+        raise ValueError(f"num_states is {shown(num_states)}; give a whole number of at least 1.")
+    return _assembled(part, None, int(num_states), mesh, axis, tuple(propositions))
+
+
+def ranges_of(num_states: int, mesh: Mesh, axis: str | None = None) -> list[tuple[int, int]]:
+    """The ranges of states, ``(start, stop)``, that this process is asked for parts of.
+
+    Raises:
+      ValueError: the axis is none, or there are fewer states than devices.
+    """
+    layout = _layout(num_states, mesh, axis)
+    return [layout.span(d) for d in layout.mine]
+
+
+def to_mesh(model: ShardedMDP, quantity: Any, fill: Any = 0) -> jax.Array:
+    """A quantity of the given model in the places of the sharded one.
+
+    Args:
+      model: the model.
+      quantity: ``[S, ...]`` of states, or of pairs of a state and an action, or of the rows of a
+        sparse model ``[R]``; on the host, the same in every process.
+      fill: where there is no such state or choice.
+
+    Returns:
+      ``[N, ...]``, of rows ``[N, A]``. Put there from the host: derivatives begin with what is on
+      the mesh.
+
+    Raises:
+      ValueError: the shape is wrong.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> path = jl.make_sparse(None, [0, 1, 2], [1, 1], [1, 1])
+      >>> model = shard(path, jax.make_mesh((1,), ("states",)))
+      >>> to_mesh(model, np.array([1.0, 2.0])).shape
+      (2,)
+    """
+    quantity = np.asarray(quantity)
+    if quantity.dtype == np.float64:
+        quantity = quantity.astype(model.dtype)
+    index = model.number
+    if quantity.shape[:1] != (model.num_given,):
+        index = _rows_of(model, quantity.shape)
+    sharding, found = model.sharding, {}
+    for piece in index.addressable_shards:
+        number = np.asarray(piece.data)
+        taken = quantity[np.maximum(number, 0)]
+        missing = (number < 0).reshape(*number.shape, *(1,) * (taken.ndim - number.ndim))
+        found[piece.device] = np.where(missing, quantity.dtype.type(fill), taken)
+    shape = (*index.shape, *quantity.shape[1:])
+    return jax.make_array_from_single_device_arrays(
+        shape, sharding, [jax.device_put(x, device) for device, x in found.items()]
+    )
+
+
+def _rows_of(model: ShardedMDP, shape: tuple[int, ...]) -> jax.Array:
+    if model.row is None or shape != (_num_rows(model),):
+        raise ValueError(
+            f"the quantity has shape {shape}; expected ({model.num_given}, ...), a number for each "
+            "state or each pair of a state and an action, or for each choice of a sparse model."
+        )
+    return model.row
+
+
+def _num_rows(model: ShardedMDP) -> int:
+    return int(jax.jit(lambda x: x.sum())(model.available)) - (model.num_states - model.num_given)
+
+
+def from_mesh(model: ShardedMDP, quantity: jax.Array) -> np.ndarray:
+    """A quantity ``[N, ...]`` as one of the given model, ``[S, ...]``, on the host.
+
+    In several processes all of them call it, and each gets all of it.
+
+    Args:
+      model: the model on the mesh.
+      quantity: ``[N, ...]``, such as a solution's value.
+
+    Returns:
+      ``[S, ...]``, NumPy's.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> path = jl.make_sparse(None, [0, 1, 2], [1, 1], [1, 1])
+      >>> model = shard(path, jax.make_mesh((1,), ("states",)))
+      >>> from_mesh(model, to_mesh(model, np.array([1.0, 2.0]))).tolist()
+      [1.0, 2.0]
+    """
+    number, found = on_host((model.number, quantity))
+    result = np.zeros((model.num_given, *found.shape[1:]), found.dtype)
+    result[number[number >= 0]] = found[number >= 0]
+    return result
+
+
+# --- what stands where ----------------------------------------------------------------------------
+
+
+class _Layout(NamedTuple):
+    """Who holds which states."""
+
+    mesh: Mesh
+    axis: str
+    num_given: int
+
+    @property
+    def starts(self) -> np.ndarray:
+        """Where the ranges begin, and where the last one ends."""
+        return np.arange(self.parts + 1) * self.num_given // self.parts
+
+    @property
+    def size(self) -> int:
+        """The places on a device."""
+        return -(-self.num_given // self.parts)
+
+    def place(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Which range a state is in, and where."""
+        range_ = np.searchsorted(self.starts, state, "right") - 1
+        return range_, state - self.starts[range_]
+
+    @property
+    def parts(self) -> int:
+        return self.mesh.shape[self.axis]
+
+    @property
+    def sharding(self) -> NamedSharding:
+        return NamedSharding(self.mesh, PartitionSpec(self.axis))
+
+    def devices(self, d: int) -> list[Any]:
+        """The devices with the d-th range, more than one where the mesh has other axes."""
+        along = self.mesh.axis_names.index(self.axis)
+        return list(np.moveaxis(self.mesh.devices, along, 0)[d : d + 1].ravel())
+
+    def owner(self, d: int) -> int:
+        """The process that speaks for a range."""
+        return min(device.process_index for device in self.devices(d))
+
+    @property
+    def mine(self) -> list[int]:
+        """The ranges of which this process holds a copy."""
+        here = jax.process_index()
+        return [
+            d
+            for d in range(self.parts)
+            if any(device.process_index == here for device in self.devices(d))
+        ]
+
+    def span(self, d: int) -> tuple[int, int]:
+        return int(self.starts[d]), int(self.starts[d + 1])
+
+    def array(self, pieces: Mapping[int, np.ndarray]) -> jax.Array:
+        """The global array of which each device has a piece, all of one shape."""
+        here, found = jax.process_index(), []
+        for d, piece in pieces.items():
+            found += [
+                jax.device_put(piece, device)
+                for device in self.devices(d)
+                if device.process_index == here
+            ]
+        some = next(iter(pieces.values()))
+        shape = (some.shape[0] * self.parts, *some.shape[1:])
+        return jax.make_array_from_single_device_arrays(shape, self.sharding, found)
+
+    def replicated(self, x: np.ndarray) -> jax.Array:
+        """The same on all devices."""
+        return jax.make_array_from_callback(
+            x.shape, NamedSharding(self.mesh, PartitionSpec()), lambda index: x[index]
+        )
+
+    def exchanged(self, pieces: Mapping[int, np.ndarray]) -> list[np.ndarray]:
+        """What every range has, in every process; pieces differ in their first axis alone."""
+        if jax.process_count() == 1:
+            return [pieces[d] for d in range(self.parts)]
+        from jax.experimental import multihost_utils
+
+        length = np.zeros(self.parts, np.int64)
+        for d, piece in pieces.items():
+            length[d] = len(piece)
+        length = np.asarray(multihost_utils.process_allgather(length)).max(0)
+        some = next(iter(pieces.values()))
+        padded = np.zeros((self.parts, int(length.max()), *some.shape[1:]), some.dtype)
+        for d, piece in pieces.items():
+            padded[d, : len(piece)] = piece
+        # Bytes, since JAX may hold no wider numbers than single precision.
+        every = np.asarray(multihost_utils.process_allgather(padded.view(np.uint8)))
+        return [
+            np.ascontiguousarray(every[self.owner(d), d]).view(some.dtype)[: length[d]]
+            for d in range(self.parts)
+        ]
+
+
+def _layout(num_states: int, mesh: Mesh, axis: str | None) -> _Layout:
+    validation.instance("mesh", mesh, Mesh, "a jax.sharding.Mesh, such as jax.make_mesh makes")
+    names = axes_of(mesh, axis)
+    if len(names) != 1:
+        raise ValueError(f"the mesh has axes {mesh.axis_names}; name one of them as axis.")
+    axis = names[0]
+    if num_states < mesh.shape[axis]:
+        raise ValueError(
+            f"{num_states} states cannot lie on {mesh.shape[axis]} devices; give a mesh of fewer."
+        )
+    return _Layout(automatic(mesh), axis, num_states)
+
+
+def _order(model: SparseMDP, order: Any) -> np.ndarray:
+    host = model.host
+    if isinstance(order, str):
+        if order not in ("given", "near"):
+            raise ValueError(f'order={order!r}; it must be "given", "near" or the states in order.')
+        if order == "given":
+            return np.arange(host.num_states)
+        from scipy.sparse import csgraph, csr_array
+
+        start = host.entry_start[host.row_start]
+        one = np.ones(host.num_transitions, np.int8)
+        graph = csr_array((one, host.successor, start), shape=(host.num_states,) * 2)
+        return np.asarray(csgraph.reverse_cuthill_mckee(graph.tocsr(), symmetric_mode=False))
+    order = np.asarray(order)
+    if order.shape != (host.num_states,) or not np.array_equal(
+        np.sort(order), np.arange(host.num_states)
+    ):
+        raise ValueError(f"order must hold each of the {host.num_states} states once.")
+    return order
+
+
+# --- assembling -----------------------------------------------------------------------------------
+
+
+class _Piece(NamedTuple):
+    """What a device has of the arrays of a ShardedMDP."""
+
+    tables: tuple[RowTable, ...]
+    place: np.ndarray | None
+    available: np.ndarray
+    initial: np.ndarray
+    kind: np.ndarray
+    rewards: dict[str, np.ndarray]
+    number: np.ndarray
+    row: np.ndarray | None
+
+
+def _assembled(
+    part: Any, ordered: Any, num_states: int, mesh: Mesh, axis: str | None, propositions: Any
+) -> ShardedMDP:
+    layout = _layout(num_states, mesh, axis)
+    parts = {d: _checked(part, layout, d, len(propositions)) for d in layout.mine}
+    facts = np.concatenate(layout.exchanged({d: _facts(x) for d, x in parts.items()}))
+    halo = _halo(layout, parts)
+    total = facts[:, _INITIAL].sum()
+    if abs(total - 1) > 1e-6:
+        raise ValueError(f"the initial distribution sums to {total:.9g}, not 1.")
+    labels = np.unique(
+        np.concatenate(layout.exchanged({d: np.unique(x.label, axis=0) for d, x in parts.items()})),
+        axis=0,
+    )
+    pieces = {}
+    for d, x in parts.items():
+        tables, place = _tables(layout, halo, facts, d, x)
+        pieces[d] = _of_states(layout, facts, d, x, tables, place, labels, ordered)
+    whole: _Piece = jax.tree.map(
+        lambda *each: layout.array(dict(zip(pieces, each, strict=True))), *pieces.values()
+    )
+    return ShardedMDP(
+        **whole._asdict(),
+        sent=tuple(layout.array(x) for x in halo.sent),
+        shown=layout.replicated(labels),
+        propositions=propositions,
+        num_given=num_states,
+        mesh=layout.mesh,
+        axis=layout.axis,
+        rounds=halo.rounds,
+    )
+
+
+class _Range(NamedTuple):
+    """A part with all that it may leave out."""
+
+    entry_start: np.ndarray
+    successor: np.ndarray
+    probability: np.ndarray
+    row_start: np.ndarray
+    action: np.ndarray
+    initial: np.ndarray
+    label: np.ndarray
+    rewards: dict[str, np.ndarray]
+    row: np.ndarray | None
+
+
+def _checked(part: Any, layout: _Layout, d: int, num_labels: int) -> _Range:
+    start, stop = layout.span(d)
+    found = part(start, stop)
+    if not isinstance(found, ModelPart):
+        raise ValueError(f"part({start}, {stop}) is {shown(found)}; it must return a ModelPart.")
+    successor, probability = np.asarray(found.successor), np.asarray(found.probability, np.float64)
+    entry_start = checked_starts("entry_start", found.entry_start, successor.size, "transitions")
+    row_start = found.row_start
+    if row_start is None:
+        row_start = np.arange(entry_start.size)
+    row_start = checked_starts("row_start", row_start, entry_start.size - 1, "choices")
+    count = row_start.size - 1
+    if count != stop - start:
+        raise ValueError(f"part({start}, {stop}) has {count} states; it must have {stop - start}.")
+    check_entries(
+        row_start, entry_start, successor, probability, first=start, num_states=layout.num_given
+    )
+    probability = scaled(row_start, entry_start, probability, first=start)
+    owner = np.repeat(np.arange(count), np.diff(row_start))
+    action = np.arange(owner.size) - row_start[owner] if found.action is None else found.action
+    initial = np.full(count, 1 / layout.num_given) if found.initial is None else found.initial
+    label = np.zeros((count, num_labels), bool) if found.label is None else found.label
+    for name, x, shape in (
+        ("action", action, (owner.size,)),
+        ("initial", initial, (count,)),
+        ("label", label, (count, num_labels)),
+        ("row", action if found.row is None else found.row, (owner.size,)),
+        *((f"reward {n!r}", r, (owner.size,)) for n, r in found.rewards.items()),
+    ):
+        if np.shape(x) != shape:
+            raise ValueError(
+                f"part({start}, {stop}): {name} has shape {np.shape(x)}; expected {shape}."
+            )
+    return _Range(
+        entry_start,
+        successor,
+        probability,
+        row_start,
+        np.asarray(action),
+        np.asarray(initial, np.float64),
+        np.asarray(label, bool),
+        dict(found.rewards),
+        found.row,
+    )
+
+
+_ACTIONS, _WIDEST, _TRANSITIONS, _INITIAL, _COUNTS = range(5)
+
+
+def _facts(part: _Range) -> np.ndarray:
+    """Of a range: actions, widest row, transitions, initial mass, and the rows of each width."""
+    width = np.diff(part.entry_start)
+    rows = np.bincount(np.searchsorted(_WIDTHS, width), minlength=_WIDTHS.size)
+    return np.concatenate(
+        [
+            [
+                part.action.max(initial=0) + 1.0,
+                width.max(initial=1),
+                part.successor.size,
+                part.initial.sum(),
+            ],
+            rows,
+        ]
+    )[None]
+
+
+class _Halo(NamedTuple):
+    """What is exchanged before a sweep."""
+
+    layout: _Layout
+    rounds: Any
+    sent: list[dict[int, np.ndarray]]
+    asked: list[np.ndarray] | None  # the states that each range asks for, in order
+    first: dict[tuple[int, int], int]  # where what comes from another range begins
+
+    def own(self, d: int) -> int:
+        """Where a device sees its own states."""
+        return d * self.layout.size if self.asked is None else 0
+
+    def places(self, d: int, successor: np.ndarray) -> np.ndarray:
+        """Numbers of states as places among what a device sees."""
+        owner, found = self.layout.place(successor)
+        if self.asked is None:
+            return (owner * self.layout.size + found).astype(np.int32)
+        for e in np.unique(owner[owner != d]):
+            here = owner == e
+            of_e = _within(self.asked[d], *self.layout.span(int(e)))
+            found[here] = self.first[d, int(e)] + np.searchsorted(of_e, successor[here])
+        return found.astype(np.int32)
+
+
+def _within(ascending: np.ndarray, start: int, stop: int) -> np.ndarray:
+    return ascending[slice(*np.searchsorted(ascending, (start, stop)))]
+
+
+def _halo(layout: _Layout, parts: Mapping[int, _Range]) -> _Halo:
+    count, size = layout.parts, layout.size
+    asked = {}
+    for d, part in parts.items():
+        wanted = np.zeros(layout.num_given, bool)
+        wanted[part.successor] = True
+        wanted[slice(*layout.span(d))] = False
+        asked[d] = np.flatnonzero(wanted)
+    lengths = np.concatenate(layout.exchanged({d: np.array([x.size]) for d, x in asked.items()}))
+    if lengths.sum() > _HALO * layout.num_given * (count - 1):
+        return _Halo(layout, None, [], None, {})
+    every = layout.exchanged(asked)
+    rounds, sent, first, begins = [], [], {}, size
+    for k in range(1, count):
+        lists = [_within(x, *layout.span((d + k) % count)) for d, x in enumerate(every)]
+        longest = max(x.size for x in lists)
+        if not longest:
+            continue
+        rounds.append(tuple(((d + k) % count, d) for d, x in enumerate(lists) if x.size))
+        pieces = {}
+        for e in parts:
+            pieces[e] = np.zeros(longest, np.int32)
+            asking = lists[(e - k) % count]
+            pieces[e][: asking.size] = asking - layout.starts[e]
+        sent.append(pieces)
+        first.update({(d, (d + k) % count): begins for d in range(count)})
+        begins += longest
+    return _Halo(layout, tuple(rounds), sent, every, first)
+
+
+def _tables(
+    layout: _Layout, halo: _Halo, facts: np.ndarray, d: int, part: _Range
+) -> tuple[tuple[RowTable, ...], np.ndarray | None]:
+    """A range's rows by width, and which row each choice is; filled states lead to themselves."""
+    num_actions, widest = (int(x) for x in facts[:, [_ACTIONS, _WIDEST]].max(0))
+    here, size, own = part.initial.size, layout.size, halo.own(d)
+    successor = halo.places(d, part.successor)
+    width = np.diff(part.entry_start)
+    row = np.repeat(np.arange(width.size), width)
+    rank = np.arange(row.size) - part.entry_start[row]
+    state = np.repeat(np.arange(here), np.diff(part.row_start))
+    if layout.parts * size * num_actions * widest <= _PADDED * facts[:, _TRANSITIONS].sum():
+        target = np.zeros((size * num_actions, widest), np.int32)
+        weight = np.zeros(target.shape)
+        at = (state * num_actions + part.action)[row], rank
+        target[at], weight[at] = successor, part.probability
+        filled = np.arange(here, size)
+        target[filled * num_actions, 0], weight[filled * num_actions, 0] = own + filled, 1
+        return (RowTable(target, weight),), None
+    most, kind = facts[:, _COUNTS:].max(0).astype(np.int64), np.searchsorted(_WIDTHS, width)
+    # The last two rows are that of filled states and that of what is no choice.
+    tables = [RowTable(np.zeros((2, 1), np.int32), np.zeros((2, 1)))]
+    tables[0].successor[0, 0], tables[0].probability[0, 0] = own + min(here, size - 1), 1
+    place, begins = np.ones((size, num_actions), np.int32), 2
+    place[here:, 0] = 0
+    for c in np.flatnonzero(most):
+        rows = np.flatnonzero(kind == c)
+        number = np.zeros(width.size, np.int64)
+        number[rows] = np.arange(rows.size)
+        target = np.zeros((int(most[c]), int(_WIDTHS[c])), np.int32)
+        weight = np.zeros(target.shape)
+        entry = kind[row] == c
+        within = number[row[entry]], rank[entry]
+        target[within], weight[within] = successor[entry], part.probability[entry]
+        place[state[rows], part.action[rows]] = begins + np.arange(rows.size)
+        tables.append(RowTable(target, weight))
+        begins += int(most[c])
+    return tuple(tables), place
+
+
+def _of_states(
+    layout: _Layout,
+    facts: np.ndarray,
+    d: int,
+    part: _Range,
+    tables: Any,
+    place: Any,
+    labels: np.ndarray,
+    ordered: Any,
+) -> _Piece:
+    num_actions, here = int(facts[:, _ACTIONS].max()), part.initial.size
+    state = np.repeat(np.arange(here), np.diff(part.row_start))
+    pair = state, part.action
+
+    def on_choices(x: np.ndarray, fill: Any, dtype: Any) -> np.ndarray:
+        found = np.full((layout.size, num_actions), fill, dtype)
+        found[pair] = x
+        return found
+
+    available = on_choices(np.ones(state.size, bool), False, bool)
+    if available.sum() != state.size:
+        raise ValueError(
+            f"two choices of one of the states {layout.span(d)} have the same action; "
+            "number them apart."
+        )
+    available[here:, 0] = True
+    kind = np.zeros(layout.size, np.int32)  # filled states show what another shows
+    different, of = np.unique(part.label, axis=0, return_inverse=True)
+    place_of = {shown.tobytes(): i for i, shown in enumerate(labels)}
+    kind[:here] = np.array([place_of[x.tobytes()] for x in different], np.int32)[of.ravel()]
+    start, stop = layout.span(d)
+    number = np.full(layout.size, -1, np.int32)
+    number[:here] = np.arange(start, stop) if ordered is None else ordered[start:stop]
+    row = None if part.row is None else on_choices(part.row, -1, np.int32)
+    initial = np.zeros(layout.size)
+    initial[:here] = part.initial
+    kept = jax.dtypes.canonicalize_dtype(np.float64)
+    tables = tuple(RowTable(x.successor, x.probability.astype(kept)) for x in tables)
+    rewards = {name: on_choices(x, 0, kept) for name, x in part.rewards.items()}
+    return _Piece(tables, place, available, initial.astype(kept), kind, rewards, number, row)

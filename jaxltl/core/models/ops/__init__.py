@@ -1,0 +1,1 @@
+"""Primitives on models: expectation, pushforward, successors, reductions over choices."""

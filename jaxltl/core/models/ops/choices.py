@@ -1,0 +1,380 @@
+"""A state's choices, and the reductions over them, by which algorithms see any kind of model.
+
+Quantities on choices are ``[S, A]`` where models are padded (``[S, Q, A]`` in a product), and
+``[R]``, a number for each row, where they are sparse. What is asked of them is the same.
+"""
+
+from __future__ import annotations
+
+from functools import singledispatch
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxltl.core.models.ops import kernels
+from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.pretty_print import brief
+from jaxltl.core.validation import no_model, shown
+
+
+def action_mean(policy: jax.Array, quantity: jax.Array) -> jax.Array:
+    """Mean over a policy's actions, ``sum_a pi(s, a) x(s, a)``.
+
+    Args:
+      policy: ``float[S, A]``, or ``int32[S]`` for a deterministic policy.
+      quantity: ``[S, A]``, finite.
+
+    Returns:
+      ``[S]``.
+    """
+    if is_deterministic(policy):
+        return jnp.take_along_axis(quantity, policy[..., None], axis=-1)[..., 0]
+    return jnp.sum(policy * quantity, axis=-1)
+
+
+def action_max(quantity: jax.Array, available: jax.Array) -> jax.Array:
+    """Maximum over available actions, ``[S]`` from ``[S, A]``; written out for few actions."""
+    quantity = jnp.where(available, quantity, -jnp.inf)
+    if quantity.shape[-1] > kernels.UNROLL:
+        return quantity.max(axis=-1)
+    best = quantity[..., 0]
+    for a in range(1, quantity.shape[-1]):
+        best = jnp.maximum(best, quantity[..., a])
+    return best
+
+
+def action_argmax(quantity: jax.Array, available: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Maximum over available actions and the first action that attains it, ``[S]`` each."""
+    quantity = jnp.where(available, quantity, -jnp.inf)
+    if quantity.shape[-1] > kernels.UNROLL:
+        return quantity.max(axis=-1), quantity.argmax(axis=-1).astype(jnp.int32)
+    best, action = quantity[..., 0], jnp.zeros(quantity.shape[:-1], jnp.int32)
+    for a in range(1, quantity.shape[-1]):
+        better = quantity[..., a] > best
+        best = jnp.where(better, quantity[..., a], best)
+        action = jnp.where(better, a, action)
+    return best, action
+
+
+def first_action(condition: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Whether a condition ``bool[S, A]`` holds for some action, and the first one (or 0)."""
+    if condition.shape[-1] > kernels.UNROLL:
+        return condition.any(axis=-1), condition.argmax(axis=-1).astype(jnp.int32)
+    some = jnp.zeros(condition.shape[:-1], bool)
+    action = jnp.zeros(condition.shape[:-1], jnp.int32)
+    for a in reversed(range(condition.shape[-1])):
+        some |= condition[..., a]
+        action = jnp.where(condition[..., a], a, action)
+    return some, action
+
+
+def is_deterministic(policy: chex.Array) -> bool:
+    """Whether a policy is given as one action per state (integers) rather than a distribution."""
+    try:
+        kind = jnp.result_type(policy)
+    except TypeError:
+        raise ValueError(
+            f"policy is {shown(policy)}; give the number of an action (of a sparse "
+            "model, of a choice) for each state, or weights of all."
+        ) from None
+    return jnp.issubdtype(kind, jnp.integer)
+
+
+@brief
+class Actions(NamedTuple):
+    """Choices that are padded to as many actions in every state.
+
+    Attributes:
+      available: ``bool[S, A]``, which of them exist.
+    """
+
+    available: jax.Array
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Of a quantity on choices."""
+        return self.available.shape
+
+    @property
+    def layout(self) -> Columns:
+        """What reduces quantities in columns."""
+        return Columns()
+
+    def spread(self, x: jax.Array) -> jax.Array:
+        """What holds of states, of their choices: something that combines with ``[S, A]``."""
+        return x[..., None]
+
+    def sum(self, quantity: jax.Array) -> jax.Array:
+        """``[S]``, of a quantity that is zero where there is no choice."""
+        return jnp.sum(quantity, axis=-1)
+
+    def max(self, quantity: jax.Array, where: jax.Array | None = None) -> jax.Array:
+        """``[S]``; of some of the choices, minus infinity where there is none."""
+        return action_max(quantity, self.available if where is None else where)
+
+    def argmax(self, quantity: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """The maximum and the first choice that attains it, ``[S]`` each."""
+        return action_argmax(quantity, self.available)
+
+    def first(self, condition: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Whether a condition holds for some choice, and the first one (or the first of all)."""
+        return first_action(condition)
+
+    def all(self, condition: jax.Array) -> jax.Array:
+        """Whether a condition holds for all entries of a state, ``bool[S]``."""
+        return jnp.all(condition, axis=-1)
+
+    def logits(self, quantity: jax.Array) -> jax.Array:
+        """The quantity, minus infinity where there is no choice."""
+        return jnp.where(self.available, quantity, -jnp.inf)
+
+    def top(self, logits: jax.Array) -> jax.Array:
+        """The largest of the logits."""
+        return jnp.max(logits, axis=-1)
+
+    def logsumexp(self, logits: jax.Array) -> jax.Array:
+        """``log sum_a exp x(s, a)``."""
+        return jax.scipy.special.logsumexp(logits, axis=-1)
+
+    def softmax(self, logits: jax.Array) -> jax.Array:
+        """``exp x(s, a) / sum_b exp x(s, b)``."""
+        return jax.nn.softmax(logits, axis=-1)
+
+    def mean(self, policy: jax.Array, quantity: jax.Array) -> jax.Array:
+        """``sum_a pi(s, a) x(s, a)`` for weights, or integers that name a choice of each state."""
+        return action_mean(policy, quantity)
+
+    def one_hot(self, choice: jax.Array, dtype: Any) -> jax.Array:
+        """Weight one on a choice of each state; none on what is no choice of it."""
+        return jax.nn.one_hot(choice, self.shape[-1], dtype=dtype)
+
+    def columns(self, quantity: jax.Array) -> list[jax.Array]:
+        """A arrays ``[N]``, which lie side by side in memory."""
+        return action_columns(self.shape[-1], quantity)
+
+    def whole(self, columns: list[jax.Array]) -> jax.Array:
+        """The quantity with these columns."""
+        return jnp.stack(columns, axis=-1).reshape(self.shape)
+
+
+@brief
+class Columns(NamedTuple):
+    """Padded choices whose quantities are an array ``[N, ...]`` for each action.
+
+    Unavailable ones have weight zero and, in maxima, minus infinity.
+    """
+
+    def spread(self, x: jax.Array, like: list[jax.Array]) -> list[jax.Array]:
+        """What holds of states, or of all of them, of each of their choices."""
+        return [x] * len(like)
+
+    def sum(self, quantity: list[jax.Array]) -> jax.Array:
+        """As of :class:`Actions`."""
+        total = quantity[0]
+        for x in quantity[1:]:
+            total = jnp.add(total, x)
+        return total
+
+    def max(self, quantity: list[jax.Array]) -> jax.Array:
+        """As of :class:`Actions`."""
+        best = quantity[0]
+        for x in quantity[1:]:
+            best = jnp.maximum(best, x)
+        return best
+
+    def best(self, quantity: list[jax.Array]) -> tuple[jax.Array, list[jax.Array]]:
+        """The maximum, and weight one on the first choice that attains it."""
+        best = self.max(quantity)
+        weight, free = [], jnp.ones(best.shape, bool)
+        for x in quantity:
+            here = free & (x >= best)
+            weight.append(here.astype(best.dtype))
+            free &= ~here
+        return best, weight
+
+    def mean(self, weight: list[jax.Array], quantity: list[jax.Array]) -> jax.Array:
+        """As of :class:`Actions`; weights may lack the lanes."""
+        return self.sum([_beside(w, x) * x for w, x in zip(weight, quantity, strict=True)])
+
+    def size(self, quantity: list[jax.Array]) -> int:
+        """The number of states."""
+        return quantity[0].shape[0]
+
+    def packed(self, quantity: list[jax.Array]) -> jax.Array:
+        """One array of all."""
+        return jnp.stack(quantity)
+
+    def unpacked(self, packed: jax.Array) -> list[jax.Array]:
+        """What was packed."""
+        return list(packed)
+
+
+@brief
+class Rows(NamedTuple):
+    """Choices without padding; those of a state stand together.
+
+    Quantities on them are ``[R, ...]``, in every layout.
+
+    Attributes:
+      state: ``int32[R]``, whose they are; ascending.
+      start: ``int32[S + 1]``, where each state's begin.
+    """
+
+    state: jax.Array
+    start: jax.Array
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Of a quantity on choices."""
+        return self.state.shape
+
+    @property
+    def layout(self) -> Rows:
+        """Itself."""
+        return self
+
+    @property
+    def num_states(self) -> int:
+        return self.start.shape[0] - 1
+
+    @property
+    def available(self) -> jax.Array:
+        """All exist."""
+        return jnp.ones(self.shape, bool)
+
+    def size(self, quantity: jax.Array) -> int:
+        """The number of states."""
+        return self.num_states
+
+    def spread(self, x: jax.Array, like: jax.Array | None = None) -> jax.Array:
+        """As of :class:`Actions`; with `like`, a quantity, what has no axis of states stays."""
+        x = jnp.asarray(x)
+        if like is not None and x.ndim < like.ndim:
+            return x
+        return kernels.gather(x, self.state)
+
+    def sum(self, quantity: jax.Array) -> jax.Array:
+        """As of :class:`Actions`."""
+        if quantity.dtype == bool:
+            quantity = quantity.astype(jnp.int32)
+        return kernels.segment(jax.ops.segment_sum, quantity, self.state, self.num_states)
+
+    def max(self, quantity: jax.Array, where: jax.Array | None = None) -> jax.Array:
+        """As of :class:`Actions`, with the derivative of the choice that attains it."""
+        if where is not None:
+            quantity = jnp.where(where, quantity, -jnp.inf)
+        best, row = self.argmax(quantity)
+        return jnp.where(jnp.isnan(best), jnp.nan, kernels.gather(quantity, row))
+
+    def argmax(self, quantity: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """As of :class:`Actions`."""
+        fixed = lax.stop_gradient(quantity)
+        best = kernels.segment(jax.ops.segment_max, fixed, self.state, self.num_states)
+        some, row = self.first(fixed >= kernels.gather(best, self.state))
+        return jnp.where(some, best, jnp.nan), row
+
+    def first(self, condition: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """As of :class:`Actions`."""
+        last = self.shape[0]
+        number = jnp.arange(last, dtype=jnp.int32)
+        found = kernels.segment(
+            jax.ops.segment_min, jnp.where(condition, number, last), self.state, self.num_states
+        )
+        some = found < last
+        return some, jnp.where(some, found, self.start[:-1]).astype(jnp.int32)
+
+    def all(self, condition: jax.Array) -> jax.Array:
+        """As of :class:`Actions`."""
+        return ~self.first(~condition)[0]
+
+    def logits(self, quantity: jax.Array) -> jax.Array:
+        """As of :class:`Actions`."""
+        return quantity
+
+    def top(self, logits: jax.Array) -> jax.Array:
+        """As of :class:`Actions`; without derivative."""
+        fixed = lax.stop_gradient(logits)
+        return kernels.segment(jax.ops.segment_max, fixed, self.state, self.num_states)
+
+    def logsumexp(self, logits: jax.Array) -> jax.Array:
+        """As of :class:`Actions`."""
+        top = lax.stop_gradient(self.top(logits))
+        return jnp.log(self.sum(jnp.exp(logits - self.spread(top)))) + top
+
+    def softmax(self, logits: jax.Array) -> jax.Array:
+        """As of :class:`Actions`."""
+        raised = jnp.exp(logits - self.spread(lax.stop_gradient(self.top(logits))))
+        return raised / self.spread(self.sum(raised))
+
+    def mean(self, policy: jax.Array, quantity: jax.Array) -> jax.Array:
+        """As of :class:`Actions`; weights may lack the lanes."""
+        if is_deterministic(policy):
+            return kernels.gather(quantity, policy)
+        return self.sum(_beside(policy, quantity) * quantity)
+
+    def one_hot(self, choice: jax.Array, dtype: Any) -> jax.Array:
+        """As of :class:`Actions`."""
+        number = jnp.arange(self.shape[0], dtype=jnp.int32)
+        mine = kernels.gather(jnp.asarray(choice), self.state)
+        return (number == mine).astype(jax.dtypes.canonicalize_dtype(dtype))
+
+    def best(self, quantity: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """As of :class:`Columns`."""
+        best, row = self.argmax(quantity)
+        return best, self.one_hot(row, best.dtype)
+
+    def columns(self, quantity: jax.Array) -> jax.Array:
+        """Itself: every layout is one."""
+        return quantity
+
+    def whole(self, quantity: jax.Array) -> jax.Array:
+        """Itself."""
+        return quantity
+
+    def packed(self, quantity: jax.Array) -> jax.Array:
+        """Itself."""
+        return quantity
+
+    def unpacked(self, quantity: jax.Array) -> jax.Array:
+        """Itself."""
+        return quantity
+
+
+@singledispatch
+def choices(model: Any) -> Actions | Rows:
+    """The choices of a model's states; of a representation of one's own, its `available`."""
+    if not hasattr(model, "available"):
+        raise ValueError(no_model(model))
+    return Actions(model.available)
+
+
+@choices.register(SparseMDP)
+def row_choices(model: SparseMDP) -> Rows:
+    """Of a sparse model."""
+    return Rows(kernels.owners(model.row_start, model.num_rows), jnp.asarray(model.row_start))
+
+
+@singledispatch
+def choice_shape(model: Any) -> tuple[int, ...]:
+    """The shape of a quantity on choices: ``(S, A)``, in a product ``(S, Q, A)``, or ``(R,)``."""
+    if not hasattr(model, "num_actions"):
+        raise ValueError(no_model(model))
+    return (*model.state_shape, model.num_actions)
+
+
+@choice_shape.register
+def _(model: SparseMDP) -> tuple[int, ...]:
+    return (model.num_rows,)
+
+
+def action_columns(num_actions: int, quantity: jax.Array) -> list[jax.Array]:
+    """``[S, A]`` as A arrays ``[N]``, which lie side by side in memory."""
+    rows = quantity.reshape(-1, num_actions)
+    return [rows[:, a] for a in range(num_actions)]
+
+
+def _beside(weight: jax.Array, quantity: jax.Array) -> jax.Array:
+    return weight.reshape(weight.shape + (1,) * (quantity.ndim - weight.ndim))

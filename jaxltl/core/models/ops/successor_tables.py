@@ -1,0 +1,238 @@
+"""Successors and predecessors of numbered states, for sweeps whose speed matters.
+
+A model's states are numbered in order of their arrays (``s * Q + q`` in a product), and what
+is swept has the states first and, behind them, lanes that are solved side by side: one gather
+then moves whole rows of lanes. The transposed sweep gathers from lists of predecessors: XLA
+runs a scatter on a CPU one entry at a time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from jaxltl.core.models.game import Game
+from jaxltl.core.models.mdp import MDP
+from jaxltl.core.models.mesh.sharded import ShardedMDP, over_devices, seen_by
+from jaxltl.core.models.ops import kernels, operators
+from jaxltl.core.models.ops.array_namespace import to_jax
+from jaxltl.core.models.ops.choices import Columns
+from jaxltl.core.models.ops.choices import action_columns as action_columns
+from jaxltl.core.models.ops.entries import Entries, entries
+from jaxltl.core.models.product import Product
+from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.pretty_print import brief
+
+_LARGEST = 2**22  # transitions up to which a product's are written down, one by one
+_WIDEST = 6  # predecessor lists are at most this many times wider than successor lists
+
+
+@brief
+class Successors(NamedTuple):
+    """Where the pairs of a model lead, ``[A, K, N]``: an array ``[N]`` for each transition.
+
+    Separate arrays lie side by side in memory whatever layout XLA chooses, without which
+    its loops over states are not vectorised. Where there are few transitions in all, they are
+    one array: programs are smaller.
+
+    Attributes:
+      successor: ``int32[N]``, by action and number of the successor.
+      probability: ``float[N]``, likewise; zero at unavailable actions.
+    """
+
+    successor: list[list[jax.Array]] | jax.Array
+    probability: list[list[jax.Array]] | jax.Array
+
+    @property
+    def choices(self) -> Columns:
+        """How quantities on actions are laid out."""
+        return Columns()
+
+    def expectation(self, value: jax.Array) -> list[jax.Array]:
+        """Expected value of the next state, ``[N, ...]`` for each action, from ``[N, ...]``."""
+        if not (isinstance(self.successor, list) or isinstance(self.probability, list)):
+            return list(kernels.folded(self.successor, self.probability, value, axis=1))
+        pairs = zip(self.successor, self.probability, strict=True)
+        return [kernels.fold(targets, weights, value) for targets, weights in pairs]
+
+
+@brief
+@struct.dataclass
+class Primitives:
+    """The same by a model's own primitive, for models that are too wide or too large to write down.
+
+    Attributes:
+      model: any model.
+    """
+
+    model: Any
+
+    @property
+    def choices(self) -> Columns:
+        """As of :class:`Successors`."""
+        return Columns()
+
+    def expectation(self, value: jax.Array) -> list[jax.Array]:
+        """As :meth:`Successors.expectation`."""
+        shape = self.model.state_shape
+
+        def one(value: jax.Array) -> list[jax.Array]:
+            found = operators.expectation(self.model, value.reshape(shape))
+            return [x.ravel() for x in jnp.moveaxis(found, -1, 0)]
+
+        if value.ndim == 1:
+            return one(value)
+        return jax.vmap(one, in_axes=-1, out_axes=-1)(value)
+
+
+@brief
+@struct.dataclass
+class SpreadSuccessors:
+    """As :class:`Successors` of a model over a mesh, one table of all choices.
+
+    Attributes:
+      model: the model.
+      successor, probability: ``[N]`` by action and number of the successor; places, not states.
+    """
+
+    model: Any
+    successor: list[list[jax.Array]]
+    probability: list[list[jax.Array]]
+
+    @property
+    def choices(self) -> Columns:
+        """As of :class:`Successors`."""
+        return Columns()
+
+    def expectation(self, value: jax.Array) -> list[jax.Array]:
+        """As :meth:`Successors.expectation`."""
+
+        def one(successor: Any, probability: Any, sent: Any, value: jax.Array) -> list[jax.Array]:
+            seen = seen_by(self.model, sent, value)
+            pairs = zip(successor, probability, strict=True)
+            return [kernels.fold(targets, weights, seen) for targets, weights in pairs]
+
+        return over_devices(
+            self.model, one, self.successor, self.probability, self.model.sent, value
+        )
+
+
+@brief
+class Predecessors(NamedTuple):
+    """The pairs that lead to each state, ``a * N + i``, padded with probability zero.
+
+    Attributes:
+      pair: ``int32[P, N]``.
+      probability: ``float[P, N]``.
+    """
+
+    pair: jax.Array
+    probability: jax.Array
+
+    def pushforward(self, mass: jax.Array) -> jax.Array:
+        """Mass that flows into each state: ``[N, ...]`` from ``[A * N, ...]``."""
+        return kernels.fold(list(self.pair), list(self.probability), mass)
+
+
+def table(model: Any) -> Successors | SpreadSuccessors | Primitives | Entries:
+    """What sweeps a model: its successors where they can be written down, else its primitives.
+
+    Of a sparse model, or a game on one, its entries.
+    """
+    world = model.mdp if isinstance(model, Game) else model
+    if isinstance(world, SparseMDP):
+        return entries(world)
+    if isinstance(world, ShardedMDP) and (spread := _spread_out(world)):
+        return spread
+    return successors(model) or Primitives(model)
+
+
+def _spread_out(model: ShardedMDP) -> SpreadSuccessors | None:
+    num_actions, width = model.num_actions, model.num_successors
+    if model.place is not None or num_actions * width > kernels.WRITTEN_OUT:
+        return None
+    successor, probability = (
+        [
+            [x.reshape(-1, num_actions, width)[:, a, k] for k in range(width)]
+            for a in range(num_actions)
+        ]
+        for x in model.tables[0]
+    )
+    return SpreadSuccessors(model, successor, probability)
+
+
+def successors(model: Any) -> Successors | None:
+    """The successor table of an MDP, of a product of one or of a game; None where it is too large."""
+    model = model.mdp if isinstance(model, Game) else model
+    world = model.mdp if isinstance(model, Product) else model
+    if not isinstance(world, MDP):
+        return None
+    num_pairs = int(np.prod(world.probability.shape[-2:]))
+    if num_pairs > kernels.WRITTEN_OUT:
+        return None
+    weight = world.successor_probability
+    if world is model:
+        return Successors(_columns(world.successor), _columns(weight))
+    if model.num_states * num_pairs > _LARGEST:
+        return None
+    num_memory, memory = model.num_memory, model.next_memory
+    shape = (*model.state_shape, *world.successor.shape[1:])
+    if model.label_on == "exit":
+        after = jnp.broadcast_to(memory[:, :, None, None], shape)
+    else:
+        after = jnp.swapaxes(memory[world.successor], 1, -1)  # [S, Q, K, A]
+        after = jnp.swapaxes(after, 2, 3)
+    flat = world.successor[:, None] * num_memory + after
+    probability = jnp.broadcast_to(weight[:, None], shape)
+    rows = (model.num_states, *shape[2:])
+    return Successors(_columns(flat.reshape(rows)), _columns(probability.reshape(rows)))
+
+
+def _columns(entries: jax.Array) -> list[list[jax.Array]] | jax.Array:
+    """``[N, A, K]`` as arrays ``[N]``, or as one ``[A, K, N]``."""
+    if entries.size <= kernels.FEW:
+        return jnp.moveaxis(entries, 0, -1)
+    _, num_actions, width = entries.shape
+    return [[entries[:, a, k] for k in range(width)] for a in range(num_actions)]
+
+
+def predecessors(models: Sequence[Any]) -> Predecessors | None:
+    """The predecessor lists of models of one shape, with a leading axis, on the host.
+
+    Args:
+      models: W models.
+
+    Returns:
+      Lists padded to the longest, ``[W, P, N]``; None if there is no successor table, or if
+      some state has too many predecessors for that to pay.
+    """
+    table_of = jax.jit(successors)
+    tables = [table_of(model) for model in models]
+    lists = []
+    for table in tables:
+        if table is None:
+            return None
+        target, weight = (np.asarray(x) for x in table)
+        num_actions, width, num_states = target.shape
+        numbers = np.arange(num_actions * num_states).reshape(num_actions, 1, num_states)
+        pair = np.broadcast_to(numbers, target.shape).ravel()
+        used = weight.ravel() > 0
+        target, weight, pair = target.ravel()[used], weight.ravel()[used], pair[used]
+        order = np.argsort(target, kind="stable")
+        target, weight, pair = target[order], weight[order], pair[order]
+        count = np.bincount(target, minlength=num_states)
+        rank = np.arange(target.size) - np.repeat(np.cumsum(count) - count, count)
+        lists.append((target, rank, pair, weight, count.max()))
+        if lists[-1][-1] > _WIDEST * num_actions * width:
+            return None
+    widest = max(x[-1] for x in lists)
+    pairs = np.zeros((len(lists), widest, num_states), np.int32)
+    probability = np.zeros(pairs.shape, weight.dtype)
+    for w, (target, rank, pair, weight, _) in enumerate(lists):
+        pairs[w, rank, target], probability[w, rank, target] = pair, weight
+    return Predecessors(to_jax(pairs), to_jax(probability))

@@ -1,0 +1,1 @@
+"""Parametric MDPs: rational functions of parameters and their ranges over boxes."""

@@ -1,0 +1,310 @@
+"""Models whose probabilities and rewards are differentiable functions of parameters in a box."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax.tree_util import Partial
+
+from jaxltl.core.models import facts
+from jaxltl.core.models.ops.array_namespace import is_traced
+from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
+from jaxltl.core.pretty_print import brief
+from jaxltl.core.validation import listed, shown
+from jaxltl.core.validation import numbers as _numbers
+
+Ends = Any  # a number for all parameters, a number for each name, or float[D]
+_TRIALS = 64  # points that are tried for one at which the functions are a model
+
+
+@brief(facts=facts.parametric)
+@struct.dataclass
+class ParametricMDP:
+    """A Markov chain or decision process for each point of a box of parameters.
+
+    Which transitions there are is the same at all points. Made by :func:`make_parametric`, or by
+    ``read_parametric(path).over(low, high)``.
+
+    Attributes:
+      model: the model at `inside`; its graph and labels are those of all.
+      numbers: ``float[D] -> (float[T], {name: float[R]})``, the probabilities and the rewards of
+        choices, a pytree.
+      low, high: ``float64[D]``, the box.
+      inside: ``float64[D]``, a point at which the numbers are as they must be.
+      parameters: the D names, static.
+      exact: ``float64[D] -> SparseMDP`` with the same transitions, each number of which is rounded
+        `roundings` times at most; None where `numbers` are all that is known. Static.
+      roundings: static.
+
+    Example:
+      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
+      >>> biased = make_parametric(coin, lambda x: jnp.array([x[0], 1 - x[0], 1, 1]),
+      ...                          {"heads": 0.1}, {"heads": 0.9})
+      >>> biased.parameters, biased.low.tolist(), biased.high.tolist()
+      (('heads',), [0.1], [0.9])
+    """
+
+    model: Any
+    numbers: Any
+    low: Any
+    high: Any
+    inside: Any
+    parameters: tuple[str, ...] = struct.field(pytree_node=False)
+    exact: Callable[[np.ndarray], SparseMDP] | None = struct.field(pytree_node=False, default=None)
+    roundings: int = struct.field(pytree_node=False, default=0)
+
+    def at(self, values: Mapping[str, float] | chex.Array) -> SparseMDP:
+        """The model at a point, on the host.
+
+        Args:
+          values: ``float[D]``, or a number for each name.
+
+        Raises:
+          ValueError: a parameter is missing, not finite or outside of the box, or what the
+            functions say there is no model with the same transitions.
+        """
+        point = _point("values", values, self.parameters)
+        outside = (point < self.low) | (point > self.high)
+        if outside.any():
+            d = int(np.flatnonzero(outside)[0])
+            raise ValueError(
+                f"{self.parameters[d]} = {point[d]:.9g} is outside of its interval "
+                f"[{self.low[d]:.9g}, {self.high[d]:.9g}]."
+            )
+        return self._at(point)
+
+    def inside_of(self, name: str, points: Any) -> np.ndarray:
+        """Points of the box, ``float64[N, D]``, checked.
+
+        Raises:
+          ValueError: they have another shape, or one of them is outside.
+        """
+        found, names = _numbers(f"{name}s", points), self.parameters
+        if found.ndim != 2 or found.shape[1] != len(names) or not len(found):
+            raise ValueError(
+                f"{name}s has shape {found.shape}; expected (N, {len(names)}), a number "
+                f"for each of {', '.join(names)}."
+            )
+        out = ~((found >= self.low) & (found <= self.high))
+        if out.any():
+            n, d = (int(i) for i in np.argwhere(out)[0])
+            raise ValueError(
+                f"{name} {n} has {names[d]} = {found[n, d]:.9g}; its interval is "
+                f"[{self.low[d]:.9g}, {self.high[d]:.9g}]."
+            )
+        return found
+
+    def _at(self, point: np.ndarray) -> SparseMDP:
+        if self.exact is None:
+            return _evaluated(self.model, self.numbers, point)
+        return self.exact(point)
+
+    def within(self, low: Ends, high: Ends) -> ParametricMDP:
+        """The same over a smaller box.
+
+        Args:
+          low, high: as for :func:`make_parametric`.
+
+        Raises:
+          ValueError: the box is none, or reaches out of the other.
+        """
+        low, high = box_of(low, high, self.parameters)
+        out = (low < self.low) | (high > self.high)
+        if out.any():
+            d = int(np.flatnonzero(out)[0])
+            raise ValueError(
+                f"the interval [{low[d]:.9g}, {high[d]:.9g}] of {self.parameters[d]} is not within "
+                f"[{self.low[d]:.9g}, {self.high[d]:.9g}]."
+            )
+        inside, model = point_inside(low, high, self._at)
+        return replace(self, low=low, high=high, inside=inside, model=model)
+
+
+def make_parametric(
+    model: SparseMDP,
+    numbers: Callable[[jax.Array], Any],
+    low: Ends,
+    high: Ends,
+    *,
+    parameters: Sequence[str] | None = None,
+) -> ParametricMDP:
+    """A checked :class:`ParametricMDP` from a JAX function.
+
+    Args:
+      model: any model with the transitions, labels and rewards that all have; the numbers of
+        transitions are those of its entries.
+      numbers: ``float[D] -> float[T]``, the probabilities, or a pair of them and of a dict of
+        rewards by name, on states ``[S]`` or choices ``[R]``. Names that it leaves out are
+        constant. Give arrays that it needs by ``jax.tree_util.Partial(function, *arrays)``.
+      low, high: ``float[D]``, one number for all, or a number for each name: keep the box away
+        from where a probability becomes zero.
+      parameters: the names; default those of `low`, else p0, p1 and so on.
+
+    Returns:
+      :class:`ParametricMDP`.
+
+    Raises:
+      ValueError: the box is none, names are missing, or the function returns other shapes, or in
+        the box no probabilities of these transitions.
+
+    Example:
+      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
+      >>> biased = make_parametric(coin, lambda x: jnp.array([x[0], 1 - x[0], 1, 1]), [0.1], [0.9])
+      >>> biased.at({"p0": 0.25}).probability.tolist()
+      [0.25, 0.75, 1.0, 1.0]
+    """
+    if is_traced((model, low, high)):
+        raise ValueError("make_parametric reads its model: call it before jit.")
+    if not isinstance(model, SparseMDP):
+        raise ValueError(
+            f"{type(model).__name__} has no entries whose probabilities could be "
+            "functions; give a SparseMDP (to_sparse makes one; of an interval model, "
+            "its nominal one)."
+        )
+    if not callable(numbers):
+        raise ValueError(f"numbers is {shown(numbers)}; give a function of float[D].")
+    if parameters is None:
+        parameters = (
+            tuple(low)
+            if isinstance(low, Mapping)
+            else tuple(f"p{d}" for d in range(max(np.size(low), np.size(high))))
+        )
+    names = tuple(listed("parameters", parameters))
+    if not all(isinstance(x, str) for x in names) or len(set(names)) < len(names):
+        raise ValueError(f"parameters are {shown(names)}; name each once.")
+    low, high = box_of(low, high, names)
+    numbers = numbers if isinstance(numbers, Partial) else Partial(numbers)
+    numbers = Partial(_paired, numbers, model.host.state)
+    model = replace(model, valuation={})
+    _check_shapes(numbers, model, len(names))
+    inside, found = point_inside(low, high, lambda x: _evaluated(model, numbers, x))
+    return ParametricMDP(found, numbers, low, high, inside, names)
+
+
+def _paired(numbers: Any, state: Any, x: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """Probabilities, and rewards of choices."""
+    found = numbers(x)
+    probability, rewards = found if isinstance(found, tuple) else (found, {})
+    size = state.shape[0]
+    return jnp.asarray(probability), {
+        name: jnp.asarray(r) if jnp.shape(r) == (size,) else jnp.asarray(r)[state]
+        for name, r in rewards.items()
+    }
+
+
+def _check_shapes(numbers: Any, model: SparseMDP, num_parameters: int) -> None:
+    x = jax.ShapeDtypeStruct((num_parameters,), jnp.zeros(()).dtype)
+    probability, rewards = jax.eval_shape(numbers, x)
+    shapes = {
+        "probabilities": (probability.shape, (model.num_transitions,)),
+        **{f"reward {n!r}": (r.shape, (model.num_rows,)) for n, r in rewards.items()},
+    }
+    for name, (shape, expected) in shapes.items():
+        if shape != expected:
+            raise ValueError(f"{name} of numbers have shape {shape}; expected {expected}.")
+
+
+@jax.jit
+def _evaluate(numbers: Any, x: jax.Array) -> Any:
+    return numbers(x)
+
+
+def _evaluated(model: SparseMDP, numbers: Any, point: np.ndarray) -> SparseMDP:
+    """The model whose numbers a function says, checked."""
+    found = _evaluate(numbers, np.asarray(point, jnp.zeros(()).dtype))
+    probability, rewards = jax.tree.map(lambda x: np.asarray(x, np.float64), found)
+    host = model.host
+    wrong = ~(probability > 0)  # NaN too
+    if wrong.any():
+        e = int(np.flatnonzero(wrong)[0])
+        raise ValueError(
+            f"the probability from state {host.state[host.row[e]]} to state {host.successor[e]} "
+            f"is {probability[e]:.6g}; it must be positive."
+        )
+    structures = {**model.rewards, **{n: Rewards(choice=r) for n, r in rewards.items()}}
+    return make_sparse(
+        model.row_start,
+        model.entry_start,
+        model.successor,
+        probability,
+        initial=model.initial,
+        label=model.label,
+        propositions=model.propositions,
+        rewards=structures,
+        action=model.action,
+        action_names=model.action_names,
+    )
+
+
+def point_inside(
+    low: np.ndarray, high: np.ndarray, model_at: Callable[[np.ndarray], SparseMDP]
+) -> tuple[np.ndarray, SparseMDP]:
+    """A point of a box at which functions are a model, and the model.
+
+    Args:
+      low, high: ``float64[D]``.
+      model_at: the model at a point; ValueError where there is none.
+
+    Raises:
+      ValueError: there is none at any of some points, with what is wrong at the first.
+    """
+    # Multiples of irrational numbers, all different: no function is zero there by accident.
+    step = np.modf(np.sqrt(np.arange(low.size) + 2.0))[0]
+    first = ""
+    for trial in range(_TRIALS):
+        share = 0.5 + 0.01 * (step - 0.5) if trial == 0 else np.modf(trial * (step + 0.618))[0]
+        point = np.clip(low + share * (high - low), low, high)
+        try:
+            return point, model_at(point)
+        except ValueError as error:
+            first = first or f"at {point.round(6).tolist()}: {error}"
+    raise ValueError(f"the functions are no model at any of {_TRIALS} points of the box; {first}")
+
+
+def box_of(low: Ends, high: Ends, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+    """The checked ends of a box, ``float64[D]`` both.
+
+    Raises:
+      ValueError: a name is missing or unknown, or the ends are not finite or cross.
+    """
+    ends = [_point(of, x, names) for of, x in (("low", low), ("high", high))]
+    crossed = ~(ends[0] < ends[1])
+    if crossed.any():
+        d = int(np.flatnonzero(crossed)[0])
+        raise ValueError(
+            f"the interval of {names[d]} is [{ends[0][d]:.9g}, {ends[1][d]:.9g}]; "
+            "low must be below high."
+        )
+    return ends[0], ends[1]
+
+
+def _point(of: str, values: Any, names: Sequence[str]) -> np.ndarray:
+    """A number for each name, ``float64[D]``."""
+    if isinstance(values, Mapping):
+        if set(values) != set(names):
+            missing = sorted(set(names) - set(values)) or sorted(set(values) - set(names))
+            word = "missing" if set(names) - set(values) else "unknown"
+            raise ValueError(
+                f"{of}: {', '.join(missing)} {'is' if len(missing) == 1 else 'are'} "
+                f"{word}; the parameters are {', '.join(names)}."
+            )
+        values = [values[name] for name in names]
+    found = _numbers(of, values)
+    if found.ndim == 0 and of != "values":
+        found = np.full(len(names), found)
+    if found.shape != (len(names),):
+        raise ValueError(
+            f"{of} has shape {found.shape}; expected ({len(names)},), a number for "
+            f"each of {', '.join(names)}."
+        )
+    if not np.isfinite(found).all():
+        d = int(np.flatnonzero(~np.isfinite(found))[0])
+        raise ValueError(f"{of} of {names[d]} is {found[d]}; give a finite number.")
+    return found

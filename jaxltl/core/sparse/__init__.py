@@ -1,0 +1,1 @@
+"""Certified solvers on sparse rows of concrete arrays, by NumPy and SciPy."""

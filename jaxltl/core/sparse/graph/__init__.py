@@ -1,0 +1,1 @@
+"""Graph algorithms on sparse rows: components, attractors, qualitative preprocessing."""

@@ -1,0 +1,59 @@
+"""Where runs beside an automaton are accepted almost surely: end components of sparse rows."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxltl.core.array_types import Booleans, Integers
+from jaxltl.core.sparse.graph.qualitative import end_components, towards
+from jaxltl.core.sparse.mdp import HostMDP
+
+
+class AcceptingRegion(NamedTuple):
+    """The states of end components whose least priority can be even for ever.
+
+    Attributes:
+      region: ``bool[S]``.
+      row: ``int32[S]``, in the region the row of a policy by which almost every run is accepted;
+        elsewhere a state's first.
+    """
+
+    region: Booleans
+    row: Integers
+
+
+def accepting_region(mdp: HostMDP, priority: Integers) -> AcceptingRegion:
+    """Where the least priority that is read for ever can be even.
+
+    For each even p: the maximal end components of the rows that read no priority below p, with a
+    row that reads p (Baier and Katoen 2008, section 10.6.4, for Rabin pairs). A run is accepted
+    with the largest probability of reaching them.
+
+    Args:
+      mdp: the product.
+      priority: ``int[T]``, what each entry reads.
+
+    Example:
+      >>> from jaxltl import make_sparse
+      >>> ring = make_sparse(None, [0, 1, 2, 3], [1, 0, 2], [1.0, 1.0, 1.0]).host
+      >>> accepting_region(ring, np.array([1, 0, 1])).region.tolist()
+      [True, True, False]
+    """
+    least = np.minimum.reduceat(priority, mdp.entry_start[:-1])
+    region = np.zeros(mdp.num_states, bool)
+    row = mdp.row_start[:-1].astype(np.int32)
+    for p in np.unique(least[least % 2 == 0]):
+        allowed = (least >= p) & ~region[mdp.state]
+        components = end_components(mdp, rows=allowed)
+        hit = components.inside & (least == p)
+        wins = np.zeros(mdp.num_states, bool)
+        wins[components.component[mdp.state[hit]]] = True
+        new = wins[components.component] & components.region(mdp)
+        inside = components.inside & new[mdp.state]
+        some, first = mdp.first_choice(hit)
+        taken = np.where(some, first, towards(mdp, some, inside))
+        region |= new
+        row = np.where(new, taken, row)
+    return AcceptingRegion(region, row.astype(np.int32))

@@ -1,0 +1,299 @@
+"""Sets of pairs of a world's state and a memory, as one word of bits for each state.
+
+What is asked of the graph of a product is then asked of all memories at once: who leads to a set is
+the union of its successors' words. Sweeps go through blocks of states, and each reads what those
+before it found.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxltl.core.array_types import Booleans, Integers
+
+LARGEST = 64  # memories that a word has room for
+_BLOCK = 2**15  # states of a block
+_SWEEPS = 400  # after which a search is given up
+
+Words = NDArray[np.unsignedinteger[Any]]
+
+
+@dataclass(frozen=True)
+class BitGraph:
+    """The graph of a world beside a memory, read where a state is entered.
+
+    Attributes:
+      columns: for each action and successor ``int32[S]``; S where there is none.
+      permitted: for each action the memories in which it may be taken, ``word[S]``.
+      after: ``word[L * 256]`` for each eight bits of a word: the memories from which a letter leads
+        to one of these.
+      letter: ``int64[S]``, 256 times the letter that each state shows.
+      full: all memories.
+    """
+
+    columns: list[list[Integers]]
+    permitted: list[Words]
+    after: list[Words]
+    letter: Integers
+    full: Any
+
+    @property
+    def num_states(self) -> int:
+        return self.letter.size
+
+    @property
+    def nothing(self) -> Words:
+        """The empty set."""
+        return np.zeros(self.num_states, self.permitted[0].dtype)
+
+    def read(self, words: Words, part: Any) -> Words:
+        """The memories in which entering a state of a block leads to a pair of a set."""
+        letter = self.letter[part]
+        found: Any = self.after[0][letter + (words & 255).astype(np.int64)]
+        for i, table in enumerate(self.after[1:], 1):
+            found |= table[letter + (words >> (8 * i) & 255).astype(np.int64)]
+        return found
+
+    def seen(self, words: Words) -> Words:
+        """The same of all states, with the empty set for none."""
+        found = np.zeros(self.num_states + 1, words.dtype)
+        found[:-1] = self.read(words, slice(None))
+        return found
+
+    def hits(self, action: int, seen: Words, part: Any) -> Words:
+        """The memories of some states in which an action may lead to a set."""
+        first, *others = self.columns[action]
+        found = seen[first[part]]
+        for column in others:
+            found |= seen[column[part]]
+        return found
+
+    def grow(
+        self,
+        goal: Words,
+        among: Words,
+        *,
+        forced: bool,
+        kept: list[Words] | None = None,
+        action: Integers | None = None,
+    ) -> Words | None:
+        """The least set with a goal to which some action may lead, or else every one.
+
+        Args:
+          goal: ``word[S]``.
+          among: ``word[S]``, what may join.
+          forced: whether every action must, else some.
+          kept: for each action where it counts; default where it is permitted.
+          action: ``int[S, Q]``, filled with an action by which each that joins may come nearer.
+
+        Returns:
+          ``word[S]``; None if that takes too many sweeps.
+        """
+        region, kept = goal.copy(), self.permitted if kept is None else kept
+        seen = self.seen(region)
+        for _ in range(_SWEEPS):
+            grown = False
+            for a in range(0, self.num_states, _BLOCK):
+                block = slice(a, min(a + _BLOCK, self.num_states))
+                open_ = among[block] & ~region[block]
+                part: Any = block
+                if np.count_nonzero(open_) * 2 < open_.size:
+                    part = np.flatnonzero(open_)
+                    if not part.size:
+                        continue
+                    open_, part = open_[part], part + a
+                new = self._joining(open_, part, seen, forced, kept, action)
+                if new.any():
+                    region[part] |= new
+                    seen[part] = self.read(region[part], part)
+                    grown = True
+            if not grown:
+                return region
+        return None
+
+    def _joining(
+        self,
+        open_: Words,
+        part: Any,
+        seen: Words,
+        forced: bool,
+        kept: list[Words],
+        action: Integers | None,
+    ) -> Words:
+        found = open_.copy() if forced else np.zeros_like(open_)
+        for a in range(len(self.columns)):
+            hit = self.hits(a, seen, part)
+            if forced:
+                found &= hit | ~kept[a][part]
+                continue
+            hit &= kept[a][part] & open_
+            if action is not None:
+                _note(action, part, hit & ~found, a)
+            found |= hit
+        return found
+
+    def only(self, words: Words) -> list[Words]:
+        """For each action where it is permitted and surely leads to a set."""
+        seen = self.seen(self.full & ~words)
+        return [x & ~self.hits(a, seen, slice(None)) for a, x in enumerate(self.permitted)]
+
+
+def _note(action: Integers, part: Any, words: Words, number: int) -> None:
+    """Writes a number where bits are set."""
+    state = np.flatnonzero(words)
+    if not state.size:
+        return
+    where = np.arange(action.shape[0])[part][state] if isinstance(part, slice) else part[state]
+    for q in range(action.shape[1]):
+        action[where[(words[state] >> q & 1).astype(bool)], q] = number
+
+
+def _first(action: Integers, words: Words, kept: list[Words]) -> None:
+    """Writes the first action that counts; the array has its zeros where that is the first one."""
+    left = words & ~kept[0]
+    for a in range(1, len(kept)):
+        _note(action, slice(None), left & kept[a], a)
+        left &= ~kept[a]
+
+
+def pack(mask: Booleans) -> Words:
+    """Words of bits, the q-th of which is ``mask[..., q]``.
+
+    >>> pack(np.array([[True, False, True]])).tolist()
+    [5]
+    """
+    size = mask.shape[-1]
+    kind: Any = next(
+        k for k in (np.uint8, np.uint16, np.uint32, np.uint64) if np.iinfo(k).bits >= size
+    )
+    words = np.zeros(mask.shape[:-1], kind)
+    for q in range(size):
+        words |= mask[..., q].astype(kind) << kind(q)
+    return words
+
+
+def bit_graph(
+    successor: Integers,
+    used: Booleans,
+    available: Booleans,
+    delta: Integers,
+    letter: Integers,
+    allowed: Booleans | None = None,
+) -> BitGraph:
+    """The graph of a world beside an automaton of 64 states at most.
+
+    Args:
+      successor: ``int[S, A, K]``.
+      used: ``bool[S, A, K]``.
+      available: ``bool[S, A]``.
+      delta: ``int[Q, L]``.
+      letter: ``int[S]``.
+      allowed: ``bool[S, Q, A]``, or None for all.
+    """
+    num_states, num_actions, width = successor.shape
+    num_memory = delta.shape[0]
+    every = used.all()
+    columns = [
+        [
+            np.ascontiguousarray(successor[:, a, k])
+            if every
+            else np.where(used[:, a, k], successor[:, a, k], num_states)
+            for k in range(width)
+        ]
+        for a in range(num_actions)
+    ]
+    full = pack(np.ones(num_memory, bool))
+    permitted = [
+        np.where(available[:, a], full if allowed is None else pack(allowed[:, :, a]), 0).astype(
+            full.dtype
+        )
+        for a in range(num_actions)
+    ]
+    after = []
+    byte = np.arange(256)
+    for first in range(0, num_memory, 8):
+        place = delta - first  # [Q, L]
+        inside = (place >= 0) & (place < 8)
+        leads = inside[None] & (byte[:, None, None] >> np.clip(place, 0, 7) & 1).astype(bool)
+        after.append(pack(leads.transpose(2, 0, 1)).ravel())
+    return BitGraph(columns, permitted, after, letter.astype(np.int64) * 256, full)
+
+
+class BitSets(NamedTuple):
+    """What the graph decides of an optimum.
+
+    Attributes:
+      one, zero: ``word[S]``, where the probability is 1 and where it is 0.
+      stays: ``word[S]``, what is left and can be kept for ever: where end components are.
+      action: ``int32[S, Q]``, actions that attain what is decided.
+    """
+
+    one: Words
+    zero: Words
+    stays: Words
+    action: Integers
+
+
+def decided(graph: BitGraph, target: Words, num_memory: int, *, maximize: bool) -> BitSets | None:
+    """Where the largest or least probability of reaching a target is 1 or 0.
+
+    Returns:
+      None if the graph is too deep for sweeps.
+    """
+    everything = graph.full | graph.nothing
+    action = np.zeros((graph.num_states, num_memory), np.int32)
+    before = everything & ~target
+    _first(action, everything, graph.permitted)
+    found = (_largest if maximize else _smallest)(graph, target, before, action)
+    if found is None:
+        return None
+    one, zero = found
+    left = everything & ~(one | zero)
+    out = graph.grow(everything & ~left, left, forced=True) if maximize else everything
+    return None if out is None else BitSets(one, zero, everything & ~out, action)
+
+
+def _largest(
+    graph: BitGraph, target: Words, before: Words, action: Integers
+) -> tuple[Words, Words] | None:
+    some = graph.grow(target, before, forced=False)
+    if some is None:
+        return None
+    everything = graph.full | graph.nothing
+    outside = everything & ~some
+    while True:
+        # First all that are forced out, then what cannot reach the target inside.
+        grown = graph.grow(outside, before, forced=True)
+        if grown is None:
+            return None
+        kept = graph.only(everything & ~grown)
+        among = before & ~grown
+        found = graph.grow(target, among, forced=False, kept=kept) if among.any() else target
+        if found is None:
+            return None
+        if (found == everything & ~grown).all():
+            break
+        outside = everything & ~found
+    if among.any():
+        graph.grow(target, among, forced=False, kept=kept, action=action)
+    return found, everything & ~some
+
+
+def _smallest(
+    graph: BitGraph, target: Words, before: Words, action: Integers
+) -> tuple[Words, Words] | None:
+    everything = graph.full | graph.nothing
+    grown = graph.grow(target, before, forced=True)
+    if grown is None:
+        return None
+    zero = everything & ~grown
+    doomed = graph.grow(zero, before, forced=False)
+    if doomed is None:
+        return None
+    kept = graph.only(zero)
+    _first(action, zero, kept)
+    return everything & ~doomed, zero

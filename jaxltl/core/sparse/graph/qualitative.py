@@ -1,0 +1,298 @@
+"""What the graph of sparse rows decides: who can get where, who must, and end components."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxltl.core.array_types import Booleans, Integers
+from jaxltl.core.sparse.graph.components import strong_components
+from jaxltl.core.sparse.mdp import HostMDP
+from jaxltl.core.sparse.rows import LARGE, changes, count_down, distinct, spans
+
+_FEW = 24  # states of a frontier up to which Python's own loop beats NumPy's overhead
+_MANY = 64  # transitions into one of them from which it does not
+
+
+def reaching(mdp: HostMDP, goal: Booleans, rows: Booleans | None = None) -> Booleans:
+    """The states from which some path leads to a goal: where its largest probability is positive.
+
+    Args:
+      mdp: the model.
+      goal: ``bool[S]``.
+      rows: ``bool[R]``, the rows that may be taken; default all.
+
+    Returns:
+      ``bool[S]``.
+    """
+    start, row = mdp.predecessors
+    source = mdp.state[row]
+    if rows is not None:
+        kept = rows[row]
+        source = source[kept]
+        start = np.concatenate([[0], kept.cumsum()])[start]
+    return searched(start, source, goal)
+
+
+def searched(start: Integers, after: Integers, first: Booleans) -> Booleans:
+    """All nodes that a search from some nodes meets; node i leads to ``after[start[i] : ...]``."""
+    seen = first.copy()
+    frontier = np.flatnonzero(first)
+    if after.size > LARGE // 4:
+        from scipy import sparse
+        from scipy.sparse import csgraph
+
+        # One search from a node of its own that leads to all where it starts.
+        size = first.size + 1
+        starts = np.append(start, start[-1] + frontier.size)
+        targets = np.concatenate([after, frontier.astype(after.dtype)])
+        graph = sparse.csr_array((np.ones(targets.size), targets, starts), shape=(size, size))
+        order = csgraph.breadth_first_order(graph, first.size, return_predecessors=False)
+        seen[order[1:]] = True
+        return seen
+    while frontier.size:
+        new = after[spans(start[frontier], start[frontier + 1] - start[frontier])]
+        seen_new = np.zeros(first.size, bool)
+        seen_new[new] = True
+        seen_new &= ~seen
+        seen |= seen_new
+        frontier = np.flatnonzero(seen_new)
+    return seen
+
+
+def forced(
+    mdp: HostMDP, goal: Booleans, rows: Booleans | None = None, among: Booleans | None = None
+) -> Booleans:
+    """The states whose every row may lead on to a goal: its least probability is positive.
+
+    The least set with the goal and with all states each of whose rows has a successor in it. From
+    the other states some rows lead never to the goal, whatever happens.
+
+    Args:
+      mdp: the model.
+      goal: ``bool[S]``.
+      rows: ``bool[R]``, the rows that count; a state without any joins. Default all.
+      among: ``bool[S]``, the states that may join; default all.
+
+    Returns:
+      ``bool[S]``.
+    """
+    if mdp.is_chain and rows is None and among is None:
+        return reaching(mdp, goal)
+    counts = np.diff(mdp.row_start)
+    waiting = np.ones(mdp.num_rows, bool)
+    left = counts.astype(np.int32)
+    if rows is not None:
+        waiting = rows.copy()
+        left = np.bincount(mdp.state[rows], minlength=mdp.num_states).astype(np.int32)
+    open_ = ~goal if among is None else among & ~goal
+    region = goal | (open_ & (left == 0))
+    open_ = open_ & ~region
+    search = _Forced(mdp, waiting, left, open_, region)
+    frontier: Integers = np.flatnonzero(region)
+    start = mdp.predecessors[0]
+    while frontier.size:
+        few = frontier.size <= _FEW and (start[frontier + 1] - start[frontier]).max() <= _MANY
+        frontier = search.few(frontier) if few else search.many(frontier)
+    return region
+
+
+class _Forced(NamedTuple):
+    """A growing region; `left` counts the rows of a state that do not lead there yet."""
+
+    mdp: HostMDP
+    waiting: Booleans
+    left: Integers
+    open: Booleans
+    region: Booleans
+
+    def many(self, frontier: Integers) -> Integers:
+        """The states that join after a frontier."""
+        start, pred = self.mdp.predecessors
+        row = pred[spans(start[frontier], start[frontier + 1] - start[frontier])]
+        row = row[self.waiting[row]]
+        if not row.size:
+            return row
+        row = distinct(row, self.mdp.num_rows)
+        self.waiting[row] = False
+        state = self.mdp.state[row]
+        count_down(self.left, state)
+        state = state[(self.left[state] == 0) & self.open[state]]
+        self.open[state], self.region[state] = False, True
+        # Rows are in order, so one state's stand together.
+        return state[changes(state)]
+
+    def few(self, frontier: Integers) -> Integers:
+        """The same by plain loops, while few states join at a time, as along a chain."""
+        arrays: tuple[Any, ...] = (
+            *self.mdp.predecessors,
+            self.mdp.state,
+            self.waiting,
+            self.left,
+            self.open,
+            self.region,
+        )
+        start, pred, owner, waiting, left, open_, region = (memoryview(x) for x in arrays)
+        todo = frontier.tolist()
+        while todo and len(todo) <= _FEW:
+            new: list[int] = []
+            for target in todo:
+                first, last = start[target], start[target + 1]
+                if last - first > _MANY:
+                    return np.array(new + todo)  # rows that were counted do not wait any more
+                for row in pred[first:last]:
+                    if waiting[row]:
+                        waiting[row] = False
+                        state = owner[row]
+                        left[state] -= 1
+                        if not left[state] and open_[state]:
+                            open_[state], region[state] = False, True
+                            new.append(state)
+            todo = new
+        return np.array(todo, np.int64)
+
+
+def surely_reaching(
+    mdp: HostMDP, goal: Booleans, rows: Booleans | None = None
+) -> tuple[Booleans, Booleans]:
+    """The states from which some policy reaches a goal almost surely, and the rows it may take.
+
+    Args:
+      mdp: the model.
+      goal: ``bool[S]``.
+      rows: ``bool[R]``, the rows that may be taken; default all.
+
+    Returns:
+      ``bool[S]``, and ``bool[R]``, the rows of these states that never leave them.
+    """
+    kept = np.ones(mdp.num_rows, bool) if rows is None else rows.copy()
+    inside = reaching(mdp, goal, rows)
+    while True:
+        outside = ~inside
+        leaving = mdp.support.lead_to(outside)
+        kept &= ~leaving & inside[mdp.state]
+        found = reaching(mdp, goal & inside, kept)
+        if (found == inside).all():
+            return inside, kept
+        inside = found
+
+
+def towards(mdp: HostMDP, goal: Booleans, rows: Booleans) -> Integers:
+    """A row by which each state may come nearer to a goal, among some rows: ``int32[S]``.
+
+    The first row of states at the goal, and of those that cannot get there.
+    """
+    first = mdp.row_start[:-1].astype(np.int32)
+    if not (rows & ~goal[mdp.state]).any():
+        return first
+    nearer = _next_on_the_way(mdp, goal, rows)
+    entry = np.flatnonzero(rows[mdp.row] & (nearer[mdp.state[mdp.row]] == mdp.successor))
+    row = mdp.row[entry][::-1]
+    first[mdp.state[row]] = row  # the first one is written last
+    return first
+
+
+def _next_on_the_way(mdp: HostMDP, goal: Booleans, rows: Booleans) -> Integers:
+    """The next state on a shortest path to a goal, ``int[S]``; -1 at it and where there is none."""
+    from scipy.sparse import csgraph, csr_array
+
+    start, row = mdp.predecessors
+    kept = rows[row]
+    last = np.flatnonzero(goal)
+    # One search backwards, from a node of its own that leads to every goal.
+    index = np.concatenate([[0], kept.cumsum()])[start]
+    edges = np.concatenate([mdp.state[row[kept]], last])
+    size = mdp.num_states + 1
+    graph: Any = csr_array(
+        (np.ones(edges.size), edges, np.append(index, edges.size)), shape=(size, size)
+    )
+    _, before = csgraph.breadth_first_order(graph, size - 1, return_predecessors=True)
+    before = before[:-1]
+    return np.where((before < 0) | (before == size - 1), -1, before)
+
+
+class Components(NamedTuple):
+    """Maximal end components.
+
+    Attributes:
+      component: ``int64[S]``, the least state of a state's end component; its own elsewhere.
+      inside: ``bool[R]``, the rows of end components that stay in them.
+    """
+
+    component: Integers
+    inside: Booleans
+
+    def region(self, mdp: HostMDP) -> Booleans:
+        """``bool[S]``, the states of end components."""
+        found = np.zeros(mdp.num_states, bool)
+        found[mdp.state[self.inside]] = True
+        return found
+
+
+def end_components(
+    mdp: HostMDP, states: Booleans | None = None, rows: Booleans | None = None
+) -> Components:
+    """The maximal end components of some states and rows (Baier and Katoen 2008, section 10.6.3).
+
+    States that cannot stay are taken away first, so that components are looked for among few.
+    Rows that stand still belong to them and hold nothing together: they come last, else each state
+    at the rim of what does not stay would be taken away in a round of its own.
+
+    Args:
+      mdp: the model.
+      states: ``bool[S]``; default all.
+      rows: ``bool[R]``; default all.
+    """
+    kept = np.ones(mdp.num_rows, bool) if rows is None else rows.copy()
+    if states is not None:
+        kept &= states[mdp.state]
+    still = kept & mdp.standing
+    found = _moving_components(mdp, kept & ~still)
+    return found._replace(inside=found.inside | still)
+
+
+def _moving_components(mdp: HostMDP, kept: Booleans) -> Components:
+    """Those of some rows."""
+    component = np.arange(mdp.num_states)
+    inside = np.zeros(mdp.num_rows, bool)
+    while True:
+        candidates = np.zeros(mdp.num_states, bool)
+        candidates[mdp.state[kept]] = True
+        candidates &= ~forced(mdp, ~candidates, kept)
+        row = np.flatnonzero(kept & candidates[mdp.state])
+        if not row.size:
+            return Components(component, inside)
+        count = mdp.entry_start[row + 1] - mdp.entry_start[row]
+        entry = spans(mdp.entry_start[row], count)
+        of, target = np.repeat(np.arange(row.size), count), mdp.successor[entry]
+        leaves = np.bincount(of[~candidates[target]], minlength=row.size) > 0
+        label = _labels(mdp.state[row], of, target, leaves, candidates)
+        crossing = leaves.copy()
+        crossing[of[label[target] != label[mdp.state[row]][of]]] = True
+        final = _untouched(mdp.state[row], crossing, leaves, label)
+        inside[row[final]] = True
+        component[mdp.state[row[final]]] = label[mdp.state[row[final]]]
+        kept = np.zeros(mdp.num_rows, bool)
+        kept[row[~crossing & ~final]] = True
+
+
+def _labels(
+    state: Integers, of: Integers, target: Integers, leaves: Booleans, candidates: Booleans
+) -> Integers:
+    """The least state of each candidate's strongly connected component; -1 elsewhere."""
+    node = np.flatnonzero(candidates)
+    number = np.full(candidates.size, -1)
+    number[node] = np.arange(node.size)
+    stays = ~leaves[of]
+    found = strong_components(number[state[of[stays]]], number[target[stays]], node.size)
+    label: Any = np.full(candidates.size, -1)
+    label[node] = node[found]
+    return label
+
+
+def _untouched(state: Integers, crossing: Booleans, leaves: Booleans, label: Integers) -> Booleans:
+    """The rows of components that no further row was taken from, which are end components."""
+    touched = np.zeros(label.size, bool)
+    touched[label[state[crossing & ~leaves]]] = True
+    return ~crossing & ~touched[label[state]]

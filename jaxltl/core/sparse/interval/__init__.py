@@ -1,0 +1,1 @@
+"""Interval MDPs: uncertainty sets of rows, and the solvers on them."""

@@ -1,0 +1,1 @@
+"""Linear systems of policies: elimination, Gauss-Seidel, refinement, exact fractions."""

@@ -1,0 +1,375 @@
+"""Systems ``(I - P) x = b`` of policies that leave, solved by sparse elimination where it pays.
+
+Unknowns are ordered by strongly connected component, and in each by Cuthill and McKee (1969), so
+that elimination fills these, and what leads from one to another. Where that would be much, large
+components are eliminated one after the other, and nothing between them fills. Where a component
+itself would (graphs that mix well), Krylov steps and sweeps converge. What fills is counted before.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxltl.core.array_types import Floats, Integers
+
+_SMALL = 3000  # states of a component up to which it may be filled
+_LARGE = 3000  # states of a component from which
+_SEVERAL = 1.5  # mean number of successors, fewer of which are nearly trees and fill little,
+_NARROW = 40  # and mean bandwidth beyond which it fills less to begin with those of least degree
+_SPREAD = 8  # how many times its mean bandwidth a larger one must have states
+_MOST = 2**28  # entries that may be filled, 12 bytes each
+_MOST_BETWEEN = 10**7  # of these, between components that are eliminated together
+_APART = 500  # states from which a component is eliminated alone, if they are not
+_LAST = 8000  # states up to which it is eliminated, however it fills, where sweeps fail
+_WORK = 1e11  # multiplications of a band from which Krylov steps come first,
+_MANY = 2  # if there are more successors than these in the mean
+_SAMPLED = 64  # rows in which what fills is counted where its bound is too large
+_PANEL = 2  # columns that are eliminated at once: each wants room for a full one
+_FILL = 4  # growth of the fill after which the order is sought anew
+_AGAIN = 8  # times, at most,
+_KRYLOV = 500  # steps of a Krylov method where elimination would fill
+_SWEEPS = 20_000  # and sweeps after it
+_ROUNDED = 4 * float(np.finfo(np.float64).eps)  # of the solution, which may be left of it
+_LEFT = 1e-14  # largest residual of what they find, as a share of the right side
+
+
+class _Block(NamedTuple):
+    """Some components, which lead to no block behind.
+
+    Attributes:
+      order: ``int[B]``, the states in the order of elimination; ascending where they are swept.
+      inner: ``float64[B, B]``, the policy's matrix on these.
+      outer: ``float64[B, M]``, on the blocks before; None where there are none.
+      factor: of SuperLU; None where it is swept.
+      fill: entries of the first factors in this order.
+      sparing: whether those of least degree go first, wherever that may help.
+    """
+
+    order: Integers
+    inner: Any
+    outer: Any
+    factor: Any
+    fill: int
+    sparing: bool = False
+
+
+class Factors(NamedTuple):
+    """The system of a policy, ready to be solved.
+
+    Attributes:
+      rows: ``float64[R, M]``, all rows, SciPy's.
+      label: ``int[M]``, components in order.
+      blocks: in the order of solution.
+    """
+
+    rows: Any
+    label: Integers
+    blocks: tuple[_Block, ...]
+
+    @property
+    def method(self) -> str:
+        """How it is solved, in words."""
+        swept = {x.factor is None for x in self.blocks}
+        how = {True: "sweeps", False: "elimination"}
+        return "policy iteration by " + " and ".join(how[x] for x in sorted(swept))
+
+    @property
+    def fill(self) -> int:
+        """How many entries the factors had at first."""
+        return sum(x.fill for x in self.blocks)
+
+    def solve(self, b: Floats) -> Floats:
+        """The solution; NaN where it could not be found."""
+        x = np.zeros(b.size)
+        for block in self.blocks:
+            right = b[block.order]
+            if block.outer is not None:
+                right = right + block.outer @ x
+            if not np.isfinite(right).all():
+                return np.full(b.size, np.nan)
+            x[block.order] = (
+                _swept(block.inner, right)
+                if block.factor is None
+                else block.factor.solve(right, trans="T")
+            )
+        return x
+
+    def other(self, chosen: Integers) -> Factors | None:
+        """The same for another policy."""
+        found = []
+        for block in self.blocks:
+            swept = block.factor is None
+            new = _block(
+                self.rows, self.label, block.order, chosen, swept=swept, sparing=block.sparing
+            )
+            if new is None:
+                return None
+            if not swept and (new.factor is None or new.fill > _FILL * block.fill):
+                return factors(self.rows, self.label, chosen)
+            found.append(new._replace(fill=block.fill))
+        return self._replace(blocks=tuple(found))
+
+    def eliminated(self, chosen: Integers) -> Factors | None:
+        """The same of a policy with which sweeps do not come to an end; None if too large."""
+        if not any(x.factor is None for x in self.blocks):
+            return None
+        found, matrix = [], self.rows[chosen]
+        for block in self.blocks:
+            nodes, swept = block.order, block.factor is None
+            if (
+                swept
+                and nodes.size > _LAST
+                and order_of(matrix[nodes][:, nodes], self.label[nodes]) is None
+            ):
+                return None
+            new = _block(self.rows, self.label, nodes, chosen, sparing=swept or block.sparing)
+            if new is None or new.factor is None:
+                return None
+            found.append(new)
+        return self._replace(blocks=tuple(found))
+
+
+def factors(rows: Any, label: Integers, chosen: Integers) -> Factors | None:
+    """The system of a policy.
+
+    Args:
+      rows: ``float64[R, M]``, SciPy's.
+      label: ``int[M]``, numbers of components; no row leads to a greater one.
+      chosen: ``int[M]``, the row of each state.
+
+    Returns:
+      Its factors; None where it is singular.
+    """
+    matrix, size = rows[chosen], np.bincount(label)
+    if min(_between(matrix, label, size)) <= _MOST_BETWEEN:
+        order = order_of(matrix, label, _WORK)
+        one = None if order is None else _block(rows, label, order, chosen)
+        if order is not None and one is None:
+            return None
+        if one is not None and one.factor is not None:
+            return Factors(rows, label, (one,))
+    found = []
+    for nodes in _parts(label, size):
+        order = order_of(matrix[nodes][:, nodes], label[nodes], _WORK)
+        kept = nodes if order is None else nodes[order]
+        block = _block(rows, label, kept, chosen, swept=order is None)
+        if block is None:
+            return None
+        found.append(block)
+    return Factors(rows, label, tuple(found))
+
+
+def _parts(label: Integers, size: Integers) -> list[Integers]:
+    """The states of each large component, and of what stands between two of them."""
+    large = size > _APART
+    begins = large.copy()
+    begins[1:] |= large[:-1]
+    begins[:1] = False
+    part = begins.cumsum()[label]
+    return np.split(np.argsort(part, kind="stable"), np.bincount(part).cumsum()[:-1])
+
+
+def _between(matrix: Any, label: Integers, size: Integers) -> tuple[int, int]:
+    """What may fill between components: if the earlier ones stand first, and if the later ones."""
+    source = np.repeat(label, np.diff(matrix.indptr))
+    target = label[matrix.indices]
+    between = source != target
+    return int(size[target[between]].sum()), int(size[source[between]].sum())
+
+
+def order_of(matrix: Any, label: Integers, work: float = np.inf) -> Integers | None:
+    """By component, and in each one after its neighbours; None where that would not help.
+
+    Args:
+      matrix: ``float64[M, M]``, SciPy's.
+      label: ``int[M]``, the components.
+      work: multiplications, as bands have them, that a component may cost.
+    """
+    from scipy.sparse import csgraph
+
+    size = np.bincount(label)
+    if size.max(initial=0) <= 1:
+        return np.argsort(label, kind="stable")
+    source = np.repeat(np.arange(label.size), np.diff(matrix.indptr))
+    into, out_of = _between(matrix, label, size)
+    within = matrix.copy()
+    within.data[label[source] != label[matrix.indices]] = 0
+    within.eliminate_zeros()
+    both = (within + within.T).tocsr()
+    order = csgraph.reverse_cuthill_mckee(both, symmetric_mode=True)
+    order = order[np.argsort(label[order], kind="stable")]
+    large = size[label] > _SMALL
+    if large.any():
+        place = np.empty(label.size, np.int64)
+        place[order] = np.arange(label.size)
+        source = np.repeat(np.arange(label.size), np.diff(both.indptr))
+        furthest = np.zeros(label.size, np.int64)
+        np.maximum.at(furthest, source, place[source] - place[both.indices])
+        mean = np.bincount(label, furthest) / np.maximum(size, 1)
+        fills = (size * mean**2 > work) & (within.nnz > _MANY * label.size)
+        if ((size > _SMALL) & ((mean * _SPREAD > size) | fills)).any():
+            return None
+    # What leads from one component to another fills, of the two, the one that stands first.
+    return order[::-1] if out_of < into else order
+
+
+def _block(
+    rows: Any,
+    label: Integers,
+    order: Integers,
+    chosen: Integers,
+    *,
+    swept: bool = False,
+    sparing: bool = False,
+) -> _Block | None:
+    """Some states of a policy, factored unless that would fill too much; None if singular."""
+    from scipy.sparse import linalg
+
+    whole = order.size == label.size
+    place = np.full(label.size, -1, np.int32)
+    place[order] = np.arange(order.size, dtype=np.int32)
+    inner, outer = rows[chosen[order]], None
+    if whole:
+        inner.indices = place[inner.indices]
+        inner.has_sorted_indices = False
+    else:
+        outer = inner.copy()
+        outer.data[place[outer.indices] >= 0] = 0
+        outer.eliminate_zeros()
+        inner = inner[:, order]
+    if swept or _too_much(inner, label[order]):
+        return _Block(order, inner, outer, None, 0)
+    # In one large component those of least degree may go first (Liu 1985).
+    most = np.bincount(label[order]).max(initial=0)
+    wide = (
+        most > max(order.size / 2, _LARGE)
+        and inner.nnz > _SEVERAL * order.size
+        and _bandwidth(inner) > _NARROW
+    )
+    try:
+        factor = linalg.splu(
+            _minus(inner).T,
+            permc_spec="MMD_AT_PLUS_A" if sparing or wide else "NATURAL",
+            diag_pivot_thresh=0,
+            relax=1,
+            panel_size=_PANEL,
+            options={"SymmetricMode": True},
+        )
+    except (RuntimeError, MemoryError):
+        return None
+    return _Block(order, inner, outer, factor, int(factor.nnz), sparing)
+
+
+def _bandwidth(matrix: Any) -> float:
+    """How far the first entries of rows and columns stand from the diagonal, in the mean."""
+    size = matrix.shape[0]
+    source = np.repeat(np.arange(size), np.diff(matrix.indptr))
+    left, top = _first_entries(source, matrix.indices, size)
+    return float((2 * np.arange(size) - left - top).mean()) / 2
+
+
+def _first_entries(source: Integers, target: Integers, size: int) -> tuple[Integers, Integers]:
+    """Where the first entry of each row, and of each column, stands; at most at the diagonal."""
+    left, top = np.arange(size), np.arange(size)
+    np.minimum.at(left, source, target.astype(left.dtype))  # of one type, which is far faster
+    np.minimum.at(top, target, source.astype(top.dtype))
+    return left, top
+
+
+def _too_much(matrix: Any, label: Integers) -> bool:
+    """Whether elimination in the order of the states would fill more than there may be.
+
+    Factors fill nothing before the first entry of a row and of a column (George and Liu 1981). In
+    components where that allows too much, rows are counted along the elimination tree.
+
+    Args:
+      matrix: ``float64[B, B]``.
+      label: ``int[B]``, the components, which stand together.
+    """
+    size = label.size
+    if size * (size + 1) <= _MOST:
+        return False
+    source = np.repeat(np.arange(size), np.diff(matrix.indptr))
+    target = matrix.indices
+    between = label[source] != label[target]
+    last = np.zeros(int(label.max(initial=0)) + 1, np.int64)
+    last[label] = np.arange(1, size + 1)
+    first = np.minimum(source[between], target[between])
+    allowed = _MOST - size - int((last[label[first]] - first).sum())
+    source, target = source[~between], target[~between]
+    left, top = _first_entries(source, target, size)
+    if int((2 * np.arange(size) - left - top).sum()) <= allowed:
+        return False
+    return allowed <= 0 or 2 * _counted(source, target, size) > allowed
+
+
+def _counted(source: Integers, target: Integers, size: int) -> float:
+    """About how many entries one factor of a symmetric pattern has, by some of its rows.
+
+    Row i is filled where the elimination tree leads from its entries towards i (Liu 1990).
+    """
+    from scipy import sparse
+
+    low, high = np.minimum(source, target), np.maximum(source, target)
+    kept = low < high
+    pattern = sparse.coo_array(
+        (np.ones(np.count_nonzero(kept), bool), (high[kept], low[kept])), shape=(size, size)
+    ).tocsr()
+    starts, entries = pattern.indptr.tolist(), pattern.indices.tolist()
+    parent, beyond = [-1] * size, [-1] * size
+    for i in range(size):
+        for k in entries[starts[i] : starts[i + 1]]:
+            while k != -1 and k < i:
+                after, beyond[k] = beyond[k], i
+                if after == -1:
+                    parent[k] = i
+                k = after
+    sampled = np.linspace(0, size - 1, min(_SAMPLED, size)).astype(int).tolist()
+    total = 0
+    for i in sampled:
+        seen = {i}
+        for k in entries[starts[i] : starts[i + 1]]:
+            while k not in seen:
+                seen.add(k)
+                k = parent[k]
+        total += len(seen) - 1
+    return total * size / len(sampled)
+
+
+def _minus(matrix: Any) -> Any:
+    from scipy import sparse
+
+    found = (sparse.eye_array(matrix.shape[0], format="csr") - matrix).tocsr()
+    found.sort_indices()
+    return found
+
+
+def _swept(matrix: Any, b: Floats) -> Floats:
+    """By a Krylov method (van der Vorst 1992), and by sweeps as long as what is left shrinks."""
+    from scipy.sparse import linalg
+
+    size = np.abs(b).max(initial=0)
+    system = linalg.LinearOperator(matrix.shape, matvec=lambda x: x - matrix @ x, dtype=float)
+    x, left = np.zeros(b.size), np.array(b)
+
+    def enough() -> bool:
+        # Where x is far larger than b, its own rounding is left.
+        least = max(_LEFT * size, _ROUNDED * float(np.abs(x).max(initial=0)))
+        return bool(np.abs(left).max(initial=0) <= least)
+
+    for _ in range(_AGAIN):  # from what is left, where it stagnates or breaks down
+        more, _ = linalg.bicgstab(system, left, rtol=0, atol=_LEFT * size, maxiter=_KRYLOV)
+        after = left - (more - matrix @ more)
+        if not np.isfinite(more).all() or not np.abs(after).max() < np.abs(left).max():
+            break
+        x, left = x + more, after
+        if enough():
+            return x
+    for _ in range(_SWEEPS):
+        if enough():
+            return x
+        x = x + left
+        left = matrix @ left
+    return np.full(b.size, np.nan)

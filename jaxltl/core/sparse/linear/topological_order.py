@@ -1,0 +1,114 @@
+"""The order in which a system of states can be solved: level by level before and after its circles."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxltl.core.array_types import Booleans, Integers
+from jaxltl.core.sparse.rows import count_down, distinct, spans
+
+_ROUNDS = 16  # levels, and
+_NODES = 64  # so many nodes for a further one, until elimination is faster
+
+
+class Edges(NamedTuple):
+    """A graph: node i leads to ``target[start[i] : start[i + 1]]``, maybe repeatedly."""
+
+    start: Integers
+    target: Integers
+
+    @property
+    def num_nodes(self) -> int:
+        return self.start.size - 1
+
+    def reverse(self) -> Edges:
+        """The graph with its edges turned round."""
+        size = self.num_nodes
+        if self.target.size > 20_000:
+            from scipy import sparse
+
+            ones = np.ones(self.target.size, np.int8)
+            turned = sparse.csr_array((ones, self.target, self.start), shape=(size, size)).tocsc()
+            return Edges(turned.indptr, turned.indices)
+        order = np.argsort(self.target, kind="stable")
+        source = np.repeat(np.arange(size, dtype=np.int32), np.diff(self.start))
+        count = np.bincount(self.target, minlength=size)
+        return Edges(np.concatenate([[0], count.cumsum()]), source[order])
+
+
+class Levels(NamedTuple):
+    """Nodes in an order in which each leads only to earlier ones.
+
+    Attributes:
+      node: ``int[M]``.
+      start: where each level starts in it, and M. Nodes of one level do not lead to each other.
+    """
+
+    node: Integers
+    start: list[int]
+
+
+def peel(back: Edges, number: Integers, among: Booleans) -> Levels:
+    """The nodes that lead, through others of their kind, to nothing that is left.
+
+    Args:
+      back: for each node those that lead to it.
+      number: ``int[N]``, how many edges of a node lead to nodes that are left; counted down.
+      among: ``bool[N]``, the nodes that are left; those that are found are taken away.
+
+    Returns:
+      The nodes by level; not all of them where levels are too narrow to be solved one by one.
+    """
+    found: list[Integers] = []
+    start = [0]
+    frontier: Integers = np.flatnonzero(among & (number == 0))
+    most = _ROUNDS + number.size // _NODES
+    while frontier.size and len(found) < most:
+        found.append(frontier)
+        start.append(start[-1] + frontier.size)
+        among[frontier] = False
+        first = back.start[frontier]
+        source = back.target[spans(first, back.start[frontier + 1] - first)]
+        count_down(number, source)
+        frontier = distinct(source[(number[source] == 0) & among[source]], number.size)
+    none: Any = np.zeros(0, np.int64)
+    return Levels(np.concatenate(found) if found else none, start)
+
+
+def components_in_order(edges: Edges) -> Integers:
+    """Numbers of strongly connected components, ``int[N]``: no edge leads to a greater one."""
+    from scipy import sparse
+    from scipy.sparse import csgraph
+
+    size = edges.num_nodes
+    ones = np.ones(edges.target.size)
+    graph = sparse.csr_array((ones, edges.target.copy(), edges.start), shape=(size, size))
+    graph.sum_duplicates()  # with repeated edges SciPy may not end
+    _, label = csgraph.connected_components(graph, connection="strong")
+    source = np.repeat(np.arange(size), np.diff(graph.indptr))
+    if (label[source] >= label[graph.indices]).all():
+        return label
+    return _sorted(label, label[source], label[graph.indices])
+
+
+def _sorted(label: Integers, source: Integers, target: Integers) -> Integers:
+    """The same components, renumbered from the last ones on (Kahn 1962)."""
+    between = source != target
+    count = int(label.max()) + 1
+    pairs = np.unique(np.stack([source[between], target[between]], -1), axis=0)
+    start = np.concatenate([[0], np.bincount(pairs[:, 0], minlength=count).cumsum()])
+    after = Edges(start, pairs[:, 1])
+    number = np.diff(start)
+    back, order = after.reverse(), np.zeros(count, np.int64)
+    todo, place = np.flatnonzero(number == 0).tolist(), 0
+    while todo:
+        one = todo.pop()
+        order[one] = place
+        place += 1
+        for source_ in back.target[back.start[one] : back.start[one + 1]].tolist():
+            number[source_] -= 1
+            if not number[source_]:
+                todo.append(source_)
+    return order[label]

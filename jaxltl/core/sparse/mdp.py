@@ -1,0 +1,117 @@
+"""A decision process as sparse rows on the host, and reductions over its choices."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxltl.core.array_types import Booleans, Floats, Integers
+from jaxltl.core.pretty_print import brief
+from jaxltl.core.sparse.rows import Rows, spans
+
+
+@brief
+@dataclass(frozen=True)
+class HostMDP:
+    """The transitions of a decision process, without padding, as NumPy arrays.
+
+    The choices of state s are the rows ``row_start[s]`` to ``row_start[s + 1] - 1``, and the
+    successors of row r the entries ``entry_start[r]`` to ``entry_start[r + 1] - 1``.
+
+    Attributes:
+      row_start: ``int32[S + 1]``, strictly ascending: every state has a choice.
+      entry_start: ``int[R + 1]``, strictly ascending.
+      successor: ``int32[T]``, ascending and without repetition within a row.
+      probability: ``float64[T]``, positive; a row sums to one up to rounding.
+    """
+
+    row_start: Integers
+    entry_start: Integers
+    successor: Integers
+    probability: Floats
+
+    @property
+    def num_states(self) -> int:
+        return self.row_start.size - 1
+
+    @property
+    def num_rows(self) -> int:
+        return self.entry_start.size - 1
+
+    @property
+    def num_transitions(self) -> int:
+        return self.successor.size
+
+    @property
+    def is_chain(self) -> bool:
+        """Whether every state has one choice."""
+        return self.num_rows == self.num_states
+
+    @cached_property
+    def state(self) -> Integers:
+        """The state of each row, ``int32[R]``."""
+        if self.is_chain:
+            return np.arange(self.num_states, dtype=np.int32)
+        return np.repeat(np.arange(self.num_states, dtype=np.int32), np.diff(self.row_start))
+
+    @cached_property
+    def row(self) -> Integers:
+        """The row of each entry, ``int32[T]``."""
+        return np.repeat(np.arange(self.num_rows, dtype=np.int32), np.diff(self.entry_start))
+
+    @cached_property
+    def standing(self) -> NDArray[np.bool_]:
+        """Whether a row leads to its own state alone, ``bool[R]``."""
+        found: NDArray[np.bool_] = self.successor[self.entry_start[:-1]] == self.state
+        count = np.diff(self.entry_start)
+        several = np.flatnonzero(found & (count > 1))
+        entry = spans(self.entry_start[several], count[several])
+        of = several.repeat(count[several])
+        found[of[self.successor[entry] != self.state[of]]] = False
+        return found
+
+    @cached_property
+    def predecessors(self) -> tuple[Integers, Integers]:
+        """The rows that lead to state t, one an entry: ``row[start[t] : start[t + 1]]``."""
+        return self.support.predecessors
+
+    @cached_property
+    def support(self) -> Rows:
+        """Which states a row leads to."""
+        return Rows(self.entry_start, self.successor, self.num_states)
+
+    @cached_property
+    def matrix(self) -> Any:
+        """The transition matrix, SciPy's sparse ``float64[R, S]``."""
+        from scipy import sparse  # a tenth of a second that only those need who multiply
+
+        arrays = self.probability, self.successor, self.entry_start
+        return sparse.csr_array(arrays, shape=(self.num_rows, self.num_states))
+
+    def expectation(self, value: Floats) -> Floats:
+        """The expected value of the next state, ``float64[R]``."""
+        return self.matrix @ value
+
+    def over_choices(self, operation: Any, quantity: NDArray[Any]) -> NDArray[Any]:
+        """A reduction, such as ``np.maximum``, over the choices of each state: ``[S]``, ``[R]``."""
+        if self.is_chain:
+            return quantity
+        return operation.reduceat(quantity, self.row_start[:-1])
+
+    def first_choice(self, mask: Booleans) -> tuple[Booleans, Integers]:
+        """Whether some choice of a state is marked, and the row of the first one (or the first).
+
+        Args:
+          mask: ``bool[R]``.
+        """
+        row = np.flatnonzero(mask)
+        first = self.row_start[:-1].astype(np.int32)
+        some = np.zeros(self.num_states, bool)
+        state = self.state[row]
+        some[state] = True
+        first[state[::-1]] = row[::-1]  # the first one is written last
+        return some, first

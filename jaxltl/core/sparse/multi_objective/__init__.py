@@ -1,0 +1,1 @@
+"""Weighted sums of objectives and Pareto fronts."""

@@ -1,0 +1,303 @@
+"""Sets of values that policies attain together: between the hull of points and half-spaces.
+
+Every objective is to be made large. What is attained lies below points' mixtures; what is not
+exceeded, in half-spaces with normals that are not negative. Linear programs find where the two are
+farthest apart; what is certified is checked in the arithmetic of floats, with its rounding.
+"""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxltl.core.array_types import Floats
+
+_EPS = float(np.finfo(np.float64).eps)
+_NEAR = 1e-6  # of the size of a program: what it may not tell from what is farthest out
+_ZOOMS = 12
+_EXACT = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
+
+
+class Separation(NamedTuple):
+    """How far a vector is beyond what is attained.
+
+    Attributes:
+      distance: the least t for which all of the vector less t times the scale is attained.
+      normal: ``float64[n]``, the direction that shows it; sums to one in units of the scale.
+      share: ``float64[N]``, the mixture of points nearest to it.
+    """
+
+    distance: float
+    normal: Floats
+    share: Floats
+
+
+def separation(points: Floats, vector: Floats, scale: Floats) -> Separation:
+    """How far a vector is beyond the mixtures of points.
+
+    A program tells distances as shares of its largest one. So it is solved again for the points
+    near the face that it finds, measured from the vector, until all of these are far apart.
+
+    Args:
+      points: ``float64[N, n]``.
+      vector: ``float64[n]``.
+      scale: ``float64[n]``, the unit of each objective.
+    """
+    ahead = (points - vector) / scale
+    chosen = np.arange(len(points))
+    distance, normal, share = 0.0, np.full(scale.size, 1 / scale.size), np.eye(len(points))[0]
+    for _ in range(_ZOOMS):
+        size = float(np.abs(ahead[chosen]).max())
+        found = _apart(ahead[chosen] / size) if size > 0 else None
+        if found is None:
+            break
+        distance, normal, share = found[0] * size, found[1], np.zeros(len(points))
+        share[chosen] = found[2]
+        height = ahead @ normal
+        top = height[chosen].max()
+        beyond = np.flatnonzero(height > top + 8 * _EPS * np.abs(ahead).max(1))
+        near = np.flatnonzero(height >= top - _NEAR * size)
+        if beyond.size:
+            chosen = np.union1d(chosen, beyond)
+        elif np.abs(ahead[near]).max() > size / 2:
+            break
+        else:
+            chosen = near
+    return Separation(distance, normal / scale, share)
+
+
+def _apart(ahead: Floats) -> tuple[float, Floats, Floats] | None:
+    """The least t with ``sum_i share_i ahead_i >= -t``, the normal of that face, and the shares."""
+    from scipy import optimize
+
+    count, size = ahead.shape
+    found = optimize.linprog(
+        np.append(np.zeros(count), 1.0),
+        A_ub=np.hstack([-ahead.T, -np.ones((size, 1))]),
+        b_ub=np.zeros(size),
+        A_eq=np.append(np.ones(count), 0.0)[None],
+        b_eq=[1.0],
+        bounds=[(0, None)] * count + [(None, None)],
+        method="highs",
+        options=_EXACT,
+    )
+    if found.status != 0:
+        return None
+    normal = np.maximum(-np.asarray(found.ineqlin.marginals), 0)
+    total = normal.sum()
+    share = np.maximum(found.x[:-1], 0)
+    return (
+        float(found.x[-1]),
+        normal / total if total > 0 else np.full(size, 1 / size),
+        share / share.sum(),
+    )
+
+
+def mixture(lower: Floats, share: Floats) -> Floats:
+    """What a mixture of policies attains at least, ``float64[n]``."""
+    sums = share @ lower
+    return sums - 4 * _EPS * (len(share) + 2) * (share @ np.abs(lower)) / max(share.sum(), 1e-300)
+
+
+def meets(lower: Floats, share: Floats, wanted: Floats) -> bool:
+    """Whether a mixture surely attains a vector, in exact arithmetic.
+
+    Args:
+      lower: ``float64[N, n]``.
+      share: ``float64[N]``, not negative; taken as parts of its sum.
+      wanted: ``float64[n]``, minus infinity where nothing is asked.
+
+    Example:
+      >>> meets(np.eye(2), np.array([0.5, 0.5]), np.array([0.5, 0.5]))
+      True
+    """
+    used = np.flatnonzero(share)
+    parts = [Fraction(float(x)) for x in share[used]]
+    total = sum(parts, Fraction(0))
+    for column, least in zip(lower[used].T, wanted, strict=True):
+        if np.isfinite(least):
+            sums = sum(
+                (p * Fraction(float(x)) for p, x in zip(parts, column, strict=True)), Fraction(0)
+            )
+            if sums < Fraction(float(least)) * total:
+                return False
+    return True
+
+
+def plain(share: Floats) -> Floats:
+    """A mixture with simple fractions in place of what rounding made of them.
+
+    >>> plain(np.array([0.25000000000000006, 0.75])).tolist()
+    [0.25, 0.75]
+    """
+    near = np.array([float(Fraction(float(x)).limit_denominator(1000)) for x in share])
+    return np.where(np.abs(near - share) < 1e-12, near, share)
+
+
+def exceeds(normal: Floats, bound: float, vector: Floats) -> bool:
+    """Whether a vector is surely outside of a half-space ``normal @ y <= bound``."""
+    slack = 4 * _EPS * (vector.size + 2) * (normal @ np.abs(vector) + abs(bound))
+    return bool(normal @ vector - slack > bound)
+
+
+class Largest(NamedTuple):
+    """The largest value of one objective when others must be at least something.
+
+    Attributes:
+      lower: attained by the mixture; minus infinity where none was found.
+      share: ``float64[N]``.
+      upper: what nothing exceeds.
+      vector: ``float64[n]``, the farthest vector that the half-spaces allow; None if none.
+    """
+
+    lower: float
+    share: Floats
+    upper: float
+    vector: Floats | None
+
+
+def largest(
+    points: Floats,
+    normals: Floats,
+    bounds: Floats,
+    index: int,
+    least: Floats,
+    scale: Floats,
+    known: Floats | None = None,
+) -> Largest:
+    """The largest value of an objective, by what is known.
+
+    Args:
+      points: ``float64[N, n]``, lower bounds of attained vectors.
+      normals, bounds: ``float64[K, n]``, ``[K]``, half-spaces.
+      index: which objective.
+      least: ``float64[n]``, what the others must be; minus infinity where nothing is asked.
+      scale: ``float64[n]``.
+      known: a mixture of the first points, to be tried too.
+    """
+    count = len(points)
+    asked = np.flatnonzero(np.isfinite(least))
+    lower, share = -np.inf, np.full(count, 1 / count)
+    mixtures = _largest_mixtures(points, index, least, asked, scale) if asked.size else []
+    if known is not None:
+        mixtures.append(np.append(known, np.zeros(count - known.size)))
+    for tried in mixtures:
+        value = mixture(points, tried)
+        if value[index] > lower and meets(points, tried, least):
+            lower, share = float(value[index]), tried
+    for i in np.flatnonzero((points[:, asked] >= least[asked]).all(1)):
+        if points[i, index] > lower:
+            lower, share = float(points[i, index]), np.eye(count)[i]
+    upper, vector = _outer(normals, bounds, index, least, asked, scale)
+    return Largest(lower, share, upper, vector)
+
+
+def _largest_mixtures(
+    points: Floats, index: int, least: Floats, asked: Any, scale: Floats
+) -> list[Floats]:
+    """Mixtures that may be the best of an objective, the others being at least something."""
+    from scipy import optimize
+
+    count = len(points)
+    found = optimize.linprog(
+        -points[:, index] / scale[index],
+        A_ub=-(points[:, asked] / scale[asked]).T,
+        b_ub=-least[asked] / scale[asked],
+        A_eq=np.ones((1, count)),
+        b_eq=[1.0],
+        bounds=[(0, None)] * count,
+        method="highs",
+        options=_EXACT,
+    )
+    inner = separation(points[:, asked], least[asked], scale[asked]).share
+    if found.status != 0:
+        return [inner]
+    best = np.maximum(found.x, 0)
+    best /= best.sum()
+    # A program's answer is rounded: what it misses, a little of what is well inside makes up for.
+    misses = (least - mixture(points, best))[asked] + 4 * _EPS * np.abs(least[asked])
+    misses = np.maximum(misses, 0)
+    spare = (mixture(points, inner) - least)[asked]
+    if not (spare > 0).all():
+        return [best, inner]
+    part = float((misses / (misses + spare)).max())
+    return [best, (1 - part) * best + part * inner]
+
+
+def _outer(
+    normals: Floats, bounds: Floats, index: int, least: Floats, asked: Any, scale: Floats
+) -> tuple[float, Floats | None]:
+    from scipy import optimize
+
+    normals, bounds = normals[np.isfinite(bounds)], bounds[np.isfinite(bounds)]
+    size = len(scale)
+    goal = np.zeros(size)
+    goal[index] = -1
+    floor = [(float(least[i] / scale[i]) if i in asked else None, None) for i in range(size)]
+    found = optimize.linprog(
+        goal, A_ub=normals * scale, b_ub=bounds, bounds=floor, method="highs", options=_EXACT
+    )
+    if found.status != 0:
+        return np.inf, None
+    weight = np.maximum(-np.asarray(found.ineqlin.marginals), 0)
+    # Any combination of half-spaces is one, and the others are at least what is asked of them.
+    normal, bound = weight @ normals, float(weight @ bounds)
+    if not normal[index] > 0:
+        return np.inf, found.x * scale
+    others = np.arange(size) != index
+    needless = others & ~np.isfinite(least)
+    if (normal[needless] > 1e-12 * normal[index]).any():
+        return np.inf, found.x * scale
+    taken = np.where(others & np.isfinite(least), least, 0)
+    upper = (bound - normal @ taken) / normal[index]
+    slack = (
+        8
+        * _EPS
+        * (len(weight) + size)
+        * (weight @ np.abs(bounds) + normal @ np.abs(taken))
+        / normal[index]
+    )
+    return float(upper + slack), found.x * scale
+
+
+def corners(normals: Floats, bounds: Floats, floor: Floats) -> NDArray[Any]:
+    """The corners of half-spaces above a floor, ``float64[V, n]``."""
+    normals, bounds = normals[np.isfinite(bounds)], bounds[np.isfinite(bounds)]
+    size = len(floor)
+    if size == 2:
+        return _corners_of_two(normals, bounds, floor)
+    from scipy import optimize, spatial
+
+    faces = np.vstack([normals, -np.eye(size)])
+    limits = np.concatenate([bounds, -floor])
+    length = np.linalg.norm(faces, axis=1)
+    inner = optimize.linprog(
+        np.append(np.zeros(size), -1.0),
+        A_ub=np.hstack([faces, length[:, None]]),
+        b_ub=limits,
+        bounds=[(None, None)] * size + [(0, None)],
+        method="highs",
+    )
+    if inner.status != 0 or inner.x[-1] <= 1e-12:
+        return np.zeros((0, size))
+    found = spatial.HalfspaceIntersection(
+        np.hstack([faces, -limits[:, None]]), inner.x[:-1], qhull_options="QJ"
+    )
+    return found.intersections
+
+
+def _corners_of_two(normals: Floats, bounds: Floats, floor: Floats) -> NDArray[Any]:
+    faces = np.vstack([normals, -np.eye(2)])
+    limits = np.concatenate([bounds, -floor])
+    first, second = np.triu_indices(len(faces), 1)
+    a, b = faces[first], faces[second]
+    det = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    kept = np.abs(det) > 1e-12 * np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
+    a, b, det = a[kept], b[kept], det[kept]
+    c, d = limits[first[kept]], limits[second[kept]]
+    points = np.stack([(c * b[:, 1] - d * a[:, 1]) / det, (a[:, 0] * d - b[:, 0] * c) / det], -1)
+    slack = 1e-9 * (1 + np.abs(limits) + np.abs(faces) @ np.abs(floor))
+    return points[(points @ faces.T <= limits + slack).all(1)]

@@ -1,0 +1,310 @@
+"""Weighted sums of several objectives: the best, a bound on it, and a policy that attains it.
+
+A run ends in an end component, and there in one whose least priorities are even for as many
+probability objectives at once as it chooses to satisfy. So a weighted sum is an optimal stopping
+problem: rewards on the way, and for stopping in a component the weight of the best set of
+objectives that can be satisfied together in it (Etessami, Kwiatkowska, Vardi and Yannakakis 2008;
+Forejt, Kwiatkowska, Norman, Parker and Qu 2011).
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxltl.core.array_types import Booleans, Floats, Integers
+from jaxltl.core.sparse.graph.qualitative import (
+    Components,
+    end_components,
+    surely_reaching,
+    towards,
+)
+from jaxltl.core.sparse.mdp import HostMDP
+from jaxltl.core.sparse.rows import spans, starts_of
+from jaxltl.core.sparse.solvers.policy_iteration import Transient, optimum
+
+_EPS = float(np.finfo(np.float64).eps)
+_ROUNDS = 100
+
+
+class Sums(NamedTuple):
+    """A model with several objectives, all to be made large.
+
+    Attributes:
+      mdp: the model, N states, all of them reached.
+      start: ``float64[N]``, the initial distribution.
+      priority: ``int[B, R]``, the least priority that a row reads, of each probability objective;
+        it is satisfied where the least that is read for ever is even.
+      gain: ``float64[K, R]``, at least 0: rewards to be made large.
+      cost: ``float64[C, R]``, at least 0: rewards to be made small.
+      ended: ``bool[N]``, where all rewards that have a target have met it.
+    """
+
+    mdp: HostMDP
+    start: Floats
+    priority: NDArray[Any]
+    gain: Floats
+    cost: Floats
+    ended: Booleans
+
+
+class Ends(NamedTuple):
+    """Where runs may end: end components without cost, by the sets of what is satisfied there.
+
+    Attributes:
+      rows: ``bool[R]``, the rows that may be taken at all.
+      sets: ``bool[M, B]``, sets of objectives.
+      inside: for each set, the rows of end components in which it can be satisfied.
+    """
+
+    rows: Booleans
+    sets: Booleans
+    inside: list[Booleans]
+
+
+def ends(sums: Sums) -> Ends | None:
+    """Where runs may end; None if some initial state is not surely left for there."""
+    mdp = sums.mdp
+    free = (sums.cost == 0).all(0) & sums.ended[mdp.state]
+    homes = end_components(mdp, rows=free)
+    inside, rows = surely_reaching(mdp, homes.region(mdp))
+    if (sums.start > 0)[~inside].any():
+        return None
+    count = len(sums.priority)
+    sets, found = [], []
+    for size in range(count, -1, -1):
+        for chosen in itertools.combinations(range(count), size):
+            wanted = np.zeros(count, bool)
+            wanted[list(chosen)] = True
+            region = _satisfying(mdp, sums.priority[wanted], homes.inside & rows)
+            if region.any():
+                sets.append(wanted)
+                found.append(region)
+    return Ends(rows, np.array(sets, bool).reshape(len(sets), count), found)
+
+
+def _satisfying(mdp: HostMDP, priority: NDArray[Any], rows: Booleans) -> Booleans:
+    """The rows of end components whose least priorities are all even.
+
+    A component whose least priority is odd is searched without the rows that read it.
+    """
+    while True:
+        found = end_components(mdp, rows=rows)
+        leader = found.component[mdp.state]
+        bad = np.zeros(mdp.num_rows, bool)
+        for level in priority:
+            least = np.full(mdp.num_states, np.iinfo(np.int64).max)
+            np.minimum.at(least, leader[found.inside], level[found.inside])
+            bad |= found.inside & (least[leader] % 2 == 1) & (level == least[leader])
+        if not bad.any():
+            return found.inside
+        rows = found.inside & ~bad
+
+
+class Weighed(NamedTuple):
+    """The best of a weighted sum.
+
+    Attributes:
+      bound: what no policy exceeds.
+      weight: ``float64[R]``, a policy: the weights of each state's rows, one or equal ones.
+      home: ``bool[N]``, the states in which it ends.
+    """
+
+    bound: float
+    weight: Floats
+    home: Booleans
+
+
+def weigh(
+    sums: Sums, where: Ends, sure: Floats, gain: Floats, cost: Floats, tolerance: float
+) -> Weighed:
+    """The largest weighted sum over all policies that surely end.
+
+    Args:
+      sums, where: the objectives, and where runs may end.
+      sure, gain, cost: ``float64[B]``, ``[K]``, ``[C]``, weights of at least 0.
+      tolerance: the width asked for.
+    """
+    mdp = sums.mdp
+    earned, spent = gain @ sums.gain, cost @ sums.cost
+    worth = where.sets @ sure
+    # The best end of each state, of which a later one does not take the place.
+    best = np.full(mdp.num_states, -1)
+    for i in np.argsort(-worth, kind="stable"):
+        states = np.zeros(mdp.num_states, bool)
+        states[mdp.state[where.inside[i]]] = True
+        best = np.where(states & (best < 0), i, best)
+    free = end_components(mdp, rows=where.rows & (spent == 0) & (earned == 0))
+    quotient = _quotient(mdp, where.rows, free, best, worth)
+    bound, row = _solved(quotient, earned, spent, tolerance)
+    first = np.flatnonzero(sums.start)
+    share, high = sums.start[first], bound[quotient.node[first]]
+    total = float(share @ high)
+    # What ends are worth may cancel what is spent, and its rounding stays.
+    size = float(share @ np.abs(high)) + float(np.abs(worth).max(initial=0))
+    total += 4 * _EPS * size * (1 + first.size)
+    weight, home = _policy(mdp, where, free, best, quotient, row)
+    return Weighed(total, weight, home)
+
+
+class _Quotient(NamedTuple):
+    """Components as one node each, and a last node where runs stop.
+
+    Attributes:
+      mdp: the model.
+      node: ``int[N]``, the node of each state; -1 where none may be.
+      row: ``int[R']``, the row that each row is; -1 for stops.
+      known: ``float64[R']``, what stopping is worth.
+      stop: ``int[nodes]``, the state in which a node stops, or -1.
+    """
+
+    mdp: HostMDP
+    node: Integers
+    row: Integers
+    known: Floats
+    stop: Integers
+
+
+def _quotient(
+    mdp: HostMDP, rows: Booleans, free: Components, best: Integers, worth: Floats
+) -> _Quotient:
+    used = np.zeros(mdp.num_states, bool)
+    used[mdp.state[rows]] = True
+    heads = np.unique(free.component[used])
+    node = np.where(used, np.searchsorted(heads, free.component), 0)
+    # A component stops in the state whose end is worth the most.
+    candidates = np.flatnonzero(used & (best >= 0))
+    order = candidates[np.argsort(-worth[best[candidates]], kind="stable")]
+    stop = np.full(heads.size, -1)
+    stop[node[order[::-1]]] = order[::-1]
+    stops = np.flatnonzero(stop >= 0)
+    row = np.flatnonzero(rows & ~free.inside)
+    end = heads.size
+    owner = np.concatenate([node[mdp.state[row]], stops, [end]])
+    width = np.concatenate([np.diff(mdp.entry_start)[row], np.ones(stops.size + 1, np.int64)])
+    entry = spans(mdp.entry_start[row], width[: row.size])
+    target = np.concatenate([node[mdp.successor[entry]], np.full(stops.size + 1, end)])
+    chance = np.concatenate([mdp.probability[entry], np.ones(stops.size + 1)])
+    known = np.concatenate([np.zeros(row.size), worth[best[stop[stops]]], [0.0]])
+    origin = np.concatenate([row, np.full(stops.size + 1, -1)])
+    order = np.argsort(owner, kind="stable")
+    taken = spans((width.cumsum() - width)[order], width[order])
+    small = HostMDP(
+        starts_of(np.bincount(owner, minlength=end + 1)),
+        starts_of(width[order]),
+        target[taken].astype(np.int32),
+        chance[taken],
+    )
+    return _Quotient(small, node, origin[order], known[order], stop)
+
+
+def _solved(
+    quotient: _Quotient, earned: Floats, spent: Floats, tolerance: float
+) -> tuple[Floats, Integers]:
+    """An upper bound for each node, and the rows of a policy that comes near it."""
+    mdp, moves = quotient.mdp, quotient.row >= 0
+    own = np.where(moves, quotient.row, 0)
+    gain = np.where(moves, earned[own], quotient.known)
+    loss = np.where(moves, spent[own], 0)
+    end = np.arange(mdp.num_states) == mdp.num_states - 1
+    none = np.zeros(mdp.num_states)
+    first = towards(mdp, end, np.ones(mdp.num_rows, bool)).astype(np.int64)
+    if not loss.any():
+        problem = Transient(mdp, ~end, none, gain, first=first)
+        found = optimum(problem, maximize=True, tolerance=tolerance, relative=False)
+        return found.upper, found.row
+    if not (gain[moves] > 0).any():
+        most = quotient.known.max()
+        lost = np.where(moves, loss, most - quotient.known)
+        lost[-1] = 0
+        problem = Transient(mdp, ~end, none, lost, first=first)
+        found = optimum(problem, maximize=False, tolerance=tolerance, relative=False)
+        return most - found.lower, found.row
+    return _signed(mdp, end, gain - loss, np.abs(gain) + loss, first, tolerance)
+
+
+def _signed(
+    mdp: HostMDP,
+    end: Booleans,
+    reward: Floats,
+    magnitude: Floats,
+    first: Integers,
+    tolerance: float,
+) -> tuple[Floats, Integers]:
+    """The same with rewards of both signs, by policy iteration (Howard 1960).
+
+    Every step earns a little more than it does, so that the value is one that no step exceeds.
+    """
+    from jaxltl.core.sparse.linear.elimination import factors
+    from jaxltl.core.sparse.linear.topological_order import Edges, components_in_order
+
+    inner = np.flatnonzero(~end)
+    rows = np.flatnonzero(~end[mdp.state])
+    matrix = mdp.matrix[rows][:, inner]
+    owner, reward, magnitude = mdp.state[rows], reward[rows], magnitude[rows]
+    starts = mdp.row_start[:-1][inner]
+    unit = (2 * int(np.diff(mdp.entry_start).max()) + 8) * _EPS
+    chosen, policy = first[inner], first
+    begins = matrix.indptr[np.append(starts, rows.size)]
+    solver = factors(matrix, components_in_order(Edges(begins, matrix.indices)), chosen)
+    extra = 0.0
+    for _ in range(_ROUNDS):
+        if solver is None:
+            break
+        if not extra:
+            time = solver.solve(np.ones(inner.size))
+            size = np.abs(solver.solve(magnitude[chosen])).max(initial=0)
+            extra = max(1e-3 * tolerance / max(time.max(initial=1), 1), 32 * unit * size)
+        value = solver.solve(reward[chosen] + extra)
+        if not np.isfinite(value).all():
+            break
+        image = reward + matrix @ value
+        gain = image - value[owner]
+        slack = unit * (magnitude + matrix @ np.abs(value) + np.abs(value)[owner])
+        policy = first.copy()
+        policy[inner] = rows[chosen]
+        if (gain + slack <= 0).all():
+            return np.append(value, 0.0), policy
+        best = np.maximum.reduceat(gain, starts)
+        hit = np.flatnonzero(gain == best[owner])
+        new = chosen.copy()
+        new[owner[hit[::-1]]] = hit[::-1]
+        chosen = np.where(best > -extra / 2, new, chosen)
+        solver = solver.other(chosen)
+    return np.full(mdp.num_states, np.inf), policy
+
+
+def _policy(
+    mdp: HostMDP, where: Ends, free: Components, best: Integers, quotient: _Quotient, row: Integers
+) -> tuple[Floats, Booleans]:
+    """The weights of rows of a policy on nodes, and the states where it ends."""
+    region = free.region(mdp)
+    own = quotient.row[row[quotient.node]]
+    stops = (own < 0) & (quotient.stop[quotient.node] >= 0)
+    # Where a component stops: all of the end component of that state.
+    home, inside = np.zeros(mdp.num_states, bool), np.zeros(mdp.num_rows, bool)
+    ending = np.unique(quotient.stop[quotient.node[stops]])
+    for i in np.unique(best[ending]):
+        part = end_components(mdp, rows=where.inside[i])
+        wanted = np.zeros(mdp.num_states, bool)
+        wanted[part.component[ending[best[ending] == i]]] = True
+        new = part.inside & wanted[part.component][mdp.state] & ~home[mdp.state]
+        inside |= new
+        home[mdp.state[new]] = True
+    goal = home.copy()
+    moving = np.flatnonzero(~stops & (own >= 0))
+    goal[mdp.state[own[moving]]] = True
+    found = towards(mdp, goal, free.inside & region[mdp.state])
+    exits = np.zeros(mdp.num_states, bool)
+    exits[mdp.state[own[moving]]] = True
+    at = exits & (own >= 0) & (mdp.state[np.maximum(own, 0)] == np.arange(mdp.num_states))
+    found = np.where(at, own, found)
+    weight = np.zeros(mdp.num_rows)
+    weight[found] = 1
+    weight[home[mdp.state]] = 0
+    count = np.bincount(mdp.state[inside], minlength=mdp.num_states)
+    weight[inside] = 1 / count[mdp.state[inside]]
+    return weight, home

@@ -1,0 +1,1 @@
+"""Preprocessing of questions that are solved many times with other numbers."""

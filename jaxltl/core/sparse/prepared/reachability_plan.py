@@ -1,0 +1,305 @@
+"""What a prepared solve knows of a question: the schedule, and how numbers and answers go through.
+
+Numbers are the probabilities of the T entries, the rewards of the R rows, one and zero, in this
+order: T + R is one, and T + R + 1 zero.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxltl.core.array_types import Booleans, Floats, Integers
+from jaxltl.core.sparse.contraction import without_chains
+from jaxltl.core.sparse.graph.qualitative import forced, reaching, surely_reaching
+from jaxltl.core.sparse.mdp import HostMDP
+from jaxltl.core.sparse.prepared.block_schedule import GOAL, LOST, ONE, Nodes, Schedule, schedule
+from jaxltl.core.sparse.rows import spans
+from jaxltl.core.sparse.solvers.reachability import Reduced, leaving_by
+
+
+class Loops(NamedTuple):
+    """Groups of rows that lead to where they are, and whose other entries share all the weight.
+
+    Attributes:
+      entry: ``int[E]``, the entries that lead elsewhere.
+      group: ``int[E]``, their groups, ascending.
+      row: ``int[L]``, the rows.
+      row_group: ``int[L]``.
+      groups: how many there are.
+    """
+
+    entry: Integers
+    group: Integers
+    row: Integers
+    row_group: Integers
+    groups: int
+
+
+class Circles(NamedTuple):
+    """End components that are one node each, in which one goes to where the node is left.
+
+    Attributes:
+      state: ``int[M]``, their states.
+      row, row_state: ``int[K]``, the rows that stay inside, and their states by rank in `state`.
+      entry_row, entry_state: ``int[E]``, what these rows lead to, by ranks in `row` and `state`.
+    """
+
+    state: Integers
+    row: Integers
+    row_state: Integers
+    entry_row: Integers
+    entry_state: Integers
+
+
+class Plan(NamedTuple):
+    """All that a question keeps for other numbers.
+
+    Attributes:
+      schedule: the order of the nodes.
+      place: ``int32[S]``, where the value of a state is, see :class:`Schedule`.
+      own: ``int32[S]``, the place of the node whose row a state takes, or -1.
+      row: ``int32[S]``, the row that it takes else.
+      loops: rows that lead to where they are.
+      circles: end components that are one node.
+      terms: how many roundings stand behind a weight.
+    """
+
+    schedule: Schedule
+    place: Integers
+    own: Integers
+    row: Integers
+    loops: Loops | None
+    circles: Circles | None
+    terms: int
+
+
+class _Entries(NamedTuple):
+    """The entries of some rows of a reduced model: rows by rank, nodes, sources."""
+
+    row: Integers
+    target: Integers
+    source: Integers
+
+
+def plan_optimum(reduced: Reduced, cost: Floats | None) -> Plan:
+    """The plan of an optimum, or of a chain.
+
+    Args:
+      reduced: what the graph leaves.
+      cost: ``float[R]``, the rewards of the rows of the model; None for probabilities.
+    """
+    mdp, whole, part = reduced.mdp, reduced.whole, reduced.part
+    small = whole.mdp if part is None else part.mdp
+    origin = whole.row if part is None else whole.row[part.row]
+    node = whole.node if part is None else part.node[whole.node]
+    finite = np.isfinite(reduced.known)
+    codes = np.where(finite & ((reduced.known == 0) | (cost is not None)), GOAL, ONE)
+    codes = np.where(finite, codes, LOST)
+    if cost is None:
+        codes[reduced.known == 0] = LOST
+    open_, rows = np.zeros(small.num_states, bool), np.zeros(0, np.int64)
+    if reduced.problem is not None:
+        open_ = reduced.problem.open
+        kept = open_[small.state]
+        if reduced.problem.rows is not None:
+            kept &= reduced.problem.rows
+        rows = np.flatnonzero(kept)
+    nodes, loops = _optimum_nodes(mdp, small, origin, open_, rows, codes, cost)
+    order = schedule(
+        nodes, mdp.num_transitions + mdp.num_rows, mdp.num_transitions + mdp.num_rows + 1
+    )
+    codes = order.size - 1 - codes
+    codes[open_] = order.place
+    own, row = _own(reduced, codes)
+    circles = _circles(reduced)
+    return Plan(order, codes[node].astype(np.int32), own, row, loops, circles, _terms(loops))
+
+
+def _optimum_nodes(
+    mdp: HostMDP,
+    small: HostMDP,
+    origin: Integers,
+    open_: Booleans,
+    rows: Integers,
+    codes: Integers,
+    cost: Floats | None,
+) -> tuple[Nodes, Loops | None]:
+    found = _entries(mdp, small, origin, rows)
+    state = small.state[rows]
+    loop = found.target == state[found.row]
+    ends = np.bincount(found.row[~loop], minlength=rows.size) > 0
+    if not ends.all():  # rows that never get anywhere
+        rows, state = rows[ends], state[ends]
+        found = _entries(mdp, small, origin, rows)
+        loop = found.target == state[found.row]
+    loops = None
+    if loop.any():
+        looping = np.zeros(rows.size, bool)
+        looping[found.row[loop]] = True
+        loops = _loops(found, loop, looping, np.cumsum(looping) - 1, origin[rows])
+    number = np.cumsum(open_) - 1
+    target = np.where(open_[found.target], number[found.target], codes[found.target])
+    kept = ~loop & ((target >= 0) | (target == ONE))
+    entries = _Entries(found.row[kept], target[kept], found.source[kept])
+    entries = _with_costs(entries, origin[rows], cost, mdp.num_transitions)
+    nodes = Nodes(int(open_.sum()), number[state], origin[rows].astype(np.int64), *entries)
+    return nodes, loops
+
+
+def _entries(mdp: HostMDP, small: HostMDP, origin: Integers, rows: Integers) -> _Entries:
+    width = np.diff(small.entry_start)[rows]
+    return _Entries(
+        np.repeat(np.arange(rows.size), width),
+        small.successor[spans(small.entry_start[rows], width)],
+        spans(mdp.entry_start[origin[rows]], width),
+    )
+
+
+def _loops(
+    found: _Entries, loop: Booleans, looping: Booleans, group: Integers, origin: Integers
+) -> Loops:
+    """Of the rows that are marked, which are in groups by rank."""
+    rest = np.flatnonzero(~loop & looping[found.row])
+    of = group[found.row[rest]]
+    order = np.argsort(of, kind="stable")
+    rows = np.flatnonzero(looping)
+    return Loops(
+        found.source[rest][order], of[order], origin[rows], group[rows], int(group[rows].max()) + 1
+    )
+
+
+def _with_costs(
+    entries: _Entries, origin: Integers, cost: Floats | None, num_entries: int
+) -> _Entries:
+    """What a row earns comes in through the constant one."""
+    if cost is None:
+        return entries
+    paid = np.flatnonzero(cost[origin] > 0)
+    row = np.concatenate([paid, entries.row])
+    order = np.argsort(row, kind="stable")
+    return _Entries(
+        row[order],
+        np.concatenate([np.full(paid.size, ONE), entries.target])[order],
+        np.concatenate([num_entries + origin[paid], entries.source])[order],
+    )
+
+
+def _own(reduced: Reduced, codes: Integers) -> tuple[Integers, Integers]:
+    """The nodes whose rows states take, and the rows of the others."""
+    mdp, whole, part = reduced.mdp, reduced.whole, reduced.part
+    mine = mdp.state[whole.row[whole.mdp.row_start[:-1]]]  # the state that each node is
+    chosen: Any = reduced.row
+    node: Any = np.arange(mine.size)
+    if part is not None and reduced.components is not None:
+        chosen = leaving_by(whole.mdp, reduced.components, part.row[reduced.row][part.node])
+        node = part.node
+    if reduced.sure is not None and reduced.sure_row is not None:
+        chosen = np.where(reduced.sure, reduced.sure_row, chosen)
+    row: Any = mdp.row_start[:-1].astype(np.int32)
+    row[mine] = whole.row[chosen]
+    own: Any = np.full(mdp.num_states, -1, np.int32)
+    if reduced.problem is not None:
+        own[mine] = np.where(reduced.problem.open, codes, -1)[node]
+    return own, row
+
+
+def _circles(reduced: Reduced) -> Circles | None:
+    """The states of end components that are open; elsewhere rows are known."""
+    components, whole, part = reduced.components, reduced.whole, reduced.part
+    if components is None or part is None or reduced.problem is None:
+        return None
+    mdp = whole.mdp
+    open_ = reduced.problem.open[part.node]
+    inside = components.inside & open_[mdp.state]
+    region: Any = np.zeros(mdp.num_states, bool)
+    region[mdp.state[inside]] = True
+    if not region.any():
+        return None
+    number = np.cumsum(region) - 1
+    rows = np.flatnonzero(inside)
+    width = np.diff(mdp.entry_start)[rows]
+    mine = reduced.mdp.state[whole.row[mdp.row_start[:-1]]]
+    return Circles(
+        mine[region],
+        whole.row[rows],
+        number[mdp.state[rows]],
+        np.repeat(np.arange(rows.size), width),
+        number[mdp.successor[spans(mdp.entry_start[rows], width)]],
+    )
+
+
+def plan_policy(mdp: HostMDP, target: Booleans, stay: Booleans | None, cost: Floats | None) -> Plan:
+    """The plan of policies, whatever they are.
+
+    Args:
+      mdp: the model.
+      target: ``bool[S]``.
+      stay: ``bool[S]``, the states that may be passed; default all.
+      cost: ``float[R]``, the rewards of the rows; None for probabilities.
+    """
+    blocked = np.zeros(mdp.num_states, bool) if stay is None else ~stay & ~target
+    fixed = target | blocked
+    if cost is not None:
+        fixed |= mdp.over_choices(np.maximum, cost) > 0
+    whole = without_chains(mdp, fixed, None)
+    small = mdp if whole is None else whole.mdp
+    node = np.arange(mdp.num_states) if whole is None else whole.node
+    origin = np.arange(mdp.num_rows) if whole is None else whole.row
+    goal, dead = (np.zeros(small.num_states, bool) for _ in range(2))
+    goal[node[target]], dead[node[blocked]] = True, True
+    if cost is None:
+        before = ~(goal | dead)[small.state]
+        lost = ~reaching(small, goal, before)
+        some = dead | ~forced(small, goal, among=~dead)
+        reached = goal | ~reaching(small, some, before)
+        codes = np.where(reached, ONE, LOST)
+    else:
+        lost = ~surely_reaching(small, goal, np.ones(small.num_rows, bool))[0]
+        reached, codes = goal, np.where(goal, GOAL, LOST)
+    open_ = ~(lost | reached)
+    found = _entries(mdp, small, origin, np.flatnonzero(open_[small.state]))
+    rows = np.flatnonzero(open_[small.state])
+    state = small.state[rows]
+    number = np.cumsum(open_) - 1
+    loop = found.target == state[found.row]
+    loops = None
+    if loop.any():
+        of = np.zeros(small.num_states, bool)
+        of[found.target[loop]] = True
+        loops = _loops(found, loop, of[state], (np.cumsum(of) - 1)[state], origin[rows])
+    to = np.where(open_[found.target], number[found.target], codes[found.target])
+    entries = _Entries(found.row[~loop], to[~loop], found.source[~loop])
+    entries = _with_costs(entries, origin[rows], cost, mdp.num_transitions)
+    count = int(open_.sum())
+    nodes = Nodes(
+        count,
+        np.arange(count),
+        np.zeros(count, np.int64),
+        number[state][entries.row],
+        entries.target,
+        entries.source,
+    )
+    order = schedule(
+        nodes, mdp.num_transitions + mdp.num_rows, mdp.num_transitions + mdp.num_rows + 1
+    )
+    place = order.size - 1 - codes
+    place[open_] = order.place
+    most = int(np.diff(mdp.row_start).max())
+    row: Any = mdp.row_start[:-1].astype(np.int32)
+    return Plan(
+        order,
+        place[node].astype(np.int32),
+        np.full(mdp.num_states, -1, np.int32),
+        row,
+        loops,
+        None,
+        _terms(loops) + 2 * most + 4,
+    )
+
+
+def _terms(loops: Loops | None) -> int:
+    if loops is None:
+        return 6
+    return 10 + int(np.bincount(loops.group, minlength=loops.groups).max(initial=0))

@@ -1,0 +1,220 @@
+"""A decision process beside an automaton, as far as it is reached, written out without padding."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxltl.core.array_types import Booleans, Integers
+from jaxltl.core.pretty_print import brief
+from jaxltl.core.sparse.mdp import HostMDP
+from jaxltl.core.sparse.rows import spans, starts_of
+
+MAX_PAIRS = 2**31  # pairs of a state and a memory; a bit vector of them takes 2 GB
+_DENSE = 2**27  # pairs up to which the number of each is looked up in a table
+_ROUNDS = 64  # after which a narrow search is handed over
+_NARROW = 2000  # states a round, below which NumPy's overhead outweighs its work
+_MAX_EDGES = 2**27  # of the whole product, that are written down for the search
+
+
+@brief
+class HostProduct(NamedTuple):
+    """What is reached of a product, numbered by world state first and memory next.
+
+    Attributes:
+      host: the process, N states.
+      base_state: ``int32[N]``, the world's state.
+      memory: ``int32[N]``, the automaton's state.
+      base_row: ``int32[R']``, the world's row of each row; of a state that stands still, its first.
+      start: ``int64[I]``, the state in which the run from each start begins.
+      still: ``bool[N]``, the states whose verdict is known, made to stand still by a loop.
+    """
+
+    host: HostMDP
+    base_state: Integers
+    memory: Integers
+    base_row: Integers
+    start: Integers
+    still: Booleans
+
+    def entry_letter(self, letter: Integers, on_entry: bool) -> Integers:
+        """The letter that each entry reads, ``int[T']``.
+
+        Args:
+          letter: ``int[S]``, of the world's states.
+          on_entry: whether a step reads the state that is entered, not the one that is left.
+        """
+        if on_entry:
+            return letter[self.base_state[self.host.successor]]
+        return letter[self.base_state[self.host.state[self.host.row]]]
+
+
+def host_product(
+    host: HostMDP,
+    delta: NDArray[Any],
+    letter: Integers,
+    state: Integers,
+    memory: Integers,
+    *,
+    on_entry: bool = True,
+    still: Booleans | None = None,
+) -> HostProduct:
+    """The part of the product that is reached from some pairs.
+
+    A step leads from ``(s, q)`` to ``(t, delta[q, letter[t]])``, or to ``(t, delta[q, letter[s]])``
+    where letters are read on exit.
+
+    Args:
+      host: the world.
+      delta: ``int[Q, L]``.
+      letter: ``int[S]``, the letter that each state shows.
+      state, memory: ``int[I]``, where runs start.
+      on_entry: whether the letter of the state that is entered is read.
+      still: ``bool[Q]``, memories in which nothing matters any more; their states get one loop.
+
+    Raises:
+      ValueError: there are more than 2^31 pairs, with their number.
+
+    Example:
+      >>> from jaxltl import make_sparse
+      >>> ring = make_sparse(None, [0, 1, 2], [1, 0], [1.0, 1.0]).host
+      >>> found = host_product(ring, np.array([[0, 1], [1, 1]]), np.array([0, 1]), [0], [0])
+      >>> found.base_state.tolist(), found.memory.tolist(), found.host.successor.tolist()
+      ([0, 0, 1], [0, 1, 1], [2, 2, 1])
+    """
+    num_memory = delta.shape[0]
+    if host.num_states * num_memory > MAX_PAIRS:
+        raise ValueError(
+            f"the product of {host.num_states} states and an automaton of {num_memory} has up to "
+            f"{host.num_states * num_memory:.3g} states, more than 2^31; use a smaller formula."
+        )
+    step = delta.T.astype(np.int64)  # [L, Q], so that one letter's column is together
+    still = np.zeros(num_memory, bool) if still is None else still
+    world = _World(host, step, np.asarray(letter), still, on_entry)
+    start = np.asarray(state, np.int64) * num_memory + np.asarray(memory)
+    seen = _reached(world, start)
+    code = np.flatnonzero(seen)
+    if host.num_states * num_memory <= _DENSE:
+        number = np.zeros(seen.size, np.int32)
+        number[code] = np.arange(code.size, dtype=np.int32)
+        return _written(world, code, number.__getitem__, start)
+    return _written(world, code, lambda x: np.searchsorted(code, x).astype(np.int32), start)
+
+
+def without_memory(host: HostMDP, state: Integers) -> HostProduct:
+    """The world itself as its product with an automaton of one state, reached or not."""
+    number = np.arange(host.num_states, dtype=np.int32)
+    return HostProduct(
+        host,
+        number,
+        np.zeros_like(number),
+        np.arange(host.num_rows, dtype=np.int32),
+        np.asarray(state, np.int64),
+        np.zeros(host.num_states, bool),
+    )
+
+
+class _World(NamedTuple):
+    host: HostMDP
+    step: NDArray[np.int64]
+    letter: Integers
+    still: Booleans
+    on_entry: bool
+
+    @property
+    def num_memory(self) -> int:
+        return self.step.shape[1]
+
+    def after(self, target: Integers, source: Integers, memory: Integers) -> NDArray[np.int64]:
+        """The pairs that follow when ``source`` leads to ``target``."""
+        read = self.letter[target if self.on_entry else source]
+        return target.astype(np.int64) * self.num_memory + self.step[read, memory]
+
+
+def _reached(world: _World, start: Integers) -> Booleans:
+    """``bool[S * Q]``, the pairs to which some run leads."""
+    host = world.host
+    seen = np.zeros(host.num_states * world.num_memory, bool)
+    seen[start] = True
+    first_entry = host.entry_start[host.row_start]
+    scratch = np.empty(seen.size, np.int32) if seen.size <= _DENSE else None
+    frontier, rounds, work = np.flatnonzero(seen), 0, 0
+    while frontier.size:
+        state, memory = np.divmod(frontier, world.num_memory)
+        moving = ~world.still[memory]
+        state, memory = state[moving], memory[moving]
+        count = first_entry[state + 1] - first_entry[state]
+        entry = spans(first_entry[state], count)
+        follower = world.after(
+            host.successor[entry], np.repeat(state, count), np.repeat(memory, count)
+        )
+        follower = follower[~seen[follower]]
+        seen[follower] = True
+        if scratch is None:
+            frontier = np.unique(follower)
+        else:  # of each pair's repetitions the last one stays
+            place = np.arange(follower.size, dtype=np.int32)
+            scratch[follower] = place
+            frontier = follower[scratch[follower] == place]
+        rounds, work = rounds + 1, work + follower.size
+        if rounds == _ROUNDS:
+            if work < _NARROW * rounds and (host.num_transitions * world.num_memory <= _MAX_EDGES):
+                return _searched(world, start)
+            rounds = work = 0
+    return seen
+
+
+def _searched(world: _World, start: Integers) -> Booleans:
+    """The same by SciPy's search of the whole product, whose time does not grow with its depth."""
+    from scipy.sparse import csgraph, csr_array
+
+    host, (num_states, num_memory) = world.host, (world.host.num_states, world.num_memory)
+    first_entry = host.entry_start[host.row_start].astype(np.int64)
+    left = host.state[host.row] if not world.on_entry else host.successor
+    # Pairs are numbered by memory first here, so that each memory's edges are together.
+    target, count = [], []
+    for q in range(num_memory):
+        moves = not world.still[q]
+        count.append(np.diff(first_entry) * moves)
+        if moves:
+            target.append(world.step[world.letter[left], q] * num_states + host.successor)
+    first = np.unique(start % num_memory * num_states + start // num_memory)
+    target.append(first)  # of a node of its own
+    size = num_states * num_memory + 1
+    index = np.concatenate([[0], np.concatenate([*count, [first.size]]).cumsum()])
+    edges = np.concatenate(target)
+    graph = csr_array((np.ones(edges.size), edges, index), shape=(size, size))
+    order = csgraph.breadth_first_order(graph, size - 1, return_predecessors=False)[1:]
+    memory, state = np.divmod(order.astype(np.int64), num_states)
+    seen = np.zeros(size - 1, bool)
+    seen[state * num_memory + memory] = True
+    return seen
+
+
+def _written(world: _World, code: Integers, number: Any, start: Integers) -> HostProduct:
+    """The rows of the pairs that are reached."""
+    host = world.host
+    state, memory = np.divmod(code, world.num_memory)
+    still = world.still[memory]
+    choices = np.where(still, 1, np.diff(host.row_start)[state])
+    base_row = spans(host.row_start[state], choices)
+    owner = np.repeat(np.arange(code.size), choices)
+    width = np.where(still[owner], 1, np.diff(host.entry_start)[base_row])
+    entry = spans(host.entry_start[base_row], width)
+    source = np.repeat(owner, width)
+    follower = world.after(host.successor[entry], state[source], memory[source])
+    alone = still[source]
+    successor = number(np.where(alone, code[source], follower) if alone.any() else follower)
+    probability = host.probability[entry]
+    probability[alone] = 1.0
+    product = HostMDP(starts_of(choices), starts_of(width), successor, probability)
+    return HostProduct(
+        product,
+        state.astype(np.int32),
+        memory.astype(np.int32),
+        base_row.astype(np.int32),
+        number(start).astype(np.int64),
+        still,
+    )

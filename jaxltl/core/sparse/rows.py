@@ -1,0 +1,209 @@
+"""Sparse rows: the successors of every choice, without padding, and sweeps over them.
+
+SciPy takes a tenth of a second to import and small models take none of that, so below some
+size NumPy alone does the work.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxltl.core.array_types import Booleans, Integers
+
+LARGE = 100_000  # entries from which importing SciPy pays
+_FEW = 16  # columns up to which reducing them one by one beats a reduction over a short axis
+
+
+@dataclass(frozen=True)
+class Rows:
+    """The support of a transition function: row r leads to ``successor[entry_start[r] : ...]``.
+
+    Attributes:
+      entry_start: ``int[R + 1]``.
+      successor: ``int32[T]``, by row.
+      num_states: S, above every successor.
+    """
+
+    entry_start: Integers
+    successor: Integers
+    num_states: int
+
+    @property
+    def num_rows(self) -> int:
+        return self.entry_start.size - 1
+
+    @cached_property
+    def count(self) -> Integers:
+        """``int[R]``: how many entries a row has."""
+        return np.diff(self.entry_start)
+
+    @cached_property
+    def matrix(self) -> Any:
+        """The sparse matrix of ones, ``[R, S]``."""
+        from scipy import sparse  # a tenth of a second that only large models need
+
+        # Bytes are the fastest, but a row of 256 of them can add up to zero.
+        data = np.ones(self.successor.size, np.uint8 if self.count.max() < 256 else bool)
+        shape = (self.num_rows, self.num_states)
+        return sparse.csr_array((data, self.successor, self.entry_start), shape=shape)
+
+    def lead_to(self, region: Booleans) -> Booleans:
+        """Whether some successor lies in a region: ``bool[R, ...]`` from ``bool[S, ...]``."""
+        if not region.any():
+            return np.zeros((self.num_rows, *region.shape[1:]), bool)
+        if region.all():
+            full = (self.count > 0).reshape(-1, *(1,) * (region.ndim - 1))
+            return np.broadcast_to(full, (self.num_rows, *region.shape[1:])).copy()
+        if self.successor.size > LARGE:
+            return self.matrix @ region.astype(self.matrix.dtype) > 0
+        return self._reduce(np.logical_or, region, False)
+
+    def least(self, value: NDArray[Any], default: Any) -> NDArray[Any]:
+        """The smallest value among the successors, ``[R, ...]``; the default without any."""
+        return self._reduce(np.minimum, value, default)
+
+    def number_in(self, region: Booleans) -> Integers:
+        """How many entries lie in a region: ``int32[R, ...]``."""
+        return self._reduce(np.add, region.astype(np.int32), 0)
+
+    def _reduce(self, operation: Any, value: NDArray[Any], default: Any) -> NDArray[Any]:
+        found = np.full((self.num_rows, *value.shape[1:]), default, value.dtype)
+        full = self.count > 0
+        if full.any():
+            start = self.entry_start[:-1][full]
+            found[full] = operation.reduceat(value[self.successor], start, axis=0)
+        return found
+
+    def take(self, rows: Integers) -> Rows:
+        """Some of the rows, in the order asked for."""
+        if self.successor.size > LARGE:
+            part = self.matrix[rows]
+            return Rows(part.indptr, part.indices, self.num_states)
+        count = self.count[rows]
+        start: Integers = np.concatenate([[0], count.cumsum()])
+        return Rows(start, self.successor[spans(self.entry_start[rows], count)], self.num_states)
+
+    @cached_property
+    def predecessors(self) -> tuple[Integers, Integers]:
+        """The rows into state t, one an entry: ``row[start[t] : start[t + 1]]``, in order."""
+        if self.successor.size > LARGE:
+            columns = self.matrix.tocsc()
+            return columns.indptr, columns.indices
+        order = np.argsort(self.successor, kind="stable")
+        count = np.bincount(self.successor, minlength=self.num_states)
+        row = np.repeat(np.arange(self.num_rows), self.count)
+        return np.concatenate([[0], count.cumsum()]), row[order]
+
+
+def spans(start: Integers, count: Integers) -> Integers:
+    """The numbers ``start[i], ..., start[i] + count[i] - 1`` of all spans in a row."""
+    end = count.cumsum()
+    found = (start - end + count).repeat(count)
+    found += np.arange(found.size)
+    return found
+
+
+def starts_of(count: Integers) -> Integers:
+    """Where spans of so many begin, and where the last one ends: ``int32[N + 1]``, if that fits.
+
+    >>> starts_of(np.array([2, 0, 1])).tolist()
+    [0, 2, 2, 3]
+    """
+    found: Any = np.zeros(count.size + 1, np.int64)
+    np.cumsum(count, out=found[1:])
+    return found.astype(np.int32) if found[-1] < 2**31 else found
+
+
+def distinct(number: Integers, size: int) -> Integers:
+    """Numbers below a size in order, each once.
+
+    >>> distinct(np.array([3, 1, 3]), 5).tolist()
+    [1, 3]
+    """
+    if number.size < size // 16:
+        number = np.sort(number)
+        return number[changes(number)]
+    mark = np.zeros(size, bool)
+    mark[number] = True
+    return np.flatnonzero(mark)
+
+
+def changes(number: Integers) -> Booleans:
+    """Whether each number is another one than the number before it: ``bool[N]``.
+
+    >>> changes(np.array([1, 1, 3])).tolist()
+    [True, False, True]
+    """
+    found = np.ones(number.size, bool)
+    np.not_equal(number[1:], number[:-1], out=found[1:])
+    return found
+
+
+def count_down(counter: Integers, number: Integers) -> None:
+    """Takes one from a counter for each time that its number stands, in place."""
+    if number.size < counter.size:
+        np.subtract.at(counter, number, counter.dtype.type(1))  # another type is far slower
+    else:
+        counter -= np.bincount(number, minlength=counter.size).astype(counter.dtype)
+
+
+def rows_of(successor: Integers, used: Booleans, num_states: int) -> Rows:
+    """Rows from padded lists.
+
+    Args:
+      successor: ``int[..., K]``; entries that are not used may be anything.
+      used: ``bool[..., K]``.
+      num_states: S.
+
+    Example:
+      >>> rows = rows_of(np.array([[1, 7], [0, 1]]), np.array([[True, False], [True, True]]), 2)
+      >>> rows.entry_start.tolist(), rows.successor.tolist()
+      ([0, 1, 3], [1, 0, 1])
+    """
+    width = used.shape[-1]
+    index: Any = np.int32 if used.size < 2**31 else np.int64
+    if used.all():
+        every: Integers = np.arange(0, used.size + 1, width, dtype=index)
+        return Rows(every, successor.reshape(-1), num_states)
+    start: Integers = np.zeros(used.size // width + 1, index)
+    start[1:] = np.cumsum(used.ravel(), dtype=index)[width - 1 :: width]
+    return Rows(start, successor[used], num_states)
+
+
+def rows_of_matrix(used: Booleans) -> Rows:
+    """Rows from a full support, ``bool[..., S]``."""
+    flat = used.reshape(-1, used.shape[-1])
+    start: Integers = np.concatenate([[0], flat.sum(-1).cumsum()])
+    return Rows(start, np.nonzero(flat)[1].astype(np.int32), used.shape[-1])
+
+
+# --- masks of actions -------------------------------------------------------------------------
+
+
+def some_action(mask: Booleans) -> Booleans:
+    """Whether a mask ``bool[..., A]`` holds for some action."""
+    if mask.shape[-1] > _FEW:
+        return np.any(mask, -1, keepdims=True)[..., 0]
+    some: Booleans = mask[..., 0].copy()
+    for a in range(1, mask.shape[-1]):
+        some |= mask[..., a]
+    return some
+
+
+def first_action(mask: Booleans) -> tuple[Booleans, Integers]:
+    """Whether a mask ``bool[..., A]`` holds for some action, and the first one (or 0)."""
+    if mask.shape[-1] > _FEW:
+        return np.any(mask, -1, keepdims=True)[..., 0], mask.argmax(-1).astype(np.int32)
+    # Counting the actions before the first one is ten times faster than writing where it is.
+    some: Booleans = mask[..., 0].copy()
+    action = np.zeros(mask.shape[:-1], np.int8)
+    for a in range(1, mask.shape[-1]):
+        action += ~some
+        some |= mask[..., a]
+    action *= some
+    return some, action.astype(np.int32)

@@ -1,0 +1,1 @@
+"""Reachability, total, average, bounded and discounted values of sparse MDPs."""

@@ -1,0 +1,351 @@
+"""Reaching pairs of a large world's state and an automaton's, one part of the automaton at a time.
+
+The automaton's strongly connected components (most of them single states) are left for ever in one
+order. From the last one on, each asks a question of the world alone, in which entering a state that
+leads on is worth what is known of it by then, between two bounds. The graph is searched for all
+memories at once (:mod:`jaxltl.core.sparse.graph.bitsets`), and what it leaves open is found by sweeps
+(:mod:`jaxltl.core.sparse.linear.gauss_seidel`).
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxltl.core.array_types import Booleans, Floats, Integers
+from jaxltl.core.sparse.contraction import merged
+from jaxltl.core.sparse.graph.bitsets import LARGEST, BitSets, bit_graph, decided, pack
+from jaxltl.core.sparse.graph.qualitative import end_components
+from jaxltl.core.sparse.linear.gauss_seidel import Cut, Relaxed, Sums, cut, relaxed
+from jaxltl.core.sparse.linear.topological_order import Edges, components_in_order
+from jaxltl.core.sparse.mdp import HostMDP
+from jaxltl.core.sparse.rows import starts_of
+from jaxltl.core.sparse.solvers.mixing import spreads
+from jaxltl.core.sparse.solvers.reachability import leaving_by
+
+_EPS = float(np.finfo(np.float64).eps)
+_TINY = 1e-290
+_STARTS = 8  # states from one of which few steps
+_MET = 4096  # lead to so many, where the graph is shallow and sweeps end soon
+_MOST = 2**27  # transitions of a component that is written out, at most
+
+
+class World(NamedTuple):
+    """A padded world beside an automaton, whose letters are read where states are entered.
+
+    Attributes:
+      successor: ``int[S, A, K]``.
+      used: ``bool[S, A, K]``.
+      probability: ``float[S, A, K]``.
+      available: ``bool[S, A]``.
+      delta: ``int[Q, L]``.
+      letter: ``int[S]``.
+      allowed: ``bool[S, Q, A]``, or None for all.
+    """
+
+    successor: Integers
+    used: Booleans
+    probability: Floats
+    available: Booleans
+    delta: Integers
+    letter: Integers
+    allowed: Booleans | None = None
+
+
+class Layered(NamedTuple):
+    """An optimum, enclosed.
+
+    Attributes:
+      lower, upper: ``float64[S, Q]``, exactly 0 or 1 where the graph says so.
+      action: ``int32[S, Q]``, a policy that attains the bound on the safe side.
+      sweeps: over the world.
+    """
+
+    lower: Floats
+    upper: Floats
+    action: Integers
+    sweeps: int
+
+
+class _Rows:
+    """The world's rows, their actions, and in blocks."""
+
+    def __init__(self, world: World) -> None:
+        available, used = world.available, world.used
+        self.regular = bool(available.all() and used.all())
+        num_states, num_actions, width = used.shape
+        if self.regular:
+            count = np.full(num_states, num_actions)
+            starts = np.arange(0, used.size + 1, width, dtype=starts_of(count * width).dtype)
+            column, weight = world.successor.reshape(-1), world.probability.reshape(-1)
+            self.action = np.tile(np.arange(num_actions, dtype=np.int32), num_states)
+        else:
+            kept = used & available[:, :, None]
+            count, starts = available.sum(1), starts_of(kept.sum(2)[available])
+            column, weight = world.successor[kept], world.probability[kept]
+            self.action = np.nonzero(available)[1].astype(np.int32)
+        self.available = available
+        self.host = HostMDP(
+            starts_of(count), starts, column.astype(np.int32, copy=False), weight.astype(np.float64)
+        )
+
+    @cached_property
+    def cut(self) -> Cut:
+        """Of all rows."""
+        host = self.host
+        return cut(
+            host.row_start, host.entry_start, host.successor, host.probability, host.num_states
+        )
+
+    def of(self, choices: Booleans) -> Booleans:
+        """What holds of actions ``bool[S, A]``, of rows."""
+        return choices.reshape(-1) if self.regular else choices[self.available]
+
+
+def layered(world: World, target: Booleans, *, maximize: bool, tolerance: float) -> Layered | None:
+    """The largest or smallest probability of reaching a target.
+
+    Args:
+      world: the product.
+      target: ``bool[S, Q]``.
+      maximize: which of the two.
+      tolerance: how far apart the bounds may be.
+
+    Returns:
+      The bounds; None where sweeps would take long, or could not prove them.
+    """
+    num_memory = world.delta.shape[0]
+    if num_memory > LARGEST or not _mixes(world):
+        return None
+    graph = bit_graph(
+        world.successor, world.used, world.available, world.delta, world.letter, world.allowed
+    )
+    sets = decided(graph, pack(target), num_memory, maximize=maximize)
+    del graph
+    if sets is None:
+        return None
+    search = _Search(world, sets, 1 if maximize else -1, tolerance)
+    return search.found() if search.solve() else None
+
+
+def _mixes(world: World) -> bool:
+    """Whether few steps from some state lead to many others."""
+    size = world.letter.size
+
+    def follow(states: Any) -> Any:
+        return world.successor[states][world.used[states]]
+
+    return any(spreads(follow, np.array([i * size // _STARTS]), size, _MET) for i in range(_STARTS))
+
+
+class _Search:
+    """Bounds by memory, ``float64[Q, S]``, that are filled in component after component."""
+
+    def __init__(self, world: World, sets: BitSets, sign: int, tolerance: float) -> None:
+        self.world, self.sets, self.sign, self.tolerance = world, sets, sign, tolerance
+        num_memory = world.delta.shape[0]
+        self.near = np.stack([self.has(sets.one, q) for q in range(num_memory)]).astype(float)
+        self.far = self.near.copy()
+        self.action, self.sweeps, self.known = sets.action, 0, 0.0
+        self.guess: tuple[Floats, float] | None = None  # of values, and of how long runs stay
+
+    @cached_property
+    def rows(self) -> _Rows:
+        """The world's rows."""
+        return _Rows(self.world)
+
+    @staticmethod
+    def has(words: Any, q: Any) -> Booleans:
+        """The states in which a set has a memory."""
+        return (words >> q & 1).astype(bool)
+
+    def open(self, q: Any) -> Booleans:
+        """The states in which the probability is neither 0 nor 1."""
+        return ~self.has(self.sets.one | self.sets.zero, q)
+
+    def solve(self) -> bool:
+        """Fills in all components; whether that succeeded."""
+        num_memory = self.world.delta.shape[0]
+        read = np.unique(self.world.letter)
+        label = components_in_order(
+            Edges(
+                np.arange(0, num_memory * read.size + 1, read.size),
+                self.world.delta[:, read].ravel().astype(np.int32),
+            )
+        )
+        parts = [np.flatnonzero(label == i) for i in range(label.max() + 1)]
+        parts = [x for x in parts if any(self.open(q).any() for q in x)]
+        for i, part in enumerate(parts, 1):
+            budget = self.tolerance * i / len(parts) - self.known
+            if budget <= 0 or not self.component(part, budget):
+                return False
+        return True
+
+    def component(self, part: Integers, budget: float) -> bool:
+        """One component, whose bounds may be that much farther apart than those that are known."""
+        host = self.rows.host
+        if part.size > 1 and host.num_transitions * part.size > _MOST:
+            return False
+        # Columns are pairs that a step may enter; of one memory, numbered by the state.
+        problem = _alone(self, int(part[0])) if part.size == 1 else _together(self, part)
+        guess = self.guess if part.size == 1 else None
+        found = _solved(problem, self.sign, budget, self.unit, guess)
+        if found is None:
+            return False
+        near, far, row = found.near, found.far, found.row
+        self.sweeps += found.sweeps
+        self.known = max(
+            self.known, float(np.abs(far - near)[problem.open[: far.size]].max(initial=0))
+        )
+        for i, q in enumerate(part):
+            span = slice(i * host.num_states, (i + 1) * host.num_states)
+            open_ = problem.open[span]
+            np.copyto(self.near[q], near[span], where=open_)
+            np.copyto(self.far[q], far[span], where=open_)
+            action = self.rows.action[row[span] - i * host.num_rows]
+            np.copyto(self.action[:, q], action, where=open_)
+        self.guess = (self.near[part[0]], found.time) if part.size == 1 else None
+        return True
+
+    @cached_property
+    def unit(self) -> float:
+        """The relative rounding of one backup."""
+        return (4 * self.world.used.shape[2] + 16) * _EPS
+
+    def found(self) -> Layered:
+        """The bounds as they were asked for."""
+        low, high = (self.near, self.far) if self.sign > 0 else (self.far, self.near)
+        # Products too small for a float to hold are lost; relative errors do not count them.
+        open_ = low != high
+        low = np.where(open_, np.clip(low - _TINY, 0, 1), low)
+        high = np.where(open_, np.clip(high + _TINY, 0, 1), high)
+        return Layered(low.T, high.T, self.action, self.sweeps)
+
+
+class _Problem(NamedTuple):
+    """What is asked of a component: :class:`Sums`, and where end components are.
+
+    Attributes:
+      host: as many states as there are columns; the first ones are nodes.
+      cut: of its rows, if that is known.
+      open, live, near, far: as of Sums, all of the columns.
+      rows: ``bool[R]``, or None.
+      stays: ``bool[M]``, where end components are looked for.
+      inner: ``bool[M]``, the columns that are read as nodes.
+    """
+
+    host: HostMDP
+    cut: Cut | None
+    open: Booleans
+    live: Booleans
+    near: Floats
+    far: Floats
+    rows: Booleans | None
+    stays: Booleans
+    inner: Booleans
+
+
+def _alone(search: _Search, q: int) -> _Problem:
+    """Of one memory: entering a state leads to it, or on to another one."""
+    world, rows = search.world, search.rows
+    after = world.delta[q][world.letter]
+    place = np.arange(after.size)
+    inner, open_ = after == q, search.open(q)
+    mask = None if world.allowed is None else rows.of(world.allowed[:, q])
+    return _Problem(
+        rows.host,
+        rows.cut,
+        open_,
+        inner & open_,
+        search.near[after, place],
+        search.far[after, place],
+        mask,
+        search.has(search.sets.stays, q),
+        inner,
+    )
+
+
+def _together(search: _Search, part: Integers) -> _Problem:
+    """Of several memories: their rows written out, and a state for each pair that leads on."""
+    world, host = search.world, search.rows.host
+    size = host.num_states
+    after = world.delta[part][:, world.letter]  # [C, S]
+    others = np.setdiff1d(after, part)
+    number = np.zeros(world.delta.shape[0], np.int64)
+    number[part] = np.arange(part.size)
+    number[others] = part.size + np.arange(others.size)
+    column = (number[after] * size + np.arange(size)).astype(np.int32)
+    ends = others.size * size
+    nodes = part.size * size
+    entries = np.concatenate([x[host.successor] for x in column])
+    width = np.concatenate([np.tile(np.diff(host.entry_start), part.size), np.ones(ends, int)])
+    written = HostMDP(
+        starts_of(
+            np.concatenate([np.tile(np.diff(host.row_start), part.size), np.ones(ends, int)])
+        ),
+        starts_of(width),
+        np.concatenate([entries, np.arange(nodes, nodes + ends, dtype=np.int32)]),
+        np.concatenate([np.tile(host.probability, part.size), np.ones(ends)]),
+    )
+    every = np.concatenate([part, others])
+    near, far = (x[every].ravel() for x in (search.near, search.far))
+    none = np.zeros(ends, bool)
+    open_ = np.concatenate([*map(search.open, part), none])
+    stays = np.concatenate([*(search.has(search.sets.stays, q) for q in part), none])
+    mask = None
+    if world.allowed is not None:
+        mask = np.concatenate(
+            [*(search.rows.of(world.allowed[:, q]) for q in part), np.ones(ends, bool)]
+        )
+    return _Problem(
+        written, None, open_, open_, near, far, mask, stays, np.arange(nodes + ends) < nodes
+    )
+
+
+def _solved(
+    problem: _Problem, sign: int, budget: float, unit: float, guess: tuple[Floats, float] | None
+) -> Relaxed | None:
+    """Bounds of the nodes, and their rows."""
+    host = problem.host
+    circles = None
+    if problem.stays.any():
+        # Rows that stay in the component of the automaton, and where they can be taken for ever.
+        here = problem.stays & problem.inner
+        rows = problem.stays[host.state] & ~host.support.lead_to(~here)
+        if problem.rows is not None:
+            rows &= problem.rows
+        circles = end_components(host, problem.stays, rows)
+        if not circles.inside.any():
+            circles = None
+    if circles is None:
+        blocks = problem.cut or _cut(host)
+        sums = Sums(
+            blocks, problem.open, problem.live, problem.near, problem.far, None, problem.rows
+        )
+        start, time = (None, None) if guess is None else guess
+        return relaxed(
+            sums, sign=sign, tolerance=budget, relative=False, unit=unit, start=start, time=time
+        )
+    part = merged(host, circles.component, circles.inside, np.zeros(host.num_rows))
+    leader = np.flatnonzero(circles.component == np.arange(host.num_states))
+    mask = None if problem.rows is None else problem.rows[part.row]
+    sums = Sums(
+        _cut(part.mdp),
+        problem.open[leader],
+        problem.live[leader],
+        problem.near[leader],
+        problem.far[leader],
+        None,
+        mask,
+    )
+    found = relaxed(sums, sign=sign, tolerance=budget, relative=False, unit=unit)
+    if found is None:
+        return None
+    row = leaving_by(host, circles, part.row[found.row][part.node])
+    return found._replace(near=found.near[part.node], far=found.far[part.node], row=row)
+
+
+def _cut(host: HostMDP) -> Cut:
+    return cut(host.row_start, host.entry_start, host.successor, host.probability, host.num_states)

@@ -1,0 +1,290 @@
+"""Probability of a target before so much reward is spent, level by level of what is left.
+
+With l units left a step that costs c leads to level ``l - c``. Steps that cost nothing stay on a
+level, where they make a system of equations: it is the same on every level, so its factors are
+kept, and one bound on how long a run can go on without cost proves them all.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxltl.core.array_types import Booleans, Floats, Integers
+from jaxltl.core.sparse.graph.qualitative import end_components, reaching, towards
+from jaxltl.core.sparse.mdp import HostMDP
+from jaxltl.core.sparse.rows import spans
+from jaxltl.core.sparse.solvers.step_bounded import backup_unit
+
+_LEVELS = 10**7  # amounts of reward at most
+_LARGEST = 8 * 2**30  # bytes of the levels that are kept
+_DENOMINATOR = 10**9  # of the fractions that rewards are taken for
+_GAIN = 1e-13  # relative gain that may be rounding
+_ROUNDS = 100
+
+
+class Level(NamedTuple):
+    """What can be had with everything left to spend.
+
+    Attributes:
+      value: ``float64[S]``.
+      open: ``bool[S]``, where that is not exact.
+      error: how far it may be off there.
+      row: ``int32[S]``, the choices with everything left; ``int32[L + 1, S]`` if all are asked for.
+    """
+
+    value: Floats
+    open: Booleans
+    error: float
+    row: Integers
+
+
+def in_units(cost: Floats, bound: float) -> tuple[Integers, int]:
+    """Costs as whole multiples of their greatest common unit, and how many units a bound has.
+
+    Each number is taken for the simplest fraction that is rounded to it.
+
+    Args:
+      cost: ``float64[T]``, not negative.
+      bound: not negative.
+
+    Returns:
+      ``int64[T]`` and an integer.
+
+    Raises:
+      ValueError: a cost has no unit in common with the others of which the bound has at most 10^7.
+
+    Example:
+      >>> units, most = in_units(np.array([0.1, 0.0, 0.3]), 0.7)
+      >>> units.tolist(), most
+      ([1, 0, 3], 7)
+    """
+    distinct, place = np.unique(cost, return_inverse=True)
+    exact = [_simplest(float(x)) for x in distinct]
+    scale = math.lcm(*(x.denominator for x in exact))
+    whole = [int(x * scale) for x in exact]
+    unit = Fraction(math.gcd(*whole) or scale, scale)
+    most = math.floor(_simplest(float(bound)) / unit)
+    if most > _LEVELS:
+        worst = max(exact, key=lambda x: x.denominator)
+        raise ValueError(
+            f"the rewards have no unit in common but {float(unit):.3g} (one of them is "
+            f"{float(worst)!r}), and the bound {bound} has {most:.3g} of these; at most {_LEVELS} "
+            "can be counted. Round the rewards to multiples of a larger unit."
+        )
+    # What costs more than everything costs just too much.
+    units = np.array([min(int(x / unit), most + 1) for x in exact], np.int64)
+    return units[place.reshape(cost.shape)], most
+
+
+def _simplest(x: float) -> Fraction:
+    exact = Fraction(x)
+    for size in (10, 10**3, 10**6, _DENOMINATOR):
+        near = exact.limit_denominator(size)
+        if float(near) == x:
+            return near
+    return exact
+
+
+def bounded_cost(
+    mdp: HostMDP,
+    target: Booleans,
+    stay: Booleans,
+    cost: Integers,
+    most: int,
+    maximal: bool,
+    by_level: bool = False,
+) -> Level:
+    """Optimal probability of a target through states where one may stay, at a cost.
+
+    Args:
+      mdp: the model.
+      target, stay: ``bool[S]``.
+      cost: ``int64[T]``, of each entry.
+      most: what may be spent.
+      maximal: whether the largest probability is meant, or the smallest.
+      by_level: whether the choices of all levels are asked for.
+    """
+    open_ = stay & ~target
+    shape = _shape(mdp, target, open_, cost, maximal)
+    parts = _parts(mdp, shape, target, cost, most)
+    system = _System(shape, parts[0][1], maximal)
+    size = parts[-1][0] + 1
+    if 8.0 * size * shape.starts.size > _LARGEST:
+        raise ValueError(
+            f"{shape.starts.size} states with rewards of up to {size - 1} units would take "
+            f"{8 * size * shape.starts.size / 2**30:.0f} GB; round them to a larger unit."
+        )
+    ring = np.zeros((size, shape.starts.size))  # the last levels
+    error, every = 0.0, []
+    for level in range(most + 1):
+        b = parts[0][2].copy()
+        for c, matrix, hit in parts[1:]:
+            if c > level:
+                break
+            b += matrix @ ring[(level - c) % size]
+            b += hit
+        value, off = system.solve(b, backup_unit(mdp) * (len(parts) + 1))
+        error += off
+        ring[level % size] = value
+        if by_level or level == most:
+            every.append(_policy(mdp, shape, system.chosen))
+    found = target.astype(np.float64)
+    found[shape.member] = ring[most % size][shape.node[shape.member]]
+    return Level(found, shape.member, error, np.stack(every) if by_level else every[-1])
+
+
+class _Shape(NamedTuple):
+    """The nodes of the system: states that are not decided, those of an end component as one.
+
+    Attributes:
+      member: ``bool[S]``, the states that are no constant.
+      node: ``int[S]``, the node of a member.
+      row: ``int[R']``, the rows of the nodes, in order.
+      starts: ``int[N]``, where those of each node begin.
+      inside: ``bool[R]``, rows without cost of end components that stay in them.
+    """
+
+    member: Booleans
+    node: Integers
+    row: Integers
+    starts: Integers
+    inside: Booleans
+
+
+def _shape(
+    mdp: HostMDP, target: Booleans, open_: Booleans, cost: Integers, maximal: bool
+) -> _Shape:
+    free = np.maximum.reduceat(cost, mdp.entry_start[:-1]) == 0
+    member = reaching(mdp, target, open_[mdp.state]) & open_
+    found = end_components(mdp, member if maximal else open_, free)
+    inside = found.inside
+    if not maximal:
+        # Who may go round without cost for ever need not get there.
+        member &= ~found.region(mdp)
+        inside = np.zeros_like(inside)
+    leader = np.where(member & maximal, found.component, np.arange(mdp.num_states))
+    row = np.flatnonzero(member[mdp.state] & ~inside)
+    row = row[np.argsort(leader[mdp.state[row]], kind="stable")]
+    leaders, starts = np.unique(leader[mdp.state[row]], return_index=True)
+    node = np.searchsorted(leaders, leader)
+    return _Shape(member, node, row, starts, inside)
+
+
+def _parts(
+    mdp: HostMDP, shape: _Shape, target: Booleans, cost: Integers, most: int
+) -> list[tuple[int, Any, Floats]]:
+    """By cost: the matrix of the entries of that cost, and what of it hits the target."""
+    from scipy import sparse
+
+    count = np.diff(mdp.entry_start)[shape.row]
+    entry = spans(mdp.entry_start[shape.row], count)
+    row = np.repeat(np.arange(shape.row.size), count)
+    goal, probability = mdp.successor[entry], mdp.probability[entry]
+    found = []
+    for c in np.union1d([0], cost[entry]).tolist():
+        if c > most:
+            break
+        of = cost[entry] == c
+        hit = of & target[goal]
+        of &= shape.member[goal]
+        place = row[of], shape.node[goal[of]]
+        matrix = sparse.csr_array(
+            (probability[of], place), shape=(shape.row.size, shape.starts.size)
+        )
+        enters = np.bincount(row[hit], probability[hit], shape.row.size).astype(np.float64)
+        found.append((c, matrix, enters))
+    return found
+
+
+def _policy(mdp: HostMDP, shape: _Shape, chosen: Integers) -> Integers:
+    """The rows that were chosen, and in end components the ways to where they are."""
+    found = mdp.row_start[:-1].astype(np.int32)
+    row = shape.row[chosen].astype(np.int32)
+    found[mdp.state[row]] = row
+    if shape.inside.any():
+        goal = np.zeros(mdp.num_states, bool)
+        goal[mdp.state[row]] = True
+        within = np.zeros(mdp.num_states, bool)
+        within[mdp.state[shape.inside]] = True
+        found = np.where(within & ~goal, towards(mdp, goal, shape.inside), found)
+    return found
+
+
+@dataclass
+class _System:
+    """``x = opt (b + P x)`` where all runs end, with what is known of it.
+
+    Attributes:
+      shape: whose rows these are.
+      matrix: ``P``, of the rows without cost.
+      maximal: which optimum.
+      chosen: ``int[N]``, the number of each node's row.
+      factors: of the rows chosen; None where ``P`` is zero.
+      longest: ``float``, a bound on the number of steps in a row without cost.
+    """
+
+    shape: _Shape
+    matrix: Any
+    maximal: bool
+
+    def __post_init__(self) -> None:
+        self.chosen = self.shape.starts
+        self.factors: Any = None
+        self.longest = 1.0
+        if self.matrix.nnz:
+            wish, self.maximal = self.maximal, True
+            self._factor()
+            steps = self._iterate(np.ones(self.shape.row.size))
+            ahead = np.repeat(steps, np.diff(np.append(self.shape.starts, self.shape.row.size)))
+            enough = (ahead - self.matrix @ steps >= 0.5).all() and (steps >= 0).all()
+            self.longest = 2 * float(steps.max()) if enough else math.inf
+            self.maximal = wish
+
+    def best(self, image: Floats) -> Floats:
+        operation = np.maximum if self.maximal else np.minimum
+        return operation.reduceat(image, self.shape.starts) if image.size else image
+
+    def solve(self, b: Floats, unit: float) -> tuple[Floats, float]:
+        """The solution and how far it may be off if each sum is off by so many roundings."""
+        if not self.matrix.nnz:
+            value = self.best(b)
+            self._choose(b, value, np.zeros_like(value, bool))
+            return value, unit
+        value = np.clip(self._iterate(b), 0, 1)
+        residual = np.abs(self.best(b + self.matrix @ value) - value).max(initial=0)
+        return value, float(residual + unit) * self.longest
+
+    def _iterate(self, b: Floats) -> Floats:
+        """Policy iteration (Howard 1960) from the last policy, whose factors are at hand."""
+        for _ in range(_ROUNDS):
+            value = self.factors.solve(b[self.chosen])
+            image = b + self.matrix @ value
+            best = self.best(image)
+            kept = np.abs(best - image[self.chosen]) <= _GAIN * np.abs(best)
+            if kept.all():
+                break
+            self._choose(image, best, kept)
+            self._factor()
+        return value
+
+    def _choose(self, image: Floats, best: Floats, kept: Booleans) -> None:
+        starts = self.shape.starts
+        if starts.size < self.shape.row.size:
+            count = np.diff(np.append(starts, self.shape.row.size))
+            hit = np.flatnonzero(image == np.repeat(best, count))
+            node = np.repeat(np.arange(starts.size), count)[hit]
+            first = starts.copy()
+            first[node[::-1]] = hit[::-1]  # the first one is written last
+            self.chosen = np.where(kept, self.chosen, first)
+
+    def _factor(self) -> None:
+        from scipy import sparse
+        from scipy.sparse import linalg
+
+        system = sparse.eye_array(self.shape.starts.size) - self.matrix[self.chosen]
+        self.factors = linalg.splu(system.tocsc())

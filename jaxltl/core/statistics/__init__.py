@@ -1,0 +1,1 @@
+"""Statistical bounds: binomial, empirical Bernstein, and confidence sets of transition probabilities."""

@@ -1,0 +1,187 @@
+"""Intervals of a probability from how often it came true, with ends that err outward.
+
+Each function takes ``count`` of ``total`` and the chance `failure` of a miss, and gives ends
+``(lower, upper)`` in double precision. Rounding is accounted for: what an end excludes is excluded
+by the mathematics, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from jaxltl.core.array_types import Floats, Integers
+
+_EPS = float(np.finfo(np.float64).eps)
+# The tails of SciPy err by less than 1e-10 of themselves for up to 1e12 trials. What an interval
+# gives away for this margin is less than its 1e-6th part.
+_MARGIN = 1e-7
+_STEPS = 100  # of Newton; a few are enough
+
+Ends = tuple[Floats, Floats]
+
+
+def clopper_pearson(count: Integers, total: Integers, failure: float) -> Ends:
+    """The ends that a binomial test on each side excludes (Clopper and Pearson 1934).
+
+    ``P(Bin(n, lower) >= k) = P(Bin(n, upper) <= k) = failure / 2``. Each side misses with a chance
+    of at most ``failure / 2``, whatever the probability, if n does not depend on what came.
+
+    Args:
+      count: ``int[N]``, k, from 0 to n.
+      total: ``int[N]``, n, below 2^53.
+      failure: in (0, 1).
+
+    Returns:
+      ``float64[N]`` each; 0 and 1 where nothing was tried.
+
+    Example:
+      >>> lower, upper = clopper_pearson(np.array([0, 5]), np.array([10, 10]), 0.05)
+      >>> lower.round(4).tolist(), upper.round(4).tolist()
+      ([0.0, 0.1871], [0.3085, 0.8129])
+    """
+    return _of_distinct(_tails, count, total, failure)
+
+
+def hoeffding(count: Integers, total: Integers, failure: float) -> Ends:
+    """The frequency and as much on both sides as Hoeffding (1963, theorem 1) allows.
+
+    ``k / n -+ sqrt(log(2 / failure) / (2 n))``, if n does not depend on what came.
+
+    Args, Returns: as of :func:`clopper_pearson`.
+
+    Example:
+      >>> lower, upper = hoeffding(np.array([0, 50]), np.array([10, 100]), 0.05)
+      >>> lower.round(4).tolist(), upper.round(4).tolist()
+      ([0.0, 0.3642], [0.4295, 0.6358])
+    """
+    return around(frequency(count, total), hoeffding_deviation(total, failure))
+
+
+def anytime(count: Integers, total: Integers, failure: float) -> Ends:
+    """The probabilities that a mixture of all others does not outbid, at any time.
+
+    ``p^k (1 - p)^(n - k) >= failure B(k + 1/2, n - k + 1/2) / B(1/2, 1/2)``: the likelihood of
+    Jeffreys' mixture over that of p is a martingale, so the chance that it ever exceeds
+    ``1 / failure`` is at most `failure` (Ville; Robbins 1970; Waudby-Smith and Ramdas 2020). The
+    intervals of all n hold at once: n may depend on what came, as where one tries until
+    something happens, or looks at the intervals in order to go on.
+
+    Args, Returns: as of :func:`clopper_pearson`.
+
+    Example:
+      >>> lower, upper = anytime(np.array([0, 5]), np.array([10, 10]), 0.05)
+      >>> lower.round(4).tolist(), upper.round(4).tolist()
+      ([0.0, 0.1176], [0.377, 0.8824])
+    """
+    return _of_distinct(_mixed, count, total, failure)
+
+
+def frequency(count: Integers, total: Integers) -> Floats:
+    """``count / total``, and 0 where nothing was tried."""
+    return np.asarray(count, np.float64) / np.maximum(total, 1)
+
+
+def hoeffding_deviation(total: Integers, failure: float) -> Floats:
+    """By how much a frequency misses at most, but for a chance of `failure`."""
+    with np.errstate(divide="ignore"):
+        return np.sqrt((np.log(2) - np.log(failure)) / (2.0 * np.asarray(total)))
+
+
+def around(center: Floats, deviation: Floats) -> Ends:
+    """What lies within a deviation, and in [0, 1]; a little more than rounding could hide."""
+    deviation = deviation * (1 + 16 * _EPS) + 4 * _EPS
+    return np.maximum(center - deviation, 0), np.minimum(center + deviation, 1)
+
+
+def _of_distinct(
+    lower_ends: Callable[[Integers, Integers, float], Floats],
+    count: Integers,
+    total: Integers,
+    failure: float,
+) -> Ends:
+    """Both ends from the lower ones, by symmetry, of each pair of numbers once."""
+    count, total = np.broadcast_arrays(np.asarray(count), np.asarray(total))
+    pair, place = np.unique(count.ravel() + 1j * total.ravel(), return_inverse=True)
+    k, n = (x.astype(np.int64) for x in (pair.real, pair.imag))
+    lower, mirrored = np.zeros(k.size), np.zeros(k.size)
+    for end, number in ((lower, k), (mirrored, n - k)):
+        some = number > 0
+        end[some] = lower_ends(number[some], n[some], failure)
+    upper = np.where(mirrored > 0, np.nextafter(1 - mirrored, 2), 1)
+    upper = np.minimum(upper, 1)
+    return lower[place].reshape(count.shape), upper[place].reshape(count.shape)
+
+
+def _tails(k: Integers, n: Integers, failure: float) -> Floats:
+    """The lower ends of Clopper and Pearson for k > 0.
+
+    SciPy's inverse of the tail misses by far for large n and small k (1.17.1: a thousand of 1e9);
+    the tail itself is right.
+    """
+    from scipy.special import betainc, betaln  # a tenth of a second that few need
+
+    side = np.log(failure / 2)
+
+    def gap(x: Floats, i: Integers) -> Ends:
+        ones, others = k[i], n[i] - k[i]
+        with np.errstate(divide="ignore"):
+            tail = np.log(betainc(ones, others + 1, x))
+        fit = ones * np.log(x) + others * np.log1p(-x) - betaln(ones, others + 1)
+        return tail - side, np.exp(np.minimum(fit - tail, 500))
+
+    return _climbed(gap, k, n, -side)
+
+
+def _mixed(k: Integers, n: Integers, failure: float) -> Floats:
+    """The lower ends of :func:`anytime` for k > 0."""
+    from scipy.special import betaln
+
+    mixture = betaln(k + 0.5, n - k + 0.5) - np.log(np.pi)
+    best = k * np.log(k / n) + (n - k) * np.log1p(-np.minimum(k / n, 1 - _EPS))
+
+    def gap(x: Floats, i: Integers) -> Ends:
+        ones, others = k[i] * np.log(x), (n - k)[i] * np.log1p(-x)
+        rounding = 64 * _EPS * (np.abs(mixture[i]) + np.abs(ones) + np.abs(others))
+        above = ones + others + rounding - mixture[i] - np.log(failure)
+        return above, k[i] - (n - k)[i] * x / (1 - x)
+
+    return _climbed(gap, k, n, np.maximum(best - mixture - np.log(failure), 0))
+
+
+def _climbed(
+    gap: Callable[[Floats, Integers], Ends], k: Integers, n: Integers, deviance: Floats | float
+) -> Floats:
+    """The largest x, or nearly, at which a concave, rising function of log x is below zero.
+
+    Newton's steps end left of the zero, where the function is below its tangents; so they climb to
+    it, and what is found does not depend on what else is looked for.
+
+    Args:
+      gap: the function and its derivative, at some x and their numbers.
+      k, n: the zero is left of ``k / n``.
+      deviance: how far the function rises until there, nearly.
+    """
+    # The lower end of Wilson's interval.
+    share, half = k / n, deviance / n
+    x = share * share / (share + half + np.sqrt(half * (half + 2 * share * (1 - share))))
+    x = np.minimum(x, 1 - _EPS)
+    found, active = np.zeros(k.size), np.arange(k.size)
+    for _ in range(_STEPS):
+        at = x[active]
+        above, slope = gap(at, active)
+        below = above <= -_MARGIN
+        found[active[below]] = np.maximum(found[active], at)[below]
+        with np.errstate(invalid="ignore"):
+            step = (-5 * _MARGIN - above) / slope
+        lost = ~np.isfinite(step)  # so far left that it is not told from zero
+        step = np.where(lost, np.log(share[active] / at) / 2, np.maximum(step, -100))
+        new = np.minimum(at * np.exp(step), 1 - _EPS)
+        new = np.where(below, new, np.minimum(new, np.nextafter(at, 0)))
+        done = below & ~lost & (new <= at * (1 + 1e-9 * np.minimum(1, (1 - at) / at)))
+        x[active] = new
+        active = active[~done]
+        if not active.size:
+            break
+    return found

@@ -1,0 +1,389 @@
+"""From counts of transitions to sets that hold their probabilities, all at once.
+
+Every row (state and action) is a die with its own probabilities. What is known of it after n throws
+is an interval for each outcome, or a ball in the L1 norm around the frequencies. A union bound
+makes all of them hold together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from jaxltl.core.array_types import Booleans, Floats, Integers
+from jaxltl.core.pretty_print import brief, count, readable, span
+from jaxltl.core.statistics.binomial import (
+    Ends,
+    anytime,
+    around,
+    clopper_pearson,
+    frequency,
+    hoeffding,
+)
+from jaxltl.core.validation import number, one_of, whole
+
+Method = Literal["clopper-pearson", "hoeffding", "weissman", "anytime"]
+
+_ENDS: dict[str, Callable[[Integers, Integers, float], Ends]] = {
+    "clopper-pearson": clopper_pearson,
+    "hoeffding": hoeffding,
+    "anytime": anytime,
+}
+_EPS = float(np.finfo(np.float64).eps)
+_MOST = 2**53  # throws of a row, up to which doubles count
+
+
+def _facts(sets: Any) -> Iterator[str]:
+    yield count(sets.num_samples.size, "row")
+    samples, low, high = (readable(x) for x in (sets.num_samples, sets.lower, sets.upper))
+    yield count(samples.sum(), "sample") if samples is not None else ""
+    yield f"{sets.method}, confidence {sets.confidence:g} shared by {sets.num_claims:,}"
+    yield f"intervals {span(high - low)} wide" if low is not None and high is not None else ""
+    yield f"radius {span(sets.radius)}" if sets.radius is not None else ""
+
+
+@brief(facts=_facts)
+@dataclass(frozen=True)
+class ConfidenceSets:
+    """A set of distributions for each row; together they hold all true ones, with `confidence`.
+
+    Attributes:
+      lower, upper: ``float64[T]`` or ``float64[..., K]`` as the counts, ends of intervals; 0 at
+        what is no successor. Of a ball, the smallest intervals around it.
+      center: of the same shape, the frequencies; a row that was never seen has equal ones.
+      radius: ``float64[R]`` or ``float64[...]``, the ball ``sum_t |p_t - center_t| <= radius`` of
+        the method of Weissman et al.; None for the others.
+      rest: of a row each, an upper bound of what goes to outcomes that are not listed; 0 where all
+        are.
+      num_samples: of a row each, ``int64``.
+      num_claims: M, how many claims share the chance ``1 - confidence`` to be wrong.
+      confidence, method: as asked for.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> found = jl.intervals_from_counts([[90, 10]], confidence=0.95)
+      >>> found.num_samples.tolist(), bool((found.lower[0] < [0.9, 0.1]).all())
+      ([100], True)
+    """
+
+    lower: Floats
+    upper: Floats
+    center: Floats
+    radius: Floats | None
+    rest: Floats
+    num_samples: Integers
+    num_claims: int
+    confidence: float
+    method: Method
+
+
+def intervals_from_counts(
+    counts: Any,
+    confidence: float,
+    *,
+    method: Method = "clopper-pearson",
+    entry_start: Any = None,
+    used: Any = None,
+    rows: Any = None,
+    num_outcomes: Any = None,
+    num_claims: int | None = None,
+) -> ConfidenceSets:
+    """Sets that hold the probabilities of all rows at once, with a chance of `confidence`.
+
+    The chance to be wrong, ``1 - confidence``, is shared equally by M claims, each of which fails
+    with a chance of at most ``(1 - confidence) / M``; so all hold together, however rows and
+    outcomes depend on one another (union bound). A row of J possible outcomes makes
+
+    - none if J is 1: the probability is one;
+    - one if J is 2: the interval of an outcome is one minus that of the other;
+    - J if it has more: an interval for each;
+    - one if J > 1 for ``"weissman"``: the ball.
+
+    Each claim is that of :mod:`~jaxltl.core.statistics.binomial`, ``"clopper-pearson"``, ``"hoeffding"``
+    or ``"anytime"``; or ``"weissman"``: ``sum_t |p_t - k_t / n| <= sqrt(2 / n log((2^J - 2) M / (1
+    - confidence)))`` (Weissman et al. 2003, theorem 2.1). All but ``"anytime"`` are valid if the
+    number of throws of a row does not depend on what came: as many of each row, say, asked of a
+    simulator. In the log of an agent it does depend (who falls back tries again), and more so where
+    data decide what is tried or when to end. There take ``"anytime"``, which holds for any
+    way to gather data, at all times at once.
+
+    A guarantee for all policies that is drawn from these sets holds for one chosen by the same
+    data. Rows that were never seen have [0, 1]; they are counted in M, as `rows` says.
+
+    Args:
+      counts: how often each successor came, integers: ``[..., K]`` with the successors of a row on
+        the last axis, or ``[T]`` by rows, with `entry_start`. Zero is a successor never seen.
+      confidence: in (0, 1).
+      method: how.
+      entry_start: ``int[R + 1]``, where the rows of ``counts[T]`` begin, as in a
+        :class:`~jaxltl.core.models.sparse.SparseMDP`.
+      used: ``bool[..., K]``, which entries of a padded table are successors; default: all.
+      rows: ``bool[R]`` or ``bool[...]``, the rows that matter: what a policy can meet, or what was
+        sampled. The others have [0, 1] and make no claim. What they are may depend on how often
+        rows were thrown where that is decided before, but never on what came: for a policy that is
+        learned from the same data, it must be all rows.
+      num_outcomes: J, an integer or one of each row: how many outcomes a row may truly have, listed
+        or not; of an unknown graph, all S states. Default: those listed. What is not listed shares
+        what the others leave, `rest`, and none of it has more than an outcome that never came.
+      num_claims: M, at least as many as these rows make. Where data decided which rows there are,
+        it must have been fixed before: ``S * A * S``, say. Default: as many as these rows make.
+
+    Returns:
+      The sets; rounding never makes them smaller.
+
+    Raises:
+      ValueError: naming the argument, and the row and entry: `confidence` is not in (0, 1), counts
+        are no integers, negative, or at what is no successor, shapes do not fit, or a row lists
+        more than `num_outcomes`.
+
+    Example:
+      >>> sets = intervals_from_counts([[8, 2, 0], [5, 5, 0]], 0.9,
+      ...                              used=[[True, True, True], [True, True, False]])
+      >>> sets.num_claims, sets.lower.round(3).tolist(), sets.upper.round(3).tolist()
+      (4, [[0.401, 0.017, 0.0], [0.159, 0.159, 0.0]], [[0.983, 0.599, 0.355], [0.841, 0.841, 0.0]])
+    """
+    _check_method(method)
+    check_confidence(confidence)
+    count, listed, is_entry = _entries(counts, entry_start, used)
+    row = np.repeat(np.arange(listed.size), listed)
+    shape = (listed.size,) if entry_start is not None else is_entry.shape[:-1]
+    outcomes = _outcomes(num_outcomes, listed, shape)
+    asked = _asked(rows, shape)
+    total = np.bincount(row, count, listed.size).astype(np.int64)
+    if (total >= _MOST).any():
+        raise ValueError(
+            f"{_name(int(np.argmax(total)), shape)} was thrown {total.max()} times; at most 2^53 "
+            "are counted."
+        )
+    by_row = method == "weissman"
+    claims = np.where((outcomes > 2) & ~np.array(by_row), outcomes, outcomes > 1)
+    num_claims = _claims(num_claims, int(claims[asked].sum()))
+    failure = (1 - confidence) / max(num_claims, 1)
+    center = np.where(total[row] > 0, frequency(count, total[row]), 1 / np.maximum(listed, 1)[row])
+    radius = None
+    if by_row:
+        radius = np.where(asked, l1_radius(total, outcomes, failure), 2.0 * (outcomes > 1))
+        lower, upper = around(center, (radius / 2)[row])
+        rest = radius / 2
+    else:
+        lower, upper = _ENDS[method](count, total[row], failure)
+        rest = _ENDS[method](np.zeros_like(total), total, failure)[1] * (outcomes - listed)
+    known = (outcomes == 1)[row]
+    unknown = (~asked & (outcomes > 1))[row]
+    lower = np.where(known, 1.0, np.where(unknown, 0.0, lower))
+    upper = np.where(known | unknown, 1.0, upper)
+    left = 1 - np.bincount(row, lower, listed.size) + (listed + 2) * _EPS
+    rest = np.minimum(np.where(asked, rest * (1 + 4 * _EPS), 1), np.clip(left, 0, 1))
+    return ConfidenceSets(
+        lower=_as_given(lower, is_entry),
+        upper=_as_given(upper, is_entry),
+        center=_as_given(center, is_entry),
+        radius=None if radius is None else radius.reshape(shape),
+        rest=np.where(outcomes > listed, rest, 0.0).reshape(shape),
+        num_samples=total.reshape(shape),
+        num_claims=num_claims,
+        confidence=float(confidence),
+        method=method,
+    )
+
+
+def l1_radius(total: Integers, num_outcomes: Integers, failure: float) -> Floats:
+    """How far frequencies are from the probabilities in all, but for a chance of `failure`.
+
+    ``sqrt(2 / n log((2^J - 2) / failure))`` (Weissman et al. 2003, theorem 2.1), at most 2.
+
+    Args:
+      total: ``int[R]``, n.
+      num_outcomes: ``int[R]``, J.
+      failure: in (0, 1).
+
+    Returns:
+      ``float64[R]``, rounded up; 0 where J is at most 1.
+
+    Example:
+      >>> l1_radius(np.array([100, 0]), np.array([3, 3]), 0.1).round(4).tolist()
+      [0.2862, 2.0]
+    """
+    many = np.maximum(num_outcomes, 2)
+    with np.errstate(divide="ignore"):
+        log_events = many * np.log(2) + np.log1p(-np.exp2(1.0 - many))
+        radius = np.sqrt(2 * (log_events - np.log(failure)) / np.asarray(total))
+    radius = np.minimum(radius * (1 + 32 * _EPS) + 8 * _EPS, 2)
+    return np.where(np.asarray(num_outcomes) > 1, radius, 0.0)
+
+
+def samples_needed(
+    width: float,
+    confidence: float,
+    *,
+    method: Method = "clopper-pearson",
+    num_claims: int = 1,
+    num_outcomes: int = 2,
+) -> int:
+    """How many throws of a row make every interval at most so wide, whatever comes.
+
+    The widest interval is that of an outcome which comes half of the time.
+
+    Args:
+      width: of an interval, in (0, 1).
+      confidence: in (0, 1), of all claims together.
+      method: as for :func:`intervals_from_counts`.
+      num_claims: M, that share ``1 - confidence``.
+      num_outcomes: J, which only ``"weissman"`` asks for.
+
+    Raises:
+      ValueError: `width` or `confidence` is not in (0, 1), `num_claims` is below 1 or
+        `num_outcomes` below 2, or more than 2^53 throws are needed.
+
+    Example:
+      >>> [samples_needed(0.02, 0.99, method=m) for m in ("clopper-pearson", "hoeffding")]
+      [16684, 26492]
+    """
+    _check_method(method)
+    check_confidence(confidence)
+    if not 0 < number("width", width) < 1:
+        raise ValueError(f"width={width}; it must lie strictly between 0 and 1.")
+    num_claims = whole("num_claims", num_claims, least=1)
+    num_outcomes = whole("num_outcomes", num_outcomes, least=2)
+    failure = (1 - confidence) / num_claims
+
+    def widest(total: int) -> float:
+        half, whole = np.array([total // 2]), np.array([total])
+        if method == "weissman":
+            radius = l1_radius(whole, np.asarray(num_outcomes), failure)
+            lower, upper = around(frequency(half, whole), radius / 2)
+        else:
+            lower, upper = _ENDS[method](half, whole, failure)
+        return float(upper[0] - lower[0])
+
+    low, high = 0, 1
+    while widest(high) > width:
+        low, high = high, 2 * high
+        if high >= _MOST:
+            raise ValueError(f"width={width} takes more than 2^53 throws of a row; ask for less.")
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if widest(middle) > width else (low, middle)
+    return high
+
+
+# --- what is given ----------------------------------------------------------------------------
+
+
+def _check_method(method: str) -> None:
+    one_of("method", method, get_args(Method))
+
+
+def check_confidence(confidence: float) -> None:
+    """Raises a ValueError unless a confidence is a number strictly between 0 and 1."""
+    given = np.asarray(confidence)
+    if given.ndim or given.dtype.kind not in "fiu" or not 0 < given < 1:  # NaN is not
+        raise ValueError(
+            f"confidence={confidence!r}; it must lie strictly between 0 and 1, such as 0.95."
+        )
+
+
+def _entries(counts: Any, entry_start: Any, used: Any) -> tuple[Integers, Integers, Booleans]:
+    """The counts of all successors by row, how many each row has, and which entries these are."""
+    counts = np.asarray(counts)
+    if entry_start is not None:
+        start: Any = np.asarray(entry_start)
+        if used is not None:
+            raise ValueError(
+                "entry_start and used are both given; counts are either by rows, with "
+                "entry_start, or padded, with used."
+            )
+        if (
+            counts.ndim != 1
+            or start.ndim != 1
+            or not start.size
+            or start[0] != 0
+            or (start[-1] != counts.size)
+            or (start[1:] < start[:-1]).any()
+        ):
+            raise ValueError(
+                f"counts has shape {counts.shape}; entry_start must ascend from 0 to "
+                "the number of its entries."
+            )
+        is_entry = np.ones(counts.size, bool)
+        listed = np.diff(start.astype(np.int64))
+    else:
+        if not counts.ndim:
+            raise ValueError("counts is a number; give [..., K], or [T] with entry_start.")
+        is_entry = np.ones(counts.shape, bool) if used is None else np.asarray(used, bool)
+        if is_entry.shape != counts.shape:
+            raise ValueError(
+                f"used has shape {is_entry.shape}, and counts {counts.shape}; they must agree."
+            )
+        listed = is_entry.sum(-1).reshape(-1)
+    whole = counts
+    if not np.issubdtype(counts.dtype, np.integer):
+        with np.errstate(invalid="ignore"):
+            whole = counts.astype(np.int64)
+    bad = (whole != counts) | (counts < 0) | (counts >= _MOST) | (~is_entry & (counts != 0))
+    if bad.any():
+        place = tuple(int(i) for i in np.argwhere(bad)[0])
+        if not is_entry[place]:
+            raise ValueError(
+                f"counts{list(place)} is {counts[place]}, at an entry that is no "
+                "successor; correct the count, or the graph."
+            )
+        raise ValueError(
+            f"counts{list(place)} is {counts[place]}; counts are integers from 0 to 2^53."
+        )
+    return whole[is_entry].astype(np.int64), listed, is_entry
+
+
+def _outcomes(num_outcomes: Any, listed: Integers, shape: tuple[int, ...]) -> Integers:
+    if num_outcomes is None:
+        return listed
+    given = np.asarray(num_outcomes)
+    if given.shape not in ((), shape) or not np.issubdtype(given.dtype, np.integer):
+        raise ValueError(
+            f"num_outcomes is {given.dtype}{list(given.shape)}; expected an integer, "
+            f"or integers {list(shape)}."
+        )
+    outcomes = np.broadcast_to(given, shape).reshape(-1).astype(np.int64)
+    if (outcomes < listed).any():
+        row = int(np.argmax(outcomes < listed))
+        raise ValueError(
+            f"{_name(row, shape)} lists {listed[row]} successors, more than its "
+            f"num_outcomes, {outcomes[row]}."
+        )
+    return outcomes
+
+
+def _claims(given: int | None, made: int) -> int:
+    if given is None:
+        return made
+    found = whole("num_claims", given)
+    if found < made:
+        raise ValueError(f"num_claims={given}; the rows make {made}, and no fewer can be counted.")
+    return found
+
+
+def _name(row: int, shape: tuple[int, ...]) -> str:
+    """A row, for messages."""
+    place = [int(i) for i in np.unravel_index(row, shape)]
+    return f"state {place[0]}, action {place[1]}" if len(place) == 2 else f"row {place}"
+
+
+def _asked(rows: Any, shape: tuple[int, ...]) -> Booleans:
+    if rows is None:
+        return np.ones(int(np.prod(shape)), bool)
+    rows = np.asarray(rows)
+    if rows.shape != shape or rows.dtype != bool:
+        raise ValueError(
+            f"rows is {rows.dtype}{list(rows.shape)}; expected bool{list(shape)}, "
+            "which rows matter."
+        )
+    return rows.reshape(-1)
+
+
+def _as_given(entries: Floats, is_entry: Booleans) -> Floats:
+    found = np.zeros(is_entry.shape)
+    found[is_entry] = entries
+    return found

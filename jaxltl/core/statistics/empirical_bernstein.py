@@ -1,0 +1,68 @@
+"""Intervals of the mean of bounded numbers that come one after the other, at any time.
+
+The predictable plug-in empirical-Bernstein confidence sequence (Waudby-Smith and Ramdas 2024,
+"Estimating means of bounded random variables by betting", theorem 2): of numbers ``X_i`` in [0, 1]
+that each have the mean m, whatever came before, with weights ``w_i`` in [0, 1) that may depend on
+what came before::
+
+    sum_i w_i X_i / sum_i w_i  -+  (log(2 / failure) + sum_i (X_i - c_i)^2 psi(w_i)) / sum_i w_i,
+
+where ``c_i`` is a guess of m from what came before and ``psi(w) = -log(1 - w) - w``. All intervals
+of one sequence hold at once but for a chance of `failure`, so that one may stop when one likes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jaxltl.core import validation
+from jaxltl.core.array_types import Floats
+from jaxltl.core.statistics.binomial import around
+
+_MOST = 0.5  # of a weight; more gains little where the variance is small, and loses much else
+
+
+def bounded_mean(
+    numbers: Floats, failure: float, *, planned: int | None = None
+) -> tuple[float, float]:
+    """The ends of the interval of the mean of numbers in [0, 1], itself in [0, 1].
+
+    Args:
+      numbers: ``float64[N]`` in the order in which they came; those outside are clipped.
+      failure: the chance of a miss, in (0, 1).
+      planned: how many there were to be from the start, if that is known: the interval is then
+        narrowest. It holds without, too, however it was decided how many there are.
+
+    Raises:
+      ValueError: what are no numbers, or a chance outside of its range.
+
+    Example:
+      >>> ends = bounded_mean(np.tile([0.2, 0.3], 500), 0.05, planned=1000)
+      >>> [round(end, 3) for end in ends]
+      [0.242, 0.258]
+    """
+    x = np.atleast_1d(validation.numbers("numbers", numbers))
+    failure = validation.share("failure", failure, ends=(False, False))
+    if planned is not None:
+        planned = validation.whole("planned", planned, least=1)
+    if x.ndim != 1 or np.isnan(x).any():
+        raise ValueError(
+            f"numbers is {validation.shown(numbers)}; give one axis of them, none NaN."
+        )
+    x = np.clip(x, 0, 1)
+    count = np.arange(1, x.size + 1)
+    mean = (0.5 + np.cumsum(x)) / (count + 1)
+    variance = (0.25 + np.cumsum((x - mean) ** 2)) / (count + 1)
+    # Guesses from what came before each number.
+    guess, old = np.append(0.5, mean)[:-1], np.append(0.25, variance)[:-1]
+    many = count * np.log1p(count) if planned is None else planned
+    weight = np.minimum(np.sqrt(2 * np.log(2 / failure) / (many * old)), _MOST)
+    spread = (x - guess) ** 2 @ (-np.log1p(-weight) - weight)
+    total = weight.sum()
+    if not total:
+        return 0.0, 1.0
+    # Sums of n numbers are off by less than n roundings each.
+    rounding = 8 * float(np.finfo(np.float64).eps) * (x.size + 8)
+    deviation = (np.log(2 / failure) + spread) / total * (1 + rounding) + rounding
+    lower, upper = around(np.array(weight @ x / total), np.array(deviation))
+    return float(lower), float(upper)

@@ -1,0 +1,1 @@
+"""Long-run average rewards and mean payoffs."""

@@ -1,0 +1,81 @@
+"""Long-run average rewards of Markov chains and decision processes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from jaxltl.core.models.build.convert import to_sparse
+from jaxltl.core.sparse.solvers.average_reward import average
+from jaxltl.core.types import Solution
+from jaxltl.core.values.undiscounted.step_bounded import enclosed, finite_reward, optimum_of
+
+
+def average_reward(
+    model: Any,
+    reward: Any,
+    *,
+    objective: str = "max",
+    tolerance: float = 1e-6,
+    max_steps: int = 1_000_000,
+) -> Solution:
+    """Largest or smallest expected long-run average of a reward, a step.
+
+    ``lim 1/n E[r_1 + ... + r_n]`` from every state, of multichain models too (Puterman 1994,
+    chapter 9). It is the best expected gain of the end component in which a run ends: in each of
+    these the optimal gain is enclosed by the span of ``T v - v``, by value iteration, then policy
+    iteration with sparse elimination; and they are the terminal rewards of an optimal stopping
+    problem, whose every policy ends. Solved on the host, in double precision; every bound
+    includes its rounding. Games have :func:`~jaxltl.core.values.average.mean_payoff.mean_payoff`.
+
+    Args:
+      model: a SparseMDP, or any concrete model that :func:`to_sparse` takes.
+      reward: as for :func:`~jaxltl.core.models.sparse.row_reward`; finite.
+      objective: ``"max"`` or ``"min"``; of chains either.
+      tolerance: the width of the enclosure asked for, as a share of the value; where that is
+        small, of a millionth of the largest reward (a thousandth, if some are negative).
+      max_steps: sweeps of value iteration at most.
+
+    Returns:
+      :class:`Solution`; `value` is ``float64[S]``, `policy` rows ``int32[S]``: it attains the bound
+      on the safe side (`lower` of a maximum). `residual` is half the width of the gain's widest
+      enclosure.
+
+    Raises:
+      ValueError: the reward, the objective, or probabilities that are intervals.
+
+    Concrete arrays only, on the host; not differentiable.
+
+    Example:
+      >>> from jaxltl import make_sparse
+      >>> model = make_sparse([0, 2, 3, 4], [0, 2, 3, 4, 5], [1, 2, 0, 1, 2],
+      ...                     [0.25, 0.75, 1, 1, 1])
+      >>> found = average_reward(model, [3.0, 8.0, 4.0])
+      >>> found.value.round(9).tolist(), found.policy.tolist()
+      ([5.0, 8.0, 4.0], [0, 2, 3])
+    """
+    if hasattr(model, "nominal"):
+        raise ValueError(
+            "averages in the long run are not solved for where probabilities are "
+            "intervals; ask robust_discounted_value, with a discount near 1, or "
+            "total_reward until a target, or give model.nominal, which is one "
+            "choice of nature."
+        )
+    model = to_sparse(model)
+    sign = 1 if optimum_of(objective) is np.maximum else -1
+    earned, magnitude = finite_reward(model, reward)
+    found = average(
+        model.host, sign * earned, magnitude, tolerance=tolerance, max_steps=max_steps, sign=sign
+    )
+    small = 1e-6 if (earned >= 0).all() else 1e-3
+    error = np.maximum(found.upper - found.value, found.value - found.lower)
+    return enclosed(
+        sign * found.value,
+        error,
+        found.row.astype(np.int32),
+        found.rounds,
+        tolerance=tolerance,
+        least=small * float(magnitude.max()),
+        residual=found.residual,
+    )

@@ -1,0 +1,1 @@
+"""Discounted values: of policies, optimal, soft, and of zero-sum games."""

@@ -1,0 +1,294 @@
+"""Values of the softmax policy of its own action values."""
+
+from __future__ import annotations
+
+from functools import partial, reduce
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jaxltl.core.models.compiled.compiled import compiled_form, in_shape_of
+from jaxltl.core.models.ops.choices import choices
+from jaxltl.core.models.ops.successor_tables import table
+from jaxltl.core.types import Solution, Status, status_code
+from jaxltl.core.values.discounted.discounted import (
+    action_value,
+    differentiable,
+    expected_reward,
+    gains,
+    optimal_value,
+    reward_size,
+)
+from jaxltl.core.values.discounted.soft import policy_logits, soft_maximum, with_softmax
+from jaxltl.core.values.engine import newton
+from jaxltl.core.values.engine.certificates import most_choices, rounding_unit
+from jaxltl.core.values.engine.linear import System
+
+
+def boltzmann_expansion(num_actions: Any) -> Any:
+    """Largest row sum of the Jacobian of ``sum_a softmax(q)_a q_a`` over all q.
+
+    The Boltzmann operator contracts for discounts below its inverse. The supremum is
+    attained where one action stands above the rest, which are equal: by g, of which it is half,
+    the root of ``g tanh((g - log(n - 1)) / 2) = 2``.
+
+    Args:
+      num_actions: n, a number or traced.
+
+    Returns:
+      A float of at least 1, or an array of `num_actions`' shape; not differentiable.
+
+    Example:
+      >>> [round(boltzmann_expansion(n), 2) for n in (1, 2, 3, 4)]
+      [1.0, 1.2, 1.33, 1.42]
+    """
+    xp: Any = jnp if isinstance(num_actions, jax.Array) else np
+    n = xp.asarray(num_actions, float)
+    others = xp.log(xp.maximum(n - 1, 1))
+
+    def halved(_: Any, ends: Any) -> Any:
+        low, high = ends
+        middle = (low + high) / 2
+        above = middle * xp.tanh((middle - others) / 2) >= 2
+        return xp.where(above, low, middle), xp.where(above, middle, high)
+
+    ends = (others, others + 4)  # from one to the other the left side goes from 0 to more than 2
+    if xp is jnp:
+        high = lax.fori_loop(0, 30, halved, ends)[1]
+    else:
+        high = reduce(lambda ends, i: halved(i, ends), range(30), ends)[1]
+    # Bisection, and rounding in what it looks at.
+    found = xp.where(n > 1, high / 2 * (1 + 64 * float(jnp.finfo(high.dtype).eps)) + 1e-7, 1.0)
+    return found if xp is jnp else float(found)
+
+
+def boltzmann_value(
+    model: Any,
+    reward: jax.Array,
+    discount: jax.Array | float,
+    *,
+    initial: jax.Array | None = None,
+    adjoint: str = "exact",
+    method: str = "damped",
+    tolerance: jax.Array | float | None = None,
+    max_steps: jax.Array | int = 5_000,
+) -> Solution:
+    """Value of the softmax policy of its own action values (2.1)-(2.3).
+
+    ``V = sum_a softmax(Q)_a Q_a`` with ``Q = R + discount * P V``. This operator
+    contracts only while ``discount * boltzmann_expansion(A) < 1``. Beyond, it can cycle or
+    have several fixed points: damped steps of one half are polished by Newton's method,
+    the enclosure is infinite, and the status tells when no fixed point was reached. See
+    :func:`boltzmann_fixed_points`.
+
+    Args:
+      model: the model.
+      reward: ``float[S, A]`` or ``float[S, A, K]``; of a sparse model a name or as of
+        :func:`~jaxltl.core.models.sparse.row_reward`.
+      discount: scalar in [0, 1).
+      initial: ``float[S]``, where to start; default zero.
+      adjoint: ``"exact"``, or ``"approximate"`` for the sensitivity (2.7) that holds the
+        policy constant.
+      method: ``"damped"``, or ``"newton"`` for Newton steps from the start on, which may
+        also find fixed points that repel.
+      tolerance: on the certified error where the operator contracts, on the
+        residual elsewhere; default: what the dtype allows.
+      max_steps: damped steps at most.
+
+    Returns:
+      :class:`Solution`; `policy` is ``float[S, A]``, of a sparse model ``float[R]``, the softmax.
+
+    Raises:
+      ValueError: the reward has the wrong shape, or an unknown method or adjoint.
+
+    Value and policy are differentiable in the reward, the discount and the probabilities.
+
+    Example:
+      >>> from jaxltl import from_dense
+      >>> mdp = from_dense([[[1.0], [1.0]]])
+      >>> round(boltzmann_value(mdp, jnp.ones((1, 2)), 0.5).value.item(), 4)
+      2.0
+    """
+    if adjoint not in ("exact", "approximate"):
+        raise ValueError(f"adjoint={adjoint!r}; choose exact or approximate.")
+    if method not in ("damped", "newton"):
+        raise ValueError(f"method={method!r}; choose damped or newton.")
+    form, reward = compiled_form(model, reward)
+    return in_shape_of(
+        model,
+        _boltzmann_value(
+            form, reward, discount, initial, tolerance, max_steps, adjoint=adjoint, method=method
+        ),
+    )
+
+
+@partial(jax.jit, static_argnames=("adjoint", "method"))
+def _boltzmann_value(
+    model: Any,
+    reward: Any,
+    discount: Any,
+    initial: Any,
+    tolerance: Any,
+    max_steps: Any,
+    *,
+    adjoint: str,
+    method: str,
+) -> Solution:
+    discount = jnp.asarray(discount, model.dtype)
+    given = _given(model, reward, discount, tolerance)
+    reward, over = expected_reward(model, reward), choices(model)
+    start = jnp.zeros(model.num_states, model.dtype) if initial is None else initial.ravel()
+    damping = jnp.where(given.contracts | (method == "newton"), 0.0, 0.5).astype(model.dtype)
+    value, image, n = newton.solve(
+        table(model),
+        softmax_mean,
+        _judge,
+        newton.Backup(gains(model, reward), discount, damping, given),
+        start,
+        monotone=False,
+        first_sweeps=4 if method == "damped" else 0,
+        max_steps=max_steps,
+    )
+    bound = _error(value, image, given)
+    converged = bound <= given.goal
+    half = jnp.where(converged & given.contracts, bound, jnp.inf)
+    value, image = (x.reshape(model.state_shape) for x in (value, image))
+    solution = jax.tree.map(
+        lax.stop_gradient,
+        Solution(
+            value=value,
+            policy=value,
+            lower=value - half,
+            upper=value + half,
+            residual=jnp.max(jnp.abs(image - value)),
+            num_steps=n,
+            status=status_code(
+                converged,
+                jnp.isfinite(bound) & (discount < 1),
+                bound <= given.enough,
+                certified=given.contracts,
+            ),
+        ),
+    )
+
+    def backup(v: jax.Array) -> jax.Array:
+        policy = over.softmax(policy_logits(model, reward, discount, v))
+        if adjoint == "approximate":
+            policy = lax.stop_gradient(policy)
+        return over.mean(policy, action_value(model, reward, discount, v))
+
+    def system() -> System:
+        policy = over.softmax(policy_logits(model, reward, discount, solution.value))
+        if adjoint == "exact":
+            q = action_value(model, reward, discount, solution.value)
+            policy *= 1 + q - over.spread(over.mean(policy, q))
+        return System(table(model), over.columns(policy), discount)
+
+    solution = differentiable(solution, backup, system)
+    return with_softmax(model, reward, discount, solution)
+
+
+class _Given(NamedTuple):
+    """What decides when a Boltzmann value is good enough."""
+
+    contracts: jax.Array
+    gap: jax.Array
+    rounding: jax.Array
+    goal: jax.Array
+    enough: jax.Array  # the error below which there is little but rounding
+
+
+def _given(model: Any, reward: jax.Array, discount: jax.Array, tolerance: Any) -> _Given:
+    expansion = discount * boltzmann_expansion(most_choices(model))
+    contracts = expansion < 1
+    gap = jnp.where(contracts, 1 - expansion, 1)
+    size = reward_size(model, reward)
+    rounding = rounding_unit(model) * (size + size / (1 - discount)) / gap
+    goal = 4 * rounding if tolerance is None else jnp.asarray(tolerance, model.dtype)
+    return _Given(contracts, gap, rounding, goal, jnp.maximum(goal, 2 * rounding))
+
+
+def _error(value: jax.Array, image: jax.Array, given: _Given) -> jax.Array:
+    """Certified where the operator contracts; elsewhere the residual."""
+    return jnp.max(jnp.abs(image - value), axis=0) / given.gap + given.rounding
+
+
+def _judge(value: jax.Array, image: jax.Array, given: _Given) -> tuple[jax.Array, jax.Array]:
+    error = _error(value, image, given)
+    return (error <= given.enough) | ~jnp.isfinite(error), error
+
+
+def softmax_mean(over: Any, q: Any, given: Any) -> tuple[jax.Array, Any]:
+    """``sum_a softmax(q)_a q_a`` of columns, and its derivative."""
+    _, policy = soft_maximum(over, q, given)
+    finite = jax.tree.map(lambda x: jnp.where(jnp.isneginf(x), 0, x), q)
+    value = over.mean(policy, finite)
+    return value, jax.tree.map(
+        lambda p, x, v: p * (1 + x - v), policy, finite, over.spread(value, finite)
+    )
+
+
+def boltzmann_fixed_points(
+    model: Any,
+    reward: jax.Array,
+    discount: jax.Array | float,
+    key: chex.PRNGKey,
+    *,
+    num_starts: int = 64,
+    tolerance: float = 1e-6,
+) -> list[Solution]:
+    """Distinct fixed points of the Boltzmann operator that were found from many starts.
+
+    Damped and Newton iterations from zero, from the optimal and the worst value, and from
+    random values between. A search, not a proof that there are no others.
+
+    Args:
+      model, reward, discount: as in :func:`boltzmann_value`.
+      key: a PRNG key, consumed.
+      num_starts: starts for each of the two methods.
+      tolerance: fixed points nearer than this (sup norm) are one; the residual allowed is a
+        tenth of it times ``1 - discount``.
+
+    Returns:
+      Converged solutions (``CONVERGED`` or ``UNCERTIFIED``), ordered by the sum of their values; a
+      list as long as there were fixed points.
+
+    Raises:
+      ValueError: the reward has the wrong shape.
+
+    The list is made on the host and not differentiable; :func:`boltzmann_value` is, and goes on
+    from one of these by `initial`.
+
+    Example:
+      >>> from jaxltl import make_mdp
+      >>> loop_or_end = make_mdp([[[0], [1]], [[1], [1]]], [[[1.0], [1.0]], [[1.0], [0.0]]])
+      >>> reward = jnp.array([[0.2, 0.0], [0.0, 0.0]])  # for going round
+      >>> found = boltzmann_fixed_points(
+      ...     loop_or_end, reward, 0.99, jax.random.key(0), tolerance=0.1)
+      >>> [round(one.value[0].item(), 1) for one in found]
+      [0.3, 2.5, 20.0]
+    """
+    best = optimal_value(model, reward, discount).value
+    worst = -optimal_value(model, -jnp.asarray(reward), discount).value
+    weight = jax.random.uniform(key, (num_starts, *(1 for _ in best.shape)), best.dtype)
+    weight = weight.at[0].set(0).at[-1].set(1)
+    starts = worst + weight * (best - worst)
+    # A residual this small leaves a value within the tolerance, as far as the discount tells.
+    residual = tolerance * (1 - discount) / 10
+    found: list[Solution] = []
+    for method in ("damped", "newton"):
+        run = jax.vmap(
+            lambda v, method=method: boltzmann_value(
+                model, reward, discount, initial=v, method=method, tolerance=residual
+            )
+        )
+        batch = run(starts)
+        for i in np.flatnonzero(np.asarray(batch.status) <= Status.UNCERTIFIED):
+            one = jax.tree.map(lambda x, i=i: x[i], batch)
+            if all(jnp.max(jnp.abs(one.value - f.value)) > tolerance for f in found):
+                found.append(one)
+    return sorted(found, key=lambda f: float(f.value.sum()))

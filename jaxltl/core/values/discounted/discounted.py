@@ -1,0 +1,408 @@
+"""Discounted values of a policy, and optimal ones.
+
+Every solver stops on a certified error, returns the enclosure that certifies it, and is
+differentiable by the implicit function theorem in the reward, the discount and the
+transition probabilities. A ``model`` is an MDP, a DenseMDP, a SparseMDP or a Product; shapes are
+written for an MDP, and a product's values have ``[S, Q]`` for ``[S]``. Of a sparse model quantities
+on actions are ``[R]``, and actions of policies are rows.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxltl.core.models.compiled.compiled import compiled_form, flat_policy, in_shape_of
+from jaxltl.core.models.ops.array_namespace import is_traced
+from jaxltl.core.models.ops.choices import choices
+from jaxltl.core.models.ops.operators import expectation, following, require_policy, valid_policy
+from jaxltl.core.models.ops.successor_tables import table
+from jaxltl.core.models.sparse import SparseMDP, row_reward
+from jaxltl.core.types import Solution, status_code
+from jaxltl.core.values.engine import newton
+from jaxltl.core.values.engine.certificates import Enclosure, enclose, refuse, rounding_unit
+from jaxltl.core.values.engine.host_solution import discounted, is_sparse
+from jaxltl.core.values.engine.implicit_diff import implicit
+from jaxltl.core.values.engine.iterate import iterate
+from jaxltl.core.values.engine.linear import DENSE_LIMIT, System, solver
+
+_METHODS = ("auto", "policy_iteration", "modified_policy_iteration", "value_iteration")
+
+
+def action_value(
+    model: Any, reward: jax.Array, discount: jax.Array | float, value: jax.Array
+) -> jax.Array:
+    """``Q(s, a) = R(s, a) + discount * sum_t P(t | s, a) V(t)``; zero at unavailable actions.
+
+    Args:
+      model: the model.
+      reward: ``float[S, A]``, of a sparse model ``float[R]``, as below.
+      discount: scalar.
+      value: ``float[S]``.
+
+    Returns:
+      ``float[S, A]``.
+    """
+    q = reward + discount * expectation(model, value)
+    return jnp.where(choices(model).available, q, 0)
+
+
+def expected_reward(model: Any, reward: jax.Array) -> jax.Array:
+    """A reward on pairs ``[S, A]`` or transitions ``[S, A, K]`` as its expectation ``[S, A]``.
+
+    Zero at unavailable actions; what stands there and in padding is not read. Of a sparse model it
+    is that of :func:`~jaxltl.core.models.sparse.row_reward`.
+
+    Raises:
+      ValueError: the reward has another shape.
+    """
+    if isinstance(getattr(model, "mdp", model), SparseMDP):
+        return jnp.asarray(row_reward(getattr(model, "mdp", model), reward), model.dtype)
+    actions = (*model.state_shape, model.num_actions)
+    transitions = (*actions, model.num_successors)
+    reward = jnp.asarray(reward, model.dtype)
+    if reward.shape == actions:
+        return jnp.where(model.available, reward, 0)
+    if reward.shape == transitions:
+        weight = model.successor_probability
+        return jnp.sum(weight * jnp.where(weight > 0, reward, 0), axis=-1)
+    raise ValueError(f"reward has shape {reward.shape}; expected {actions} or {transitions}.")
+
+
+def reward_size(model: Any, reward: Any) -> jax.Array:
+    """The largest sum of magnitudes behind an expected reward; its rounding is in terms of that.
+
+    Large rewards of transitions may cancel in the expectation, their rounding does not.
+    """
+    return jnp.max(expected_reward(model, jax.tree.map(jnp.abs, reward)))
+
+
+# --- what discounted solvers share -----------------------------------------------------------
+
+
+class Parameters(NamedTuple):
+    """What the parts of :mod:`jaxltl.core.values.engine.newton` read of a discounted problem.
+
+    Attributes:
+      discount: a scalar.
+      size: the largest reward, see :func:`reward_size`.
+      unit: relative rounding of a backup.
+      tolerance: certified error asked for, or None.
+      policy: a policy's weights, in columns, or None.
+    """
+
+    discount: jax.Array
+    size: jax.Array
+    unit: jax.Array
+    tolerance: jax.Array | None
+    policy: Any = None
+
+
+def judge(value: jax.Array, image: jax.Array, given: Parameters) -> tuple[jax.Array, jax.Array]:
+    """Whether MacQueen's bounds are narrow enough or will not narrow, and half their width."""
+    found = _enclosed(value, image, given)
+    return found.ended, found.half
+
+
+def _enclosed(value: jax.Array, image: jax.Array, given: Parameters) -> Enclosure:
+    rounding = given.unit * (given.size + jnp.max(jnp.abs(image), axis=0))
+    return enclose(value, image, given.discount, rounding, given.tolerance)
+
+
+def parameters(model: Any, reward: Any, discount: Any, tolerance: Any) -> Parameters:
+    """Of a problem with a reward as it was given."""
+    goal = None if tolerance is None else jnp.asarray(tolerance, model.dtype)
+    return Parameters(
+        jnp.asarray(discount, model.dtype),
+        reward_size(model, reward),
+        jnp.asarray(rounding_unit(model), model.dtype),
+        goal,
+    )
+
+
+def gains(model: Any, reward: jax.Array) -> Any:
+    """The reward's columns, minus infinity at unavailable actions."""
+    over = choices(model)
+    return over.columns(over.logits(reward))
+
+
+def solution_of(
+    model: Any,
+    given: Parameters,
+    value: jax.Array,
+    image: jax.Array,
+    policy: jax.Array,
+    num_steps: jax.Array,
+) -> Solution:
+    """The solution that a value and its image certify, without derivatives.
+
+    Args:
+      model: the model.
+      given: the problem's parameters.
+      value, image: ``float[N]``.
+      policy: what belongs to it.
+      num_steps: applications of the operator.
+    """
+    found = _enclosed(value, image, given)
+    middle = (image + found.shift).reshape(model.state_shape)
+    # With a certificate the whole image is finite.
+    solution = Solution(
+        value=middle,
+        policy=policy,
+        lower=middle - found.half,
+        upper=middle + found.half,
+        residual=jnp.max(jnp.abs(image - value)),
+        num_steps=num_steps,
+        status=status_code(found.converged, found.finite, found.exhausted),
+    )
+    return jax.tree.map(lax.stop_gradient, solution)
+
+
+def differentiable(
+    solution: Solution, backup: Callable[[jax.Array], jax.Array], system: Callable[[], System]
+) -> Solution:
+    """The solution with the implicit derivatives of ``v = backup(v)`` on its value.
+
+    Args:
+      solution: without derivatives.
+      backup: closes over what it is differentiable in.
+      system: makes ``I - J``, with J the derivative of `backup` in v at the solution.
+    """
+
+    def solve(b: jax.Array) -> jax.Array:
+        return solver(system()).solve(b)
+
+    def transpose_solve(b: jax.Array) -> jax.Array:
+        return solver(system()).transpose_solve(b)
+
+    value = implicit(backup, solution.value, solve=solve, transpose_solve=transpose_solve)
+    return replace(solution, value=value)
+
+
+# --- a policy --------------------------------------------------------------------------------
+
+
+def policy_value(
+    model: Any,
+    policy: jax.Array,
+    reward: jax.Array,
+    discount: jax.Array | float,
+    *,
+    tolerance: jax.Array | float | None = None,
+    max_steps: jax.Array | int = 100_000,
+) -> Solution:
+    """Expected discounted reward of a policy.
+
+    ``V = r_pi + discount * P_pi V`` (dissertation, section 2.2.1). Solved by BiCGSTAB, with
+    elimination on small models and sweeps on others where that stalls; the enclosure holds for
+    any iterate.
+
+    Args:
+      model: the model.
+      policy: ``float[S, A]`` or ``int32[S]``.
+      reward: ``float[S, A]`` or ``float[S, A, K]``; of a sparse model a name or as of
+        :func:`~jaxltl.core.models.sparse.row_reward`.
+      discount: scalar in [0, 1).
+      tolerance: certified absolute error asked for; default: what the dtype allows.
+      max_steps: sweeps at most.
+
+    Returns:
+      :class:`Solution`; `value` is ``float[S]``.
+
+    Raises:
+      ValueError: policy or reward has the wrong shape, or a row of the policy is no distribution
+        over available actions (under ``jit`` the status is then INVALID).
+
+    Differentiable in the policy, the reward, the discount and the probabilities.
+
+    Example:
+      >>> from jaxltl import from_dense
+      >>> mdp = from_dense([[[1.0]]])
+      >>> round(policy_value(mdp, jnp.array([0]), jnp.ones((1, 1)), 0.5).value.item(), 4)
+      2.0
+    """
+    if is_sparse(model) and not is_traced((model, policy, reward, discount, tolerance)):
+        return discounted(model, reward, discount, policy=policy, tolerance=tolerance)
+    form, reward = compiled_form(model, reward)
+    policy = flat_policy(model, policy)
+    require_policy(form, policy)
+    return in_shape_of(model, _policy_value(form, policy, reward, discount, tolerance, max_steps))
+
+
+@jax.jit
+def _policy_value(model, policy, reward, discount, tolerance, max_steps) -> Solution:
+    given = parameters(model, reward, discount, tolerance)
+    reward = expected_reward(model, reward)
+    checked = valid_policy(model, policy)
+    over, rows = choices(model), table(model)
+    weight = over.columns(checked.distribution)
+    given = given._replace(policy=weight)
+
+    def combine(over: Any, q: Any, given: Parameters):
+        return over.mean(given.policy, q), given.policy
+
+    value, image, n = newton.solve(
+        rows,
+        combine,
+        judge,
+        newton.Backup(over.columns(reward), given.discount, jnp.zeros_like(given.discount), given),
+        jnp.zeros(model.num_states, model.dtype),
+        max_steps=max_steps,
+    )
+
+    def backup(v: jax.Array) -> jax.Array:
+        return over.mean(checked.distribution, action_value(model, reward, given.discount, v))
+
+    solution = solution_of(model, given, value, image, checked.distribution, n)
+    solution = differentiable(solution, backup, lambda: System(rows, weight, given.discount))
+    return refuse(replace(solution, policy=checked.distribution), checked.given, checked.valid)
+
+
+# --- optimal values --------------------------------------------------------------------------
+
+
+def optimal_value(
+    model: Any,
+    reward: jax.Array,
+    discount: jax.Array | float,
+    *,
+    method: str = "auto",
+    tolerance: jax.Array | float | None = None,
+    max_steps: jax.Array | int = 100_000,
+    evaluation_sweeps: jax.Array | int = 24,
+) -> Solution:
+    """Largest expected discounted reward, ``V = max_a R + discount * P V``.
+
+    Stops on MacQueen's bounds, so a tolerance met is a certified error.
+
+    Args:
+      model: the model.
+      reward: ``float[S, A]`` or ``float[S, A, K]``; of a sparse model a name or as of
+        :func:`~jaxltl.core.models.sparse.row_reward`.
+      discount: scalar in [0, 1).
+      method: ``"policy_iteration"`` (Howard 1960, its systems solved to a hundredth),
+        ``"modified_policy_iteration"`` (Puterman and Shin 1978: after each sweep of the
+        optimality operator, `evaluation_sweeps` cheap ones under the greedy policy),
+        ``"value_iteration"``, or ``"auto"``, the first up to 512 states, then the second.
+      tolerance: certified absolute error asked for; default: what the dtype allows.
+      max_steps: applications of the optimality operator or of the linear one at most.
+      evaluation_sweeps: sweeps under a fixed policy, in modified policy iteration.
+
+    Returns:
+      :class:`Solution`; `value` is ``float[S]``, `policy` ``int32[S]`` is greedy and its
+      own value is at least `lower`.
+
+    Raises:
+      ValueError: the reward has the wrong shape, or an unknown method.
+
+    Differentiable in the reward, the discount and the probabilities, wherever the
+    greedy policy is unique.
+
+    Example:
+      >>> from jaxltl import from_dense
+      >>> mdp = from_dense([[[1.0, 0], [0, 1.0]], [[0, 1.0], [0, 1.0]]])
+      >>> best = optimal_value(mdp, jnp.array([[0.0, 0.0], [1.0, 1.0]]), 0.5)
+      >>> [round(v, 4) for v in best.value.tolist()], best.policy.tolist()
+      ([1.0, 2.0], [1, 0])
+    """
+    if is_sparse(model) and not is_traced((model, reward, discount, tolerance)):
+        return discounted(model, reward, discount, tolerance=tolerance)
+    form, reward = compiled_form(model, reward)
+    return in_shape_of(
+        model,
+        _optimal_value(
+            form,
+            reward,
+            discount,
+            method=method,
+            tolerance=tolerance,
+            max_steps=max_steps,
+            evaluation_sweeps=evaluation_sweeps,
+        ),
+    )
+
+
+@partial(jax.jit, static_argnames=("method",))
+def _optimal_value(
+    model: Any,
+    reward: jax.Array,
+    discount: jax.Array | float,
+    *,
+    method: str,
+    tolerance: jax.Array | float | None,
+    max_steps: jax.Array | int,
+    evaluation_sweeps: jax.Array | int,
+) -> Solution:
+    if method not in _METHODS:
+        raise ValueError(f"method={method!r}; choose {', '.join(_METHODS[:-1])} or {_METHODS[-1]}.")
+    if method == "auto":
+        few = math.prod(model.state_shape) <= DENSE_LIMIT
+        method = "policy_iteration" if few else "modified_policy_iteration"
+    given = parameters(model, reward, discount, tolerance)
+    reward, over = expected_reward(model, reward), choices(model)
+    zero = jnp.zeros(model.num_states, model.dtype)
+    if method == "modified_policy_iteration":
+        value, image, n = _modified_policy_iteration(
+            model, reward, given, max_steps, evaluation_sweeps
+        )
+    else:
+        value, image, n = newton.solve(
+            table(model),
+            best_action,
+            judge,
+            newton.Backup(
+                gains(model, reward), given.discount, jnp.zeros_like(given.discount), given
+            ),
+            zero,
+            newton=method == "policy_iteration",
+            max_steps=max_steps,
+        )
+    q = reward + given.discount * expectation(model, value.reshape(model.state_shape))
+    _, policy = over.argmax(q)
+
+    def backup(v: jax.Array) -> jax.Array:
+        return over.max(reward + given.discount * expectation(model, v))
+
+    def system() -> System:
+        chosen = over.one_hot(policy, model.dtype)
+        return System(table(model), over.columns(chosen), given.discount)
+
+    return differentiable(solution_of(model, given, value, image, policy, n), backup, system)
+
+
+def best_action(over: Any, q: Any, given: Any) -> tuple[jax.Array, Any]:
+    """The largest action value, and weight one on the first action that attains it."""
+    return over.best(q)
+
+
+def _modified_policy_iteration(model, reward, given: Parameters, max_steps, sweeps):
+    over = choices(model)
+
+    def greedy(v: jax.Array) -> tuple[jax.Array, jax.Array]:
+        q = reward + given.discount * expectation(model, v.reshape(model.state_shape))
+        image, policy = over.argmax(q)
+        return image.ravel(), policy
+
+    def step(_, carry, __):
+        _, image, policy = carry
+        onward = following(model, policy)
+        gain = over.mean(policy, reward).ravel()
+        value = lax.fori_loop(0, sweeps, lambda _, v: gain + given.discount * onward(v), image)
+        return value, *greedy(value)
+
+    def finished(carry, _):
+        return judge(carry[0], carry[1], given)[0]
+
+    zero = jnp.zeros(model.num_states, model.dtype)
+    start = lax.stop_gradient((zero, *greedy(zero)))
+    (value, image, _), n = lax.stop_gradient(
+        iterate(step, finished, None, start, None, max_steps=max_steps, lanes="mapped")
+    )
+    return value, image, n

@@ -1,0 +1,585 @@
+"""Discounted values of zero-sum games, and of one strategy in the worst case.
+
+The system maximises and the environment minimises. Values come with a certified
+enclosure, and are differentiable by the implicit function theorem. Shapes are written for
+states ``[S]``; a game on a Product has ``[S, Q]``. In a game on a sparse model quantities on
+actions are ``[R]``, and an action is a row.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jaxltl.core.graphs.attractor import attract
+from jaxltl.core.graphs.graph import Graph, graph_of, take
+from jaxltl.core.models.compiled.compiled import compiled_form, flat_policy, in_shape_of
+from jaxltl.core.models.game import Game, as_game
+from jaxltl.core.models.ops.array_namespace import namespace, to_jax
+from jaxltl.core.models.ops.choices import choice_shape, choices
+from jaxltl.core.models.ops.operators import (
+    expectation,
+    is_deterministic,
+    require_policy,
+    valid_policy,
+)
+from jaxltl.core.models.ops.successor_tables import table
+from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.types import Solution, require_shape, status_code
+from jaxltl.core.values.discounted.discounted import best_action, expected_reward
+from jaxltl.core.values.engine import newton
+from jaxltl.core.values.engine.certificates import Enclosure, judged, refuse, rounding_unit
+from jaxltl.core.values.engine.implicit_diff import implicit
+from jaxltl.core.values.engine.iterate import iterate
+from jaxltl.core.values.engine.linear import DENSE_LIMIT, System, solver
+
+_METHODS = ("policy_iteration", "value_iteration", "strategy_iteration")
+
+
+def minimax_value(
+    game: Any,
+    reward: chex.Array,
+    discount: chex.Numeric,
+    *,
+    per: str = "move",
+    method: str = "policy_iteration",
+    allowed: chex.Array | None = None,
+    tolerance: chex.Numeric | None = None,
+    max_steps: chex.Numeric = 100_000,
+) -> Solution:
+    """Discounted reward that the system can secure against every environment.
+
+    ``V(s) = max_a R(s, a) + g(s) * sum_t P(t | s, a) V(t)`` where the system moves, the same
+    with min where the environment does (Shapley 1953; dissertation, section 5.2.4). With
+    ``per="move"``, g is the discount; with ``per="system_move"`` it is the discount at the
+    system's states and 1 at the environment's, so that time is counted in moves of the system.
+
+    The bounds rest on a function h with ``h >= 1 + g P h`` for all moves of both players, the
+    discounted time that is left at most: ``|T v - v| <= e`` puts the value within ``e * h`` of
+    v. It is what :func:`~jaxltl.core.values.engine.certificates.m_matrix_error` asks of an error, for all
+    choices at once, and found by policy iteration too.
+
+    Args:
+      game: a Game; any other model is the game in which the system always moves.
+      reward: ``float[S, A]`` or ``float[S, A, K]``; what is paid at environment states counts. In
+        a game on a sparse model as of :func:`~jaxltl.core.models.sparse.row_reward`.
+      discount: scalar in [0, 1).
+      per: ``"move"`` or ``"system_move"``, which moves are discounted.
+      method: ``"policy_iteration"``: linear solves for both players' greedy choices (Pollatschek
+        and Avi-Itzhak 1969), kept where they halve the error, and sweeps where they do not;
+        ``"value_iteration"``, sweeps alone; or ``"strategy_iteration"`` (Hoffman and Karp 1966),
+        the environment answering best before the system improves, which always ends.
+      allowed: ``bool[S, A]``, the moves that may be made, such as a permissive strategy's;
+        default the available ones. A play that reaches a state without any is worth minus
+        infinity, so the system keeps away, and that is the value where it cannot.
+      tolerance: certified absolute error asked for; default: what the dtype allows.
+      max_steps: applications of the operator, or of the linear one of fixed choices, at most;
+        in strategy iteration, choices that are looked at. As many again may go into h where
+        not every move is discounted; they are not counted.
+
+    Returns:
+      :class:`Solution`; `policy` is ``int32[S]``, greedy for both players: the system's part
+      secures at least `lower`, the environment's concedes at most `upper`. Where the value is
+      minus infinity the policy means nothing.
+
+    Raises:
+      ValueError: a wrong shape, an unknown method or `per`, or, with ``per="system_move"``,
+        an environment that can move for ever without the system, which leaves the value
+        undefined. (Under ``jit`` the status is then NONFINITE.)
+
+    Differentiable in the reward, the discount and the probabilities, wherever the greedy
+    choices are unique.
+
+    Example:
+      >>> from jaxltl import from_dense, make_game
+      >>> world = from_dense([[[0, 1.0], [0, 1.0]], [[1.0, 0], [1.0, 0]]])
+      >>> game = make_game(world, [True, False])
+      >>> reward = jnp.array([[1.0, 2.0], [0.0, 1.0]])
+      >>> [round(v, 4) for v in minimax_value(game, reward, 0.5).value.tolist()]
+      [2.6667, 1.3333]
+      >>> best = minimax_value(game, reward, 0.5, per="system_move")
+      >>> [round(v, 4) for v in best.value.tolist()], best.policy.tolist()
+      ([4.0, 4.0], [1, 0])
+    """
+    _require("method", method, _METHODS)
+    given = as_game(game)
+    game, reward = compiled_form(given, reward)
+    if allowed is not None:
+        require_shape("allowed", allowed, choice_shape(game))
+    graph = graph_of(game, allowed)
+    xp = graph.xp
+    system, moves = take(graph, (game.system, graph.available))
+    if allowed is not None:
+        moves = moves & xp.asarray(allowed, bool)
+    # Chance and the environment may lead to where play gets stuck.
+    lost = attract(graph, ~graph.first(moves)[0], moves, rule=~system).region
+    moves = moves & ~graph.on_choices(lost) & ~graph.exists(lost)
+    defined = _returns(graph, per, system | lost, moves, xp.zeros_like(lost))
+    moves, live = to_jax((moves, ~lost))
+    return in_shape_of(
+        given,
+        _solve(
+            game,
+            None,
+            moves,
+            live,
+            defined,
+            reward,
+            discount,
+            tolerance,
+            max_steps,
+            per=per,
+            method=method,
+        ),
+    )
+
+
+def strategy_value(
+    game: Any,
+    strategy: chex.Array,
+    reward: chex.Array,
+    discount: chex.Numeric,
+    *,
+    per: str = "move",
+    environment: chex.Array | str = "adversarial",
+    method: str = "policy_iteration",
+    tolerance: chex.Numeric | None = None,
+    max_steps: chex.Numeric = 100_000,
+) -> Solution:
+    """Discounted reward of a strategy of the system, in the worst case or against a policy.
+
+    ``V(s) = sum_a mu(s, a) (R(s, a) + g(s) * P V)`` where the system moves; where the
+    environment does, the minimum over its moves (dissertation, (5.2)), or the mean under its
+    policy. Discounts, methods and bounds are those of :func:`minimax_value`.
+
+    Args:
+      game, reward, discount, per, method, tolerance, max_steps: as in :func:`minimax_value`.
+      strategy: ``int32[S]`` or ``float[S, A]``, distributions over available moves; read at
+        the system's states only. Where no move is available play gets stuck, which is worth
+        minus infinity, as is each state from which it can come to that.
+      environment: ``"adversarial"``, or a policy ``int32[S]`` or ``float[S, A]``, read at the
+        environment's states only.
+
+    Returns:
+      :class:`Solution`; `policy` is ``float[S, A]``, both players' choices.
+
+    Raises:
+      ValueError: as :func:`minimax_value`; or a row of the strategy or of the environment's
+        policy that is read is no distribution over available moves (under ``jit`` the status is
+        then INVALID).
+
+    Differentiable in the reward, the discount, the probabilities and stochastic strategies,
+    wherever the environment's best answer is unique.
+
+    Example:
+      >>> from jaxltl import from_dense, make_game
+      >>> world = from_dense([[[0, 1.0], [0, 1.0]], [[1.0, 0], [1.0, 0]]])
+      >>> game = make_game(world, [True, False])
+      >>> reward = jnp.array([[1.0, 2.0], [0.0, 1.0]])
+      >>> worst = strategy_value(game, jnp.array([0, 0]), reward, 0.5, per="system_move")
+      >>> [round(v, 4) for v in worst.value.tolist()]
+      [2.0, 2.0]
+      >>> mild = jnp.array([[0.0, 0.0], [0.5, 0.5]])
+      >>> met = strategy_value(game, jnp.array([0, 0]), reward, 0.5, environment=mild)
+      >>> [round(v, 4) for v in met.value.tolist()]
+      [1.6667, 1.3333]
+    """
+    _require("method", method, _METHODS)
+    asked = as_game(game)
+    game, reward = compiled_form(asked, reward)
+    if isinstance(environment, str):
+        _require("environment", environment, ("adversarial",))
+        environment = None
+    strategy, environment = (flat_policy(asked.mdp, x) for x in (strategy, environment))
+    given = [("strategy", strategy, game.system)]
+    if environment is not None:
+        given.append(("environment", environment, ~game.system))
+    for name, policy, states in given:
+        kind, shape = "stochastic", choice_shape(game)
+        if is_deterministic(policy):
+            kind, shape = "of integers", game.state_shape
+        require_shape(f"{name} ({kind})", policy, shape)
+        require_policy(game, policy, _read(game, states))
+    checked = _joint(game, strategy, environment)
+    graph = graph_of(game, checked)
+    system, used = take(graph, (game.system, checked.used))
+    followed = graph.xp.ones_like(system)
+    drawn = followed if environment is not None else system
+    moves = graph.available & graph.xp.where(graph.on_choices(drawn), used, True)
+    # Whoever plays, nobody keeps away from where play gets stuck.
+    lost = attract(graph, ~graph.first(moves)[0], moves, rule=followed).region
+    moves = moves & ~graph.on_choices(lost)
+    defined = _returns(graph, per, system | lost, moves, drawn)
+    moves, drawn, live = to_jax((moves, drawn, ~lost))
+    return in_shape_of(
+        asked,
+        _solve(
+            game,
+            checked._replace(used=drawn),
+            moves,
+            live,
+            defined,
+            reward,
+            discount,
+            tolerance,
+            max_steps,
+            per=per,
+            method=method,
+        ),
+    )
+
+
+def _read(game: Game, states: Any) -> Any:
+    """The states of a player whose rows of a policy are read: those that have moves at all."""
+    if isinstance(game.mdp, SparseMDP):  # whose every state has a choice
+        return states
+    xp, states, available = namespace(states, game.available)
+    return states & xp.any(available, axis=-1)
+
+
+class _Drawn(NamedTuple):
+    """Moves of players whose policies are given.
+
+    Attributes:
+      weight: ``float[S, A]``, distributions.
+      given: as they were, NaN at moves that are not available.
+      valid: whether they are distributions.
+      used: ``bool[S, A]``, the moves of positive weight; later ``bool[S]``, where they count.
+    """
+
+    weight: jax.Array
+    given: jax.Array
+    valid: jax.Array
+    used: jax.Array
+
+
+@jax.jit
+def _joint(game: Game, strategy: chex.Array, environment: chex.Array | None) -> _Drawn:
+    """The policies of both players as one, zero where neither is read."""
+    read, over = _read(game, game.system), choices(game)
+    weight, given, valid = valid_policy(game, jnp.asarray(strategy), read)
+    weight = jnp.where(over.spread(read), weight, 0)  # nothing of what is not read
+    if environment is not None:
+        read = _read(game, ~game.system)
+        other = valid_policy(game, jnp.asarray(environment), read)
+        weight = jnp.where(over.spread(read), other.distribution, weight)
+        given = jnp.where(over.spread(read), other.given, given)
+        valid &= other.valid
+    return _Drawn(weight, given, valid, lax.stop_gradient(weight) > 0)
+
+
+def _require(name: str, value: str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise ValueError(f"{name}={value!r}; choose {' or '.join(choices)}.")
+
+
+def _returns(graph: Graph, per: str, goal: Any, moves: Any, drawn: Any) -> Any:
+    """Whether the environment always comes back to a goal, as values per system move need."""
+    _require("per", per, ("move", "system_move"))
+    if per == "move":
+        return np.True_
+    back = attract(graph, goal, moves, rule=drawn).region
+    if graph.xp is np and not back.all():
+        first = tuple(int(i) for i in np.argwhere(~back)[0])
+        raise ValueError(
+            f"from state {first[0] if len(first) == 1 else first} the environment can move "
+            "for ever without the system, and such moves are not discounted with "
+            "per='system_move', so there is no value; use per='move', or give the system "
+            "a move in every cycle."
+        )
+    return back.all()
+
+
+# --- what is played ------------------------------------------------------------------------
+
+
+class _Play(NamedTuple):
+    """A discounted game over numbered states, as the loops read it; lanes may differ in it all.
+
+    Attributes:
+      system: ``bool[N]``.
+      drawn: ``bool[N]``, where moves are drawn by `weight`; None where nobody's are.
+      weight: in columns.
+      horizon: the largest value of h, or infinite, or NaN where there is none.
+      discount: a scalar.
+      unit: relative rounding of a backup.
+      size: the largest reward.
+      tolerance: certified error asked for, or None.
+    """
+
+    system: jax.Array
+    drawn: jax.Array | None
+    weight: Any
+    horizon: jax.Array
+    discount: jax.Array
+    unit: jax.Array
+    size: jax.Array
+    tolerance: jax.Array | None
+
+
+def _chosen(over: Any, q: Any, play: _Play) -> tuple[jax.Array, Any]:
+    """What both players' best moves are worth, and their weights."""
+    own = jax.tree.map(lambda s, x: jnp.where(s, x, -x), over.spread(play.system, q), q)
+    best, weight = best_action(over, own, play)
+    best = jnp.where(play.system, best, -best)
+    if play.drawn is None:
+        return best, weight
+    weight = jax.tree.map(jnp.where, over.spread(play.drawn, q), play.weight, weight)
+    return jnp.where(play.drawn, _mean(over, weight, q), best), weight
+
+
+def _mean(over: Any, weight: Any, q: Any) -> jax.Array:
+    """The mean of columns that are infinite where moves are not allowed."""
+    return over.mean(weight, jax.tree.map(lambda x: jnp.where(jnp.isinf(x), 0, x), q))
+
+
+def _gains(rows: Any, play: _Play, reward: Any, moves: Any, live: jax.Array) -> Any:
+    """Columns of a reward, infinitely bad for who moves where it is not allowed; else zero."""
+    never = jnp.where(play.system, -jnp.inf, jnp.inf).astype(play.discount.dtype)
+    if play.drawn is not None:
+        never = jnp.where(play.drawn, 0, never)
+    spread = rows.choices.spread
+    return jax.tree.map(
+        lambda lives, m, r, none: jnp.where(lives, jnp.where(m, r, none), 0),
+        spread(live, reward),
+        moves,
+        reward,
+        spread(never, reward),
+    )
+
+
+# --- bounds --------------------------------------------------------------------------------
+
+
+def _horizon(rows: Any, play: _Play, moves, live, per: str, defined, max_steps) -> jax.Array:
+    """A function h with ``h >= 1 + g P h`` for all moves; infinite or NaN if there is none.
+
+    With tau the expected number of undiscounted moves before the next discounted one, at most,
+    and L its maximum: ``h = (1 + discount * L) / (1 - discount) + tau``. It is the value of the
+    play in which both players want it long. Where each move is discounted it is one number.
+    """
+    tau = jnp.zeros((), play.discount.dtype)
+    if per == "system_move":
+        free = live & ~play.system
+        slow = play._replace(system=jnp.ones_like(live))
+
+        def judge(tau, after, given):
+            growth = jnp.max(after - tau, axis=0)
+            # Below, from 1 + P tau <= tau + growth follows that tau / (1 - growth) is enough.
+            return (growth <= 2.0**-7) | ~jnp.isfinite(growth) | ~given[1], jnp.abs(growth)
+
+        ones = jax.tree.map(lambda m: jnp.ones(m.shape, tau.dtype), moves)
+        tau, after, _ = newton.solve(
+            rows,
+            lambda over, q, given: _chosen(over, q, given[0]),
+            judge,
+            newton.Backup(
+                _gains(rows, slow, ones, moves, free),
+                free.astype(tau.dtype),
+                jnp.zeros_like(play.discount),
+                (slow, defined),
+            ),
+            jnp.zeros(live.shape, tau.dtype),
+            max_steps=max_steps,
+        )
+        growth = jnp.max(after - tau)
+        tau = jnp.where(growth < 0.5, tau / (1 - growth), jnp.inf)
+    horizon = (1 + play.discount * jnp.max(tau)) / (1 - play.discount) + tau
+    slack = 2 * play.unit * jnp.max(horizon)
+    horizon = jnp.where(slack < 0.5, horizon * (1 + slack), jnp.inf)
+    valid = defined & (play.discount >= 0) & (play.discount < 1)
+    return jnp.where(valid, horizon, jnp.nan)
+
+
+def _certify(play: _Play, value: jax.Array, image: jax.Array) -> Enclosure:
+    """``T v + [down, up]`` encloses the fixed point of T; `horizon` for each state or its largest.
+
+    With ``c = max(T v - v)``: if c >= 0, ``u = v + c h`` has ``T u <= u``, so the fixed point
+    is at most ``T u <= T v + c (h - 1)``. If c < 0 the same holds with the constant
+    ``1 / (1 - discount)``, as no move is discounted more. Likewise below. As the width grows
+    with h, its maximum in place of h tells whether the enclosure is narrow enough everywhere.
+    """
+    horizon = play.horizon
+    unit = play.unit * (play.size + jnp.max(jnp.abs(image), axis=0))
+    change = image - value
+    top, bottom = jnp.max(change, axis=0), jnp.min(change, axis=0)
+    least = play.discount / (1 - play.discount)
+    up = top * jnp.where(top > 0, horizon - 1, least) + unit * horizon
+    down = bottom * jnp.where(bottom < 0, horizon - 1, least) - unit * horizon
+    finite = jnp.isfinite(top - bottom) & jnp.isfinite(play.size) & ~jnp.isnan(horizon)
+    return judged(down, up, unit * horizon, play.tolerance)._replace(finite=finite)
+
+
+def _judge(value: jax.Array, image: jax.Array, play: _Play) -> tuple[jax.Array, jax.Array]:
+    found = _certify(play, value, image)
+    # Where the horizon is not finite no number of sweeps proves anything.
+    return found.converged | found.exhausted | ~jnp.isfinite(found.half), found.half
+
+
+# --- solvers -------------------------------------------------------------------------------
+
+
+_FIRST_SWEEPS = 128  # of large games: they cost less than linear systems far from the value
+
+
+@partial(jax.jit, static_argnames=("per", "method"))
+def _solve(
+    game: Game,
+    drawn: _Drawn | None,
+    moves,
+    live,
+    defined,
+    reward,
+    discount,
+    tolerance,
+    max_steps,
+    *,
+    per: str,
+    method: str,
+) -> Solution:
+    discount = jnp.asarray(discount, game.dtype)
+    size = jnp.where(moves, expected_reward(game, jax.tree.map(jnp.abs, reward)), 0)
+    reward, over = jnp.where(moves, expected_reward(game, reward), 0), choices(game)
+    free = ~game.system if per == "system_move" else jnp.zeros_like(game.system)
+    rate = jnp.where(live, jnp.where(free, 1, discount), 0)
+    sign = jnp.where(game.system, 1, -1).astype(game.dtype)
+
+    def backup(value: jax.Array) -> jax.Array:
+        q = reward + over.spread(rate) * expectation(game, value)
+        best = sign * over.max(over.spread(sign) * q, moves)
+        if drawn is not None:
+            best = jnp.where(drawn.used, over.mean(drawn.weight, q), best)
+        return jnp.where(live, best, 0)
+
+    flat = live.ravel()
+    play = _Play(
+        game.system.ravel(),
+        None if drawn is None else drawn.used.ravel(),
+        None if drawn is None else over.columns(drawn.weight),
+        discount,
+        discount,
+        jnp.asarray(rounding_unit(game), game.dtype),
+        jnp.max(size),
+        None if tolerance is None else jnp.asarray(tolerance, game.dtype),
+    )
+    rows, columns = table(game), over.columns(moves)
+    horizon = _horizon(rows, play, columns, flat, per, defined, max_steps)
+    play = play._replace(horizon=jnp.max(horizon))
+    numbers = newton.Backup(
+        _gains(rows, play, over.columns(reward), columns, flat),
+        rate.ravel(),
+        jnp.zeros_like(discount),
+        play,
+    )
+    zero = jnp.zeros(flat.shape, game.dtype)
+    value, image, num_steps, weight = _approached(rows, numbers, zero, method, max_steps)
+    play, horizon = lax.stop_gradient((play, horizon))
+    weight = over.whole(weight)
+    verdict = _certify(play, value, image)
+    evidence = verdict
+    if per == "system_move":
+        evidence = _certify(play._replace(horizon=horizon), value, image)
+    known = jnp.all(evidence.half < jnp.inf)
+
+    def answer(x: jax.Array) -> jax.Array:
+        return jnp.where(live, x.reshape(live.shape), -jnp.inf)
+
+    middle = image + evidence.shift
+    solution = Solution(
+        value=middle.reshape(live.shape),
+        policy=over.first(weight == 1)[1] if drawn is None else weight,
+        lower=answer(jnp.where(known, middle - evidence.half, -jnp.inf)),
+        upper=answer(jnp.where(known, middle + evidence.half, jnp.inf)),
+        residual=jnp.max(jnp.abs(image - value)),
+        num_steps=num_steps,
+        status=status_code(verdict.converged, verdict.finite, verdict.exhausted),
+    )
+    solution = jax.tree.map(lax.stop_gradient, solution)
+    solution = replace(solution, value=answer(implicit(backup, solution.value)))
+    return solution if drawn is None else refuse(solution, drawn.given, drawn.valid)
+
+
+def _approached(rows: Any, numbers: newton.Backup, zero: jax.Array, method: str, max_steps: Any):
+    """A value near the fixed point, its image, the steps, and the weights of the choices there."""
+    policies = method == "policy_iteration"
+    if method == "strategy_iteration":
+        value, image, num_steps = _strategy_iteration(rows, numbers, zero, max_steps)
+    else:
+        value, image, num_steps, *chosen = newton.solve(
+            rows,
+            _chosen,
+            _judge,
+            numbers,
+            zero,
+            newton=policies,
+            monotone=False,
+            first_sweeps=_FIRST_SWEEPS if zero.size > DENSE_LIMIT else 0,
+            max_steps=max_steps,
+            weights=policies,
+        )
+    rows, numbers = lax.stop_gradient((rows, numbers))
+    if policies:
+        return value, image, num_steps, rows.choices.unpacked(*chosen)
+    q = newton.action_values(rows.choices, numbers, rows.expectation(value))
+    return value, image, num_steps, _chosen(rows.choices, q, numbers.extra)[1]
+
+
+_UNCHANGED = 3  # solves without a change of strategy after which more would not help
+
+
+class _Strategies(NamedTuple):
+    """Where strategy iteration is: z is to be looked at, the value of the choices `weight`."""
+
+    z: jax.Array
+    weight: Any
+    value: jax.Array
+    image: jax.Array
+    unchanged: jax.Array
+    done: jax.Array
+
+
+def _strategy_iteration(rows: Any, numbers: newton.Backup, zero: jax.Array, max_steps: Any):
+    """Solves for the value of both players' choices, then improves the environment's, or,
+    where those are a best answer already, the system's (Hoffman and Karp 1966)."""
+
+    def step(rows: Any, k: _Strategies, given: newton.Backup) -> _Strategies:
+        over, play = rows.choices, given.extra
+        q = newton.action_values(over, given, rows.expectation(k.z))
+        image, best = _chosen(over, q, play)
+        own = _mean(over, k.weight, q)
+        margin = 2 * play.unit * (play.size + jnp.max(jnp.abs(k.z)))
+        better = jnp.where(play.system, image - own, own - image) > margin
+        if play.drawn is not None:
+            better &= ~play.drawn
+        answers = better & ~play.system
+        change = jnp.where(answers.any(), answers, better)
+        weight = jax.tree.map(jnp.where, over.spread(change, q), best, k.weight)
+        unchanged = jnp.where(change.any(), 0, k.unchanged + 1)
+        done = _judge(k.z, image, play)[0] | (unchanged > _UNCHANGED)
+
+        def solved() -> jax.Array:
+            # Solving for the correction refines the value where the choices stay the same.
+            return k.z + solver(System(rows, weight, given.scale)).solve(
+                _mean(over, weight, q) - k.z
+            )
+
+        z = lax.cond(done, lambda: k.z, solved)
+        return _Strategies(z, weight, k.z, image, unchanged, done)
+
+    start = _Strategies(
+        zero,
+        _chosen(rows.choices, numbers.reward, numbers.extra)[1],
+        zero,
+        zero,
+        jnp.int32(-1),
+        jnp.bool_(False),
+    )
+    last, n = iterate(step, lambda k, _: k.done, rows, start, numbers, max_steps=max_steps)
+    return last.value, last.image, n

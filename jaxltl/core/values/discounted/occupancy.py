@@ -1,0 +1,157 @@
+"""Discounted visitation measures of a policy, and expectations under them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxltl.core.models.compiled.compiled import compiled_form, flat_policy
+from jaxltl.core.models.mdp import MDP, DenseMDP
+from jaxltl.core.models.ops.choices import choices
+from jaxltl.core.models.ops.operators import pushforward, require_policy, valid_policy
+from jaxltl.core.models.ops.successor_tables import table
+from jaxltl.core.models.product import Product
+from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.types import Solution, status_code
+from jaxltl.core.values.engine.certificates import most_choices, refuse
+from jaxltl.core.values.engine.implicit_diff import implicit
+from jaxltl.core.values.engine.iterate import in_turn
+from jaxltl.core.values.engine.linear import System, solver
+
+
+def occupancy_measure(
+    model: Any,
+    policy: jax.Array,
+    discount: jax.Array | float,
+    *,
+    initial: jax.Array | None = None,
+    tolerance: jax.Array | float | None = None,
+) -> Solution:
+    """Expected discounted visits, ``x(s, a) = sum_t discount^t P(s_t = s, a_t = a)``.
+
+    The solution of ``x(t, .) = pi(. | t) (initial(t) + discount * (P' x)(t))`` (Puterman
+    1994, section 6.9). Its sum is ``1 / (1 - discount)``.
+
+    Args:
+      model: the model.
+      policy: ``float[S, A]`` or ``int32[S]``; of a sparse model ``float[R]``, or rows ``int32[S]``.
+      discount: scalar in [0, 1).
+      initial: ``float[S]``, mass to start from; default the model's distribution.
+      tolerance: certified absolute error asked for; default: what the dtype allows.
+
+    Returns:
+      :class:`Solution` whose `value`, `lower` and `upper` are ``float[S, A]``, of a sparse model
+      ``float[R]``.
+
+    Raises:
+      ValueError: policy has the wrong shape, or is none (under ``jit`` the status is INVALID).
+
+    Differentiable in the policy, the discount, `initial` and the probabilities.
+
+    Example:
+      >>> from jaxltl import from_dense
+      >>> mdp = from_dense([[[0, 1.0]], [[0, 1.0]]], initial=[1, 0])
+      >>> x = occupancy_measure(mdp, jnp.array([0, 0]), 0.5).value
+      >>> [round(v, 4) for v in x[:, 0].tolist()]
+      [1.0, 1.0]
+    """
+    (form, _), policy = compiled_form(model), flat_policy(model, policy)
+    require_policy(form, policy)
+    start = model.initial if initial is None else initial
+    return _occupancy(form, policy, discount, start, tolerance)
+
+
+@jax.jit
+def _occupancy(model, policy, discount, start, tolerance) -> Solution:
+    checked, over = valid_policy(model, policy), choices(model)
+    policy = checked.distribution
+    discount = jnp.asarray(discount, model.dtype)
+    start = jnp.asarray(start, model.dtype)
+    start = (
+        jnp.broadcast_to(start, model.state_shape)
+        if start.ndim < 2
+        else start.reshape(model.state_shape)
+    )
+
+    def flow(d: jax.Array) -> jax.Array:
+        return start + discount * pushforward(model, over.spread(d) * policy)
+
+    system = System(table(model), over.columns(policy), discount)
+    linear = solver(system)
+    visits, n = in_turn(_visits, model, policy, discount, start, linear)
+    residual = jnp.sum(jnp.abs(flow(visits) - visits))
+    gap = jnp.where(discount < 1, 1 - discount, jnp.nan)
+    # The operator is a contraction in the sum norm, and a state's inflow sums what all pairs that
+    # lead there contribute.
+    epsilon = float(jnp.finfo(model.dtype).eps)
+    terms = lax.stop_gradient(_inflow_terms(model)) + most_choices(model) + 4
+    rounding = epsilon * jnp.sum(terms * jnp.abs(visits)) / gap
+    # So does the sum over the states.
+    rounding, residual = (x * (1 + model.num_states * epsilon) for x in (rounding, residual))
+    bound = residual / gap + rounding
+    finite = jnp.isfinite(bound)
+    bound = jnp.where(finite, bound, jnp.inf)
+    goal = 4 * rounding if tolerance is None else tolerance
+    visits = implicit(flow, visits, solve=linear.transpose_solve, transpose_solve=linear.solve)
+    value = over.spread(visits) * policy
+    frozen = lax.stop_gradient(value)
+    solution = Solution(
+        value=value,
+        policy=policy,
+        lower=lax.stop_gradient(jnp.maximum(frozen - bound, 0)),
+        upper=lax.stop_gradient(frozen + bound),
+        residual=lax.stop_gradient(residual),
+        num_steps=n,
+        status=status_code(
+            lax.stop_gradient(bound <= goal), lax.stop_gradient(finite), bound <= 8 * rounding
+        ),
+    )
+    return refuse(solution, checked.given, checked.valid)
+
+
+def _inflow_terms(model: Any) -> Any:
+    """How many numbers are added up for what flows into a state, in some order: ``[S]`` or more."""
+    if isinstance(model, Product):
+        return _inflow_terms(model.mdp)[:, None] + model.num_memory
+    if isinstance(model, MDP):
+        used = model.successor_probability > 0
+        return jnp.zeros(model.num_states, jnp.int32).at[model.successor].add(used)
+    if isinstance(model, DenseMDP):
+        return jnp.sum(model.successor_probability > 0, axis=(0, 1))
+    if isinstance(model, SparseMDP):
+        return jnp.bincount(jnp.asarray(model.successor), length=model.num_states)
+    return jnp.full(model.state_shape, model.num_states * most_choices(model))
+
+
+def _visits(model, policy, discount, start, linear) -> tuple[jax.Array, jax.Array]:
+    visits, n = linear.transpose_counted(start)
+    flow = start + discount * pushforward(model, choices(model).spread(visits) * policy)
+    # One step more brings down what elimination has left.
+    more, m = linear.transpose_counted(flow - visits)
+    return visits + more, n + m + 1
+
+
+def feature_expectation(occupancy: jax.Array, features: jax.Array) -> jax.Array:
+    """Expected discounted features, ``sum_{s, a} x(s, a) f(s, a)``: ``float[F]``.
+
+    Args:
+      occupancy: ``float[S, A]``, the value of :func:`occupancy_measure`; of a product
+        ``float[S, Q, A]``, of a sparse model ``float[R]``.
+      features: one axis more, ``float[S, A, F]``.
+
+    Returns:
+      ``float[F]``; linear in both, and differentiable in them.
+
+    Raises:
+      TypeError: shapes that do not fit.
+
+    Example:
+      >>> visits = jnp.array([[1.0, 0.5], [0.0, 2.5]])
+      >>> kind = jnp.array([[[1.0, 0], [1, 0]], [[0, 1], [0, 1]]])  # which state
+      >>> feature_expectation(visits, kind).tolist()
+      [1.5, 2.5]
+    """
+    return jnp.tensordot(occupancy, features, axes=occupancy.ndim)

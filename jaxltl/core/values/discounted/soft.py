@@ -1,0 +1,220 @@
+"""Soft (maximum-entropy) values and the derivative of their policies."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxltl.core.models.compiled.compiled import compiled_form, in_shape_of
+from jaxltl.core.models.ops.choices import choices
+from jaxltl.core.models.ops.operators import expectation, pushforward
+from jaxltl.core.models.ops.successor_tables import Predecessors, table
+from jaxltl.core.types import Solution
+from jaxltl.core.values.discounted.discounted import (
+    Parameters,
+    differentiable,
+    expected_reward,
+    gains,
+    judge,
+    parameters,
+    solution_of,
+)
+from jaxltl.core.values.engine import newton
+from jaxltl.core.values.engine.iterate import iterate
+from jaxltl.core.values.engine.linear import System
+
+_LEAST = 0.95  # of the logarithm of the least normal number, to which probabilities may fall
+_SWEEPS_BETWEEN = 4  # sweeps between two looks at what is left
+
+
+def soft_value(
+    model: Any,
+    reward: jax.Array,
+    discount: jax.Array | float,
+    *,
+    initial: jax.Array | None = None,
+    method: str = "newton",
+    tolerance: jax.Array | float | None = None,
+    max_steps: jax.Array | int = 100_000,
+) -> Solution:
+    """Soft (maximum-entropy) value, ``V = log sum_a exp(R + discount * P V)`` (3.4).
+
+    Args:
+      model: the model.
+      reward: ``float[S, A]`` or ``float[S, A, K]``; of a sparse model a name or as of
+        :func:`~jaxltl.core.models.sparse.row_reward`.
+      discount: scalar in [0, 1).
+      initial: ``float[S]``, where to start; default zero. It changes the number of steps only.
+      method: ``"newton"`` (soft policy iteration, few linear solves, for any discount)
+        or ``"value_iteration"`` (cheap sweeps).
+      tolerance: certified absolute error asked for; default: what the dtype allows.
+      max_steps: steps of the method at most.
+
+    Returns:
+      :class:`Solution`; `policy` is ``float[S, A]``, ``exp(Q - V)``, of a sparse model
+      ``float[R]``.
+
+    Raises:
+      ValueError: the reward has the wrong shape, or an unknown method.
+
+    Value and policy are differentiable in the reward, the discount and the
+    probabilities. The bounds are certified: the soft operator is monotone and commutes
+    with constants up to the discount, as MacQueen's bounds need.
+
+    Example:
+      >>> from jaxltl import from_dense
+      >>> mdp = from_dense([[[1.0], [1.0]]])
+      >>> round(soft_value(mdp, jnp.zeros((1, 2)), 0.5).value.item(), 4)  # 2 log 2
+      1.3863
+    """
+    if method not in ("newton", "value_iteration"):
+        raise ValueError(f"method={method!r}; choose newton or value_iteration.")
+    form, reward = compiled_form(model, reward)
+    return in_shape_of(
+        model, _soft_value(form, reward, discount, initial, tolerance, max_steps, method=method)
+    )
+
+
+@partial(jax.jit, static_argnames=("method",))
+def _soft_value(
+    model: Any,
+    reward: Any,
+    discount: Any,
+    initial: Any,
+    tolerance: Any,
+    max_steps: Any,
+    *,
+    method: str,
+) -> Solution:
+    given = parameters(model, reward, discount, tolerance)
+    reward, over = expected_reward(model, reward), choices(model)
+    start = jnp.zeros(model.num_states, model.dtype) if initial is None else initial.ravel()
+    value, image, n = newton.solve(
+        table(model),
+        soft_maximum,
+        judge,
+        newton.Backup(gains(model, reward), given.discount, jnp.zeros_like(given.discount), given),
+        start,
+        newton=method == "newton",
+        max_steps=max_steps,
+    )
+    solution = solution_of(model, given, value, image, value, n)
+
+    def backup(v: jax.Array) -> jax.Array:
+        return over.logsumexp(policy_logits(model, reward, given.discount, v))
+
+    def system() -> System:
+        logits = policy_logits(model, reward, given.discount, solution.value)
+        return System(table(model), over.columns(over.softmax(logits)), given.discount)
+
+    solution = differentiable(solution, backup, system)
+    return with_softmax(model, reward, given.discount, solution)
+
+
+def soft_maximum(over: Any, q: Any, given: Parameters) -> tuple[jax.Array, Any]:
+    """``log sum_a exp q_a`` of columns, and its derivative, the softmax."""
+    # Elementwise over columns: reductions over a short last axis take several times as long.
+    top = over.max(q)
+    raised = jax.tree.map(lambda x, t: jnp.exp(x - t), q, over.spread(top, q))
+    total = over.sum(raised)
+    return top + jnp.log(total), jax.tree.map(jnp.divide, raised, over.spread(total, q))
+
+
+def policy_logits(
+    model: Any, reward: jax.Array, discount: jax.Array | float, value: jax.Array
+) -> jax.Array:
+    """Action values with minus infinity at unavailable actions, whose softmax is the policy."""
+    q = reward + discount * expectation(model, value)
+    return choices(model).logits(q)
+
+
+def with_softmax(
+    model: Any, reward: jax.Array, discount: jax.Array, solution: Solution
+) -> Solution:
+    """The solution with the softmax of its action values as its policy."""
+    return replace(solution, policy=softmax_policy(model, reward, discount, solution.value))
+
+
+def softmax_policy(
+    model: Any, reward: jax.Array, discount: jax.Array | float, value: jax.Array
+) -> jax.Array:
+    """The softmax of the action values of a value, ``float[S, A]`` or ``float[R]``.
+
+    Every available action has a positive probability, also where its exponential is too small for
+    the dtype: what a policy surely does depends on it.
+    """
+    q, over = policy_logits(model, reward, discount, value), choices(model)
+    # As a constant: where the compiler rounds q otherwise elsewhere, no entry equals the maximum,
+    # and its derivative is 0 / 0.
+    best = over.spread(lax.stop_gradient(over.top(q)))
+    least = best + _LEAST * math.log(jnp.finfo(q.dtype).tiny)
+    q = jnp.where(over.available, jnp.maximum(q, least), q)
+    return over.softmax(q)
+
+
+def soft_policy_adjoint(
+    model: Any,
+    policy: jax.Array,
+    discount: jax.Array | float,
+    cotangent: jax.Array,
+    *,
+    predecessors: Predecessors | None = None,
+    max_steps: jax.Array | int = 100_000,
+) -> jax.Array:
+    """The derivative of ``sum c log pi`` in the reward, for the soft policy pi of that reward.
+
+    With ``g = c - pi sum_a c`` and x the solution of ``x = discount * P'(g + pi x)``, it is
+    ``g + pi x``: the transpose of the sensitivity (3.6), one linear system for any number of
+    parameters. Solved by sweeps, as the series ``sum_k (discount * P_pi')^k b``: what is left
+    is known exactly and shrinks at the rate of the discount or faster.
+
+    Args:
+      model: the model.
+      policy: ``float[S, A]`` or ``float[R]``, of :func:`soft_value`.
+      discount: scalar in [0, 1).
+      cotangent: ``float[S, A]`` or ``float[R]``, the weights c; zero at unavailable actions.
+      predecessors: of the model (without their leading axis), which make it faster.
+      max_steps: sweeps at most.
+
+    Returns:
+      As `cotangent`.
+    """
+    over = choices(model)
+    g = cotangent - policy * over.spread(over.sum(cotangent))
+    weight, discount = over.columns(policy), jnp.asarray(discount, policy.dtype)
+
+    def push(before, discount, mass):
+        """The discounted flow ``[N]`` of masses ``[N]`` of the actions."""
+        if before is not None:
+            return discount * before.pushforward(jnp.concatenate(mass))
+        return discount * pushforward(model, over.whole(mass)).ravel()
+
+    def step(before, carry, given):
+        (x, r), (weight, discount, _) = carry, given
+        return x + r, push(
+            before, discount, jax.tree.map(jnp.multiply, weight, over.layout.spread(r, weight))
+        )
+
+    def finished(carry, given):
+        return jnp.sum(jnp.abs(carry[1]), 0) <= given[2]
+
+    b = push(predecessors, discount, over.columns(g))
+    target = float(jnp.finfo(b.dtype).eps) ** 0.8 * jnp.sum(jnp.abs(b), 0)
+    start = lax.stop_gradient((jnp.zeros_like(b), b))
+    (x, r), _ = iterate(
+        step,
+        finished,
+        predecessors,
+        start,
+        lax.stop_gradient((weight, discount, target)),
+        max_steps=max_steps,
+        every=_SWEEPS_BETWEEN,
+        lanes="mapped" if predecessors is None else "side by side",
+    )
+    return g + policy * over.spread((x + r).reshape(model.state_shape))

@@ -1,0 +1,211 @@
+"""Values of many models of one game at once, each from a first guess.
+
+For learners that solve a model again and again as it changes. Under ``vmap`` over models of one
+graph the lanes become the last axis of every array, so that whole rows of lanes are read at
+each successor, several times faster than lane by lane. The loop is its own: lanes that are not
+active are left out of its condition, and it ends on the width of the bounds alone.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxltl.core.models.game import Game
+from jaxltl.core.values.engine.iterate import fill_row
+
+_MOST_SWEEPS = 100_000
+_FEWEST = 16  # lanes that are worth a loop of their own, and fill its rows
+_WRITTEN_OUT = 16  # successors up to which a sum over them is written out
+
+
+class _Graph(NamedTuple):
+    """What all lanes share."""
+
+    successor: jax.Array  # [S, A, K]
+    allowed: jax.Array  # [S, A]
+    sign: jax.Array  # [S], 1 where the system moves and -1 elsewhere
+
+
+class _Models(NamedTuple):
+    """What differs, with a last axis of lanes, or none."""
+
+    gain: jax.Array  # [S, A]
+    probability: jax.Array  # [S, A, K]; with K = 1 not read
+    value: jax.Array  # [S]
+    discount: jax.Array
+    enough: jax.Array
+    active: jax.Array
+
+
+def span_iteration(
+    game: Game,
+    allowed: jax.Array,
+    gain: jax.Array,
+    probability: jax.Array,
+    value: jax.Array,
+    discount: jax.Array,
+    *,
+    enough: jax.Array,
+    active: jax.Array | bool = True,
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The value of a discounted game from a first guess, and the moves' values.
+
+    Sweeps ``v <- T v + c`` with ``T v(s) = max_a gain(s, a) + discount * P v`` (min where the
+    environment moves), where c is the middle of MacQueen's (1966) bounds ``discount / (1 -
+    discount) * [min, max](T v - v)``. A constant changes no choice, so that it is the width of
+    the bounds that counts, which shrinks faster than their distance from zero.
+
+    Args:
+      game: explicit; its graph and whose turn it is are used, not its probabilities.
+      allowed: ``bool[S, A]``, the moves that exist; states without any stay as they are, and
+        must not be led to.
+      gain: ``float[S, A]``, expected rewards.
+      probability: ``float[S, A, K]``, of the listed successors.
+      value: ``float[S]``, the first guess.
+      discount: of every move.
+      enough: the error at which to stop.
+      active: ``bool[]``, False to return the guess.
+
+    Returns:
+      The value ``float[S]``, its error at most (infinite if not active), up to rounding; and
+      ``gain + discount * P v`` for it, ``float[S, A]``.
+    """
+    dtype = game.dtype
+    graph = _Graph(game.mdp.successor, allowed, jnp.where(game.system, 1, -1).astype(dtype))
+    models = _Models(
+        gain,
+        probability,
+        value,
+        jnp.asarray(discount, dtype),
+        jnp.asarray(enough, dtype),
+        jnp.asarray(active),
+    )
+    return _iterate(graph, models)
+
+
+class _Sweeps(NamedTuple):
+    """What a loop over sweeps carries; `change` is ``T v - v``, written out once for all uses."""
+
+    value: jax.Array
+    change: jax.Array
+    error: jax.Array
+    number: jax.Array
+
+
+def _plain(graph: _Graph, models: _Models) -> tuple[jax.Array, jax.Array, jax.Array]:
+    start = _Sweeps(
+        models.value,
+        _change(graph, models, models.value),
+        jnp.full_like(models.enough, jnp.inf),
+        jnp.int32(0),
+    )
+    lanes = models.active.shape
+    few = lanes[0] // (4 * _FEWEST) * _FEWEST if lanes else 0
+    found = _swept(graph, models, start, few)
+    if few:
+        found = _last_lanes(graph, models, found, few)
+    return found.value, found.error, jnp.stack(_quantities(graph, models, found.value), axis=1)
+
+
+def _unfinished(models: _Models, now: _Sweeps) -> jax.Array:
+    return models.active & (now.error > models.enough) & (now.number < _MOST_SWEEPS)
+
+
+def _swept(graph: _Graph, models: _Models, start: _Sweeps, few: int = 0) -> _Sweeps:
+    """Sweeps until at most a few lanes are left that are not done."""
+    live = _beside(models, graph.allowed.any(-1))
+    ahead = models.discount / (1 - models.discount)
+
+    def sweep(now: _Sweeps) -> _Sweeps:
+        top = jnp.where(live, now.change, -jnp.inf).max(axis=0)
+        bottom = jnp.where(live, now.change, jnp.inf).min(axis=0)
+        going = models.active & (now.error > models.enough)
+        moved = now.value + now.change + ahead * (top + bottom) / 2
+        value = jnp.where(live & going, moved, now.value)
+        error = jnp.where(going, ahead * (top - bottom) / 2, now.error)
+        return _Sweeps(value, _change(graph, models, value), error, now.number + 1)
+
+    def left(now: _Sweeps) -> jax.Array:
+        going = _unfinished(models, now)
+        return jnp.sum(going) > few if few else jnp.any(going)
+
+    return lax.while_loop(left, sweep, start)
+
+
+def _last_lanes(graph: _Graph, models: _Models, found: _Sweeps, few: int) -> _Sweeps:
+    """The lanes that are not done go on by themselves: most models need a few sweeps, some many."""
+    going = _unfinished(models, found)
+    place = jnp.cumsum(going) - 1
+    who = jnp.nonzero(going, size=few, fill_value=0)[0]
+    narrow, rest = jax.tree.map(lambda x: x[..., who] if x.ndim else x, (models, found))
+    narrow = narrow._replace(active=jnp.arange(few) <= place[-1])
+    last = _swept(graph, narrow, rest)
+    place = jnp.maximum(place, 0)
+    return jax.tree.map(
+        lambda x, y: jnp.where(going, x[..., place], y) if y.ndim else x, last, found
+    )
+
+
+def _beside(models: _Models, x: jax.Array) -> jax.Array:
+    """One entry for all lanes."""
+    return x.reshape(x.shape + (1,) * models.active.ndim)
+
+
+def _change(graph: _Graph, models: _Models, value: jax.Array) -> jax.Array:
+    """``T v - v``; zero where there is no move."""
+    allowed, sign = _beside(models, graph.allowed), _beside(models, graph.sign)
+    best = jnp.full_like(value, -jnp.inf)
+    for a, column in enumerate(_quantities(graph, models, value)):
+        best = jnp.maximum(best, jnp.where(allowed[:, a], sign * column, -jnp.inf))
+    return jnp.where(_beside(models, graph.allowed.any(-1)), sign * best - value, 0)
+
+
+def _quantities(graph: _Graph, models: _Models, value: jax.Array) -> list[jax.Array]:
+    """``gain + discount * P v``, a column for each action: so it is read in the order of memory."""
+    num_actions, width = graph.successor.shape[1:]
+
+    def reached(*where: Any) -> jax.Array:
+        return value.at[graph.successor[:, *where]].get(
+            mode="promise_in_bounds", wrap_negative_indices=False
+        )
+
+    columns = []
+    for a in range(num_actions):
+        if width == 1:  # what is certain need not be weighed
+            mean = reached(a, 0)
+        elif width > _WRITTEN_OUT:
+            mean = jnp.sum(models.probability[:, a] * reached(a), axis=1)
+        else:
+            terms = [models.probability[:, a, k] * reached(a, k) for k in range(width)]
+            mean = sum(terms[1:], start=terms[0])
+        columns.append(models.gain[:, a] + models.discount * mean)
+    return columns
+
+
+_iterate = jax.custom_batching.custom_vmap(_plain)
+
+
+@_iterate.def_vmap
+def _lanes_last(size: int, batched: Any, graph: _Graph, models: _Models) -> Any:
+    shared, own = batched
+    if any(shared):
+        axes = jax.tree.map(lambda b: 0 if b else None, (shared, own))
+        return jax.vmap(_plain, axes)(graph, models), (True, True, True)
+    lanes = models.value.ndim - own.value - 1
+    number = size * (models.value.shape[-1] if lanes else 1)
+
+    def last(x: jax.Array, is_batched: bool) -> jax.Array:
+        x = x if is_batched else jnp.broadcast_to(x, (size, *x.shape))
+        x = jnp.moveaxis(x, 0, -1)
+        return fill_row(x.reshape(*x.shape[:-2], -1) if lanes else x)
+
+    def first(x: jax.Array) -> jax.Array:
+        x = x[..., :number]
+        return jnp.moveaxis(x.reshape(*x.shape[:-1], -1, size) if lanes else x, -1, 0)
+
+    found = _iterate(graph, jax.tree.map(last, models, own))
+    return jax.tree.map(first, found), (True, True, True)

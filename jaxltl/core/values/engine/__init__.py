@@ -1,0 +1,1 @@
+"""The traced engine: iteration, certificates, linear systems, implicit derivatives."""

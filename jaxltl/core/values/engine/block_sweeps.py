@@ -1,0 +1,236 @@
+"""Passes over the blocks of a schedule, forwards, backwards, and until nothing moves."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jax import lax
+
+from jaxltl.core.values.engine.linear import solve_linear
+
+
+@struct.dataclass
+class Blocks:
+    """A segment of a :class:`~jaxltl.core.sparse.prepared.block_schedule.Schedule` with its numbers.
+
+    Attributes:
+      target: ``int32[C, A, W, B]``, places.
+      source: ``int32[C, A, W, B]``, which numbers the weights are.
+      weight: ``float[C, A, W, B]``.
+      name: ``int32[C, A, B]``, of the rows.
+      first: the place of the first node, static.
+    """
+
+    target: Any
+    source: Any
+    weight: Any
+    name: Any
+    first: int = struct.field(pytree_node=False)
+
+    @property
+    def size(self) -> int:
+        """How many places there are."""
+        return self.target.shape[0] * self.target.shape[3]
+
+    @property
+    def last(self) -> int:
+        return self.first + self.size
+
+
+def _look(x: jax.Array, place: jax.Array) -> jax.Array:
+    return x.at[place].get(mode="promise_in_bounds")
+
+
+def _combined(target: jax.Array, weight: jax.Array, x: jax.Array) -> list[jax.Array]:
+    """``sum_w weight * x`` of each row of a block: A arrays ``[B]``."""
+    images = []
+    for t, w in zip(target, weight, strict=True):
+        terms = [w[k] * _look(x, t[k]) for k in range(t.shape[0])]
+        images.append(sum(terms[1:], terms[0]))
+    return images
+
+
+def sweep(
+    blocks: Blocks,
+    x: jax.Array,
+    *,
+    maximize: bool,
+    factor: float = 1.0,
+    shift: float | jax.Array = 0.0,
+    keep: jax.Array | None = None,
+    put: jax.Array | None = None,
+    choose: bool = False,
+) -> tuple[jax.Array, jax.Array | None]:
+    """One pass: ``x = opt_a sum_w weight * x`` from the first block on, in place.
+
+    Args:
+      blocks: what to pass over.
+      x: ``float[N + 3]``.
+      maximize: which optimum.
+      factor, shift: what an image is multiplied by, and what is then added; not below 0.
+      keep, put: ``float[N]``, multiplied by and added to that.
+      choose: whether the choices are asked for too.
+
+    Returns:
+      x, and ``int32[C, B]``, the ranks of the optimal rows, or None.
+    """
+    count, _, _, size = blocks.target.shape
+    if not count:
+        return x, jnp.zeros((0, size), jnp.int32) if choose else None
+    better = jnp.greater if maximize else jnp.less
+
+    def body(x: jax.Array, block: Any) -> Any:
+        c, target, weight = block
+        images = _combined(target, weight, x)
+        best, rank = images[0], jnp.zeros(size, jnp.int32)
+        for a, image in enumerate(images[1:], 1):
+            wins = better(image, best)
+            best, rank = jnp.where(wins, image, best), jnp.where(wins, a, rank)
+        start = blocks.first + c * size
+        if factor != 1.0:
+            best = best * factor
+        if isinstance(shift, jax.Array) or shift != 0.0:
+            best = jnp.maximum(best + shift, 0)
+        if keep is not None and put is not None:
+            best = best * lax.dynamic_slice(keep, (start,), (size,))
+            best = best + lax.dynamic_slice(put, (start,), (size,))
+        return lax.dynamic_update_slice(x, best, (start,)), rank if choose else None
+
+    numbers = jnp.arange(count, dtype=jnp.int32)
+    return lax.scan(body, x, (numbers, blocks.target, blocks.weight))
+
+
+def images(blocks: Blocks, x: jax.Array) -> jax.Array:
+    """``sum_w weight * x`` of all rows at once, ``float[C, A, B]``."""
+    return jnp.sum(blocks.weight * _look(x, blocks.target), axis=2)
+
+
+def chosen_names(names: jax.Array, rank: jax.Array, rounds: int) -> jax.Array:
+    """``int32[N]``, the names of the rows that nodes take.
+
+    Args:
+      names: ``int32[C, A, B]`` of all blocks.
+      rank: ``int32[C, B]``.
+      rounds: how often a choice may be what another node chose.
+    """
+    found = jnp.take_along_axis(names, rank[:, None], 1).ravel()
+    for _ in range(rounds):
+        found = jnp.where(found < 0, _look(found, jnp.maximum(-1 - found, 0)), found)
+    return found
+
+
+def meets(
+    segments: tuple[Blocks, ...], support: tuple[jax.Array, ...], x: jax.Array, cyclic: bool
+) -> jax.Array:
+    """The places from which entries that have weight lead to some places.
+
+    Args:
+      segments: of a system of one row a node.
+      support: ``bool[C, 1, W, B]`` for each of them.
+      x: ``bool[N + 3]``, where to get.
+      cyclic: whether the second segment has circles.
+    """
+
+    def once(blocks: Blocks, has: jax.Array, x: jax.Array) -> jax.Array:
+        count, _, _, size = blocks.target.shape
+
+        def body(x: jax.Array, block: Any) -> Any:
+            c, target, has = block
+            start = blocks.first + c * size
+            found = lax.dynamic_slice(x, (start,), (size,))
+            for k in range(target.shape[1]):
+                found = found | (has[0, k] & _look(x, target[0, k]))
+            return lax.dynamic_update_slice(x, found, (start,)), None
+
+        if not count:
+            return x
+        return lax.scan(body, x, (jnp.arange(count, dtype=jnp.int32), blocks.target, has))[0]
+
+    x = once(segments[0], support[0], x)
+    if cyclic:
+
+        def again(state: Any) -> Any:
+            x, _ = state
+            new = once(segments[1], support[1], x)
+            return new, jnp.any(new != x)
+
+        x, _ = lax.while_loop(lambda s: s[1], again, (x, jnp.asarray(True)))
+    return once(segments[2], support[2], x)
+
+
+# --- the linear system of chosen rows -----------------------------------------------------------
+
+
+@struct.dataclass
+class Chosen:
+    """The rows of a policy: ``x = sum_w weight * x[target]``.
+
+    Attributes:
+      target: ``int32[C, W, B]`` of all blocks.
+      weight: ``float[C, W, B]``.
+      cyclic: static.
+    """
+
+    target: Any
+    weight: Any
+    cyclic: bool = struct.field(pytree_node=False)
+
+    def image(self, x: jax.Array) -> jax.Array:
+        """``sum_w weight * x[target]``, ``float[N]`` from ``float[N + 3]``."""
+        return jnp.sum(self.weight * x[self.target], axis=1).ravel()
+
+    @property
+    def _starts(self) -> jax.Array:
+        count, _, size = self.target.shape
+        return jnp.arange(count, dtype=jnp.int32) * size
+
+    def _forward(self, x: jax.Array, b: jax.Array) -> jax.Array:
+        """A pass of ``x = b + P x``; the constants are 0."""
+        size = self.target.shape[2]
+
+        def body(x: jax.Array, block: Any) -> Any:
+            start, target, weight = block
+            (image,) = _combined(target[None], weight[None], x)
+            image = image + lax.dynamic_slice(b, (start,), (size,))
+            return lax.dynamic_update_slice(x, image, (start,)), None
+
+        full = jnp.concatenate([x, jnp.zeros(3, x.dtype)])
+        full, _ = lax.scan(body, full, (self._starts, self.target, self.weight))
+        return full[:-3]
+
+    def _backward(self, x: jax.Array, b: jax.Array) -> jax.Array:
+        """A pass of ``x = b + P' x`` from the last block on."""
+        size = self.target.shape[2]
+        onward = self.target < self._starts[:, None, None]
+        ahead = jnp.where(onward, self.weight, 0)
+        sums = jnp.concatenate([b, jnp.zeros(3, b.dtype)])
+        if self.cyclic:
+            inner = onward | (self.target >= b.size)
+            spread = jnp.where(inner, 0, self.weight) * x.reshape(self.target.shape[0], 1, size)
+            sums = sums.at[self.target].add(spread)
+
+        def body(sums: jax.Array, block: Any) -> Any:
+            start, target, weight = block
+            mine = lax.dynamic_slice(sums, (start,), (size,))
+            return sums.at[target].add(weight * mine, mode="promise_in_bounds"), None
+
+        sums, _ = lax.scan(body, sums, (self._starts, self.target, ahead), reverse=True)
+        return sums[:-3]
+
+    def solve(self, b: jax.Array) -> jax.Array:
+        """x with ``x - P x = b``; the constants are 0."""
+        return self._solved(self._forward, b)
+
+    def transpose_solve(self, b: jax.Array) -> jax.Array:
+        """x with ``x - P' x = b``."""
+        return self._solved(self._backward, b)
+
+    def _solved(self, one_pass: Any, b: jax.Array) -> jax.Array:
+        # A pass leaves what goes round for the next one, and nothing where there are no circles.
+        first = one_pass(jnp.zeros_like(b), b)
+        if not self.cyclic:
+            return first
+        return solve_linear(lambda x: x - one_pass(x, jnp.zeros_like(b)), first)

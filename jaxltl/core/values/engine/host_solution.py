@@ -1,0 +1,236 @@
+"""Certified answers of the host engine as solutions, for sparse and for padded models."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxltl.core.models.build.convert import to_sparse
+from jaxltl.core.models.compiled.compiled import flat_policy
+from jaxltl.core.models.compiled.compiled import is_sparse as is_sparse
+from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
+from jaxltl.core.models.ops.operators import is_deterministic, require_weights, row_weights
+from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.pretty_print import brief
+from jaxltl.core.sparse.mdp import HostMDP
+from jaxltl.core.sparse.solvers import reachability as optimal
+from jaxltl.core.sparse.solvers.discounted import discounted_value
+from jaxltl.core.sparse.solvers.policy_iteration import Enclosed
+from jaxltl.core.types import (
+    Method,
+    Solution,
+    Status,
+    require_shape,
+    row_tolerance,
+)
+from jaxltl.core.values.undiscounted.step_bounded import finite_reward
+
+
+def status_between(
+    low: np.ndarray, high: np.ndarray, tolerance: float, *, relative: bool
+) -> Status:
+    """Whether bounds are as narrow as asked; where both are infinite they are."""
+    finite = np.isfinite(high)
+    width = np.where(finite, high, 0) - np.where(finite, low, 0)
+    scale = np.where(finite, high, 1) if relative else 1
+    narrow = (width <= tolerance * scale) & (finite | (low == high))
+    return Status.CONVERGED if narrow.all() else Status.PRECISION
+
+
+def solution_of(
+    model: Any, sparse: SparseMDP, found: Enclosed, tolerance: float, *, relative: bool
+) -> Solution:
+    """A solution with the model's shapes; bounds in its precision, rounded outwards.
+
+    Args:
+      model: the model that was asked about.
+      sparse: the same as sparse rows.
+      found: the enclosure.
+      tolerance: the width that was asked for.
+      relative: whether that is a share of the value.
+    """
+    low, high = found.lower, found.upper
+    status = status_between(low, high, tolerance, relative=relative)
+    policy = found.row
+    shape = model.state_shape
+    if not is_sparse(model):
+        policy = np.asarray(sparse.action)[found.row]
+    policy = policy.astype(np.int32).reshape(shape)
+    parts: dict[str, Any] = {
+        "value": found.value.reshape(shape),
+        "policy": policy,
+        "lower": low.reshape(shape),
+        "upper": high.reshape(shape),
+        "residual": np.float64(found.residual),
+        "num_steps": np.int32(found.rounds),
+        "status": np.int32(status),
+    }
+    method = Method(found.method)
+    if is_sparse(model):
+        return Solution(**parts, method=method)
+    dtype = np.dtype(model.dtype)
+    exact = low == high
+    low, high = (
+        np.where(exact, x, np.nextafter(x.astype(dtype), end)).astype(dtype)
+        for x, end in ((low, dtype.type(-np.inf)), (high, dtype.type(np.inf)))
+    )
+    low = np.maximum(low, 0)
+    if not relative:
+        high = np.minimum(high, 1)
+    low, high = low.reshape(shape), high.reshape(shape)
+    parts |= {
+        "value": np.clip(parts["value"].astype(dtype), low, high),
+        "lower": low,
+        "upper": high,
+        "residual": np.asarray(found.residual, dtype),
+    }
+    return Solution(**to_jax(parts), method=method)
+
+
+@brief
+class Chain(NamedTuple):
+    """The Markov chain of a policy.
+
+    Attributes:
+      mdp: the chain.
+      weight: ``float64[R]``, how much of each row it takes; a state's sum to one.
+      depth: how many roundings stand behind a number of the chain.
+    """
+
+    mdp: HostMDP
+    weight: np.ndarray
+    depth: int
+
+    def mean(self, quantity: np.ndarray, row_start: np.ndarray) -> np.ndarray:
+        """The mean of a quantity on rows in each state, ``float64[S]``; 0 of rows not taken."""
+        taken = np.where(self.weight > 0, self.weight * quantity, 0)
+        return np.add.reduceat(taken, row_start[:-1])
+
+
+def chain_of(model: Any, sparse: SparseMDP, policy: Any) -> Chain:
+    """The Markov chain of a policy.
+
+    Args:
+      model: the model that the policy is for.
+      sparse: the same as sparse rows.
+      policy: rows ``int32[S]`` or their weights ``float[R]``; for a padded model actions
+        ``int32[S]`` or ``float[S, A]``.
+
+    Raises:
+      ValueError: a shape is wrong, or a state's row is no distribution over its choices.
+    """
+    host = sparse.host
+    if is_sparse(model):
+        weight = row_weights(sparse, flat_policy(model, policy))
+    else:
+        weight = _weights(model, sparse, np.asarray(policy))
+        require_weights(host, weight, row_tolerance(np.float64))
+    total = host.over_choices(np.add, weight)
+    from scipy.sparse import csr_array
+
+    taken = np.flatnonzero(weight > 0)
+    count = np.bincount(host.state[taken], minlength=host.num_states)
+    starts = np.concatenate([[0], count.cumsum()])
+    weight = weight / total[host.state]
+    mix = csr_array((weight[taken], taken, starts), shape=(host.num_states, host.num_rows))
+    chain = (mix @ host.matrix).tocsr()
+    chain.sort_indices()
+    most = int(count.max())
+    depth = 2 * most + 4 if most > 1 else 0  # two sums of so many terms, one to divide by
+    states = np.arange(host.num_states + 1)
+    return Chain(HostMDP(states, chain.indptr, chain.indices, chain.data), weight, depth)
+
+
+def _weights(model: Any, sparse: SparseMDP, policy: np.ndarray) -> np.ndarray:
+    """A padded model's policy as weights of its rows."""
+    actions = (*model.state_shape, model.num_actions)
+    if is_deterministic(policy) and policy.shape == actions[:-1]:
+        policy = np.eye(model.num_actions)[policy]
+    if policy.shape != actions:
+        raise ValueError(
+            f"policy has shape {policy.shape}; expected {actions[:-1]} of actions "
+            f"or {actions} of their probabilities."
+        )
+    flat = policy.reshape(sparse.num_states, -1)
+    return flat[sparse.host.state, np.asarray(sparse.action)].astype(np.float64)
+
+
+def given_policy(solution: Solution, policy: Any) -> Solution:
+    """A solution with the policy that it is of, where one was given."""
+    if policy is None:
+        return solution
+    table = np.asarray(policy)
+    kind: Any = np.int32 if is_deterministic(table) else table.dtype
+    given: Any = table.astype(kind)
+    return replace(solution, policy=given)
+
+
+def reachability(
+    model: Any, target: Any, *, stay: Any, policy: Any, objective: str, tolerance: Any
+) -> Solution:
+    """Probabilities of reaching a target through some states, by the host engine.
+
+    Arguments as of :func:`~jaxltl.core.values.undiscounted.reachability.reachability_probability`.
+    """
+    if is_traced((model, target, stay, policy)):
+        raise ValueError(
+            "a sparse model, or what may be passed (stay), is read on the host: give concrete "
+            "arrays; inside jit use prepare(model, target), or the formula's product."
+        )
+    sparse = to_sparse(model)
+    target = np.asarray(target, bool).ravel()
+    if stay is not None:
+        require_shape("stay", stay, model.state_shape)
+        stay = np.asarray(stay, bool).ravel()
+    asked = default_tolerance(model) if tolerance is None else float(tolerance)
+    host, depth = sparse.host, 0
+    if policy is not None:
+        host, _, depth = chain_of(model, sparse, policy)
+    found = optimal.reachability(
+        host, target, maximize=objective == "max", stay=stay, tolerance=asked, depth=depth
+    )
+    return given_policy(solution_of(model, sparse, found, asked, relative=False), policy)
+
+
+def discounted(
+    model: Any, reward: Any, discount: Any, *, policy: Any = None, tolerance: Any = None
+) -> Solution:
+    """Discounted values of a sparse model; arguments as of the functions for padded ones.
+
+    Rewards are named, or arrays on states, choices or transitions, see
+    :func:`~jaxltl.core.models.sparse.row_reward`; they are finite.
+    """
+    if not 0 <= float(discount) < 1:
+        raise ValueError(f"discount={float(discount):.6g}; it must be at least 0 and below 1.")
+    sparse = to_sparse(model)
+    earned, magnitude = finite_reward(sparse, reward)
+    host, depth = sparse.host, 0
+    largest = float(np.abs(earned).max()) / (1 - float(discount))
+    asked = 1e-8 * max(largest, 1e-300) if tolerance is None else 2 * float(tolerance)
+    if policy is not None:
+        chain = chain_of(model, sparse, policy)
+        earned, magnitude = (chain.mean(x, host.row_start) for x in (earned, magnitude))
+        host, depth = chain.mdp, chain.depth
+    found = discounted_value(
+        host, earned, magnitude, float(discount), maximize=True, tolerance=asked, depth=depth
+    )
+    width = found.upper - found.lower
+    status = Status.CONVERGED if (width <= asked).all() else Status.PRECISION
+    parts: dict[str, Any] = {
+        "value": found.value,
+        "policy": found.row.astype(np.int32),
+        "lower": found.lower,
+        "upper": found.upper,
+        "residual": np.float64(found.residual),
+        "num_steps": np.int32(found.rounds),
+        "status": np.int32(status),
+    }
+    parts = {name: x.reshape(model.state_shape) if np.ndim(x) else x for name, x in parts.items()}
+    return given_policy(Solution(**parts, method=Method(found.method)), policy)
+
+
+def default_tolerance(model: Any) -> float:
+    """The width that is asked for where nothing is said."""
+    return 1e-6 if np.dtype(model.dtype) == np.float64 else 1e-3

@@ -1,0 +1,467 @@
+"""Linear systems ``(I - c P_w) x = b`` and their transposes, small and large.
+
+Small systems are inverted by elimination: it does not matter how slowly a policy makes progress.
+The library's own, since LAPACK's threads make batches of small systems wait for one another.
+Large ones are solved by BiCGSTAB.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxltl.core.models.mesh.sharded import is_sharded
+from jaxltl.core.models.ops.entries import Entries
+from jaxltl.core.models.ops.operators import transition_matrix
+from jaxltl.core.models.ops.successor_tables import Primitives, SpreadSuccessors, Successors
+from jaxltl.core.values.engine.iterate import in_turn, iterate
+
+Operator = Callable[[jax.Array], jax.Array]
+
+DENSE_LIMIT = 512  # states up to which a system is inverted
+_BLOCK = 32
+_REFINEMENTS = 2
+_GOOD_RATE = 0.7  # a contraction at least this fast needs no Krylov method
+_STRETCH = 64  # steps between two looks at the true residual
+
+
+class System(NamedTuple):
+    """``x - scale * sum_a w(s, a) (P x)(s, a)`` over numbered states.
+
+    Attributes:
+      table: the model's successors, see :func:`~jaxltl.core.models.ops.successor_tables.table`.
+      weight: ``float[N]`` for each action, such as a policy's columns; of a sparse model
+        ``float[R]``.
+      scale: ``float[N]`` or a scalar, such as the discount; zero where a value is fixed.
+    """
+
+    table: Any
+    weight: Any
+    scale: jax.Array
+
+    @property
+    def num_states(self) -> int:
+        return self.table.choices.size(self.weight)
+
+    def onward(self, x: jax.Array) -> jax.Array:
+        """``scale * P_w x`` for ``[N, ...]``."""
+        return self.scale * self.table.choices.mean(self.weight, self.table.expectation(x))
+
+    def matvec(self, x: jax.Array) -> jax.Array:
+        """The system applied to ``[N]``."""
+        return x - self.onward(x)
+
+    def vecmat(self, y: jax.Array) -> jax.Array:
+        """Its transpose applied to ``[N]``."""
+        shape = jax.ShapeDtypeStruct(y.shape, y.dtype)
+        (back,) = jax.linear_transpose(self.onward, shape)(y)
+        return y - back
+
+    def matrix(self) -> jax.Array:
+        """``float[N, N]``, written out."""
+        n = self.num_states
+        eye = jnp.eye(n, dtype=jax.tree.leaves(self.weight)[0].dtype)
+        if not isinstance(self.table, Successors):
+            if isinstance(self.table, Primitives):
+                model = self.table.model
+                policy = jnp.stack(self.weight, -1).reshape(*model.state_shape, -1)
+                found = transition_matrix(model, policy)
+            elif isinstance(self.table, Entries):
+                found = self.table.matrix(self.weight)
+            else:
+                found = self.table.choices.mean(self.weight, self.table.expectation(eye))
+            return eye - jnp.broadcast_to(self.scale, (n,))[:, None] * found
+        rows = jnp.arange(n)
+        target = jnp.asarray(self.table.successor)  # [A, K, N]
+        weight = jnp.stack(self.weight)[:, None] * jnp.asarray(self.table.probability)
+        return eye.at[jnp.broadcast_to(rows, target.shape), target].add(-self.scale * weight)
+
+
+class Inverse(NamedTuple):
+    """An inverse, with the system to refine by.
+
+    Attributes:
+      system: what was inverted.
+      inverse: ``float[N, N]``.
+    """
+
+    system: System
+    inverse: jax.Array
+
+    def counted(self, b: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """As :meth:`solve`, and the products with the system that it took."""
+        x = _refined(self.inverse, self.system.matvec, b.ravel())
+        return x.reshape(b.shape), jnp.int32(_REFINEMENTS)
+
+    def solve(self, b: jax.Array) -> jax.Array:
+        """x with ``(I - c P_w) x = b``, for values of any shape with N entries."""
+        return self.counted(b)[0]
+
+    def transpose_counted(self, b: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """As :meth:`transpose_solve`, and the products that it took."""
+        # Without refinement: the transposed product would be a scatter.
+        return (b.ravel() @ self.inverse).reshape(b.shape), jnp.int32(0)
+
+    def transpose_solve(self, b: jax.Array) -> jax.Array:
+        """The same of the transpose."""
+        return self.transpose_counted(b)[0]
+
+
+class Krylov(NamedTuple):
+    """The same without a matrix.
+
+    Attributes:
+      system: what is to be solved.
+      tolerance: relative residual; default as of :func:`solve_linear`.
+      max_steps: products with the system at most.
+    """
+
+    system: System
+    tolerance: jax.Array | float | None = None
+    max_steps: jax.Array | int = 100_000
+
+    def solve(self, b: jax.Array) -> jax.Array:
+        """As :meth:`Inverse.solve`."""
+        return self.counted(b)[0]
+
+    def counted(self, b: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """As of an Inverse."""
+        x, n = _krylov(
+            lambda table, given, x: System(table, *given).matvec(x),
+            self.system.table,
+            self.system[1:],
+            b.ravel(),
+            self.tolerance,
+            self.max_steps,
+        )
+        return x.reshape(b.shape), n
+
+    def transpose_solve(self, b: jax.Array) -> jax.Array:
+        """As of an Inverse."""
+        return self.transpose_counted(b)[0]
+
+    def transpose_counted(self, b: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """As of an Inverse."""
+        x, n = _krylov(
+            lambda table, given, x: System(table, *given).vecmat(x),
+            self.system.table,
+            self.system[1:],
+            b.ravel(),
+            self.tolerance,
+            self.max_steps,
+        )
+        return x.reshape(b.shape), n
+
+
+def solver(
+    system: System, method: str = "auto", *, max_steps: jax.Array | int = 100_000
+) -> Inverse | Krylov:
+    """What solves a system; its derivatives are not taken.
+
+    Args:
+      system: the system.
+      method: ``"direct"`` (inversion), ``"iterative"`` (BiCGSTAB), or ``"auto"``, direct up to
+        512 states.
+      max_steps: products with the system at most, if it is not inverted.
+
+    Raises:
+      ValueError: unknown method.
+    """
+    if method not in ("auto", "direct", "iterative"):
+        raise ValueError(f"method={method!r}; choose auto, direct or iterative.")
+    system = lax.stop_gradient(system)
+    small = is_small(system.table, system.num_states)
+    if method == "iterative" or (method == "auto" and not small):
+        return Krylov(system, max_steps=max_steps)
+    return Inverse(system, in_turn(inverse, system.matrix()))
+
+
+def is_small(table: Any, num_states: int) -> bool:
+    """Whether systems of so many states are inverted; those on several devices never are."""
+    spread = isinstance(table, Primitives | SpreadSuccessors) and is_sharded(table.model)
+    return num_states <= DENSE_LIMIT and not spread
+
+
+def _refined(inverse_: jax.Array, matvec: Any, b: jax.Array) -> jax.Array:
+    x = inverse_ @ b
+    for _ in range(_REFINEMENTS):
+        better = x + inverse_ @ (b - matvec(x))
+        x = jnp.where(jnp.isfinite(better), better, x)
+    return x
+
+
+def inverse(matrix: jax.Array) -> jax.Array:
+    """The inverse of a matrix by Gauss-Jordan elimination without pivoting, in blocks.
+
+    Stable for ``I - c P`` with a stochastic P and ``c <= 1``: elimination without pivoting does not
+    let the entries of a diagonally dominant matrix grow (Higham 2002, section 9.5). A singular
+    matrix gives NaN or infinity.
+
+    Args:
+      matrix: ``float[N, N]``.
+
+    Example:
+      >>> inverse(jnp.array([[1.0, -0.5], [-0.5, 0.75]])).tolist()
+      [[1.5, 1.0], [1.0, 2.0]]
+    """
+    n = matrix.shape[-1]
+    block = min(_BLOCK, n)
+    padded = -(-n // block) * block
+    work = jnp.eye(padded, dtype=matrix.dtype).at[:n, :n].set(matrix)
+    number = jnp.arange(padded) // block
+    smallest = float(jnp.finfo(matrix.dtype).tiny) ** 0.5
+
+    def step(i: jax.Array, a: jax.Array) -> jax.Array:
+        start = i * block
+        inside = number == i
+        rows = lax.dynamic_slice(a, (start, 0), (block, padded))
+        columns = jnp.where(inside[:, None], 0, lax.dynamic_slice(a, (0, start), (padded, block)))
+        pivot = _small_inverse(lax.dynamic_slice(rows, (0, start), (block, block)))
+        rows = pivot @ jnp.where(inside, 0, rows)
+        a = jnp.where(inside, 0, a) - columns @ rows
+        # Products of numbers this small would be denormal, which are slow, and weigh nothing.
+        a = jnp.where(jnp.abs(a) < smallest, 0, a)
+        a = lax.dynamic_update_slice(a, -columns @ pivot, (0, start))
+        rows = lax.dynamic_update_slice(rows, pivot, (0, start))
+        return lax.dynamic_update_slice(a, rows, (start, 0))
+
+    return lax.fori_loop(0, padded // block, step, work)[:n, :n]
+
+
+def _small_inverse(matrix: jax.Array) -> jax.Array:
+    def step(k: jax.Array, x: jax.Array) -> jax.Array:
+        pivot, column = x[k, k], x[:, k]
+        row = (x[k] / pivot).at[k].set(1 / pivot)
+        x = (x - column[:, None] * row).at[:, k].set(-column / pivot)
+        return x.at[k].set(row)
+
+    return lax.fori_loop(0, matrix.shape[0], step, matrix)
+
+
+# --- large systems ---------------------------------------------------------------------------
+
+
+class Bicgstab(NamedTuple):
+    """BiCGSTAB in the names of van der Vorst (1992): two products with the system a step.
+
+    Arrays ``[N]``; `r` is the residual of x by recurrence.
+    """
+
+    x: jax.Array
+    r: jax.Array
+    shadow: jax.Array
+    p: jax.Array
+    v: jax.Array
+    rho: jax.Array
+    alpha: jax.Array
+
+    @property
+    def size(self) -> jax.Array:
+        """The norm of the residual."""
+        return norm(self.r)
+
+    def first(self, image: jax.Array) -> Bicgstab:
+        """With the system applied to `p`; it is to be applied to `r` next."""
+        alpha = _ratio(self.rho, dot(self.shadow, image))
+        return self._replace(
+            x=self.x + alpha * self.p, r=self.r - alpha * image, v=image, alpha=alpha
+        )
+
+    def second(self, image: jax.Array) -> Bicgstab:
+        """With the system applied to `r`; it is to be applied to `p` next."""
+        omega = _ratio(dot(image, self.r), dot(image, image))
+        x, r = self.x + omega * self.r, self.r - omega * image
+        rho = dot(self.shadow, r)
+        p = r + _ratio(rho * self.alpha, self.rho * omega) * (self.p - omega * self.v)
+        return self._replace(x=x, r=r, p=p, rho=rho)
+
+
+def start_bicgstab(x: jax.Array, r: jax.Array) -> Bicgstab:
+    """From an x and its residual."""
+    rho = dot(r, r)
+    return Bicgstab(x, r, r, r, jnp.zeros_like(r), rho, jnp.ones_like(rho))
+
+
+class _Search(NamedTuple):
+    """The state of :func:`solve_linear`."""
+
+    phase: jax.Array
+    z: jax.Array  # what the operator is applied to next
+    krylov: Bicgstab
+    error: jax.Array  # the norm of the residual
+    steps: jax.Array  # in this phase
+    forced: jax.Array  # whether the last stretch was forced Richardson steps
+    returning: jax.Array  # whether this look only fetches the residual of the best x
+    best: jax.Array  # the best x whose true residual was looked at
+    best_error: jax.Array
+    num_steps: jax.Array
+
+
+_RICHARDSON, _FIRST, _SECOND, _LOOK, _DONE = range(5)
+
+
+class _Wanted(NamedTuple):
+    """What is to be solved: the right-hand side, the residual to reach, the steps at most."""
+
+    b: jax.Array
+    target: jax.Array
+    most: jax.Array
+
+
+def solve_linear(
+    matvec: Operator,
+    b: jax.Array,
+    *,
+    tolerance: jax.Array | float | None = None,
+    max_steps: jax.Array | int = 100_000,
+) -> jax.Array:
+    """Solves ``matvec(x) = b`` where matvec is the identity minus an operator.
+
+    Richardson steps ``x + (b - matvec(x))`` for as long as they contract well, then
+    BiCGSTAB (van der Vorst 1992), with regular looks at the true residual. Where
+    BiCGSTAB did not halve it, Richardson steps follow all the same, which converge
+    whenever the operator is a contraction in some norm; they end as soon as their pace
+    shows that max_steps would not be enough. Each step applies `matvec` once; what it is applied
+    to depends on the phase.
+
+    Args:
+      matvec: a linear map on arrays of the shape of `b`.
+      b: the right-hand side.
+      tolerance: relative residual in the Euclidean norm; default ``eps ** 0.8``.
+      max_steps: applications of `matvec` at most.
+
+    Returns:
+      x. Judge it by its residual: the best iterate is returned however it ended.
+    """
+
+    def flat(table: None, given: tuple[()], x: jax.Array) -> jax.Array:
+        return matvec(x.reshape(b.shape)).ravel()
+
+    x, _ = _krylov(flat, None, (), b.ravel(), tolerance, max_steps, lanes="mapped")
+    return x.reshape(b.shape)
+
+
+def _krylov(matvec, table, given, b, tolerance, max_steps, *, lanes: str = "in turn"):
+    """The solution ``[N]`` of ``matvec(table, given, x) = b``, and the steps made."""
+    if tolerance is None:
+        tolerance = float(jnp.finfo(b.dtype).eps) ** 0.8
+    size = norm(b)
+    wanted = _Wanted(b, tolerance * size, jnp.asarray(max_steps, jnp.int32))
+
+    def step(table: Any, k: _Search, given: Any) -> _Search:
+        given, wanted = given
+        image = matvec(table, given, k.z)
+        branches = [partial(f, wanted) for f in (_richardson, _first, _second, _look)]
+        k = lax.switch(k.phase, branches, k, image)
+        return k._replace(num_steps=k.num_steps + 1)
+
+    zero, none, no = jnp.zeros_like(b), jnp.int32(0), jnp.bool_(False)
+    start = _Search(
+        phase=jnp.int32(_RICHARDSON),
+        z=b,
+        krylov=start_bicgstab(zero, b),
+        error=size,
+        steps=none,
+        forced=no,
+        returning=no,
+        best=jnp.where(jnp.isfinite(size), zero, jnp.nan),
+        best_error=size,
+        num_steps=none,
+    )
+    last, n = iterate(
+        step,
+        lambda k, _: k.phase == _DONE,
+        table,
+        start,
+        (given, wanted),
+        max_steps=max_steps,
+        lanes=lanes,
+    )
+    return last.best, n
+
+
+def _richardson(wanted: _Wanted, k: _Search, image: jax.Array) -> _Search:
+    x, r = k.krylov.x + k.krylov.r, k.krylov.r - image
+    error = norm(r)
+    small = (error <= wanted.target) | ~jnp.isfinite(error) | (k.forced & (k.steps >= _STRETCH))
+    # At first for as long as it goes well; then BiCGSTAB from where it got to.
+    slow = ~k.forced & (error > _GOOD_RATE * k.error)
+    look = small & ~slow
+    after = jnp.where(look, _LOOK, jnp.where(slow, _FIRST, _RICHARDSON)).astype(jnp.int32)
+    return k._replace(
+        phase=after,
+        krylov=start_bicgstab(x, r),
+        error=error,
+        z=jnp.where(look, x, r),
+        steps=jnp.where(slow, 0, k.steps + 1),
+    )
+
+
+def _first(wanted: _Wanted, k: _Search, image: jax.Array) -> _Search:
+    krylov = k.krylov.first(image)
+    return k._replace(krylov=krylov, phase=jnp.full_like(k.phase, _SECOND), z=krylov.r)
+
+
+def _second(wanted: _Wanted, k: _Search, image: jax.Array) -> _Search:
+    krylov = k.krylov.second(image)
+    error = krylov.size
+    ended = (error <= wanted.target / 2) | (k.steps >= _STRETCH) | ~jnp.isfinite(error)
+    return k._replace(
+        krylov=krylov,
+        error=error,
+        steps=k.steps + 1,
+        phase=jnp.where(ended, _LOOK, _FIRST).astype(jnp.int32),
+        z=jnp.where(ended, krylov.x, krylov.p),
+    )
+
+
+def _look(wanted: _Wanted, k: _Search, image: jax.Array) -> _Search:
+    """Judges x by its true residual; what failed is left for the best x so far."""
+    r = wanted.b - image
+    error = norm(r)
+    better = error < k.best_error  # false for NaN
+    halved = error <= k.best_error / 2
+    best = jnp.where(better, k.krylov.x, k.best)
+    best_error = jnp.where(better, error, k.best_error)
+    # How many stretches more at this pace, if it was forced.
+    tiny = float(jnp.finfo(r.dtype).tiny)
+    pace = jnp.log(k.best_error / best_error)
+    stretches = jnp.log(best_error / jnp.maximum(wanted.target, tiny)) / jnp.maximum(pace, tiny)
+    # It says nothing before news can have come through from every state.
+    told = k.num_steps > 4 * r.shape[0]
+    hopeless = told & (stretches * _STRETCH > wanted.most - k.num_steps)
+    stop = (best_error <= wanted.target) | (k.forced & ~k.returning & (~better | hopeless))
+    returning = ~(better | k.returning | stop)
+    after = jnp.where(halved, _FIRST, jnp.where(returning, _LOOK, _RICHARDSON))
+    return k._replace(
+        phase=jnp.where(stop, _DONE, after).astype(jnp.int32),
+        steps=jnp.zeros_like(k.steps),
+        krylov=start_bicgstab(best, r),
+        error=error,
+        z=jnp.where(returning, best, r),
+        best=best,
+        best_error=best_error,
+        forced=jnp.where(returning, k.forced, ~halved),
+        returning=returning,
+    )
+
+
+def dot(x: jax.Array, y: jax.Array) -> jax.Array:
+    """Inner products along the states, one for each lane."""
+    return jnp.sum(x * y, axis=0)
+
+
+def norm(x: jax.Array) -> jax.Array:
+    """Euclidean norms along the states."""
+    return jnp.sqrt(dot(x, x))
+
+
+def _ratio(x: jax.Array, y: jax.Array) -> jax.Array:
+    """x / y, and zero where y has vanished, which restarts the recurrence."""
+    safe = jnp.abs(y) > float(jnp.finfo(y.dtype).tiny)
+    return jnp.where(safe, x / jnp.where(safe, y, 1), 0)

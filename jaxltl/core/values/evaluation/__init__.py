@@ -1,0 +1,1 @@
+"""Statistical evaluation of policies and guarantees from data."""

@@ -1,0 +1,256 @@
+"""From counted transitions to a policy and what is guaranteed of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from jaxltl.core.automata.translate import Task
+from jaxltl.core.models.build.convert import to_sparse
+from jaxltl.core.models.build.counts import TransitionCounts, counts_on
+from jaxltl.core.models.interval import IntervalMDP, make_interval
+from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.pretty_print import brief
+from jaxltl.core.statistics.confidence_sets import ConfidenceSets, Method, intervals_from_counts
+from jaxltl.core.validation import whole
+from jaxltl.core.values import facts
+from jaxltl.core.values.interval.robust import require_direction
+from jaxltl.core.values.interval.satisfaction import RobustSatisfaction, robust_satisfaction
+from jaxltl.core.values.undiscounted.mixture import safe_mean
+
+
+@brief(facts=facts.guarantee)
+@dataclass(frozen=True)
+class DataGuarantee:
+    """What data guarantee of a task.
+
+    Attributes:
+      bound: a probability, of the initial distribution; with the confidence that was asked for, the
+        task has at least this probability under the policy (at most, where it was to be made
+        small).
+      confidence: the chance, in (0, 1), that data are drawn of which all this is true.
+      optimistic: a probability that no policy exceeds, with the same confidence, of the same data:
+        how much more data can gain at most.
+      satisfaction: the policy, the automaton that is its memory, and nature's worst case.
+      model: the model with its intervals.
+      sets: the sets from which these come.
+      gain: ``float64[R]``, where more samples help: by how much the bound would rise, to first
+        order, if a choice were known to be what its frequencies say.
+
+    Example:
+      >>> from jaxltl import make_sparse
+      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [.5, .5, 1, 1], initial=[1, 0, 0],
+      ...                    label=[[0], [1], [0]], propositions=["a"])
+      >>> found = learn_guarantee(coin, np.array([900, 100, 0, 0]), "F a", confidence=0.95)
+      >>> 0.85 < found.bound < 0.9 < found.optimistic < 0.95, found.confidence
+      (True, 0.95)
+      >>> found.gain.argmax().item(), found.gain.shape  # sample choice 0
+      (0, (3,))
+    """
+
+    bound: float
+    confidence: float
+    optimistic: float
+    satisfaction: RobustSatisfaction
+    model: IntervalMDP
+    sets: ConfidenceSets
+    gain: np.ndarray
+
+
+def learn_guarantee(
+    model: Any,
+    counts: TransitionCounts | np.ndarray,
+    task: Task,
+    confidence: float,
+    *,
+    method: Method = "anytime",
+    objective: str = "max",
+    rows: Any = None,
+    num_claims: int | None = None,
+    tolerance: float | None = None,
+) -> DataGuarantee:
+    """A policy for a formula, and the probability that it has with a confidence.
+
+    Sets that hold all probabilities at once with the confidence
+    (:func:`~jaxltl.core.statistics.confidence_sets.intervals_from_counts`) make an interval model; its worst
+    case over nature is at most (for ``"min"`` at least) the truth for every policy, so it may be
+    optimised over the same data. A ball is taken as it is.
+
+    Args:
+      model: its graph, labels and initial distribution count; its probabilities do not. See
+        :func:`~jaxltl.core.models.build.counts.counted_model` for one that is made of a log.
+      counts: of its transitions, matched by name; or ``int[T]``, beside its entries.
+      task: a formula, its text or an automaton.
+      confidence: in (0, 1), of everything that is returned at once.
+      method: ``"anytime"`` holds however data were gathered, ``"clopper-pearson"``,
+        ``"hoeffding"`` and ``"weissman"`` where the number of samples of each choice does not
+        depend on what they were.
+      objective: ``"max"`` or ``"min"``.
+      rows, num_claims: as of :func:`~jaxltl.core.statistics.confidence_sets.intervals_from_counts`.
+      tolerance: of :func:`~jaxltl.core.values.interval.satisfaction.robust_satisfaction`.
+
+    Returns:
+      :class:`DataGuarantee`.
+
+    Raises:
+      ValueError: the counts do not fit the model, the confidence, a label or a direction.
+
+    Concrete arrays only, on the host; not differentiable.
+
+    Example:
+      >>> from jaxltl import make_sparse
+      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [.5, .5, 1, 1], initial=[1, 0, 0],
+      ...                    label=[[0], [1], [0]], propositions=["a"])
+      >>> found = learn_guarantee(coin, np.array([900, 100, 0, 0]), "F a", 0.95,
+      ...                         method="clopper-pearson")
+      >>> round(found.bound, 3), round(found.optimistic, 3)
+      (0.88, 0.918)
+    """
+    require_direction(None, objective)
+    sparse = to_sparse(model)
+    count = counts_on(sparse, counts) if isinstance(counts, TransitionCounts) else counts
+    sets = intervals_from_counts(
+        count,
+        confidence,
+        method=method,
+        entry_start=sparse.entry_start,
+        rows=rows,
+        num_claims=num_claims,
+    )
+    interval, kept = _with_sets(sparse, sets)
+    against, along = ("min", "max") if objective == "max" else ("max", "min")
+    found = robust_satisfaction(
+        interval, task, objective=objective, nature=against, tolerance=tolerance
+    )
+    best = robust_satisfaction(
+        interval, task, objective=objective, nature=along, tolerance=tolerance
+    )
+    share = np.asarray(interval.initial)
+    share = share[share > 0]
+    sure, most = ("lower", "upper") if objective == "max" else ("upper", "lower")
+    center = np.asarray(sets.center, np.float64)[kept]
+    sign = 1 if objective == "max" else -1
+    return DataGuarantee(
+        bound=safe_mean(share, getattr(found.solution, sure), up=objective != "max", highest=1),
+        confidence=float(confidence),
+        satisfaction=found,
+        optimistic=safe_mean(share, getattr(best.solution, most), up=objective == "max", highest=1),
+        model=interval,
+        sets=sets,
+        gain=sign * _gain(interval, found, center, share),
+    )
+
+
+def _with_sets(model: SparseMDP, sets: ConfidenceSets) -> tuple[IntervalMDP, np.ndarray]:
+    """The model with intervals; all entries are kept, which are those that it had."""
+    ball = {} if sets.radius is None else {"center": sets.center, "radius": sets.radius}
+    found = make_interval(model, sets.lower, sets.upper, **ball)
+    if found.num_transitions == model.num_transitions:
+        return found, np.ones(model.num_transitions, bool)
+    code = [
+        np.asarray(x.host.row, np.int64) * model.num_states + x.successor
+        for x in (model, found.nominal)
+    ]
+    return found, np.isin(*code)
+
+
+def _gain(
+    model: IntervalMDP, found: RobustSatisfaction, center: np.ndarray, share: np.ndarray
+) -> np.ndarray:
+    """Expected visits of each choice, times what nature takes there: ``float64[R]``."""
+    from scipy.sparse import csr_array, eye_array
+    from scipy.sparse.linalg import spsolve
+
+    product, value = found.product, found.value
+    host = product.host
+    policy = np.asarray(found.solution.policy)
+    taken = product.base_row == policy[host.state]
+    entry = taken[host.row]
+    nature = np.asarray(found.solution.nature)
+    open_ = (value > 0) & (value < 1)
+    # Inside what is open every state is left almost surely, with nature as it is.
+    inner = entry & open_[host.state[host.row]] & open_[host.successor] & (nature > 0)
+    size = host.num_states
+    step = csr_array(
+        (nature[inner], (host.successor[inner], host.state[host.row][inner])), shape=(size, size)
+    )
+    first = np.zeros(size)
+    np.add.at(first, product.start, share)
+    visits = spsolve((eye_array(size) - step).tocsc(), np.where(open_, first, 0))
+    world = model.nominal.host
+    width = np.diff(host.entry_start)
+    whole = width == np.diff(world.entry_start)[product.base_row]
+    begin = world.entry_start[product.base_row]
+    rank = np.arange(host.num_transitions) - np.repeat(host.entry_start[:-1], width)
+    known = np.where(whole[host.row], center[(np.repeat(begin, width) + rank)], nature)
+    better = np.add.reduceat((known - nature) * value[host.successor], host.entry_start[:-1])
+    gain = np.zeros(world.num_rows)
+    use = taken & open_[host.state] & whole
+    np.add.at(gain, product.base_row[use], (visits[host.state] * better)[use])
+    return gain
+
+
+def guarantee_curve(
+    model: Any,
+    counts: TransitionCounts | np.ndarray,
+    task: Task,
+    confidence: float,
+    sizes: Sequence[int],
+    *,
+    seed: int = 0,
+    method: Method = "anytime",
+    objective: str = "max",
+) -> np.ndarray:
+    """The bound over the number of samples, of random parts of the data.
+
+    Each part is drawn from the one before without replacement, so the curve is that of one order
+    in which the data might have come.
+
+    Args:
+      model, counts, task, confidence, method, objective: as of :func:`learn_guarantee`; each point
+        has the confidence by itself.
+      sizes: how many transitions to take, each at most as many as there are.
+      seed: of the order.
+
+    Returns:
+      ``float64[len(sizes)]``, in the order of `sizes`.
+
+    Raises:
+      ValueError: a size is negative or larger than the data; and as there.
+
+    Concrete arrays only, on the host; not differentiable.
+
+    Example:
+      >>> from jaxltl import make_sparse
+      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [.5, .5, 1, 1], initial=[1, 0, 0],
+      ...                    label=[[0], [1], [0]], propositions=["a"])
+      >>> curve = guarantee_curve(coin, np.array([900, 100, 0, 0]), "F a", 0.95, [10, 100, 1000])
+      >>> curve.shape, bool((np.diff(curve) > 0).all())
+      ((3,), True)
+    """
+    sparse = to_sparse(model)
+    every = counts_on(sparse, counts) if isinstance(counts, TransitionCounts) else counts
+    every, wanted = np.asarray(every), np.asarray(sizes)
+    for name, x in (("counts", every), ("sizes", wanted)):
+        if x.ndim != 1 or x.dtype.kind not in "iuf" or (x != np.floor(x)).any():
+            raise ValueError(f"{name} is {x.dtype}{list(x.shape)}; expected a list of integers.")
+    if (every < 0).any():
+        raise ValueError(f"counts[{int(np.argmax(every < 0))}] is {every.min()}; none is negative.")
+    every = every.astype(np.int64)
+    total = int(every.sum())
+    wrong = (wanted < 0) | (wanted > total)
+    if wrong.any():
+        raise ValueError(
+            f"sizes[{int(np.argmax(wrong))}] is {wanted[wrong][0]}; there are {total} transitions."
+        )
+    rng = np.random.default_rng(whole("seed", seed))
+    bound = np.empty(wanted.size)
+    for i in np.argsort(-wanted, kind="stable"):
+        every = rng.multivariate_hypergeometric(every, int(wanted[i]), method="marginals")
+        bound[i] = learn_guarantee(
+            sparse, every, task, confidence, method=method, objective=objective
+        ).bound
+    return bound

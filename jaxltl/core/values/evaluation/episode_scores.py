@@ -1,0 +1,157 @@
+"""What searches over parameters ask of a policy, from episodes: an objective and costs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jax.tree_util import Partial
+
+from jaxltl.core import validation
+from jaxltl.core.environments.environment import Environment, as_partial, require_environment
+from jaxltl.core.environments.monitor import Verdict
+from jaxltl.core.values.evaluation.evaluation import (
+    EpisodeTotals,
+    checked_steps,
+    episode_totals,
+    task_world,
+)
+
+Score = str | Callable[[EpisodeTotals], chex.Numeric]
+
+SUMS = ("reward", "discounted_reward", "cost", "length")
+OF_TASKS = ("success", "failure", "violation", "undecided", "visits", "discounted_visits")
+
+
+@struct.dataclass
+class _Scores:
+    """What is counted, and of how many episodes; static."""
+
+    objective: Score = struct.field(pytree_node=False)
+    costs: tuple[Score, ...] = struct.field(pytree_node=False)
+    num_episodes: int = struct.field(pytree_node=False)
+    num_steps: int = struct.field(pytree_node=False)
+
+
+def episode_evaluator(
+    environment: Environment,
+    agent: Callable[..., Any],
+    *,
+    objective: Score = "reward",
+    costs: Score | Sequence[Score] = (),
+    num_episodes: int = 10,
+    num_steps: int | None = None,
+    discount: chex.Numeric = 1.0,
+) -> Partial:
+    """``evaluate(parameters, key) -> (objective, costs)`` of a policy, means over episodes.
+
+    For ``cce.make_problem(evaluate, family, limit=...)`` and any other search. Scores are the
+    fields of :class:`~jaxltl.core.values.evaluation.evaluation.EpisodeTotals` by name (``"reward"``,
+    ``"cost"``, ``"length"``, ...); of an environment with a task also ``"success"``,
+    ``"violation"`` and ``"undecided"``, shares of episodes by the verdict at their end, and
+    ``"failure"``, which is ``1 - success``; or functions of the totals of one episode. A task to be
+    done with a chance of at least .9 is the cost ``"failure"`` with the limit .1.
+
+    Args:
+      environment: plain or with a task; it travels as an argument.
+      agent: ``parameters -> Agent``, a function or a ``Partial``, such as
+        :func:`~jaxltl.envs.networks.network_agent` gives.
+      objective: to be large.
+      costs: one, or several; none gives evaluations without a cost.
+      num_episodes: M, of each evaluation.
+      num_steps: after which an episode is cut off; default the environment's horizon.
+      discount: of ``"discounted_reward"`` and ``"discounted_visits"``.
+
+    Returns:
+      A pytree; ``evaluate(parameters, key)`` under ``jit`` and ``vmap``. One cost is a number,
+      several are ``float[C]``. Episode i has the key ``split(key, M)[i]``.
+
+    Raises:
+      ValueError: an unknown score, one of a task without a task, episodes that never end, or no
+        episodes.
+
+    Not made for derivatives: an episode is a loop that ends by itself, through which forward mode
+    goes alone; searches such as ``cce`` need none.
+
+    Example:
+      >>> from jaxltl import Timestep, agent_of, make_box, make_environment
+      >>> def step(place, action, key):
+      ...     return Timestep(place + action, -jnp.sum(place**2), False, cost=jnp.sum(action**2))
+      >>> cart = make_environment(
+      ...     lambda key: jnp.ones(1), step, lambda place: place,
+      ...     actions=make_box(-1, 1, (1,)), horizon=3)
+      >>> def proportional(gain):
+      ...     return agent_of(jax.tree_util.Partial(lambda gain, place, key: -gain * place, gain))
+      >>> evaluate = episode_evaluator(cart, proportional, costs="cost")
+      >>> [float(x) for x in evaluate(jnp.array([0.5]), jax.random.key(0))]
+      [-1.3125, 0.328125]
+    """
+    num_episodes = validation.whole("num_episodes", num_episodes, least=1, most=2**31 - 1)
+    several = (
+        (costs,)
+        if isinstance(costs, str) or callable(costs)
+        else tuple(validation.listed("costs", costs))
+    )
+    task = task_world(jax.eval_shape(require_environment(environment).reset, jax.random.key(0)))
+    names = SUMS if task is None else SUMS + OF_TASKS
+    for score in (objective, *several):
+        if not callable(score) and not (isinstance(score, str) and score in names):
+            of_task = isinstance(score, str) and score in OF_TASKS
+            why = "needs a task, which task_environment gives" if of_task else "is none"
+            raise ValueError(
+                f"the score {validation.shown(score)} {why}; choose one of {', '.join(names)}, or "
+                "give a function of the totals."
+            )
+    settings = _Scores(objective, several, num_episodes, checked_steps(environment, num_steps))
+    if not isinstance(discount, jax.core.Tracer):
+        validation.share("discount", discount)
+    return Partial(_evaluate, settings, environment, as_partial(agent, "agent"), discount)
+
+
+@jax.jit  # so that calls outside of jit share one compilation
+def _evaluate(
+    settings: _Scores,
+    environment: Environment,
+    agent: Callable[..., Any],
+    discount: chex.Numeric,
+    parameters: chex.Array,
+    key: chex.PRNGKey,
+) -> Any:
+    run = partial(
+        episode_totals,
+        environment=environment,
+        agent=agent(parameters),
+        num_steps=settings.num_steps,
+        discount=discount,
+    )
+    totals = jax.vmap(run)(jax.random.split(key, settings.num_episodes))
+
+    def mean(score: Score) -> jax.Array:
+        return jnp.mean(jax.vmap(partial(_of_one, score))(totals).astype(jnp.result_type(float)))
+
+    objective, costs = mean(settings.objective), [mean(score) for score in settings.costs]
+    if not costs:
+        return objective
+    return objective, costs[0] if len(costs) == 1 else jnp.stack(costs)
+
+
+_VERDICTS = {
+    "success": Verdict.SATISFIED,
+    "violation": Verdict.VIOLATED,
+    "undecided": Verdict.UNDECIDED,
+}
+
+
+def _of_one(score: Score, totals: Any) -> jax.Array:
+    if callable(score):
+        return jnp.asarray(score(totals))
+    if score in _VERDICTS:
+        return totals.verdict == _VERDICTS[score]
+    if score == "failure":
+        return totals.verdict != Verdict.SATISFIED
+    return getattr(totals, score)

@@ -1,0 +1,556 @@
+"""How well an agent does in an environment: shares and means over fresh episodes, with intervals.
+
+Any agent, any environment; of one with a task (:mod:`~jaxltl.core.environments.task_environment`) also
+how often the task is satisfied and violated. Episodes are independent, so each interval is one of
+a binomial test or of a mean of independent numbers, whatever the agent is made of. What is
+estimated is what happens within ``num_steps`` steps: what is undecided then is counted as that.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.sharding import NamedSharding
+
+from jaxltl.core import validation
+from jaxltl.core.environments.environment import (
+    Environment,
+    allowed_in,
+    as_partial,
+    require_environment,
+    require_key,
+    some_action,
+)
+from jaxltl.core.environments.episodes import Agent, begin_episode, continue_episode, require_agent
+from jaxltl.core.environments.monitor import Verdict
+from jaxltl.core.models.mesh.lanes import on_host, require_split, vmap_split
+from jaxltl.core.pretty_print import brief
+from jaxltl.core.statistics.binomial import anytime, clopper_pearson
+from jaxltl.core.statistics.empirical_bernstein import bounded_mean
+from jaxltl.core.types import Status
+from jaxltl.core.values import facts
+
+
+@brief(codes={"verdict": Verdict})
+class EpisodeTotals(NamedTuple):
+    """What is counted of one episode; with a leading axis of many.
+
+    Attributes:
+      reward: sum of the rewards.
+      discounted_reward: with the discount, and the environment's own.
+      cost: sum of the costs.
+      length: ``int32``, steps made.
+      terminated, truncated: how it ended; neither if it was cut off.
+      verdict: ``int32``, the task's :class:`~jaxltl.Verdict` at the end; None without a task.
+      visits: ``int32``, accepting readings, that of the first label included; None without.
+      discounted_visits: the k-th reading, from 0, counts ``discount ** k``.
+
+    Example:
+      >>> from jaxltl import agent_of, environment_of, from_dense
+      >>> clock = environment_of(from_dense([[[0.0, 1.0]], [[1.0, 0.0]]]))
+      >>> agent = agent_of(lambda observation, key: jnp.int32(0))
+      >>> keys = jax.random.split(jax.random.key(0), 4)
+      >>> shapes = jax.eval_shape(jax.vmap(
+      ...     lambda key: episode_totals(key, clock, agent, num_steps=3)), keys)
+      >>> shapes.reward.shape, shapes.verdict
+      ((4,), None)
+    """
+
+    reward: jax.Array
+    discounted_reward: jax.Array
+    cost: jax.Array
+    length: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    verdict: jax.Array | None
+    visits: jax.Array | None
+    discounted_visits: jax.Array | None
+
+
+def episode_totals(
+    key: chex.PRNGKey,
+    environment: Environment,
+    agent: Agent,
+    *,
+    num_steps: int,
+    discount: chex.Numeric = 1.0,
+) -> EpisodeTotals:
+    """What an episode adds up to, the one that ``run_episode`` gives for the same key.
+
+    For ``jit`` and ``vmap``. Nothing is kept of a step, and it ends with the episode; side by side
+    with others, with the longest.
+
+    Args:
+      key: of everything that is drawn.
+      environment, agent: what is run.
+      num_steps: after which it is cut off; static.
+      discount: of rewards and of accepting visits.
+    """
+    begin, path = begin_episode(key, environment, agent)
+    task, number = task_world(begin.world), jnp.result_type(float)
+    counted = hasattr(task, "accepted")
+    zero, one = jnp.zeros((), number), jnp.ones((), number)
+
+    def accepting(world: Any) -> jax.Array:
+        return jnp.asarray(task_world(world).accepted) if counted else jnp.bool_(False)
+
+    first = accepting(begin.world)
+    sums = (zero, zero, zero, first.astype(jnp.int32), first.astype(number))
+
+    def going(carry: Any) -> jax.Array:
+        now, time, *_ = carry
+        return (time < num_steps) & ~(now.terminated | now.truncated)
+
+    def move(carry: Any) -> Any:
+        now, time, paid, kept, sums = carry
+        now, made = continue_episode(now, environment, agent, jax.random.fold_in(path, time))
+        kept, read = kept * discount, accepting(now.world)
+        reward, discounted, cost, visits, early = sums
+        sums = (
+            reward + made.reward,
+            discounted + paid * made.reward,
+            cost + made.cost,
+            visits + read.astype(jnp.int32),
+            early + jnp.where(read, kept, 0),
+        )
+        sums = tuple(x.astype(y.dtype) for x, y in zip(sums, carry[-1], strict=True))
+        paid = (paid * discount * made.discount).astype(number)
+        return now, time + 1, paid, kept.astype(number), sums
+
+    now, time, _, _, sums = lax.while_loop(going, move, (begin, jnp.int32(0), one, one, sums))
+    reward, discounted, cost, visits, early = sums
+    task = task_world(now.world)
+    return EpisodeTotals(
+        reward,
+        discounted,
+        cost,
+        time,
+        now.terminated,
+        now.truncated & ~now.terminated,
+        None if task is None else jnp.asarray(task.verdict, jnp.int32),
+        visits if counted else None,
+        early if counted else None,
+    )
+
+
+def task_world(world: Any) -> Any:
+    """The part of a world that tells a verdict, also inside of others; None if there is none."""
+
+    def tells(x: Any) -> bool:
+        return hasattr(x, "verdict")
+
+    return next(filter(tells, jax.tree.leaves(world, is_leaf=tells)), None)
+
+
+# --- what is told ---------------------------------------------------------------------------------
+
+
+@brief(facts=facts.estimate)
+@dataclass(frozen=True)
+class Estimate:
+    """A share or a mean with its interval.
+
+    Attributes:
+      mean: over the episodes; a share is in [0, 1], else it has the unit of what is averaged.
+      lower, upper: ends of the interval, in the same unit.
+      error: the standard error of the mean.
+      method: what the interval rests on.
+
+    Example:
+      >>> found = share_estimate(8, 10, 0.05)
+      >>> found.mean, round(found.lower, 3), round(found.upper, 3)
+      (0.8, 0.444, 0.975)
+    """
+
+    mean: float
+    lower: float
+    upper: float
+    error: float
+    method: str
+
+
+@brief(facts=facts.evaluation)
+@dataclass(frozen=True)
+class Evaluation:
+    """What :func:`evaluate` found; printed as a table.
+
+    Attributes:
+      success, violation, undecided: shares of the episodes, by the task's verdict at their end;
+        None without a task.
+      reward, discounted_reward, cost: of an episode; the second None without a discount.
+      length: steps of an episode.
+      visits, discounted_visits: accepting readings of an episode, see :class:`EpisodeTotals`; None
+        without a task, or without a discount.
+      terminated, truncated, cut_off: how many episodes ended each way; at most `num_steps` steps
+        were simulated of any.
+      num_episodes: that were simulated.
+      num_steps, confidence, threshold, discount: as asked.
+      decision: True if the chance of success is at least the threshold, False if it is below, None
+        if that is open, or no threshold was given.
+      status: CONVERGED; MAX_STEPS if a threshold was not decided; NONFINITE if a sum was not
+        finite, whose mean is then not either.
+
+    Example:
+      >>> from jaxltl import agent_of, environment_of, from_dense
+      >>> from jaxltl.core.environments.task_environment import task_environment
+      >>> coin = from_dense(
+      ...     [[[.0, .6, .4]], [[.0, 1., .0]], [[.0, .0, 1.]]], initial=[1, 0, 0],
+      ...     label=[[0, 0], [1, 0], [0, 1]], propositions=["heads", "tails"])
+      >>> task = task_environment(environment_of(coin), "!tails U heads")
+      >>> agent = agent_of(lambda observation, key: jnp.int32(0))
+      >>> found = evaluate(jax.random.key(0), agent, task, num_steps=5, threshold=0.8)
+      >>> found.success.lower < 0.6 < found.success.upper, found.decision
+      (True, False)
+      >>> found.length.mean, found.discounted_reward, found.status.name
+      (1.0, None, 'CONVERGED')
+    """
+
+    success: Estimate | None
+    violation: Estimate | None
+    undecided: Estimate | None
+    reward: Estimate
+    discounted_reward: Estimate | None
+    cost: Estimate
+    length: Estimate
+    visits: Estimate | None
+    discounted_visits: Estimate | None
+    terminated: int
+    truncated: int
+    cut_off: int
+    num_episodes: int
+    num_steps: int
+    confidence: float
+    threshold: float | None
+    discount: float | None
+    decision: bool | None
+    status: Status
+
+    def __str__(self) -> str:
+        lines = [
+            f"{self.num_episodes:,} episodes of at most {self.num_steps:,} steps; each interval "
+            f"holds with {self.confidence:g}"
+        ]
+        for name in ESTIMATES:
+            found = getattr(self, name)
+            if found is not None:
+                ends = f"[{found.lower:.6g}, {found.upper:.6g}]"
+                lines.append(
+                    f"  {name.replace('_', ' '):18}{found.mean:<10.6g}{ends:24}{found.method}"
+                )
+        lines.append(
+            f"  ended: {self.terminated:,} terminated, {self.truncated:,} truncated, "
+            f"{self.cut_off:,} cut off"
+        )
+        if self.threshold is not None:
+            said = {None: "open whether success is", True: "success is", False: "success is not"}
+            lines.append(f"  {said[self.decision]} at least {self.threshold:g}")
+        if self.status == Status.NONFINITE:
+            lines.append("  a reward or a cost is not finite")
+        return "\n".join(lines)
+
+
+ESTIMATES = (
+    "success",
+    "violation",
+    "undecided",
+    "reward",
+    "discounted_reward",
+    "cost",
+    "length",
+    "visits",
+    "discounted_visits",
+)
+_SHARES = {
+    "success": Verdict.SATISFIED,
+    "violation": Verdict.VIOLATED,
+    "undecided": Verdict.UNDECIDED,
+}
+
+
+def evaluate(
+    key: chex.PRNGKey,
+    agent: Agent,
+    environment: Environment,
+    *,
+    num_episodes: int = 1000,
+    num_steps: int | None = None,
+    confidence: float = 0.95,
+    threshold: float | None = None,
+    discount: float | None = None,
+    batch: int = 256,
+    sharding: NamedSharding | None = None,
+) -> Evaluation:
+    """How well an agent does: shares and means over fresh episodes, with honest intervals.
+
+    Episode i is ``run_episode(fold_in(key, i), environment, agent, num_steps=num_steps)``, whatever
+    the batch. Each interval alone holds with probability `confidence` (several at once: take
+    ``1 - (1 - confidence) / number`` for each).
+
+    - Shares of success, violation and undecided: exact by Clopper and Pearson (1934), where the
+      number of episodes is fixed.
+    - With a `threshold` the simulation stops after the first batch after which success is known to
+      be at least that, or below. The number of episodes then depends on what came, and the shares'
+      intervals are those of Jeffreys' mixture, whose chance to miss *at any time* is at most
+      ``1 - confidence`` (Ville; Robbins 1970): so is the chance of a wrong decision.
+    - Lengths and visits are bounded by `num_steps`: empirical Bernstein, which holds at any time
+      (Waudby-Smith and Ramdas 2024, theorem 2).
+    - Rewards and costs have no known bounds: Student's interval, which rests on the
+      central limit theorem, and as if the number of episodes had been fixed. What never varied
+      has an interval of length zero.
+
+    Args:
+      key: of everything that is drawn.
+      agent: what acts, such as ``ppo.policy(state, problem, hparams)``, or ``agent_of(function)``.
+      environment: plain, or with a task. Visits and shares are those of a task.
+      num_episodes: how many; with a threshold at most.
+      num_steps: after which an episode is cut off; default the environment's horizon.
+      confidence: of each interval, in (0, 1).
+      threshold: on the chance of success, in (0, 1).
+      discount: in (0, 1), of `discounted_reward` and `discounted_visits`.
+      batch: episodes that are simulated side by side; they alone take memory.
+      sharding: a ``NamedSharding`` whose spec names the mesh axis over which they are split; in
+        several processes each makes the same call, and is told the same.
+
+    Returns:
+      :class:`Evaluation`, on the host.
+
+    Raises:
+      ValueError: episodes that never end, a number out of range, a threshold without a task, or an
+        agent that is none, or whose actions do not fit.
+
+    Not differentiable: what is returned is numbers of Python, from concrete arguments.
+
+    Example:
+      >>> from jaxltl import agent_of, environment_of, from_dense, task_environment
+      >>> coin = from_dense(
+      ...     [[[.0, .6, .4]], [[.0, 1., .0]], [[.0, .0, 1.]]], initial=[1, 0, 0],
+      ...     label=[[0, 0], [1, 0], [0, 1]], propositions=["heads", "tails"])
+      >>> task = task_environment(environment_of(coin), "!tails U heads")
+      >>> agent = agent_of(lambda observation, key: jnp.int32(0))
+      >>> found = evaluate(jax.random.key(0), agent, task, num_steps=5, threshold=0.8)
+      >>> print(str(found).rpartition("\\n")[2].strip())
+      success is not at least 0.8
+    """
+    num_steps = checked_steps(require_environment(environment), num_steps)
+    most = 2**31 - 1
+    num_episodes = validation.whole("num_episodes", num_episodes, least=1, most=most)
+    batch = validation.whole("batch", batch, least=1, most=most)
+    confidence = validation.share("confidence", confidence, ends=(False, False))
+    if threshold is not None:
+        threshold = validation.share("threshold", threshold, ends=(False, False))
+    if discount is not None:
+        discount = validation.share("discount", discount, ends=(False, False))
+    require_key(key)
+    require_split("sharding", sharding)
+    agent, world = _checked_agent(agent, environment)
+    if threshold is not None and task_world(world) is None:
+        raise ValueError(
+            f"threshold={threshold}, but the environment has no task; make one with "
+            "task_environment."
+        )
+    failure, parts, count, success, decision = 1 - confidence, [], 0, 0, None
+    while count < num_episodes and decision is None:
+        found = on_host(
+            _batch(
+                key,
+                environment,
+                agent,
+                jnp.int32(count),
+                1.0 if discount is None else discount,
+                num_steps=num_steps,
+                batch=min(batch, num_episodes),
+                sharding=sharding,
+            )
+        )
+        parts.append(jax.tree.map(lambda x, most=num_episodes - count: x[:most], found))
+        count += len(parts[-1].length)
+        if threshold is not None:
+            success += int((parts[-1].verdict == Verdict.SATISFIED).sum())
+            decision = _decided(success, count, threshold, failure)
+    totals = jax.tree.map(lambda *x: np.concatenate(x), *parts)
+    return _told(totals, num_steps, confidence, threshold, discount, decision)
+
+
+@partial(jax.jit, static_argnames=("num_steps", "batch", "sharding"))
+def _batch(
+    key: chex.PRNGKey,
+    environment: Environment,
+    agent: Agent,
+    first: jax.Array,
+    discount: chex.Numeric,
+    *,
+    num_steps: int,
+    batch: int,
+    sharding: NamedSharding | None = None,
+) -> EpisodeTotals:
+    def one(
+        key: chex.PRNGKey, environment: Environment, agent: Agent, discount: Any
+    ) -> EpisodeTotals:
+        return episode_totals(key, environment, agent, num_steps=num_steps, discount=discount)
+
+    axes, keys = (
+        (0, None, None, None),
+        jax.vmap(partial(jax.random.fold_in, key))(first + jnp.arange(batch)),
+    )
+    return vmap_split(one, sharding, axes)(keys, environment, agent, discount)
+
+
+# --- on the host ----------------------------------------------------------------------------------
+
+
+def _decided(success: int, count: int, threshold: float, failure: float) -> bool | None:
+    """Whether the chance of success is at least a threshold, if that is known."""
+    lower, upper = anytime(np.array([success]), np.array([count]), failure)
+    if lower[0] >= threshold:
+        return True
+    return False if upper[0] < threshold else None
+
+
+def _told(
+    totals: EpisodeTotals,
+    num_steps: int,
+    confidence: float,
+    threshold: float | None,
+    discount: float | None,
+    decision: bool | None,
+) -> Evaluation:
+    count, failure, fixed = len(totals.length), 1 - confidence, threshold is None
+    sums = (totals.reward, totals.discounted_reward, totals.cost)
+    fine = all(np.isfinite(x).all() for x in sums)
+    status = Status.CONVERGED if fixed or decision is not None else Status.MAX_STEPS
+    shares: dict[str, Estimate | None] = dict.fromkeys(_SHARES)
+    if totals.verdict is not None:
+        shares = {
+            name: share_estimate(int((totals.verdict == code).sum()), count, failure, fixed)
+            for name, code in _SHARES.items()
+        }
+
+    def bounded(x: Any, low: float, high: float) -> Estimate | None:
+        planned = count if fixed else None
+        return None if x is None else _bounded_estimate(x, low, high, failure, planned)
+
+    early = None
+    if discount is not None:
+        # All readings accepting, the first label's included.
+        most = (1 - discount ** (num_steps + 1)) / (1 - discount)
+        early = bounded(totals.discounted_visits, 0, most)
+    length = bounded(totals.length, 1, num_steps)
+    assert length is not None
+    return Evaluation(
+        **shares,
+        reward=_mean_estimate(totals.reward, failure),
+        discounted_reward=None
+        if discount is None
+        else _mean_estimate(totals.discounted_reward, failure),
+        cost=_mean_estimate(totals.cost, failure),
+        length=length,
+        visits=bounded(totals.visits, 0, num_steps + 1),
+        discounted_visits=early,
+        terminated=int(totals.terminated.sum()),
+        truncated=int(totals.truncated.sum()),
+        cut_off=int((~totals.terminated & ~totals.truncated).sum()),
+        num_episodes=count,
+        num_steps=num_steps,
+        confidence=confidence,
+        threshold=threshold,
+        discount=discount,
+        decision=decision,
+        status=status if fine else Status.NONFINITE,
+    )
+
+
+def share_estimate(count: int, total: int, failure: float, fixed: bool = True) -> Estimate:
+    """A share with its interval: exact for a fixed number of trials, or valid at any time.
+
+    Example:
+      >>> found = share_estimate(8, 10, 0.05)
+      >>> round(found.lower, 3), round(found.upper, 3), found.method
+      (0.444, 0.975, 'Clopper-Pearson')
+    """
+    total = validation.whole("total", total, least=1, most=2**53)
+    count = validation.whole("count", count, most=total)
+    failure = validation.share("failure", failure, ends=(False, False))
+    ends = clopper_pearson if fixed else anytime
+    (lower,), (upper,) = ends(np.array([count]), np.array([total]), failure)
+    share = count / total
+    return Estimate(
+        share,
+        float(lower),
+        float(upper),
+        math.sqrt(share * (1 - share) / total),
+        "Clopper-Pearson" if fixed else "Jeffreys' mixture, at any time",
+    )
+
+
+def _mean_estimate(x: Any, failure: float) -> Estimate:
+    from scipy.special import stdtrit  # a tenth of a second
+
+    mean, error = _mean_error(x)
+    margin = float(stdtrit(len(x) - 1, 1 - failure / 2)) * error if len(x) > 1 else math.inf
+    return Estimate(mean, mean - margin, mean + margin, error, "central limit theorem")
+
+
+def _bounded_estimate(
+    x: Any, low: float, high: float, failure: float, planned: int | None
+) -> Estimate:
+    mean, error = _mean_error(x)
+    size = high - low
+    if not size:
+        return Estimate(mean, low, high, error, "there is no other")
+    numbers = (np.asarray(x, np.float64) - low) / size
+    lower, upper = bounded_mean(numbers, failure, planned=planned)
+    method = "empirical Bernstein" + (", at any time" if planned is None else "")
+    return Estimate(mean, low + size * lower, low + size * upper, error, method)
+
+
+def _mean_error(x: Any) -> tuple[float, float]:
+    """The mean, and its standard error; infinite of one number."""
+    x = np.asarray(x, np.float64)
+    with np.errstate(invalid="ignore", over="ignore"):
+        error = float(x.std(ddof=1)) / math.sqrt(len(x)) if len(x) > 1 else math.inf
+        return float(x.mean()), error
+
+
+# --- checks ---------------------------------------------------------------------------------------
+
+
+def checked_steps(environment: Environment, num_steps: int | None) -> int:
+    """After how many steps episodes are cut off; refused if nothing tells."""
+    steps = environment.horizon if num_steps is None else num_steps
+    if steps is None:
+        raise ValueError(
+            "episodes that never end: neither the environment nor num_steps says after how many "
+            "steps; give num_steps, or with_time_limit(environment, num_steps)."
+        )
+    return validation.whole("num_steps", steps, least=1, most=2**31 - 1)
+
+
+def _checked_agent(agent: Any, environment: Environment) -> tuple[Agent, Any]:
+    """An agent as a tree of arrays, whose actions are the environment's; and the world's shapes."""
+    agent = require_agent(agent)
+    agent = replace(agent, act=as_partial(agent.act, "agent.act"))
+
+    def first(key: chex.PRNGKey) -> Any:
+        world = environment.reset(key)
+        seen, mask = environment.observe(world), allowed_in(environment, world)
+        return agent.act(agent.memory, seen, mask, key)[0], world
+
+    found, world = jax.eval_shape(first, jax.random.key(0))
+    space = some_action(environment.actions)
+    whole = jnp.issubdtype(space.dtype, jnp.integer)
+    if getattr(found, "shape", None) != space.shape or (
+        whole and not jnp.issubdtype(found.dtype, jnp.integer)
+    ):
+        raise ValueError(
+            f"the agent's action is {found}; the environment takes {space.dtype}"
+            f"{list(space.shape)}."
+        )
+    return agent, world

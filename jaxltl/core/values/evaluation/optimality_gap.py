@@ -1,0 +1,362 @@
+"""How far an agent in a finite world is from the best that anyone could do, certified."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxltl.core import validation
+from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.automata.translate import to_automaton
+from jaxltl.core.environments.environment import Environment, as_partial
+from jaxltl.core.environments.monitor import Verdict, lasting_verdicts, verdicts
+from jaxltl.core.environments.tabulate import Table
+from jaxltl.core.environments.time_limit import without_time_limit
+from jaxltl.core.logic.ltl import Formula
+from jaxltl.core.models.ops.operators import is_deterministic
+from jaxltl.core.models.product import product
+from jaxltl.core.pretty_print import brief
+from jaxltl.core.sparse.product import host_product
+from jaxltl.core.sparse.solvers import step_bounded as host
+from jaxltl.core.types import Solution
+from jaxltl.core.values import facts
+from jaxltl.core.values.engine.host_solution import chain_of
+from jaxltl.core.values.undiscounted.sparse_satisfaction import (
+    as_sparse,
+    at_states,
+    product_satisfaction,
+)
+from jaxltl.core.values.undiscounted.step_bounded import enclosed
+
+_BATCH = 4096  # pairs of a world and a memory that are shown to an agent at once
+_SUM = 1e-4  # by how much a network's distribution may miss one; it is scaled
+
+
+@brief(facts=facts.gap)
+class OptimalityGap(NamedTuple):
+    """What :func:`optimality_gap` found, for each of the N worlds where an episode may begin.
+
+    Attributes:
+      start: ``int32[N]``, their states in the table.
+      weight: ``float64[N]``, how likely an episode begins there.
+      value, optimum: of the agent, and the best: :class:`~jaxltl.core.types.Solution` whose
+        `value`, `lower` and `upper` are ``float64[N]``.
+      lower, upper: ``float64[N]``, bounds on the gap, optimum minus value.
+      mean: bounds on the mean gap over the beginnings.
+      mean_value, mean_optimum: bounds on theirs.
+      evidence: why the table is the environment, on which all bounds rest; see
+        :class:`~jaxltl.core.environments.tabulate.Table`.
+
+    Example:
+      >>> from jaxltl import Timestep, make_environment, tabulate
+      >>> corridor = make_environment(
+      ...     lambda key: jnp.int32(2),
+      ...     lambda at, action, key: Timestep(jnp.clip(at + 2 * action - 1, 0, 4), 0.0, False),
+      ...     lambda place: place[None], actions=2,
+      ...     labels=lambda place: jnp.array([place == 4]), propositions=["goal"])
+      >>> found = optimality_gap(tabulate(corridor), "F goal", np.full((5, 2, 2), 0.5), num_steps=4)
+      >>> found.start.tolist(), found.weight.tolist(), found.mean_optimum  # listed from the start
+      ([0], [1.0], (1.0, 1.0))
+      >>> bool(found.lower[0] <= 0.625 <= found.upper[0])
+      True
+    """
+
+    start: np.ndarray
+    weight: np.ndarray
+    value: Solution
+    optimum: Solution
+    lower: np.ndarray
+    upper: np.ndarray
+    mean: tuple[float, float]
+    mean_value: tuple[float, float]
+    mean_optimum: tuple[float, float]
+    evidence: str
+
+
+def tabulate_policy(
+    policy: Callable[..., Any], environment: Environment, table: Table, num_memory: int
+) -> np.ndarray:
+    """What an agent does in each world of a table and each memory of a task.
+
+    Args:
+      policy: a function of ``(observation, memory)``: an action, or the probabilities
+        ``float[A]``, of one world; `memory` is ``int32[]``, the state of the task's automaton. A
+        ``Partial`` with a network's parameters is compiled once.
+      environment: the one that was tabulated.
+      table: of it.
+      num_memory: Q.
+
+    Returns:
+      ``int32[S, Q]`` or ``float[S, Q, A]``, for :func:`optimality_gap`.
+
+    Raises:
+      ValueError: the table is none of :func:`~jaxltl.core.environments.tabulate.tabulate`, the number of
+        memories is none, or the policy is no function.
+
+    Not differentiable: the answer is a NumPy array.
+
+    Example:
+      >>> from jaxltl import Timestep, make_environment, tabulate
+      >>> corridor = make_environment(
+      ...     lambda key: jnp.int32(2),
+      ...     lambda at, action, key: Timestep(jnp.clip(at + 2 * action - 1, 0, 4), 0.0, False),
+      ...     lambda place: place[None], actions=2,
+      ...     labels=lambda place: jnp.array([place == 4]), propositions=["goal"])
+      >>> def to_the_right(observation, memory):
+      ...     return jnp.where(memory == 0, 1, 0)
+      >>> tabulate_policy(to_the_right, corridor, tabulate(corridor), 2).tolist()
+      [[1, 0], [1, 0], [1, 0], [1, 0], [1, 0]]
+    """
+    inner, _ = without_time_limit(environment)
+    validation.instance("table", table, Table, "one of tabulate")
+    num_memory = validation.whole("num_memory", num_memory, least=1, most=2**24)
+    count = table.model.num_states
+    size = max(1, min(count, _BATCH // num_memory))
+    policy = as_partial(policy, "policy")
+    memory = jnp.arange(num_memory, dtype=jnp.int32)
+    parts = []
+    for begin in range(0, count, size):
+        place = np.minimum(np.arange(begin, begin + size), count - 1)
+        some = jax.tree.map(lambda x, i=place: jnp.asarray(x)[i], table.world)
+        parts.append(np.asarray(_acts(policy, inner, memory, some))[: count - begin])
+    return np.concatenate(parts)
+
+
+@jax.jit
+def _acts(policy: Any, environment: Environment, memory: jax.Array, worlds: Any) -> jax.Array:
+    def one(world: Any) -> jax.Array:
+        return jax.vmap(partial(policy, environment.observe(world)))(memory)
+
+    return jax.vmap(one)(worlds)
+
+
+def optimality_gap(
+    table: Table,
+    task: Automaton | Formula | str,
+    policy: Any,
+    *,
+    num_steps: int | None = None,
+) -> OptimalityGap:
+    """The best probability of a task minus an agent's, from each beginning, with bounds on it.
+
+    Both are of doing the task for sure within so many steps, ``P(some prefix of n steps at most is
+    such that every continuation satisfies it)``: what an episode of n steps at most of
+    :func:`~jaxltl.core.environments.task_environment.task_environment` counts as success. They are
+    step-bounded reachability in the product of the table and the task (Baier and Katoen 2008,
+    section 10.1.1), enclosed with their rounding; exactly 0 or 1 where the graph says so. The agent
+    decides by the world and the automaton's state alone; the optimum is that of all policies, also
+    of those that know the time. Without a limit of steps both are the probabilities of the task, by
+    the exact solvers.
+
+    An episode that ends by itself stays where it is, and its last label repeats: that is then its
+    one continuation. One that the environment cuts off has had its steps.
+
+    Args:
+      table: from :func:`~jaxltl.core.environments.tabulate.tabulate`.
+      task: a formula, its text, or an automaton. Memories are the states of
+        ``to_automaton(formula)``, as they are in a task's environment.
+      policy: actions ``int[S, Q]`` or their probabilities ``float[S, Q, A]``, such as
+        :func:`tabulate_policy` returns. Rows that miss a sum of one by rounding are scaled.
+      num_steps: default the table's.
+
+    Returns:
+      :class:`OptimalityGap`.
+
+    Raises:
+      ValueError: a policy of another shape, or that is no distribution over the actions that are
+        allowed where a run may come to; or worlds that are cut off without a limit.
+
+    Concrete arrays only, on the host; not differentiable.
+
+    Example:
+      >>> from jaxltl import Timestep, make_environment, tabulate
+      >>> corridor = make_environment(
+      ...     lambda key: jnp.int32(2),
+      ...     lambda at, action, key: Timestep(jnp.clip(at + 2 * action - 1, 0, 4), 0.0, False),
+      ...     lambda place: place[None], actions=2,
+      ...     labels=lambda place: jnp.array([place == 4]), propositions=["goal"])
+      >>> lazy = np.full((5, 2, 2), 0.5)
+      >>> found = optimality_gap(tabulate(corridor), "F goal", lazy, num_steps=4)
+      >>> found.optimum.value.tolist(), found.value.value.tolist(), round(found.mean[1], 9)
+      ([1.0], [0.375], 0.625)
+    """
+    validation.instance("table", table, Table, "one of tabulate")
+    if not isinstance(task, Automaton):
+        task = to_automaton(task)
+    steps = table.num_steps if num_steps is None else validation.whole("num_steps", num_steps)
+    model = product(table.model, task)
+    shown = _rows_of(policy)
+    shape, num_actions = model.state_shape, int(np.max(np.asarray(table.model.action))) + 1
+    if (
+        shown.shape[:2] != shape
+        or shown.ndim != 2 + (not is_deterministic(shown))
+        or (shown.ndim == 3 and shown.shape[2] < num_actions)
+    ):
+        raise ValueError(
+            f"policy is {shown.dtype}{list(shown.shape)}; expected actions "
+            f"int{list(shape)}, or probabilities float{[*shape, num_actions]}."
+        )
+    start = np.unique(np.asarray(table.start))
+    weight = np.asarray(table.model.initial)[start]
+    if steps is None:
+        value, optimum = _unbounded(table, model, shown, start)
+    else:
+        value, optimum = _bounded(table, model, task, shown, start, steps)
+    own, best = (tuple(np.asarray(x) for x in (y.lower, y.upper)) for y in (value, optimum))
+    sure = np.isin(own, (0, 1)).all(axis=0) & np.isin(best, (0, 1)).all(axis=0)
+    below, above = best[0] - own[1], best[1] - own[0]
+    # No policy is better than the best.
+    lower = np.maximum(np.where(sure, below, np.nextafter(below, -np.inf)), 0)
+    upper = np.maximum(np.where(sure, above, np.nextafter(above, np.inf)), 0)
+    return OptimalityGap(
+        start.astype(np.int32),
+        weight,
+        value,
+        optimum,
+        lower,
+        upper,
+        _mean(weight, lower, upper),
+        _mean(weight, *own),
+        _mean(weight, *best),
+        table.evidence,
+    )
+
+
+def _rows_of(policy: Any) -> np.ndarray:
+    try:
+        found = np.asarray(policy)
+    except ValueError:  # ragged
+        found = np.asarray(None)
+    if found.dtype.kind not in "iuf":
+        raise ValueError(
+            f"policy is {validation.shown(policy)}; give actions, or their probabilities."
+        )
+    return found
+
+
+def _bounded(
+    table: Table, model: Any, task: Automaton, policy: np.ndarray, start: np.ndarray, steps: int
+) -> tuple[Any, Any]:
+    """The agent's probability and the best within so many steps, from each beginning."""
+    base, decisions, letter = table.model.host, verdicts(task), np.asarray(model.letter)
+    found = host_product(
+        base,
+        np.asarray(task.delta),
+        letter,
+        start,
+        np.asarray(model.initial_memory)[start],
+        still=decisions != Verdict.UNDECIDED,
+    )
+    ended = np.asarray(table.terminated)[found.base_state]
+    at_end = lasting_verdicts(task)[found.memory, letter[found.base_state]]
+    target = np.where(ended, at_end, decisions[found.memory]) == Verdict.SATISFIED
+    going = ~np.asarray(table.truncated)[found.base_state]
+    best = host.until(found.host, target, going, steps, np.maximum)
+    single = np.diff(base.row_start)[found.base_state] == 1
+    fixed = found.still | (single & (ended | ~going))
+    weight = _weights(
+        policy,
+        np.asarray(table.model.action)[found.base_row],
+        found.base_state,
+        found.memory,
+        found.host,
+        fixed,
+    )
+    written = as_sparse(found)
+    chain = chain_of(written, written, weight)
+    own = host.until(chain.mdp, target, going, steps, np.maximum)
+    # The chain's numbers are rounded before the sweeps begin.
+    unit = host.backup_unit(chain.mdp) + chain.depth * float(np.finfo(np.float64).eps)
+    wide = np.minimum(own.value * host.relative_error(unit, steps) + host.UNDERFLOW, 1)
+    error = np.where(own.error > 0, wide, 0)
+    at = found.start
+    return (
+        enclosed(own.value[at], error[at], None, own.num_steps, highest=1),
+        enclosed(
+            best.value[at], best.error[at], found.base_row[best.row[at]], best.num_steps, highest=1
+        ),
+    )
+
+
+def _unbounded(table: Table, model: Any, policy: np.ndarray, start: np.ndarray) -> tuple[Any, Any]:
+    """The same without a limit."""
+    if np.asarray(table.truncated).any():
+        raise ValueError(
+            "optimality_gap: the environment cuts episodes off, and what would come is not in the "
+            "table; give num_steps, or tabulate it without its limit."
+        )
+    base = table.model
+    num_memory = model.num_memory
+    state, memory = (
+        np.repeat(base.host.state, num_memory),
+        np.tile(np.arange(num_memory), base.num_rows),
+    )
+    ended = np.asarray(table.terminated)
+    action = np.repeat(np.asarray(base.action), num_memory)
+    mass = _mass(policy, action, state, memory)
+    mass = np.where(ended[state], 1.0, mass).reshape(base.num_rows, num_memory)
+    total = np.add.reduceat(mass, base.host.row_start[:-1], axis=0)
+    _require(
+        total,
+        np.minimum.reduceat(mass, base.host.row_start[:-1], axis=0),
+        lambda at: (int(at[0]), int(at[1])),
+    )
+    own = product_satisfaction(model, policy=mass / total[base.host.state])
+    best = product_satisfaction(model)
+    at: Any = start, np.asarray(model.initial_memory)[start]
+    return at_states(own, at), at_states(best, at)
+
+
+def _mass(
+    policy: np.ndarray, action: np.ndarray, state: np.ndarray, memory: np.ndarray
+) -> np.ndarray:
+    """The probability with which rows are taken."""
+    if is_deterministic(policy):
+        return (policy[state, memory] == action).astype(np.float64)
+    return policy[state, memory, action].astype(np.float64)
+
+
+def _weights(
+    policy: np.ndarray,
+    action: np.ndarray,
+    base: np.ndarray,
+    memory: np.ndarray,
+    mdp: Any,
+    fixed: np.ndarray,
+) -> np.ndarray:
+    """``float64[R']``, the agent's distribution over the rows of each pair."""
+    weight = _mass(policy, action, base[mdp.state], memory[mdp.state])
+    weight = np.where(fixed[mdp.state], 1.0, weight)
+    total = mdp.over_choices(np.add, weight)
+    _require(
+        total,
+        mdp.over_choices(np.minimum, weight),
+        lambda at: (int(base[at[0]]), int(memory[at[0]])),
+    )
+    return weight / total[mdp.state]
+
+
+def _require(total: np.ndarray, least: np.ndarray, place: Callable[..., tuple[int, int]]) -> None:
+    for at in np.argwhere(~((np.abs(total - 1) <= _SUM) & (least >= 0)))[:1]:
+        state, memory = place(at)
+        raise ValueError(
+            f"policy: in state {state} with memory {memory} the actions that are allowed have the "
+            f"probability {total[tuple(at)]:.9g} in sum; it must be a distribution over them."
+        )
+
+
+def _mean(weight: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[float, float]:
+    """Bounds on a mean of numbers between zero and one, rounding included."""
+    slack = (weight.size + 4) * float(np.finfo(np.float64).eps)
+
+    def mean(x: np.ndarray, scale: float) -> float:
+        if (x == x[0]).all():
+            return float(x[0])
+        return float(np.clip(weight @ x / weight.sum() * scale, 0, 1))
+
+    return mean(lower, 1 - slack), mean(upper, 1 + slack)

@@ -1,0 +1,1 @@
+"""Values of interval MDPs with adversarial or cooperative nature."""

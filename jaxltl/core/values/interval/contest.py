@@ -1,0 +1,397 @@
+"""Values of a policy and of nature, each for a value or against it, enclosed inside ``jit``.
+
+Values carry a sign, such that one side, the leader, wants them large and must get out of what is
+open: of a probability who makes it large, of a reward until a target who makes it small. Policy
+iteration (Howard 1960; with two players, Hoffman and Karp 1966) over rows and distributions
+together, each round one linear system. It is done of the problem in which each step costs the
+leader a little more, and of that in which each earns a little more: the solutions are bounds, by
+one application of the operator with room for rounding.
+
+- Where each open state gains strictly, the leader's choices get out, whoever is against them, and
+  attain the bound.
+- Where none gains, the bound holds for probabilities, as the value is the least solution, and for
+  rewards, as who does not reach the target pays without end. Where the leader may circle for
+  nothing, values have to be equal for this: steps between states of equal value earn nothing, and
+  values which rounding alone tells apart are made equal.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jax import lax
+
+from jaxltl.core.values.engine.linear import DENSE_LIMIT, inverse, solve_linear
+
+_AIM = 0.1  # of the tolerance: how much of it the extra of all steps may take
+_HASTY = 12  # rounds in which both sides move at once; then the leader waits for the other one
+_ROUNDS = 100
+_GROWTH = 8.0  # of the extra where nobody moves and yet nothing is proven
+_MOST_GROWTH = 1e5
+_PAIRS = 16  # entries of a row up to which each pair is compared
+_EQUAL = 2.0**12  # roundings by which equal values may differ
+
+
+@struct.dataclass
+class Contest:
+    """Rows of intervals between open states, and who wants what.
+
+    Attributes:
+      target: ``int32[R, W]``, nodes; N is worth 0, N + 1 is worth 1.
+      owner: ``int32[R]``.
+      choice: ``int32[N, A]``, the rows of each node.
+      first: ``int32[N]``, rows by which the policy gets out, if it leads.
+      lower, upper: ``float[R, W]``, 0 where there is no entry.
+      cost: ``float[R]``, with the sign.
+      policy_leads, nature_leads: static.
+      relative: whether widths are asked for as a share of the value, static.
+      circling: whether the leader may stay for ever for nothing, static.
+    """
+
+    target: Any
+    owner: Any
+    choice: Any
+    first: Any
+    lower: Any
+    upper: Any
+    cost: Any
+    policy_leads: bool = struct.field(pytree_node=False)
+    nature_leads: bool = struct.field(pytree_node=False)
+    relative: bool = struct.field(pytree_node=False)
+    circling: bool = struct.field(pytree_node=False)
+
+    @property
+    def size(self) -> int:
+        """The number N of nodes."""
+        return self.first.shape[0]
+
+    @property
+    def eps(self) -> float:
+        return float(jnp.finfo(self.lower.dtype).eps)
+
+    @property
+    def out(self) -> jax.Array:
+        """``bool[R, W]``, entries that leave their node."""
+        return (self.target != self.owner[:, None]) & (self.upper > 0)
+
+    def ahead(self, z: jax.Array) -> jax.Array:
+        """How much more each entry leads to than where it comes from, ``float[R, W]``."""
+        return jnp.where(self.out, _all(z)[self.target] - z[self.owner][:, None], 0)
+
+    def greedy(self, gain: jax.Array) -> jax.Array:
+        """Nature's distributions at some gains."""
+        return chances(self.lower, self.upper, self.key(gain))
+
+    def key(self, gain: jax.Array) -> jax.Array:
+        """The order in which nature gives mass."""
+        return -gain if self.nature_leads else gain
+
+    def best(self, gain: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """The gain that the policy prefers in each node, and its row: ``[N]``."""
+        each = gain[self.choice]
+        rank = jnp.argmax(each if self.policy_leads else -each, axis=1)[:, None]
+        return (
+            jnp.take_along_axis(each, rank, 1)[:, 0],
+            jnp.take_along_axis(self.choice, rank, 1)[:, 0],
+        )
+
+
+class Bounds(NamedTuple):
+    """What was found, of the nodes.
+
+    Attributes:
+      near, far: ``float[N]``: what the leader attains, and what it cannot exceed.
+      attained, bounded: whether they are proven.
+      middle: ``float[N]``, the solution between them.
+      row: ``int32[N]``, rows of the policy.
+      probability: ``float[R, W]``, nature's distributions.
+      rounds: systems solved.
+    """
+
+    near: jax.Array
+    far: jax.Array
+    attained: jax.Array
+    bounded: jax.Array
+    middle: jax.Array
+    row: jax.Array
+    probability: jax.Array
+    rounds: jax.Array
+
+
+def _all(z: jax.Array) -> jax.Array:
+    """Values of the nodes and of the two ends."""
+    return jnp.concatenate([z, jnp.asarray([0, 1], z.dtype)])
+
+
+def rounding(width: Any, dtype: Any) -> Any:
+    """By how much a sum of so many terms may miss, of numbers that add up to one."""
+    return 4 * float(jnp.finfo(dtype).eps) * (width + 1)
+
+
+def chances(lower: jax.Array, upper: jax.Array, key: jax.Array) -> jax.Array:
+    """The distributions between ends that give mass first where a key is small, ``float[R, W]``.
+
+    Differentiable in the ends, the order held fixed.
+    """
+    left, free = _left(lower, upper, key)
+    left = jnp.where(left > rounding(key.shape[1], key.dtype), left, 0)
+    return jnp.where(left >= free, upper, lower + jnp.maximum(left, 0))
+
+
+def _left(lower: jax.Array, upper: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The mass that is left when it is an entry's turn, and how much the entry may take."""
+    width = key.shape[1]
+    free = upper - lower
+    rest = jnp.maximum(1 - jnp.sum(lower, axis=1, keepdims=True), 0)
+    key = lax.stop_gradient(key)
+    if width <= _PAIRS:
+        rank = jnp.arange(width)
+        mine, other = key[:, :, None], key[:, None, :]
+        earlier = (other < mine) | ((other == mine) & (rank < rank[:, None]))
+        before = jnp.sum(jnp.where(earlier, free[:, None, :], 0), axis=2)
+    else:
+        order = jnp.argsort(key, axis=1)
+        ranked = jnp.take_along_axis(free, order, 1)
+        sums = jnp.concatenate([jnp.zeros_like(rest), jnp.cumsum(ranked[:, :-1], axis=1)], axis=1)
+        before = jnp.take_along_axis(sums, jnp.argsort(order, axis=1), 1)
+    return rest - before, free
+
+
+def system(target: jax.Array, weight: jax.Array) -> tuple[Any, Any]:
+    """Solvers of ``x - P x = b`` and of its transpose.
+
+    Args:
+      target: ``int32[N, W]``; from N on, what is known.
+      weight: ``float[N, W]``; rows of more than one in all are not allowed.
+    """
+    size = target.shape[0]
+    weight = jnp.where(target < size, weight, 0)
+    place = jnp.minimum(target, size - 1)
+
+    def left(x: jax.Array) -> jax.Array:
+        return x - jnp.sum(weight * x[place], axis=1)
+
+    def back(y: jax.Array) -> jax.Array:
+        return y - jnp.zeros_like(y).at[place].add(weight * y[:, None])
+
+    if size > DENSE_LIMIT:
+        return partial(solve_linear, left), partial(solve_linear, back)
+    matrix = jnp.eye(size, dtype=weight.dtype)
+    inverted = inverse(matrix.at[jnp.arange(size)[:, None], place].add(-weight))
+
+    def solve(b: jax.Array) -> jax.Array:
+        x = inverted @ b
+        return x + inverted @ (b - left(x))
+
+    def transposed(b: jax.Array) -> jax.Array:
+        y = b @ inverted
+        return y + (b - back(y)) @ inverted
+
+    return solve, transposed
+
+
+def leaving(target: jax.Array, probability: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The mass that leaves each node, 1 where there is none, and what it is divided by that."""
+    own = jnp.arange(target.shape[0])[:, None]
+    out = jnp.where(target != own, probability, 0)
+    mass = jnp.sum(out, axis=1)
+    mass = jnp.where(mass > 0, mass, 1)
+    return mass, out / mass[:, None]
+
+
+# --- policy iteration -----------------------------------------------------------------------------
+
+
+class _Play(NamedTuple):
+    row: jax.Array
+    probability: jax.Array
+    base: jax.Array  # the solution without anything extra
+    z: jax.Array
+    extra: jax.Array
+    growth: jax.Array
+    rounds: jax.Array
+    hasty: jax.Array  # whether both sides move at once
+    still: jax.Array  # whether nobody moves
+    proven: jax.Array
+
+
+def enclose(contest: Contest, tolerance: jax.Array, max_rounds: jax.Array) -> Bounds:
+    """Bounds of both sides.
+
+    Args:
+      contest: who plays what.
+      tolerance: the width asked for.
+      max_rounds: systems at most, for each bound.
+    """
+    every = jnp.sum(contest.upper - contest.lower, axis=1, keepdims=True)
+    rest = jnp.maximum(1 - jnp.sum(contest.lower, axis=1, keepdims=True), 0)
+    share = jnp.where(every > 0, jnp.minimum(rest / jnp.where(every > 0, every, 1), 1), 0)
+    p = contest.lower + (contest.upper - contest.lower) * share
+    zero, no = jnp.zeros(contest.size, p.dtype), jnp.asarray(False)
+    start = _Play(
+        contest.first,
+        p,
+        zero,
+        zero,
+        jnp.full((), jnp.inf, p.dtype),
+        jnp.ones((), p.dtype),
+        jnp.int32(0),
+        ~no,
+        no,
+        no,
+    )
+    apart = jnp.arange(contest.size + 2)
+    near = _played(contest, start, -1.0, apart, tolerance, max_rounds)
+    label = apart
+    if contest.circling:
+        label = jnp.concatenate([_groups(near.base, contest.eps)[0], apart[contest.size :]])
+    again = start._replace(row=near.row, probability=near.probability)
+    far = _played(contest, again, 1.0, label, tolerance, max_rounds)
+    low, high = contest.ahead(near.z), contest.ahead(far.z)
+    p_low, p_high = contest.greedy(low), contest.greedy(high)
+    lows, highs = (jnp.sum(p * d, axis=1) + contest.cost for p, d in ((p_low, low), (p_high, high)))
+    # Who leads shows what attains the one bound, and who is against it what attains the other.
+    row = contest.best(lows if contest.policy_leads else highs)[1]
+    middle = jnp.where(near.proven & far.proven, (near.z + far.z) / 2, near.base)
+    return Bounds(
+        near.z,
+        far.z,
+        near.proven,
+        far.proven,
+        middle,
+        row,
+        p_low if contest.nature_leads else p_high,
+        near.rounds + far.rounds,
+    )
+
+
+def _groups(z: jax.Array, eps: float) -> tuple[jax.Array, jax.Array]:
+    """Numbers of values that rounding alone may tell apart, and the largest value of each."""
+    order = jnp.argsort(z)
+    ranked = z[order]
+    apart = _EQUAL * eps * jnp.max(jnp.abs(z))
+    new = jnp.diff(ranked, prepend=ranked[:1]) > apart
+    number = jnp.cumsum(new)
+    largest = jax.ops.segment_max(ranked, number, z.shape[0], indices_are_sorted=True)
+    label = jnp.zeros_like(number).at[order].set(number)
+    return label, largest[label]
+
+
+def _played(
+    contest: Contest,
+    start: _Play,
+    sign: float,
+    label: jax.Array,
+    tolerance: jax.Array,
+    max_rounds: jax.Array,
+) -> _Play:
+    """Policy iteration until a bound is proven: from below the value, or from above it."""
+    out, size = contest.out, contest.size
+    earning = out & (label[contest.target] != label[contest.owner][:, None])
+    equal = contest.circling and sign > 0
+
+    def body(play: _Play) -> _Play:
+        target = contest.target[play.row]
+        p = jnp.where(out[play.row], play.probability[play.row], 0)
+        mass, share = leaving(target, p)
+        known = jnp.where(target == size + 1, share, 0)
+        steps = jnp.sum(jnp.where(earning[play.row], share, 0), axis=1)
+        solve = system(target, share)[0]
+        base = solve(jnp.sum(known, axis=1) + contest.cost[play.row] / mass)
+        time = solve(steps)
+        # Never more again: else who goes round for it comes and goes with it.
+        aim = _extra(contest, base, time, tolerance)
+        least = jnp.where(jnp.isfinite(aim), jnp.minimum(play.extra, aim), play.extra)
+        extra = play.growth * least
+        z = base + sign * extra * time
+        if equal:
+            z = _groups(z, contest.eps)[1]
+        row, chance = _moved(contest, play, z, sign * extra * earning)
+        # Moves at once may end where nobody gets out; moves in turn do not.
+        lost = ~(jnp.all(jnp.isfinite(z)) & jnp.all(time >= 0))
+        again = lost & play.hasty
+        row, chance = (
+            jnp.where(again, x, y) for x, y in ((start.row, row), (start.probability, chance))
+        )
+        z = jnp.where(again, 0, z)
+        hasty = play.hasty & ~lost & (play.rounds < _HASTY)
+        still = jnp.all(row == play.row) & jnp.all(chance == play.probability)
+        proven = _proves(contest, z, sign) & ~lost
+        growth = jnp.where(still & ~proven, _GROWTH * play.growth, play.growth)
+        return _Play(row, chance, base, z, least, growth, play.rounds + 1, hasty, still, proven)
+
+    def goes_on(play: _Play) -> jax.Array:
+        alive = jnp.all(jnp.isfinite(play.z)) & (play.growth < _MOST_GROWTH)
+        done = play.proven & play.still
+        return ~done & alive & (play.rounds < jnp.minimum(max_rounds, _ROUNDS))
+
+    return lax.while_loop(goes_on, body, start)
+
+
+def _extra(contest: Contest, base: jax.Array, time: jax.Array, tolerance: jax.Array) -> jax.Array:
+    """How much more a step earns: little beside the tolerance, and more than rounding."""
+    largest = jnp.max(jnp.abs(base))
+    scale: jax.Array | float = 1.0
+    if contest.relative:
+        scale = jnp.min(jnp.where(base != 0, jnp.abs(base), largest))
+    width = contest.target.shape[1]
+    finest = 64 * (width + 8) * contest.eps * jnp.maximum(largest, 0.0 if contest.relative else 1.0)
+    tiny = 1e6 * float(jnp.finfo(base.dtype).tiny)
+    aim = _AIM * tolerance * scale / jnp.maximum(jnp.max(time), 1)
+    return jnp.maximum(jnp.maximum(aim, finest), tiny)
+
+
+def _moved(
+    contest: Contest, play: _Play, z: jax.Array, more: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Rows and distributions that are better than those that were solved."""
+    gain = contest.ahead(z) + more
+    greedy = contest.greedy(gain)
+    now = jnp.sum(play.probability * gain, axis=1) + contest.cost
+    then = jnp.sum(greedy * gain, axis=1) + contest.cost
+    slack = 4 * contest.eps * (jnp.abs(z) + rounding(contest.target.shape[1], z.dtype))
+    policy = 1.0 if contest.policy_leads else -1.0
+    nature = 1.0 if contest.nature_leads else -1.0
+    best, row = contest.best(then)
+    switches = policy * best > slack
+    moved = jnp.where(switches, row, play.row)
+    better = nature * (then - now) > slack[contest.owner]
+    fresh = jnp.zeros(contest.owner.shape, bool).at[moved].max(switches)
+    chance = jnp.where((better | fresh)[:, None], greedy, play.probability)
+    if contest.policy_leads == contest.nature_leads:
+        return moved, chance
+    if contest.policy_leads:
+        answers = better[play.row]
+        only = play.row, jnp.where(better[:, None], greedy, play.probability)
+    else:
+        best, row = contest.best(now)
+        answers = -best > slack
+        only = jnp.where(answers, row, play.row), play.probability
+        # A leader that waited moves, and the policy answers what it has found.
+        moved = jnp.where(play.hasty, moved, play.row)
+        chance = jnp.where(play.hasty, chance, jnp.where(better[:, None], greedy, play.probability))
+    waits = ~play.hasty & jnp.any(answers)
+    return jnp.where(waits, only[0], moved), jnp.where(waits, only[1], chance)
+
+
+def _proves(contest: Contest, z: jax.Array, sign: float) -> jax.Array:
+    """Whether values are a bound: all gain strictly, or none gains; rounding included."""
+    gain = contest.ahead(z)
+    p = contest.greedy(gain)
+    size = jnp.abs(gain)
+    width, dtype = contest.target.shape[1], z.dtype
+    terms = (2 * width + 8) * contest.eps
+    # Mass is known up to rounding where it is not certain to be all or nothing.
+    left, free = _left(contest.lower, contest.upper, contest.key(gain))
+    miss = rounding(width, dtype)
+    partly = (left > -miss) & (left < free + miss)
+    slack = terms * (jnp.sum(p * size, axis=1) + jnp.abs(contest.cost))
+    slack = slack + miss * jnp.max(jnp.where(partly, size, 0), axis=1)
+    slack = slack + (width + 2) * float(jnp.finfo(dtype).tiny) * (slack > 0)
+    image = jnp.sum(p * gain, axis=1) + contest.cost
+    best = contest.best(image + sign * slack)[0]
+    return jnp.all(best <= 0) if sign > 0 else jnp.all(best > 0)

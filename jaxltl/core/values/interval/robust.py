@@ -1,0 +1,467 @@
+"""Certified values of interval models: of a policy, or optimal, with nature for or against it."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxltl.core.models.game import Game
+from jaxltl.core.models.interval import IntervalMDP, make_interval
+from jaxltl.core.models.ops.operators import is_deterministic, row_weights
+from jaxltl.core.models.sparse import Rewards, SparseMDP, reward_parts, row_reward
+from jaxltl.core.sparse.interval import reachability as interval_values
+from jaxltl.core.sparse.interval.discounted import discounted
+from jaxltl.core.sparse.interval.game_encoding import Spread, spread
+from jaxltl.core.sparse.interval.reachability import Robust
+from jaxltl.core.sparse.interval.uncertainty_set import HostInterval
+from jaxltl.core.types import Method, Solution, require_shape
+from jaxltl.core.validation import numbers, shown
+from jaxltl.core.values.engine.host_solution import status_between
+from jaxltl.core.values.undiscounted.step_bounded import states
+
+TOLERANCE = 1e-6
+
+
+def require_direction(nature: str | None, objective: str) -> str:
+    """Nature's direction; against the objective where nothing is said.
+
+    Raises:
+      ValueError: it, or the objective, is none of ``"min"`` and ``"max"``.
+    """
+    if not isinstance(objective, str) or objective not in ("max", "min"):
+        raise ValueError(f'objective={shown(objective)}; it must be "max" or "min".')
+    if nature is None:
+        return "min" if objective == "max" else "max"
+    if not isinstance(nature, str) or nature not in ("max", "min"):
+        raise ValueError(
+            f'nature={shown(nature)}; it must be "min" (nature makes the value '
+            'small) or "max" (large).'
+        )
+    return nature
+
+
+def width_asked(tolerance: Any) -> float:
+    """The width of an enclosure that is asked for, 1e-6 where nothing is said.
+
+    Raises:
+      ValueError: it is negative, infinite or no number.
+    """
+    if tolerance is None:
+        return TOLERANCE
+    try:
+        width = float(tolerance)
+    except (TypeError, ValueError):
+        width = float("nan")
+    if not 0 <= width < np.inf:
+        raise ValueError(f"tolerance={shown(tolerance)}; it must be a finite number of at least 0.")
+    return width
+
+
+def refuse_nature(nature: str | None) -> None:
+    """Raises ValueError if a direction of nature is given where it has nothing to choose."""
+    if nature is not None:
+        raise ValueError(
+            f"nature={nature!r} is for models with intervals (make_interval); the "
+            "probabilities of this one are given. Leave it out."
+        )
+
+
+def robust_reachability(
+    model: Any,
+    target: Any,
+    *,
+    policy: Any = None,
+    objective: str = "max",
+    nature: str | None = None,
+    stay: Any = None,
+    tolerance: Any = None,
+) -> Solution:
+    """Probability of reaching a target when probabilities lie in intervals.
+
+    ``x(s) = opt_a opt_p sum_t p_t x(t)`` outside of the target, p among the distributions of row a
+    (Nilim and El Ghaoui 2005, Iyengar 2005); the least solution.
+
+    Args:
+      model: the model, or a :class:`~jaxltl.core.models.game.Game` on one (or on a sparse model),
+        whose environment wants the opposite of its system.
+      target: ``bool[S]``, or the name of a label.
+      policy: ``int32[S]``, rows, or ``float[R]``, their weights, to be evaluated; default:
+        optimise. Of a game, the system's, whose environment still chooses.
+      objective: ``"max"`` or ``"min"``, what the policy (the system) makes of the probability.
+      nature: ``"min"`` or ``"max"``, what nature makes of it; default: the opposite of
+        `objective` (for a given policy: ``"min"``).
+      stay: ``bool[S]``, the states that may be passed; default all.
+      tolerance: the width of the enclosure asked for, 1e-6.
+
+    Returns:
+      :class:`Solution`, with `nature`.
+
+    Raises:
+      ValueError: shapes, or a direction.
+
+    Concrete arrays only, on the host;
+    :func:`~jaxltl.core.values.interval.sensitivity.robust_sensitivity` has the derivatives in the
+    ends.
+
+    Example:
+      >>> from jaxltl import make_interval, make_sparse
+      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
+      >>> model = make_interval(coin, [0.4, 0.3, 1, 1], [0.7, 0.6, 1, 1])
+      >>> robust_reachability(model, [False, True, False]).value.tolist()
+      [0.4, 1.0, 0.0]
+    """
+    asked = width_asked(tolerance)
+    sides = sides_of(model, policy, objective, nature)
+    model = sides.model
+    target = sides.states(states(model.nominal, target, "target"))
+    if stay is not None:
+        stay = sides.states(states(model.nominal, stay, "stay")) | sides.added
+    found = interval_values.reachability(
+        sides.host,
+        target,
+        maximize=sides.maximize,
+        helpful=sides.helpful,
+        stay=stay,
+        tolerance=asked,
+    )
+    return robust_solution(sides, found, asked, relative=False)
+
+
+def robust_total_reward(
+    model: Any,
+    reward: Any,
+    target: Any,
+    *,
+    policy: Any = None,
+    objective: str = "max",
+    nature: str | None = None,
+    tolerance: Any = None,
+) -> Solution:
+    """Expected reward until a target is reached when probabilities lie in intervals.
+
+    ``x(s) = opt_a opt_p (r(s, a) + sum_t p_t x(t))`` outside of the target, infinite where the
+    target is not surely reached.
+
+    Args:
+      model: the model.
+      reward: as of :func:`~jaxltl.core.models.sparse.row_reward`; at least 0. On transitions it is
+        taken of the successors with nature's distribution, so these must not differ within a row
+        unless the interval is a point.
+      target: ``bool[S]``, or the name of a label.
+      policy, objective, nature: as of :func:`robust_reachability`.
+      tolerance: the width of the enclosure asked for, as a share of the value, 1e-6.
+
+    Returns:
+      :class:`Solution`, with `nature`.
+
+    Raises:
+      ValueError: shapes, a direction, or a reward that is negative or depends on nature.
+
+    Concrete arrays only, on the host;
+    :func:`~jaxltl.core.values.interval.sensitivity.robust_sensitivity` has the derivatives in the
+    ends.
+
+    Example:
+      >>> from jaxltl import interval_rows
+      >>> coin = interval_rows(None, [0, 2, 3], [0, 1, 1], [0.25, 0.5, 1], [0.5, 0.75, 1])
+      >>> found = robust_total_reward(coin, [1.0, 0.0], [False, True], objective="min")
+      >>> found.value.round(6).tolist(), found.nature.tolist()  # tosses, if nature is against it
+      ([2.0, 0.0], [0.5, 0.5, 1.0])
+    """
+    asked = width_asked(tolerance)
+    sides = sides_of(model, policy, objective, nature)
+    model = sides.model
+    target = sides.states(states(model.nominal, target, "target"))
+    earned = sides.rows(interval_reward(model, reward))
+    found = interval_values.total_reward(
+        sides.host, earned, target, maximize=sides.maximize, large=sides.helpful, tolerance=asked
+    )
+    return robust_solution(sides, found, asked, relative=True)
+
+
+def robust_discounted_value(
+    model: Any,
+    reward: Any,
+    discount: float,
+    *,
+    policy: Any = None,
+    objective: str = "max",
+    nature: str | None = None,
+    tolerance: float | None = None,
+) -> Solution:
+    """Discounted value when probabilities lie in intervals.
+
+    ``V(s) = opt_a opt_p sum_t p_t (r(s, a, t) + discount V(t))`` (Iyengar 2005), by policy
+    iteration; the bounds are ``V +- |Phi V - V| / (1 - discount)``, with rounding.
+
+    Args:
+      model: the model, or a game on one.
+      reward: of any sign, as of :func:`~jaxltl.core.models.sparse.row_reward`; on transitions,
+        what nature picks earns it.
+      discount: in ``[0, 1)``.
+      policy, objective, nature: as of :func:`robust_reachability`.
+      tolerance: the width of the enclosure asked for; default 1e-8 of the largest possible value.
+
+    Returns:
+      :class:`Solution`, with `nature`.
+
+    Raises:
+      ValueError: shapes, a direction, the discount, or a reward that is not finite.
+
+    Concrete arrays only, on the host; not differentiable.
+
+    Example:
+      >>> from jaxltl import interval_rows
+      >>> coin = interval_rows(None, [0, 2, 3], [0, 1, 1], [0.25, 0.5, 1], [0.5, 0.75, 1])
+      >>> found = robust_discounted_value(coin, [1.0, 0.0], 0.5)
+      >>> found.value.round(6).tolist(), found.nature.tolist()
+      ([1.142857, 0.0], [0.25, 0.75, 1.0])
+    """
+    try:
+        rate = float(discount)
+    except (TypeError, ValueError):
+        rate = float("nan")
+    if not 0 <= rate < 1:
+        raise ValueError(f"discount={shown(discount)}; it must be at least 0 and below 1.")
+    sides = sides_of(model, policy, objective, nature)
+    earned = sides.entries(entry_reward(sides.model, reward))
+    largest = float(np.abs(earned).max(initial=0)) / (1 - float(discount))
+    asked = 1e-8 * max(largest, 1e-300) if tolerance is None else width_asked(tolerance)
+    found = discounted(
+        sides.host,
+        earned,
+        np.where(sides.choosing, 1.0, float(discount)),
+        maximize=sides.maximize,
+        large=sides.helpful,
+        tolerance=asked,
+    )
+    return robust_solution(sides, found, asked, relative=False)
+
+
+def robust_expectation(
+    model: IntervalMDP, value: Any, *, nature: str = "min"
+) -> tuple[np.ndarray, np.ndarray]:
+    """The expected value of the next state of each choice, as nature makes it.
+
+    ``min_p sum_t p_t value(t)``, or the maximum, over the distributions of each row: mass goes
+    first to the least (largest) values.
+
+    Args:
+      model: the model.
+      value: ``float[S]``, finite.
+      nature: ``"min"`` or ``"max"``.
+
+    Returns:
+      ``float64[R]``, and nature's distributions, ``float64[T]``.
+
+    Raises:
+      ValueError: a direction, the shape of the value, a model without intervals, or a successor's
+        value that is not finite.
+
+    Concrete arrays only, on the host; not differentiable.
+
+    Example:
+      >>> from jaxltl import interval_rows
+      >>> model = interval_rows(None, [0, 2, 3], [0, 1, 1], [.25, .5, 1], [.5, .75, 1])
+      >>> robust_expectation(model, [0.0, 4.0])[0].tolist()
+      [2.0, 4.0]
+    """
+    require_direction(nature, "max")
+    model, _ = world_of(model)
+    require_shape("value", value, model.state_shape)
+    ahead = numbers("value", value)[model.host.mdp.successor]
+    if not np.isfinite(ahead).all():
+        raise ValueError("value is not finite in some successor; give numbers.")
+    p = model.host.nature(ahead, maximize=nature == "max")
+    return model.host.total(p * ahead), p
+
+
+def entry_reward(model: IntervalMDP, reward: Any) -> np.ndarray:
+    """What each entry earns, ``float64[T]``.
+
+    Raises:
+      ValueError: some of it is not finite.
+    """
+    given = reward_parts(model.nominal, reward)
+    host = model.nominal.host
+    apart = row_reward(model.nominal, Rewards(state=given.state, choice=given.choice))
+    earned = apart[host.row]
+    if given.transition is not None:
+        earned = earned + np.asarray(given.transition, np.float64)
+    if not np.isfinite(earned).all():
+        row = int(host.row[np.flatnonzero(~np.isfinite(earned))[0]])
+        raise ValueError(
+            f"the reward of state {host.state[row]}, choice "
+            f"{row - int(host.row_start[host.state[row]])} is not finite."
+        )
+    return earned
+
+
+def interval_reward(model: IntervalMDP, reward: Any) -> np.ndarray:
+    """The reward of each choice, ``float64[R]``.
+
+    Raises:
+      ValueError: it is negative or not finite, or depends on the successor that nature picks.
+    """
+    earned = row_reward(model.nominal, reward)
+    bad = ~((earned >= 0) & np.isfinite(earned))
+    if bad.any():
+        row = int(np.flatnonzero(bad)[0])
+        state = int(model.nominal.host.state[row])
+        raise ValueError(
+            f"the reward of state {state}, choice "
+            f"{row - int(model.nominal.row_start[state])} is {earned[row]}; it must "
+            "be finite and at least 0."
+        )
+    of = reward_parts(model.nominal, reward).transition
+    if of is not None:
+        each = np.asarray(of)
+        start = model.nominal.host.entry_start[:-1]
+        differs = np.maximum.reduceat(each, start) != np.minimum.reduceat(each, start)
+        loose = np.logical_or.reduceat(model.host.lower < model.host.upper, start)
+        if (differs & loose).any():
+            row = int(np.flatnonzero(differs & loose)[0])
+            raise ValueError(
+                f"the reward of row {row} differs between its successors, whose probabilities are "
+                "intervals; put it on states that are entered, or on choices."
+            )
+    return earned
+
+
+def robust_solution(sides: Sides, found: Robust, tolerance: float, *, relative: bool) -> Solution:
+    """What the host found, with its status."""
+    size = sides.model.num_states
+    value, lower, upper = (x[:size] for x in (found.value, found.lower, found.upper))
+    status = status_between(lower, upper, tolerance, relative=relative)
+    row, chance = found.row, found.probability
+    if sides.spread is not None:
+        row = sides.spread.policy(row, chance)
+        chance = sides.spread.nature(chance, np.asarray(sides.model.nominal.probability))
+    policy = np.asarray(row.astype(np.int32) if sides.policy is None else sides.policy)
+    parts: dict[str, Any] = {
+        "value": value,
+        "policy": policy,
+        "nature": chance,
+        "lower": lower,
+        "upper": upper,
+        "residual": np.float64(found.residual),
+        "num_steps": np.int32(found.rounds),
+        "status": np.int32(status),
+    }
+    return Solution(**parts, method=Method(found.method))
+
+
+class Sides(NamedTuple):
+    """A question with the wishes of all who choose.
+
+    Attributes:
+      model: the model that was asked about.
+      host: the one that is solved, in which a policy and nature choose.
+      maximize, helpful: whether the policy, and nature, make a value large.
+      spread: how the one became the other, where they differ.
+      policy: the policy that was given.
+    """
+
+    model: Any
+    host: HostInterval
+    maximize: bool
+    helpful: bool
+    spread: Spread | None
+    policy: Any
+
+    @property
+    def choosing(self) -> np.ndarray:
+        """``bool[R']``, the rows by which nature chooses among rows, in no time."""
+        if self.spread is None:
+            return np.zeros(self.host.mdp.num_rows, bool)
+        return self.spread.row < 0
+
+    @property
+    def added(self) -> np.ndarray:
+        """``bool[S']``, the states that were not there."""
+        return np.arange(self.host.mdp.num_states) >= self.model.num_states
+
+    def states(self, quantity: np.ndarray) -> np.ndarray:
+        """``bool[S']``, nothing of what is new."""
+        return np.append(quantity, np.zeros(np.count_nonzero(self.added), bool))
+
+    def entries(self, quantity: np.ndarray) -> np.ndarray:
+        """``float64[T']``, nothing where nature chooses."""
+        if self.spread is None:
+            return quantity
+        return np.where(self.spread.entry < 0, 0, quantity[self.spread.entry])
+
+    def rows(self, quantity: np.ndarray) -> np.ndarray:
+        """``float64[R']``, nothing where nature chooses."""
+        if self.spread is None:
+            return quantity
+        return np.where(self.choosing, 0, quantity[self.spread.row])
+
+
+def sides_of(model: Any, policy: Any, objective: str, nature: str | None) -> Sides:
+    """Who chooses what, and what for.
+
+    Args:
+      model: an IntervalMDP, or a game on one or on a sparse model.
+      policy: rows ``int[S]``, or weights ``float[R]``, or None.
+      objective, nature: directions; of a game, the system's and nature's.
+    """
+    world, system = world_of(model)
+    if policy is None:
+        return host_sides(world.host, system, objective, nature)._replace(model=world)
+    helpful = require_direction(nature, objective) == "max"
+    parted = _under(world, np.asarray(policy), True if system is None else system)
+    # What is left to choose is the environment's, against the policy.
+    against = helpful if system is None else objective == "min"
+    return Sides(world, parted.model, against, helpful, parted, policy)
+
+
+def world_of(model: Any) -> tuple[IntervalMDP, np.ndarray | None]:
+    """The interval model, and of a game the states where the system moves.
+
+    Raises:
+      ValueError: the model, or what a game is on, is none.
+    """
+    world = model.mdp if isinstance(model, Game) else model
+    if isinstance(world, SparseMDP) and isinstance(model, Game):
+        world = make_interval(world, world.probability, world.probability)
+    if not isinstance(world, IntervalMDP):
+        raise ValueError(
+            f"{type(world).__name__} has no intervals; give an IntervalMDP, or a game "
+            "on one or on a SparseMDP."
+        )
+    return world, np.asarray(model.system, bool) if isinstance(model, Game) else None
+
+
+def host_sides(
+    host: HostInterval, system: np.ndarray | None, objective: str, nature: str | None
+) -> Sides:
+    """:func:`sides_of` on the host, without a policy."""
+    helpful = require_direction(nature, objective) == "max"
+    maximize = objective == "max"
+    if system is None:
+        return Sides(None, host, maximize, helpful, None, None)
+    # Who wants what nature wants becomes nature, and the other one is the policy.
+    rows = np.ones(host.mdp.num_rows)
+    parted = spread(host, system if maximize == helpful else ~system, 0 * rows, rows)
+    return Sides(None, parted.model, not helpful, helpful, parted, None)
+
+
+def _under(model: IntervalMDP, policy: np.ndarray, where: Any) -> Spread:
+    """The model in which a policy's choices are made, in all states or those of one player."""
+    host = model.host
+    if is_deterministic(policy) and np.all(where):
+        row_weights(model.nominal, policy)
+        chain, entry = host.chain(policy)
+        return Spread(
+            chain,
+            np.arange(model.num_states),
+            policy.astype(np.int64),
+            entry,
+            np.full(entry.size, -1),
+        )
+    weight = row_weights(model.nominal, policy, where)
+    total = host.mdp.over_choices(np.add, weight)
+    weight = weight / np.where(total > 0, total, 1)[host.mdp.state]
+    return spread(host, np.broadcast_to(where, (model.num_states,)), weight, weight)

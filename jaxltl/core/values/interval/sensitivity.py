@@ -1,0 +1,160 @@
+"""How much the value of an interval model changes with each end of each interval."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxltl.core.array_types import Booleans, Floats, Integers
+from jaxltl.core.models.interval import IntervalMDP, refuse_ball, require_interval
+from jaxltl.core.models.ops.operators import is_deterministic
+from jaxltl.core.pretty_print import brief
+from jaxltl.core.sparse.graph.qualitative import reaching
+from jaxltl.core.sparse.mdp import HostMDP
+from jaxltl.core.types import Solution
+from jaxltl.core.validation import numbers, shown
+from jaxltl.core.values.interval.robust import require_direction
+from jaxltl.core.values.undiscounted.step_bounded import states
+
+
+@brief
+class Sensitivity(NamedTuple):
+    """Derivatives of a value in the ends of intervals, see :func:`robust_sensitivity`.
+
+    Attributes:
+      lower, upper: ``float64[T]``, in units of the value for one of probability.
+
+    Example:
+      >>> change = Sensitivity(lower=np.zeros(2), upper=np.array([0.0, -1.0]))
+      >>> narrower = np.array([0.0, -0.1])  # by how much the upper ends come down
+      >>> (change.upper @ narrower).item()  # what the value gains by it, to first order
+      0.1
+    """
+
+    lower: Floats
+    upper: Floats
+
+
+def robust_sensitivity(
+    model: IntervalMDP,
+    solution: Solution,
+    target: Any,
+    *,
+    nature: str,
+    stay: Any = None,
+    initial: Any = None,
+) -> Sensitivity:
+    """The derivative of the value from the initial distribution in each end of each interval.
+
+    ``dV = sum_s y(s) (v(t) - v(t*)) d end(s, t)`` with y how often each state is visited,
+    ``y = initial + P' y`` under the policy and nature, an end that binds, and t* the successor that
+    is given the rest of the mass: the implicit function theorem, with one sparse system for all
+    ends. Policy and order of successors are held fixed; where neither is tied, this is the
+    derivative, else one of several one-sided ones.
+
+    Args:
+      model: the model.
+      solution: of it: the probability of reaching a target, or the reward until it is reached.
+      target: ``bool[S]``, or the name of a label.
+      nature: ``"min"`` or ``"max"``, what nature made of it.
+      stay: ``bool[S]``, the states that may be passed, if the solution was asked so; default all.
+      initial: ``float[S]``, weights of the states; default the initial distribution.
+
+    Returns:
+      :class:`Sensitivity`. The wider an interval that matters, the more is gained by narrowing it:
+      ``upper * (model.upper - p) + lower * (model.lower - p)`` estimates by how much.
+
+    Raises:
+      ValueError: shapes, a direction, a policy of weights, a model with a radius, or an infinite
+        value from the initial states.
+
+    It is a derivative, and not differentiable itself: concrete arrays only, on the host.
+
+    Example:
+      >>> from jaxltl import make_interval, make_sparse, robust_reachability
+      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
+      >>> model = make_interval(coin, [0.4, 0.3, 1, 1], [0.7, 0.6, 1, 1])
+      >>> goal = [False, True, False]
+      >>> found = robust_reachability(model, goal, nature="min")
+      >>> change = robust_sensitivity(model, found, goal, nature="min", initial=[1, 0, 0])
+      >>> change.lower.tolist(), change.upper.tolist()
+      ([0.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0])
+    """
+    require_direction(nature, "max")
+    refuse_ball(require_interval(model), "robust_sensitivity is about ends")
+    if not isinstance(solution, Solution) or solution.nature is None:
+        raise ValueError(
+            f"solution is {shown(solution)}; give what a solver of interval models "
+            "returned, reachability_probability, say."
+        )
+    goal = states(model.nominal, target, "target")
+    passed = np.ones(goal.size, bool) if stay is None else states(model.nominal, stay, "stay")
+    weight = numbers("initial", model.initial if initial is None else initial)
+    value, policy = np.asarray(solution.value, np.float64), np.asarray(solution.policy)
+    if weight.shape != goal.shape or value.shape != goal.shape:
+        raise ValueError(
+            f"initial has shape {weight.shape} and the solution's value "
+            f"{value.shape}; expected {goal.shape}, one for each state."
+        )
+    if policy.shape != goal.shape or not is_deterministic(policy):
+        raise ValueError(
+            "the solution's policy is no row for each state; weights have no single "
+            "order of successors."
+        )
+    if not np.isfinite(value[weight > 0]).all():
+        raise ValueError(
+            "the value from an initial state is infinite, which no end changes a little."
+        )
+    host = model.host
+    value = np.where(np.isfinite(value), value, 0)
+    ahead = value[host.mdp.successor]
+    chain, entry = host.chain(policy)
+    chance = np.asarray(solution.nature, np.float64)[entry]
+    visits = _visits(chain.fixed(chance), goal, passed, weight)
+    change, given = _against_the_rest(host, ahead, nature == "max")
+    taken = np.zeros(host.mdp.num_rows)
+    taken[policy] = visits
+    change = np.where(taken[host.mdp.row] > 0, change * taken[host.mdp.row], 0)
+    return Sensitivity(np.where(given, 0, change), np.where(given, change, 0))
+
+
+def _visits(chain: HostMDP, goal: Booleans, stay: Booleans, weight: Floats) -> Floats:
+    """How often each state is visited before a goal is reached or lost: ``float64[S]``."""
+    from scipy.sparse import csc_array, eye_array
+    from scipy.sparse.linalg import splu
+
+    open_ = reaching(chain, goal, stay[chain.state]) & stay & ~goal
+    states: Integers = np.flatnonzero(open_)
+    found = np.zeros(goal.size)
+    if not (weight[states] != 0).any():
+        return found
+    number = np.cumsum(open_) - 1
+    kept = open_[chain.state[chain.row]] & open_[chain.successor]
+    place = number[chain.successor[kept]], number[chain.state[chain.row[kept]]]
+    shape = (states.size, states.size)
+    back = csc_array((chain.probability[kept], place), shape=shape)
+    found[states] = splu((eye_array(states.size, format="csc") - back).tocsc()).solve(
+        weight[states]
+    )
+    return found
+
+
+def _against_the_rest(host: Any, ahead: Floats, maximize: bool) -> tuple[Floats, Booleans]:
+    """How much better each entry is than the one that is given the rest of its row's mass.
+
+    Returns:
+      ``float64[T]``, and ``bool[T]``: whether its upper end binds, else the lower one.
+    """
+    mdp = host.mdp
+    start, far = mdp.entry_start[:-1], np.inf
+    key = -ahead if maximize else ahead
+    p = host.nature(ahead, maximize=maximize)
+    free = host.upper > host.lower
+    short = free & (p < host.upper)  # those that are not given all that they may take
+    rest = np.minimum.reduceat(np.where(short, key, far), start)
+    # Where all are, the last of them is the one that would get more.
+    last = np.maximum.reduceat(np.where(free, key, -far), start)
+    rest = np.where(np.isfinite(rest), rest, np.where(np.isfinite(last), last, key[start]))
+    change = key - rest[mdp.row]
+    return (-change if maximize else change), change < 0

@@ -1,0 +1,199 @@
+"""What can be had in so many steps when probabilities lie in intervals, enclosed."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from jaxltl.core.models.interval import IntervalMDP, require_interval
+from jaxltl.core.sparse.interval import step_bounded as interval_bounded
+from jaxltl.core.sparse.interval.step_bounded import RobustSteps
+from jaxltl.core.types import Method, Solution
+from jaxltl.core.validation import whole
+from jaxltl.core.values.interval.robust import entry_reward, require_direction
+from jaxltl.core.values.undiscounted.step_bounded import enclosed, state_reward, states
+
+
+def robust_next_probability(
+    model: IntervalMDP, target: Any, *, objective: str = "max", nature: str | None = None
+) -> Solution:
+    """Probability that the next state is in a set, when probabilities lie in intervals.
+
+    ``opt_a opt_p sum_t p_t [t in target]``, p among the distributions of row a.
+
+    Args:
+      model: the model.
+      target: ``bool[S]``, or the name of a label.
+      objective: ``"max"`` or ``"min"``, what the policy makes of the probability.
+      nature: ``"min"`` or ``"max"``, what nature makes of it; default: the opposite.
+
+    Returns:
+      :class:`~jaxltl.core.types.Solution`, exactly 0 or 1 where supports say so.
+
+    Raises:
+      ValueError: the target, or a direction.
+
+    Concrete arrays only, on the host; not differentiable.
+
+    Example:
+      >>> from jaxltl import interval_rows
+      >>> coin = interval_rows(None, [0, 2, 3], [0, 1, 1], [0.25, 0.5, 1], [0.5, 0.75, 1])
+      >>> robust_next_probability(coin, [False, True]).value.tolist()
+      [0.5, 1.0]
+    """
+    nature = require_direction(nature, objective)
+    chosen = states(require_interval(model).nominal, target, "target")
+    return _solution(
+        interval_bounded.next_step(
+            model.host, chosen, maximize=objective == "max", helpful=nature == "max"
+        )
+    )
+
+
+def robust_bounded_reachability(
+    model: IntervalMDP,
+    target: Any,
+    num_steps: int,
+    *,
+    stay: Any = None,
+    objective: str = "max",
+    nature: str | None = None,
+) -> Solution:
+    """Probability to reach a set within so many steps, when probabilities lie in intervals.
+
+    ``x_0 = [s in target]``, and ``x_{k+1}(s) = 1`` on the target, ``opt_a opt_p sum_t p_t x_k(t)``
+    where one may stay, else 0; nature picks anew in each step (Givan, Leach and Dean 2000).
+
+    Args:
+      model: the model.
+      target: ``bool[S]``, or the name of a label.
+      num_steps: how many steps there are at most.
+      stay: ``bool[S]`` or a label, what must hold before the target is reached; default anything.
+      objective, nature: as of :func:`robust_next_probability`.
+
+    Returns:
+      :class:`~jaxltl.core.types.Solution`; `policy` and `nature` are of the first
+      step, with all steps left.
+
+    Raises:
+      ValueError: a shape, a direction, or a negative number of steps.
+
+    Concrete arrays only, on the host; not differentiable.
+
+    Example:
+      >>> from jaxltl import interval_rows
+      >>> coin = interval_rows(None, [0, 2, 3], [0, 1, 1], [0.25, 0.5, 1], [0.5, 0.75, 1])
+      >>> robust_bounded_reachability(coin, [False, True], 2, nature="max").value.tolist()
+      [0.9375, 1.0]
+    """
+    nature, steps = require_direction(nature, objective), whole("num_steps", num_steps)
+    goal = states(require_interval(model).nominal, target, "target")
+    free = np.ones_like(goal) if stay is None else states(model.nominal, stay, "stay")
+    return _solution(
+        interval_bounded.until(
+            model.host, goal, free, steps, maximize=objective == "max", helpful=nature == "max"
+        )
+    )
+
+
+def robust_cumulative_reward(
+    model: IntervalMDP,
+    reward: Any,
+    num_steps: int,
+    *,
+    objective: str = "max",
+    nature: str | None = None,
+) -> Solution:
+    """Expected reward of the next so many steps, when probabilities lie in intervals.
+
+    ``x_{k+1}(s) = opt_a opt_p sum_t p_t (r(s, a, t) + x_k(t))`` from ``x_0 = 0``; nature picks anew
+    in each step.
+
+    Args:
+      model: the model.
+      reward: as for :func:`~jaxltl.core.models.sparse.row_reward`; finite, of any sign.
+      num_steps: how many steps.
+      objective, nature: as of :func:`robust_next_probability`.
+
+    Returns:
+      :class:`~jaxltl.core.types.Solution`, as of :func:`robust_bounded_reachability`.
+
+    Raises:
+      ValueError: the reward, a direction, or a negative number of steps.
+
+    Concrete arrays only, on the host; not differentiable.
+
+    Example:
+      >>> from jaxltl import interval_rows
+      >>> coin = interval_rows(None, [0, 2, 3], [0, 1, 1], [0.25, 0.5, 1], [0.5, 0.75, 1])
+      >>> robust_cumulative_reward(coin, [1.0, 0.0], 2, nature="max").value.tolist()
+      [1.5, 0.0]
+    """
+    zero = np.zeros(require_interval(model).num_states)
+    return _earned(model, entry_reward(model, reward), zero, num_steps, objective, nature)
+
+
+def robust_instantaneous_reward(
+    model: IntervalMDP,
+    reward: Any,
+    num_step: int,
+    *,
+    objective: str = "max",
+    nature: str | None = None,
+) -> Solution:
+    """Expected reward of the state in which one is after so many steps, with intervals.
+
+    ``x_{k+1}(s) = opt_a opt_p sum_t p_t x_k(t)`` from the rewards of states ``x_0 = r``.
+
+    Args:
+      model: the model.
+      reward: as for :func:`~jaxltl.core.values.undiscounted.step_bounded.instantaneous_reward`.
+      num_step: after how many steps.
+      objective, nature: as of :func:`robust_next_probability`.
+
+    Returns:
+      :class:`~jaxltl.core.types.Solution`, as of :func:`robust_bounded_reachability`.
+
+    Raises:
+      ValueError: the reward has no part on states, or as for :func:`robust_cumulative_reward`.
+
+    Concrete arrays only, on the host; not differentiable.
+
+    Example:
+      >>> from jaxltl import interval_rows
+      >>> coin = interval_rows(None, [0, 2, 3], [0, 1, 1], [0.25, 0.5, 1], [0.5, 0.75, 1])
+      >>> robust_instantaneous_reward(coin, [1.0, 0.0], 2, nature="max").value.tolist()
+      [0.25, 0.0]
+    """
+    start = state_reward(require_interval(model).nominal, reward)
+    zero = np.zeros(model.num_transitions)
+    return _earned(model, zero, start, num_step, objective, nature)
+
+
+def _earned(
+    model: IntervalMDP,
+    earned: Any,
+    start: Any,
+    num_steps: int,
+    objective: str,
+    nature: str | None,
+) -> Solution:
+    nature, steps = require_direction(nature, objective), whole("num_steps", num_steps)
+    return _solution(
+        interval_bounded.total(
+            model.host, earned, start, steps, maximize=objective == "max", helpful=nature == "max"
+        ),
+        highest=math.inf,
+    )
+
+
+def _solution(found: RobustSteps, highest: float = 1) -> Solution:
+    """What sweeps found, enclosed."""
+    nature: Any = found.probability
+    solution = enclosed(
+        found.value, found.error, found.row.astype(np.int32), found.num_steps, highest=highest
+    )
+    return replace(solution, nature=nature, method=Method("step by step"))

@@ -1,0 +1,275 @@
+"""Objectives, and the model beside what it takes to know how each of them stands."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxltl.core.automata.runs import live_states, universal_states
+from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.pretty_print import brief
+from jaxltl.core.sparse.multi_objective.weighted_sum import Sums
+from jaxltl.core.sparse.product import HostProduct, host_product
+from jaxltl.core.values import facts
+from jaxltl.core.values.undiscounted.sparse_satisfaction import automaton_of
+from jaxltl.core.values.undiscounted.step_bounded import finite_reward, states
+
+_MOST = 8  # probabilities at once, of which all sets are looked at
+
+
+@brief(facts=facts.objective)
+@dataclass(frozen=True, eq=False)
+class Objective:
+    """One of several objectives: a probability or an expected reward.
+
+    Give one of ``formula`` (the probability of an LTL formula), ``avoid`` (never to enter a set),
+    ``reward`` (the expected total; with a target until that is reached, which then every policy
+    that counts does almost surely), or ``target`` alone (to reach a set, through `stay`).
+
+    Attributes:
+      formula: a formula, its text, or an automaton.
+      target: ``bool[S]``, or the name of a label.
+      stay: with a target, ``bool[S]`` or a label: what must hold until then.
+      avoid: ``bool[S]``, or the name of a label.
+      reward: as for :func:`~jaxltl.core.models.sparse.row_reward`, not negative.
+      direction: ``"max"`` or ``"min"``.
+      threshold: at least that, or at most that for ``"min"``; None to optimise.
+
+    Raises:
+      ValueError: on use, in :func:`~jaxltl.core.values.multi_objective.multi_objective.achievable` and the like:
+        none or several of the four are given, or a direction, a label or a shape is wrong.
+
+    Example:
+      >>> from jaxltl import make_sparse, multi_objective
+      >>> model = make_sparse([0, 2, 3, 4], [0, 1, 2, 3, 4], [1, 2, 1, 2], [1, 1, 1, 1],
+      ...                     initial=[1, 0, 0], label={"a": [1], "b": [2]})
+      >>> wanted = [Objective(formula="F G a"), Objective(target="b", threshold=0.25)]
+      >>> round(multi_objective(model, wanted).value, 6)
+      0.75
+    """
+
+    formula: Any = None
+    target: Any = None
+    stay: Any = None
+    avoid: Any = None
+    reward: Any = None
+    direction: str = "max"
+    threshold: float | None = None
+
+
+@brief
+class Part(NamedTuple):
+    """How an objective is counted.
+
+    Attributes:
+      number: its number, from 0.
+      kind: ``"sure"`` for a probability, ``"gain"`` for a reward to be made large, ``"cost"``.
+      place: which of those of its kind it is.
+      sign: 1 to be made large, -1 small.
+      open: ``bool[N]``, of a reward with a target, where that is not reached yet.
+    """
+
+    number: int
+    kind: str
+    place: int
+    sign: int
+    open: np.ndarray | None
+
+
+class _Tracker(NamedTuple):
+    """What is remembered for an objective.
+
+    Attributes:
+      delta: ``int[Q, L]``.
+      letter: ``int[S]``.
+      first: the memory before anything is read.
+      decided: ``bool[Q]``, where nothing changes the verdict any more.
+      priority: ``int[Q, L]`` of reading a letter, of the event to be made likely; None of a reward.
+      verdict: ``int[Q]``, the priority of decided memories.
+    """
+
+    delta: np.ndarray
+    letter: np.ndarray
+    first: int
+    decided: np.ndarray
+    priority: np.ndarray | None
+    verdict: np.ndarray | None
+
+
+def sums_of(
+    model: SparseMDP, objectives: Sequence[Objective]
+) -> tuple[Sums, list[Part], HostProduct]:
+    """The objectives as sums on the model beside what they remember, as far as it is reached."""
+    rewards = [_checked(model, i, o) for i, o in enumerate(objectives)]
+    trackers = [_tracker(model, o, r is not None) for o, r in zip(objectives, rewards, strict=True)]
+    used = [i for i, x in enumerate(trackers) if x is not None]
+    if sum(r is None for r in rewards) > _MOST:
+        raise ValueError(
+            f"there are {sum(r is None for r in rewards)} probabilities; at most "
+            f"{_MOST} can be had at once."
+        )
+    product, members = _product(
+        model,
+        [x for x in trackers if x is not None],
+        all(
+            o.target is not None for o, r in zip(objectives, rewards, strict=True) if r is not None
+        ),
+    )
+    mdp = product.host
+    state = members[product.memory]  # int[N, trackers]
+    still = product.still
+    parts: list[Part] = []
+    found: dict[str, list[np.ndarray]] = {"sure": [], "gain": [], "cost": []}
+    ended = np.ones(mdp.num_states, bool)
+    for i, (objective, reward) in enumerate(zip(objectives, rewards, strict=True)):
+        tracker, sign = trackers[i], 1 if objective.direction == "max" else -1
+        memory = None if tracker is None else state[:, used.index(i)]
+        open_ = None
+        if reward is not None:
+            kind = "gain" if sign > 0 else "cost"
+            counted = reward[product.base_row]
+            if tracker is not None and memory is not None:
+                open_ = ~tracker.decided[memory]
+                ended &= ~open_
+                counted = np.where(open_[mdp.state], counted, 0)
+        else:
+            assert tracker is not None and memory is not None
+            kind, counted = "sure", _priorities(product, tracker, memory, still)
+        parts.append(Part(i, kind, len(found[kind]), sign, open_))
+        found[kind].append(counted)
+    initial = np.asarray(model.initial, np.float64)
+    start = np.zeros(mdp.num_states)
+    start[product.start] = initial[initial > 0]
+    shape = (-1, mdp.num_rows)
+    return (
+        Sums(
+            mdp,
+            start,
+            np.array(found["sure"], np.int64).reshape(shape),
+            np.array(found["gain"], np.float64).reshape(shape),
+            np.array(found["cost"], np.float64).reshape(shape),
+            ended,
+        ),
+        parts,
+        product,
+    )
+
+
+def _checked(model: SparseMDP, index: int, objective: Objective) -> np.ndarray | None:
+    """The expected reward of rows, if it is one of rewards."""
+    name = f"objective {index + 1}"
+    if objective.direction not in ("max", "min"):
+        raise ValueError(f'{name}: direction={objective.direction!r}; it must be "max" or "min".')
+    given = [n for n in ("formula", "avoid", "reward") if getattr(objective, n) is not None]
+    if len(given) > 1 or (not given and objective.target is None):
+        raise ValueError(
+            f"{name}: give one of formula, avoid, reward or target; it has "
+            f"{', '.join(given) or 'none'}."
+        )
+    if given and given[0] != "reward" and objective.target is not None:
+        raise ValueError(f"{name}: a target goes with a reward or alone, not with {given[0]}.")
+    if objective.stay is not None and (given or objective.target is None):
+        raise ValueError(f"{name}: stay goes with the probability of a target.")
+    if objective.reward is None:
+        return None
+    reward = finite_reward(model, objective.reward)[0]
+    if (reward < 0).any():
+        r = int(np.flatnonzero(reward < 0)[0])
+        raise ValueError(
+            f"{name}: the reward of a choice of state {model.host.state[r]} is {reward[r]:.6g}; "
+            "expected total rewards need rewards of at least 0."
+        )
+    return reward
+
+
+def _tracker(model: SparseMDP, objective: Objective, is_reward: bool) -> _Tracker | None:
+    opposite = objective.direction == "min"
+    if objective.formula is not None:
+        automaton, letter = automaton_of(model, objective.formula)
+        yes, no = universal_states(automaton), ~live_states(automaton)
+        return _Tracker(
+            automaton.delta,
+            letter,
+            int(automaton.initial),
+            yes | no,
+            automaton.priority + opposite,
+            np.where(yes, 0, 1) + opposite,
+        )
+    if is_reward and objective.target is None:
+        return None
+    if objective.avoid is not None:
+        target, opposite = states(model, objective.avoid, "avoid"), not opposite
+    else:
+        target = states(model, objective.target, "target")
+    letter = target.astype(np.int64)
+    if objective.stay is not None:
+        letter[~states(model, objective.stay, "stay") & ~target] = 2
+    # Open, met, missed.
+    delta = np.array([[0, 1, 2], [1, 1, 1], [2, 2, 2]])
+    decided = np.array([False, True, True])
+    if is_reward:
+        return _Tracker(delta, letter, 0, decided, None, None)
+    return _Tracker(
+        delta,
+        letter,
+        0,
+        decided,
+        np.where(delta == 1, 0, 1) + opposite,
+        np.array([1, 0, 1]) + opposite,
+    )
+
+
+def _product(
+    model: SparseMDP, trackers: list[_Tracker], all_end: bool
+) -> tuple[HostProduct, np.ndarray]:
+    """The model beside all trackers, and the memory of each in each joint one, ``int[J, n]``."""
+    first = np.flatnonzero(np.asarray(model.initial) > 0)
+    letters: Any = np.zeros((model.num_states, len(trackers)), np.int64)
+    for i, x in enumerate(trackers):
+        letters[:, i] = x.letter
+    shown, letter = np.unique(letters, axis=0, return_inverse=True)
+    letter = letter.reshape(-1)
+
+    def after(members: np.ndarray, read: np.ndarray) -> np.ndarray:
+        return (
+            np.stack([x.delta[members[:, i], read[:, i]] for i, x in enumerate(trackers)], -1)
+            if trackers
+            else members
+        )
+
+    begin = np.tile([x.first for x in trackers], (first.size, 1)).reshape(first.size, -1)
+    begin = after(begin.astype(np.int64), letters[first])
+    known: Any = np.zeros((0, len(trackers)), np.int64)
+    frontier, steps = np.unique(begin, axis=0), []
+    codes: dict[tuple[int, ...], int] = {}
+    while len(frontier):
+        for member in frontier.tolist():
+            codes[tuple(member)] = len(codes)
+        known = np.vstack([known, frontier])
+        reached = after(np.repeat(frontier, len(shown), 0), np.tile(shown, (len(frontier), 1)))
+        steps.append(reached)
+        new = [x for x in map(tuple, np.unique(reached, axis=0).tolist()) if x not in codes]
+        frontier = np.array(new, np.int64).reshape(len(new), len(trackers))
+    delta = np.array([codes[tuple(x)] for x in np.vstack(steps).tolist()]).reshape(
+        len(known), len(shown)
+    )
+    still = np.full(len(known), all_end)
+    for i, x in enumerate(trackers):
+        still &= x.decided[known[:, i]]
+    memory = np.array([codes[tuple(x)] for x in begin.tolist()])
+    return host_product(model.host, delta, letter, first, memory, still=still), known
+
+
+def _priorities(
+    product: HostProduct, tracker: _Tracker, memory: np.ndarray, still: np.ndarray
+) -> np.ndarray:
+    """The least priority that each row reads, ``int[R']``."""
+    mdp = product.host
+    assert tracker.priority is not None and tracker.verdict is not None
+    read = product.entry_letter(tracker.letter, True)
+    of_entry = tracker.priority[memory[mdp.state[mdp.row]], read]
+    least = np.minimum.reduceat(of_entry, mdp.entry_start[:-1])
+    return np.where(still[mdp.state], tracker.verdict[memory[mdp.state]], least)

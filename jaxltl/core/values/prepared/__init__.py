@@ -1,0 +1,1 @@
+"""One question solved with many numbers, inside jit, vmap and grad."""

@@ -1,0 +1,312 @@
+"""Bounds from both sides of blocks with circles: values that rise, then policy iteration.
+
+A lower bound rises from zero, and what is a little above it is an upper bound once a pass does not
+raise it (Hartmanns and Kaminski 2020). Where that takes long, policies are evaluated by Krylov
+steps on passes (Howard 1960), of the problem in which every step costs a little more: its solution
+is a bound by one application of the operator, and its policy attains a bound that the policy's
+expected time proves. Each bound is rounded outwards.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxltl.core.values.engine.block_sweeps import Blocks, Chosen, images, sweep
+
+SLACK = 1e6  # smallest numbers that a guess is above nothing
+_NEAR = 0.9  # of the width asked for, how far the first guess of a bound is from the other
+_FINER = 0.25  # how much nearer values come before the next guess
+_PATIENCE = 20  # passes, and a quarter of those before, until a guess is given up
+_PASSES = 100  # until policy iteration is tried
+_ROUNDS = 40  # of it
+_HASTY = 15  # of them, which go on by passes; then its own improvement alone, which must end
+_SWEEPS = 12
+_AIM = 0.1  # of the tolerance: how much of it the extra cost of the steps may take
+_KEPT = 0.75  # of the extra cost: who gains less stays, and the rest is what proves the bound
+
+
+class Problem(NamedTuple):
+    """Blocks on circles, in a system.
+
+    Attributes:
+      core: the blocks.
+      given: options of :func:`~jaxltl.core.values.engine.block_sweeps.sweep`.
+      unit, least: what a sum loses, as a share and besides.
+      tolerance: the width asked for.
+      relative: whether that is a share of the value.
+    """
+
+    core: Blocks
+    given: dict[str, Any]
+    unit: float
+    least: float
+    tolerance: jax.Array
+    relative: bool
+
+    @property
+    def span(self) -> slice:
+        return slice(self.core.first, self.core.last)
+
+    @property
+    def ceiling(self) -> float:
+        """What no value exceeds."""
+        return jnp.inf if self.relative else 1.0
+
+
+class State(NamedTuple):
+    """Values of all places, ``float[N + 3]``, and how they came about."""
+
+    low: jax.Array
+    high: jax.Array
+    guessed: jax.Array
+    proven: jax.Array
+    near: jax.Array  # how little values move before a guess
+    wide: jax.Array  # how far a guess is above
+    since: jax.Array
+    steps: jax.Array
+    moved: jax.Array
+
+
+def enclose_circles(
+    problem: Problem, low: jax.Array, high: jax.Array, max_steps: jax.Array
+) -> State:
+    """Encloses the values on circles.
+
+    Args:
+      problem: the blocks.
+      low, high: ``float[N + 3]``, bounds before the circles, and zero on them.
+      max_steps: passes at most.
+
+    Returns:
+      Bounds; where nothing is proven, the upper one is the largest value there is.
+    """
+    none, zero = jnp.asarray(False), jnp.asarray(0, jnp.int32)
+    tolerance = problem.tolerance
+    state = State(
+        low,
+        high,
+        none,
+        none,
+        tolerance,
+        _NEAR * tolerance,
+        zero,
+        zero,
+        jnp.full((), jnp.inf, low.dtype),
+    )
+
+    def body(state: tuple[State, jax.Array]) -> tuple[State, jax.Array]:
+        s, tried = state
+        now = ~tried & (s.steps >= _PASSES)
+        s = lax.cond(now, lambda s: _by_policies(problem, s, high), partial(_risen, problem), s)
+        return s, tried | now
+
+    def goes_on(state: tuple[State, jax.Array]) -> jax.Array:
+        s = state[0]
+        return ~s.proven & (s.steps < max_steps) & jnp.all(jnp.isfinite(s.low))
+
+    state, _ = lax.while_loop(goes_on, body, (state, none))
+    top = jnp.where(state.proven, state.high[problem.span], problem.ceiling)
+    return state._replace(high=state.high.at[problem.span].set(top))
+
+
+def _above(problem: Problem, low: jax.Array, high: jax.Array, wide: jax.Array) -> jax.Array:
+    """A guess of an upper bound."""
+    span, given = problem.span, problem.given
+    x = low[span]
+    more = problem.relative
+    x = x * (1 + wide) + SLACK * problem.least if more else jnp.minimum(x + wide, 1)
+    if "keep" in given:
+        x = x * given["keep"][span] + given["put"][span]
+    return high.at[span].set(x)
+
+
+def _risen(problem: Problem, s: State) -> State:
+    """One pass for each side."""
+    span, unit = problem.span, problem.unit
+    down: Any = partial(sweep, factor=1 - unit, shift=-problem.least, **problem.given)
+    up: Any = partial(sweep, factor=1 + unit, shift=problem.least, **problem.given)
+    low = down(problem.core, s.low)[0]
+    high = lax.cond(s.guessed, lambda x: up(problem.core, x)[0], lambda x: x, s.high)
+    new, old = low[span], s.low[span]
+    change = jnp.abs(new - old)
+    if problem.relative:
+        change = change / jnp.maximum(new, SLACK * problem.least)
+    moved = jnp.max(change)
+    proven = s.guessed & jnp.all(high[span] <= s.high[span])
+    crossed = jnp.any(high[span] < new) | jnp.all(high[span] >= s.high[span])
+    failed = s.guessed & ~proven & (crossed | (s.since > _PATIENCE + s.steps // 4))
+    near = jnp.where(failed, s.near * _FINER, s.near)
+    wide = jnp.where(failed & (moved <= 4 * unit), 4 * s.wide, s.wide)
+    guess = (~s.guessed | failed) & (moved <= jnp.maximum(near, 4 * unit))
+    high = jnp.where(guess, _above(problem, low, high, wide), high)
+    guessed = guess | (s.guessed & ~failed)
+    since = jnp.where(guess, 0, s.since + 1)
+    return State(low, high, guessed, proven, near, wide, since, s.steps + 1, moved)
+
+
+# --- policy iteration ---------------------------------------------------------------------------
+
+
+class _Policy(NamedTuple):
+    value: jax.Array
+    rank: jax.Array
+    time: jax.Array
+    extra: jax.Array
+    done: jax.Array  # whether no row gains
+    ended: jax.Array  # and the time of the policy is known
+    rounds: jax.Array
+
+
+class _Choices(NamedTuple):
+    """The rows of the blocks, and what is known of places whatever is chosen there."""
+
+    problem: Problem
+    keep: jax.Array  # zero where `put` is known
+    put: jax.Array
+
+    @property
+    def sign(self) -> float:
+        return 1.0 if self.problem.given["maximize"] else -1.0
+
+    def image(self, outer: jax.Array, x: jax.Array) -> jax.Array:
+        """``c + P x`` of all rows, ``[C, A, B]``."""
+        count, _, _, block = self.problem.core.target.shape
+        found = images(self.problem.core, outer.at[self.problem.span].set(x))
+        return found * self.keep.reshape(count, 1, block) + self.put.reshape(count, 1, block)
+
+    def best(self, image: jax.Array) -> tuple[jax.Array, jax.Array]:
+        rank = jnp.argmax(self.sign * image, axis=1).astype(jnp.int32)
+        return rank, _of(rank, image)
+
+    def system(self, rank: jax.Array) -> Chosen:
+        core = self.problem.core
+        count, _, _, block = core.target.shape
+        target = jnp.take_along_axis(core.target, rank[:, None, None], 1)[:, 0]
+        weight = jnp.take_along_axis(core.weight, rank[:, None, None], 1)[:, 0]
+        inside = (target >= core.first) & (target < core.last)
+        return Chosen(
+            jnp.where(inside, target - core.first, count * block),
+            jnp.where(inside, weight, 0) * self.keep.reshape(count, 1, block),
+            cyclic=True,
+        )
+
+
+def _choices(problem: Problem, dtype: Any) -> _Choices:
+    if "keep" in problem.given:
+        span = problem.span
+        return _Choices(problem, problem.given["keep"][span], problem.given["put"][span])
+    size = problem.core.last - problem.core.first
+    return _Choices(problem, jnp.ones(size, dtype), jnp.zeros(size, dtype))
+
+
+def _of(rank: jax.Array, image: jax.Array) -> jax.Array:
+    """The images of the chosen rows alone."""
+    return jnp.take_along_axis(image, rank[:, None], 1).ravel()
+
+
+def _by_policies(problem: Problem, state: State, high: jax.Array) -> State:
+    """Bounds by policy iteration, or the state as it was."""
+    core, x = problem.core, state.low[problem.span]
+    rows = _choices(problem, x.dtype)
+    sign = rows.sign
+    # What comes in from before lies between its bounds, so each side is proven with its own.
+    middle = state.low.at[: core.first].set((state.low[: core.first] + high[: core.first]) / 2)
+
+    def improve(p: _Policy) -> _Policy:
+        timing = (p.rounds == 1) | p.done
+        residual = _of(p.rank, rows.image(middle, p.value)) + sign * p.extra - p.value
+        found = rows.system(p.rank).solve(jnp.where(timing, 1, residual))
+        time = jnp.where(timing, found, p.time)
+        value = jnp.where(timing, p.value, p.value + found)
+        extra = jnp.where(p.rounds == 1, _extra(problem, value, time, rows.keep), p.extra)
+        now = rows.image(middle, value)
+        rank, optimum = rows.best(now)
+        own = _of(p.rank, now)
+        better = (sign * (optimum - own) > _KEPT * extra).reshape(p.rank.shape) & ~timing
+        exact = jnp.max(jnp.abs(own + sign * extra - value)) <= extra / 16
+        done = p.done | ((p.rounds > 1) & ~jnp.any(better) & exact)
+        hasty = jnp.any(better) & (p.rounds < _HASTY)
+        ahead = partial(_swept, problem, middle, shift=extra * sign, rank=p.rank)
+        rank = lax.cond(hasty, ahead, lambda _: jnp.where(better, rank, p.rank), value)
+        return _Policy(value, rank, time, extra, done, p.done, p.rounds + 1)
+
+    none = jnp.asarray(False)
+    return _proven(
+        rows,
+        state,
+        high,
+        lax.while_loop(
+            lambda p: ~p.ended & (p.rounds < _ROUNDS) & jnp.all(jnp.isfinite(p.value)),
+            improve,
+            _Policy(
+                x,
+                rows.best(rows.image(middle, x))[0],
+                jnp.ones_like(x),
+                jnp.zeros((), x.dtype),
+                none,
+                none,
+                jnp.asarray(0, jnp.int32),
+            ),
+        ),
+    )
+
+
+def _proven(rows: _Choices, state: State, high: jax.Array, p: _Policy) -> State:
+    """The bounds that the last policy proves, or the state as it was."""
+    problem, sign, time = rows.problem, rows.sign, p.time
+    core, span = problem.core, problem.span
+    far, near = p.value, p.value - sign * 1.5 * p.extra * time
+    outer_far, outer_near = (high, state.low) if sign > 0 else (state.low, high)
+    beyond = sign * far - sign * rows.best(rows.image(outer_far, far))[1]
+    attained = sign * _of(p.rank, rows.image(outer_near, near)) - sign * near
+    # What is known, and places without a node, which are worth nothing.
+    fixed = (rows.keep == 0) | jnp.all(core.weight == 0, axis=(1, 2)).ravel()
+    far, near = (jnp.where(fixed, rows.put, y) for y in (far, near))
+    slack = problem.unit * jnp.abs(far) * 2 + problem.least
+    onward = time - rows.system(p.rank).image(jnp.concatenate([time, jnp.zeros(3, time.dtype)]))
+    proven = jnp.all(
+        fixed | ((beyond >= slack) & (attained >= slack) & (time >= 0) & (onward >= 0.5))
+    )
+    low, top = (near, far) if sign > 0 else (far, near)
+    proven, low = proven & jnp.all(top >= 0), jnp.maximum(low, 0)
+    width = problem.tolerance * top if problem.relative else problem.tolerance
+    good = proven & jnp.all(top - low <= width)
+    low_, top_ = state.low.at[span].set(low), high.at[span].set(top)
+    return state._replace(
+        low=jnp.where(good, low_, state.low),
+        high=jnp.where(good, top_, state.high),
+        proven=good,
+        steps=state.steps + p.rounds + 1,
+        moved=jnp.where(good, jnp.max(jnp.abs(beyond)), state.moved),
+    )
+
+
+def _swept(
+    problem: Problem,
+    outer: jax.Array,
+    value: jax.Array,
+    *,
+    shift: jax.Array,
+    rank: jax.Array,
+) -> jax.Array:
+    """The greedy rows after some passes, by which news goes on from where policies change."""
+    x: Any = outer.at[problem.span].set(value)
+    going: Any = partial(sweep, problem.core, shift=shift, **problem.given)
+    return lax.fori_loop(0, _SWEEPS, lambda _, c: going(c[0], choose=True), (x, rank))[1]
+
+
+def _extra(problem: Problem, value: jax.Array, time: jax.Array, keep: jax.Array) -> jax.Array:
+    """What every step shall cost besides: little, but more than rounding."""
+    time = jnp.maximum(time, 1)
+    share = 1 / jnp.max(time)
+    if problem.relative:
+        some = (value > SLACK * problem.least) & (keep > 0)
+        share = jnp.min(jnp.where(some, value / time, jnp.inf))
+        share = jnp.where(jnp.isfinite(share), share, 1)
+    most = jnp.maximum(jnp.max(jnp.abs(value)), 1e-30)
+    return jnp.maximum(_AIM * problem.tolerance * share, 32 * problem.unit * most)

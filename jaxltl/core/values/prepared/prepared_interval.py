@@ -1,0 +1,510 @@
+"""Solves of one question about an interval model with many ends, in ``jit``, ``vmap``, ``grad``."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import lax
+
+from jaxltl.core.models.interval import IntervalMDP, refuse_ball, require_interval
+from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
+from jaxltl.core.models.ops.operators import is_deterministic, row_weights
+from jaxltl.core.pretty_print import brief
+from jaxltl.core.sparse.interval.uncertainty_set import HostInterval
+from jaxltl.core.sparse.prepared.interval_plan import (
+    IntervalPlan,
+    plan_reachability,
+    plan_total_reward,
+)
+from jaxltl.core.sparse.rows import spans
+from jaxltl.core.types import Method, Solution, Status, require_shape, status_code
+from jaxltl.core.validation import numbers, shown, whole
+from jaxltl.core.values import facts
+from jaxltl.core.values.engine.implicit_diff import implicit
+from jaxltl.core.values.engine.iterate import in_turn
+from jaxltl.core.values.interval.contest import (
+    Bounds,
+    Contest,
+    chances,
+    enclose,
+    leaving,
+    rounding,
+    system,
+)
+from jaxltl.core.values.interval.robust import interval_reward, require_direction, width_asked
+from jaxltl.core.values.undiscounted.step_bounded import states
+
+_LOOSE = 1e-6  # how far ends may miss a distribution, as in the models
+
+
+@brief(facts=facts.prepared)
+@struct.dataclass
+class PreparedInterval:
+    """A question about an interval model, put in order for solves with other ends.
+
+    Made by :func:`prepare_interval`, read by :func:`solve_prepared_interval`. Give it to a
+    compiled function as an argument. Open states are nodes, of which there are N; the node N is
+    worth 0, N + 1 is worth 1, and N + 2 infinity.
+
+    Attributes:
+      table: ``int32[R', W]``, the entries of the rows that are left, T where there is none.
+      target: ``int32[R', W]``, the nodes that they lead to.
+      owner: ``int32[R']``, the node of each row.
+      row: ``int32[R']``, which row of the model it is.
+      choice: ``int32[N, A]``, the rows of a node; the first one again where it has fewer.
+      first: ``int32[N]``, a row by which it gets out.
+      node: ``int32[S]``, of each state.
+      policy: ``int32[S]``, rows of states that are no nodes, or of all if a policy was given.
+      entry_row: ``int32[T]``, the row of each entry.
+      kept: ``bool[T]``, entries to which nature keeps where values are known.
+      answers: what must stay so: entries, questions, their rows, answers.
+      lower, upper, reward: ``float[T]``, ``float[T]``, ``float[R]``, as they were.
+      question: ``"probability"`` or ``"reward"``, static.
+      objective, nature: ``"max"`` or ``"min"``, static.
+      num_rows: R, static.
+      circling: whether who gets out may stay for ever, static.
+
+    Example:
+      >>> from jaxltl import interval_rows
+      >>> coin = interval_rows(None, [0, 2, 3, 4], [1, 2, 1, 2], [.4, .3, 1, 1], [.7, .6, 1, 1])
+      >>> prepared = prepare_interval(coin, [False, True, False])
+      >>> prepared.objective, prepared.nature, prepared.size, prepared.node.tolist()
+      ('max', 'min', 1, [0, 2, 1])
+    """
+
+    table: Any
+    target: Any
+    owner: Any
+    row: Any
+    choice: Any
+    first: Any
+    node: Any
+    policy: Any
+    entry_row: Any
+    kept: Any
+    answers: Any
+    lower: Any
+    upper: Any
+    reward: Any
+    question: str = struct.field(pytree_node=False)
+    objective: str = struct.field(pytree_node=False)
+    nature: str = struct.field(pytree_node=False)
+    num_rows: int = struct.field(pytree_node=False)
+    circling: bool = struct.field(pytree_node=False)
+
+    @property
+    def num_states(self) -> int:
+        """S, of the model."""
+        return self.node.shape[-1]
+
+    @property
+    def size(self) -> int:
+        """The number N of nodes."""
+        return self.first.shape[-1]
+
+
+def prepare_interval(
+    model: IntervalMDP,
+    target: Any,
+    *,
+    stay: Any = None,
+    reward: Any = None,
+    policy: Any = None,
+    objective: str = "max",
+    nature: str | None = None,
+) -> PreparedInterval:
+    """Decides what the graph of an interval model decides, once, for solves with other ends.
+
+    Args:
+      model: concrete.
+      target: ``bool[S]``, or the name of a label.
+      stay: ``bool[S]``, the states that may be passed before; default all. Not with a reward.
+      reward: asks for the expected total reward until the target; as of
+        :func:`~jaxltl.core.values.interval.robust.robust_total_reward`.
+      policy: ``int32[S]``, rows to be evaluated; default: optimise.
+      objective: ``"max"`` or ``"min"``, what the policy makes of the value.
+      nature: ``"min"`` or ``"max"``, what nature makes of it; default: the opposite of
+        `objective` (for a given policy: ``"min"``).
+
+    Returns:
+      A pytree of arrays. Where ends and rewards are positive is settled, and so is which successors
+      nature may drop wherever that decides what is worth 0, 1 or infinity.
+
+    Raises:
+      ValueError: a shape or a direction is wrong, the model has a radius, a reward is negative, not
+        finite or depends on nature, there is `stay` with a reward, or something is traced.
+
+    Not differentiable: it reads the graph, on the host; :func:`solve_prepared_interval` has the
+    derivatives.
+
+    Example:
+      >>> from jaxltl import make_interval, make_sparse
+      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
+      >>> model = make_interval(coin, [0.4, 0.3, 1, 1], [0.7, 0.6, 1, 1])
+      >>> prepared = prepare_interval(model, [False, True, False])
+      >>> solve = jax.jit(lambda low: solve_prepared_interval(prepared, lower=low).value[0])
+      >>> round(solve(jnp.array([0.5, 0.3, 1, 1])).item(), 3)
+      0.5
+    """
+    if is_traced((model, target, stay, reward, policy)):
+        raise ValueError(
+            "prepare_interval reads its model, so it works on concrete arrays only; "
+            "call it before jit, and solve_prepared_interval inside."
+        )
+    refuse_ball(require_interval(model), "prepare_interval has no rule for its derivatives")
+    if stay is not None and reward is not None:
+        raise ValueError("expected rewards are until the target alone: leave stay out.")
+    nature = require_direction(nature, objective)
+    target = states(model.nominal, target, "target")
+    stay = None if stay is None else states(model.nominal, stay, "stay")
+    host: HostInterval = model.host
+    entry: Any = np.arange(model.num_transitions)
+    if policy is not None:
+        policy = np.asarray(policy)
+        if not is_deterministic(policy):
+            raise ValueError(
+                "prepare_interval takes a policy of rows, int[S]; weights are for "
+                "the host's solvers."
+            )
+        row_weights(model.nominal, policy)  # checks it
+        host, entry = host.chain(policy)
+    up, large = objective == "max", nature == "max"
+    if policy is not None:
+        up = large  # who decides nothing wants what nature wants
+    cost = None if reward is None else interval_reward(model, reward)
+    if cost is None:
+        plan = plan_reachability(host, target, stay, maximize=up, helpful=large)
+    else:
+        mine = cost if policy is None else cost[np.asarray(policy)]
+        plan = plan_total_reward(host, mine, target, maximize=up, large=large)
+    return _prepared(model, host, entry, plan, cost, policy, (objective, nature, up))
+
+
+def _prepared(
+    model: IntervalMDP,
+    host: HostInterval,
+    entry: np.ndarray,
+    plan: IntervalPlan,
+    cost: Any,
+    policy: Any,
+    directions: tuple[str, str, bool],
+) -> PreparedInterval:
+    """The arrays.
+
+    Args:
+      entry: ``int[T']``, which entry of the model each entry of `host` is.
+    """
+    mdp, whole = host.mdp, model.nominal.host
+    dtype = jnp.zeros(()).dtype
+    open_ = np.isnan(plan.known)
+    size = int(open_.sum())
+    node = np.where(plan.known == 1, size + 1, np.where(np.isinf(plan.known), size + 2, size))
+    node[open_] = np.arange(size)
+    rows = plan.rows
+    count = np.diff(mdp.entry_start)[rows]
+    width = int(count.max(initial=1))
+    place = np.repeat(np.arange(rows.size), count), spans(np.zeros_like(count), count)
+    mine = spans(mdp.entry_start[rows], count)
+    nowhere = whole.num_transitions
+    table, target = (np.full((rows.size, width), x, np.int32) for x in (nowhere, size))
+    kept = plan.used[mine]
+    table[place] = np.where(kept, entry[mine], nowhere)
+    target[place] = np.where(kept, node[mdp.successor[mine]], size)
+    owner = node[mdp.state[rows]]
+    each = np.bincount(owner, minlength=size)
+    rank = np.minimum(np.arange(each.max(initial=1)), each[:, None] - 1)
+    start = each.cumsum() - each
+    choice = start[:, None] + rank
+    number = np.full(mdp.num_rows, -1)
+    number[rows] = np.arange(rows.size)
+    origin = np.arange(mdp.num_rows) if policy is None else np.asarray(policy)
+    inside = np.ones(whole.num_transitions, bool)
+    inside[entry] = plan.within
+    objective, nature, _ = directions
+    answers = plan.answers
+    found = PreparedInterval(
+        table=table,
+        target=target,
+        owner=owner.astype(np.int32),
+        row=origin[rows].astype(np.int32),
+        choice=choice.astype(np.int32),
+        first=number[plan.row[open_]].astype(np.int32),
+        node=node.astype(np.int32),
+        policy=origin[plan.row].astype(np.int32),
+        entry_row=whole.row.astype(np.int32),
+        kept=inside,
+        answers=(
+            entry[answers.entry].astype(np.int32),
+            answers.group.astype(np.int32),
+            answers.room,
+            np.diff(whole.entry_start)[origin[answers.row]].astype(np.int32),
+        ),
+        lower=np.asarray(model.lower, dtype),
+        upper=np.asarray(model.upper, dtype),
+        reward=None if cost is None else cost.astype(dtype),
+        question="probability" if cost is None else "reward",
+        objective=objective,
+        nature=nature,
+        num_rows=whole.num_rows,
+        circling=plan.circling,
+    )
+    return to_jax(found)
+
+
+def solve_prepared_interval(
+    prepared: PreparedInterval,
+    *,
+    lower: chex.Array | None = None,
+    upper: chex.Array | None = None,
+    reward: chex.Array | None = None,
+    tolerance: chex.Array | float | None = None,
+    max_steps: chex.Array | int = 100,
+) -> Solution:
+    """The answer to a prepared question about intervals, with other ends where they are given.
+
+    ``x(s) = opt_a opt_p (r(s, a) + sum_t p_t x(t))``, p among the distributions of row a between
+    its ends (Nilim and El Ghaoui 2005, Iyengar 2005), enclosed from both contest, see
+    :mod:`jaxltl.core.values.interval.contest`. Under ``vmap`` lanes are solved one after the other, each in
+    its own number of rounds.
+
+    Args:
+      prepared: the question.
+      lower, upper: ``float[T]``, positive exactly where they were, with a distribution between
+        them in each row.
+      reward: ``float[R]``, at least 0, and positive exactly where it was. Only if one was prepared.
+      tolerance: the width of the enclosure asked for, for rewards as a share of the value; default
+        1e-6 in double precision, 1e-3 in single.
+      max_steps: systems at most, for each side of the enclosure; no more than 100 are solved.
+
+    Returns:
+      :class:`~jaxltl.core.types.Solution`; what the graph decides is exact. Rows are
+      shown for all states but those of infinite value, and nature's distributions for all rows.
+      ``INVALID`` where ends or rewards are not as they must be, or let nature drop other successors
+      than before where that could decide what is worth 0, 1 or infinity; ``UNCERTIFIED`` where a
+      bound could not be proven.
+
+    Raises:
+      ValueError: a shape is wrong, or a reward is given and none was prepared.
+
+    Differentiable, forward and reverse, in the ends and in the rewards, with the policy and the
+    order of each row's successors held fixed: where neither is tied, that is the derivative.
+
+    Example:
+      >>> from jaxltl import interval_rows
+      >>> coin = interval_rows(None, [0, 2, 3, 4], [1, 2, 1, 2], [.4, .3, 1, 1], [.7, .6, 1, 1])
+      >>> prepared = prepare_interval(coin, [False, True, False])
+      >>> value = jax.jit(lambda low: solve_prepared_interval(prepared, lower=low).value[0])
+      >>> round(value(jnp.array([0.5, 0.3, 1, 1])).item(), 3)
+      0.5
+    """
+    if not isinstance(prepared, PreparedInterval):
+        raise ValueError(f"prepared is {shown(prepared)}; give what prepare_interval returns.")
+    shape = prepared.lower.shape
+    lower, upper, reward = (
+        None
+        if x is None
+        else jnp.asarray(x if is_traced(x) else numbers(name, x), prepared.lower.dtype)
+        for name, x in (("lower", lower), ("upper", upper), ("reward", reward))
+    )
+    if not is_traced(max_steps):
+        max_steps = whole("max_steps", max_steps, most=2**31 - 1)
+    if tolerance is not None and not is_traced(tolerance):
+        tolerance = width_asked(tolerance)
+    for name, ends in (("lower", lower), ("upper", upper)):
+        if ends is not None:
+            require_shape(name, ends, shape)
+    if reward is not None:
+        if prepared.reward is None:
+            raise ValueError(
+                "a reward is given, but the question is a probability: prepare it with a reward."
+            )
+        require_shape("reward", reward, prepared.reward.shape)
+    if tolerance is None:
+        tolerance = 1e-6 if prepared.lower.dtype == jnp.float64 else 1e-3
+    return _solve(prepared, lower, upper, reward, tolerance, max_steps)
+
+
+@jax.jit
+def _solve(
+    prepared: PreparedInterval, lower: Any, upper: Any, reward: Any, tolerance: Any, max_steps: Any
+) -> Solution:
+    finite, valid = _checked(prepared, *lax.stop_gradient((lower, upper, reward)))
+    lower = prepared.lower if lower is None else lower
+    upper = prepared.upper if upper is None else upper
+    reward = prepared.reward if reward is None else reward
+    contest = _contest(prepared, lower, upper, reward)
+    tolerance = jnp.asarray(tolerance, lower.dtype)
+    if prepared.size:
+        found = in_turn(enclose, contest, tolerance, jnp.asarray(max_steps, jnp.int32))
+    else:
+        none, proven = jnp.zeros(0, lower.dtype), jnp.asarray(True)
+        found = Bounds(none, none, proven, proven, none, contest.first, contest.lower, jnp.int32(0))
+    return _answer(prepared, contest, found, lower, upper, tolerance, finite, valid)
+
+
+def _checked(
+    prepared: PreparedInterval, lower: Any, upper: Any, reward: Any
+) -> tuple[jax.Array, jax.Array]:
+    """Whether numbers are finite, and whether the same is decided by them."""
+    finite, valid = jnp.asarray(True), jnp.asarray(True)
+    if lower is not None or upper is not None:
+        low = prepared.lower if lower is None else lower
+        high = prepared.upper if upper is None else upper
+        total = partial(
+            jax.ops.segment_sum,
+            segment_ids=prepared.entry_row,
+            num_segments=prepared.num_rows,
+            indices_are_sorted=True,
+        )
+        finite &= jnp.all(jnp.isfinite(low)) & jnp.all(jnp.isfinite(high))
+        slack = max(_LOOSE, 128 * float(jnp.finfo(low.dtype).eps))
+        valid &= jnp.all((low >= 0) & (low <= high) & (high <= 1 + slack))
+        width = total(jnp.ones_like(low))
+        miss = rounding(width, low.dtype)
+        valid &= jnp.all((total(low) <= 1 + miss) & (total(high) >= 1 - miss))
+        valid &= jnp.all((low > 0) == (prepared.lower > 0))
+        valid &= jnp.all((high > 0) == (prepared.upper > 0))
+        entry, group, room, width = prepared.answers
+        if room.shape[0]:
+            parts = partial(
+                jax.ops.segment_sum,
+                segment_ids=group,
+                num_segments=room.shape[0],
+                indices_are_sorted=True,
+            )
+            asked = high[entry]
+            given = parts(asked)
+            # A sum near one has the right sign if no addition rounds, and the same one if nothing
+            # has changed; else it does not tell.
+            grain = 1 / float(jnp.finfo(low.dtype).eps)
+            coarse = parts(jnp.where(asked * grain == jnp.floor(asked * grain), 0, 1)) == 0
+            same = parts(jnp.where(asked == prepared.upper[entry], 0, 1)) == 0
+            clear = jnp.abs(given - 1) > rounding(width, low.dtype)
+            valid &= jnp.all(same | ((clear | coarse) & ((given >= 1) == room)))
+    if reward is not None:
+        finite &= jnp.all(jnp.isfinite(reward))
+        valid &= jnp.all(reward >= 0) & jnp.all((reward > 0) == (prepared.reward > 0))
+    return finite, valid
+
+
+def _contest(prepared: PreparedInterval, lower: Any, upper: Any, reward: Any) -> Contest:
+    """The rows that are left, with their numbers."""
+    low, high = (jnp.append(x, 0)[prepared.table] for x in (lower, upper))
+    is_reward = prepared.question == "reward"
+    cost = -reward[prepared.row] if is_reward else jnp.zeros(prepared.row.shape, low.dtype)
+    wanted = "min" if is_reward else "max"
+    chain = prepared.choice.shape[1] == 1
+    nature = prepared.nature == wanted
+    return Contest(
+        prepared.target,
+        prepared.owner,
+        prepared.choice,
+        prepared.first,
+        low,
+        high,
+        cost,
+        policy_leads=nature if chain else prepared.objective == wanted,
+        nature_leads=nature,
+        relative=is_reward,
+        circling=prepared.circling,
+    )
+
+
+def _answer(
+    prepared: PreparedInterval,
+    contest: Contest,
+    found: Bounds,
+    lower: jax.Array,
+    upper: jax.Array,
+    tolerance: jax.Array,
+    finite: jax.Array,
+    valid: jax.Array,
+) -> Solution:
+    """The answer of the states."""
+    is_reward, dtype = contest.relative, contest.lower.dtype
+    near, far, middle = found.near, found.far, found.middle
+    most = jnp.inf if is_reward else 1.0
+    sign = -1 if is_reward else 1
+    low, high = (sign * x for x in ((far, near) if is_reward else (near, far)))
+    sure = (found.bounded, found.attained) if is_reward else (found.attained, found.bounded)
+    low = jnp.where(sure[0], jnp.clip(low, 0, most), 0)
+    high = jnp.where(sure[1], jnp.clip(high, 0, most), most)
+    middle = jnp.clip(sign * middle, low, high)
+    residual = jnp.max(jnp.abs(_image(contest, middle, sign) - middle), initial=0)
+    value = _attached(contest, found, middle, sign) if prepared.size else middle
+    scale = jnp.where(jnp.isfinite(high), high, 1) if is_reward else 1.0
+    narrow = jnp.all((high - low <= tolerance * scale) & (low <= high))
+    proven = found.attained & found.bounded
+    small = residual <= tolerance * jnp.max(jnp.abs(middle), initial=1 if not is_reward else 0)
+    valid |= ~finite  # of numbers that are none, that is said
+    finite &= jnp.all(jnp.isfinite(lax.stop_gradient(middle)))
+    status = status_code(proven & narrow, finite, proven, valid=valid)
+    status = jnp.where(~proven & small & (status == Status.MAX_STEPS), Status.UNCERTIFIED, status)
+    good = valid & finite
+    ends = jnp.asarray([0, 1, jnp.inf], dtype)
+
+    def everywhere(x: jax.Array, bad: float) -> jax.Array:
+        return jnp.where(good, jnp.concatenate([x, ends]), bad)[prepared.node]
+
+    row, free = prepared.policy, upper - lower
+    if prepared.size:
+        mine = jnp.append(prepared.row[found.row], 0)[jnp.minimum(prepared.node, prepared.size)]
+        row = jnp.where(prepared.node < prepared.size, mine, row)
+    total = partial(
+        jax.ops.segment_sum,
+        segment_ids=prepared.entry_row,
+        num_segments=prepared.num_rows,
+        indices_are_sorted=True,
+    )
+    room = total(jnp.where(prepared.kept, free, 0))
+    rest = jnp.maximum(1 - total(lower), 0)
+    share = jnp.where(room > 0, jnp.minimum(rest / jnp.where(room > 0, room, 1), 1), 0)
+    chance = jnp.where(prepared.kept, lower + free * share[prepared.entry_row], 0)
+    chance = chance.at[prepared.table].set(found.probability, mode="drop")
+    return Solution(
+        value=everywhere(value, jnp.nan),
+        policy=row,
+        nature=lax.stop_gradient(chance),
+        lower=everywhere(low, -jnp.inf),
+        upper=everywhere(high, jnp.inf),
+        residual=jnp.where(good, residual, jnp.nan),
+        num_steps=found.rounds,
+        status=status,
+        method=Method("policy iteration with nature"),
+    )
+
+
+def _image(contest: Contest, x: jax.Array, sign: int) -> jax.Array:
+    """What the operator makes of values."""
+    if not contest.size:
+        return x
+    gain = contest.ahead(sign * x)
+    best = contest.best(jnp.sum(contest.greedy(gain) * gain, axis=1) + contest.cost)[0]
+    return lax.stop_gradient(x + sign * best)
+
+
+def _attached(contest: Contest, found: Bounds, value: jax.Array, sign: int) -> jax.Array:
+    """Values with their implicit derivative: policy and order held fixed."""
+    row, target = found.row, contest.target[found.row]
+    value = lax.stop_gradient(value)
+    key = lax.stop_gradient(contest.ahead(sign * value))[row]
+    p = chances(contest.lower[row], contest.upper[row], contest.key(key))
+    ends = jnp.asarray([0, 1], value.dtype)
+
+    def operator(x: jax.Array) -> jax.Array:
+        return sign * contest.cost[row] + jnp.sum(p * jnp.concatenate([x, ends])[target], axis=1)
+
+    mass, share = lax.stop_gradient(leaving(target, p))
+    solve, transposed = system(target, share)
+    return implicit(
+        operator,
+        value,
+        solve=lambda b: solve(b / mass),
+        transpose_solve=lambda b: transposed(b) / mass,
+    )

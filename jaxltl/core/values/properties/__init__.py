@@ -1,0 +1,1 @@
+"""Model checking: dispatches a property to its solver."""

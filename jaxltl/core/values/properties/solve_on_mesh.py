@@ -1,0 +1,233 @@
+"""Answers to properties of models that lie on the devices of a mesh, and how far they have come.
+
+Bounds are found by sweeps, which a question can be left after and gone on from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import NamedSharding, PartitionSpec
+
+from jaxltl.core.logic.labels import is_boolean, satisfying
+from jaxltl.core.logic.ltl import Formula
+from jaxltl.core.logic.properties import Property
+from jaxltl.core.models.mesh.lanes import on_host
+from jaxltl.core.models.mesh.sharded import ShardedMDP
+from jaxltl.core.models.ops import kernels
+from jaxltl.core.models.product import Product, product
+from jaxltl.core.types import Solution, Status
+from jaxltl.core.values.properties.solve_property import FINER, Answer, as_answer
+from jaxltl.core.values.undiscounted.reachability import reachability_probability
+from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction
+from jaxltl.core.values.undiscounted.total_reward import total_reward
+
+Bounds = tuple[jax.Array, jax.Array]
+
+
+@dataclass(frozen=True)
+class Question:
+    """A property of a sharded model, on its way.
+
+    Attributes:
+      prop: the property.
+      states: ``int[I]``, the initial states, by their numbers in the given model.
+      shape: of the bounds: ``(N,)``, of a product ``(N, Q)``.
+      advance: from bounds, half the width that is asked for and how many steps to make at most: the
+        next solution. Of rewards, where bounds are no help, it is the last.
+      taken: from quantities of `shape`, those of the initial states, ``float64[I]``.
+    """
+
+    prop: Property
+    states: np.ndarray
+    shape: tuple[int, ...]
+    advance: Callable[[Bounds, float, int], Solution]
+    taken: Callable[[jax.Array], np.ndarray]
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether bounds are narrowed step by step."""
+        return self.prop.operator == "P"
+
+    def tolerance(self, wanted: float, part: float = 1.0) -> float:
+        """Half the width to ask for, a little less: bounds have to be as narrow as is wanted."""
+        return 0.49 * wanted * part
+
+    def answer(self, found: Solution, wanted: float) -> Answer:
+        """What a solution says."""
+        names = ("value", "lower", "upper")
+        small: Any = {name: self.taken(getattr(found, name)) for name in names}
+        nobody: Any = np.zeros(0, np.int32)
+        told = replace(found, **small, policy=nobody, status=on_host(found.status))
+        method = "interval iteration" if self.goes_on else "policy iteration by a Krylov method"
+        return as_answer(self.prop, self.states, told, wanted, f"{method} on the mesh")
+
+    def is_answered(self, answer: Answer, part: float) -> bool:
+        """Whether no narrower bounds are to be tried, of those in :data:`FINER`."""
+        return self.prop.relation is None or answer.status == Status.CONVERGED or part <= FINER[-1]
+
+
+def question_on_mesh(model: ShardedMDP, prop: Property) -> Question:
+    """What it takes to answer a property over the devices that a model lies on.
+
+    Args:
+      model: the model.
+      prop: a probability of a formula without bounds on steps or rewards, or an expected reward, or
+        number of steps, until a state is reached.
+
+    Raises:
+      ValueError: an unknown label, a missing direction, or a property that is not answered there.
+    """
+    path = _path(prop)
+    if prop.nature is not None:
+        raise ValueError(f"{prop.text}: the model has no intervals from which nature could pick.")
+    objective = _objective(model, prop)
+    starts = _starts(model)
+    states = np.asarray(on_host(_pick(model, starts, model.number)))
+    if path.operator == "F" and is_boolean(path.operands[0]):
+        holds = satisfying(np.asarray(model.shown), model.propositions, path.operands[0], prop.text)
+        target = _shown_by(model, holds)
+        if prop.operator == "P":
+            advance = partial(_reach, model, target, objective)
+        else:
+            advance = partial(_earn, model, _reward(model, prop), target, objective)
+        return Question(
+            prop,
+            states,
+            model.state_shape,
+            advance,
+            lambda x: np.asarray(on_host(_pick(model, starts, x)), np.float64),
+        )
+    both = product(model, path)
+    return Question(
+        prop,
+        states,
+        both.state_shape,
+        partial(_satisfy, both, objective),
+        lambda x: np.asarray(on_host(_pick_memory(both, starts, x)), np.float64),
+    )
+
+
+def _path(prop: Property) -> Formula:
+    """What is asked for, where it is answered here."""
+    path = prop.path
+    if prop.operator in ("P", "R", "T") and isinstance(path, Formula):
+        return path
+    what = {
+        "LRA": "averages in the long run",
+        "multi": "several objectives",
+        "P": "bounds on steps or rewards",
+    }.get(prop.operator, f"rewards [ {path} ]")
+    raise ValueError(
+        f"{prop.text}: {what} are not solved for over a mesh; probabilities of formulas are, and "
+        "expected rewards and steps until a state is reached (F). Leave --mesh out for this one."
+    )
+
+
+def _reward(model: ShardedMDP, prop: Property) -> Any:
+    """On choices, ``float[N, A]``; where none is named the only one."""
+    if prop.operator == "T":
+        return jax.jit(lambda x: jnp.ones(x.shape, model.dtype))(model.available)
+    names = [prop.reward] if prop.reward is not None else list(model.rewards)
+    if len(names) != 1 or names[0] not in model.rewards:
+        asked = "" if prop.reward is None else f" {prop.reward!r}"
+        raise ValueError(
+            f"{prop.text}: which reward{asked}? The model has "
+            f"{', '.join(map(repr, model.rewards)) or 'none'}."
+        )
+    return model.rewards[names[0]]
+
+
+def first_bounds(model: ShardedMDP, question: Question) -> Bounds:
+    """Those that any probability has, where the model's values are."""
+
+    def one(fill: float) -> jax.Array:
+        make = jax.jit(
+            lambda: jnp.full(question.shape, fill, model.dtype), out_shardings=model.sharding
+        )
+        return make()
+
+    return one(0.0), one(1.0)
+
+
+def _objective(model: ShardedMDP, prop: Property) -> str:
+    if prop.direction is not None:
+        return prop.direction
+    if bool(on_host(jax.jit(lambda x: (x.sum(-1) > 1).any())(model.available))):
+        raise ValueError(
+            f"{prop.text}: the model has states with several choices, so the value depends on a "
+            "strategy; ask for Pmax=? or Pmin=?."
+        )
+    return "max"
+
+
+def _starts(model: ShardedMDP) -> jax.Array:
+    """Where the initial states are, in order of their numbers; on every device."""
+    number = int(on_host(jax.jit(lambda x: (x > 0).sum())(model.initial)))
+    found = jax.jit(
+        lambda x: jnp.flatnonzero(x > 0, size=number), out_shardings=_everywhere(model)
+    )(model.initial)
+    order = np.argsort(on_host(_pick(model, found, model.number)), kind="stable")
+    return jax.jit(lambda x: x[order], out_shardings=_everywhere(model))(found)
+
+
+def _everywhere(model: Any) -> NamedSharding:
+    return NamedSharding(model.mesh, PartitionSpec())
+
+
+def _pick(model: ShardedMDP, places: jax.Array, quantity: jax.Array) -> jax.Array:
+    return jax.jit(lambda x, i: x[i], out_shardings=_everywhere(model))(quantity, places)
+
+
+def _pick_memory(both: Product, places: jax.Array, quantity: jax.Array) -> jax.Array:
+    def one(both: Product, i: jax.Array, x: jax.Array) -> jax.Array:
+        return x[i, both.initial_memory[i]]
+
+    return jax.jit(one, out_shardings=_everywhere(both.mdp))(both, places, quantity)
+
+
+def _shown_by(model: ShardedMDP, holds: np.ndarray) -> jax.Array:
+    """Where a state shows one of the labels that are marked."""
+    return jax.jit(lambda kind: kernels.gather(jnp.asarray(holds), kind))(model.kind)
+
+
+@partial(jax.jit, static_argnames="objective")
+def _reach_for(model: Any, target: Any, start: Any, half: Any, steps: Any, objective: str) -> Any:
+    return reachability_probability(
+        model, target, objective=objective, tolerance=half, max_steps=steps, start=start
+    )
+
+
+def _reach(
+    model: ShardedMDP, target: jax.Array, objective: str, start: Bounds, half: float, steps: int
+) -> Solution:
+    return _reach_for(model, target, start, half, np.int32(steps), objective)
+
+
+@partial(jax.jit, static_argnames="objective")
+def _earn_until(model: Any, reward: Any, target: Any, share: Any, objective: str) -> Any:
+    return total_reward(model, reward, target, objective=objective, tolerance=share)
+
+
+def _earn(
+    model: ShardedMDP,
+    reward: jax.Array,
+    target: jax.Array,
+    objective: str,
+    start: Bounds,
+    half: float,
+    steps: int,
+) -> Solution:
+    return _earn_until(model, reward, target, 2 * half, objective)
+
+
+def _satisfy(both: Product, objective: str, start: Bounds, half: float, steps: int) -> Solution:
+    return optimal_satisfaction(
+        both, objective=objective, tolerance=half, max_steps=steps, start=start
+    )

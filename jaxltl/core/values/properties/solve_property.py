@@ -1,0 +1,548 @@
+"""Answers to properties of models: each goes to the solver that it is a question for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from fractions import Fraction
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxltl.core.logic.bounded import Bounded, Earned, unfolded
+from jaxltl.core.logic.labels import is_boolean
+from jaxltl.core.logic.ltl import TRUE, Formula
+from jaxltl.core.logic.properties import MAX_UNFOLDED_STEPS, Property, parse_property
+from jaxltl.core.models.build.state_formulas import states_satisfying
+from jaxltl.core.models.interval import IntervalMDP
+from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.pretty_print import brief
+from jaxltl.core.types import Solution, Status
+from jaxltl.core.validation import shown
+from jaxltl.core.values import facts
+from jaxltl.core.values.average.average_reward import average_reward
+from jaxltl.core.values.interval.robust import width_asked
+from jaxltl.core.values.interval.satisfaction import RobustSatisfaction, robust_satisfaction
+from jaxltl.core.values.interval.step_bounded import (
+    robust_bounded_reachability,
+    robust_cumulative_reward,
+    robust_instantaneous_reward,
+    robust_next_probability,
+)
+from jaxltl.core.values.undiscounted import step_bounded as bounded
+from jaxltl.core.values.undiscounted.complement import opposite_event
+from jaxltl.core.values.undiscounted.reachability import reachability_probability
+from jaxltl.core.values.undiscounted.sparse_satisfaction import (
+    Satisfaction,
+    at_states,
+    sparse_satisfaction,
+    starting_states,
+)
+from jaxltl.core.values.undiscounted.total_reward import total_reward
+
+TOLERANCE = 1e-6
+FINER = (1.0, 1e-3, 1e-6)  # parts of the tolerance by which a threshold is tried
+TINY = 1e-12  # width of an interval of rewards that is narrow enough whatever they are
+_AVERAGE = "averages of end components"
+_OTHER = {"max": "min", "min": "max"}
+
+
+@brief
+class PropertyStrategy(NamedTuple):
+    """What attains an answer.
+
+    Attributes:
+      row: the row of the model that is taken: ``int32[S]``; with a memory ``int32[N]``, for each
+        state of the product.
+      by: how many steps (``"steps"``) or how much reward (``"reward"``) is left, if the row is the
+        first choice of a strategy that depends on that; else empty.
+      memory: the automaton and the product that a memory is from, or None.
+      nature: of an interval model nature's distributions, ``float64[T]``; with a memory of the
+        product's entries. Else None.
+
+    Example:
+      >>> from jaxltl import make_sparse
+      >>> safe_or_not = make_sparse([0, 2, 3, 4], [0, 1, 3, 4, 5], [1, 1, 2, 1, 2],
+      ...                           [1, 0.5, 0.5, 1, 1], initial=[1, 0, 0], label={"a": [1]})
+      >>> solve_property(safe_or_not, 'Pmin=? [ F "a" ]').strategy.row.tolist()  # in each state
+      [1, 2, 3]
+    """
+
+    row: np.ndarray
+    by: str = ""
+    memory: Satisfaction | RobustSatisfaction | None = None
+    nature: np.ndarray | None = None
+
+
+@brief(facts=facts.answer)
+class Answer(NamedTuple):
+    """What a property asked for.
+
+    Attributes:
+      states: ``int[I]``, the states that were asked for.
+      value, lower, upper: ``float64[I]``; the bounds are certified.
+      holds: of a threshold, whether it is met in each state; None where the bounds do not tell.
+      status: CONVERGED where all bounds are narrow, or decide the threshold.
+      method: how it was found and proven, in a few words.
+      strategy: what attains the value; None where nothing is chosen.
+
+    Example:
+      >>> from jaxltl import make_sparse
+      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1],
+      ...                    initial=[1, 0, 0], label={"a": [1]})
+      >>> found = solve_property(coin, 'P>=0.4 [ F "a" ]')
+      >>> found.states.tolist(), found.value.tolist(), found.holds, found.status.name
+      ([0], [0.5], [True], 'CONVERGED')
+    """
+
+    states: np.ndarray
+    value: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    holds: list[bool | None] | None
+    status: Status
+    method: str
+    strategy: PropertyStrategy | None
+
+
+class _Found(NamedTuple):
+    """The bounds of one solve at the states that were asked for."""
+
+    solution: Solution
+    method: str
+    strategy: PropertyStrategy | None
+
+
+class _Aim(NamedTuple):
+    """What a policy makes of a number, ``"max"`` or ``"min"``, and nature within intervals."""
+
+    policy: str
+    nature: str | None = None
+
+    @property
+    def opposite(self) -> _Aim:
+        return _Aim(_OTHER[self.policy], None if self.nature is None else _OTHER[self.nature])
+
+    @property
+    def directions(self) -> dict[str, Any]:
+        """As solvers take it."""
+        return {"objective": self.policy, "nature": self.nature}
+
+
+def solve_property(
+    model: SparseMDP | IntervalMDP,
+    prop: Property | str,
+    *,
+    states: Any = None,
+    tolerance: float = TOLERANCE,
+) -> Answer:
+    """The value of a property, or whether its threshold is met, with certified bounds.
+
+    Args:
+      model: the model; with intervals, the policy's direction and nature's are both named, as in
+        ``Pmaxmin=?``, in chains nature's alone.
+      prop: a property or its text, see :func:`~jaxltl.core.logic.properties.parse_properties`.
+      states: ``int[I]``; default the initial states.
+      tolerance: the width of the bounds, absolute for probabilities and relative for the rest.
+
+    Returns:
+      :class:`Answer`. A threshold that the bounds do not decide is tried with narrower ones; where
+      those do not tell either, `holds` is None and the status is not CONVERGED.
+
+    Raises:
+      ValueError: an unknown label or reward; no direction though the model has choices, or
+        intervals; a question that the solvers do not take, with the reason.
+
+    Concrete arrays only, on the host; not differentiable.
+
+    Example:
+      >>> from jaxltl import make_sparse
+      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1],
+      ...                    initial=[1, 0, 0], label=[[0], [1], [0]], propositions=["a"])
+      >>> solve_property(coin, 'P=? [ F "a" ]').value.tolist()
+      [0.5]
+      >>> solve_property(coin, 'P>0.4 [ X "a" ]').holds
+      [True]
+    """
+    prop = parse_property(prop) if isinstance(prop, str) else prop
+    if not isinstance(prop, Property):
+        raise ValueError(f"prop is {shown(prop)}; give a property or its text.")
+    if not isinstance(model, SparseMDP | IntervalMDP):
+        raise ValueError(
+            f"{type(model).__name__} is no model that answers properties; give a "
+            "SparseMDP (to_sparse makes one) or an IntervalMDP."
+        )
+    if prop.operator == "multi":
+        raise ValueError("multi(...) has several values; solve it with achievable or pareto.")
+    if states is None:
+        states = np.flatnonzero(np.asarray(model.initial) > 0)
+    states = starting_states(model, states)
+    tolerance = width_asked(tolerance)
+    solve = _solver(model, prop, _aim(model, prop), states)
+    found = solve(tolerance)
+    if prop.relation is None:
+        return _answer(prop, states, found, None, tolerance)
+    verdicts = _verdicts(prop, found)
+    for part in FINER[1:]:
+        if None not in verdicts or _is_exact(found):
+            break
+        found = solve(tolerance * part)
+        verdicts = _verdicts(prop, found)
+    return _answer(prop, states, found, verdicts, tolerance)
+
+
+def as_answer(
+    prop: Property, states: np.ndarray, solution: Solution, tolerance: float, method: str
+) -> Answer:
+    """What bounds say of a property at the states that were asked for, without a strategy."""
+    found = _Found(solution, method, None)
+    holds = None if prop.relation is None else _verdicts(prop, found)
+    return _answer(prop, states, found, holds, tolerance)
+
+
+def _answer(
+    prop: Property,
+    states: np.ndarray,
+    found: _Found,
+    holds: list[bool | None] | None,
+    tolerance: float,
+) -> Answer:
+    value, lower, upper = (
+        np.asarray(x, np.float64)
+        for x in (found.solution.value, found.solution.lower, found.solution.upper)
+    )
+    if holds is None:
+        status = _status(prop, found, tolerance)
+    else:
+        status = Status.PRECISION if None in holds else Status.CONVERGED
+    return Answer(states, value, lower, upper, holds, status, found.method, found.strategy)
+
+
+def _status(prop: Property, found: _Found, tolerance: float) -> Status:
+    """CONVERGED if the bounds of the states that were asked for are narrow."""
+    lower, upper = found.solution.lower, found.solution.upper
+    told = Status(int(np.max(found.solution.status)))
+    if np.isnan(lower).any() or np.isnan(upper).any() or told == Status.INVALID:
+        return max(told, Status.NONFINITE)
+    with np.errstate(invalid="ignore"):
+        width = np.where(lower == upper, 0, upper - lower)
+        most: Any = tolerance
+        if prop.operator in ("R", "T"):
+            most = np.maximum(tolerance * np.maximum(np.abs(lower), np.abs(upper)), TINY)
+        narrow = (width == 0) | ((width <= most) & np.isfinite(width))
+    # An average near zero is narrow as a share of the rewards that cancel out in it.
+    told_narrow = prop.path == Earned("average") and told == Status.CONVERGED
+    if narrow.all() or told_narrow:
+        return Status.CONVERGED
+    return max(told, Status.PRECISION)
+
+
+def _is_exact(found: _Found) -> bool:
+    return bool((found.solution.lower == found.solution.upper).all())
+
+
+def _verdicts(prop: Property, found: _Found) -> list[bool | None]:
+    assert prop.relation is not None and prop.threshold is not None
+    lower, upper = np.asarray(found.solution.lower), np.asarray(found.solution.upper)
+    return [
+        meets(prop.relation, prop.threshold, low, high)
+        for low, high in zip(lower.tolist(), upper.tolist(), strict=True)
+    ]
+
+
+def meets(relation: str, threshold: Fraction, lower: float, upper: float) -> bool | None:
+    """Whether all numbers between two bounds meet a threshold, or none does; else None.
+
+    >>> meets(">=", Fraction(1, 2), 0.5, 0.75), meets("<", Fraction(1, 2), 0.25, 0.5)
+    (True, None)
+    """
+    if lower != lower or upper != upper:
+        return None
+    if relation in ("<", "<="):
+        opposite = meets({"<": ">=", "<=": ">"}[relation], threshold, lower, upper)
+        return None if opposite is None else not opposite
+    # Floats and fractions are compared exactly.
+    if relation == ">=":
+        return True if lower >= threshold else False if upper < threshold else None
+    return True if lower > threshold else False if upper <= threshold else None
+
+
+def _aim(model: SparseMDP | IntervalMDP, prop: Property) -> _Aim:
+    sign = prop.operator + (f'{{"{prop.reward}"}}' if prop.reward else "")
+    if isinstance(model, IntervalMDP):
+        return _robust_aim(model, prop, sign)
+    if prop.nature is not None:
+        raise ValueError(
+            f"{prop.text}: the model has no intervals from which nature could pick; ask for "
+            f"{sign}{prop.objective}=?."
+        )
+    if prop.direction is not None:
+        return _Aim(prop.direction)
+    if not model.is_chain:
+        raise ValueError(
+            f"{prop.text}: the model has states with several choices, so the value depends on a "
+            f"strategy; ask for {sign}max=? or {sign}min=?."
+        )
+    return _Aim("max")
+
+
+def _robust_aim(model: IntervalMDP, prop: Property, sign: str) -> _Aim:
+    """Both directions; a threshold without any is for all strategies and all that nature picks."""
+    if prop.nature is not None:
+        assert prop.objective is not None
+        return _Aim(prop.objective, prop.nature)
+    if prop.direction is not None and (model.is_chain or prop.objective is None):
+        return _Aim(prop.direction, prop.direction)
+    if model.is_chain:
+        raise ValueError(
+            f"{prop.text}: the probabilities of this chain are intervals, so the value depends on "
+            f"what nature picks from them; ask for {sign}min=? or {sign}max=?."
+        )
+    firsts = ("max", "min") if prop.objective is None else (prop.objective,)
+    listed = [f"{sign}{first}{second}=?" for first in firsts for second in ("min", "max")]
+    raise ValueError(
+        f"{prop.text}: probabilities are intervals, so the value depends on a strategy and on what "
+        f"nature picks; ask for {', '.join(listed[:-1])} or {listed[-1]}, the strategy's direction "
+        "first and nature's second."
+    )
+
+
+# --- which solver -----------------------------------------------------------------------------
+
+
+def _solver(
+    model: SparseMDP | IntervalMDP, prop: Property, aim: _Aim, states: np.ndarray
+) -> Callable[[float], _Found]:
+    """What solves a property at a tolerance."""
+    path, graph = prop.path, _graph(model)
+    if prop.operator == "P":
+        assert not isinstance(path, Earned)
+        return _Probability(model, states, prop.text).of(path, aim)
+    if prop.operator == "LRA":
+        assert isinstance(path, Formula)
+        known = _without_intervals(model, prop, "averages in the long run")
+        share = states_satisfying(graph, path, prop.text).astype(np.float64)
+        return lambda tolerance: _plain(
+            states, average_reward(known, share, objective=aim.policy, tolerance=tolerance)
+        )._replace(method=_AVERAGE)
+    reward: Any = np.ones(model.num_rows) if prop.operator == "T" else prop.reward
+    if isinstance(path, Formula):
+        target: Any = states_satisfying(graph, path.operands[0], prop.text)
+        return lambda tolerance: _plain(
+            states, total_reward(model, reward, target, tolerance=tolerance, **aim.directions)
+        )
+    assert isinstance(path, Earned)
+    if path.steps is not None:
+        return _steps_solver(model, path.kind == "cumulative", reward, path.steps, aim, states)
+    what = "rewards for ever (C)" if path.kind == "total" else "averages in the long run"
+    known = _without_intervals(model, prop, what)
+    if path.kind == "total":
+        return lambda tolerance: _plain(
+            states, total_reward(known, reward, objective=aim.policy, tolerance=tolerance)
+        )
+    return lambda tolerance: _plain(
+        states, average_reward(known, reward, objective=aim.policy, tolerance=tolerance)
+    )._replace(method=_AVERAGE)
+
+
+def _steps_solver(
+    model: SparseMDP | IntervalMDP,
+    cumulative: bool,
+    reward: Any,
+    steps: int,
+    aim: _Aim,
+    states: np.ndarray,
+) -> Callable[[float], _Found]:
+    if isinstance(model, IntervalMDP):
+        robust = robust_cumulative_reward if cumulative else robust_instantaneous_reward
+        return lambda tolerance: _plain(
+            states, robust(model, reward, steps, **aim.directions), by="steps"
+        )
+    solve = bounded.cumulative_reward if cumulative else bounded.instantaneous_reward
+    return lambda tolerance: _plain(
+        states, solve(model, reward, steps, objective=aim.policy), by="steps"
+    )
+
+
+def _graph(model: SparseMDP | IntervalMDP) -> SparseMDP:
+    """All of a model but its intervals."""
+    return model.nominal if isinstance(model, IntervalMDP) else model
+
+
+def _without_intervals(
+    model: SparseMDP | IntervalMDP, prop: Property | str, what: str
+) -> SparseMDP:
+    """The model, for those who know nothing of intervals."""
+    if not isinstance(model, IntervalMDP):
+        return model
+    raise ValueError(
+        f"{prop}: {what} are not solved for where probabilities are intervals; solved for are "
+        "probabilities of formulas, and expected rewards until a state is reached (F), of so many "
+        "steps (C<=k) and after them (I=k). Ask for one of these, or give model.nominal, which is "
+        "one choice of nature."
+    )
+
+
+def _plain(states: np.ndarray, solution: Solution, by: str = "") -> _Found:
+    method = str(solution.method) or {
+        "steps": "step by step",
+        "reward": "level by level of the reward",
+    }.get(by, "")
+    nature = None if solution.nature is None else np.asarray(solution.nature)
+    return _Found(
+        at_states(solution, states),
+        method,
+        PropertyStrategy(np.asarray(solution.policy), by, nature=nature),
+    )
+
+
+class _Probability(NamedTuple):
+    """Probabilities of paths of one model, at some states."""
+
+    model: SparseMDP | IntervalMDP
+    states: np.ndarray
+    text: str
+
+    def of(self, path: Formula | Bounded, aim: _Aim) -> Callable[[float], _Found]:
+        """What solves a path at a tolerance; simple ones without an automaton."""
+        if isinstance(path, Bounded):
+            return self.within(path, aim)
+        if path.operator == "!" and not is_boolean(path):
+            return self.opposite(path.operands[0], aim)
+        if is_boolean(path):
+            return lambda tolerance: self.at_once(path)
+        if not all(is_boolean(f) for f in path.operands):
+            return self.automaton(path, aim)
+        left, right = path.operands[0], path.operands[-1]
+        match path.operator:
+            case "X":
+                target = self.where(right)
+                return lambda tolerance: self.next(target, aim)
+            case "F":
+                return self.until(TRUE, right, aim)
+            case "U":
+                return self.until(left, right, aim)
+            case "G":
+                return self.opposite(Formula("F", (~right,)), aim)
+            case "W":
+                return self.opposite(Formula("U", (~right, ~left & ~right)), aim)
+            case "R":
+                return self.opposite(Formula("U", (~left, ~right)), aim)
+        raise AssertionError(path.operator)
+
+    def where(self, condition: Formula) -> np.ndarray:
+        return states_satisfying(_graph(self.model), condition, self.text)
+
+    def at_once(self, path: Formula) -> _Found:
+        holds: Any = self.where(path).astype(np.float64)[self.states]
+        zero: Any = np.int32(0)
+        nobody: Any = np.zeros(0, np.int32)
+        return _Found(
+            Solution(
+                value=holds,
+                policy=nobody,
+                lower=holds,
+                upper=holds,
+                residual=zero,
+                num_steps=zero,
+                status=zero,
+            ),
+            "the label",
+            None,
+        )
+
+    def opposite(self, path: Formula | Bounded, aim: _Aim) -> Callable[[float], _Found]:
+        solve = self.of(path, aim.opposite)
+
+        def found(tolerance: float) -> _Found:
+            result = solve(tolerance)
+            return result._replace(solution=opposite_event(result.solution))
+
+        return found
+
+    def until(self, left: Formula, right: Formula, aim: _Aim) -> Callable[[float], _Found]:
+        target: Any = self.where(right)
+        stay: Any = None if left == TRUE else self.where(left)
+        return lambda tolerance: _plain(
+            self.states,
+            reachability_probability(
+                self.model, target, stay=stay, tolerance=tolerance, **aim.directions
+            ),
+        )
+
+    def next(self, target: np.ndarray, aim: _Aim) -> _Found:
+        if isinstance(self.model, IntervalMDP):
+            return _plain(
+                self.states, robust_next_probability(self.model, target, **aim.directions)
+            )
+        return _plain(
+            self.states, bounded.next_probability(self.model, target, objective=aim.policy)
+        )
+
+    def automaton(self, path: Formula, aim: _Aim) -> Callable[[float], _Found]:
+        def found(tolerance: float) -> _Found:
+            result: Satisfaction | RobustSatisfaction
+            nature = None
+            if isinstance(self.model, IntervalMDP):
+                result = robust_satisfaction(
+                    self.model, path, states=self.states, tolerance=tolerance, **aim.directions
+                )
+                row, nature = (
+                    np.asarray(x) for x in (result.solution.policy, result.solution.nature)
+                )
+            else:
+                result = sparse_satisfaction(
+                    self.model, path, objective=aim.policy, states=self.states, tolerance=tolerance
+                )
+                row = result.row
+            method = str(result.solution.method)
+            size = f"product of {result.product.host.num_states} states"
+            return _Found(
+                result.solution,
+                f"{size}, {method}" if method else size,
+                PropertyStrategy(row, memory=result, nature=nature),
+            )
+
+        return found
+
+    def within(self, path: Bounded, aim: _Aim) -> Callable[[float], _Found]:
+        if path.operator == "R":
+            negated = TRUE if path.left.operator == "false" else ~path.left
+            return self.opposite(replace(path, operator="U", left=negated, right=~path.right), aim)
+        if path.reward is not None:
+            return self.within_reward(path, aim)
+        if path.lower or path.upper is None:
+            if max(path.lower, path.upper or 0) > MAX_UNFOLDED_STEPS:
+                raise ValueError(
+                    f"{self.text}: a lower bound on steps is solved for up to "
+                    f"{MAX_UNFOLDED_STEPS} steps; drop it or make it smaller."
+                )
+            return self.of(unfolded(path), aim)
+        target, stay = self.where(path.right), self.where(path.left)
+        steps, model = path.upper, self.model
+        if isinstance(model, IntervalMDP):
+            return lambda tolerance: _plain(
+                self.states,
+                robust_bounded_reachability(model, target, steps, stay=stay, **aim.directions),
+                by="steps",
+            )
+        return lambda tolerance: _plain(
+            self.states,
+            bounded.bounded_reachability(model, target, steps, stay=stay, objective=aim.policy),
+            by="steps",
+        )
+
+    def within_reward(self, path: Bounded, aim: _Aim) -> Callable[[float], _Found]:
+        assert path.limit is not None
+        target, stay = self.where(path.right), self.where(path.left)
+        # Rewards are counted in units of more than 1e-9, so this is just below the limit.
+        limit = path.limit - Fraction(1, 10**9) * path.strict
+        reward = path.reward or None
+        model = _without_intervals(self.model, self.text, "bounds on rewards")
+        return lambda tolerance: _plain(
+            self.states,
+            bounded.reward_bounded_reachability(
+                model, target, reward, float(limit), stay=stay, objective=aim.policy
+            ),
+            by="reward",
+        )

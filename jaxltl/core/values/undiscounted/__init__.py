@@ -1,0 +1,1 @@
+"""Reachability, satisfaction probabilities and total rewards."""

@@ -1,0 +1,198 @@
+"""Policies mixed until the probability of a task is as large as asked.
+
+Of two policies one state at a time: ``(1 - share) policy + share sure``, which is again a policy
+without memory of its own. Everything here is on the host.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxltl.core.models.ops.array_namespace import to_jax
+from jaxltl.core.models.product import Product
+from jaxltl.core.pretty_print import brief
+from jaxltl.core.types import Solution
+from jaxltl.core.values.undiscounted.satisfaction import satisfaction_probability
+
+WINDOW = 0.02  # how far above an asked probability the certified one may be
+_AIM = WINDOW / 4  # and is aimed to be
+_HALVINGS = 30
+
+
+@brief
+class Mixture(NamedTuple):
+    """A policy, how much of a surer one is in it, and what it is certified to attain.
+
+    Attributes:
+      policy: ``float[S, Q, A]``.
+      share: of the surer policy, in [0, 1].
+      attained: its certified probability, of the mean or the worst initial state.
+    """
+
+    policy: np.ndarray
+    share: float
+    attained: float
+
+
+def at_starts(model: Product, value: Any, over: str) -> tuple[float, int]:
+    """The mean or the least of a product's value over its initial states, and where it is least."""
+    weight = np.asarray(model.mdp.initial, float)
+    starts = np.flatnonzero(weight > 0)
+    known = from_starts(model, value)[starts].astype(float)
+    least, place = known.min(), int(starts[known.argmin()])
+    if over == "worst":
+        return float(least), place
+    # Rounding does not take a mean out of what it is a mean of.
+    mean = known @ (weight[starts] / weight[starts].sum())
+    return float(np.clip(mean, least, known.max())), place
+
+
+def from_starts(model: Product, value: Any) -> np.ndarray:
+    """A product's value at the memory in which a run starts: ``[S]`` from ``[S, Q]``."""
+    memory = np.asarray(model.initial_memory)
+    return np.asarray(value)[np.arange(len(memory)), memory]
+
+
+def attained(model: Product, policy: Any, over: str) -> float:
+    """What a policy ``[S, Q, A]`` is certified to attain, on average or from the worst start."""
+    found = satisfaction_probability(model, to_jax(np.asarray(policy, model.dtype)))
+    return at_starts(model, found.lower, over)[0]
+
+
+def require_attainable(
+    model: Product, best: Solution, probability: float, over: str, place: Callable[[int], str]
+) -> None:
+    """Refuses a probability that no policy has.
+
+    Args:
+      model: the product.
+      best: the best probability of its task.
+      probability: asked for.
+      over: ``"mean"`` of the initial states, or the ``"worst"``.
+      place: the name of a world state.
+
+    Raises:
+      ValueError: with what is possible, and from where least.
+    """
+    possible, where = at_starts(model, best.lower, over)
+    if possible < probability:
+        raise ValueError(
+            f"guarantee = {probability}: the best that can be achieved is "
+            f"{np.floor(possible * 1e6) / 1e6:g} "
+            + (
+                "on average over the initial states"
+                if over == "mean"
+                else "from the worst initial state"
+            )
+            + f" (least from {place(where)}); ask for no more than that, or change the "
+            "task, the map or where runs start."
+        )
+
+
+def least_mixture(
+    model: Product, policy: Any, sure: Any, probability: float, *, over: str = "mean"
+) -> Mixture:
+    """The least share of a surer policy by which a probability is reached.
+
+    Never all of it if less is enough: what it does not do would then be impossible.
+
+    Args:
+      model: the product.
+      policy: ``float[S, Q, A]``.
+      sure: ``float[S, Q, A]``, which is to have that probability.
+      probability: asked for, certified.
+      over: ``"mean"`` of the initial states, or the ``"worst"``.
+    """
+    policy, sure = np.asarray(policy), np.asarray(sure)
+    found = Mixture(policy, 0.0, attained(model, policy, over))
+    if found.attained >= probability:
+        return found
+    found = Mixture(sure, 1.0, attained(model, sure, over))
+    low, high = 0.0, 1.0
+    aim = probability + min(_AIM, (found.attained - probability) / 64)
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        mixed = (1 - middle) * policy + middle * sure
+        reached = attained(model, mixed, over)
+        if reached < probability:
+            low = middle
+            continue
+        high, found = middle, Mixture(mixed, middle, reached)
+        if reached <= aim:
+            break
+    return found
+
+
+def reaching(
+    model: Product,
+    policy: Any,
+    inside: Any,
+    best: Solution,
+    probability: float,
+    *,
+    over: str = "mean",
+) -> Mixture:
+    """A policy with the least share of moves that lose nothing by which a probability is reached.
+
+    Where a policy of such moves takes its time, so that any share of steps that lose is too much,
+    it is the quickest of the best policies that is mixed in.
+
+    Args:
+      model: the product.
+      policy: ``float[S, Q, A]``, what is wanted but for the probability.
+      inside: ``float[S, Q, A]``, what is wanted of the actions that lose nothing.
+      best: of :func:`~jaxltl.core.values.undiscounted.satisfaction.optimal_satisfaction`.
+      probability: asked for, certified, and attainable.
+      over: ``"mean"`` of the initial states, or the ``"worst"``.
+
+    Example:
+      >>> from jaxltl import from_dense, optimal_actions, product
+      >>> world = from_dense([[[0, 1.0, 0], [0, 0, 1.0]], [[0, 1.0, 0]] * 2, [[0, 0, 1.0]] * 2],
+      ...                    label=[[0], [1], [0]], propositions=["goal"], initial=[1, 0, 0])
+      >>> model = product(world, "F goal")
+      >>> sure, alike = optimal_actions(model), np.full((3, 2, 2), 0.5)
+      >>> found = reaching(model, alike, sure.policy, sure.best, 0.75)
+      >>> 0.75 <= found.attained < 0.76, 0.5 <= found.share < 0.52
+      (True, True)
+    """
+    found = least_mixture(model, policy, inside, probability, over=over)
+    if found.share and found.attained > probability + WINDOW:
+        quickest = np.eye(model.num_actions)[np.asarray(best.policy)]
+        other = least_mixture(model, policy, quickest, probability, over=over)
+        found = other if other.share < found.share else found
+    return found
+
+
+def safe_mean(share: np.ndarray, bound: np.ndarray, *, up: bool, highest: float = np.inf) -> float:
+    """The mean of bounds of at least 0, rounded up or down.
+
+    Args:
+      share: ``float64[I]``, positive weights of any sum.
+      bound: ``float64[I]``, maybe infinite.
+      up: whether upper bounds are given, else lower ones.
+      highest: what no value exceeds.
+
+    Example:
+      >>> safe_mean(np.array([0.5, 0.5]), np.array([1.0, 1.0]), up=False)
+      1.0
+    """
+    bound = np.asarray(bound, np.float64)
+    if (bound == bound[0]).all():
+        return float(bound[0])
+    slack = (share.size + 4) * float(np.finfo(np.float64).eps)
+    mean = float(share @ bound / share.sum())
+    return min(mean * (1 + slack), highest) if up else mean * (1 - slack)
+
+
+def safe_ends(model: Any, found: Any, *, highest: float = np.inf) -> tuple[float, float]:
+    """What encloses the mean over the initial distribution of what `lower` and `upper` enclose."""
+    share = np.asarray(model.initial, np.float64)
+    start = np.flatnonzero(share)
+    low, high = (
+        safe_mean(share[start], x[start], up=up, highest=highest)
+        for x, up in ((found.lower, False), (found.upper, True))
+    )
+    return low, high

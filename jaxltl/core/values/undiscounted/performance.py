@@ -1,0 +1,579 @@
+"""How well a policy does a task in a world it may never have seen, with certified bounds.
+
+The probability of the task from each start (3.8), its mean over the starts (3.9) and its
+least value. One product's evaluation is written so that ``vmap`` over stacked worlds and
+policies is one fast program: the linear system falls into one block for each memory
+state, each is inverted once, and a second solve certifies the first.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import lax
+
+from jaxltl.core.graphs.acceptance import accepting_bottom_components
+from jaxltl.core.graphs.graph import TracedGraph, graph_of, take
+from jaxltl.core.graphs.reaching import max_sets, min_sets, policy_sets
+from jaxltl.core.models.build.batch import is_stacked, num_worlds
+from jaxltl.core.models.ops.array_namespace import namespace, to_jax
+from jaxltl.core.models.ops.operators import (
+    action_mean,
+    expectation,
+    policy_distribution,
+    require_policy,
+    transition_matrix,
+    valid_policy,
+)
+from jaxltl.core.models.product import Product
+from jaxltl.core.pretty_print import brief
+from jaxltl.core.types import Status, require_shape, status_code
+from jaxltl.core.values.engine.certificates import m_matrix_error
+from jaxltl.core.values.engine.linear import inverse
+from jaxltl.core.values.undiscounted.satisfaction import as_reachability, satisfaction_probability
+
+_BLOCK_LIMIT = 1024  # world states up to which a block is inverted
+_MAX_SWEEPS = 1000  # of automata with cycles; one without needs at most Q
+_EXACT_LIMIT = 4096  # product states up to which a stiff chain is eliminated on the host
+
+
+@brief(codes={"status": Status})
+@struct.dataclass
+class Performance:
+    """How well a policy does the task of a product; fields have a leading axis under ``vmap``.
+
+    Attributes:
+      mean: L_phi (3.9), the mean over the starts of the probability of the task.
+      lower, upper: a certified enclosure of the mean.
+      worst: the least probability over the starts.
+      worst_lower, worst_upper: a certified enclosure of that.
+      worst_state: ``int32[]``, the start where it is attained.
+      value: ``float[S]``, the probability from each world state, started there.
+      status: whether the bounds at all starts are as narrow as asked.
+
+    Example:
+      >>> from jaxltl import from_dense, product
+      >>> world = from_dense([[[0, 0.5, 0.5]], [[0, 1.0, 0]], [[0, 0, 1.0]]], initial=[0.5, 0.5, 0],
+      ...                    label=[[0], [1], [0]], propositions=["a"])
+      >>> found = task_performance(product(world, "F a", label_on="exit"), jnp.ones((3, 2, 1)))
+      >>> round(found.mean.item(), 6), round(found.worst.item(), 6), found.worst_state.item()
+      (0.75, 0.5, 0)
+    """
+
+    mean: jax.Array
+    lower: jax.Array
+    upper: jax.Array
+    worst: jax.Array
+    worst_lower: jax.Array
+    worst_upper: jax.Array
+    worst_state: jax.Array
+    value: jax.Array
+    status: jax.Array
+
+
+def task_performance(
+    model: Product,
+    policy: jax.Array,
+    *,
+    method: str = "auto",
+    tolerance: jax.Array | float | None = None,
+) -> Performance:
+    """Probability that a policy does the product's task: mean and least over the starts (3.9).
+
+    Args:
+      model: one product; ``vmap`` over stacked ones, or :func:`task_performances`.
+      policy: ``float[S, Q, A]`` or ``int32[S, Q]``.
+      method: ``"blocks"`` (one inverse for each memory state, of co-safe and safety
+        tasks), ``"general"`` (:func:`~jaxltl.core.values.undiscounted.satisfaction.satisfaction_probability`,
+        for any task), or ``"auto"``, blocks up to 1024 world states.
+      tolerance: half the width of the bounds asked for; default the square root of the
+        dtype's precision.
+
+    Returns:
+      :class:`Performance`. Where a policy hardly ever leaves a set, rounding may leave
+      nothing certain: the bounds are then 0 and 1, the status is PRECISION, and
+      :func:`task_performances` has an answer.
+
+    Raises:
+      ValueError: the policy has the wrong shape or a row that is no distribution over available
+        actions (under ``jit`` the status is then INVALID), blocks are asked for another kind of
+        task, or an unknown method.
+
+    Differentiable in the policy and in the world's probabilities, with the support held fixed: in
+    forward mode, and with ``method="general"`` in reverse mode too.
+
+    Example:
+      >>> from jaxltl import from_dense, product
+      >>> world = from_dense([[[0.5, 0.25, 0.25]], [[0, 1.0, 0]], [[0, 0, 1.0]]],
+      ...                    label=[[0], [1], [0]], propositions=["a"], initial=[1, 0, 0])
+      >>> model = product(world, "F a", label_on="exit")
+      >>> found = task_performance(model, jnp.ones((3, 2, 1)))
+      >>> round(found.mean.item(), 3), found.worst_state.item()
+      (0.5, 0)
+    """
+    if method not in ("auto", "blocks", "general"):
+        raise ValueError(f"method={method!r}; choose auto, blocks or general.")
+    require_policy(model, policy)
+    return _task_performance(model, policy, tolerance, method=method)
+
+
+@partial(jax.jit, static_argnames=("method",))
+def _task_performance(model: Product, policy: jax.Array, tolerance, *, method: str) -> Performance:
+    policy, _, valid = valid_policy(model, policy)
+    simple = model.automaton.acceptance in ("cosafe", "safety")
+    if method == "blocks" and not simple:
+        raise ValueError(
+            f'method="blocks" is for co-safe and safety tasks, not {model.automaton.acceptance}; '
+            'choose "general".'
+        )
+    few = model.mdp.num_states <= _BLOCK_LIMIT
+    if method == "blocks" or (method == "auto" and simple and few):
+        safety = model.automaton.acceptance == "safety"
+        target = ~model.final if safety else model.final
+        value, error = _reach(model, target, policy)
+        value = 1 - value if safety else value
+        lower, upper = jnp.maximum(value - error, 0), jnp.minimum(value + error, 1)
+    else:
+        solution = satisfaction_probability(
+            model,
+            policy,
+            tolerance=tolerance,
+            method="iterative" if math.prod(model.state_shape) > _BLOCK_LIMIT else "auto",
+        )
+        value, lower, upper = solution.value, solution.lower, solution.upper
+    found = _summarize(model, value, lower, upper, tolerance)
+    unknown: Any = {
+        "mean": jnp.nan,
+        "lower": 0,
+        "upper": 1,
+        "worst": jnp.nan,
+        "worst_lower": 0,
+        "worst_upper": 1,
+        "value": jnp.nan,
+        "status": Status.INVALID,
+    }
+    return jax.tree.map(
+        lambda x, bad: jnp.where(valid, x, jnp.asarray(bad, x.dtype)),
+        found,
+        replace(found, **unknown),
+    )
+
+
+def _summarize(model: Product, value, lower, upper, tolerance) -> Performance:
+    start = model.initial_memory[:, None]
+    value, lower, upper = (
+        jnp.take_along_axis(x, start, axis=1)[:, 0] for x in (value, lower, upper)
+    )
+    weight = model.mdp.initial
+    starts = weight > 0
+    eps = jnp.finfo(model.dtype).eps
+    slack = 4 * eps * jnp.sqrt(1.0 * weight.size)  # rounding of a sum of at most one
+    goal = jnp.sqrt(eps) if tolerance is None else tolerance
+    worst_state = jnp.argmin(jnp.where(starts, value, jnp.inf)).astype(jnp.int32)
+    narrow = jnp.max(jnp.where(starts, upper - lower, 0)) <= 2 * goal
+    finite = jnp.all(jnp.isfinite(value))
+
+    def mean(x: jax.Array, slack: jax.Array) -> jax.Array:
+        # Rounding takes no mean out of the range of what it is of.
+        least, most = (
+            f(jnp.where(starts, x, out)) for f, out in ((jnp.min, jnp.inf), (jnp.max, -jnp.inf))
+        )
+        return jnp.clip(jnp.sum(weight * x) + slack, least, most)
+
+    return Performance(
+        mean=mean(value, 0 * slack),
+        lower=mean(lower, -slack),
+        upper=mean(upper, slack),
+        worst=value[worst_state],
+        worst_lower=jnp.min(jnp.where(starts, lower, jnp.inf)),
+        worst_upper=jnp.min(jnp.where(starts, upper, jnp.inf)),
+        worst_state=worst_state,
+        value=value,
+        status=status_code(narrow, finite, exhausted=True),
+    )
+
+
+def _reach(model: Product, target: jax.Array, policy: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Probability ``float[S, Q]`` of reaching a set, and a certified bound on its error.
+
+    ``(I - P) y = b`` on the undecided states is solved block by block: between memory
+    states by sweeps, which end exactly when the automaton's only cycles are loops, and
+    within each by its inverse; :func:`~jaxltl.core.values.engine.certificates.m_matrix_error` certifies it.
+    """
+    sets = policy_sets(TracedGraph(model), target, policy)
+    undecided = ~(sets.one | sets.zero)
+    one = sets.one.astype(model.dtype)
+    solve = _block_solver(model, policy, undecided)
+
+    def onward(y: jax.Array) -> jax.Array:
+        return jnp.where(undecided, action_mean(policy, expectation(model, y)), 0)
+
+    value = jnp.where(undecided, solve(one), one)
+    # Elimination can break down where rounding closes what leaves a set hardly ever.
+    value = jnp.clip(jnp.where(jnp.isfinite(value), value, 0), 0, 1)
+    return value, m_matrix_error(model, solve, onward, value, undecided)[0]
+
+
+def _block_solver(model: Product, policy: jax.Array, undecided: jax.Array):
+    """Solves ``x - P x = b`` on the undecided states, ``x = b`` elsewhere, for ``[S, Q]``.
+
+    Block Jacobi with a block for each memory state. Where the automaton's only cycles are
+    loops, it ends exactly after as many sweeps as its longest path has states.
+    """
+    stays = model.next_memory == jnp.arange(model.num_memory)  # [S, Q]
+    inside = jnp.where(undecided.T[:, :, None], _within(model, policy, stays), 0)
+    inverses = jax.vmap(inverse)(jnp.eye(inside.shape[-1], dtype=inside.dtype) - inside)
+
+    def outside(x: jax.Array) -> jax.Array:
+        if model.label_on == "exit":
+            return jnp.where(stays, 0, action_mean(policy, expectation(model, x)))
+        read = jnp.where(stays, 0, jnp.take_along_axis(x, model.next_memory, axis=1))
+        successors = jax.vmap(partial(expectation, model.mdp), in_axes=1, out_axes=1)(read)
+        return action_mean(policy, successors)
+
+    def solve(b: jax.Array) -> jax.Array:
+        def sweep(carry):
+            x, _, n = carry
+            right = b + jnp.where(undecided, outside(x), 0)
+            new = jnp.einsum("qst,tq->sq", inverses, right)
+            return new, jnp.any(jnp.abs(new - x) > 0), n + 1  # false for NaN
+
+        def unfinished(carry):
+            _, moved, n = carry
+            return moved & (n < _MAX_SWEEPS)
+
+        start = (jnp.zeros_like(b), jnp.bool_(True), jnp.int32(0))
+        return lax.while_loop(unfinished, sweep, start)[0]
+
+    return solve
+
+
+def _within(model: Product, policy: jax.Array, stays: jax.Array) -> jax.Array:
+    """``float[Q, S, S]``, the policy's transitions that leave the memory as it is."""
+    steps = jax.vmap(partial(transition_matrix, model.mdp), in_axes=1)(policy)
+    kept = stays.T[:, :, None] if model.label_on == "exit" else stays.T[:, None, :]
+    return jnp.where(kept, steps, 0)
+
+
+# --- many worlds ------------------------------------------------------------------------------
+
+
+def task_performances(
+    models: Product,
+    policies: jax.Array,
+    *,
+    tolerance: jax.Array | float | None = None,
+    batch: int = 128,
+) -> Performance:
+    """:func:`task_performance` in each of several worlds, on the host.
+
+    Co-safe and safety tasks by one compiled program for all; other tasks one world after the
+    other, on the graph and by a system in what it leaves open. What that cannot certify in the
+    models' precision, because the policy hardly ever leaves some set, is done again in double
+    precision by an elimination without subtractions (Grassmann, Taksar and Heyman 1985), whose
+    relative error is bounded whatever the chain (O'Cinneide 1993).
+
+    Args:
+      models: stacked products, see :func:`~jaxltl.core.models.build.batch.stack_products`.
+      policies: ``float[W, S, Q, A]`` or ``int32[W, S, Q]``; without W the same in every world.
+      tolerance: as in :func:`task_performance`.
+      batch: worlds that are in memory at once.
+
+    Returns:
+      :class:`Performance` with a leading axis W.
+
+    Raises:
+      ValueError: the models are not stacked or the policies have the wrong shape.
+
+    Not differentiable; :func:`task_performance` is.
+
+    Example:
+      >>> from jaxltl import from_dense, stack_products
+      >>> def world(p):
+      ...     return from_dense([[[0, p, 1 - p]], [[0, 1.0, 0]], [[0, 0, 1.0]]], initial=[1, 0, 0],
+      ...                       label=[[0], [1], [0]], propositions=["a"])
+      >>> both = stack_products([world(0.25), world(0.75)], "G F a", label_on="exit")
+      >>> found = task_performances(both, jnp.ones((3, 1, 1)))  # one policy in both worlds
+      >>> found.mean.round(6).tolist(), found.value.shape
+      ([0.25, 0.75], (2, 3))
+    """
+    if not is_stacked(models):
+        raise ValueError("models is a single product; use task_performance, or as_stacked(model).")
+    policies = jnp.asarray(policies)
+    states = (num_worlds(models), models.mdp.num_states, models.num_memory)
+    deterministic = jnp.issubdtype(policies.dtype, jnp.integer)
+    shape = states if deterministic else (*states, models.num_actions)
+    if policies.shape == shape[1:]:
+        policies = jnp.broadcast_to(policies, shape)
+    require_shape("policies", policies, shape)
+    if models.automaton.acceptance in ("cosafe", "safety"):
+        found = _batched(models, policies, tolerance, batch=batch)
+    else:
+        found = _one_by_one(models, policies, tolerance)
+    status = np.asarray(found.status)
+    for w in np.flatnonzero(status == Status.INVALID):
+        require_policy(*jax.tree.map(lambda x, w=w: np.asarray(x)[w], (models, policies)))
+    redone = np.flatnonzero((status != Status.CONVERGED) & (status != Status.INVALID))
+    if not redone.size or math.prod(states[1:]) > _EXACT_LIMIT:
+        return found
+    columns = jax.tree.map(np.array, found)
+    for w in redone:
+        model, policy = to_jax(jax.tree.map(lambda x, w=w: np.asarray(x)[w], (models, policies)))
+        bounds = _by_elimination(model, policy_distribution(model, policy))
+        value, lower, upper = (to_jax(np.asarray(x, model.dtype)) for x in bounds)
+        exact = _summarize(model, value, lower, upper, tolerance)
+        jax.tree.map(lambda to, x, w=w: to.__setitem__(w, x), columns, exact)
+    return to_jax(columns)
+
+
+def _batched(models: Product, policies: jax.Array, tolerance, *, batch: int) -> Performance:
+    """Batch after batch, so that memory does not grow with the number of worlds."""
+    count = len(policies)
+    size = min(batch, count)
+    parts = []
+    for first in range(0, count, size):
+        # The last batch is filled up from before, so that one program serves all.
+        begin = min(first, count - size)
+        lanes = jax.tree.map(lambda x, i=begin: x[i : i + size], (models, policies))
+        found = jax.block_until_ready(_together(*lanes, tolerance))
+        parts.append(jax.tree.map(lambda x, i=first - begin: np.asarray(x)[i:], found))
+    return to_jax(jax.tree.map(lambda *x: np.concatenate(x), *parts))
+
+
+def _one_by_one(models: Product, policies: jax.Array, tolerance) -> Performance:
+    """World after world on the host, where the components of a chain are found quickest."""
+    parts = []
+    for w in range(num_worlds(models)):
+        model, policy = jax.tree.map(lambda x, w=w: np.asarray(x)[w], (models, policies))
+        found = satisfaction_probability(model, policy, tolerance=tolerance)
+        parts.append(_summarized(model, found.value, found.lower, found.upper, tolerance))
+    return to_jax(jax.tree.map(lambda *x: np.stack(x), *parts))
+
+
+_summarized = jax.jit(_summarize)
+
+
+@jax.jit
+def _together(models: Product, policies: jax.Array, tolerance) -> Performance:
+    return jax.vmap(partial(task_performance, tolerance=tolerance))(models, policies)
+
+
+def _by_elimination(model: Product, policy: jax.Array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Probability of the task and bounds on it, ``float64[S, Q]``, on the host.
+
+    States are eliminated one by one. Each weight stays a sum of products of weights, so
+    its relative error is small however rare a transition is.
+    """
+    kind = model.automaton.acceptance
+    safety = kind == "safety"
+    if kind in ("cosafe", "safety"):
+        target = np.asarray(~model.final if safety else model.final).ravel()
+    else:
+        target = np.asarray(accepting_bottom_components(model, policy)).ravel()
+    weight = _chain(model, policy)
+    reaching = _reaching(weight, target)
+    doomed = _reaching(np.where(target[:, None], 0, weight), ~reaching)
+    rest = np.flatnonzero(doomed & reaching)
+    value = (~doomed).astype(float)
+    inner = weight[np.ix_(rest, rest)]
+    np.fill_diagonal(inner, 0)
+    hit = weight[rest][:, ~doomed].sum(1)
+    miss = weight[rest][:, ~reaching].sum(1)
+    total = np.zeros(len(rest))
+    for k in reversed(range(len(rest))):
+        row = inner[k, :k]
+        total[k] = row.sum() + hit[k] + miss[k]
+        sources = np.flatnonzero(inner[:k, k])
+        columns = np.flatnonzero(row)
+        share = inner[sources, k] / total[k]
+        inner[np.ix_(sources, columns)] += share[:, None] * row[columns]
+        inner[sources, sources] = 0
+        hit[sources] += share * hit[k]
+        miss[sources] += share * miss[k]
+    solved = np.zeros(len(rest))
+    for k in range(len(rest)):
+        solved[k] = (hit[k] + inner[k, :k] @ solved[:k]) / total[k]
+    value[rest] = np.minimum(solved, 1)
+    # To first order 2 n^3 roundings; the rest of the factor is for what is of higher order.
+    error = np.zeros_like(value)
+    n = len(rest) + 8
+    # Rounding to the model's precision comes on top.
+    rounding = 3.0 * n**3 * np.finfo(float).eps + 2 * float(jnp.finfo(model.dtype).eps)
+    error[rest] = np.minimum(rounding * value[rest], 1)
+    value = 1 - value if safety else value
+    bounds = (value, np.maximum(value - error, 0), np.minimum(value + error, 1))
+    value, lower, upper = (x.reshape(model.state_shape) for x in bounds)
+    return value, lower, upper
+
+
+def _chain(model: Product, policy: jax.Array) -> np.ndarray:
+    """``float64[S * Q, S * Q]``, the policy's transitions, of rows that sum to one."""
+    world = model.mdp
+    num_states, num_memory = model.state_shape
+    memory = np.asarray(model.next_memory)
+    given = np.asarray(policy, np.float64)
+    given = given / given.sum(-1, keepdims=True)
+    probability = np.asarray(world.successor_probability, np.float64)
+    total = probability.sum(-1, keepdims=True)
+    probability = np.divide(probability, total, where=total > 0, out=np.zeros_like(probability))
+    successor = np.broadcast_to(
+        getattr(world, "successor", np.arange(num_states)), probability.shape
+    )
+    s, q, a, k = np.indices((num_states, num_memory, *probability.shape[1:]))
+    read = successor[s, a, k] if model.label_on == "entry" else s
+    column = successor[s, a, k] * num_memory + memory[read, q]
+    weight = np.zeros((model.num_states, model.num_states))
+    np.add.at(weight, (s * num_memory + q, column), given[s, q, a] * probability[s, a, k])
+    return weight
+
+
+def _reaching(weight: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    """States with a path of positive weight to a goal."""
+    found = np.flatnonzero(goal)
+    inside = np.array(goal, bool)
+    while found.size:
+        found = np.flatnonzero((weight[:, found] > 0).any(1) & ~inside)
+        inside[found] = True
+    return inside
+
+
+# --- what the worlds have in common -----------------------------------------------------------
+
+
+def infeasible_starts(model: Product) -> jax.Array:
+    """Starts from which no policy can do the task, ``bool[S]``; decided on the graph.
+
+    From there the best probability is zero: no final state of a co-safe task can be reached, those
+    of a safety task cannot but be left, or no accepting end component can be reached.
+
+    Args:
+      model: one product; on the host if it is concrete, else under ``jit`` and ``vmap``.
+
+    Returns:
+      ``bool[S]``; not differentiable.
+
+    Example:
+      >>> from jaxltl import from_dense, product
+      >>> world = from_dense([[[0, 1.0]], [[0, 1.0]]], label=[[0], [1]], propositions=["g"])
+      >>> [infeasible_starts(product(world, task)).tolist() for task in ("G F g", "G !g")]
+      [[False, False], [True, True]]
+    """
+    problem = as_reachability(model, "max")
+    graph = graph_of(problem.model)
+    target = take(graph, problem.target)
+    if problem.objective == "max":
+        never = max_sets(graph, target).zero
+    else:
+        never = min_sets(graph, target).one
+    xp, never, memory, initial = namespace(never, model.initial_memory, model.mdp.initial)
+    here = xp.take_along_axis(never, memory[:, None], axis=1)[:, 0]
+    return to_jax((initial > 0) & here)
+
+
+@brief
+class Summary(NamedTuple):
+    """Performance over worlds.
+
+    Attributes:
+      mean, std: of L_phi over the worlds (std of the sample; 0 for one world).
+      lower, upper: certified bounds on the mean.
+      worst_world: the name of the world with the least L_phi, and that value.
+      worst: likewise.
+      worst_start: the least probability from any start of any world.
+      num_worlds: how many worlds these figures are of.
+      infeasible: names of the worlds with starts from which no policy does the task. They
+        count in the figures unless they are left out.
+      left_out: names of the worlds that the figures leave out.
+      uncertain: names of the worlds whose bounds are wider than was asked.
+    """
+
+    mean: float
+    std: float
+    lower: float
+    upper: float
+    worst_world: str
+    worst: float
+    worst_start: float
+    num_worlds: int
+    infeasible: tuple[str, ...]
+    left_out: tuple[str, ...]
+    uncertain: tuple[str, ...]
+
+
+def summarize(
+    models: Product,
+    performance: Performance,
+    *,
+    names: Sequence[str] | None = None,
+    leave_out: Collection[str] = (),
+) -> Summary:
+    """Mean, spread and worst case over worlds, on the host.
+
+    Args:
+      models: stacked products.
+      performance: of :func:`task_performances`.
+      names: W names of the worlds; default ``"world 0"`` and so on.
+      leave_out: names of worlds that do not count. Nothing is left out otherwise.
+
+    Returns:
+      :class:`Summary`, numbers of Python.
+
+    Raises:
+      ValueError: names are missing, double or unknown, or no world is left.
+
+    Example:
+      >>> from jaxltl import from_dense, stack_products
+      >>> def world(p):
+      ...     return from_dense([[[0, p, 1 - p]], [[0, 1.0, 0]], [[0, 0, 1.0]]], initial=[1, 0, 0],
+      ...                       label=[[0], [1], [0]], propositions=["a"])
+      >>> both = stack_products([world(0.25), world(0.75)], "G F a", label_on="exit")
+      >>> shares = task_performances(both, jnp.ones((3, 1, 1)))
+      >>> found = summarize(both, shares, names=["rough", "fair"])
+      >>> round(found.mean, 6), found.worst_world, found.infeasible
+      (0.5, 'rough', ())
+    """
+    count = num_worlds(models)
+    names = [f"world {w}" for w in range(count)] if names is None else list(names)
+    if len(names) != count or len(set(names)) != count:
+        raise ValueError(f"names has {len(names)} entries; give {count} different ones.")
+    for name in leave_out:
+        if name not in names:
+            raise ValueError(f"leave_out: there is no world {name!r}; there are {names[:5]}, ...")
+    kept = np.array([name not in leave_out for name in names])
+    if not kept.any():
+        raise ValueError("leave_out names every world; leave at least one in.")
+    infeasible = np.array(
+        [
+            np.asarray(
+                infeasible_starts(jax.tree.map(lambda x, w=w: np.asarray(x)[w], models))
+            ).any()
+            for w in range(count)
+        ]
+    )
+    mean = np.asarray(performance.mean, np.float64)
+    worst = int(np.argmin(np.where(kept, mean, np.inf)))
+
+    def named(chosen: np.ndarray) -> tuple[str, ...]:
+        return tuple(name for name, is_in in zip(names, chosen, strict=True) if is_in)
+
+    return Summary(
+        mean=float(mean[kept].mean()),
+        std=float(mean[kept].std(ddof=1)) if kept.sum() > 1 else 0.0,
+        lower=float(np.asarray(performance.lower, np.float64)[kept].mean()),
+        upper=float(np.asarray(performance.upper, np.float64)[kept].mean()),
+        worst_world=names[worst],
+        worst=float(mean[worst]),
+        worst_start=float(np.asarray(performance.worst)[kept].min()),
+        num_worlds=int(kept.sum()),
+        infeasible=named(infeasible),
+        left_out=named(~kept),
+        uncertain=named(np.asarray(performance.status) != Status.CONVERGED),
+    )

@@ -1,0 +1,303 @@
+"""Probabilities of satisfying a formula: of a policy, largest and smallest."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jax import lax
+
+from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.graphs.acceptance import (
+    Accepting,
+    accepting_bottom_components,
+    accepting_end_components,
+)
+from jaxltl.core.models.interval import IntervalMDP
+from jaxltl.core.models.mesh.sharded import is_sharded
+from jaxltl.core.models.ops.array_namespace import is_traced, namespace, to_jax
+from jaxltl.core.models.ops.operators import is_deterministic, require_policy
+from jaxltl.core.models.product import Product
+from jaxltl.core.pretty_print import brief
+from jaxltl.core.sparse.solvers.shortest_path import quickest, until_read
+from jaxltl.core.types import Solution
+from jaxltl.core.values.engine.host_solution import is_sparse
+from jaxltl.core.values.interval.robust import refuse_nature
+from jaxltl.core.values.interval.satisfaction import robust_product_satisfaction
+from jaxltl.core.values.undiscounted.complement import opposite_event
+from jaxltl.core.values.undiscounted.reachability import (
+    QUICK_LIMIT,
+    action_matrices,
+    reachability_probability,
+)
+from jaxltl.core.values.undiscounted.sparse_satisfaction import product_satisfaction
+
+
+def satisfaction_probability(
+    model: Product,
+    policy: jax.Array,
+    *,
+    nature: str | None = None,
+    method: str = "auto",
+    tolerance: jax.Array | float | None = None,
+) -> Solution:
+    """Probability that a policy satisfies the product's task, from every product state.
+
+    For a co-safe task, of reaching a final state (2.5); for a safety task, of never
+    leaving the final states; for Buchi and parity, of reaching a closed component of the
+    policy's chain whose least priority is even.
+
+    Args:
+      model: the product.
+      policy: ``float[S, Q, A]`` or ``int32[S, Q]``; where the world is sparse ``float[R, Q]``, or
+        its rows ``int32[S, Q]``.
+      nature: of products of interval models only, ``"min"`` (the default) or ``"max"``.
+      method, tolerance: as in :func:`reachability_probability`.
+
+    Returns:
+      :class:`Solution`; `value` is ``float[S, Q]``. The probability from the start is
+      ``jnp.sum(model.initial * solution.value)``.
+
+    Raises:
+      ValueError: the model is no product, the policy has the wrong shape or a row that is no
+        distribution over available actions (under ``jit`` the status is then INVALID), nature is
+        named where probabilities are no intervals, or an unknown method.
+
+    Differentiable in the policy and in the world's transition probabilities, with the
+    support held fixed.
+
+    Not so of products of sparse and of interval models, which are solved on the host.
+
+    Example:
+      >>> from jaxltl import from_dense, product
+      >>> world = from_dense([[[0, 1.0, 0], [0, 0.5, 0.5]], [[0, 1.0, 0]] * 2, [[0, 0, 1.0]] * 2],
+      ...                    label=[[0], [1], [0]], propositions=["goal"], initial=[1, 0, 0])
+      >>> model = product(world, "F goal")
+      >>> found = satisfaction_probability(model, np.full((3, 2, 2), 0.5))
+      >>> round(float(np.sum(model.initial * found.value)), 6)
+      0.75
+    """
+    _require_product(model)
+    if isinstance(model.mdp, IntervalMDP):
+        return robust_product_satisfaction(model, policy=policy, nature=nature, tolerance=tolerance)
+    refuse_nature(nature)
+    if is_sparse(model):
+        return product_satisfaction(model, policy=policy, tolerance=tolerance)
+    kind = model.automaton.acceptance
+    if kind in ("cosafe", "safety"):
+        target = model.final if kind == "cosafe" else _not_final(model)
+    else:
+        require_policy(model, policy)
+        support = policy
+        if is_deterministic(policy):
+            support = _one_hot(policy, model.num_actions)
+        target = accepting_bottom_components(model, lax.stop_gradient(support))
+    reach = reachability_probability(
+        model, target, policy=policy, method=method, tolerance=tolerance
+    )
+    return opposite_event(reach) if kind == "safety" else reach
+
+
+def optimal_satisfaction(
+    model: Product,
+    *,
+    objective: str = "max",
+    nature: str | None = None,
+    tolerance: jax.Array | float | None = None,
+    max_steps: jax.Array | int = 1_000_000,
+    start: tuple[jax.Array, jax.Array] | None = None,
+) -> Solution:
+    """Largest or smallest probability of satisfying the product's task, with its policy.
+
+    For a co-safe task, of reaching a final state; for a safety task, of never leaving
+    them; for Buchi and parity, of reaching an accepting end component, where the policy
+    goes on so that acceptance is almost sure (Baier and Katoen 2008, section 10.6.4).
+    The least probability of a task is one minus the largest of its negation.
+
+    The policy is also the **quickest of the best**: of all policies that attain the optimum, it
+    has the least expected number of steps from every state until nothing is open any more. That is
+
+    - for what is to be reached (a final state of a co-safe task, by ``"min"`` a state off those of
+      a safety task): until it is reached, or out of reach;
+    - for what is to be avoided (the same with the other objective): until it is out of reach, or
+      sure;
+    - for Buchi and parity: until the accepting end component is reached, or none can be; and in it,
+      by its own actions, from any state until its least priority is read again.
+
+    Every best policy decides almost surely, so these times are finite: a stochastic shortest path
+    (Bertsekas and Tsitsiklis 1991) over the conserving actions. Of equally quick actions it takes
+    the first. On a concrete model whose bounds are not found on the host, as of more than some
+    thousand states, actions are known to tie where the graph shows it: where the best
+    probability is 1, and in end components. Under ``jit`` and ``vmap`` the policy attains the same
+    optimum but may take longer.
+
+    Args:
+      model: the product.
+      objective: ``"max"`` or ``"min"``.
+      nature: of products of interval models only, see
+        :func:`~jaxltl.core.values.interval.satisfaction.robust_satisfaction`.
+      tolerance: half the width of the enclosure asked for; default as in
+        :func:`reachability_probability`, as closely as the dtype allows.
+      max_steps: sweeps at most.
+      start: bounds to go on from, as for :func:`reachability_probability`.
+
+    Returns:
+      :class:`Solution`; `value` is ``float[S, Q]``, `policy` ``int32[S, Q]``, memoryless in
+      the product: its memory is the automaton's state. Where the world is sparse, it is one of the
+      best policies, of the world's rows.
+
+    Raises:
+      ValueError: the model is no product, the objective is unknown, nature is named where
+        probabilities are no intervals, or the world is sparse and its actions are restricted.
+
+    Differentiable in the world's transition probabilities, with the support and the best policy
+    held fixed; not so of products of sparse and of interval models, which are solved on the host.
+
+    Example:
+      >>> from jaxltl import from_dense, product
+      >>> world = from_dense([[[0, 0.5, 0.5], [0, 0.75, 0.25]], [[0, 1, 0]] * 2, [[0, 0, 1]] * 2],
+      ...                    label=[[0], [1], [0]], propositions=["goal"], initial=[1, 0, 0])
+      >>> best = optimal_satisfaction(product(world, "F goal"))
+      >>> best.value[0, 0].item(), best.policy[0, 0].item()
+      (0.75, 1)
+      >>> optimal_satisfaction(product(world, "G F goal"), objective="min").value[0, 0].item()
+      0.5
+    """
+    _require_product(model)
+    if isinstance(model.mdp, IntervalMDP):
+        return robust_product_satisfaction(
+            model, objective=objective, nature=nature, tolerance=tolerance
+        )
+    refuse_nature(nature)
+    if objective in ("max", "min") and is_sparse(model):
+        return product_satisfaction(model, objective=objective, tolerance=tolerance)
+    run = _over_mesh if is_sharded(model) else _optimal
+    return run(model, tolerance, max_steps, start, objective=objective)
+
+
+def _optimal(
+    model: Product, tolerance: Any, max_steps: Any, start: Any, *, objective: str
+) -> Solution:
+    problem = as_reachability(model, objective)
+    if start is not None and problem.opposite:  # rounded outwards
+        eps = np.finfo(model.dtype).eps
+        start = 1 - start[1] - eps, 1 - start[0] + eps
+    found = reachability_probability(
+        problem.model,
+        problem.target,
+        objective=problem.objective,
+        tolerance=tolerance,
+        max_steps=max_steps,
+        start=start,
+    )
+    if problem.accepting is not None:
+        xp, region, action, chosen = namespace(
+            problem.accepting.region, _visiting(problem, found), found.policy
+        )
+        found = replace(found, policy=to_jax(xp.where(region, action, chosen).astype(xp.int32)))
+    return opposite_event(found) if problem.opposite else found
+
+
+# What no host reads is one program, not one an operation.
+_over_mesh = jax.jit(_optimal, static_argnames=("objective",))
+
+
+@brief
+class Reaching(NamedTuple):
+    """The optimal reachability problem that a task's optimum is.
+
+    Attributes:
+      model: the product, or that of the task's negation.
+      target: ``bool[S, Q]``.
+      objective: ``"max"`` or ``"min"``.
+      opposite: whether the task's probability is one minus that of the target.
+      accepting: for Buchi and parity, what the target is made of.
+    """
+
+    model: Product
+    target: Any
+    objective: str
+    opposite: bool
+    accepting: Accepting | None = None
+
+
+def as_reachability(model: Product, objective: str) -> Reaching:
+    """What is to be reached, and whether often or seldom, for the best probability of a task.
+
+    Raises:
+      ValueError: the objective is unknown.
+    """
+    if objective not in ("max", "min"):
+        raise ValueError(f'objective={objective!r}; it must be "max" or "min".')
+    kind = model.automaton.acceptance
+    if kind == "cosafe":
+        return Reaching(model, model.final, objective, False)
+    if kind == "safety":
+        return Reaching(model, _not_final(model), "min" if objective == "max" else "max", True)
+    if objective == "min":
+        model = replace(model, automaton=_shifted(model.automaton))
+    accepting = accepting_end_components(model)
+    return Reaching(model, accepting.region, "max", objective == "min", accepting)
+
+
+def _visiting(problem: Reaching, found: Solution) -> Any:
+    """In accepting end components, a policy that meets their least priority again and again.
+
+    On a concrete model, the one by which the next time is soonest.
+    """
+    model, accepting = problem.model, problem.accepting
+    assert accepting is not None
+    if is_traced((model, found)) or model.num_states > QUICK_LIMIT:
+        return accepting.action
+    rows = until_read(action_matrices(model), *visiting(problem))
+    inside = np.asarray(accepting.inside).reshape(model.num_states, -1)
+    action = np.asarray(accepting.action)
+    quick = quickest(rows, inside, np.asarray(accepting.region).ravel(), action.ravel())
+    return action if quick is None else quick.reshape(action.shape)
+
+
+def visiting(problem: Reaching) -> tuple[Any, Any]:
+    """The reads that an accepting end component is visited for, as `until_read` takes them.
+
+    Returns:
+      ``bool[N, L]``, whether reading a letter in a state is a visit, and ``int[N]``, the letter
+      that is read when a state is entered; on the host.
+    """
+    model, accepting = problem.model, problem.accepting
+    assert accepting is not None
+    automaton, letter = jax.tree.map(np.asarray, (model.automaton, model.letter))
+    least = np.asarray(accepting.least)
+    if model.label_on == "entry":
+        marked = automaton.priority == least[..., None]  # [S, Q, L]
+        read = np.repeat(letter, model.num_memory)
+    else:
+        marked = least == automaton.priority[:, letter].T
+        read = np.zeros(model.num_states, np.int32)
+    return marked.reshape(model.num_states, -1), read
+
+
+def _shifted(automaton: Automaton) -> Automaton:
+    """The automaton of the negation; unlike `complement`, for traced tables too."""
+    xp, priority = namespace(automaton.priority)
+    priority = to_jax((priority + 1).astype(xp.int32))
+    return replace(automaton, priority=priority, acceptance="parity", state_names=())
+
+
+def _not_final(model: Product) -> Any:
+    _, final = namespace(model.final)
+    return to_jax(~final)
+
+
+def _one_hot(policy: Any, num_actions: int) -> Any:
+    xp, table = namespace(policy)
+    return table[..., None] == xp.arange(num_actions)
+
+
+def _require_product(model: Any) -> None:
+    if not hasattr(model, "automaton"):
+        raise ValueError(
+            f"{type(model).__name__} is no product of a world and a task; give "
+            "product(world, formula)."
+        )

@@ -1,0 +1,317 @@
+"""The best probability of a formula of linear temporal logic on a sparse model, on the host."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxltl.core.automata.automaton import Automaton, letter_index
+from jaxltl.core.automata.runs import live_states, universal_states
+from jaxltl.core.automata.translate import Task, to_automaton
+from jaxltl.core.logic.ltl import as_formula
+from jaxltl.core.models.build.state_formulas import letters_of
+from jaxltl.core.models.ops.operators import is_deterministic
+from jaxltl.core.models.product import Product
+from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.pretty_print import brief
+from jaxltl.core.sparse.graph.accepting import accepting_region
+from jaxltl.core.sparse.product import HostProduct, host_product, without_memory
+from jaxltl.core.sparse.solvers.reachability import reachability
+from jaxltl.core.types import Solution, require_shape
+from jaxltl.core.values import facts
+from jaxltl.core.values.engine.host_solution import Chain, chain_of, default_tolerance, solution_of
+from jaxltl.core.values.undiscounted.complement import opposite_event
+
+
+@brief(facts=facts.satisfaction)
+class Satisfaction(NamedTuple):
+    """The best probability of a task, with a policy that has a memory.
+
+    Attributes:
+      solution: value, lower and upper are ``float64[I]``, one for each state that was asked for.
+      automaton: the task, over the letters that occur.
+      letter: ``int[S]``, the letter that each state shows.
+      product: what is reached of the model beside the automaton, N states.
+      row: ``int32[N]``, the row of the model that the policy takes in each of them.
+
+    Example:
+      >>> from jaxltl import make_sparse
+      >>> two_ways = make_sparse([0, 2, 3, 4], [0, 1, 2, 3, 4], [1, 2, 1, 2], [1, 1, 1, 1],
+      ...                        initial=[1, 0, 0], label={"a": [1]})
+      >>> found = sparse_satisfaction(two_ways, "F a")
+      >>> found.solution.value.tolist(), found.row[found.product.start].tolist()
+      ([1.0], [0])
+    """
+
+    solution: Solution
+    automaton: Automaton
+    letter: np.ndarray
+    product: HostProduct
+    row: np.ndarray
+
+
+def sparse_satisfaction(
+    model: SparseMDP,
+    task: Task,
+    *,
+    objective: str = "max",
+    states: Any = None,
+    label_on: str = "entry",
+    tolerance: float | None = None,
+) -> Satisfaction:
+    """Largest or smallest probability of satisfying a formula, from some states.
+
+    Only what is reached of the product of the model and the formula's automaton is written out (an
+    automaton of one state has the model itself for a product), and that only until the verdict is
+    known. In it the task is to reach states whose verdict is yes, among them, for Buchi and parity
+    acceptance, the accepting end components (Baier and Katoen 2008, section 10.6.4); for a safety
+    formula, not to reach those whose verdict is no. The least probability of Buchi and parity is
+    one minus the largest of the negation.
+
+    Args:
+      model: the model.
+      task: a formula, its text, or an automaton over the letters that occur in the model.
+      objective: ``"max"`` or ``"min"``.
+      states: ``int[I]``, where runs start; default the initial states.
+      label_on: ``"entry"``: the label of the first state is read at once; ``"exit"``: as it is
+        left. The probabilities are the same, for the run shows the same word.
+      tolerance: of :func:`~jaxltl.core.values.undiscounted.reachability.reachability_probability`.
+
+    Returns:
+      :class:`Satisfaction`.
+
+    Raises:
+      ValueError: an unknown label, state, objective or reading, or a product beyond 2^31
+        states.
+
+    Concrete arrays only, on the host; not differentiable.
+
+    Example:
+      >>> from jaxltl import make_sparse
+      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1],
+      ...                    initial=[1, 0, 0], label=[[0], [1], [0]], propositions=["a"])
+      >>> sparse_satisfaction(coin, "F G a").solution.value.tolist()
+      [0.5]
+    """
+    if objective not in ("max", "min"):
+        raise ValueError(f'objective={objective!r}; it must be "max" or "min".')
+    if label_on not in ("entry", "exit"):
+        raise ValueError(f'label_on={label_on!r}; it must be "entry" or "exit".')
+    automaton, letter = automaton_of(model, task)
+    states = starting_states(model, states)
+    yes, no = universal_states(automaton), ~live_states(automaton)
+    on_entry = label_on == "entry"
+    product = _product(model, automaton, letter, states, on_entry, yes | no)
+    found, row = _best(product, automaton, letter, yes, no, on_entry, objective, tolerance)
+    return Satisfaction(
+        at_states(found, product.start), automaton, letter, product, product.base_row[row]
+    )
+
+
+def starting_states(model: Any, states: Any) -> np.ndarray:
+    """Where runs start, ``int64[I]``: the numbers that are given, else the initial states.
+
+    Raises:
+      ValueError: they are no numbers of states.
+    """
+    if states is None:
+        return np.flatnonzero(np.asarray(model.initial) > 0)
+    given = np.asarray(states)
+    if not given.size or given.dtype.kind not in "iu":
+        raise ValueError(
+            f"states is {given.dtype}{list(given.shape)}; give the numbers of states, at least one."
+        )
+    wrong = (given < 0) | (given >= model.num_states)
+    if wrong.any():
+        raise ValueError(
+            f"states has {given[wrong][0]}; the states are 0 to {model.num_states - 1}."
+        )
+    return given.astype(np.int64)
+
+
+def _best(
+    product: HostProduct,
+    automaton: Automaton,
+    letter: np.ndarray,
+    yes: np.ndarray,
+    no: np.ndarray,
+    on_entry: bool,
+    objective: str,
+    tolerance: float | None,
+    depth: int = 0,
+) -> tuple[Solution, np.ndarray]:
+    """The best probability from all states of a product, and the rows that attain it."""
+    opposite = automaton.acceptance == "safety" or (
+        automaton.acceptance in ("buchi", "parity") and objective == "min"
+    )
+    goal: Any = (no if opposite else yes)[product.memory]
+    visiting = None
+    if automaton.acceptance in ("buchi", "parity"):
+        entry_letter = product.entry_letter(letter, on_entry)
+        priority = (
+            automaton.priority[product.memory[product.host.state[product.host.row]], entry_letter]
+            + opposite
+        )
+        # What stands still has its verdict, and no end component of its own.
+        priority[product.still[product.host.state[product.host.row]]] = 1
+        visiting = accepting_region(product.host, priority)
+        goal = goal | visiting.region
+        aim = "max"
+    else:
+        aim = objective if not opposite else {"max": "min", "min": "max"}[objective]
+    whole = as_sparse(product)
+    asked = default_tolerance(whole) if tolerance is None else float(tolerance)
+    found = solution_of(
+        whole,
+        whole,
+        reachability(product.host, goal, maximize=aim == "max", tolerance=asked, depth=depth),
+        asked,
+        relative=False,
+    )
+    row = np.asarray(found.policy)
+    if visiting is not None:
+        row = np.where(visiting.region, visiting.row, row)
+    return (opposite_event(found) if opposite else found), row
+
+
+def product_satisfaction(
+    model: Product, *, policy: Any = None, objective: str = "max", tolerance: Any = None
+) -> Solution:
+    """The same from every pair of a state and a memory of a product of a sparse model.
+
+    Args:
+      model: a product of a concrete sparse model.
+      policy: rows of the world ``int32[S, Q]``, or their weights ``float[R, Q]``, to be evaluated;
+        default: optimise.
+      objective: ``"max"`` or ``"min"``; ignored when a policy is given.
+      tolerance: of :func:`~jaxltl.core.values.undiscounted.reachability.reachability_probability`.
+
+    Returns:
+      :class:`Solution`; `value` is ``float64[S, Q]``, `policy` rows of the world, ``int32[S, Q]``.
+
+    Raises:
+      ValueError: the product's actions are restricted, or a policy is none.
+
+    Concrete arrays only, on the host; not differentiable.
+
+    Example:
+      >>> from jaxltl import make_sparse, product
+      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1],
+      ...                    initial=[1, 0, 0], label={"a": [1]})
+      >>> product_satisfaction(product(coin, "F a")).value[:, 0].tolist()
+      [0.5, 1.0, 0.0]
+    """
+    if model.allowed is not None:
+        raise ValueError(
+            "a product of a sparse model takes no mask of actions; restrict the world "
+            "by with_allowed(world, rows), or write the product out by to_sparse."
+        )
+    world: Any = model.mdp
+    task = model.automaton
+    automaton = replace(task, delta=np.asarray(task.delta), priority=np.asarray(task.priority))
+    letter, shape = np.asarray(model.letter), model.state_shape
+    on_entry = model.label_on == "entry"
+    state, memory = (x.ravel() for x in np.indices(shape))
+    product = host_product(world.host, automaton.delta, letter, state, memory, on_entry=on_entry)
+    depth = 0
+    if policy is not None:
+        chain = _chain(product, model, policy)
+        product, depth, objective = product._replace(host=chain.mdp), chain.depth, "max"
+    found, row = _best(
+        product,
+        automaton,
+        letter,
+        universal_states(automaton),
+        ~live_states(automaton),
+        on_entry,
+        objective,
+        tolerance,
+        depth,
+    )
+    parts: dict[str, Any] = {
+        name: np.asarray(getattr(found, name)).reshape(shape)
+        for name in ("value", "lower", "upper")
+    }
+    parts["policy"] = (
+        np.asarray(policy)
+        if policy is not None
+        else product.base_row[row].astype(np.int32).reshape(shape)
+    )
+    return replace(found, **parts)
+
+
+def _chain(product: HostProduct, model: Product, policy: Any) -> Chain:
+    """The chain of a policy of the world's rows."""
+    policy = np.asarray(policy)
+    written = as_sparse(product)
+    memory = product.memory[product.host.state]
+    if is_deterministic(policy):
+        require_shape("policy", policy, model.state_shape)
+        taken = policy.ravel()[product.host.state] == product.base_row
+        weight = taken.astype(np.float64)
+    else:
+        world: Any = model.mdp
+        require_shape("policy", policy, (world.num_rows, model.num_memory))
+        weight = policy[product.base_row, memory]
+    return chain_of(written, written, weight)
+
+
+def _product(
+    model: SparseMDP,
+    automaton: Automaton,
+    letter: np.ndarray,
+    states: np.ndarray,
+    on_entry: bool,
+    still: np.ndarray,
+) -> HostProduct:
+    if still.size == 1 and not still.any():
+        return without_memory(model.host, states)
+    initial = np.broadcast_to(automaton.initial, states.shape)
+    memory = automaton.delta[initial, letter[states]] if on_entry else initial
+    return host_product(
+        model.host, automaton.delta, letter, states, memory, on_entry=on_entry, still=still
+    )
+
+
+def automaton_of(model: SparseMDP, task: Task) -> tuple[Automaton, np.ndarray]:
+    """The automaton of a task over the letters of a model, and the letter of each state."""
+    if not isinstance(task, Automaton):
+        task = as_formula(task)
+        shown, number = letters_of(model, task.propositions)
+        task = to_automaton(task, letters=shown)
+    else:
+        shown, number = letters_of(model, task.propositions)
+    index = np.array([letter_index(task, letter) for letter in shown], np.int64)
+    automaton = replace(
+        task,
+        delta=np.asarray(task.delta),
+        priority=np.asarray(task.priority),
+        letters=np.asarray(task.letters),
+    )
+    return automaton, index[number]
+
+
+def as_sparse(product: HostProduct) -> SparseMDP:
+    """A product as a model without labels, that starts where its runs do."""
+    host = product.host
+    initial = np.zeros(host.num_states)
+    initial[product.start] = 1
+    return SparseMDP(
+        host.row_start,
+        host.entry_start,
+        host.successor,
+        host.probability,
+        initial / initial.sum(),
+        np.zeros((host.num_states, 0), bool),
+    )
+
+
+def at_states(solution: Solution, states: np.ndarray) -> Solution:
+    """A solution's value and bounds at some states."""
+    taken: dict[str, Any] = {
+        name: np.asarray(getattr(solution, name), np.float64)[states]
+        for name in ("value", "lower", "upper")
+    }
+    return replace(solution, **taken)

@@ -1,0 +1,376 @@
+"""What can be had in so many steps, or for so much reward: probabilities and expected rewards.
+
+All are solved on the host, in double precision, and enclosed with their rounding.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from jaxltl.core.models.build.convert import to_sparse
+from jaxltl.core.models.sparse import Rewards, SparseMDP, reward_parts, row_reward
+from jaxltl.core.sparse.solvers import step_bounded as host
+from jaxltl.core.sparse.solvers.reward_bounded import bounded_cost, in_units
+from jaxltl.core.types import Solution, Status
+from jaxltl.core.validation import shown, whole
+
+TOLERANCE = 1e-6  # half the width of an enclosure up to which it counts as narrow, relative
+
+
+def next_probability(model: Any, target: Any, *, objective: str = "max") -> Solution:
+    """Probability that the next state is in a set.
+
+    ``max_a P(target | s, a)``, or the minimum (Baier and Katoen 2008, section 10.6.1).
+
+    Args:
+      model: a SparseMDP, or any concrete model that :func:`to_sparse` takes.
+      target: ``bool[S]``, or the name of a label.
+      objective: ``"max"`` or ``"min"``; of chains either.
+
+    Returns:
+      :class:`Solution`; `value` is ``float64[S]``, `policy` the row of each state ``int32[S]``.
+
+    Raises:
+      ValueError: the shape of the target or the objective.
+
+    Concrete arrays only, on the host; not differentiable.
+
+    Example:
+      >>> from jaxltl import make_sparse
+      >>> model = make_sparse([0, 2, 3], [0, 2, 3, 4], [0, 1, 0, 1], [0.75, 0.25, 1, 1])
+      >>> found = next_probability(model, [False, True])
+      >>> found.value.tolist(), found.policy.tolist()
+      ([0.25, 1.0], [0, 2])
+    """
+    model, operation = _problem(model, objective)
+    mdp, target = model.host, states(model, target, "target")
+    # One step of "until" in which the target counts only once it is entered.
+    image = mdp.expectation(target.astype(np.float64))
+    value = mdp.over_choices(operation, image)
+    choose = np.logical_or if operation is np.maximum else np.logical_and
+    positive = mdp.over_choices(choose, mdp.support.lead_to(target))
+    sure = mdp.over_choices(choose, ~mdp.support.lead_to(~target))
+    error = value * host.relative_error(host.backup_unit(mdp), 1)
+    value = np.where(sure, 1, np.where(positive, value, 0))
+    _, row = mdp.first_choice(
+        image == np.repeat(mdp.over_choices(operation, image), np.diff(mdp.row_start))
+    )
+    return enclosed(value, np.where(sure | ~positive, 0, error), row, 1, highest=1)
+
+
+def bounded_reachability(
+    model: Any,
+    target: Any,
+    num_steps: int,
+    *,
+    stay: Any = None,
+    objective: str = "max",
+    by_step: bool = False,
+) -> Solution:
+    """Probability to reach a set within so many steps, through states where one may stay.
+
+    ``x_0 = [s in target]``, and ``x_{k+1}(s) = 1`` on the target, ``max_a (P x_k)(s, a)`` where
+    one may stay, else 0 (Baier and Katoen 2008, section 10.1.1).
+
+    Args:
+      model: a SparseMDP, or any concrete model that :func:`to_sparse` takes.
+      target: ``bool[S]``, or the name of a label.
+      num_steps: how many steps there are at most.
+      stay: ``bool[S]`` or a label, what must hold before the target is reached; default anything.
+      objective: ``"max"`` or ``"min"``; of chains either.
+      by_step: give the choices of all steps.
+
+    Returns:
+      :class:`Solution`; `value` is ``float64[S]``, exactly 0 or 1 where the graph says so.
+      `policy` is the first choice, with all steps left, as a row, ``int32[S]``; with `by_step` the
+      choices of all steps, the first step's first, ``int32[n, S]``. `num_steps` is after how many
+      steps nothing changes any more, at most n.
+
+    Raises:
+      ValueError: a shape, the objective, or a negative number of steps.
+
+    Concrete arrays only, on the host; not differentiable.
+
+    Example:
+      >>> from jaxltl import make_sparse
+      >>> model = make_sparse(None, [0, 2, 3], [0, 1, 1], [0.5, 0.5, 1.0])
+      >>> bounded_reachability(model, [False, True], 3).value.tolist()
+      [0.875, 1.0]
+    """
+    model, operation = _problem(model, objective, num_steps)
+    target = states(model, target, "target")
+    stay = np.ones_like(target) if stay is None else states(model, stay, "stay")
+    found = host.until(model.host, target, stay, num_steps, operation, by_step)
+    return enclosed(found.value, found.error, found.row, found.num_steps, highest=1)
+
+
+def cumulative_reward(
+    model: Any, reward: Any, num_steps: int, *, objective: str = "max", by_step: bool = False
+) -> Solution:
+    """Expected reward of the next so many steps.
+
+    ``x_{k+1}(s) = max_a r(s, a) + (P x_k)(s, a)`` from ``x_0 = 0`` (Puterman 1994, section 4.3).
+
+    Args:
+      model: a SparseMDP, or any concrete model that :func:`to_sparse` takes.
+      reward: as for :func:`~jaxltl.core.models.sparse.row_reward`; finite.
+      num_steps, objective, by_step: as for :func:`bounded_reachability`.
+
+    Returns:
+      :class:`Solution`, as of :func:`bounded_reachability`.
+
+    Raises:
+      ValueError: the reward, the objective, or a negative number of steps.
+
+    Concrete arrays only, on the host; not differentiable.
+
+    Example:
+      >>> from jaxltl import make_sparse
+      >>> model = make_sparse(None, [0, 2, 3], [0, 1, 1], [0.5, 0.5, 1.0])
+      >>> cumulative_reward(model, [1.0, 0.0], 3).value.tolist()
+      [1.75, 0.0]
+    """
+    model, operation = _problem(model, objective, num_steps)
+    earned, magnitude = finite_reward(model, reward)
+    zero = np.zeros(model.num_states)
+    found = host.total(model.host, earned, magnitude, zero, num_steps, operation, by_step)
+    return enclosed(found.value, found.error, found.row, found.num_steps)
+
+
+def instantaneous_reward(
+    model: Any, reward: Any, num_step: int, *, objective: str = "max", by_step: bool = False
+) -> Solution:
+    """Expected reward of the state in which one is after so many steps.
+
+    ``x_{k+1}(s) = max_a (P x_k)(s, a)`` from the rewards of states ``x_0 = r``.
+
+    Args:
+      model: a SparseMDP, or any concrete model that :func:`to_sparse` takes.
+      reward: the name of a reward, a structure, or an array ``[S]``; of a structure what states
+        earn counts alone. None is the only reward that the model has.
+      num_step: after how many steps.
+      objective, by_step: as for :func:`bounded_reachability`.
+
+    Returns:
+      :class:`Solution`, as of :func:`bounded_reachability`.
+
+    Raises:
+      ValueError: the reward has no part on states, or as for :func:`cumulative_reward`.
+
+    Concrete arrays only, on the host; not differentiable.
+
+    Example:
+      >>> from jaxltl import make_sparse
+      >>> model = make_sparse(None, [0, 2, 3], [0, 1, 1], [0.5, 0.5, 1.0])
+      >>> instantaneous_reward(model, [1.0, 0.0], 3).value.tolist()
+      [0.125, 0.0]
+    """
+    model, operation = _problem(model, objective, num_step)
+    start = state_reward(model, reward)
+    zero = np.zeros(model.num_rows)
+    found = host.total(model.host, zero, zero, start, num_step, operation, by_step)
+    return enclosed(found.value, found.error, found.row, found.num_steps)
+
+
+def reward_bounded_reachability(
+    model: Any,
+    target: Any,
+    reward: Any,
+    bound: float,
+    *,
+    stay: Any = None,
+    objective: str = "max",
+    by_level: bool = False,
+) -> Solution:
+    """Probability to reach a set before more than so much reward is earned.
+
+    With ``x_l`` for l units left, ``x_l(s) = 1`` on the target, and the least solution of
+    ``x_l(s) = max_a sum_t P(t | s, a) x_{l - c(s, a, t)}(t)`` elsewhere, zero below level 0
+    (Andova, Hermanns and Katoen 2003). What is earned in the target does not count.
+
+    Args:
+      model: a SparseMDP, or any concrete model that :func:`to_sparse` takes.
+      target: ``bool[S]``, or the name of a label.
+      reward: as for :func:`~jaxltl.core.models.sparse.row_reward`, not negative, multiples of one
+        unit; numbers are read as the simplest fractions that round to them.
+      bound: what may be earned at most.
+      stay, objective: as for :func:`bounded_reachability`.
+      by_level: give the choices for all amounts left.
+
+    Returns:
+      :class:`Solution`; `value` is ``float64[S]``. `policy` is the first choice, ``int32[S]``; with
+      `by_level`, row l are the choices with l units left, ``int32[L + 1, S]``. `num_steps` is
+      the number of levels, L + 1.
+
+    Raises:
+      ValueError: a shape, the objective, a reward that is negative, or has no unit in common with
+        the others of which the bound has at most 10^7.
+
+    Concrete arrays only, on the host; not differentiable.
+
+    Example:
+      >>> from jaxltl import make_sparse
+      >>> model = make_sparse(None, [0, 2, 3], [0, 1, 1], [0.5, 0.5, 1.0])
+      >>> reward_bounded_reachability(model, [False, True], [0.1, 0], 0.3).value.tolist()
+      [0.875, 1.0]
+    """
+    model, operation = _problem(model, objective)
+    mdp, target = model.host, states(model, target, "target")
+    stay = np.ones_like(target) if stay is None else states(model, stay, "stay")
+    if not 0 <= bound < math.inf:
+        raise ValueError(f"bound={bound}; it must be finite and not negative.")
+    cost = _entry_reward(model, reward_parts(model, reward))
+    if (cost < 0).any():
+        e = int(np.flatnonzero(cost < 0)[0])
+        raise ValueError(
+            f"the reward is {cost[e]:.9g} from state {mdp.state[mdp.row[e]]} to "
+            f"{mdp.successor[e]}; a bound on rewards needs rewards of at least 0."
+        )
+    units, most = in_units(np.where((stay & ~target)[mdp.state[mdp.row]], cost, 0), bound)
+    found = bounded_cost(mdp, target, stay, units, most, operation is np.maximum, by_level)
+    error = np.where(found.open, found.error, 0)
+    return enclosed(found.value, error, found.row, most + 1, highest=1)
+
+
+# --- what these and other host solvers share -----------------------------------------------------
+
+
+def _problem(model: Any, objective: str, num_steps: int = 0) -> tuple[SparseMDP, Any]:
+    whole("num_steps", num_steps)
+    return to_sparse(model), optimum_of(objective)
+
+
+def optimum_of(objective: str) -> Any:
+    """``np.maximum`` or ``np.minimum``.
+
+    Raises:
+      ValueError: it is neither "max" nor "min".
+    """
+    if not isinstance(objective, str) or objective not in ("max", "min"):
+        raise ValueError(f'objective={shown(objective)}; it must be "max" or "min".')
+    return np.maximum if objective == "max" else np.minimum
+
+
+def states(model: SparseMDP, given: Any, name: str) -> np.ndarray:
+    """A set of states as ``bool[S]``, given so (in the model's shape) or by a label."""
+    if isinstance(given, str):
+        return np.asarray(model.states_where(given), bool)
+    given = np.asarray(given).reshape(-1)
+    if given.shape != (model.num_states,) or given.dtype != bool:
+        raise ValueError(
+            f"{name} is {given.dtype}{list(given.shape)}; give one bool for each of "
+            f"the {model.num_states} states, or a label."
+        )
+    return given
+
+
+def state_reward(model: SparseMDP, reward: Any) -> np.ndarray:
+    """What states earn, ``float64[S]``.
+
+    Raises:
+      ValueError: nothing of the reward is on states, or some is not finite.
+    """
+    given = reward_parts(model, reward)
+    if given.state is None:
+        raise ValueError(
+            "the reward of a state after so many steps needs a reward on states, and "
+            "this one has none; give an array of one number a state."
+        )
+    return finite_reward(model, Rewards(state=given.state))[0][model.host.row_start[:-1]]
+
+
+def finite_reward(model: SparseMDP, reward: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Expected rewards of choices, and the same of absolute values: ``float64[R]`` each.
+
+    Raises:
+      ValueError: some reward is not finite.
+    """
+    given = reward_parts(model, reward)
+    earned = row_reward(model, given)
+    if not np.isfinite(earned).all():
+        row = int(np.flatnonzero(~np.isfinite(earned))[0])
+        state = int(model.host.state[row])
+        raise ValueError(
+            f"the reward of state {state}, choice {row - int(model.row_start[state])} "
+            f"is {earned[row]}; make it finite."
+        )
+    if all(
+        x is None or (np.asarray(x) >= 0).all()
+        for x in (given.state, given.choice, given.transition)
+    ):
+        return earned, earned
+    sizes = {
+        name: None if x is None else np.abs(np.asarray(x))
+        for name, x in (
+            ("state", given.state),
+            ("choice", given.choice),
+            ("transition", given.transition),
+        )
+    }
+    return earned, row_reward(model, Rewards(**sizes))
+
+
+def _entry_reward(model: SparseMDP, given: Rewards) -> np.ndarray:
+    """What each entry earns, ``float64[T]``."""
+    mdp = model.host
+    found = np.zeros(mdp.num_transitions)
+    if given.transition is not None:
+        found += np.asarray(given.transition, np.float64)
+    if given.choice is not None:
+        found += np.asarray(given.choice, np.float64)[mdp.row]
+    if given.state is not None:
+        found += np.asarray(given.state, np.float64)[mdp.state[mdp.row]]
+    if not np.isfinite(found).all():
+        e = int(np.flatnonzero(~np.isfinite(found))[0])
+        raise ValueError(
+            f"the reward is {found[e]} from state {mdp.state[mdp.row[e]]} to "
+            f"{mdp.successor[e]}; make it finite."
+        )
+    return found
+
+
+def enclosed(
+    value: np.ndarray,
+    error: Any,
+    policy: Any,
+    num_steps: int,
+    *,
+    highest: float = math.inf,
+    tolerance: float = TOLERANCE,
+    least: float = 1.0,
+    residual: float = 0.0,
+) -> Solution:
+    """A host solver's :class:`Solution`.
+
+    Args:
+      value: ``float64[S]``.
+      error: how far it may be off, of any shape that goes with it.
+      policy: rows.
+      num_steps: what was spent.
+      highest: 1 for probabilities.
+      tolerance: the error up to which it has converged, as a share of the value.
+      least: or of this, where that is more.
+      residual: what the solution says.
+    """
+    error = np.broadcast_to(np.asarray(error, np.float64), value.shape)
+    out = error > 0
+    lower = np.where(out, np.nextafter(value - error, -np.inf), value)
+    upper = np.where(out, np.nextafter(value + error, np.inf), value)
+    if highest == 1:
+        lower, upper, value = (np.clip(x, 0, 1) for x in (lower, upper, value))
+    finite = bool(np.isfinite(value).all())
+    narrow = bool((error <= tolerance * np.maximum(np.abs(value), least)).all())
+    status = Status.CONVERGED if narrow else Status.PRECISION if finite else Status.NONFINITE
+    found: Any = {
+        "value": value + 0.0,
+        "policy": policy,
+        "lower": lower,
+        "upper": upper,
+        "residual": np.float64(residual),
+        "num_steps": np.int32(num_steps),
+        "status": np.int32(status),
+    }
+    return Solution(**found)

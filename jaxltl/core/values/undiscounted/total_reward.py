@@ -1,0 +1,209 @@
+"""Expected total reward until a target is reached, or for ever, with certified bounds."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxltl.core.models.build.convert import to_sparse
+from jaxltl.core.models.interval import IntervalMDP
+from jaxltl.core.models.mdp import MDP, DenseMDP
+from jaxltl.core.models.mesh.sharded import ShardedMDP, is_sharded
+from jaxltl.core.models.ops.array_namespace import is_traced
+from jaxltl.core.models.product import Product
+from jaxltl.core.models.sparse import Rewards, SparseMDP, row_reward
+from jaxltl.core.sparse.solvers import reachability as optimal
+from jaxltl.core.types import Solution, require_shape
+from jaxltl.core.values.engine.host_solution import (
+    chain_of,
+    default_tolerance,
+    given_policy,
+    is_sparse,
+    solution_of,
+)
+from jaxltl.core.values.interval.robust import refuse_nature, robust_total_reward
+from jaxltl.core.values.undiscounted.traced_total_reward import total_reward_by_sweeps
+
+
+def total_reward(
+    model: Any,
+    reward: str | Rewards | chex.Array | None,
+    target: chex.Array | None = None,
+    *,
+    policy: chex.Array | None = None,
+    objective: str = "max",
+    nature: str | None = None,
+    tolerance: float | None = None,
+) -> Solution:
+    """Expected reward until a target is reached; without a target, for ever.
+
+    The least solution of ``x = 0`` on the target, ``x = opt_a (r(s, a) + (P x)(s, a))`` elsewhere
+    (Puterman 1994, chapter 7; Baier and Katoen 2008, section 10.5.1). What comes after the target
+    does not count. It is infinite where the target is not reached almost surely: for ``"max"``
+    under some policy, for ``"min"`` under every policy; without a target where reward is earned
+    for ever. That is decided on the graph; where going round earns nothing, states are one.
+
+    Inside ``jit``, and of a :class:`~jaxltl.core.models.mesh.sharded.ShardedMDP`, inexact policy
+    iteration and two sweeps that prove the bounds answer, see
+    :mod:`~jaxltl.core.values.undiscounted.traced_total_reward`.
+
+    Args:
+      model: an MDP, DenseMDP, SparseMDP or product of one, or an IntervalMDP; inside ``jit`` an
+        MDP, DenseMDP, ShardedMDP or product of one.
+      reward: at least 0. For a sparse model as of
+        :func:`~jaxltl.core.models.sparse.row_reward`: a name, a structure, or an array on states,
+        choices or transitions; else ``float[S]`` or ``float[S, A]``, what a step earns, or of a
+        ShardedMDP the name of one.
+      target: ``bool[S]``; inside ``jit`` and over a mesh there has to be one.
+      policy: evaluate this policy; default: optimise.
+      objective: ``"max"`` or ``"min"``; ignored when a policy is given.
+      nature: of interval models only, see
+        :func:`~jaxltl.core.values.interval.robust.robust_total_reward`, which answers then.
+      tolerance: the width of the enclosure asked for, as a share of the value; default 1e-6 in
+        double precision, 1e-3 in single.
+
+    Returns:
+      :class:`Solution`; `value` is ``float[S]``, infinite or 0 exactly where the graph says so. An
+      optimum's `policy` attains its bound on the safe side: ``int32[S]``, rows of a sparse model,
+      else actions. Inside ``jit`` bad rewards give the status ``NONFINITE``, a bad policy
+      ``INVALID``.
+
+    Raises:
+      ValueError: a shape, the objective or a policy is wrong, a reward is negative, or inside
+        ``jit`` the model is sparse or there is no target.
+
+    Inside ``jit`` and over a mesh differentiable in the reward, the probabilities and the policy,
+    with the support held fixed.
+
+    Example:
+      >>> from jaxltl import make_sparse
+      >>> coin = make_sparse(None, [0, 2, 3], [0, 1, 1], [0.5, 0.5, 1.0])
+      >>> total_reward(coin, np.ones(2), np.array([False, True])).value.round(6).tolist()
+      [2.0, 0.0]
+    """
+    if objective not in ("max", "min"):
+        raise ValueError(f'objective={objective!r}; it must be "max" or "min".')
+    if isinstance(model, IntervalMDP):
+        if target is None:
+            raise ValueError("total rewards of interval models need a target; give one.")
+        return robust_total_reward(
+            model,
+            reward,
+            target,
+            policy=policy,
+            objective=objective,
+            nature=nature,
+            tolerance=tolerance,
+        )
+    refuse_nature(nature)
+    if is_sharded(model) or is_traced((model, reward, target, policy, tolerance)):
+        return _by_sweeps(model, reward, target, policy, objective, tolerance)
+    sparse = to_sparse(model)
+    earned = _earned(model, sparse, reward)
+    if (earned < 0).any():
+        r = int(np.flatnonzero(earned < 0)[0])
+        raise ValueError(
+            f"the reward of a choice of state {sparse.host.state[r]} is {earned[r]:.6g}; expected "
+            "total rewards need rewards of at least 0."
+        )
+    if target is not None:
+        require_shape("target", target, model.state_shape)
+        target = np.asarray(target, bool).ravel()
+    asked = default_tolerance(model) if tolerance is None else float(tolerance)
+    host, depth, maximize = sparse.host, 0, objective == "max"
+    if policy is not None:
+        chain = chain_of(model, sparse, policy)
+        earned = chain.mean(earned, host.row_start)
+        host, depth = chain.mdp, chain.depth
+    if target is None:
+        found = optimal.reward_forever(
+            host, earned, maximize=maximize, tolerance=asked, depth=depth
+        )
+    else:
+        found = optimal.total_reward(
+            host, earned, target, maximize=maximize, tolerance=asked, depth=depth
+        )
+    return given_policy(solution_of(model, sparse, found, asked, relative=True), policy)
+
+
+def _earned(model: Any, sparse: SparseMDP, reward: Any) -> np.ndarray:
+    if is_sparse(model):
+        return row_reward(sparse, reward)
+    if reward is None or isinstance(reward, str | Rewards):
+        raise ValueError(f"reward={reward!r}; only a SparseMDP has named rewards: give an array.")
+    reward = np.asarray(reward, np.float64)
+    states = model.state_shape
+    if reward.shape == states:
+        return reward.ravel()[sparse.host.state]
+    require_shape("reward", reward, (*states, model.num_actions))
+    flat = reward.reshape(sparse.num_states, -1)
+    return flat[sparse.host.state, np.asarray(sparse.action)]
+
+
+# --- what no host reads -------------------------------------------------------------------------
+
+
+def _by_sweeps(
+    model: Any, reward: Any, target: Any, policy: Any, objective: str, tolerance: Any
+) -> Solution:
+    world = model.mdp if isinstance(model, Product) else model
+    if not isinstance(world, MDP | DenseMDP | ShardedMDP):
+        raise ValueError(
+            f"inside jit, or over a mesh, total_reward needs an MDP, a DenseMDP, a ShardedMDP or a "
+            f"product of one, not {type(world).__name__}; inside jit use prepare(model, target)."
+        )
+    if target is None:
+        raise ValueError(
+            "total rewards for ever are found on the host; inside jit, or over a mesh, give a "
+            "target."
+        )
+    require_shape("target", target, model.state_shape)
+    reward = _on_choices(model, world, reward)
+    _require_rewards(model, world, reward)
+    asked = default_tolerance(model) if tolerance is None else tolerance
+    return total_reward_by_sweeps(model, reward, target, policy, asked, objective=objective)
+
+
+def _on_choices(model: Any, world: Any, reward: Any) -> Any:
+    """A reward as it was given, on choices: ``float[S, A]``."""
+    actions = (*model.state_shape, model.num_actions)
+    if reward is None or isinstance(reward, str | Rewards):
+        named = world.rewards if isinstance(world, ShardedMDP) else {}
+        if reward not in named:
+            known = f"; it has {', '.join(named)}" if named else ": give an array"
+            raise ValueError(
+                f"reward={reward!r} is no reward of this {type(world).__name__}{known}."
+            )
+        found = named[reward]
+        return found if world is model else jnp.broadcast_to(found[:, None], actions)
+    if np.shape(reward) == model.state_shape:
+        return jnp.broadcast_to(jnp.asarray(reward)[..., None], actions)
+    require_shape("reward", reward, actions)
+    return reward
+
+
+def _require_rewards(model: Any, world: Any, reward: Any) -> None:
+    least, state = _least_reward(model, world, reward)
+    # Inside jit the status says it.
+    if not isinstance(least, jax.core.Tracer) and not least >= 0:
+        raise ValueError(
+            f"the reward of a choice of state {state} is {least:.6g}; expected total rewards need "
+            "rewards of at least 0."
+        )
+
+
+@jax.jit
+def _least_reward(model: Any, world: Any, reward: Any) -> Any:
+    """The least reward of a choice, NaN if one is, and its state."""
+    least = jnp.min(jnp.where(model.available, reward, jnp.inf), axis=-1)
+    least = least.reshape(world.num_states, -1).min(-1)
+    if isinstance(world, ShardedMDP):
+        least = jnp.where(world.number >= 0, least, jnp.inf)
+        number = world.number
+    else:
+        number = jnp.arange(world.num_states)
+    return jnp.min(least), number[jnp.argmin(least)]

@@ -1,0 +1,589 @@
+"""Expected total rewards inside ``jit``, and of models over the devices of a mesh.
+
+Where the value is infinite or 0 is decided on the graph. In between it is the fixed point of
+``T x = opt_a (r(s, a) + (P x)(s, a))``, and enclosed by two sweeps that prove a bound each: of the
+solutions of ``l = (1 - e) T l`` and ``u = (1 + e) T u``, for a small e, one is below its image and
+the other above, by more than rounding. The share e of the value that is lost or gained in a step
+is small enough once all that are lost on the way are: it is found by trying.
+
+- ``u >= T u`` and ``u >= 0`` bound a maximum, which is the least such u. Of a minimum
+  ``u >= T_pi u`` bounds the value of pi, where the graph says that pi reaches the target.
+- ``l <= T l`` bounds the value of every policy that reaches the target almost surely: repeated,
+  T leaves nothing of l (Bertsekas and Tsitsiklis 1991). A maximum is finite only where all do.
+- A minimum whose end components earn nothing has many fixed points. There the states of each are
+  one: they take the best choice that leads out of any of them.
+
+The equations are solved by inexact policy iteration (Newton's method): in every step the linear
+system of the greedy policy is solved to a hundredth of its right-hand side, the forcing term, by
+BiCGSTAB, on small models that lie on one device by elimination. It is scaled by the value, so that
+small values get as many digits as large ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxltl.core.graphs.attractor import attract, avoid, surely
+from jaxltl.core.graphs.end_components import EndComponents, components_within
+from jaxltl.core.graphs.graph import TracedGraph
+from jaxltl.core.models.ops.operators import (
+    action_argmax,
+    action_mean,
+    expectation,
+    following,
+    valid_policy,
+)
+from jaxltl.core.models.ops.successor_tables import action_columns, table
+from jaxltl.core.models.product import Product
+from jaxltl.core.types import Solution, status_code
+from jaxltl.core.values.engine.certificates import refuse, rounding_unit
+from jaxltl.core.values.engine.implicit_diff import implicit
+from jaxltl.core.values.engine.iterate import in_turn
+from jaxltl.core.values.engine.linear import (
+    Bicgstab,
+    System,
+    dot,
+    inverse,
+    is_small,
+    norm,
+    start_bicgstab,
+)
+from jaxltl.core.values.undiscounted.reachability import policy_sets
+
+_FORCING = 1e-2  # relative residual asked of a linear system
+_POOR = 0.5  # of one that was solved too badly to be of use
+_MOST_INNER = 20_000  # applications of P for one
+_REFINEMENTS = 16  # systems for a derivative
+_SWEEPS = 128  # under the greedy policy, where it cannot be solved
+_ATTEMPTS = 8  # shares e that are tried
+_ROUNDINGS = 3  # of a backup, that the smallest e is
+_REST = 400  # steps of policy iteration that may pass without the error being halved
+_SAME = 80  # of these that one counts for in which the policy stays as it was
+_LARGEST = 0.1  # share e
+_MOST_STEPS = 1_000_000
+
+
+class _Problem(NamedTuple):
+    """What is left when the graph has decided what it can.
+
+    Attributes:
+      model: the model.
+      sign: 1 or -1 times values are maximised; static.
+      reward: ``float[S, A]``.
+      policy: ``float[S, A]``, the weights of a given policy, or None.
+      open: ``bool[S]``, where the value is finite and not 0; policies that matter stay there until
+        it is decided.
+      finite: ``bool[S]``.
+      allowed: ``bool[S, A]``, the actions that may be best; in end components those that leave.
+      start: ``int32[S]``, actions that decide almost surely.
+      decided: ``int32[S]``, actions for the states that are not open.
+      circles: of a minimum, the end components in which nothing is earned.
+    """
+
+    model: Any
+    sign: int
+    reward: jax.Array
+    policy: jax.Array | None
+    open: jax.Array
+    finite: jax.Array
+    allowed: jax.Array
+    start: jax.Array
+    decided: jax.Array
+    circles: EndComponents | None
+
+
+class _Point(NamedTuple):
+    """A value, its image, and what attains that: an action, and in an end component the state whose
+    action it is."""
+
+    value: jax.Array
+    image: jax.Array
+    action: jax.Array
+    leaves: jax.Array
+
+
+class Found(NamedTuple):
+    """What :func:`total_reward_by_sweeps` knows before derivatives.
+
+    Attributes:
+      value, lower, upper: ``float[S]``, 0 where it is infinite.
+      policy: ``int32[S]``, attains the bound on the safe side.
+      leaves: ``int32[S]``, the number of the state whose action a state's value comes from.
+      open, finite: as of the problem.
+      residual, num_steps, status: as of a Solution.
+    """
+
+    value: jax.Array
+    lower: jax.Array
+    upper: jax.Array
+    policy: jax.Array
+    leaves: jax.Array
+    open: jax.Array
+    finite: jax.Array
+    residual: jax.Array
+    num_steps: jax.Array
+    status: jax.Array
+
+
+@partial(jax.jit, static_argnames=("objective",))
+def total_reward_by_sweeps(
+    model: Any,
+    reward: jax.Array,
+    target: jax.Array,
+    policy: jax.Array | None,
+    tolerance: jax.Array | float,
+    *,
+    objective: str,
+) -> Solution:
+    """Expected reward until a target is reached, of models that no host reads.
+
+    Args:
+      model: an MDP, a DenseMDP, a ShardedMDP or a product of one.
+      reward: ``float[S, A]``, at least 0 and finite.
+      target: ``bool[S]``.
+      policy: ``float[S, A]`` or ``int32[S]``; None: optimise.
+      tolerance: the width of the enclosure asked for, as a share of the value.
+      objective: ``"max"`` or ``"min"``.
+
+    Returns:
+      :class:`Solution` as of :func:`~jaxltl.core.values.undiscounted.total_reward.total_reward`. Bounds are 0
+      and infinity as far as nothing is proven, and the status says so. Where a reward is none, the
+      value is NaN and the status ``NONFINITE``.
+
+    Differentiable in the reward, the probabilities and the policy, with the support held fixed.
+    """
+    target, reward = jnp.asarray(target, bool), jnp.asarray(reward, model.dtype)
+    earns = jnp.all(jnp.where(model.available, (reward >= 0) & jnp.isfinite(reward), True))
+    reward = jnp.where(model.available & earns, reward, 0)
+    checked = None if policy is None else valid_policy(model, policy)
+    weight = None if checked is None else checked.distribution
+    found: Found = in_turn(
+        partial(_enclosed, objective=objective), model, reward, target, weight, tolerance
+    )
+    # The optimum's derivative is that of the policy that attains it (Danskin).
+    chosen = found.policy if weight is None else weight
+
+    def follow(y: jax.Array) -> jax.Array:
+        ahead = action_mean(chosen, reward + expectation(model, y))
+        return jnp.where(found.open, ahead.ravel()[found.leaves], 0)
+
+    finite = found.finite & earns
+    value = implicit(follow, found.value, linear=_refined)
+    value, lower, upper = (
+        jnp.where(finite, x, jnp.where(earns, jnp.inf, bad))
+        for x, bad in ((value, jnp.nan), (found.lower, -jnp.inf), (found.upper, jnp.inf))
+    )
+    none = status_code(earns, earns)
+    solution = Solution(
+        value=value,
+        policy=chosen,
+        lower=lower,
+        upper=upper,
+        residual=found.residual,
+        num_steps=found.num_steps,
+        status=jnp.maximum(found.status, none),
+    )
+    return solution if checked is None else refuse(solution, checked.given, checked.valid)
+
+
+def _enclosed(
+    model: Any,
+    reward: jax.Array,
+    target: jax.Array,
+    policy: Any,
+    tolerance: Any,
+    *,
+    objective: str,
+) -> Found:
+    graph = TracedGraph(model)
+    if policy is not None:
+        problem = _of_policy(graph, reward, target, policy)
+    else:
+        problem = (_largest if objective == "max" else _smallest)(graph, reward, target)
+    return _solution(problem, jnp.asarray(tolerance, model.dtype))
+
+
+# --- what the graph decides -------------------------------------------------------------------
+
+
+def _of_policy(graph: TracedGraph, reward: jax.Array, target: jax.Array, policy: Any) -> _Problem:
+    taken = graph.available & (policy > 0)
+    finite = policy_sets(graph, target, policy).one
+    first = graph.first(taken)[1]
+    return _Problem(
+        graph.model,
+        1,
+        reward,
+        policy,
+        _earning(graph, reward, target, taken) & finite,
+        finite,
+        taken,
+        first,
+        first,
+        None,
+    )
+
+
+def _earning(graph: TracedGraph, reward: jax.Array, target: jax.Array, taken: Any) -> jax.Array:
+    """From where something may be earned before the target."""
+    some = graph.first(taken & _positive(reward))[0] & ~target
+    return attract(graph, some, taken, among=~target).region & ~target
+
+
+def _positive(reward: jax.Array) -> jax.Array:
+    """Whether it is more than 0, also where it is so small that arithmetic takes it for 0."""
+    kind = jnp.int64 if reward.dtype.itemsize == 8 else jnp.int32
+    return lax.bitcast_convert_type(reward, kind) > 0
+
+
+def _largest(graph: TracedGraph, reward: jax.Array, target: jax.Array) -> _Problem:
+    never = avoid(graph, target)
+    doomed = attract(graph, never, among=~target)
+    finite = ~doomed.region
+    first = graph.first(graph.available)[1]
+    avoids = graph.first(graph.available & graph.forall(never))[1]
+    decided = jnp.where(never, avoids, jnp.where(finite, first, doomed.action))
+    open_ = _earning(graph, reward, target, graph.available) & finite
+    return _Problem(
+        graph.model, 1, reward, None, open_, finite, graph.available, first, decided, None
+    )
+
+
+def _smallest(graph: TracedGraph, reward: jax.Array, target: jax.Array) -> _Problem:
+    sure = surely(graph, target)
+    finite = sure.region
+    allowed = graph.available & graph.forall(finite) & graph.on_choices(finite & ~target)
+    # What can surely be done for nothing is worth nothing.
+    free = allowed & ~_positive(reward)
+    nothing = surely(graph, target, free)
+    open_ = finite & ~nothing.region
+    circles = components_within(graph, open_, free)
+    return _Problem(
+        graph.model,
+        -1,
+        reward,
+        None,
+        open_,
+        finite,
+        allowed & ~circles.inside,
+        sure.action,
+        nothing.action,
+        circles,
+    )
+
+
+# --- the operator -----------------------------------------------------------------------------
+
+
+def _numbers(shape: tuple[int, ...]) -> jax.Array:
+    size = 1
+    for n in shape:
+        size *= n
+    return jnp.arange(size, dtype=jnp.int32).reshape(shape)
+
+
+def _backup(problem: _Problem, value: jax.Array) -> _Point:
+    """A value's image under T, 0 where it is not open."""
+    ahead = problem.reward + expectation(problem.model, value)
+    leaves = _numbers(value.shape)
+    if problem.policy is not None:
+        image, action = action_mean(problem.policy, ahead), problem.start
+    else:
+        best, action = action_argmax(problem.sign * ahead, problem.allowed)
+        image = problem.sign * best
+    if problem.circles is not None:
+        image, leaves = lax.cond(
+            jnp.any(problem.circles.inside),
+            partial(_least, problem.circles.component),
+            lambda image: (image, leaves),
+            image,
+        )
+    return _Point(value, jnp.where(problem.open, image, 0), action, leaves)
+
+
+def _least(component: jax.Array, image: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The least in each state's end component, and the first state that has it."""
+    label, flat, last = component.ravel(), image.ravel(), image.size - 1
+    best = jax.ops.segment_min(flat, label, num_segments=flat.size)[label]
+    mine = jnp.where(flat <= best, _numbers(flat.shape), last)
+    first = jax.ops.segment_min(mine, label, num_segments=flat.size)[label]
+    return best.reshape(image.shape), first.reshape(image.shape)
+
+
+def _where_it_leaves(problem: _Problem, at: _Point, x: jax.Array) -> jax.Array:
+    if problem.circles is None:
+        return x
+    return lax.cond(jnp.any(problem.circles.inside), lambda x: x.ravel()[at.leaves], lambda x: x, x)
+
+
+def _onward(problem: _Problem, at: _Point) -> Callable[[jax.Array], jax.Array]:
+    """``x -> P_pi x`` of the policy that attains an image, 0 where it is not open."""
+    model = problem.model
+    if problem.policy is None and not isinstance(model, Product):
+        along = following(model, at.action)
+    else:
+        weight = at.action if problem.policy is None else problem.policy
+
+        def along(x: jax.Array) -> jax.Array:
+            return action_mean(weight, expectation(model, x))
+
+    return lambda x: jnp.where(problem.open, _where_it_leaves(problem, at, along(x)), 0)
+
+
+def _improved(problem: _Problem, factor: jax.Array, at: _Point) -> tuple[jax.Array, jax.Array]:
+    """A step of policy iteration for ``v = factor * T v``, and the applications of P it took.
+
+    Where the linear system cannot be solved, sweeps under its policy.
+    """
+    model, onward = problem.model, _onward(problem, at)
+    swept = factor * at.image
+    change = swept - at.value
+    positive = jnp.all(jnp.where(problem.open, at.value > 0, True))
+    scale = jnp.where(positive & problem.open, at.value, 1)
+    wanted = change / scale
+
+    def matvec(x: jax.Array) -> jax.Array:
+        return x - factor * onward(scale * x) / scale
+
+    if is_small(table(model), change.size):
+        weight = problem.policy
+        if weight is None:
+            weight = jax.nn.one_hot(at.action, model.num_actions, dtype=model.dtype)
+        system = System(
+            table(model), action_columns(model.num_actions, weight), problem.open.ravel() * factor
+        )
+        eye = jnp.eye(change.size, dtype=model.dtype)
+        moves = (eye - system.matrix())[at.leaves.ravel()]
+        x = (inverse(eye - moves) @ change.ravel()).reshape(change.shape) / scale
+        n = jnp.int32(0)
+    else:
+        x, n = _bicgstab(matvec, wanted)
+    left = norm((wanted - matvec(x)).ravel())
+    solved = left <= _POOR * norm(wanted.ravel())  # false for NaN
+    x = lax.cond(
+        solved,
+        lambda: x,
+        lambda: lax.fori_loop(1, _SWEEPS, lambda _, x: x + (wanted - matvec(x)), wanted),
+    )
+    return at.value + scale * x, n + jnp.where(solved, 1, _SWEEPS)
+
+
+def _bicgstab(
+    matvec: Callable[[jax.Array], jax.Array], b: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """x with ``matvec(x) = b``, nearly, and how often that was applied."""
+
+    def flat(x: jax.Array) -> jax.Array:
+        return matvec(x.reshape(b.shape)).ravel()
+
+    right = b.ravel()
+    # Where states lead on to others and seldom back, which is what progress looks like, residuals
+    # are soon orthogonal to the first one, from which the method then learns nothing.
+    shadow = jax.random.normal(jax.random.key(0), right.shape, right.dtype)
+    start = start_bicgstab(jnp.zeros_like(right), right)._replace(
+        shadow=shadow, rho=dot(shadow, right)
+    )
+    goal, most = _FORCING * norm(right), min(_MOST_INNER, 8 * right.size + 64)
+
+    def body(carry: tuple[Bicgstab, jax.Array]) -> tuple[Bicgstab, jax.Array]:
+        k, n = carry
+        k = k.first(flat(k.p))
+        return k.second(flat(k.r)), n + 2
+
+    def goes_on(carry: tuple[Bicgstab, jax.Array]) -> jax.Array:
+        k, n = carry
+        return (k.size > goal) & jnp.isfinite(k.size) & (n < most)
+
+    k, n = lax.while_loop(goes_on, body, (start, jnp.int32(0)))
+    return k.x.reshape(b.shape), n
+
+
+def _refined(matvec: Callable[[jax.Array], jax.Array], b: jax.Array) -> jax.Array:
+    """x with ``matvec(x) = b``, as nearly as the dtype allows."""
+    goal = float(jnp.finfo(b.dtype).eps) ** 0.8 * norm(b.ravel())
+
+    def body(carry: Any) -> Any:
+        x, left, _, n = carry
+        better = x + _bicgstab(matvec, left)[0]
+        left = b - matvec(better)
+        return better, left, norm(left.ravel()), n + 1
+
+    def goes_on(carry: Any) -> jax.Array:
+        _, _, size, n = carry
+        return (size > goal) & (n < _REFINEMENTS)
+
+    start = jnp.zeros_like(b), b, norm(b.ravel()), jnp.int32(0)
+    return lax.while_loop(goes_on, body, start)[0]
+
+
+def _solved(
+    problem: _Problem, factor: jax.Array, goal: jax.Array, at: _Point, num_steps: jax.Array
+) -> tuple[_Point, jax.Array]:
+    """A point near ``v = factor * T v``, by policy iteration from one; nothing is proven here."""
+    tiny = jnp.finfo(at.value.dtype).tiny
+
+    def error(at: _Point) -> jax.Array:
+        swept = factor * at.image
+        size = jnp.maximum(jnp.maximum(jnp.abs(swept), jnp.abs(at.value)), tiny)
+        return jnp.max(jnp.where(problem.open, jnp.abs(swept - at.value) / size, 0))
+
+    def body(carry: Any) -> Any:
+        at, n, _, best, rest = carry
+        value, m = _improved(problem, factor, at)
+        new = _backup(problem, value)
+        found = error(new)
+        waits = rest + jnp.where(jnp.all(new.action == at.action), _SAME, 1)
+        halved = found < best / 2  # false for NaN
+        return (
+            new,
+            n + m + 1,
+            found,
+            jnp.where(halved, found, best),
+            jnp.where(halved, 0, waits).astype(jnp.int32),
+        )
+
+    def goes_on(carry: Any) -> jax.Array:
+        _, n, found, _, rest = carry
+        return ~(found <= goal) & (rest < _REST) & (n < _MOST_STEPS)
+
+    first = error(at)
+    start = (at, num_steps, first, jnp.where(jnp.isfinite(first), first, jnp.inf), jnp.int32(0))
+    return lax.while_loop(goes_on, body, start)[:2]
+
+
+# --- the enclosure ----------------------------------------------------------------------------
+
+
+class _Search(NamedTuple):
+    """What is proven, and where the search is; pairs are below and above.
+
+    Attributes:
+      at: where it is.
+      share: e.
+      bounds: two values.
+      shares: the e by which each was proven, infinite if it was not.
+      safe: the point whose policy attains the bound on the safe side.
+      tries, num_steps: how many bounds were looked for, and the applications of P.
+      ended: whether other shares would not help.
+    """
+
+    at: _Point
+    share: jax.Array
+    bounds: tuple[jax.Array, jax.Array]
+    shares: tuple[jax.Array, jax.Array]
+    safe: _Point
+    tries: jax.Array
+    num_steps: jax.Array
+    ended: jax.Array
+
+
+def _width(problem: _Problem, bounds: tuple[jax.Array, jax.Array]) -> jax.Array:
+    """The largest width, as a share of the value."""
+    lower, upper = bounds
+    each = jnp.where(jnp.isfinite(upper), (upper - lower) / upper, jnp.inf)
+    return jnp.max(jnp.where(problem.open, each, 0))
+
+
+def _tried(problem: _Problem, unit: jax.Array, tolerance: jax.Array, k: _Search) -> _Search:
+    """Looks for one of the bounds, proves it if it is one, and says how to go on."""
+    above = k.tries % 2 == 1
+    factor = 1 + jnp.where(above, k.share, -k.share)
+    at, n = _solved(problem, factor, k.share / 4, k.at, k.num_steps)
+    # Images are the same all over an end component.
+    offered = jnp.where(problem.open, jnp.maximum(factor * at.image, 0), 0)
+    at = _backup(problem, offered)
+    # Sums of terms that are not negative err by a share of them, and by what underflows.
+    least = unit / jnp.finfo(unit.dtype).eps * jnp.finfo(unit.dtype).tiny
+    most, fewest = at.image * (1 + unit) + least, at.image * (1 - unit) - least
+    holds = jnp.where(above, most <= offered, fewest >= offered)
+    proven = jnp.all(jnp.where(problem.open, holds & jnp.isfinite(offered), True))
+
+    def kept(new: Any, old: Any, where: jax.Array) -> Any:
+        return jax.tree.map(lambda x, y: jnp.where(where, x, y), new, old)
+
+    news = tuple(
+        proven & side & (k.share <= old)
+        for side, old in zip((~above, above), k.shares, strict=True)
+    )
+    bounds = tuple(kept(offered, old, new) for new, old in zip(news, k.bounds, strict=True))
+    shares = tuple(kept(k.share, old, new) for new, old in zip(news, k.shares, strict=True))
+    safe = kept(at, k.safe, news[0] if problem.sign > 0 else news[1])
+    below_known, above_known = (x <= k.share for x in shares)
+    narrower = jnp.clip(tolerance / (2 * _width(problem, bounds)), 1e-3, 0.5)
+    floor = _ROUNDINGS * unit
+    change = jnp.where(below_known, jnp.where(above_known, narrower, 1 / 32), 16)
+    share = jnp.where(above, jnp.maximum(k.share * change, floor), k.share)
+    ended = above & ((below_known & (k.share <= floor)) | (share > _LARGEST))
+    return _Search(at, share, bounds, shares, safe, k.tries + 1, n, ended)
+
+
+def _solution(problem: _Problem, tolerance: jax.Array) -> Found:
+    zero = jnp.zeros(problem.open.shape, problem.reward.dtype)
+    weight = problem.start if problem.policy is None else problem.policy
+    gain = jnp.where(problem.open, action_mean(weight, problem.reward), 0)
+    start = _Point(zero, gain, problem.start, _numbers(zero.shape))
+    unit = jnp.asarray(rounding_unit(problem.model), zero.dtype)
+    never = jnp.asarray(jnp.inf, zero.dtype)
+    k = _Search(
+        start,
+        jnp.sqrt(jnp.maximum(tolerance, 0) * _ROUNDINGS * unit),
+        (zero, jnp.where(problem.open, jnp.inf, zero)),
+        (never, never),
+        start,
+        jnp.int32(0),
+        jnp.int32(0),
+        jnp.bool_(False),
+    )
+    k = lax.while_loop(
+        lambda k: (_width(problem, k.bounds) > tolerance) & (k.tries < 2 * _ATTEMPTS) & ~k.ended,
+        partial(_tried, problem, unit, tolerance),
+        k,
+    )
+    policy, decides = _policy(problem, k.safe)
+    lower, upper = k.bounds
+    if problem.sign < 0:
+        # The bound is that of a policy that stops.
+        upper = jnp.where(problem.open & ~decides, jnp.inf, upper)
+    both = jnp.isfinite(upper)
+    value = jnp.where(both, (lower + upper) / 2, jnp.maximum(k.at.image, lower))
+    mine = _backup(problem, value)
+    residual = jnp.max(jnp.where(problem.open, jnp.abs(mine.image - value), 0))
+    narrow = _width(problem, (lower, upper)) <= tolerance
+    status = status_code(narrow, jnp.isfinite(residual), jnp.all(both) & k.ended)
+    return Found(
+        value,
+        lower,
+        upper,
+        policy,
+        k.safe.leaves,
+        problem.open,
+        problem.finite,
+        residual,
+        k.num_steps,
+        status,
+    )
+
+
+def _policy(problem: _Problem, safe: _Point) -> tuple[jax.Array, jax.Array]:
+    """A point's policy in all states, and whether it leaves the open ones almost surely."""
+    graph = TracedGraph(problem.model)
+    action, always = safe.action, jnp.bool_(True)
+    if problem.circles is not None:
+        inside = problem.circles.inside
+        circling, _ = graph.first(inside)
+        exits = circling & (safe.leaves == _numbers(circling.shape))
+        towards = lax.cond(
+            jnp.any(circling), lambda: attract(graph, exits, inside).action, lambda: action
+        )
+        action = jnp.where(circling & ~exits, towards, action)
+    if problem.sign < 0:
+        taken = jax.nn.one_hot(action, problem.model.num_actions, dtype=problem.reward.dtype)
+        goal = problem.finite & ~problem.open
+        always = jnp.all(policy_sets(graph, goal, taken).one | ~problem.open)
+    return jnp.where(problem.open, action, problem.decided), always

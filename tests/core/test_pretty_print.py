@@ -1,0 +1,482 @@
+"""Objects in a few lines: what is told of each, and that nothing is too large or strange for it."""
+
+import dataclasses
+import importlib
+import pickle
+import pkgutil
+import sys
+import warnings
+from functools import cache, partial
+from types import SimpleNamespace
+from xml.etree import ElementTree
+
+import jax
+import jax.numpy as jnp
+import matplotlib
+import numpy as np
+import pytest
+from jax.sharding import NamedSharding, PartitionSpec
+
+import jaxltl as jl
+from jaxltl import algos, envs
+from jaxltl.algos import behavioral_cloning, cce, learner, mlirl, ppo
+from jaxltl.algos.schedules import Linear
+from jaxltl.core import pretty_print as show
+from jaxltl.core.types import Method
+from tests.support import replaced
+
+MAP = """
+. . . r .
+. g . r .
+. . . # .
+s . r . y
+"""
+
+
+def lines_of(value) -> list[str]:
+    text = repr(value)
+    lines = text.split("\n")
+    assert len(lines) <= show.LINES, text
+    assert max(map(len, lines)) <= show.WIDTH, text
+    return lines
+
+
+def told(value) -> str:
+    return " ".join(line.strip() for line in lines_of(value))
+
+
+@cache
+def made():
+    """Objects by their class, all made on the host."""
+    world = jl.gridworld(MAP, slip=0.1, absorbing=["y"], initial="s")
+    automaton = jl.to_automaton("!r U y")
+    product = jl.product(world, automaton)
+    coin = jl.make_sparse(
+        [0, 2, 3, 4],
+        [0, 2, 4, 5, 6],
+        [0, 1, 0, 2, 1, 2],
+        [0.5, 0.5, 0.9, 0.1, 1.0, 1.0],
+        initial=[1, 0, 0],
+        label={"done": [1, 2], "lost": [2]},
+        rewards={"steps": jl.Rewards(state=np.array([1.0, 0, 0]))},
+    )
+    rough = jl.make_interval(coin, [0.4, 0.4, 0.8, 0.0, 1, 1], [0.6, 0.6, 1.0, 0.2, 1, 1])
+    solution = jl.reachability_probability(coin, coin.states_where("lost"))
+    counts = jl.make_counts([0, 1, 0], [0, 0, 0], [1, 1, 0], [880, 5, 120], states=["dock", "bay"])
+    game = jl.grid_game("a.\n.b")
+    region = np.arange(32) < 20
+    objective = jl.Parity(np.zeros(32, np.int32), region, ~region, 2)
+    estimate = jl.Estimate(0.5, 0.25, 0.75, 0.01, "exact")
+    evaluation = jl.Evaluation(
+        estimate,
+        None,
+        None,
+        estimate,
+        None,
+        estimate,
+        estimate,
+        None,
+        None,
+        900,
+        100,
+        0,
+        1000,
+        50,
+        0.95,
+        0.5,
+        None,
+        None,
+        jl.Status.MAX_STEPS,
+    )
+    box = jl.make_box(-1.0, [1.0, 2.0])
+    environment = jl.make_environment(
+        partial(_start),
+        partial(_step),
+        partial(_see),
+        actions=3,
+        observations=box,
+        propositions=(),
+        horizon=7,
+    )
+    satisfaction = jl.sparse_satisfaction(coin, "F lost")
+    sure = jl.ConfidenceSets(
+        np.zeros(3),
+        np.array([0.5, 0.25, 1]),
+        np.zeros(3),
+        None,
+        np.zeros(2),
+        np.array([6, 9]),
+        3,
+        0.95,
+        "anytime",
+    )
+    found = [
+        world,
+        jl.to_dense(world),
+        automaton,
+        product,
+        coin,
+        coin.rewards["steps"],
+        rough,
+        solution,
+        counts,
+        game,
+        objective,
+        estimate,
+        evaluation,
+        box,
+        environment,
+        satisfaction,
+        sure,
+        jl.make_monitor(automaton),
+        jl.make_trajectories(world, [[(15, 0), (10, 0)], [(15, 3)]]),
+        jl.FiniteMemoryPolicy(
+            np.zeros((20, 3), np.int32), np.zeros(20, np.int32), np.zeros((20, 3), np.int32)
+        ),
+        jl.GR1(np.ones((2, 32), bool), np.ones((3, 32), bool), ~region),
+        jl.Winning(game, objective, region, np.zeros(32, np.int32), np.zeros(32, np.int32)),
+        jl.Permissive(
+            game,
+            region,
+            np.ones((32, 5), bool),
+            np.arange(32),
+            np.zeros(32),
+            True,
+            "maximal: it includes all",
+        ),
+        jl.Verification(False, True, "state 3 loses"),
+        jl.Answer(
+            np.array([0]),
+            np.array([0.5]),
+            np.array([0.5]),
+            np.array([0.5001]),
+            [None],
+            jl.Status.PRECISION,
+            "levels",
+            None,
+        ),
+        jl.OptimalActions(
+            np.ones((20, 3, 4), bool),
+            np.ones((20, 3, 4)),
+            solution,
+            solution,
+            np.float32(1e-7),
+            np.int32(0),
+        ),
+        jl.OptimalityGap(
+            np.arange(2),
+            np.ones(2),
+            solution,
+            solution,
+            np.zeros(2),
+            np.array([0, 0.1]),
+            (0.0, 0.05),
+            (0.9, 0.9),
+            (0.9, 0.95),
+            "keyless",
+        ),
+        jl.DataGuarantee(0.9, 0.95, 0.99, satisfaction, rough, sure, np.zeros(4)),
+        jl.Table(coin, np.arange(3), np.zeros(1, int), np.zeros(3, bool), np.ones(3, bool), 9),
+        jl.ParametricMDP(coin, None, np.zeros(2), np.ones(2), np.ones(2) / 2, ("p", "q")),
+        jl.Objective(formula="F a", threshold=0.5),
+        jl.parse_property('P>=0.5 [ F "a" ]'),
+        jl.ModelPart(np.arange(3), np.zeros(2, int), np.ones(2), rewards={"cost": np.ones(2)}),
+        jl.TaskWorld(np.zeros(2), np.int32(1), np.int32(2), np.bool_(True), np.int32(3)),
+        jl.Episode(
+            *[np.zeros((4, 5))] * 6,
+            np.tri(4, 5, 1, bool),
+            np.ones(4, bool),
+            np.zeros(4, bool),
+            np.ones((4, 5)),
+        ),
+    ]
+    return {type(x).__name__: x for x in found}
+
+
+def _start(key):
+    return jnp.zeros(2)
+
+
+def _step(world, action, key):
+    return jl.Timestep(world, reward=1.0, terminated=world[0] > 3)
+
+
+def _see(world):
+    return world
+
+
+FACTS = {
+    "MDP": "20 states, 4 actions, 240 transitions, over g, r, s, y, starts in 15",
+    "DenseMDP": "20 states, 4 actions, 214 transitions, over g, r, s, y",
+    "Automaton": "Automaton(cosafe, 3 states, 4 letters over r, y, for !r U y)",
+    "Product": "60 states with 3 memories, MDP(20 states, 4 actions, beside Automaton(cosafe, 3",
+    "SparseMDP": "3 states, 4 choices, 6 transitions, over done, lost, rewards steps, starts in 0",
+    "IntervalMDP": "4 choices, 6 transitions, intervals at most 0.2 wide",
+    "ParametricMDP": "p in [0, 1], q in [0, 1], SparseMDP(3 states,",
+    "Rewards": "Rewards(state=[1, 0, 0], choice=None, transition=None)",
+    "Solution": "CONVERGED, value [1, 0, 1], bounds meet, 0 steps, by the graph, policy",
+    "Satisfaction": "Solution(CONVERGED, value, Automaton(, states of the product",
+    "TransitionCounts": "1,005 samples, 3 transitions, 2 states: dock, bay, 1 action: 0",
+    "ConfidenceSets": "2 rows, 15 samples, anytime, confidence 0.95 shared by 3, 0.25, 1] wide",
+    "Game": "the system moves in 16 of 32 states, MDP(32 states, 5 actions",
+    "Parity": "priorities below 2, 32 states, won 20 of 32 true, lost 12 of 32 true",
+    "GR1": "2 assumptions, 3 guarantees, 32 states, lost 12 of 32 true",
+    "Winning": "system wins from 20 of 32 states, environment from 12, not realizable, Parity(",
+    "Permissive": "wins from 20 of 32 states, 160 of 160 true, maximal: it includes all, Game(",
+    "Verification": "Verification(system=False, environment=True, reason='state 3 loses')",
+    "Estimate": "Estimate(0.5 in [0.25, 0.75], exact)",
+    "Evaluation": "MAX_STEPS, 1,000 episodes, success 0.5 in [0.25, 0.75], threshold 0.5 open",
+    "Box": "Box(float, [2], from -1 to [1, 2]",
+    "Environment": "3 actions, observations Box(, over no propositions, at most 7 steps",
+    "Monitor": "3 states, 4 letters, 1 UNDECIDED, 1 SATISFIED, 1 VIOLATED",
+    "Trajectories": "2 of at most 2 steps, lengths [2, 1]",
+    "FiniteMemoryPolicy": "20 states, 3 memories, deterministic",
+    "Answer": "PRECISION, 1 state, value [0.5], bounds at most 0.0001 apart, by levels",
+    "OptimalActions": "CONVERGED, with 240 of 240 true, loses at most 1e-07",
+    "OptimalityGap": "2 beginnings, mean gap in [0, 0.05], gap at most 0.1, evidence 'keyless'",
+    "DataGuarantee": "at least 0.9, no policy beyond 0.99, confidence 0.95, 15 samples, Interval",
+    "Table": "SparseMDP(3 states, 1 beginning, truncated [True, True, True], at most 9 steps",
+    "Objective": "Objective(formula='F a', threshold=0.5, direction='max')",
+    "Property": 'Property(P>=0.5 [ F "a" ])',
+    "ModelPart": "2 states, 2 choices, 2 transitions, rewards cost",
+    "TaskWorld": "memory=1, verdict=VIOLATED, accepted=True, visits=3",
+    "Episode": "4 lanes, at most 5 steps, made [2, 3, 4, 5], terminated [True, True, True, True]",
+}
+
+
+@pytest.mark.parametrize("name", FACTS)
+def test_the_facts_are_told(name):
+    text, place = told(made()[name]), 0
+    assert text.startswith(f"{name}(")
+    for fact in FACTS[name].split(", "):
+        assert fact in text[place:], f"{fact!r} in {text}"
+        place = text.index(fact, place)
+
+
+def test_every_fact_is_of_an_object_that_is_made():
+    assert made().keys() == FACTS.keys()
+
+
+# --- every type ---------------------------------------------------------------------------------
+
+
+@cache
+def brief_classes():
+    """Each class with a text of its own: public, of a learner, or of a world."""
+    _ = jl.__all__
+    for package in (algos, envs):
+        for module in pkgutil.iter_modules(package.__path__, f"{package.__name__}."):
+            importlib.import_module(module.name)
+    return {
+        f"{found.__module__}.{found.__qualname__}": found
+        for name, module in list(sys.modules.items())
+        if name.startswith("jaxltl.")
+        for found in vars(module).values()
+        if isinstance(found, type) and "_brief_facts" in vars(found)
+    }
+
+
+def test_every_public_type_shows_itself():
+    public = {getattr(jl, name) for name in jl.__all__}
+    others = {jl.Formula, jl.Status, jl.Verdict, jl.NotConverged, Method}
+    plain = {x for x in public if isinstance(x, type)} - others - {*brief_classes().values()}
+    assert not plain
+    for module in algos.__all__:
+        for name in ("Problem", "Hparams", "State", "Metrics"):
+            found = getattr(getattr(algos, module), name, None)
+            is_ours = str(getattr(found, "__module__", "")).startswith("jaxltl.")
+            assert not is_ours or found in brief_classes().values(), f"{module}.{name}"
+
+
+HUGE = np.broadcast_to(np.float32(0.5), (10**6, 10**6))
+STRANGE = {
+    "too large to be read": HUGE,
+    "abstract": jax.ShapeDtypeStruct((4, 3, 2), np.float32),
+    "none": None,
+    "a text": "word " * 1000,
+    "an object": object(),
+    "a tree": {"a": [np.ones(3)]},
+    "many lines": SimpleNamespace(text="\n" * 50),
+}
+
+
+@pytest.mark.parametrize("kind", STRANGE)
+def test_nothing_is_too_large_or_strange(kind):
+    for cls in brief_classes().values():
+        if hasattr(cls, "_make"):
+            value = cls._make([STRANGE[kind]] * len(cls._fields))
+        else:
+            value = object.__new__(cls)
+            for one in dataclasses.fields(cls):
+                static = not one.metadata.get("pytree_node", True)
+                object.__setattr__(value, one.name, ("a",) if static else STRANGE[kind])
+        assert told(value).startswith(f"{cls.__name__}(")
+
+
+def test_formulas_are_cut_off():
+    assert len(repr(jl.parse_ltl(" & ".join(f"F a{i}" for i in range(500))))) < 1000
+
+
+# --- inside of programs, side by side, elsewhere -------------------------------------------------
+
+
+def trees():
+    return [
+        x
+        for x in made().values()
+        if not jax.tree.all(jax.tree.map(lambda _: False, x))
+        and all(isinstance(leaf, np.ndarray | jax.Array) for leaf in jax.tree.leaves(x))
+    ]
+
+
+def test_traced_ones_are_told_by_their_shapes():
+    texts = []
+    assert len(trees()) > 15
+
+    def look(values):
+        texts.extend(map(told, values))
+        return values
+
+    shapes = jax.eval_shape(look, trees())
+    texts += map(told, shapes)
+    assert any("traced float" in text for text in texts)
+    lanes = jax.tree.map(lambda x: np.stack([np.asarray(x)] * 2), trees())
+    jax.vmap(lambda values: texts.extend(map(told, values)))(lanes)
+    texts += map(told, lanes)
+    assert sum("2 lanes" in text for text in texts) >= 5
+
+
+def test_lanes_are_counted_with_their_statuses():
+    one = made()["Solution"]
+    four = jax.tree.map(lambda x: np.stack([np.asarray(x)] * 4), one)
+    four = four.replace(
+        status=np.array([0, 3, 0, 0]), upper=np.where(np.arange(4)[:, None] == 2, np.inf, 1.0)
+    )
+    text = told(four)
+    assert "4 lanes: 3 CONVERGED, 1 MAX_STEPS" in text
+    assert "bounds at most 1 apart, none for 3 of 12" in text
+
+
+def test_arrays_on_several_devices_are_read_from_here():
+    mesh = jax.make_mesh((4,), ("x",))
+    spread = jax.device_put(np.arange(8.0), NamedSharding(mesh, PartitionSpec("x")))
+    assert show.told(spread) == "float64[8] on 4 devices from 0 to 7"
+    spread.delete()
+    assert show.told(spread) == "deleted float64[8]"
+
+
+def test_nothing_is_moved_where_that_is_forbidden():
+    value = jnp.arange(9.0)
+    with jax.transfer_guard_device_to_host("disallow"):
+        assert show.told(value).startswith("float64[9]")
+
+
+def test_they_are_the_same_in_another_process_and_after_a_walk_over_the_tree():
+    for value in trees():
+        text = repr(value)
+        assert repr(pickle.loads(pickle.dumps(value))) == text
+        assert repr(jax.tree.map(lambda x: x, value)) == text
+
+
+# --- learners ------------------------------------------------------------------------------------
+
+
+def test_settings_are_told_as_they_are():
+    assert repr(behavioral_cloning.Hparams()) == (
+        "Hparams(learning_rate=0.003, l2=0.0, patience=500, batch=128)"
+    )
+    many = mlirl.Hparams(discount=np.linspace(0, 0.9, 20))
+    assert "discount=float64[20] from 0 to 0.9, mu=None" in told(many)
+    changing = cce.Hparams(rate=Linear(1.0, 0.1, 100))
+    assert "rate=Linear(" in told(changing)
+    assert "num_envs=8" in told(ppo.Hparams(discount=0.99))
+
+
+def test_a_state_tells_its_steps_and_its_figures():
+    state = mlirl.State(jax.random.key(0), np.int32(20), {"w": np.ones(8)}, np.ones((20, 3)), ())
+    assert told(state) == (
+        "State(step=20, parameters=1 array of 8 numbers, value=float64[20, 3] all 1, optimizer=())"
+    )
+    lanes = state.replace(step=np.array([20, 20]), key=jax.random.key(0))
+    assert told(lanes).startswith("State( 2 lanes, step=[20, 20]")
+
+
+def test_rows_of_figures_are_told_by_the_last():
+    rows = behavioral_cloning.Metrics(
+        loss=np.array([3.0, 2.0, 0.25]),
+        held_out=np.array([1, 1, np.nan]),
+        gradient_norm=np.ones(3),
+        status=np.array([0, 0, 4]),
+    )
+    assert told(rows) == (
+        "Metrics( the last of 3 rows, loss=0.25, held_out=nan, gradient_norm=1, "
+        "status=2 CONVERGED, 1 NONFINITE)"
+    )
+    seeds = jax.tree.map(lambda x: np.stack([x, 2 * x]), rows)
+    assert "the last of 2 x 3 rows, loss=[0.25, 0.5]" in told(seeds)
+    learned = learner.Learned(seeds, rows, np.array([3, 2]), np.array([0, 3]))
+    assert "num_steps=[3, 2], status=1 CONVERGED, 1 MAX_STEPS" in told(learned)
+
+
+# --- pictures ------------------------------------------------------------------------------------
+
+DRAWN = (
+    "MDP",
+    "DenseMDP",
+    "Automaton",
+    "Product",
+    "SparseMDP",
+    "Solution",
+    "Game",
+    "Winning",
+    "Permissive",
+)
+
+
+@pytest.mark.parametrize("name", DRAWN)
+def test_pictures_have_their_texts(name, monkeypatch):
+    monkeypatch.setattr("shutil.which", lambda program: None)
+    value, before = made()[name], dict(matplotlib.rcParams)
+    loaded = "matplotlib.pyplot" in sys.modules
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        picture, page = value._repr_svg_(), value._repr_html_()
+    assert dict(matplotlib.rcParams) == before
+    assert ("matplotlib.pyplot" in sys.modules) == loaded
+    root = ElementTree.fromstring(picture)
+    text = " ".join(repr(value).split())
+    assert root.get("role") == "img" and root.get("aria-label") == text
+    assert root[0].tag.endswith("title") and root[0].text == text
+    assert len(ElementTree.fromstring(page)) == 2
+    assert "".join(ElementTree.fromstring(page)[1].itertext()) == repr(value)
+
+
+def test_what_would_crowd_is_not_drawn():
+    crowd = jl.make_sparse(None, np.arange(101), np.zeros(100, int), np.ones(100))
+    assert crowd._repr_svg_() is None and crowd._repr_html_() is None
+    lanes = jax.tree.map(lambda x: np.stack([np.asarray(x)] * 2), made()["Automaton"])
+    assert lanes._repr_svg_() is None
+    assert made()["Solution"].replace(value=HUGE)._repr_html_() is None
+    for value in jax.eval_shape(lambda x: x, [made()["MDP"], made()["Product"]]):
+        assert value._repr_html_() is None
+
+
+def test_a_failing_picture_is_left_out(monkeypatch):
+    def fail(*arguments, **options):
+        raise RuntimeError("no room")
+
+    monkeypatch.setattr("jaxltl.plot.notebook.to_bytes", fail)
+    assert all(made()[name]._repr_html_() is None for name in DRAWN)
+
+
+def test_texts_of_pages_are_escaped():
+    name = jl.to_automaton('F "<b> & \\"c"')
+    page = ElementTree.fromstring(name._repr_html_())
+    assert "".join(page[1].itertext()) == repr(name)
+
+
+def test_layouts_are_cut_off():
+    assert show.laid_out("A", ["b"] * 3) == "A(b, b, b)"
+    long = show.laid_out("A", [str(i) * 90 for i in range(10)] * 3)
+    assert long.count("\n") == show.LINES - 1 and long.endswith("...)")
+    assert replaced(show.laid_out("A", ["x" * 300]), ("x" * 92, "")) == "A(\n    ...)"

@@ -1,0 +1,190 @@
+"""What data guarantee holds as often as it says, and tightens with more of them."""
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from jaxltl.core.models.build.counts import make_counts
+from jaxltl.core.models.interval import make_interval
+from jaxltl.core.models.sparse import make_sparse
+from jaxltl.core.values.evaluation.data_guarantee import guarantee_curve, learn_guarantee, safe_mean
+from jaxltl.core.values.interval.satisfaction import robust_satisfaction
+from jaxltl.core.values.undiscounted.sparse_satisfaction import sparse_satisfaction
+from tests.reference_intervals import random_model
+
+METHODS = ["clopper-pearson", "hoeffding", "weissman", "anytime"]
+TASKS = ["F a", "!b U a", "G F a", "F G a | F b", "G !b"]
+
+
+def labelled(rng, num_states=5):
+    host = random_model(rng, num_states, unit=12).mdp
+    return make_sparse(
+        host.row_start,
+        host.entry_start,
+        host.successor,
+        host.probability,
+        initial=np.eye(num_states)[0],
+        label=rng.random((num_states, 2)) < 0.4,
+        propositions=["a", "b"],
+    )
+
+
+def drawn(rng, model, size):
+    """So many samples of each choice."""
+    return np.concatenate(
+        [
+            rng.multinomial(size, model.probability[i:j] / model.probability[i:j].sum())
+            for i, j in zip(model.entry_start[:-1], model.entry_start[1:], strict=True)
+        ]
+    )
+
+
+@pytest.mark.few(2)
+@pytest.mark.parametrize("count", [20, pytest.param(2000, marks=pytest.mark.exhaustive)])
+@pytest.mark.parametrize("method", METHODS)
+def test_guarantees_hold(method, count):
+    """For the policy that is returned, too; at most one in ten may fail, and few come near it."""
+    rng = np.random.default_rng(METHODS.index(method))
+    failed, loose = 0, 0.0
+    for i in range(count):
+        model, task = labelled(rng), TASKS[i % len(TASKS)]
+        found = learn_guarantee(
+            model, drawn(rng, model, int(rng.integers(1, 300))), task, 0.9, method=method
+        )
+        true = sparse_satisfaction(model, task).solution.value[0]
+        own = under(model, found)
+        failed += found.bound > own + 1e-9 or found.optimistic < true - 1e-9
+        assert own <= true + 1e-9
+        loose += true - found.bound
+    assert failed <= 0.1 * count
+    assert loose < 0.75 * count
+
+
+def under(model, found):
+    """The true probability under the policy, whose memory is the automaton's state."""
+    product = found.satisfaction.product
+    points = make_interval(model, model.probability, model.probability)
+    whole = robust_satisfaction(points, found.satisfaction.automaton, nature="max")
+    np.testing.assert_array_equal(whole.product.base_state, product.base_state)
+    host = whole.product.host
+    taken = whole.product.base_row == np.asarray(found.satisfaction.solution.policy)[host.state]
+    rows = np.flatnonzero(taken)
+    entries = np.isin(host.row, rows)
+    state, memory = product.base_state, product.memory
+    letter = found.satisfaction.letter[state]
+    chain = make_sparse(
+        None,
+        np.concatenate([[0], np.diff(host.entry_start)[rows].cumsum()]),
+        host.successor[entries],
+        host.probability[entries],
+        initial=np.eye(state.size)[product.start[0]],
+    )
+    automaton = found.satisfaction.automaton
+    if automaton.acceptance in ("buchi", "parity"):
+        # Labels name the priorities that are read.
+        level = np.asarray(automaton.priority)[memory, letter]
+        good = [
+            f"(G F p{p})" + "".join(f" & F G !p{q}" for q in range(p))
+            for p in range(0, level.max() + 1, 2)
+        ]
+        label = level[:, None] == np.arange(level.max() + 1)
+        names = [f"p{p}" for p in range(level.max() + 1)]
+        task = " | ".join(f"({x})" for x in good)
+    else:
+        final = np.asarray(automaton.final)[memory]
+        label, names = final[:, None], ["final"]
+        task = "F final" if automaton.acceptance == "cosafe" else "G final"
+    chain = make_sparse(
+        None,
+        chain.entry_start,
+        chain.successor,
+        chain.probability,
+        initial=chain.initial,
+        label=label,
+        propositions=names,
+    )
+    return sparse_satisfaction(chain, task).solution.value[0]
+
+
+def test_more_data_guarantee_more():
+    rng = np.random.default_rng(5)
+    model = labelled(np.random.default_rng(12))
+    true = sparse_satisfaction(model, "!b U a").solution.value[0]
+    counts = drawn(rng, model, 10**6)
+    for method in METHODS:
+        found = learn_guarantee(model, counts, "!b U a", 0.99, method=method)
+        assert true - 0.02 < found.bound <= true <= found.optimistic < true + 0.02
+    worst = learn_guarantee(model, counts, "!b U a", 0.99, objective="min")
+    least = sparse_satisfaction(model, "!b U a", objective="min").solution.value[0]
+    assert worst.optimistic <= least + 1e-9
+    assert least <= worst.bound < least + 0.02
+
+
+def coins():
+    """Two tosses in a row, of which one was seen more often."""
+    return make_sparse(
+        None,
+        [0, 2, 4, 5, 6],
+        [1, 3, 2, 3, 2, 3],
+        [0.9, 0.1, 0.8, 0.2, 1, 1],
+        initial=[1, 0, 0, 0],
+        label=[[0], [0], [1], [0]],
+        propositions=["a"],
+    )
+
+
+def test_where_more_samples_help():
+    """The gain is the change of the bound if a choice becomes known, while it is small."""
+    model = coins()
+    counts = np.array([900_000, 100_000, 8_000, 2_000, 0, 0])
+    found = learn_guarantee(model, counts, "F a", 0.9)
+    assert found.gain.argmax() == 1
+    assert (found.gain >= 0).all()
+    sets = found.sets
+    for row, of in ((0, slice(0, 2)), (1, slice(2, 4))):
+        lower, upper = sets.lower.copy(), sets.upper.copy()
+        lower[of] = upper[of] = sets.center[of]
+        known = robust_satisfaction(make_interval(model, lower, upper), "F a").solution.value[0]
+        assert known - found.bound == pytest.approx(found.gain[row], rel=0.05)
+
+
+def test_the_curve_of_a_log():
+    counts = np.array([9000, 1000, 8000, 2000, 0, 0])
+    curve = guarantee_curve(coins(), counts, "F a", 0.9, [0, 100, 5000, 20_000], seed=1)
+    assert curve[0] == 0
+    assert (np.diff(curve) > 0).all()
+    whole = learn_guarantee(coins(), counts, "F a", 0.9).bound
+    assert curve[-1] == whole
+    again = guarantee_curve(coins(), counts, "F a", 0.9, [20_000, 100], seed=1)
+    assert again[0] == whole
+    with pytest.raises(ValueError, match=r"sizes\[1\] is 20001; there are 20000 transitions"):
+        guarantee_curve(coins(), counts, "F a", 0.9, [5, 20_001])
+    for numbers, sizes, message in (
+        (counts, [0.5], "sizes is float64"),
+        (counts, 5, "sizes is int64"),
+        (counts + 0.5, [5], "counts is float64"),
+        (-counts, [5], "none is negative"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            guarantee_curve(coins(), numbers, "F a", 0.9, sizes)
+
+
+def test_counts_by_name():
+    counts = make_counts([0, 0, 1, 1], [0] * 4, [1, 3, 2, 3], [90, 10, 80, 20])
+    found = learn_guarantee(coins(), counts, "F a", 0.9)
+    same = learn_guarantee(coins(), np.array([90, 10, 80, 20, 0, 0]), "F a", 0.9)
+    assert found.bound == same.bound > 0.4
+    with pytest.raises(ValueError, match="confidence"):
+        learn_guarantee(coins(), counts, "F a", 1.0)
+
+
+def test_means_are_rounded_to_the_safe_side():
+    rng = np.random.default_rng(5)
+    for _ in range(200):
+        share, value = rng.dirichlet(np.ones(4)), rng.random(4)
+        weights = [Fraction(x) for x in share.tolist()]
+        mean = sum(w * Fraction(x) for w, x in zip(weights, value.tolist(), strict=True))
+        low, high = (safe_mean(share, value, up=up) for up in (False, True))
+        assert Fraction(low) <= mean / sum(weights) <= Fraction(high) <= low + Fraction(1, 10**14)
+    assert safe_mean(share, np.ones(4), up=False) == 1

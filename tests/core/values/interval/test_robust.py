@@ -1,0 +1,427 @@
+"""Interval models of a formula, a reward or a discount: laws, known values and messages."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+
+from jaxltl.core.models.build.restrict import restrict, with_allowed
+from jaxltl.core.models.game import Game
+from jaxltl.core.models.interval import IntervalMDP, interval_rows, make_interval
+from jaxltl.core.models.product import product
+from jaxltl.core.models.sparse import Rewards, make_sparse
+from jaxltl.core.types import Status
+from jaxltl.core.values.interval.robust import (
+    host_sides,
+    robust_discounted_value,
+    robust_expectation,
+    robust_reachability,
+    robust_total_reward,
+)
+from jaxltl.core.values.interval.satisfaction import _solved, robust_satisfaction
+from jaxltl.core.values.undiscounted.reachability import reachability_probability
+from jaxltl.core.values.undiscounted.satisfaction import (
+    optimal_satisfaction,
+    satisfaction_probability,
+)
+from jaxltl.core.values.undiscounted.sparse_satisfaction import sparse_satisfaction
+from jaxltl.core.values.undiscounted.total_reward import total_reward
+from tests.reference_intervals import chains, parity, random_model, reach, reward
+from tests.support import counts
+
+DIRECTIONS = [("max", "max"), ("max", "min"), ("min", "max"), ("min", "min")]
+TASKS = [
+    "F a",
+    "G !b",
+    "!b U a",
+    "G F a",
+    "F G a",
+    "G F a & F G !b",
+    "G (a -> F b)",
+    "(G F a -> G F b) & F c",
+    "X X a",
+    "F (a & X b) | G c",
+]
+
+
+def labelled(rng, host=None):
+    host = random_model(rng) if host is None else host
+    mdp = host.mdp
+    return interval_rows(
+        mdp.row_start,
+        mdp.entry_start,
+        mdp.successor,
+        host.lower,
+        host.upper,
+        label=rng.random((mdp.num_states, 3)) < 0.5,
+        propositions=["a", "b", "c"],
+    )
+
+
+def around(model, width):
+    """The same model with intervals around its probabilities."""
+    p = np.asarray(model.probability)
+    return make_interval(model, np.maximum(p - width, 0), np.minimum(p + width, 1))
+
+
+def test_points_are_the_exact_model():
+    rng = np.random.default_rng(0)
+    for i in range(20):
+        given = labelled(rng).nominal
+        model = around(given, 0.0)
+        np.testing.assert_array_equal(model.nominal.probability, given.probability)
+        task = TASKS[i % len(TASKS)]
+        for objective, nature in DIRECTIONS:
+            exact = sparse_satisfaction(given, task, objective=objective).solution
+            found = robust_satisfaction(model, task, objective=objective, nature=nature).solution
+            assert int(found.status) == Status.CONVERGED
+            np.testing.assert_allclose(found.value, exact.value, atol=2e-6)
+
+
+@pytest.mark.slow
+def test_wider_intervals_give_nature_more():
+    """Values move apart with the width, and hold the exact ones between them."""
+    rng = np.random.default_rng(1)
+    for i in range(10):
+        given = labelled(rng).nominal
+        task = TASKS[i % len(TASKS)]
+        for objective in ("max", "min"):
+            exact = sparse_satisfaction(given, task, objective=objective).solution
+            low = high = exact.value
+            for width in (0.05, 0.2, 1.0):
+                model = around(given, width)
+                least, most = (
+                    robust_satisfaction(model, task, objective=objective, nature=nature).solution
+                    for nature in ("min", "max")
+                )
+                assert int(least.status) == int(most.status) == Status.CONVERGED
+                assert (least.lower <= low + 1e-6).all()
+                assert (most.upper >= high - 1e-6).all()
+                low, high = least.value, most.value
+
+
+@pytest.mark.few(1)
+@pytest.mark.parametrize("label_on", ["entry", "exit"])
+def test_products(label_on):
+    """From every memory, whether letters are read on entry or on exit."""
+    rng = np.random.default_rng(7)
+    for task in TASKS:
+        model = labelled(rng)
+        pairs = product(model, task, label_on=label_on)
+        start = pairs.automaton.initial
+        if label_on == "entry":
+            start = np.asarray(pairs.automaton.delta)[start, np.asarray(pairs.letter)]
+        for objective, nature in DIRECTIONS:
+            found = optimal_satisfaction(pairs, objective=objective, nature=nature)
+            alone = robust_satisfaction(
+                model, task, objective=objective, nature=nature, states=np.arange(4)
+            ).solution
+            assert int(found.status) == Status.CONVERGED
+            np.testing.assert_allclose(found.value[np.arange(4), start], alone.value, atol=2e-6)
+
+
+@pytest.mark.few(1)
+@pytest.mark.parametrize("label_on", ["entry", "exit"])
+def test_policies_of_products(label_on):
+    """The best policy is worth what it is worth; points are exact models, mixtures too."""
+    rng = np.random.default_rng(12)
+    for task in TASKS:
+        model = labelled(rng)
+        pairs = product(model, task, label_on=label_on)
+        points = product(
+            make_interval(model.nominal, *[model.nominal.probability] * 2), task, label_on=label_on
+        )
+        exact = product(model.nominal, task, label_on=label_on)
+        host = model.nominal.host
+        weight = rng.random((host.num_rows, pairs.num_memory))
+        weight /= np.add.reduceat(weight, host.row_start[:-1])[host.state]
+        alone = satisfaction_probability(exact, weight).value
+        np.testing.assert_allclose(satisfaction_probability(points, weight).value, alone, atol=2e-6)
+        for nature in ("min", "max"):
+            best = optimal_satisfaction(pairs, nature=nature)
+            if nature == "min":  # else nature, too, has to keep to what attains it
+                own = satisfaction_probability(pairs, best.policy, nature=nature)
+                np.testing.assert_allclose(own.value, best.value, atol=2e-6)
+            found = satisfaction_probability(pairs, weight, nature=nature)
+            assert int(found.status) == Status.CONVERGED
+            side = 1 if nature == "max" else -1
+            assert (side * (found.value - alone) >= -2e-6).all()
+            assert (found.lower <= best.upper + 1e-9).all()
+
+
+def test_parts_of_interval_models():
+    """Fewer rows, and what is reached, keep their ends."""
+    model = labelled(np.random.default_rng(8), random_model(np.random.default_rng(8), 6, 3))
+    host = model.nominal.host
+    first = np.zeros(model.num_rows, bool)
+    first[host.row_start[:-1]] = True
+    less = with_allowed(model, first)
+    chain, entry = model.host.chain(host.row_start[:-1])
+    np.testing.assert_array_equal(less.upper, chain.upper)
+    np.testing.assert_array_equal(less.lower, model.lower[entry])
+    part = restrict(model, np.eye(6)[0], allowed=first)
+    target = model.states_where("a")
+    for nature in ("min", "max"):
+        whole = robust_reachability(model, target, policy=host.row_start[:-1], nature=nature)
+        found = robust_reachability(part.model, target[np.asarray(part.base_state)], nature=nature)
+        np.testing.assert_allclose(found.value, whole.value[np.asarray(part.base_state)], atol=1e-6)
+
+
+def test_policies_are_evaluated():
+    rng = np.random.default_rng(2)
+    for _ in range(10):
+        model = labelled(rng)
+        target = model.states_where("a")
+        for nature in ("min", "max"):
+            best = robust_reachability(model, target, nature=nature)
+            own = robust_reachability(model, target, policy=best.policy, nature=nature)
+            np.testing.assert_allclose(own.value, best.value, atol=1e-6)
+            np.testing.assert_array_equal(own.policy, best.policy)
+            other = robust_reachability(
+                model, target, policy=model.nominal.host.row_start[:-1], nature=nature
+            )
+            assert (other.lower <= best.upper + 1e-12).all()
+
+
+def test_one_function_takes_both_kinds():
+    model = labelled(np.random.default_rng(3))
+    target = model.states_where("a")
+    for objective, nature in DIRECTIONS:
+        np.testing.assert_array_equal(
+            reachability_probability(model, target, objective=objective, nature=nature).value,
+            robust_reachability(model, target, objective=objective, nature=nature).value,
+        )
+        np.testing.assert_array_equal(
+            total_reward(model, np.ones(4), target, objective=objective, nature=nature).value,
+            robust_total_reward(
+                model, np.ones(4), target, objective=objective, nature=nature
+            ).value,
+        )
+    with pytest.raises(ValueError, match=r"nature='max'.*intervals"):
+        reachability_probability(model.nominal, target, nature="max")
+
+
+def test_mixed_policies():
+    """A policy that mixes rows is as good as the one that its coin makes of them."""
+    rng = np.random.default_rng(9)
+    for _ in range(10):
+        model = labelled(rng)
+        host = model.nominal.host
+        weight = rng.random(host.num_rows)
+        weight /= np.add.reduceat(weight, host.row_start[:-1])[host.state]
+        target = model.states_where("a")
+        points = make_interval(model.nominal, *[model.nominal.probability] * 2)
+        alone = reachability_probability(model.nominal, target, policy=weight)
+        np.testing.assert_allclose(
+            robust_reachability(points, target, policy=weight).value, alone.value, atol=1e-6
+        )
+        low, high = (
+            robust_reachability(model, target, policy=weight, nature=nature)
+            for nature in ("min", "max")
+        )
+        assert (low.lower <= alone.upper).all()
+        assert (high.upper >= alone.lower).all()
+        p = np.asarray(high.nature)
+        assert ((model.lower - 1e-15 <= p) & (p <= model.upper + 1e-15)).all()
+        again = reachability_probability(
+            model.nominal.replace(probability=p), target, policy=weight
+        )
+        np.testing.assert_allclose(again.value, high.value, atol=1e-6)
+
+
+@counts(10, 100)
+def test_games(count):
+    """Against all choices of both players and all vertices of nature's."""
+    rng = np.random.default_rng(10)
+    for _ in range(count):
+        host = random_model(rng)
+        model = labelled(rng, host)
+        system = rng.random(4) < 0.5
+        goal = np.arange(4) == rng.integers(4)
+        priority = rng.integers(0, 3, 4)
+        game = Game(model, system)
+        cost = rng.integers(0, 3, model.num_rows).astype(float)
+        worth = partial(_reach, goal), partial(_reward, goal, cost), partial(_parity, priority)
+        for nature in ("min", "max"):
+            for objective in ("max", "min"):
+                of = {"objective": objective, "nature": nature}
+                held(
+                    robust_reachability(game, goal, **of),
+                    played(host, goal, system, worth[0], **of),
+                )
+                held(
+                    robust_total_reward(game, cost, goal, **of),
+                    played(host, goal, system, worth[1], **of),
+                )
+            yes = np.zeros(4, bool)
+            sides = host_sides(host, system, "max", nature)
+            found = _solved(sides, host, yes, yes, priority, False, 1e-6)
+            held(found, played(host, yes, system, worth[2], objective="max", nature=nature))
+
+
+def _reach(goal, rows, p):
+    return reach(p, goal)
+
+
+def _reward(goal, cost, rows, p):
+    return reward(p, goal, cost[list(rows)])
+
+
+def _parity(priority, rows, p):
+    return parity(p, priority)
+
+
+def played(host, goal, system, worth, objective, nature):
+    """The value of a game by trying everything."""
+    of = {rows: getattr(np, nature)(worth(rows, p), 0) for rows, p in chains(host, goal)}
+    ours, theirs = (max, min) if objective == "max" else (min, max)
+    ours, theirs = (getattr(np, x.__name__) for x in (ours, theirs))
+    by: dict = {}
+    for rows, value in of.items():
+        mine = tuple(r for r, s in zip(rows, system, strict=True) if s)
+        by.setdefault(mine, []).append(value)
+    return ours([theirs(x, 0) for x in by.values()], 0)
+
+
+def held(found, value):
+    finite = np.isfinite(value)
+    assert (np.isfinite(found.upper) == finite).all()
+    low, high, value = (np.where(finite, x, 0) for x in (found.lower, found.upper, value))
+    size = np.maximum(1, value)
+    assert ((low <= value + 1e-11 * size) & (value <= high + 1e-11 * size)).all()
+    assert (high - low <= 1e-6 * size).all()
+
+
+def test_exact_games_have_values():
+    """A game on a sparse model: the environment takes the worse of two coins."""
+    coins = make_sparse(
+        [0, 2, 3, 4],
+        [0, 2, 4, 5, 6],
+        [1, 2, 1, 2, 1, 2],
+        [0.25, 0.75, 0.5, 0.5, 1, 1],
+        label=[[0], [1], [0]],
+        propositions=["a"],
+    )
+    for system, best in ((True, 0.5), (False, 0.25)):
+        game = Game(coins, np.array([system] * 3))
+        assert robust_reachability(game, "a").value[0] == pytest.approx(best)
+        found = robust_satisfaction(game, "F G a", states=[0]).solution
+        assert found.value[0] == pytest.approx(best)
+
+
+def test_discounted_values():
+    """Against sweeps of the operator, alone and in games; points are exact models."""
+    rng = np.random.default_rng(11)
+    for _ in range(10):
+        model = labelled(rng)
+        host = model.nominal.host
+        earned = rng.normal(size=model.num_transitions)
+        if model.num_transitions in (4, model.num_rows):
+            continue  # taken for rewards of states or choices
+        for objective, nature in DIRECTIONS:
+            value = np.zeros(4)
+            for _ in range(600):
+                ahead = earned + 0.9 * value[host.successor]
+                p = model.host.nature(ahead, maximize=nature == "max")
+                image = model.host.total(p * ahead)
+                value = getattr(np, objective + "imum").reduceat(image, host.row_start[:-1])
+            found = robust_discounted_value(model, earned, 0.9, objective=objective, nature=nature)
+            assert int(found.status) == Status.CONVERGED
+            np.testing.assert_allclose(found.value, value, atol=1e-8)
+            assert (found.lower <= value + 1e-12).all()
+            assert (value <= found.upper + 1e-12).all()
+            game = Game(model, np.ones(4, bool))
+            np.testing.assert_allclose(
+                robust_discounted_value(
+                    game, earned, 0.9, objective=objective, nature=nature
+                ).value,
+                value,
+                atol=1e-7,
+            )
+
+
+COIN = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "message"),
+    [
+        (
+            [0.6, 0.3, 1, 1],
+            [0.5, 0.6, 1, 1],
+            r"state 0, choice 0: the interval of successor 1 is "
+            r"\[0.6, 0.5\]",
+        ),
+        ([-0.1, 0.3, 1, 1], [0.5, 0.6, 1, 1], r"\[-0.1, 0.5\]"),
+        ([0.1, 0.3, 1, 1], [0.5, 1.6, 1, 1], r"\[0.3, 1.6\]"),
+        ([0.1, np.nan, 1, 1], [0.5, 0.6, 1, 1], r"\[nan, 0.6\]"),
+        ([0.6, 0.5, 1, 1], [0.7, 0.6, 1, 1], "lower ends sum to 1.1, which is above 1"),
+        ([0.1, 0.2, 1, 1], [0.3, 0.4, 1, 1], "upper ends sum to 0.7, which is below 1"),
+        ([0.1, 0.2, 1], [0.3, 0.4, 1], r"lower has shape \(3,\); expected \(4,\)"),
+    ],
+)
+def test_ends_without_a_distribution(lower, upper, message):
+    with pytest.raises(ValueError, match=message):
+        make_interval(COIN, lower, upper)
+
+
+def test_entries_without_mass_are_left_out():
+    model = make_interval(COIN, [1, 0, 1, 1], [1, 0.5, 1, 1])
+    assert model.nominal.successor.tolist() == [1, 1, 2]
+    assert isinstance(model, IntervalMDP)
+
+
+def test_one_successor_twice():
+    model = interval_rows(None, [0, 3, 4], [1, 0, 1, 1], [0.1, 0.2, 0.1, 1], [0.3, 0.6, 0.3, 1])
+    assert model.nominal.successor.tolist() == [0, 1, 1]
+    np.testing.assert_allclose(model.lower, [0.2, 0.2, 1])
+    np.testing.assert_allclose(model.upper, [0.6, 0.6, 1])
+
+
+def test_bad_questions():
+    model = make_interval(COIN, [0.1, 0.2, 1, 1], [0.8, 0.9, 1, 1])
+    with pytest.raises(ValueError, match=r"IntervalMDP takes no intervals; .*its nominal one"):
+        make_interval(model, [0.1, 0.2, 1, 1], [0.8, 0.9, 1, 1])
+    target = [False, True, False]
+    with pytest.raises(ValueError, match=r'nature=.adverse.; it must be "min"'):
+        robust_reachability(model, target, nature="adverse")
+    for tolerance in (float("nan"), -1.0, "fine"):
+        with pytest.raises(ValueError, match=r"tolerance=.*at least 0"):
+            robust_reachability(model, target, tolerance=tolerance)
+    for discount in (None, 1.0, [0.5]):
+        with pytest.raises(ValueError, match=r"discount=.*below 1"):
+            robust_discounted_value(model, [0, 1, 0], discount)
+    with pytest.raises(ValueError, match="SparseMDP has no intervals"):
+        robust_expectation(COIN, [0, 1, 0])
+    with pytest.raises(ValueError, match="not finite"):
+        robust_expectation(model, [0, np.nan, 0])
+    with pytest.raises(ValueError, match="target is int64"):
+        robust_reachability(model, [0, 2, 0])
+    with pytest.raises(ValueError, match="objective='best'"):
+        robust_reachability(model, target, objective="best")
+    with pytest.raises(ValueError, match="takes row 3 in state 0, whose rows are 0 to 0"):
+        robust_reachability(model, target, policy=[3, 1, 2])
+    with pytest.raises(ValueError, match="reward of state 1, choice 0 is -1"):
+        robust_total_reward(model, [0, -1, 0], target)
+    with pytest.raises(ValueError, match="differs between its successors"):
+        robust_total_reward(model, Rewards(transition=np.array([1.0, 2, 0, 0])), target)
+
+
+@pytest.mark.parametrize(
+    ("states", "message"),
+    [
+        ([3], r"states has 3; the states are 0 to 2"),
+        ([0, -1], r"states has -1"),
+        ([True, False, True], r"states is bool\[3\]"),
+        ([0.0], "states is float64"),
+        ([], "at least one"),
+    ],
+)
+def test_states_that_are_none(states, message):
+    coin = make_sparse(
+        None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1], initial=[1, 0, 0], label={"a": [1]}
+    )
+    model = make_interval(coin, coin.probability, coin.probability)
+    for solve, of in ((robust_satisfaction, model), (sparse_satisfaction, coin)):
+        with pytest.raises(ValueError, match=message):
+            solve(of, "F a", states=states)

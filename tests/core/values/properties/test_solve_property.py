@@ -1,0 +1,263 @@
+"""Properties of sparse models are answered by the right solver, as Storm answers them."""
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from jaxltl.core.models.sparse import Rewards, make_sparse
+from jaxltl.core.types import Status
+from jaxltl.core.values.properties import solve_property as module
+from jaxltl.core.values.properties.solve_property import meets, solve_property
+from tests.core.values.undiscounted.test_sparse_satisfaction import random_sparse
+from tests.storm_oracle import storm_model, storm_values
+
+PATHS = (
+    'F "a"',
+    '"c" U "a"',
+    'X "a"',
+    'true U ("a" & "b")',
+    'F<=4 "a" & "b"',
+    '"c" U<=3 "b"',
+    'F<1 "a"',
+    'F{"step"}<=5 "a" & "b"',
+    'F{"step"}<5 "a" & "b"',
+    '"a" | "b"',
+    '!"a" & "init"',
+    '!(F "a" & "b")',
+    '!("c" U "a")',
+    'F[2,4] "a" & "b" & "c"',
+    '(G F "a") & (G !"c")',
+    'F G "a"',
+    '(F "a") & (F "b")',
+    'X X "a"',
+    'G ("a" | X "b")',
+    '(F "a" & "b") | (G !"c")',
+    '(G F "a") & (F G !"b")',
+    '!"a" & X !"a"',
+    '"init" & F "b"',
+)
+REWARDS = ('F "a" & "b"', "C<=6", "C", "C<1", "C<=0", "I=3", "I=0", "LRA", "S")
+
+
+def random_rewarded(seed: int, most_rows: int = 3):
+    rng = np.random.default_rng(seed)
+    model = random_sparse(seed, num_states=8, most_rows=most_rows)
+    return model.replace(
+        rewards={
+            "step": Rewards(choice=rng.integers(0, 4, model.num_rows).astype(float)),
+            "place": Rewards(state=rng.integers(0, 4, model.num_states).astype(float)),
+        }
+    )
+
+
+def close(found, wanted) -> bool:
+    """Whether certified bounds hold a number of Storm's."""
+    slack = 2e-6 * max(1, abs(wanted)) if np.isfinite(wanted) else 0
+    return found[0] - slack <= wanted <= found[1] + slack
+
+
+@pytest.mark.parametrize(
+    "seed", [*range(4), *(pytest.param(i, marks=pytest.mark.exhaustive) for i in range(4, 30))]
+)
+def test_storm_agrees(seed):
+    pytest.importorskip("stormpy")
+    model = random_rewarded(seed, most_rows=1 if seed % 4 == 0 else 3)
+    storm = storm_model(model)
+    signs = ("",) if model.is_chain else ("max", "min")
+    asked = [f"P{sign}=? [ {path} ]" for path in PATHS for sign in signs]
+    asked += [f'R{{"place"}}{sign}=? [ {path} ]' for path in REWARDS for sign in signs]
+    asked += [f'R{{"step"}}{sign}=? [ {path} ]' for path in REWARDS[:5] for sign in signs]
+    asked += [f'T{sign}=? [ F "a" ]' for sign in signs]
+    asked += [f'LRA{sign}=? [ "a" | "b" ]' for sign in signs]
+    for text in asked:
+        found = solve_property(model, text)
+        assert found.status == Status.CONVERGED, text
+        for low, high, wanted in zip(
+            found.lower, found.upper, storm_values(storm, text), strict=True
+        ):
+            assert close((low, high), wanted), (text, low, high, wanted)
+            assert low == high or high - low <= 1e-6 * max(1, abs(high)), text
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_storm_agrees_on_thresholds(seed):
+    pytest.importorskip("stormpy")
+    model = random_rewarded(seed, most_rows=2)
+    storm = storm_model(model)
+    for path in ('F "a" & "b"', 'X "a"', '"c" U "a"', '(G F "a") & (G !"c")'):
+        for relation in (">=", ">", "<=", "<"):
+            for threshold in ("0", "0.3", "0.7", "1"):
+                for text in (
+                    f"P{relation}{threshold} [ {path} ]",
+                    f"Pmax{relation}{threshold} [ {path} ]",
+                    f"Pmin{relation}{threshold} [ {path} ]",
+                ):
+                    found = solve_property(model, text)
+                    assert found.holds == storm_values(storm, text), text
+
+
+# --- what Storm does not take ------------------------------------------------------------------
+
+
+def both(model, text, same):
+    """The answers to two properties that mean the same."""
+    found, wanted = solve_property(model, text), solve_property(model, same)
+    np.testing.assert_allclose(found.value, wanted.value, atol=2e-6)
+    assert (found.lower <= wanted.upper).all() and (wanted.lower <= found.upper).all()
+
+
+@pytest.mark.parametrize(
+    ("text", "same"),
+    [
+        ('G<=4 "a" | "b"', '!(F<=4 !("a" | "b"))'),
+        ('"a" W "b"', '("a" U "b") || G "a"'),
+        ('"a" R "b"', '"b" W ("a" & "b")'),
+        ('"a" R<=3 "b"', '!(!"a" U<=3 !"b")'),
+        ('"a" W<=3 "b"', '("a" U<=3 "b") || (G<=3 "a")'),
+        ('F>=2 "a"', 'X X F "a"'),
+        ('F=2 "a"', 'X X "a"'),
+        ('"a" U[1,2] "b"', '"a" && X ("b" || ("a" && X "b"))'),
+        ('G "a" => X "b"', 'G (!"a" | X "b")'),
+    ],
+)
+def test_what_means_the_same_has_the_same_value(text, same):
+    model = random_rewarded(5)
+    for sign in ("max", "min"):
+        both(model, f"P{sign}=? [ {text} ]", f"P{sign}=? [ {same} ]")
+
+
+def chance(p, more=0):
+    """A state that goes to `a` with probability p, else away, and so many that stand still."""
+    size = 3 + more
+    loops = np.arange(1, size)
+    return make_sparse(
+        None,
+        np.append([0, 2], 2 + np.arange(1, size)),
+        np.append([1, 2], loops),
+        np.append([p, 1 - p], np.ones(size - 1)),
+        initial=[1] + [0] * (size - 1),
+        label=np.arange(size)[:, None] == 1,
+        propositions=["a"],
+        rewards={"r": Rewards(state=np.ones(size))},
+    )
+
+
+def test_a_threshold_that_the_bounds_touch_is_not_guessed():
+    third = chance(1 / 3)  # a double just below 1/3
+    found = solve_property(third, 'P>=1/3 [ F "a" ]')
+    assert found.holds in ([None], [False])
+    found = solve_property(third, 'P>=0.333 [ F "a" ]')
+    assert found.holds == [True] and found.status == Status.CONVERGED
+
+
+def test_undecided_thresholds_are_tried_again_more_narrowly(monkeypatch):
+    model, asked = chance(0.25), []
+    original = module.reachability_probability
+
+    def wide(*arguments, tolerance, **options):
+        asked.append(tolerance)
+        found = original(*arguments, tolerance=tolerance, **options)
+        half = tolerance / 2
+        return found.replace(lower=found.value - half, upper=found.value + half)
+
+    monkeypatch.setattr(module, "reachability_probability", wide)
+    found = solve_property(model, 'P>0.2499999 [ F "a" ]', tolerance=1e-3)
+    assert found.holds == [True] and asked == [1e-3, 1e-6, 1e-9][: len(asked)] and len(asked) > 1
+    found = solve_property(model, 'P>=0.25 [ F "a" ]')
+    assert found.holds == [None] and found.status == Status.PRECISION
+    assert found.lower < 0.25 < found.upper
+
+
+def test_zero_and_one_are_exact():
+    model = chance(0.25)
+    for text, truth in (
+        ('P>0 [ F "a" ]', True),
+        ('P>=1 [ F ("a" | !"a") ]', True),
+        ('P<1 [ F "deadlock" ]', False),
+        ('P<=0 [ G F !"deadlock" ]', True),
+        ('P>=1 [ F G "deadlock" ]', True),
+    ):
+        found = solve_property(model, text)
+        assert found.holds == [truth] and found.status == Status.CONVERGED, text
+
+
+def test_several_initial_states_have_a_value_each():
+    model = random_rewarded(1)
+    found = solve_property(model, 'Pmax=? [ F "a" & "b" ]')
+    assert found.states.tolist() == [0, 1, 2] and found.value.shape == (3,)
+    every = solve_property(model, 'Pmax=? [ F "a" & "b" ]', states=np.arange(model.num_states))
+    np.testing.assert_array_equal(found.value, every.value[:3])
+    later = solve_property(model, 'Pmax=? [ (G F "a") & (F "b") ]', states=[4, 2])
+    assert later.value.shape == (2,)
+    alone = solve_property(model, 'Pmax=? [ (G F "a") & (F "b") ]', states=[2])
+    assert abs(later.value[1] - alone.value[0]) < 1e-6
+
+
+def test_infinite_rewards_are_infinite():
+    model = chance(0.25)
+    found = solve_property(model, 'R=? [ F "a" ]')
+    assert found.value == found.lower == found.upper == np.inf
+    assert found.status == Status.CONVERGED
+    assert solve_property(model, 'R{"r"}<=100 [ F "a" ]').holds == [False]
+    assert abs(solve_property(model, 'T=? [ F "deadlock" ]').value - 1) < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('P=? [ F "a" ]', "ask for Pmax=\\? or Pmin=\\?"),
+        ('R{"step"}=? [ C ]', 'ask for R{"step"}max=\\?'),
+        ('Pmax=? [ F "gaol" ]', "'gaol'.*a, b, c, init, deadlock"),
+        ('Pmax=? [ G F "gaol" ]', "'gaol'.*a, b, c, init, deadlock"),
+        ('R{"stpe"}max=? [ C<=3 ]', "'stpe'.*'step', 'place'"),
+        ("Rmax=? [ C<=3 ]", "'step', 'place'"),
+        ('Pmax=? [ F[3,200] "a" ]', "up to 100 steps"),
+        ('multi(Pmax=? [ F "a" ])', "several values"),
+    ],
+)
+def test_mistakes_are_named(text, message):
+    with pytest.raises(ValueError, match=message):
+        solve_property(random_rewarded(1), text)
+
+
+@pytest.mark.parametrize(
+    ("relation", "lower", "upper", "verdict"),
+    [
+        (">=", 0.5, 0.6, True),
+        (">=", 0.4, 0.49, False),
+        (">=", 0.4, 0.5, None),
+        (">", 0.5, 0.6, None),
+        (">", 0.51, 0.6, True),
+        (">", 0.4, 0.5, False),
+        ("<=", 0.4, 0.5, True),
+        ("<=", 0.4, 0.6, None),
+        ("<=", 0.51, 0.6, False),
+        ("<", 0.4, 0.5, None),
+        ("<", 0.4, 0.49, True),
+        ("<", 0.5, 0.6, False),
+        (">=", np.inf, np.inf, True),
+        ("<", np.inf, np.inf, False),
+        (">=", np.nan, np.nan, None),
+        (">=", -np.inf, np.inf, None),
+    ],
+)
+def test_bounds_decide_thresholds(relation, lower, upper, verdict):
+    assert meets(relation, Fraction(1, 2), lower, upper) is verdict
+
+
+@pytest.mark.parametrize(
+    "text",
+    ['LRAmax=? [ "a" ]', "Rmax=? [ LRA ]", "Rmin=? [ C ]", "Rmax=? [ C<=3 ]", 'Pmax=? [ F "a" ]'],
+)
+def test_it_is_told_how(text):
+    model = make_sparse(
+        [0, 2, 3],
+        [0, 2, 3, 4],
+        [0, 1, 0, 1],
+        [0.75, 0.25, 1, 1],
+        initial=[1, 0],
+        label={"a": [1]},
+        rewards={"r": Rewards(state=np.array([1.0, 0]))},
+    )
+    assert solve_property(model, text).method

@@ -1,0 +1,257 @@
+"""Questions about so many steps or so much reward: explicit loops, fractions, and Storm."""
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from jaxltl.core.models.build.convert import to_padded
+from jaxltl.core.models.sparse import Rewards, make_sparse
+from jaxltl.core.sparse.solvers import step_bounded as bounded
+from jaxltl.core.types import Status, check
+from jaxltl.core.values.undiscounted.step_bounded import (
+    bounded_reachability,
+    cumulative_reward,
+    instantaneous_reward,
+    next_probability,
+    reward_bounded_reachability,
+)
+from tests.sparse_models import BEST, exact_matrix, random_sparse, storm_model, storm_values
+
+
+def exact_until(model, target, stay, num_steps, best):
+    """The probability in fractions, state by state."""
+    matrix = exact_matrix(model)
+    value = [Fraction(int(t)) for t in target]
+    for _ in range(num_steps):
+        ahead = []
+        for s in range(model.num_states):
+            sums = [
+                sum((p * x for p, x in zip(matrix[r], value, strict=True)), Fraction(0))
+                for r in range(*model.row_start[s : s + 2])
+            ]
+            ahead.append(Fraction(1) if target[s] else best(sums) if stay[s] else Fraction(0))
+        value = ahead
+    return value
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_bounds_of_steps_enclose_exact_fractions(seed, monkeypatch):
+    monkeypatch.setattr(bounded, "_MANY", 4)  # some with all states, some with those near enough
+    rng = np.random.default_rng(seed)
+    model = random_sparse(rng, 6, chain=seed % 4 == 0, fractions=64)
+    target, stay = rng.random(6) < 0.3, rng.random(6) < 0.8
+    num_steps = int(rng.integers(0, 7))
+    for objective, best in (("max", max), ("min", min)):
+        exact = exact_until(model, target, stay, num_steps, best)
+        found = check(
+            bounded_reachability(model, target, num_steps, stay=stay, objective=objective)
+        )
+        for low, x, high in zip(found.lower, exact, found.upper, strict=True):
+            assert Fraction(float(low)) <= x <= Fraction(float(high))
+            assert high - low < 1e-12
+            assert (x in (0, 1)) == (low == high and low in (0, 1))
+
+
+def test_what_rounding_takes_is_enclosed_and_no_probability_becomes_zero():
+    model = make_sparse(None, [0, 2, 3, 4], [1, 2, 0, 2], [1e-200, 1 - 1e-200, 1, 1])
+    lost = make_sparse(None, [0, 2, 4, 5, 6], [1, 3, 2, 3, 2, 3], [1e-200, 1, 1e-200, 1, 1, 1])
+    found = bounded_reachability(lost, [False, False, True, False], 2)
+    assert found.lower[0] == 0 < found.upper[0] < 1e-299
+    assert found.upper[3] == 0
+    assert bounded_reachability(model, [False, True, False], 5).value[0] == 1e-200
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_rewards_of_so_many_steps_are_what_a_loop_finds(seed):
+    rng = np.random.default_rng(seed)
+    model = random_sparse(rng, 7, chain=seed % 4 == 0)
+    mdp, matrix = model.host, model.host.matrix.toarray()
+    state, choice = rng.normal(size=7), rng.normal(size=model.num_rows)
+    entry = rng.normal(size=model.num_transitions) * (seed % 2)
+    earned = (
+        state[mdp.state]
+        + choice
+        + [
+            sum(mdp.probability[e] * entry[e] for e in range(*mdp.entry_start[r : r + 2]))
+            for r in range(mdp.num_rows)
+        ]
+    )
+    for objective, best in BEST.items():
+        total, now = np.zeros(7), state
+        for _ in range(5):
+            total = mdp.over_choices(best, earned + matrix @ total)
+            now = mdp.over_choices(best, matrix @ now)
+        reward = Rewards(state=state, choice=choice, transition=entry)
+        for found, expected in (
+            (cumulative_reward(model, reward, 5, objective=objective), total),
+            (instantaneous_reward(model, reward, 5, objective=objective), now),
+        ):
+            check(found)
+            np.testing.assert_allclose(found.value, expected, rtol=1e-10, atol=1e-12)
+            assert (found.lower <= expected + 1e-14).all()
+            assert (found.upper >= expected - 1e-14).all()
+            assert (found.upper - found.lower).max() < 1e-11
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_choices_of_all_steps_attain_the_value(seed):
+    rng = np.random.default_rng(seed)
+    model = random_sparse(rng, 8)
+    mdp, target, num_steps = model.host, rng.random(8) < 0.3, 6
+    reward = rng.random(model.num_rows)
+    for objective in BEST:
+        found = bounded_reachability(model, target, num_steps, objective=objective, by_step=True)
+        value = target.astype(float)
+        for row in found.policy[::-1]:
+            assert (mdp.state[row] == np.arange(8)).all()
+            value = np.where(target, 1, mdp.expectation(value)[row])
+        np.testing.assert_allclose(value, found.value, atol=1e-14)
+        first = bounded_reachability(model, target, num_steps, objective=objective).policy
+        assert (first == found.policy[0]).all()
+        found = cumulative_reward(
+            model, Rewards(choice=reward), num_steps, objective=objective, by_step=True
+        )
+        value = np.zeros(8)
+        for row in found.policy[::-1]:
+            value = (reward + mdp.expectation(value))[row]
+        np.testing.assert_allclose(value, found.value, atol=1e-14)
+
+
+def test_nothing_more_happens_after_it_came_to_rest():
+    model = make_sparse(None, [0, 1, 2, 3], [1, 2, 2], [1.0, 1.0, 1.0])
+    found = bounded_reachability(model, [False, False, True], 10**6, by_step=False)
+    assert found.num_steps == 3
+    assert found.value.tolist() == [1, 1, 1]
+    assert found.lower.tolist() == [1, 1, 1]
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_the_next_state(seed):
+    rng = np.random.default_rng(seed)
+    model = random_sparse(rng, 6, chain=seed % 3 == 0)
+    target, matrix = rng.random(6) < 0.5, model.host.matrix.toarray()
+    for objective, best in BEST.items():
+        found = check(next_probability(model, target, objective=objective))
+        expected = model.host.over_choices(best, matrix @ target)
+        np.testing.assert_allclose(found.value, expected, atol=1e-15)
+        np.testing.assert_allclose((matrix @ target)[found.policy], expected, atol=1e-15)
+        sure = np.where(np.isclose(expected, 1), 1, expected)
+        assert (found.lower <= sure).all() and (sure <= found.upper).all()
+        assert (found.value[np.isclose(expected, 1)] == 1).all()
+
+
+def by_levels(model, target, stay, cost, most, best, sweeps=400):
+    """``x[l]``: the probability to reach the target at a cost of at most l, by plain sweeps."""
+    mdp, found = model.host, np.zeros((most + 1, model.num_states))
+    for level in range(most + 1):
+        for _ in range(sweeps):
+            left = level - cost
+            ahead = np.where(left >= 0, found[np.maximum(left, 0), mdp.successor], 0)
+            image = np.bincount(mdp.row, mdp.probability * ahead, mdp.num_rows)
+            found[level] = np.where(target, 1, np.where(stay, mdp.over_choices(best, image), 0))
+    return found
+
+
+@pytest.mark.parametrize("seed", range(16))
+def test_rewards_are_spent_level_by_level(seed):
+    rng = np.random.default_rng(seed)
+    model = random_sparse(rng, 7, chain=seed % 4 == 0)
+    target, stay = rng.random(7) < 0.25, rng.random(7) < 0.9
+    cost = rng.choice([0, 0, 1, 2], model.num_transitions)
+    if seed % 2:  # whole choices without cost, so that there are end components of them
+        cost = rng.choice([0, 0, 0, 2], model.num_rows)[model.host.row]
+    most = int(rng.integers(0, 5))
+    for objective, best in BEST.items():
+        expected = by_levels(model, target, stay, cost, most, best)
+        found = check(
+            reward_bounded_reachability(
+                model,
+                target,
+                Rewards(transition=cost * 0.1),
+                most * 0.1,
+                stay=stay,
+                objective=objective,
+                by_level=True,
+            )
+        )
+        np.testing.assert_allclose(found.value, expected[-1], atol=1e-8)
+        assert (found.lower <= expected[-1] + 1e-9).all()
+        assert (found.upper >= expected[-1] - 1e-9).all()
+        # The choices attain it.
+        value = np.zeros_like(expected)
+        for level in range(len(expected) if found.num_steps == most + 1 else 0):
+            row = found.policy[level]
+            for _ in range(400):
+                left = level - cost
+                ahead = np.where(left >= 0, value[np.maximum(left, 0), model.successor], 0)
+                image = np.bincount(model.host.row, model.probability * ahead, model.num_rows)
+                value[level] = np.where(target, 1, np.where(stay, image[row], 0))
+            np.testing.assert_allclose(value[level], expected[level], atol=1e-8)
+
+
+def test_padded_models_are_taken_too():
+    model = random_sparse(np.random.default_rng(1), 6)
+    padded = to_padded(model)
+    target = np.arange(6) == 3
+    found = bounded_reachability(padded, target, 4)
+    np.testing.assert_allclose(found.value, bounded_reachability(model, target, 4).value, atol=1e-6)
+
+
+def test_what_is_wrong_is_named():
+    model = make_sparse(
+        None, [0, 1, 2], [1, 1], [1.0, 1.0], rewards={"r": Rewards(choice=[1.0, 0])}
+    )
+    goal = np.array([False, True])
+    with pytest.raises(ValueError, match="target is float"):
+        bounded_reachability(model, [0.0, 1.0], 3)
+    with pytest.raises(ValueError, match="num_steps=-1"):
+        bounded_reachability(model, goal, -1)
+    with pytest.raises(ValueError, match="objective='most'"):
+        next_probability(model, goal, objective="most")
+    with pytest.raises(ValueError, match="no reward 'q'"):
+        cumulative_reward(model, "q", 3)
+    with pytest.raises(ValueError, match="needs a reward on states"):
+        instantaneous_reward(model, "r", 3)
+    with pytest.raises(ValueError, match="state 0, choice 0 is inf"):
+        cumulative_reward(model, [np.inf, 0], 3)
+    with pytest.raises(ValueError, match="no unit in common"):
+        reward_bounded_reachability(model, [False, False], [np.pi, 1e-9], 10.0)
+    with pytest.raises(ValueError, match="needs rewards of at least 0"):
+        reward_bounded_reachability(model, goal, [-1.0, 0], 10.0)
+    with pytest.raises(ValueError, match="bound=-1"):
+        reward_bounded_reachability(model, goal, "r", -1)
+
+
+def test_too_many_roundings_are_said():
+    ring = make_sparse(None, [0, 3, 4, 5, 6], [1, 2, 3, 0, 2, 3], [0.5, 0.25, 0.25, 1, 1, 1])
+    found = bounded_reachability(ring, np.arange(4) == 2, 10**18)
+    assert found.upper[0] == 1
+    assert found.status == Status.PRECISION
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_storm_finds_the_same(seed):
+    pytest.importorskip("stormpy")
+    rng = np.random.default_rng(seed)
+    model = random_sparse(rng, 8, chain=seed % 3 == 0)
+    target = rng.random(8) < 0.3
+    reward = rng.integers(0, 3, 8).astype(float)
+    storm = storm_model(model, {"goal": target}, {"r": Rewards(state=reward)})
+    for objective in ("max", "min"):
+        ours = {
+            f'P{objective}=? [ X "goal" ]': next_probability(model, target, objective=objective),
+            f'P{objective}=? [ F<=5 "goal" ]': bounded_reachability(
+                model, target, 5, objective=objective
+            ),
+            f'R{{"r"}}{objective}=? [ C<=5 ]': cumulative_reward(
+                model, Rewards(state=reward), 5, objective=objective
+            ),
+            f'R{{"r"}}{objective}=? [ I=4 ]': instantaneous_reward(
+                model, Rewards(state=reward), 4, objective=objective
+            ),
+        }
+        for text, found in ours.items():
+            np.testing.assert_allclose(
+                found.value, storm_values(storm, text), atol=1e-6, err_msg=text
+            )
