@@ -286,11 +286,8 @@ def sequence_environment(
             "be of the same events."
         )
     shape = (len(sampler.length), len(rows))
-    told: Any = Sequence(
-        make_box(0, 1, shape, bool),
-        make_box(0, 1, shape, bool),  # type: ignore[arg-type]
-        make_box(0, np.inf, (), np.int32),
-    )  # type: ignore[arg-type]
+    marks, steps = make_box(0, 1, shape, bool), make_box(0, np.inf, (), np.int32)
+    told: Any = Sequence(marks, marks, steps)  # type: ignore[arg-type]
     numbers = np.array(
         [validation.number("violation", violation), validation.number("progress", progress)]
     )

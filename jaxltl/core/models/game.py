@@ -19,6 +19,7 @@ from jaxltl.core.models.mdp import support
 from jaxltl.core.models.ops import operators
 from jaxltl.core.models.ops.array_namespace import namespace, to_jax
 from jaxltl.core.models.ops.choices import choice_shape, choices
+from jaxltl.core.models.protocols import Model, base_model
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.validation import no_model
@@ -96,7 +97,7 @@ class Game:
         return self.mdp.dtype
 
 
-def make_game(model: Any, system: Sequence[bool] | chex.Array) -> Game:
+def make_game(model: Model, system: Sequence[bool] | chex.Array) -> Game:
     """A checked :class:`Game`, on the host.
 
     Args:
@@ -117,7 +118,7 @@ def make_game(model: Any, system: Sequence[bool] | chex.Array) -> Game:
     """
     owner = _owners(system, model.state_shape)
     if not isinstance(model, SparseMDP | IntervalMDP):  # whose every state has a choice
-        check_moves(np.asarray(model.available), owner)
+        check_moves(np.asarray(choices(model).available), owner)
     return Game(model, to_jax(owner))
 
 
@@ -159,7 +160,7 @@ def _owners(system: Any, shape: tuple[int, ...]) -> np.ndarray:
     return owner.astype(bool)
 
 
-def as_game(model: Any) -> Game:
+def as_game(model: Model) -> Game:
     """A game as solvers take it; any other model as the game in which the system always moves."""
     if not isinstance(model, Game):
         if not hasattr(model, "state_shape"):
@@ -168,7 +169,7 @@ def as_game(model: Any) -> Game:
     return model
 
 
-def as_padded_game(model: Any) -> Game:
+def as_padded_game(model: Model) -> Game:
     """The same, where sparse models are padded (:func:`~jaxltl.core.models.build.padded.to_padded`)."""
     game = as_game(model)
     if isinstance(game.mdp, SparseMDP):
@@ -176,12 +177,9 @@ def as_padded_game(model: Any) -> Game:
     return game
 
 
-def is_deterministic(model: Any) -> bool:
+def is_deterministic(model: Model) -> bool:
     """Whether every move has one successor, so that chance plays no part; on the host."""
-    world = model
-    while hasattr(world, "mdp"):
-        world = world.mdp
-    return not bool((support(world).sum(-1) > 1).any())
+    return not bool((support(base_model(model)).sum(-1) > 1).any())
 
 
 def swap_players(game: Game) -> Game:

@@ -12,6 +12,7 @@ from flax import struct
 
 from jaxltl.core.models import facts
 from jaxltl.core.models.mdp import MDP
+from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import (
     Array,
     Rewards,
@@ -151,7 +152,7 @@ class IntervalMDP:
         return _taken_apart(change(self.nominal.replace(rewards=self.rewards | ends)))  # type: ignore[attr-defined]
 
 
-def require_interval(model: Any) -> IntervalMDP:
+def require_interval(model: Model) -> IntervalMDP:
     """The model.
 
     Raises:

@@ -13,6 +13,7 @@ from flax import struct
 
 from jaxltl.core.models import facts
 from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
+from jaxltl.core.models.protocols import Model
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.validation import listed, no_model, numbers, shown
 
@@ -135,8 +136,10 @@ class DenseMDP:
         return self.transition.dtype
 
 
-def support(world: MDP | DenseMDP) -> np.ndarray:
+def support(world: Model) -> np.ndarray:
     """Which successors are possible, ``bool[S, A, K]``, on the host; none where unavailable."""
+    if not isinstance(world, MDP | DenseMDP):
+        raise ValueError(no_model(world))
     weight = world.transition if isinstance(world, DenseMDP) else world.probability
     used, available = np.asarray(weight) > 0, np.asarray(world.available)
     if not available.all():

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from functools import singledispatch
-from typing import Any
+from typing import Any, overload
 
 import chex
 import jax
@@ -25,6 +25,7 @@ from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.ops import kernels, operators
 from jaxltl.core.models.ops.array_namespace import namespace, to_jax
+from jaxltl.core.models.protocols import LabelledModel
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.validation import shown
 
@@ -99,7 +100,7 @@ class Product:
       ((3, 2), [[0, 1], [1, 1], [0, 1]], [False, True])
     """
 
-    mdp: MDP | DenseMDP
+    mdp: Any
     automaton: Automaton
     letter: jax.Array | np.ndarray
     label_on: str = struct.field(pytree_node=False, default="entry")
@@ -179,7 +180,7 @@ class Product:
 
 
 def letters_of(
-    world: MDP | DenseMDP, propositions: Collection[str] | None = None
+    world: LabelledModel, propositions: Collection[str] | None = None
 ) -> list[frozenset]:
     """The sets of propositions that occur at some state of a world, for ``to_automaton``.
 
@@ -204,7 +205,19 @@ def letters_of(
     return [frozenset(n for n, holds in zip(names, row, strict=True) if holds) for row in rows]
 
 
-def product(world: Any, task: Automaton | Formula | str, *, label_on: str = "entry") -> Any:
+@overload
+def product(world: Game, task: Automaton | Formula | str, *, label_on: str = ...) -> Game: ...
+
+
+@overload
+def product(
+    world: LabelledModel, task: Automaton | Formula | str, *, label_on: str = ...
+) -> Product: ...
+
+
+def product(
+    world: LabelledModel, task: Automaton | Formula | str, *, label_on: str = "entry"
+) -> Product | Game:
     """The lazy product of a world and a task.
 
     A formula is translated over the letters that occur in the world.
@@ -251,13 +264,13 @@ def product(world: Any, task: Automaton | Formula | str, *, label_on: str = "ent
 
 
 @singledispatch
-def label_rows(world: Any) -> np.ndarray:
+def label_rows(world: LabelledModel) -> np.ndarray:
     """The labels of a world on the host, ``bool[S, P]``; of one on a mesh those that occur."""
     return np.asarray(world.label)
 
 
 @singledispatch
-def shown_by(world: Any, letter: np.ndarray) -> jax.Array:
+def shown_by(world: LabelledModel, letter: np.ndarray) -> jax.Array:
     """``int32[S]``, what each state shows, from a number for each of the :func:`label_rows`."""
     return to_jax(letter)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
 
 import chex
 import jax
@@ -16,6 +15,7 @@ from jaxltl.core.models import facts
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.ops.array_namespace import is_traced, namespace, to_jax
 from jaxltl.core.models.ops.operators import policy_distribution, sample_successor
+from jaxltl.core.models.protocols import ActionModel, Model
 from jaxltl.core.pretty_print import brief
 
 
@@ -101,7 +101,7 @@ def make_trajectories(
     return Trajectories(state, action, length, state_shape=model.state_shape)
 
 
-def require_states(trajectories: Trajectories, model: Any) -> None:
+def require_states(trajectories: Trajectories, model: Model) -> None:
     """Refuses trajectories that number the states of another model.
 
     Raises:
@@ -146,7 +146,7 @@ def _check_steps(
 
 
 def rollout(
-    model: Any,
+    model: ActionModel,
     policy: jax.Array,
     key: chex.PRNGKey,
     *,
@@ -189,7 +189,7 @@ def rollout(
 
 @partial(jax.jit, static_argnums=(4, 5))
 def _rollout(
-    model: Any,
+    model: Model,
     distribution: jax.Array,
     key: chex.PRNGKey,
     stop: jax.Array,

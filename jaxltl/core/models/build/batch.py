@@ -24,6 +24,7 @@ from jaxltl.core.models.build.lifting import allowed_steps, memory_along
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.product import Product, letters_of, product
 from jaxltl.core.models.build.restrict import with_allowed
+from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.trajectories import Trajectories, make_trajectories, require_states
 
 
@@ -78,7 +79,7 @@ def stack_products(worlds: Sequence[MDP], task: Task, *, label_on: str = "exit")
     return to_jax(jax.tree.map(lambda *x: np.stack([np.asarray(y) for y in x]), *products))
 
 
-def _like_first(world: Any, number: int, first: Any) -> MDP:
+def _like_first(world: Model, number: int, first: MDP) -> MDP:
     """The world with its labels in the order of the first one's propositions."""
     if not isinstance(world, MDP):
         raise ValueError(

@@ -11,10 +11,11 @@ from jaxltl.core.sparse.rows import spans, starts_of
 from jaxltl.core.models.mdp import MDP, DenseMDP, support
 from jaxltl.core.models.build.padded import to_padded as to_padded  # for whoever converts
 from jaxltl.core.models.product import Product, flat_successor
+from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
 
 
-def to_sparse(model: Any) -> SparseMDP:
+def to_sparse(model: Model) -> SparseMDP:
     """Any concrete MDP, DenseMDP, product of one, or sparse model, as a :class:`SparseMDP`.
 
     Unavailable actions and padding are left out. Row i of a state takes the i-th of its available

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +13,7 @@ from jaxltl.core.models import facts
 from jaxltl.core.models.ops import operators
 from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
 from jaxltl.core.models.product import Product
+from jaxltl.core.models.protocols import ActionModel
 from jaxltl.core.models.trajectories import Trajectories, require_states
 from jaxltl.core.pretty_print import brief
 
@@ -113,7 +113,7 @@ def memory_along(model: Product, state: np.ndarray) -> np.ndarray:
     return memory
 
 
-def allowed_steps(model: Any, trajectories: Trajectories) -> np.ndarray:
+def allowed_steps(model: ActionModel, trajectories: Trajectories) -> np.ndarray:
     """Which steps that count take an action that the model has: ``bool[N, T]``, on the host.
 
     Args:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import chex
 import jax
@@ -14,14 +14,16 @@ from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
 from jaxltl.core.models.build.convert import to_sparse
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
-from jaxltl.core.models.mdp import MDP, make_mdp, support
+from jaxltl.core.models.mdp import MDP, DenseMDP, make_mdp, support
 from jaxltl.core.models.build.part import part_of, reachable
 from jaxltl.core.models.product import Product, flat_successor
+from jaxltl.core.validation import no_model
+from jaxltl.core.models.protocols import ActionModel, Model, ModelT
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief
 
 
-def with_allowed(model: Any, allowed: chex.Array) -> Any:
+def with_allowed(model: ModelT, allowed: chex.Array) -> ModelT:
     """The same model in which only some of the actions are left.
 
     Args:
@@ -42,10 +44,16 @@ def with_allowed(model: Any, allowed: chex.Array) -> Any:
       >>> with_allowed(mdp, np.array([[False, True]])).available.tolist()
       [[False, True]]
     """
+    return cast(ModelT, _with_allowed(model, allowed))
+
+
+def _with_allowed(model: Model, allowed: chex.Array) -> Model:
     if isinstance(model, IntervalMDP):
         return model.changed(lambda nominal: _with_rows(nominal, allowed))
     if isinstance(model, SparseMDP):
         return _with_rows(model, allowed)
+    if not isinstance(model, MDP | DenseMDP | Product | Game):
+        raise ValueError(no_model(model))
     shape = (*model.state_shape, model.num_actions)
     if np.shape(allowed) != shape or allowed.dtype != bool:
         raise ValueError(
@@ -104,7 +112,7 @@ class Restriction(NamedTuple):
 
 
 def restrict(
-    model: Any, initial: chex.Array | None = None, *, allowed: chex.Array | None = None
+    model: ActionModel, initial: chex.Array | None = None, *, allowed: chex.Array | None = None
 ) -> Restriction:
     """The states that are reachable from initial ones by allowed actions, on the host.
 
@@ -174,7 +182,7 @@ def restrict(
     return _restriction(model, mdp, states, num_memory)
 
 
-def _start(model: Any, initial: chex.Array | None) -> np.ndarray:
+def _start(model: Model, initial: chex.Array | None) -> np.ndarray:
     start = np.asarray(model.initial if initial is None else initial).ravel()
     if not (start > 0).any():
         raise ValueError("the initial distribution is zero; give a state to start from.")
@@ -198,7 +206,7 @@ def _reached(
     return np.flatnonzero(seen)
 
 
-def _restriction(model: Any, part: Any, states: np.ndarray, num_memory: int) -> Restriction:
+def _restriction(model: Model, part: Model, states: np.ndarray, num_memory: int) -> Restriction:
     """A model of some of the states, and what these are in the model."""
     base, memory = to_jax(tuple(x.astype(np.int32) for x in np.divmod(states, num_memory)))
     if isinstance(model, Game):
@@ -207,7 +215,7 @@ def _restriction(model: Any, part: Any, states: np.ndarray, num_memory: int) -> 
 
 
 def _restrict_sparse(
-    model: Any, lazy: Any, initial: chex.Array | None, allowed: chex.Array | None
+    model: Model, lazy: Model, initial: chex.Array | None, allowed: chex.Array | None
 ) -> Restriction:
     """The same of a sparse model, or of a product of one, which is written out for it."""
     sparse = to_sparse(lazy)

@@ -16,16 +16,17 @@ from jaxltl.core.models.ops.array_namespace import is_traced
 from jaxltl.core.models.ops.kernels import gather, owners
 from jaxltl.core.models.ops.operators import is_deterministic
 from jaxltl.core.models.product import Product, flat_successor
+from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import Rewards, SparseMDP, reward_parts
 from jaxltl.core.types import Solution
 
 
-def is_sparse(model: Any) -> bool:
+def is_sparse(model: Model) -> bool:
     """Whether a model's choices are rows: a SparseMDP, or a product of one."""
     return isinstance(model.mdp if isinstance(model, Product) else model, SparseMDP)
 
 
-def compiled_form(model: Any, reward: Any = None) -> tuple[Any, Any]:
+def compiled_form(model: Model, reward: Any = None) -> tuple[Any, Any]:
     """A model and a reward for solvers that are compiled; all but sparse ones as they are.
 
     A product of a sparse model is written out: its states are numbered ``s * Q + q``, and its rows
@@ -45,10 +46,10 @@ def compiled_form(model: Any, reward: Any = None) -> tuple[Any, Any]:
         return (model if form is model.mdp else Game(form, system)), reward
     if is_sharded(model):
         return _named_reward(model, reward)
-    if not is_sparse(model):
-        return model, reward
-    if isinstance(model, Product):
+    if isinstance(model, Product) and isinstance(model.mdp, SparseMDP):
         model = _written_out(model) if is_traced(model) else to_sparse(model)
+    if not isinstance(model, SparseMDP):
+        return model, reward
     if reward is not None:
         reward = reward_parts(model, reward)
     none = np.zeros((model.num_states, 0), bool)
@@ -57,7 +58,7 @@ def compiled_form(model: Any, reward: Any = None) -> tuple[Any, Any]:
     ), reward
 
 
-def _named_reward(model: Any, reward: Any) -> tuple[Any, Any]:
+def _named_reward(model: Model, reward: Any) -> tuple[Any, Any]:
     if isinstance(reward, str):
         rewards = getattr(model, "rewards", {})
         if reward not in rewards:
@@ -69,7 +70,7 @@ def _named_reward(model: Any, reward: Any) -> tuple[Any, Any]:
     return model, reward
 
 
-def in_shape_of(model: Any, solution: Solution) -> Solution:
+def in_shape_of(model: Model, solution: Solution) -> Solution:
     """A solution of a model's compiled form, with the model's states."""
     lazy = model.mdp if isinstance(model, Game) else model
     if not (is_sparse(lazy) and isinstance(lazy, Product)):
@@ -88,7 +89,7 @@ def in_shape_of(model: Any, solution: Solution) -> Solution:
     )
 
 
-def flat_policy(model: Any, policy: Any) -> Any:
+def flat_policy(model: Model, policy: Any) -> Any:
     """A policy for the compiled form: of a product of a sparse model rows ``int32[S * Q]``."""
     if is_sparse(model) and isinstance(model, Product) and np.ndim(policy) == 2:
         return policy.reshape(-1)

@@ -20,6 +20,7 @@ from jaxltl.core.models.build.convert import to_sparse
 from jaxltl.core.models.build.padded import action_of
 from jaxltl.core.models.mesh.lanes import automatic, axes_of, on_host
 from jaxltl.core.models.mesh.sharded import RowTable, ShardedMDP
+from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import SparseMDP, check_entries, checked_starts, row_reward, scaled
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.rows import spans, starts_of
@@ -65,7 +66,7 @@ class ModelPart:
 
 
 def shard(
-    model: Any, mesh: Mesh, *, axis: str | None = None, order: str | np.ndarray = "given"
+    model: Model, mesh: Mesh, *, axis: str | None = None, order: str | np.ndarray = "given"
 ) -> ShardedMDP:
     """A model whose states lie on the devices of a mesh.
 

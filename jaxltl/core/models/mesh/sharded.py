@@ -21,6 +21,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxltl.core.models import facts
 from jaxltl.core.models.ops import kernels, operators
 from jaxltl.core.models.product import label_rows, shown_by
+from jaxltl.core.models.protocols import Model
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.validation import no_model
 
@@ -139,14 +140,14 @@ class ShardedMDP:
         return sum(len(pairs) * size for pairs, size in zip(self.rounds, each, strict=True))
 
 
-def is_sharded(model: Any) -> bool:
+def is_sharded(model: Model) -> bool:
     """Whether a model, or the world of a product or a game, lies on a mesh."""
     while not isinstance(model, ShardedMDP) and hasattr(model, "mdp"):
         model = model.mdp
     return isinstance(model, ShardedMDP)
 
 
-def refuse_sharded(model: Any) -> None:
+def refuse_sharded(model: Model) -> None:
     """Raises where something reads a model on the host, and it lies on a mesh.
 
     Raises:

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxltl.core.models.ops import kernels
+from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.validation import no_model, shown
@@ -344,7 +345,7 @@ class Rows(NamedTuple):
 
 
 @singledispatch
-def choices(model: Any) -> Actions | Rows:
+def choices(model: Model) -> Actions | Rows:
     """The choices of a model's states; of a representation of one's own, its `available`."""
     if not hasattr(model, "available"):
         raise ValueError(no_model(model))
@@ -358,7 +359,7 @@ def row_choices(model: SparseMDP) -> Rows:
 
 
 @singledispatch
-def choice_shape(model: Any) -> tuple[int, ...]:
+def choice_shape(model: Model) -> tuple[int, ...]:
     """The shape of a quantity on choices: ``(S, A)``, in a product ``(S, Q, A)``, or ``(R,)``."""
     if not hasattr(model, "num_actions"):
         raise ValueError(no_model(model))

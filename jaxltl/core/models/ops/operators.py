@@ -34,13 +34,14 @@ from jaxltl.core.models.ops.choices import first_action as first_action
 from jaxltl.core.models.ops.choices import is_deterministic as is_deterministic
 from jaxltl.core.models.ops.entries import entries
 from jaxltl.core.models.ops.kernels import only_real
+from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.types import describe_row, row_tolerance
 from jaxltl.core.validation import no_model
 
 
 @singledispatch
-def expectation(model: Any, value: jax.Array) -> jax.Array:
+def expectation(model: Model, value: jax.Array) -> jax.Array:
     """Expected value of the next state, ``(P v)(s, a) = sum_t P(t | s, a) v(t)``.
 
     Args:
@@ -64,7 +65,7 @@ def expectation(model: Any, value: jax.Array) -> jax.Array:
 
 
 @singledispatch
-def exists_successor(model: Any, region: jax.Array) -> jax.Array:
+def exists_successor(model: Model, region: jax.Array) -> jax.Array:
     """Whether some successor lies in a region: ``bool[S, A]`` from ``bool[S]``.
 
     Decided on the support of the transition function. False at unavailable actions.
@@ -89,7 +90,7 @@ def exists_successor(model: Any, region: jax.Array) -> jax.Array:
 
 
 @singledispatch
-def forall_successor(model: Any, region: jax.Array) -> jax.Array:
+def forall_successor(model: Model, region: jax.Array) -> jax.Array:
     """Whether all successors lie in a region: ``bool[S, A]`` from ``bool[S]``.
 
     Decided on the support; padding counts as true, so unavailable actions are True.
@@ -114,7 +115,7 @@ def forall_successor(model: Any, region: jax.Array) -> jax.Array:
 
 
 @singledispatch
-def least_successor(model: Any, value: jax.Array) -> jax.Array:
+def least_successor(model: Model, value: jax.Array) -> jax.Array:
     """Smallest value among the successors: ``[S, A]`` from ``[S]``.
 
     Decided on the support; the largest value of the dtype at unavailable actions.
@@ -124,7 +125,7 @@ def least_successor(model: Any, value: jax.Array) -> jax.Array:
 
 @singledispatch
 def sample_successor(
-    model: Any, key: chex.PRNGKey, state: jax.Array, action: jax.Array
+    model: Model, key: chex.PRNGKey, state: jax.Array, action: jax.Array
 ) -> jax.Array:
     """One draw from ``P(. | state, action)``; the key is consumed.
 
@@ -151,7 +152,7 @@ def sample_successor(
 
 
 @singledispatch
-def induced_chain(model: Any, policy: jax.Array) -> MDP | DenseMDP:
+def induced_chain(model: Model, policy: jax.Array) -> MDP | DenseMDP:
     """The Markov chain of a deterministic policy, as a model with one action.
 
     Args:
@@ -166,7 +167,7 @@ def induced_chain(model: Any, policy: jax.Array) -> MDP | DenseMDP:
 
 
 @singledispatch
-def transition_matrix(model: Any, policy: jax.Array) -> jax.Array:
+def transition_matrix(model: Model, policy: jax.Array) -> jax.Array:
     """``P_pi(s, t) = sum_a pi(s, a) P(t | s, a)`` as a full matrix, for small models.
 
     Args:
@@ -180,17 +181,17 @@ def transition_matrix(model: Any, policy: jax.Array) -> jax.Array:
 
 
 @singledispatch
-def following(model: Any, policy: jax.Array) -> Callable[[jax.Array], jax.Array]:
+def following(model: Model, policy: jax.Array) -> Callable[[jax.Array], jax.Array]:
     """``v -> P_pi v`` of a deterministic policy, ``float[N]`` from ``float[N]``, for sweeps."""
     return along(induced_chain(model, policy))
 
 
-def along(chain: Any) -> Callable[[jax.Array], jax.Array]:
+def along(chain: Model) -> Callable[[jax.Array], jax.Array]:
     """``v -> P v`` of a model with one action."""
     return lambda value: expectation(chain, value)[:, 0]
 
 
-def pushforward(model: Any, mass: jax.Array) -> jax.Array:
+def pushforward(model: Model, mass: jax.Array) -> jax.Array:
     """Mass that flows into each state, ``(P' x)(t) = sum_{s, a} P(t | s, a) x(s, a)``.
 
     The transpose of :func:`expectation`, for every representation.
@@ -217,7 +218,7 @@ def pushforward(model: Any, mass: jax.Array) -> jax.Array:
     return result
 
 
-def _unknown(model: Any) -> str:
+def _unknown(model: Model) -> str:
     if hasattr(model, "nominal"):
         return no_model(model)
     return (
@@ -227,7 +228,9 @@ def _unknown(model: Any) -> str:
 
 
 @singledispatch
-def combined(model: Any, value: jax.Array, term: kernels.Term, combine: kernels.Term) -> jax.Array:
+def combined(
+    model: Model, value: jax.Array, term: kernels.Term, combine: kernels.Term
+) -> jax.Array:
     """Terms of a weight and the value there, combined over the successors of each choice.
 
     What :func:`expectation`, :func:`exists_successor` and :func:`least_successor` are made of where
@@ -245,13 +248,13 @@ def combined(model: Any, value: jax.Array, term: kernels.Term, combine: kernels.
 
 
 @singledispatch
-def given_states(model: Any) -> jax.Array | bool:
+def given_states(model: Model) -> jax.Array | bool:
     """The states that are the model's own: all, but of one on a mesh ``bool[N]``."""
     return True
 
 
 @singledispatch
-def greatest_predecessor(model: Any, quantity: jax.Array) -> jax.Array:
+def greatest_predecessor(model: Model, quantity: jax.Array) -> jax.Array:
     """Largest quantity among the choices that may lead to a state: ``[S, ...]``, ``[S, ..., A]``.
 
     Decided on the support; 0 where no choice leads.
@@ -441,7 +444,7 @@ def _(model: SparseMDP, policy: jax.Array) -> Callable[[jax.Array], jax.Array]:
 # --- policies ------------------------------------------------------------------------------
 
 
-def policy_distribution(model: Any, policy: Any) -> jax.Array:
+def policy_distribution(model: Model, policy: Any) -> jax.Array:
     """Any policy as ``float[S, A]``, of a sparse model ``float[R]``, its shape checked.
 
     Raises:
@@ -479,7 +482,7 @@ class Policy(NamedTuple):
     valid: jax.Array
 
 
-def valid_policy(model: Any, policy: jax.Array, where: jax.Array | bool = True) -> Policy:
+def valid_policy(model: Model, policy: jax.Array, where: jax.Array | bool = True) -> Policy:
     """A policy and whether it is one: rows at least 0, summing to 1, on available actions.
 
     Args:
@@ -500,7 +503,7 @@ def valid_policy(model: Any, policy: jax.Array, where: jax.Array | bool = True) 
     return Policy(used, lax.stop_gradient(given), jnp.all(row))
 
 
-def require_policy(model: Any, policy: Any, where: Any = True) -> None:
+def require_policy(model: Model, policy: Any, where: Any = True) -> None:
     """Raises on the host unless a policy is one; passes over traced arrays.
 
     Raises:
@@ -513,7 +516,7 @@ def require_policy(model: Any, policy: Any, where: Any = True) -> None:
         row_weights(world, policy, where)
         return
     shape = choice_shape(model)
-    table, available = np.asarray(policy), np.asarray(model.available)
+    table, available = np.asarray(policy), np.asarray(choices(model).available)
     if is_deterministic(table):
         policy_distribution(model, table)  # its shape
         known = (table >= 0) & (table < shape[-1])

@@ -25,6 +25,7 @@ from jaxltl.core.models.ops.choices import Columns
 from jaxltl.core.models.ops.choices import action_columns as action_columns
 from jaxltl.core.models.ops.entries import Entries, entries
 from jaxltl.core.models.product import Product
+from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief
 
@@ -70,7 +71,7 @@ class Primitives:
       model: any model.
     """
 
-    model: Any
+    model: Model
 
     @property
     def choices(self) -> Columns:
@@ -100,7 +101,7 @@ class SpreadSuccessors:
       successor, probability: ``[N]`` by action and number of the successor; places, not states.
     """
 
-    model: Any
+    model: ShardedMDP
     successor: list[list[jax.Array]]
     probability: list[list[jax.Array]]
 
@@ -139,7 +140,7 @@ class Predecessors(NamedTuple):
         return kernels.fold(list(self.pair), list(self.probability), mass)
 
 
-def table(model: Any) -> Successors | SpreadSuccessors | Primitives | Entries:
+def table(model: Model) -> Successors | SpreadSuccessors | Primitives | Entries:
     """What sweeps a model: its successors where they can be written down, else its primitives.
 
     Of a sparse model, or a game on one, its entries.
@@ -166,17 +167,17 @@ def _spread_out(model: ShardedMDP) -> SpreadSuccessors | None:
     return SpreadSuccessors(model, successor, probability)
 
 
-def successors(model: Any) -> Successors | None:
+def successors(model: Model) -> Successors | None:
     """The successor table of an MDP, of a product of one or of a game; None where it is too large."""
     model = model.mdp if isinstance(model, Game) else model
     world = model.mdp if isinstance(model, Product) else model
-    if not isinstance(world, MDP):
+    if not isinstance(world, MDP) or not isinstance(model, MDP | Product):
         return None
     num_pairs = int(np.prod(world.probability.shape[-2:]))
     if num_pairs > kernels.WRITTEN_OUT:
         return None
     weight = world.successor_probability
-    if world is model:
+    if not isinstance(model, Product):
         return Successors(_columns(world.successor), _columns(weight))
     if model.num_states * num_pairs > _LARGEST:
         return None

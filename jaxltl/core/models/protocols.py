@@ -1,0 +1,122 @@
+"""Protocols of models: the attributes that operators, solvers and learners read.
+
+A function states in its signature how much of a model it needs. The protocols, and the models of
+the package that satisfy them:
+
+=======================  ========================================================================
+:class:`Model`           states and initial distribution: every model
+:class:`LabelledModel`    and propositions: every model but a product
+:class:`ActionModel`     and padded actions ``[S, A]``: MDP, DenseMDP, ShardedMDP, and products of
+                         them; the attributes raise ValueError for models with sparse rows
+:class:`SuccessorModel`  and padded successors ``[S, A, K]``: MDP, DenseMDP, and products of them
+:class:`RowModel`        and sparse rows of choices ``[R]``: SparseMDP, IntervalMDP
+:class:`DerivedModel`    and a model underneath, ``mdp``: Product, Game
+=======================  ========================================================================
+
+A game satisfies what its model does. Quantities on states have the shape ``state_shape``.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol, TypeAlias, TypeVar, runtime_checkable
+
+Array: TypeAlias = Any  # a NumPy array or a JAX array, which share their operators
+PyTree: TypeAlias = Any  # a tree of arrays, such as the state of a simulated environment
+
+
+class Model(Protocol):
+    """States with an initial distribution; operators give the transition probabilities."""
+
+    @property
+    def num_states(self) -> int:
+        """S, or S Q in a product."""
+
+    @property
+    def state_shape(self) -> tuple[int, ...]:
+        """The shape of a value: ``(S,)``, or ``(S, Q)`` in a product."""
+
+    @property
+    def initial(self) -> Array:
+        """``float[S]``, the initial distribution."""
+
+    @property
+    def dtype(self) -> Any:
+        """The dtype of the probabilities."""
+
+
+class LabelledModel(Model, Protocol):
+    """A model whose states are labelled with atomic propositions."""
+
+    @property
+    def label(self) -> Array:
+        """``bool[S, P]``, the propositions that hold in each state."""
+
+    @property
+    def propositions(self) -> tuple[str, ...]:
+        """The P names."""
+
+
+class ActionModel(Model, Protocol):
+    """A model with the same number of actions in each state, some of them unavailable."""
+
+    @property
+    def num_actions(self) -> int:
+        """A."""
+
+    @property
+    def available(self) -> Array:
+        """``bool[S, A]``."""
+
+
+class SuccessorModel(ActionModel, Protocol):
+    """A model with padded lists of successors."""
+
+    @property
+    def num_successors(self) -> int:
+        """K."""
+
+    @property
+    def successor_probability(self) -> Array:
+        """``float[S, A, K]``, zero in padding and at unavailable actions."""
+
+
+class RowModel(LabelledModel, Protocol):
+    """A model whose choices are rows without padding."""
+
+    @property
+    def num_rows(self) -> int:
+        """R."""
+
+    @property
+    def num_transitions(self) -> int:
+        """T."""
+
+    @property
+    def is_chain(self) -> bool:
+        """True for a Markov chain: one row in each state."""
+
+    @property
+    def rewards(self) -> Any:
+        """Reward structures by name."""
+
+    def states_where(self, proposition: str) -> Array:
+        """``bool[S]``, the states in which a proposition holds."""
+
+
+@runtime_checkable
+class DerivedModel(Model, Protocol):
+    """A model on top of another one: a product with an automaton, or a game."""
+
+    @property
+    def mdp(self) -> Any:
+        """The model underneath."""
+
+
+ModelT = TypeVar("ModelT", bound=Model)
+
+
+def base_model(model: Model) -> Model:
+    """The model below all products and games."""
+    while hasattr(model, "mdp"):
+        model = model.mdp
+    return model
