@@ -6,18 +6,32 @@ enclosed in advance: each product and sum adds less than a unit of rounding to t
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.sparse.choice_order import Choices, choices_of
-from jaxltl.core.sparse.graph.qualitative import reaching
+from jaxltl.core.sparse.graph.qualitative import forced, reaching
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import distinct, spans
+from jaxltl.core.sparse.rows import distinct, spans, starts_of
+from jaxltl.core.sparse.solvers.policy_iteration import Enclosed
+from jaxltl.core.sparse.solvers.reachability import reachability, reward_forever, total_reward
 
 UNDERFLOW = 1e-300  # more than all that is lost where numbers are too small
 _HUGE = 1e150
+_LARGEST = 8.0 * 2**30  # bytes of the choices of all steps
+_LONG = 4096  # backups after which the effect of all further ones is bounded, then at each doubling
+_CLOSE = 1e-9  # effect of all further backups, relative, at which the iteration stops
+_POWER_STATES = 200  # states up to which long horizons of a chain are solved by matrix powers
+_WORK = (
+    2.0**38
+)  # multiplications of one iteration; beyond these, bounds of what is left are returned
+_OVERHEAD = 10_000  # multiplications in the time that NumPy's calls of one backup take
 _MANY = 32  # steps from which it pays to leave out the states that these do not lead to the target
 
 
@@ -68,6 +82,11 @@ class Backup(NamedTuple):
     places: Integers
     operation: Any
 
+    @property
+    def small_chain(self) -> bool:
+        """Whether matrix powers are cheaper than many backups."""
+        return self.choices.is_chain and self.places.size <= _POWER_STATES
+
     def best(self, quantity: Floats) -> Floats:
         """The optimum over each state's choices: ``[N]`` of a number a row."""
         return self.choices.best(quantity, self.operation)
@@ -76,23 +95,27 @@ class Backup(NamedTuple):
         """The model's row of each state's first best choice: ``int32[N]``."""
         return self.row[self.choices.first(quantity, best)].astype(np.int32)
 
-    def sweeps(
-        self, cost: Floats, value: Floats, num_steps: int, every: list[Integers] | None = None
-    ) -> tuple[Floats, Integers, int]:
-        """So many backups, fewer if nothing changes any more.
+    def iterate(
+        self,
+        cost: Floats,
+        value: Floats,
+        num_steps: int,
+        enough: Callable[[Iterate], bool],
+        every: list[Integers] | None = None,
+    ) -> Iterate:
+        """Backups from a start: all of them, or up to a fixed point or a bounded remainder.
 
         Args:
           cost: ``float64[R']``, of the rows.
-          value: ``float64[N]``, where it begins.
+          value: ``float64[N]``, the start.
           num_steps: how many.
-          every: takes the choices of each backup.
-
-        Returns:
-          The value, the choices of the last backup ``int32[N]`` (of none the next one's), and how
-          many there were.
+          enough: whether what further backups change is bounded closely.
+          every: receives the choices of each backup; these are then not cut short by `enough`.
         """
-        before, done = value, 0
-        while done < num_steps:
+        most = _LONG if self.small_chain else int(_WORK / (self.matrix.nnz + _OVERHEAD))
+        last, done, check = num_steps if every is not None else min(num_steps, most), 0, _LONG
+        before = value
+        while done < last:
             done += 1
             image = self.matrix @ value
             image += cost
@@ -100,11 +123,52 @@ class Backup(NamedTuple):
             if every is not None:
                 every.append(self.first(image, value))
             if np.array_equal(before, value):
-                break
-        image = self.matrix @ before
+                return Iterate(before, value, done, True)
+            if done == check and every is None and done < num_steps:
+                check *= 2
+                if enough(Iterate(before, value, done, False)):
+                    return Iterate(before, value, done, False)
+        if done < num_steps and self.small_chain:
+            matrix: Any = self.matrix.toarray()
+            value = _power(matrix, cost, value, num_steps - done)
+            return Iterate(before, value, num_steps, False)
+        return Iterate(before, value, done, False)
+
+    def greedy(self, cost: Floats, value: Floats) -> Integers:
+        """The model's row of each state's best choice before a value: ``int32[N]``."""
+        image = self.matrix @ value
         image += cost
-        row = self.first(image, self.best(image))
-        return value, row, done
+        return self.first(image, self.best(image))
+
+
+@dataclass(frozen=True)
+class Iterate:
+    """The last two values of an iteration, ``float64[N]``, and the number of backups.
+
+    `is_fixed` says that further backups change nothing in floating point.
+    """
+
+    before: Floats
+    value: Floats
+    num_steps: int
+    is_fixed: bool
+
+
+def _power(matrix: Floats, cost: Floats, value: Floats, num_steps: int) -> Floats:
+    """``x -> cost + P x`` applied n times, by repeated squaring of that affine map.
+
+    The relative error e of a power at most doubles with its exponent, ``e_2m <= 2 e_m + unit``, so
+    that it is at most that of n backups with rows of N entries.
+    """
+    matrix, cost = matrix.copy(), cost.copy()
+    while num_steps:
+        if num_steps % 2:
+            value = cost + matrix @ value
+        num_steps //= 2
+        if num_steps:
+            cost = cost + matrix @ cost
+            matrix = matrix @ matrix
+    return value
 
 
 def backup_on(mdp: HostMDP, places: Integers, operation: Any) -> Backup:
@@ -151,28 +215,115 @@ def until(
       operation: ``np.maximum`` or ``np.minimum``.
       by_step: whether the choices of all steps are asked for.
     """
+    _require_memory(mdp, num_steps, by_step)
     open_ = stay & ~target
     if num_steps >= _MANY:
         open_ &= _near(mdp, target, open_, num_steps)
     backup = backup_on(mdp, np.flatnonzero(open_), operation)
     cost = backup.taken @ target.astype(np.float64)
-    every: list[Integers] | None = [] if by_step else None
-    found, row, done = backup.sweeps(cost, np.zeros(backup.places.size), num_steps, every)
-    value = target.astype(np.float64)
-    value[backup.places] = found
-    relative = relative_error(backup_unit(mdp), num_steps)
-    error = np.where(open_ & (num_steps > 0), np.minimum(value * relative + UNDERFLOW, 1), 0)
-    # What is exactly zero or one, the graph tells.
     choose_some = operation is np.maximum
-    if num_steps and (open_ & (value == 0)).any():
+    every: list[Integers] | None = [] if by_step else None
+    places, limit = backup.places, _Limit(mdp, target, open_, num_steps, choose_some)
+
+    def enough(x: Iterate) -> bool:
+        low = np.maximum(limit.lower[places], x.value)
+        return bool((limit.upper[places] - low <= _CLOSE).all())
+
+    found = backup.iterate(cost, np.zeros(places.size), num_steps, enough, every)
+    value = target.astype(np.float64)
+    value[places] = found.value
+    complete = found.is_fixed or found.num_steps == num_steps
+    relative = relative_error(
+        _unit(mdp, backup, num_steps), num_steps if complete else found.num_steps
+    )
+    error = np.where(open_ & (num_steps > 0), np.minimum(value * relative + UNDERFLOW, 1), 0)
+    if places.size and (not complete or relative > _CLOSE):
+        low, high = limit.lower, limit.upper
+        low = np.maximum(low, value - error)
+        high = np.minimum(high, value + error) if complete else high
+        value, error = (
+            np.where(open_, (low + high) / 2, value),
+            np.where(open_, np.maximum(high - low, 0) / 2 + UNDERFLOW, error),
+        )
+    # The graph decides which values are exactly zero or one.
+    if num_steps and (open_ & (value - error <= 0)).any():
         zero = open_ & ~_within(mdp, target, open_, num_steps, False, choose_some)
         value[zero] = error[zero] = 0
     if num_steps and (open_ & (value + error >= 1)).any():
         one = open_ & _within(mdp, target, open_, num_steps, True, choose_some)
         value[one], error[one] = 1, 0
     if every is not None:
-        return Steps(value, error, _policies(mdp, backup, every, num_steps), done)
-    return Steps(value, error, _policy(mdp, backup, row), done)
+        return Steps(value, error, _policies(mdp, backup, every, num_steps), found.num_steps)
+    row = backup.greedy(cost, found.before)
+    return Steps(value, error, _policy(mdp, backup, row), found.num_steps)
+
+
+class _Limit:
+    """Bounds of a step-bounded probability by the unbounded one, for many steps n.
+
+    With T a bound on the expected time until the target or a state of value zero is met, from every
+    state, a run has met neither after 2 T steps with probability at most 1/2 (Markov's inequality),
+    and after n steps with at most ``2 ** -floor(n / ceil(2 T))``. The bounded probability is at
+    most the unbounded one, and lower by no more than that: of a maximum for T of an optimal policy,
+    of a minimum for T of every policy.
+    """
+
+    def __init__(
+        self, mdp: HostMDP, target: Booleans, open_: Booleans, num_steps: int, maximize: bool
+    ) -> None:
+        self.mdp, self.target, self.open = mdp, target, open_
+        self.num_steps, self.maximize = num_steps, maximize
+
+    @cached_property
+    def found(self) -> Enclosed:
+        """The unbounded probability."""
+        return reachability(
+            self.mdp,
+            self.target,
+            maximize=self.maximize,
+            stay=self.open | self.target,
+            tolerance=_CLOSE / 4,
+        )
+
+    @property
+    def upper(self) -> Floats:
+        return self.found.upper
+
+    @cached_property
+    def lower(self) -> Floats:
+        """``float64[S]``."""
+        mdp = self.mdp
+        if self.maximize and not mdp.is_chain:
+            row = self.found.row
+            mdp = HostMDP(
+                np.arange(mdp.num_states + 1),
+                starts_of(np.diff(mdp.entry_start)[row]),
+                *(
+                    x[spans(mdp.entry_start[row], np.diff(mdp.entry_start)[row])]
+                    for x in (mdp.successor, mdp.probability)
+                ),
+            )
+        ended = ~self.open | ~forced(mdp, self.target, among=self.open)
+        time = total_reward(mdp, np.ones(mdp.num_rows), ended, maximize=True, tolerance=0.1)
+        twice = max(2 * float(time.upper.max()), 1)
+        halvings = self.num_steps // math.ceil(twice) if twice < self.num_steps else 0
+        return self.found.lower - 2.0 ** -min(halvings, 1000)
+
+
+def _unit(mdp: HostMDP, backup: Backup, num_steps: int) -> float:
+    """The relative rounding of a backup, also where powers of the matrix fill its rows."""
+    if backup.small_chain and num_steps > _LONG:
+        return max(backup_unit(mdp), (2 * backup.places.size + 6) * float(np.finfo(float).eps))
+    return backup_unit(mdp)
+
+
+def _require_memory(mdp: HostMDP, num_steps: int, by_step: bool) -> None:
+    if by_step and 8.0 * num_steps * mdp.num_states > _LARGEST:
+        raise ValueError(
+            f"the choices of {num_steps} steps in {mdp.num_states} states would take "
+            f"{8 * num_steps * mdp.num_states / 2**30:.3g} GB; leave out by_step, or ask for "
+            "fewer steps."
+        )
 
 
 def _near(mdp: HostMDP, target: Booleans, open_: Booleans, num_steps: int) -> Booleans:
@@ -228,27 +379,73 @@ def total(
       start: ``float64[S]``, of the last state.
       num_steps, operation, by_step: as for :func:`until`.
     """
+    _require_memory(mdp, num_steps, by_step)
     backup = backup_on(mdp, np.arange(mdp.num_states), operation)
     every: list[Integers] | None = [] if by_step else None
-    places = backup.places
-    found, row, done = backup.sweeps(reward[backup.row], start[places], num_steps, every)
-    size = found
-    if (start < 0).any() or (magnitude != reward).any():
-        # What rounding is relative to: the largest sum of absolute values.
-        most = (
-            backup
-            if operation is np.maximum
-            else backup_on(mdp, np.arange(mdp.num_states), np.maximum)
-        )
-        size = most.sweeps(magnitude[backup.row], np.abs(start)[places], num_steps)[0]
-    error = size * relative_error(backup_unit(mdp), 2 * num_steps + 1) + UNDERFLOW
+    places, cost, unit = backup.places, reward[backup.row], _unit(mdp, backup, num_steps)
+    signed = bool((start < 0).any() or (magnitude != reward).any())
+    most, largest = float(magnitude.max(initial=0)), float(np.abs(start).max(initial=0))
+
+    def rest(x: Iterate) -> tuple[Floats, Floats]:
+        """Bounds after all steps: ``T v - v`` is at least, and at most, what each further one adds.
+
+        T is monotone and ``T (v + c) = T v + c`` for constants c (Puterman 1994, section 8.5).
+        """
+        size = x.num_steps * most + largest
+        step = x.value - x.before
+        left = num_steps - x.num_steps + 1
+        slack = size * (relative_error(unit, 2 * x.num_steps + 1) + unit * left)
+        low = x.before + left * step.min() - slack
+        high = x.before + left * step.max() + slack
+        if not most:
+            slack = size * relative_error(unit, 2 * x.num_steps + 1)
+            low, high = (
+                np.maximum(low, x.value.min() - slack),
+                np.minimum(high, x.value.max() + slack),
+            )
+        if not signed and not largest and num_steps > _LONG:
+            forever = reward_forever(
+                mdp, reward, maximize=operation is np.maximum, tolerance=_CLOSE / 4
+            )
+            low = np.maximum(low, x.value * (1 - relative_error(unit, 2 * x.num_steps + 1)))
+            high = np.minimum(high, forever.upper[places])
+        return low, high
+
+    def enough(x: Iterate) -> bool:
+        low, high = rest(x)
+        return bool((high - low <= _CLOSE * np.maximum(np.abs(low), 1)).all())
+
+    found = backup.iterate(cost, start[places], num_steps, enough, every)
+    complete = found.is_fixed or found.num_steps == num_steps
+    size: Any = found.value
+    if signed:
+        # Rounding is relative to the largest sum of absolute values.
+        size = _largest_sum(mdp, magnitude, np.abs(start), num_steps)[places]
+    relative = relative_error(unit, 2 * num_steps + 1)
+    error = size * relative + UNDERFLOW
+    value, off = np.zeros(mdp.num_states), np.zeros(mdp.num_states)
+    value[places], off[places] = found.value, error
+    if not complete or (num_steps > _LONG and relative > _CLOSE and every is None):
+        low, high = rest(found)
+        if complete:
+            low, high = np.maximum(low, found.value - error), np.minimum(high, found.value + error)
+        value[places], off[places] = (low + high) / 2, np.maximum(high - low, 0) / 2 + UNDERFLOW
     some = start != 0
     some[mdp.state[magnitude > 0]] = True
-    value, off = np.zeros(mdp.num_states), np.zeros(mdp.num_states)
-    value[places], off[places] = found, error
-    off = np.where(reaching(mdp, some), off, 0)
-    if not num_steps:
-        off = np.zeros_like(off)
+    off = np.where(reaching(mdp, some) & (num_steps > 0), off, 0)
     if every is not None:
-        return Steps(value, off, _policies(mdp, backup, every, num_steps), done)
-    return Steps(value, off, _policy(mdp, backup, row), done)
+        return Steps(value, off, _policies(mdp, backup, every, num_steps), found.num_steps)
+    row = backup.greedy(cost, found.before)
+    return Steps(value, off, _policy(mdp, backup, row), found.num_steps)
+
+
+def _largest_sum(mdp: HostMDP, magnitude: Floats, start: Floats, num_steps: int) -> Floats:
+    """Largest expected sum of absolute values, ``float64[S]``."""
+    backup = backup_on(mdp, np.arange(mdp.num_states), np.maximum)
+    places = backup.places
+    found = backup.iterate(magnitude[backup.row], start[places], num_steps, lambda _: True)
+    value = np.zeros(mdp.num_states)
+    value[places] = found.value
+    if not found.is_fixed and found.num_steps < num_steps:
+        value[:] = num_steps * magnitude.max() + start.max()
+    return value

@@ -370,7 +370,7 @@ def enclosed(
         "lower": lower,
         "upper": upper,
         "residual": np.float64(residual),
-        "num_steps": np.int32(num_steps),
+        "num_steps": np.int32(min(num_steps, 2**31 - 1)),
         "status": np.int32(status),
     }
     return Solution(**found)

@@ -9,6 +9,7 @@ from jaxltl.core.models.build.convert import to_padded
 from jaxltl.core.models.sparse import Rewards, make_sparse
 from jaxltl.core.sparse.solvers import step_bounded as bounded
 from jaxltl.core.types import Status, check
+from jaxltl.core.values.properties.solve_property import solve_property
 from jaxltl.core.values.undiscounted.step_bounded import (
     bounded_reachability,
     cumulative_reward,
@@ -225,8 +226,10 @@ def test_what_is_wrong_is_named():
 
 def test_too_many_roundings_are_said():
     ring = make_sparse(None, [0, 3, 4, 5, 6], [1, 2, 3, 0, 2, 3], [0.5, 0.25, 0.25, 1, 1, 1])
-    found = bounded_reachability(ring, np.arange(4) == 2, 10**18)
-    assert found.upper[0] == 1
+    found = check(bounded_reachability(ring, np.arange(4) == 2, 10**18))
+    assert found.lower[0] <= 0.5 <= found.upper[0] <= found.lower[0] + 1e-8
+    found = instantaneous_reward(ring, [0.0, 0.0, 1.0, -1.0], 10**18)
+    assert found.lower[0] <= 0 <= found.upper[0]
     assert found.status == Status.PRECISION
 
 
@@ -255,3 +258,73 @@ def test_storm_finds_the_same(seed):
             np.testing.assert_allclose(
                 found.value, storm_values(storm, text), atol=1e-6, err_msg=text
             )
+
+
+def chain_left_with(probability, **names):
+    return make_sparse(
+        None, [0, 2, 3], [0, 1, 1], [1 - probability, probability, 1.0], initial=[1, 0], **names
+    )
+
+
+@pytest.mark.parametrize("probability", [0.5, 0.3, 1e-6, 1e-9])
+def test_a_huge_number_of_steps_is_answered_at_once(probability):
+    num_steps = 99_999_999_999
+    model = chain_left_with(probability, label={"a": [1]})
+    for objective in ("max", "min"):
+        found = check(bounded_reachability(model, "a", num_steps, objective=objective))
+        truth = -np.expm1(num_steps * np.log1p(-probability))
+        assert found.lower[0] <= truth <= found.upper[0]
+        assert found.upper[0] - found.lower[0] <= 1e-8
+    assert check(solve_property(model, f'P=? [ F<={num_steps} "a" ]')).value[0] > 0.99
+
+
+@pytest.mark.parametrize("num_steps", [10**4, 3 * 10**6, 10**9])
+def test_long_horizons_of_chains_are_those_of_their_closed_form(num_steps):
+    p = 1e-6
+    model = chain_left_with(p)
+    left = np.exp(num_steps * np.log1p(-p))
+    reached = bounded_reachability(model, [False, True], num_steps)
+    earned = cumulative_reward(model, [1.0, 0.0], num_steps)
+    final = instantaneous_reward(model, [1.0, 0.0], num_steps)
+    for found, truth in ((reached, 1 - left), (earned, (1 - left) / p), (final, left)):
+        slack = 1e-10 * truth  # of the closed form
+        assert found.lower[0] - slack <= truth <= found.upper[0] + slack
+        assert found.upper[0] - found.lower[0] <= 1e-4 * max(truth, 1)
+    check(reached)
+    assert num_steps == 10**9 or check(earned)
+
+
+def test_average_growth_bounds_a_huge_sum():
+    model = make_sparse([0, 2, 3], [0, 1, 2, 4], [0, 1, 0, 1], [1.0, 1.0, 0.5, 0.5])
+    found = check(cumulative_reward(model, [1.0, 2.0, 4.0], 10**11))
+    # Gain 10 / 3 by leaving state 0 at once and returning after two steps in the mean.
+    assert np.allclose(found.value / 10**11, 10 / 3, rtol=1e-9)
+    assert (found.upper - found.lower <= 1e-6 * found.value).all()
+
+
+@pytest.mark.parametrize("seed", range(24))
+def test_bounds_of_remaining_steps_enclose_all_backups(seed, monkeypatch):
+    rng = np.random.default_rng(seed)
+    model = random_sparse(rng, 6, chain=seed % 3 == 0)
+    target, stay, num_steps = rng.random(6) < 0.3, rng.random(6) < 0.8, int(rng.integers(3, 300))
+    reward = rng.random(model.num_rows) * (rng.random(model.num_rows) < 0.6) - (seed % 4 == 1)
+    state = rng.random(6) - (seed % 4 == 2)
+
+    def answers():
+        for objective in ("max", "min"):
+            yield bounded_reachability(model, target, num_steps, stay=stay, objective=objective)
+            yield cumulative_reward(model, reward, num_steps, objective=objective)
+            yield instantaneous_reward(model, state, num_steps, objective=objective)
+
+    whole = list(answers())
+    for long, close, work in ((2, 1e-9, 2.0**38), (2, 1e-2, 2.0**38), (2, 0.0, 80_000.0)):
+        for name, x in (("_LONG", long), ("_CLOSE", close), ("_WORK", work)):
+            monkeypatch.setattr(bounded, name, x)
+        for exact, found in zip(whole, answers(), strict=True):
+            assert (found.lower <= exact.upper + 1e-12).all()
+            assert (exact.lower <= found.upper + 1e-12).all()
+
+
+def test_choices_of_too_many_steps_are_refused_with_their_size():
+    with pytest.raises(ValueError, match=r"GB; leave out by_step"):
+        bounded_reachability(chain_left_with(0.5), [False, True], 10**11, by_step=True)
