@@ -59,7 +59,9 @@ def cases() -> Iterator[Case]:
     """Lanes whose loops are long and short, whose steps are many and small; one seed, split."""
     keys = jax.random.split(jax.random.key(0), _LANES)
     game = robots(4)
-    inside = jl.apply_strategy(jl.permissive_strategy(game, jl.safety(game, "!collision"))).model
+    inside = jl.games.apply_strategy(
+        jl.permissive_strategy(game, jl.games.safety(game, "!collision"))
+    ).model
     problem = maximin_q.make_problem(inside, diagonal_reward(inside))
     yield Case(
         "maximin Q-learning, 8 seeds, 60 steps",
@@ -78,7 +80,9 @@ def cases() -> Iterator[Case]:
         initial="s",
         legend={"s": ["s"], "t": ["trap"], "g": ["goal"], ".": []},
     )
-    task = ppo.make_problem(jl.task_environment(jl.environment_of(world), "!trap U goal"))
+    task = ppo.make_problem(
+        jl.task_environment(jl.environments.environment_of(world), "!trap U goal")
+    )
     hparams = ppo.Hparams(discount=1.0, num_envs=16, num_steps=64)
     yield Case(
         "PPO, 8 seeds of 16 environments, 4 steps",

@@ -66,7 +66,9 @@ def _solver_cases(model: Any, name: str) -> Iterator[Case]:
                 0.5,
             )
         yield Case(
-            f"boltzmann_value, {at}", lambda x, d=discount: jl.boltzmann_value(model, x, d), reward
+            f"boltzmann_value, {at}",
+            lambda x, d=discount: jl.values.boltzmann_value(model, x, d),
+            reward,
         )
         yield Case(
             f"occupancy_measure, {at}",
@@ -111,7 +113,7 @@ def mlirl_case(model: Any, num_steps: int = 10) -> Case:
     best = jl.optimal_satisfaction(model)
     policy = 0.9 * jax.nn.one_hot(best.policy, model.num_actions) + 0.1 / model.num_actions
     shown = jl.rollout(model, policy, key, num_steps=40, num_trajectories=1)
-    world = jl.project_trajectories(model, shown)
+    world = jl.models.project_trajectories(model, shown)
     features = mlirl.task_features(model, world, avoid=["o"])
     problem = mlirl.make_problem(model, features.values, world)
     lanes = (jax.random.split(key, _LANES), jnp.logspace(-3, 1, _LANES))

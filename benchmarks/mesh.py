@@ -31,13 +31,13 @@ _DEVICES = (1, 2, 4)
 _ACTIONS, _WIDTH = 2, 5
 
 
-def strip(columns: int, num_states: int) -> Callable[[int, int], jl.ModelPart]:
+def strip(columns: int, num_states: int) -> Callable[[int, int], jl.models.ModelPart]:
     """States in rows of so many: each action goes on, to and fro and across; some keep, some pay.
 
     A state's number alone says what it is, so that any part can be made anywhere.
     """
 
-    def part(start: int, stop: int) -> jl.ModelPart:
+    def part(start: int, stop: int) -> jl.models.ModelPart:
         state = np.arange(start, stop, dtype=np.int64)
         noise = _mixed(state)
         kind = noise % 20  # 0: a goal, 1 and 2: traps
@@ -52,7 +52,7 @@ def strip(columns: int, num_states: int) -> Callable[[int, int], jl.ModelPart]:
         probability = np.stack([first, first[:, [2, 3, 0, 1, 4]]], 1)
         successor = np.broadcast_to(ahead[:, None], probability.shape)
         earned = (noise // 20 % 1000) / 1000
-        return jl.ModelPart(
+        return jl.models.ModelPart(
             np.arange(0, successor.size + 1, _WIDTH),
             successor.ravel(),
             probability.ravel(),
@@ -64,17 +64,17 @@ def strip(columns: int, num_states: int) -> Callable[[int, int], jl.ModelPart]:
     return part
 
 
-def scattered(num_states: int) -> Callable[[int, int], jl.ModelPart]:
+def scattered(num_states: int) -> Callable[[int, int], jl.models.ModelPart]:
     """The same with successors anywhere."""
     near = strip(1, num_states)
 
-    def part(start: int, stop: int) -> jl.ModelPart:
+    def part(start: int, stop: int) -> jl.models.ModelPart:
         found = near(start, stop)
         number = np.arange(found.successor.size, dtype=np.int64) + start * _ACTIONS * _WIDTH
         anywhere = _mixed(number) % num_states
         own = np.repeat(np.arange(start, stop), _ACTIONS * _WIDTH)
         stays = _mixed(own) % 20 <= 2
-        return jl.ModelPart(
+        return jl.models.ModelPart(
             found.entry_start,
             np.where(stays, own, anywhere),
             found.probability,
@@ -112,7 +112,9 @@ def measure(part: Any, num_states: int, num_devices: int, repeats: int = 3) -> d
     """Seconds a sweep on so many devices; on 0 of the padded model."""
     if num_devices:
         mesh = jax.make_mesh((num_devices,), ("states",), devices=jax.devices()[:num_devices])
-        given = _asked_of(jl.model_from_parts(part, num_states, mesh, propositions=("goal",)))
+        given = _asked_of(
+            jl.models.model_from_parts(part, num_states, mesh, propositions=("goal",))
+        )
     else:
         given = _padded(part, num_states)
     found: dict[str, Any] = {"devices": num_devices}
@@ -165,7 +167,9 @@ def _of_process(num_states: int, place: str) -> None:
     jax.distributed.initialize(f"127.0.0.1:{port}", processes, process)
     mesh = jax.make_mesh((jax.device_count(),), ("states",))
     begin = time.perf_counter()
-    model = jl.model_from_parts(strip(1000, num_states), num_states, mesh, propositions=("goal",))
+    model = jl.models.model_from_parts(
+        strip(1000, num_states), num_states, mesh, propositions=("goal",)
+    )
     told: dict[str, Any] = {
         "process": process,
         "transitions": num_states * _ACTIONS * _WIDTH,

@@ -68,13 +68,13 @@ def worlds(size: int) -> dict[str, Any]:
     game = robots(size)
     strategy = jl.permissive_strategy(game, _SAFE)
     seconds = time.perf_counter() - begin
-    world = jl.environment_of(
+    world = jl.environments.environment_of(
         game, observe=Partial(partial(_seen, size**2)), opponent=chaser(game, size)
     )
     task = jl.task_environment(world, f"{_SAFE} & {_PATROL}", reward="eventual", discount=_DISCOUNT)
     meeting = np.asarray(game.mdp.label)[:, game.mdp.propositions.index("collision")]
     task = task.replace(step=Partial(_counted, task.step, meeting))
-    shielded = jl.shield_environment(task, strategy, Partial(_state))
+    shielded = jl.environments.shield_environment(task, strategy, Partial(_state))
     return {
         "unshielded": with_time_limit(task, _EPISODE),
         "shielded": with_time_limit(shielded, _EPISODE),

@@ -77,7 +77,7 @@ def things(folder):
         initial=[1, 0, 0],
         label=[[0], [1], [0]],
         propositions=["a"],
-        rewards={"r": jl.Rewards(state=[1.0, 0, 0])},
+        rewards={"r": jl.models.Rewards(state=[1.0, 0, 0])},
     )
     model = jl.make_interval(sparse, [0.4, 0.3, 1, 1], [0.7, 0.6, 1, 1])
     counts = jl.make_counts([0, 0, 0], [0, 0, 0], [1, 2, 1])
@@ -87,7 +87,7 @@ def things(folder):
         "@type: DTMC\n@parameters\np\n@nr_states\n3\n@model\nstate 0 init\n\taction 0\n\t\t1 : p\n"
         "\t\t2 : 1-p\nstate 1 goal\n\taction 0\n\t\t1 : 1\nstate 2\n\taction 0\n\t\t2 : 1\n"
     )
-    read = jl.read_parametric(folder / "coin.drn")
+    read = jl.io.read_parametric(folder / "coin.drn")
     box = read.over(0.1, 0.9)
     problem = feasible.make_problem(box, "goal", bound=">=")
     asked = {"model": model, "target": "a", "objective": "max", "nature": "min"}
@@ -107,7 +107,7 @@ def things(folder):
     return [
         (jl.make_interval, {"model": sparse, **ends, **ball}),
         (
-            jl.interval_rows,
+            jl.models.interval_rows,
             {
                 "row_start": None,
                 **rows,
@@ -122,17 +122,17 @@ def things(folder):
         (robust_reachability, {**asked, "policy": None, "stay": None, "tolerance": 1e-6}),
         (robust_total_reward, {**asked, "reward": "r", "policy": None, "tolerance": 1e-6}),
         (
-            jl.robust_discounted_value,
+            jl.values.robust_discounted_value,
             {"model": model, "reward": "r", "discount": 0.9, "policy": None, "tolerance": 1e-6},
         ),
-        (jl.robust_expectation, {"model": model, "value": [0.0, 1, 2], "nature": "min"}),
-        (jl.robust_satisfaction, {"model": model, "task": "F a", "states": [0]}),
-        (jl.robust_next_probability, asked),
-        (jl.robust_bounded_reachability, {**asked, "num_steps": 2, "stay": None}),
-        (jl.robust_cumulative_reward, {"model": model, "reward": "r", "num_steps": 2}),
-        (jl.robust_instantaneous_reward, {"model": model, "reward": "r", "num_step": 2}),
+        (jl.values.robust_expectation, {"model": model, "value": [0.0, 1, 2], "nature": "min"}),
+        (jl.values.robust_satisfaction, {"model": model, "task": "F a", "states": [0]}),
+        (jl.values.robust_next_probability, asked),
+        (jl.values.robust_bounded_reachability, {**asked, "num_steps": 2, "stay": None}),
+        (jl.values.robust_cumulative_reward, {"model": model, "reward": "r", "num_steps": 2}),
+        (jl.values.robust_instantaneous_reward, {"model": model, "reward": "r", "num_step": 2}),
         (
-            jl.robust_sensitivity,
+            jl.values.robust_sensitivity,
             {
                 "model": model,
                 "solution": solved,
@@ -142,9 +142,9 @@ def things(folder):
                 "initial": [1, 0, 0],
             },
         ),
-        (jl.prepare_interval, {**asked, "stay": None, "reward": None, "policy": None}),
+        (jl.values.prepare_interval, {**asked, "stay": None, "reward": None, "policy": None}),
         (
-            jl.intervals_from_counts,
+            jl.data.intervals_from_counts,
             {
                 "counts": [1, 2, 3, 4],
                 "confidence": 0.9,
@@ -181,9 +181,9 @@ def things(folder):
                 "actions": None,
             },
         ),
-        (jl.counts_on, {"model": sparse, "counts": counts}),
+        (jl.data.counts_on, {"model": sparse, "counts": counts}),
         (
-            jl.counted_model,
+            jl.data.counted_model,
             {
                 "counts": counts,
                 "initial": "0",
@@ -203,7 +203,7 @@ def things(folder):
         ),
         (jl.read_log, {"path": folder / "log.csv", "states": None, "actions": None}),
         (
-            jl.read_labels,
+            jl.data.read_labels,
             {
                 "path": folder / "labels.csv",
                 "states": ["0", "1", "2"],
@@ -211,7 +211,7 @@ def things(folder):
             },
         ),
         (jl.learn_guarantee, {**told, "rows": None, "num_claims": None, "tolerance": 1e-6}),
-        (jl.guarantee_curve, {**told, "sizes": [1, 2], "seed": 0}),
+        (jl.data.guarantee_curve, {**told, "sizes": [1, 2], "seed": 0}),
         (jl.solve_property, {"model": model, "prop": 'Pmaxmin=? [F "a"]', "states": None}),
         (
             jl.make_parametric,
@@ -221,7 +221,7 @@ def things(folder):
         (box.within, {"low": 0.2, "high": 0.8}),
         (read.at, {"values": {"p": 0.5}}),
         (read.over, {"low": 0.1, "high": 0.9}),
-        (jl.read_parametric, {"path": folder / "coin.drn"}),
+        (jl.io.read_parametric, {"path": folder / "coin.drn"}),
         (
             feasible.make_problem,
             {
@@ -376,7 +376,7 @@ def simulated():
         ),
         (share_estimate, {"count": 1, "total": 2, "failure": 0.05}),
         (
-            jl.episode_evaluator,
+            jl.environments.episode_evaluator,
             {
                 "environment": task,
                 "agent": lambda numbers: agent,
@@ -388,7 +388,7 @@ def simulated():
             },
         ),
         (
-            jl.tabulate_policy,
+            jl.environments.tabulate_policy,
             {
                 "policy": lambda seen, memory: jnp.int32(0),
                 "environment": world,
@@ -454,7 +454,7 @@ def taught(world, key):
     state = jax.eval_shape(lambda: ppo.init(key, problem, hparams))
     coin = jl.from_dense([[[0.5, 0.5]], [[0, 1]]], label=[[0], [1]], propositions=["a"])
     told = {"reward": None, "observe": None, "opponent": None}
-    safe = {"environment": jl.environment_of(coin), "state_of": None}
+    safe = {"environment": jl.environments.environment_of(coin), "state_of": None}
     plane = navigation.navigation()
     network = navigation.policy_network(plane)
     score = navigation.evaluator(plane, 1, num_trajectories=1)
@@ -553,10 +553,13 @@ def taught(world, key):
                 "report": None,
             },
         ),
-        (jl.environment_of, {"model": coin, **told}),
-        (jl.environment_of, {"model": robots(2), **told}),
-        (jl.shield_environment, {"strategy": jl.permissive_strategy(coin, "F a"), **safe}),
-        (jl.shield_environment, {"strategy": np.ones((2, 1), bool), **safe}),
+        (jl.environments.environment_of, {"model": coin, **told}),
+        (jl.environments.environment_of, {"model": robots(2), **told}),
+        (
+            jl.environments.shield_environment,
+            {"strategy": jl.permissive_strategy(coin, "F a"), **safe},
+        ),
+        (jl.environments.shield_environment, {"strategy": np.ones((2, 1), bool), **safe}),
         (robots, {"size": 3}),
         (partial(grid_game, "a..\n..b"), {"system_stays": True, "environment_stays": False}),
         (partial(make_network, "2-3-1"), {"biases": True}),
@@ -623,7 +626,7 @@ def test_nonsense_given_to_adapters_is_told(name):
 
 def test_what_is_of_another_run_is_named():
     """Of settings, states, parameters and observations; nothing is compiled."""
-    key, world = jax.random.key(0), jl.letter_world(size=3, letters=2, copies=1, num_maps=2)
+    key, world = jax.random.key(0), jl.envs.letter_world(size=3, letters=2, copies=1, num_maps=2)
     plane = navigation.navigation()
     small = ppo.make_problem(world, network=ppo.ActorCritic(num_actions=4, hidden=(2,)))
     large = ppo.make_problem(world, network=ppo.ActorCritic(num_actions=4, hidden=(3,)))
@@ -739,7 +742,7 @@ def test_good_input_is_taken(tmp_path):
     ("call", "message"),
     [
         (
-            lambda m: jl.robust_bounded_reachability(m, "a", None),
+            lambda m: jl.values.robust_bounded_reachability(m, "a", None),
             "num_steps=None; it must be a whole",
         ),
         (lambda m: robust_reachability(m, "a", policy="x"), "policy is 'x'; give the number"),
@@ -752,13 +755,13 @@ def test_good_input_is_taken(tmp_path):
             lambda m: jl.bounded_reachability(m, "a", 2),
             "ask what does .*robust_bounded_reachability",
         ),
-        (lambda m: jl.to_dense(m), "or give its nominal model, model.nominal"),
-        (lambda m: jl.attractor(m, m.states_where("a")), "IntervalMDP has intervals"),
+        (lambda m: jl.models.to_dense(m), "or give its nominal model, model.nominal"),
+        (lambda m: jl.games.attractor(m, m.states_where("a")), "IntervalMDP has intervals"),
         (lambda m: jl.make_interval(m, m.lower, m.upper), "of an interval model, its nominal one"),
     ],
 )
 def test_who_asks_of_intervals_what_is_not_solved(call, message):
-    model = jl.interval_rows(
+    model = jl.models.interval_rows(
         None,
         [0, 2, 3, 4],
         [1, 2, 1, 2],
@@ -767,7 +770,7 @@ def test_who_asks_of_intervals_what_is_not_solved(call, message):
         initial=[1, 0, 0],
         label=[[0], [1], [0]],
         propositions=["a"],
-        rewards={"r": jl.Rewards(state=[1.0, 0, 0])},
+        rewards={"r": jl.models.Rewards(state=[1.0, 0, 0])},
     )
     with pytest.raises(ValueError, match=message):
         call(model)
@@ -776,7 +779,7 @@ def test_who_asks_of_intervals_what_is_not_solved(call, message):
 def test_claims_thresholds_and_steps():
     counts = {"counts": [[1, 2, 3]], "confidence": 0.9}
     with pytest.raises(ValueError, match="num_claims=inf; it must be a whole number"):
-        jl.intervals_from_counts(**counts, num_claims=np.inf)
+        jl.data.intervals_from_counts(**counts, num_claims=np.inf)
     world = jl.make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
     problem = interval_learning.make_problem(world, "true")
     for steps in (None, "x", np.nan, [1]):
@@ -795,7 +798,7 @@ def test_a_log_of_a_world_whose_slips_repeat_a_successor(tmp_path):
     assert counts.count.tolist() == [2, 1]
     assert jl.learn_guarantee(world, counts, "true", 0.9).bound == 1
     with pytest.raises(ValueError, match="convert a model whose rows repeat a successor by to_sp"):
-        jl.counts_on(world, counts)
+        jl.data.counts_on(world, counts)
     path.write_text("state,action,next\n1,0,0\n")
     with pytest.raises(ValueError, match="line 2"):
         jl.read_log(path, world)

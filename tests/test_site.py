@@ -7,7 +7,6 @@ from urllib.parse import unquote
 import nbformat
 import pytest
 
-from jaxltl import _public
 from tests.pages import PAGES, ROOT, anchors, entries, links, name_of, without_code
 
 NOTEBOOKS = sorted(ROOT.glob("notebooks/*.ipynb"))
@@ -62,11 +61,6 @@ def test_every_page_is_in_the_contents():
     there = [*names, "docs/reference/index"]
     missing = [x for x in listed if "guides" not in x and not fnmatch.filter(there, x)]
     assert not missing, "the contents name what is not there"
-
-
-def test_the_topics_are_all_names():
-    names = [name for names in _public.TOPICS.values() for name in names]
-    assert sorted(names) == sorted(_public.__all__)
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,6 @@ import jaxltl.algos
 import jaxltl.envs
 import jaxltl.io
 import jaxltl.plot
-from jaxltl import _public
 
 LOG = logging.getLogger(__name__)
 PLACE = Path(__file__).parent.parent / "reference"
@@ -112,20 +111,37 @@ def _checked(name: str, value: Any) -> None:
         LOG.warning("the public name %s has no docstring", name, type="reference")
 
 
-def topics() -> dict[str, tuple[str, ...]]:
-    """Public names by topic."""
-    return getattr(_public, "TOPICS", {"All names": tuple(_public.__all__)})
+# Modules of the top level that list names of the core, and the titles of their pages.
+TOPICS = {
+    "logic": "Logic and automata",
+    "models": "Models",
+    "values": "Values and probabilities",
+    "games": "Games",
+    "environments": "Environments and evaluation",
+    "data": "Data",
+}
+
+
+def topics() -> dict[str, tuple[str, list[tuple[str, Any]]]]:
+    """By title: the description of a namespace, and its names, the shortest that users can write."""
+    listed = {}
+    for space, title in TOPICS.items():
+        module = getattr(jaxltl, space)
+        entries = [
+            (f"jaxltl.{x}" if x in jaxltl.__all__ else f"jaxltl.{space}.{x}", getattr(module, x))
+            for x in module.__all__
+        ]
+        listed[title] = (module.__doc__, entries)
+    return listed
 
 
 def pages() -> dict[str, str]:
     """Files of the reference: the name of each, and its text."""
     texts, lists = {}, []
-    for title, names in topics().items():
-        entries = [(f"jaxltl.{name}", getattr(jaxltl, name)) for name in names]
+    for title, (about, entries) in topics().items():
         for name, value in entries:
             _note(value, name)
             _checked(name, value)
-        about = f"``import jaxltl as jl``, and these are ``jl.{names[0]}`` and so on."
         texts[_slug(title)] = _page(title, about, entries)
     lists.append(("By topic", list(texts)))
     for package, (title, about) in PACKAGES.items():

@@ -6,7 +6,7 @@ Example: networks of finitely many actions, of a box, and with a memory.
   >>> import jaxltl as jl
   >>> from jaxltl.algos import actor_critic as networks
   >>> seen = jax.ShapeDtypeStruct((3,), float)
-  >>> few = networks.default_network(jl.Finite(4))
+  >>> few = networks.default_network(jl.environments.Finite(4))
   >>> shapes = jax.eval_shape(lambda x: few.init_with_output(jax.random.key(0), x)[0], seen)
   >>> shapes[0].shape, shapes[1].shape  # logits, and a value
   ((4,), ())

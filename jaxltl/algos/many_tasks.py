@@ -15,13 +15,13 @@ Example: what a network of the letter world would be trained on, and two formula
   >>> import jaxltl as jl
   >>> from jaxltl.algos import many_tasks, ppo
   >>> from jaxltl.envs.letter_world import events_seen
-  >>> world = jl.letter_world(size=4, letters=3, copies=1, horizon=30)
-  >>> events = jl.events_of(world.propositions)  # nothing, a, b, c
+  >>> world = jl.envs.letter_world(size=4, letters=3, copies=1, horizon=30)
+  >>> events = jl.environments.events_of(world.propositions)  # nothing, a, b, c
   >>> network = many_tasks.SequenceNetwork(num_actions=4, events_seen=events_seen, hidden=(8,))
   >>> def problem(longest):  # sequences of up to so many steps
-  ...     sampler = jl.sequence_sampler(
+  ...     sampler = jl.environments.sequence_sampler(
   ...         np.arange(3) < longest, reach=[1.0], avoid=[0.5, 0.5], sets=events.any(1))
-  ...     return ppo.make_problem(jl.sequence_environment(world, events, sampler), network=network)
+  ...     return ppo.make_problem(jl.environments.sequence_environment(world, events, sampler), network=network)
   >>> stages, hparams = [problem(1), problem(3)], ppo.Hparams(discount=0.94, num_envs=2)
   >>> curriculum = partial(many_tasks.train_in_stages, init=ppo.init, run=ppo.run, num_chunks=3)
   >>> # state = curriculum(key, stages, hparams).state

@@ -21,7 +21,7 @@ Example: a corridor of which one leaves at its beginning; to go to the end and b
   ...     return jnp.int32(0)
   >>> def step(width, place, action, key):  # ahead, back, or stay
   ...     place = place + jnp.array([1, -1, 0], jnp.int32)[action]
-  ...     return jl.Timestep(place, reward=place / width, terminated=place < 0,
+  ...     return jl.environments.Timestep(place, reward=place / width, terminated=place < 0,
   ...                        truncated=jax.random.bernoulli(key, 0.1))
   >>> def observe(width, place):
   ...     return {"place": place / width, "end": place == 3}
@@ -274,7 +274,8 @@ def make_problem(
         that is not the network's; a box of integers; no environment.
 
     Example:
-      >>> from jaxltl import Timestep, make_environment
+      >>> from jaxltl import make_environment
+      >>> from jaxltl.environments import Timestep
       >>> def go(place, action, key):
       ...     place = place + 2 * action - 1
       ...     return Timestep(place, reward=1.0 * (place == 3), terminated=abs(place) == 3)

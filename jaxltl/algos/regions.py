@@ -15,7 +15,7 @@ Example: a coin that shows heads with a probability p, of which at least half is
   >>> _ = path.write_text("@type: DTMC\\n@parameters\\np\\n@nr_states\\n3\\n@model\\n"
   ...     "state 0 init\\n\\taction 0\\n\\t\\t1 : p\\n\\t\\t2 : 1-p\\n"
   ...     "state 1 goal\\n\\taction 0\\n\\t\\t1 : 1\\nstate 2\\n\\taction 0\\n\\t\\t2 : 1\\n")
-  >>> coin = feasible.make_problem(jl.read_parametric(path).over(0.01, 0.99), "goal", bound=">=")
+  >>> coin = feasible.make_problem(jl.io.read_parametric(path).over(0.01, 0.99), "goal", bound=">=")
   >>> [round(x, 6) for x in enclose(coin, 0.25, 0.75)]
   [0.25, 0.75]
   >>> found = prove_regions(coin, 0.5, max_boxes=31)

@@ -29,10 +29,10 @@ compiled for a step takes seconds, so shapes alone are shown.)
   ...     return jax.random.uniform(key, (2,), minval=-1)
   >>> def step(world, action, key):
   ...     place = world + 0.3 * action
-  ...     return jl.Timestep(
+  ...     return jl.environments.Timestep(
   ...         place, -jnp.sum(place**2), jnp.abs(place).max() > 4, cost=jnp.sum(action**2))
   >>> world = jl.make_environment(
-  ...     reset, step, lambda world: world, actions=jl.make_box(-jnp.inf, jnp.inf, (2,)))
+  ...     reset, step, lambda world: world, actions=jl.environments.make_box(-jnp.inf, jnp.inf, (2,)))
   >>> problem = trust_region.make_problem(world, horizon=4, limit=6.0)
   >>> hparams = trust_region.Hparams(
   ...     discount=0.9, method="cpo", num_trajectories=6, hidden=(3,), value_hidden=(), cg_steps=3,
@@ -292,7 +292,8 @@ def make_problem(
         1, or a limit that is no number.
 
     Example:
-      >>> from jaxltl import make_box, make_environment
+      >>> from jaxltl import make_environment
+      >>> from jaxltl.environments import make_box
       >>> def reset(key):
       ...     return jax.random.uniform(key, (1,))
       >>> def move(place, action, key):

@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import enum
 import functools
+import importlib
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, TypeVar, overload
@@ -389,6 +390,7 @@ def picture(value: object) -> str | None:
 def _svg(self: Any) -> str | None:
     """The picture that notebooks show; None, so that they show text, where there is none."""
     try:
+        importlib.import_module("jaxltl.plot.notebook")  # registers what draws; matplotlib is slow
         found = picture(self)
     except Exception:  # nobody who looks at an object wants to hear of its picture
         return None

@@ -327,7 +327,8 @@ def network_agent(network: Network, environment: Environment) -> Partial:
       ValueError: other inputs than the environment observes, or outputs than it has actions.
 
     Example:
-      >>> from jaxltl import Timestep, make_environment
+      >>> from jaxltl import make_environment
+      >>> from jaxltl.environments import Timestep
       >>> world = make_environment(
       ...     lambda key: jnp.ones(2), lambda x, a, key: Timestep(x, 0.0, False), lambda x: x,
       ...     actions=3)

@@ -20,9 +20,10 @@ from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.mdp import make_mdp
 from jaxltl.core.models.product import product
 from jaxltl.core.pretty_print import brief
-from jaxltl.envs import gridworld as grid
+from jaxltl.envs.gridworld import ACTIONS as MOVES
+from jaxltl.envs.gridworld import gridworld
 
-ACTIONS = (*grid.ACTIONS, "off", "on")
+ACTIONS = (*MOVES, "off", "on")
 _CELLS, _WORLD_STATES = 9, 36
 _MAP = """
 .  . p1
@@ -58,11 +59,11 @@ def post_offices() -> Game:
       >>> [p for p, holds in zip(game.propositions, game.label[state]) if holds]
       ['p1']
     """
-    world = grid.gridworld(_MAP)
+    world = gridworld(_MAP)
     cell, light, turn = np.unravel_index(np.arange(_WORLD_STATES), (_CELLS, 2, 2))
     system = turn == 1
     walk = np.asarray(world.successor)[cell, :, 0]  # [36, 4]; off the grid, the cell itself
-    moves = len(grid.ACTIONS)
+    moves = len(MOVES)
     successor = np.zeros((_WORLD_STATES, len(ACTIONS), 1), np.int32)
     successor[:, :moves, 0] = (walk * 2 + light[:, None]) * 2
     successor[:, moves:, 0] = (cell[:, None] * 2 + np.arange(2)) * 2 + 1

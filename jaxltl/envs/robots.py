@@ -20,9 +20,10 @@ from jaxltl.core.logic.labels import satisfying
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.mdp import MDP, make_mdp
 from jaxltl.core.models.ops import operators
-from jaxltl.envs import gridworld as grid
+from jaxltl.envs.gridworld import ACTIONS as MOVES
+from jaxltl.envs.gridworld import gridworld, parse_map
 
-ACTIONS = (*grid.ACTIONS, "stay")
+ACTIONS = (*MOVES, "stay")
 CORNERS = ("lower_left", "lower_right", "upper_left", "upper_right")
 _STAY = ACTIONS.index("stay")
 
@@ -68,7 +69,7 @@ def robots(size: int) -> Game:
             f"size={size!r}; give the cells along a side, an integer from 2 to {_MOST}."
         )
     size = int(size)
-    world = grid.gridworld("\n".join(["." * size] * size))
+    world = gridworld("\n".join(["." * size] * size))
     cells = np.arange(size * size).reshape(size, size)[::-1].ravel()  # the map's first row is up
     walk = _moves(world, cells)
     mark = np.eye(size * size, dtype=bool)[:, [0, size - 1, size * (size - 1), size**2 - 1]]
@@ -133,18 +134,18 @@ def grid_game(
       >>> [p for p, holds in zip(game.propositions, game.label[game.initial.argmax()]) if holds]
       ['system_turn', 'environment_b', 'system_a']
     """
-    world = grid.gridworld(text, slip=slip, legend=legend, wall=wall)
+    world = gridworld(text, slip=slip, legend=legend, wall=wall)
     system_stays = validation.truth("system_stays", system_stays)
     environment_stays = validation.truth("environment_stays", environment_stays)
     position = places(text, wall=wall)
-    rows_columns = grid.parse_map(text).shape
+    rows_columns = parse_map(text).shape
     cells = np.ravel_multi_index(tuple(position.T), rows_columns)
     if "turn" in world.propositions:
         raise ValueError(
             "'turn' is a proposition of the map, and system_turn says whose turn it is; "
             "give the cells another name by a legend."
         )
-    straight = _moves(grid.gridworld(text, legend=legend, wall=wall), cells)
+    straight = _moves(gridworld(text, legend=legend, wall=wall), cells)
     # Which ways are open is read off the world without slip: at slip 1 the cell ahead is padding.
     walk = _moves(world, cells)._replace(available=straight.available)
     system = walk if system_stays else _without_stay(walk)
@@ -184,7 +185,7 @@ def places(text: str, *, wall: str = "#") -> np.ndarray:
       >>> places("a#\\n.b").tolist()
       [[0, 0], [1, 0], [1, 1]]
     """
-    return np.argwhere(grid.parse_map(text) != wall)
+    return np.argwhere(parse_map(text) != wall)
 
 
 def arrival_reward(game: Any, condition: States) -> jax.Array:

@@ -389,7 +389,8 @@ def write_hoa_game(
         no objective is known.
 
     Example:
-      >>> from jaxltl import from_dense, make_game, parity
+      >>> from jaxltl import from_dense, make_game
+      >>> from jaxltl.games import parity
       >>> world = from_dense([[[0, 1.0], [1, 0]], [[1.0, 0], [1, 0]]], initial=[1, 0])
       >>> game = make_game(world, [True, False])
       >>> text = write_hoa_game(game, parity(game, [0, 1]))

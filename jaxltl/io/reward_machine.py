@@ -58,7 +58,7 @@ def read_reward_machine(
     Args:
       source: a file, or the text itself.
       letters: the letters that occur, each a collection of proposition names, such as
-        ``jaxltl.letters_of(world)``; None stands for all 2^P subsets.
+        ``jaxltl.models.letters_of(world)``; None stands for all 2^P subsets.
 
     Returns:
       :class:`RewardMachine`; :func:`machine_reward` is its reward in a product with a world.

@@ -37,7 +37,7 @@ def model(model: Any) -> Figure:
     That moves lie on a map is read off them: there are four actions, most of what each does goes
     one cell up, down, left or right, or stays, and states are numbered in rows from the top left,
     as :func:`~jaxltl.gridworld` has it. What nobody enters or leaves is a wall. In a game of two
-    robots, see :func:`~jaxltl.grid_game`, the map is that of both.
+    robots, see :func:`~jaxltl.envs.grid_game`, the map is that of both.
 
     Args:
       model: an MDP, a DenseMDP, a SparseMDP, or a Game or a Product of one of them, of which the

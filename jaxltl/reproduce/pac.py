@@ -21,7 +21,7 @@ from jaxltl.core.models.build.restrict import restrict
 from jaxltl.core.models.ops.operators import expectation
 from jaxltl.core.types import check
 from jaxltl.core.values.discounted.minimax import minimax_value, strategy_value
-from jaxltl.envs import gridworld as grid
+from jaxltl.envs.gridworld import ACTIONS
 from jaxltl.envs.post_offices import Patrol, patrol, surveillance
 
 DISCOUNT, EPSILON, REWARD_BOUND, FAILURE = 0.6, 1e-4, 1.0, 0.1
@@ -335,9 +335,9 @@ def _figure_17(model: Patrol, quantity: jax.Array) -> dict[str, Any]:
     """
     best = pac.near_optimal(quantity, model.game.available, 1e-9)
     here = np.asarray(model.game.system & (model.memory == 0))
-    moves = np.zeros((2, 9, len(grid.ACTIONS)), bool)
+    moves = np.zeros((2, 9, len(ACTIONS)), bool)
     place = np.asarray(1 - model.light)[here], np.asarray(model.cell)[here]
-    moves[place] = np.asarray(best)[here][:, : len(grid.ACTIONS)]
+    moves[place] = np.asarray(best)[here][:, : len(ACTIONS)]
     return {"best": moves}
 
 
@@ -348,8 +348,8 @@ def _figure_19(model: Patrol, winning: jax.Array, learned: rmax.Evidence) -> dic
     reached = np.asarray(learned.reachable)[system]
 
     def laid_out(play: jax.Array) -> np.ndarray:
-        maps = np.full((2, 4, 9, len(grid.ACTIONS)), np.nan)
-        shown = np.asarray(play)[system][:, : len(grid.ACTIONS)]
+        maps = np.full((2, 4, 9, len(ACTIONS)), np.nan)
+        shown = np.asarray(play)[system][:, : len(ACTIONS)]
         maps[place] = np.where(reached[:, None], shown, np.nan)
         return maps
 

@@ -25,7 +25,9 @@ def two_worlds():
 def runs(*pairs):
     """Trajectories without a check, of one pair each."""
     state, action = np.array(pairs).T[:, :, None]
-    return jl.Trajectories(jnp.asarray(state), jnp.asarray(action), jnp.ones(len(pairs), jnp.int32))
+    return jl.models.Trajectories(
+        jnp.asarray(state), jnp.asarray(action), jnp.ones(len(pairs), jnp.int32)
+    )
 
 
 def demonstrations():

@@ -44,8 +44,8 @@ def test_pair_counts_in_a_product_follow_the_memory():
     world, demonstrations = grid()
     lazy = jl.product(world, TASK)
     assert lazy.num_memory == 3
-    lifted = jl.lift_trajectories(lazy, demonstrations)
-    traced = jax.jit(jl.lift_trajectories)(lazy, demonstrations)
+    lifted = jl.models.lift_trajectories(lazy, demonstrations)
+    traced = jax.jit(jl.models.lift_trajectories)(lazy, demonstrations)
     jax.tree.map(np.testing.assert_array_equal, lifted, traced)  # the host finds the same
     counts = mlirl.pair_counts(lazy, lifted)
     np.testing.assert_array_equal(counts, jax.jit(mlirl.pair_counts)(lazy, traced))
@@ -319,7 +319,7 @@ def test_features_of_a_task_without_end_by_hand():
             reads[s, :, a] = np.asarray(automaton.priority)[:, letter[t]] == 0
     np.testing.assert_allclose(found.values[..., 1], reads, atol=1e-12)
     np.testing.assert_allclose(found.values[..., 2], red, atol=1e-12)
-    shown = np.asarray(jl.lift_trajectories(lazy, runs).state[0])
+    shown = np.asarray(jl.models.lift_trajectories(lazy, runs).state[0])
     expected = np.zeros_like(reads)
     expected.reshape(-1, 4)[shown, [RIGHT, DOWN, RIGHT]] = 1
     np.testing.assert_array_equal(found.values[..., 0], expected)
@@ -390,7 +390,7 @@ def test_inside_a_mask_the_policy_and_the_gradient_are_those_of_a_model_without_
     policy = mlirl.solve(weights, problem, hparams).policy
     assert ((policy > 0) == allowed).all()
     reward = (problem.features @ weights).reshape(flat.available.shape)
-    value = jl.soft_value if kind == "soft" else jl.boltzmann_value
+    value = jl.soft_value if kind == "soft" else jl.values.boltzmann_value
     np.testing.assert_allclose(
         policy.reshape(reward.shape), value(flat, reward, 0.6).policy, atol=1e-9
     )
@@ -416,16 +416,16 @@ def test_steps_outside_the_mask_are_left_out_by_name():
 def test_trajectories_of_another_model_are_refused():
     world, demonstrations = grid()
     lazy = jl.product(world, TASK)
-    lifted = jl.lift_trajectories(lazy, demonstrations)
+    lifted = jl.models.lift_trajectories(lazy, demonstrations)
     features = np.zeros((*lazy.state_shape, 4, 1))
     with pytest.raises(ValueError, match=r"belong to a model of shape \(6, 3\).*project_traj"):
         mlirl.make_problem(lazy, features, lifted)
     with pytest.raises(ValueError, match=r"belong to a model of shape \(6,\).*lift_traj"):
-        jl.project_trajectories(lazy, demonstrations)
+        jl.models.project_trajectories(lazy, demonstrations)
     with pytest.raises(ValueError, match="trajectory 0, step 1: state 6 does not exist"):
-        outside = jl.Trajectories(np.array([[0, 6]]), np.array([[0, 0]]), np.array([2]))
+        outside = jl.models.Trajectories(np.array([[0, 6]]), np.array([[0, 0]]), np.array([2]))
         mlirl.make_problem(world, np.zeros((6, 4, 1)), outside)
-    back = jl.project_trajectories(lazy, lifted)
+    back = jl.models.project_trajectories(lazy, lifted)
     np.testing.assert_array_equal(back.state, demonstrations.state)
     assert back.state_shape == world.state_shape
 

@@ -91,7 +91,7 @@ def four_steps(name: str, mesh: Mesh | None) -> Any:
 
 @cache
 def on_one(name: str) -> Any:
-    return jl.on_host(four_steps(name, None))
+    return jl.models.on_host(four_steps(name, None))
 
 
 def cases():
@@ -108,7 +108,7 @@ def test_eight_lanes_on_several_devices_are_those_on_one(name, number):
     found = four_steps(name, mesh)
     own = NamedSharding(mesh, PartitionSpec("lanes"))
     assert all(x.sharding.is_equivalent_to(own, x.ndim) for x in jax.tree.leaves(found))
-    found = jl.on_host(found)
+    found = jl.models.on_host(found)
     if number == 1:
         assert_bitwise(found, on_one(name))
     else:
@@ -125,7 +125,7 @@ def test_lanes_end_each_for_itself_on_each_device():
     keys, rates = jax.random.split(jax.random.key(1), 7), np.linspace(0.1, 0.4, 7)
     found = jl.vmap_over_mesh(until, mesh_of(2))(keys, rates, most)
     assert found.num_steps.tolist() == [4, 20, 8, 2, 3, 20, 10]
-    assert_bitwise(jl.on_host(found), jl.on_host(jax.vmap(until)(keys, rates, most)))
+    assert_bitwise(jl.models.on_host(found), jl.models.on_host(jax.vmap(until)(keys, rates, most)))
 
 
 # --- environments of one seed ---------------------------------------------------------------------
@@ -181,7 +181,7 @@ def test_environments_over_devices_are_the_environments(name, number):
     mesh = jax.make_mesh((number,), ("environments",), devices=jax.devices()[:number])
     run = partial(ppo.train, jax.random.key(0), problem, num_steps=6, max_rows=3)
     found = run(replace(hparams, sharding=over(mesh)))
-    assert_near(jl.on_host(found), run(hparams), 1e-10)
+    assert_near(jl.models.on_host(found), run(hparams), 1e-10)
     state = found[0]
     lie = [x.sharding.spec for x in jax.tree.leaves(state.walkers)]
     assert set(lie) == {PartitionSpec("environments")}
@@ -201,7 +201,7 @@ def test_seeds_and_their_environments_over_two_axes():
         in_axes=(0, None),
     )(keys, problem)
     expected = jax.vmap(lambda key: ppo.train(key, problem, hparams, num_steps=3))(keys)
-    assert_near(jl.on_host(found), expected, 1e-10)
+    assert_near(jl.models.on_host(found), expected, 1e-10)
 
 
 @pytest.mark.parametrize(
@@ -246,7 +246,7 @@ def test_stages_of_seeds_over_devices_are_those_of_vmap():
         lambda *x, num_steps: jax.vmap(partial(ppo.run, num_steps=num_steps), axes)(*x),
     )
     assert found.stages.tolist() == expected.stages.tolist() == [0, 1, 1]
-    assert_near(jl.on_host(found.state), expected.state, 1e-10)
+    assert_near(jl.models.on_host(found.state), expected.state, 1e-10)
 
 
 # --- several processes ----------------------------------------------------------------------------
@@ -274,10 +274,10 @@ def main(names: str, coordinator: str, process: int, processes: int) -> None:
             mesh = jax.make_mesh((4,), ("environments",))
             run = partial(ppo.train, jax.random.key(0), problem, num_steps=3)
             found = run(replace(hparams, sharding=over(mesh)))
-            assert_near(jl.on_host(found), run(hparams), 1e-10)
+            assert_near(jl.models.on_host(found), run(hparams), 1e-10)
         elif name == "episodes":
             problem, _ = plain()
-            agent = jl.agent_of(lambda seen, key: jax.random.randint(key, (), 0, 2))
+            agent = jl.environments.agent_of(lambda seen, key: jax.random.randint(key, (), 0, 2))
             run = partial(
                 jl.evaluate,
                 jax.random.key(0),
@@ -288,7 +288,7 @@ def main(names: str, coordinator: str, process: int, processes: int) -> None:
             )
             assert run(sharding=over(jax.make_mesh((4,), ("environments",)))) == run()
         else:
-            found = jl.on_host(four_steps(name, mesh_of(4)))
+            found = jl.models.on_host(four_steps(name, mesh_of(4)))
             assert_as_on_one(name, found, on_one(name))
     print(f"as on one: {len(asked)}", flush=True)
     jax.distributed.shutdown()

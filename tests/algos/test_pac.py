@@ -345,7 +345,7 @@ def played(game, strategy):
 
 
 def wins(game, accepting):
-    return np.asarray(jl.almost_sure_buchi(game, jnp.asarray(accepting)).region)
+    return np.asarray(jl.games.almost_sure_buchi(game, jnp.asarray(accepting)).region)
 
 
 @pytest.mark.exhaustive
@@ -466,7 +466,7 @@ def best_value(game, reward, discount):
 @jax.jit
 @jax.vmap
 def worst_value(game, strategy, reward, discount):
-    return jl.strategy_value(game, strategy, reward, discount)
+    return jl.values.strategy_value(game, strategy, reward, discount)
 
 
 def certain_gap(optimal, value):
@@ -525,7 +525,7 @@ def test_the_bound_is_nearly_attained(discount, share):
     near = pac.near_optimal(q, game.available, tolerance + 1e-9)
     assert near[0].tolist() == [True, True] + [False] * 8
     strategy = jnp.zeros((2, 10)).at[:, 1].set(1 - p).at[:, 5].set(p)
-    value = jl.check(jl.strategy_value(game, strategy, reward, discount))
+    value = jl.check(jl.values.strategy_value(game, strategy, reward, discount))
     gap = float(optimal.value[0] - value.value[0])
     exact = bound / (1 - discount) - (1 - p) * (bound - tolerance) / (1 - discount * (1 - p))
     assert gap == pytest.approx(exact, rel=1e-9)
@@ -560,7 +560,7 @@ def test_the_bound_of_the_hat_strategy_is_nearly_attained(discount):
     q = reward + discount * expectation(game, optimal.value)
     near = pac.near_optimal(q, game.available, 0.0)
     strategy = pac.hat_strategy(near, game.available, p)
-    value = jl.check(jl.strategy_value(game, strategy, reward, discount))
+    value = jl.check(jl.values.strategy_value(game, strategy, reward, discount))
     limit = float(pac.hat_gap(p, 0.0, discount, 1.0))
     assert limit / 1.2 < float(optimal.value[0] - value.value[0]) <= limit
 

@@ -43,7 +43,7 @@ def random_problem(seed, num_states=7, least=2):
         play = reference_games.random_game(rng, num_states, kind="mixed")
         game = make_game(as_mdp(play.model), play.system)
         accepting = rng.random(num_states) < 0.4
-        region = np.asarray(jl.almost_sure_buchi(game, jnp.asarray(accepting)).region)
+        region = np.asarray(jl.games.almost_sure_buchi(game, jnp.asarray(accepting)).region)
         if least <= region.sum() < num_states:
             break
     reward = rng.random(game.mdp.probability.shape)

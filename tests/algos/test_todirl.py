@@ -174,7 +174,7 @@ def test_the_gradient_is_that_of_the_dense_sensitivity():
     uniform = np.full(model.state_shape, 1 / model.num_states)
     whole = jl.restrict(model, uniform).model
     expected = reference.likelihood_gradient(
-        np.asarray(jl.to_dense(whole).transition),
+        np.asarray(jl.models.to_dense(whole).transition),
         policy.reshape(-1, 4),
         np.asarray(jax.jit(jax.jacobian(rewards))(flat)).reshape(-1, 4, flat.size),
         np.asarray(problem.counts[0]).reshape(-1, 4),
@@ -272,7 +272,7 @@ def test_the_expert_is_recovered_with_the_features_of_its_reward():
     true = {"params": {"table": table}}
     expert = plan(Table(), true, model, observation, hparams)
     runs = jl.rollout(model, expert.policy, jax.random.key(0), num_trajectories=200, num_steps=20)
-    runs = jl.project_trajectories(model, runs)
+    runs = jl.models.project_trajectories(model, runs)
     problem = todirl.make_problem(model, observation, runs, network=Table(), held_out=None)
     flat, unravel = ravel_pytree(true)
 
@@ -479,6 +479,6 @@ def test_masks_that_fit_no_world_are_refused(masks, message):
 
 
 def test_trajectories_of_the_product_are_refused():
-    lifted = jl.lift_trajectories(lazy(), demonstrated())
+    lifted = jl.models.lift_trajectories(lazy(), demonstrated())
     with pytest.raises(ValueError, match="demonstrations in world 0: the trajectories belong to a"):
         todirl.make_problem(lazy(), seen(lazy()), lifted)

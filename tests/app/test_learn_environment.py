@@ -21,7 +21,8 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 WORLD = """
 import jax
 import jax.numpy as jnp
-from jaxltl import Timestep, make_box, make_environment
+from jaxltl import make_environment
+from jaxltl.environments import Timestep, make_box
 
 
 def corridor(length=3, boxed=False, horizon=8, ends=True):

@@ -58,16 +58,16 @@ def made():
         [0.5, 0.5, 0.9, 0.1, 1.0, 1.0],
         initial=[1, 0, 0],
         label={"done": [1, 2], "lost": [2]},
-        rewards={"steps": jl.Rewards(state=np.array([1.0, 0, 0]))},
+        rewards={"steps": jl.models.Rewards(state=np.array([1.0, 0, 0]))},
     )
     rough = jl.make_interval(coin, [0.4, 0.4, 0.8, 0.0, 1, 1], [0.6, 0.6, 1.0, 0.2, 1, 1])
     solution = jl.reachability_probability(coin, coin.states_where("lost"))
     counts = jl.make_counts([0, 1, 0], [0, 0, 0], [1, 1, 0], [880, 5, 120], states=["dock", "bay"])
-    game = jl.grid_game("a.\n.b")
+    game = jl.envs.grid_game("a.\n.b")
     region = np.arange(32) < 20
-    objective = jl.Parity(np.zeros(32, np.int32), region, ~region, 2)
-    estimate = jl.Estimate(0.5, 0.25, 0.75, 0.01, "exact")
-    evaluation = jl.Evaluation(
+    objective = jl.games.Parity(np.zeros(32, np.int32), region, ~region, 2)
+    estimate = jl.environments.Estimate(0.5, 0.25, 0.75, 0.01, "exact")
+    evaluation = jl.environments.Evaluation(
         estimate,
         None,
         None,
@@ -88,7 +88,7 @@ def made():
         None,
         jl.Status.MAX_STEPS,
     )
-    box = jl.make_box(-1.0, [1.0, 2.0])
+    box = jl.environments.make_box(-1.0, [1.0, 2.0])
     environment = jl.make_environment(
         partial(_start),
         partial(_step),
@@ -98,8 +98,8 @@ def made():
         propositions=(),
         horizon=7,
     )
-    satisfaction = jl.sparse_satisfaction(coin, "F lost")
-    sure = jl.ConfidenceSets(
+    satisfaction = jl.values.sparse_satisfaction(coin, "F lost")
+    sure = jl.data.ConfidenceSets(
         np.zeros(3),
         np.array([0.5, 0.25, 1]),
         np.zeros(3),
@@ -112,7 +112,7 @@ def made():
     )
     found = [
         world,
-        jl.to_dense(world),
+        jl.models.to_dense(world),
         automaton,
         product,
         coin,
@@ -128,14 +128,14 @@ def made():
         environment,
         satisfaction,
         sure,
-        jl.make_monitor(automaton),
+        jl.logic.make_monitor(automaton),
         jl.make_trajectories(world, [[(15, 0), (10, 0)], [(15, 3)]]),
         jl.FiniteMemoryPolicy(
             np.zeros((20, 3), np.int32), np.zeros(20, np.int32), np.zeros((20, 3), np.int32)
         ),
-        jl.GR1(np.ones((2, 32), bool), np.ones((3, 32), bool), ~region),
-        jl.Winning(game, objective, region, np.zeros(32, np.int32), np.zeros(32, np.int32)),
-        jl.Permissive(
+        jl.games.GR1(np.ones((2, 32), bool), np.ones((3, 32), bool), ~region),
+        jl.games.Winning(game, objective, region, np.zeros(32, np.int32), np.zeros(32, np.int32)),
+        jl.games.Permissive(
             game,
             region,
             np.ones((32, 5), bool),
@@ -144,8 +144,8 @@ def made():
             True,
             "maximal: it includes all",
         ),
-        jl.Verification(False, True, "state 3 loses"),
-        jl.Answer(
+        jl.games.Verification(False, True, "state 3 loses"),
+        jl.values.Answer(
             np.array([0]),
             np.array([0.5]),
             np.array([0.5]),
@@ -155,7 +155,7 @@ def made():
             "levels",
             None,
         ),
-        jl.OptimalActions(
+        jl.values.OptimalActions(
             np.ones((20, 3, 4), bool),
             np.ones((20, 3, 4)),
             solution,
@@ -163,7 +163,7 @@ def made():
             np.float32(1e-7),
             np.int32(0),
         ),
-        jl.OptimalityGap(
+        jl.environments.OptimalityGap(
             np.arange(2),
             np.ones(2),
             solution,
@@ -175,14 +175,20 @@ def made():
             (0.9, 0.95),
             "keyless",
         ),
-        jl.DataGuarantee(0.9, 0.95, 0.99, satisfaction, rough, sure, np.zeros(4)),
-        jl.Table(coin, np.arange(3), np.zeros(1, int), np.zeros(3, bool), np.ones(3, bool), 9),
+        jl.data.DataGuarantee(0.9, 0.95, 0.99, satisfaction, rough, sure, np.zeros(4)),
+        jl.environments.Table(
+            coin, np.arange(3), np.zeros(1, int), np.zeros(3, bool), np.ones(3, bool), 9
+        ),
         jl.ParametricMDP(coin, None, np.zeros(2), np.ones(2), np.ones(2) / 2, ("p", "q")),
-        jl.Objective(formula="F a", threshold=0.5),
-        jl.parse_property('P>=0.5 [ F "a" ]'),
-        jl.ModelPart(np.arange(3), np.zeros(2, int), np.ones(2), rewards={"cost": np.ones(2)}),
-        jl.TaskWorld(np.zeros(2), np.int32(1), np.int32(2), np.bool_(True), np.int32(3)),
-        jl.Episode(
+        jl.values.Objective(formula="F a", threshold=0.5),
+        jl.logic.parse_property('P>=0.5 [ F "a" ]'),
+        jl.models.ModelPart(
+            np.arange(3), np.zeros(2, int), np.ones(2), rewards={"cost": np.ones(2)}
+        ),
+        jl.environments.TaskWorld(
+            np.zeros(2), np.int32(1), np.int32(2), np.bool_(True), np.int32(3)
+        ),
+        jl.environments.Episode(
             *[np.zeros((4, 5))] * 6,
             np.tri(4, 5, 1, bool),
             np.ones(4, bool),
@@ -198,7 +204,7 @@ def _start(key):
 
 
 def _step(world, action, key):
-    return jl.Timestep(world, reward=1.0, terminated=world[0] > 3)
+    return jl.environments.Timestep(world, reward=1.0, terminated=world[0] > 3)
 
 
 def _see(world):
@@ -278,7 +284,7 @@ def brief_classes():
 
 def test_every_public_type_shows_itself():
     public = {getattr(jl, name) for name in jl.__all__}
-    others = {jl.Formula, jl.Status, jl.Verdict, jl.NotConverged, Method}
+    others = {jl.logic.Formula, jl.Status, jl.logic.Verdict, jl.NotConverged, Method}
     plain = {x for x in public if isinstance(x, type)} - others - {*brief_classes().values()}
     assert not plain
     for module in algos.__all__:

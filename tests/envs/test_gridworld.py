@@ -41,7 +41,7 @@ def test_moves_walls_and_absorbing_cells():
 
 def test_slipping_goes_to_both_sides():
     world = jl.gridworld("...\n...\n...", slip=0.2)
-    dense = jl.to_dense(world).transition
+    dense = jl.models.to_dense(world).transition
     expected = {UP: (1, 3, 5), DOWN: (7, 3, 5), LEFT: (3, 1, 7), RIGHT: (5, 1, 7)}
     for action, (ahead, one, other) in expected.items():
         row = np.zeros(9)
@@ -52,7 +52,7 @@ def test_slipping_goes_to_both_sides():
 
 
 def test_certain_slipping():
-    dense = jl.to_dense(jl.gridworld("...", slip=1.0)).transition
+    dense = jl.models.to_dense(jl.gridworld("...", slip=1.0)).transition
     np.testing.assert_allclose(dense[1], [[0.5, 0, 0.5]] * 2 + [[0, 1, 0]] * 2, atol=1e-15)
 
 

@@ -121,8 +121,8 @@ def test_what_is_learned_by_a_plain_reading():
 def test_the_automaton_says_what_the_formula_says():
     automaton = surveillance()
     formula = jl.to_automaton("G F p1 & G F p2")
-    assert jl.is_equivalent(automaton, formula)
-    assert not jl.is_equivalent(automaton, jl.to_automaton("G F p1"))
+    assert jl.logic.is_equivalent(automaton, formula)
+    assert not jl.logic.is_equivalent(automaton, jl.to_automaton("G F p1"))
     assert automaton.acceptance == "buchi"
     assert automaton.state_names[int(automaton.initial)] == "q1"
     np.testing.assert_array_equal(automaton.delta[3], automaton.delta[0])
@@ -162,7 +162,7 @@ def quantity(model, optimal):
 
 
 def worst(model, strategy):
-    return jl.check(jl.strategy_value(model.game, strategy, model.reward, DISCOUNT))
+    return jl.check(jl.values.strategy_value(model.game, strategy, model.reward, DISCOUNT))
 
 
 def test_sizes(model):
@@ -177,7 +177,7 @@ def test_sizes(model):
 
 
 def test_the_task_can_be_done_from_everywhere(model):
-    assert jl.almost_sure_buchi(model.game, model.accepting).region.all()
+    assert jl.games.almost_sure_buchi(model.game, model.accepting).region.all()
     whole = jl.winning_region(post_offices(), "G F p1 & G F p2")
     assert whole.region.all()
     assert jl.verify(whole)
@@ -229,7 +229,7 @@ def test_a_winning_strategy_of_the_hat_game_is_nearly_optimal_too(model, optimal
     hat = pac.hat_game(game, near, p)
     # The states' copies are not accepting, as in the dissertation.
     accepting = jnp.pad(model.accepting, (0, 2 * game.num_states))
-    found = jl.almost_sure_buchi(hat, accepting)
+    found = jl.games.almost_sure_buchi(hat, accepting)
     assert found.region.all()
     chosen = jax.nn.one_hot(found.action, hat.num_actions)
     value = worst(model, pac.recover_hat_strategy(hat, chosen))

@@ -215,7 +215,7 @@ def test_starts_without_a_way_are_found():
 def test_feasibility_agrees_with_the_attractor(task, slip, label_on):
     world = tg.make_world(WALLED, 0, shape=(7, 6), slip=slip)
     model = jl.product(world.mdp, task, label_on=label_on)
-    can = np.asarray(jl.attractor(model, model.final, model.available).region)
+    can = np.asarray(jl.games.attractor(model, model.final, model.available).region)
     if label_on == "exit":  # as the generator reads
         found = tg._can_finish(
             *(
@@ -323,7 +323,7 @@ def test_demonstrations_end_where_the_task_is_decided():
     policy = tg.expert_policy(model)
     runs = tg.demonstrations(jax.random.key(1), model, policy, 60)
     assert runs.state.shape == (60, 100)
-    lifted = jl.lift_trajectories(model, runs)
+    lifted = jl.models.lift_trajectories(model, runs)
     memory = np.asarray(lifted.state) % model.num_memory
     after = np.asarray(model.next_memory)
     over, final = np.asarray(tg.is_over(model))[0], np.asarray(model.automaton.final)

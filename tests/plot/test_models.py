@@ -27,7 +27,7 @@ def test_the_map_is_read_off_the_moves(text, slip):
     expected = parse_map(text)
     np.testing.assert_array_equal(map_of(world), expected)
     if slip < 0.5:  # else most of a move may go to the sides, where those are one cell
-        np.testing.assert_array_equal(map_of(jl.to_dense(world)), expected)
+        np.testing.assert_array_equal(map_of(jl.models.to_dense(world)), expected)
 
 
 def test_cells_that_are_never_left_are_no_walls_where_they_are_entered_or_labelled():
@@ -55,7 +55,7 @@ def test_other_moves_lie_on_no_map():
 
 @pytest.mark.parametrize("text", ["a.\n.b", ".#.\n...\n.#b", "...\n.a."])
 def test_the_board_is_read_off_the_moves_of_the_robot(text):
-    board = board_of_robots(jl.grid_game(text, slip=0.1))
+    board = board_of_robots(jl.envs.grid_game(text, slip=0.1))
     np.testing.assert_array_equal(board.cells, parse_map(text))
     np.testing.assert_array_equal(board.places, places(text))
 

@@ -59,8 +59,8 @@ class SequenceSampler:
 
     Example:
       >>> import jaxltl as jl
-      >>> events = jl.events_of(["a", "b"])
-      >>> sampler = jl.sequence_sampler([1, 1], [1], [1, 1], jl.proposition_sets(events))
+      >>> events = jl.environments.events_of(["a", "b"])
+      >>> sampler = jl.environments.sequence_sampler([1, 1], [1], [1, 1], jl.environments.proposition_sets(events))
       >>> sampler.sets.shape, sampler.length.tolist()
       ((2, 3), [1.0, 1.0])
     """
@@ -79,7 +79,7 @@ class SequenceWorld(NamedTuple):
       world: the inner one.
       sequence: what was asked for.
       stage: ``int32[]``, the steps that are done.
-      verdict: ``int32[]``, a :class:`~jaxltl.Verdict`.
+      verdict: ``int32[]``, a :class:`~jaxltl.logic.Verdict`.
     """
 
     world: Any
@@ -261,7 +261,7 @@ def sequence_environment(
     Example:
       >>> import jaxltl as jl
       >>> coin = jl.make_environment(
-      ...     lambda key: jnp.int32(0), lambda world, action, key: jl.Timestep(action, 0.0, False),
+      ...     lambda key: jnp.int32(0), lambda world, action, key: jl.environments.Timestep(action, 0.0, False),
       ...     lambda world: world[None], actions=2,
       ...     labels=lambda world: world == jnp.array([1]), propositions=["a"])
       >>> events = events_of(["a"])

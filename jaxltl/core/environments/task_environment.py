@@ -62,7 +62,7 @@ class TaskWorld(NamedTuple):
     Example:
       >>> import jaxltl as jl
       >>> coin = jl.make_environment(
-      ...     lambda key: jnp.int32(0), lambda world, action, key: jl.Timestep(action, 0.0, False),
+      ...     lambda key: jnp.int32(0), lambda world, action, key: jl.environments.Timestep(action, 0.0, False),
       ...     lambda world: world[None], actions=2,
       ...     labels=lambda world: world == jnp.array([1]), propositions=["a"])
       >>> begun = jax.eval_shape(jl.task_environment(coin, "F a").reset, jax.random.key(0))
@@ -88,7 +88,7 @@ class TaskObservation(NamedTuple):
     Example:
       >>> import jaxltl as jl
       >>> coin = jl.make_environment(
-      ...     lambda key: jnp.int32(0), lambda world, action, key: jl.Timestep(action, 0.0, False),
+      ...     lambda key: jnp.int32(0), lambda world, action, key: jl.environments.Timestep(action, 0.0, False),
       ...     lambda world: world[None], actions=2,
       ...     labels=lambda world: world == jnp.array([1]), propositions=["a"])
       >>> task = jl.task_environment(coin, "F a")
@@ -403,7 +403,8 @@ def stack_tasks(environments: Sequence[Environment]) -> Environment:
       ValueError: none, or worlds of different structure.
 
     Example:
-      >>> from jaxltl import environment_of, from_dense
+      >>> from jaxltl import from_dense
+      >>> from jaxltl.environments import environment_of
       >>> walk = environment_of(from_dense(
       ...     [[[.5, .5]], [[.5, .5]]], label=[[0], [1]], propositions=["a"]))
       >>> both = stack_tasks([task_environment(walk, "F a"), task_environment(walk, "G F a")])

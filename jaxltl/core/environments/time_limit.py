@@ -35,7 +35,7 @@ def with_time_limit(environment: Environment, num_steps: int) -> Environment:
     Example:
       >>> import jaxltl as jl
       >>> coin = jl.make_environment(
-      ...     lambda key: jnp.int32(0), lambda world, action, key: jl.Timestep(action, 0.0, False),
+      ...     lambda key: jnp.int32(0), lambda world, action, key: jl.environments.Timestep(action, 0.0, False),
       ...     lambda world: world[None], actions=2)
       >>> with_time_limit(coin, 10).horizon
       10

@@ -104,7 +104,8 @@ def shield_environment(
         strategy on a world without successor lists, or `state_of` that does not return integers.
 
     Example:
-      >>> from jaxltl import environment_of, from_dense, permissive_strategy
+      >>> from jaxltl import from_dense, permissive_strategy
+      >>> from jaxltl.environments import environment_of
       >>> model = from_dense([[[1.0, 0], [0, 1.0]], [[0, 1.0], [0, 0]]],
       ...                    label=[[0], [1]], propositions=["crash"], initial=[1, 0])
       >>> safe = shield_environment(environment_of(model), permissive_strategy(model, "G !crash"))

@@ -53,7 +53,7 @@ class Winning:
       >>> import jaxltl as jl
       >>> fork = jl.from_dense([[[1.0, 0], [0, 1.0]], [[0, 1.0], [0, 0]]], initial=[1, 0],
       ...                      label={"crash": [1]})
-      >>> found = jl.winning_region(fork, jl.safety(fork, "!crash"))
+      >>> found = jl.winning_region(fork, jl.games.safety(fork, "!crash"))
       >>> found.region.tolist(), int(found.action[0]), bool(found.realizable)
       ([True, False], 0, True)
     """

@@ -94,7 +94,7 @@ class DenseMDP:
 
     Example:
       >>> import jaxltl as jl
-      >>> chain = jl.to_dense(jl.from_dense([[[0.5, 0.5]], [[0, 1.0]]]))
+      >>> chain = jl.models.to_dense(jl.from_dense([[[0.5, 0.5]], [[0, 1.0]]]))
       >>> chain.transition.shape
       (2, 1, 2)
     """

@@ -45,7 +45,7 @@ def game():
     ],
 )
 def test_sets_of_states(condition, expected):
-    for model in (world(), jl.to_dense(world()), game()):
+    for model in (world(), jl.models.to_dense(world()), game()):
         assert states_where(model, condition).tolist() == expected
 
 

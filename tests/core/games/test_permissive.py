@@ -161,7 +161,7 @@ def test_safe_strategies_allow_exactly_what_some_winning_strategy_does():
             continue
         strategy = permissive_strategy(game, task)
         available = np.asarray(game.available)
-        support = np.asarray(jl.to_dense(game.mdp).transition) > 0
+        support = np.asarray(jl.models.to_dense(game.mdp).transition) > 0
         mine = np.flatnonzero(np.asarray(game.system))
         used = np.zeros_like(available)
         for choice in itertools.product(*(np.flatnonzero(available[s]) for s in mine)):

@@ -14,9 +14,11 @@ from tests.sparse_models import random_sparse
 
 COUNT, GAMES = 7, 40
 SPECS = {
-    "parity": lambda game, x: jl.parity(game, x["priority"], safe=x["safe"], num_priorities=4),
-    "reach": lambda game, x: jl.reach(game, "a", safe=x["safe"]),
-    "gr1": lambda game, x: jl.gr1(game, ["a"], ["b", "!a"], safe=x["safe"]),
+    "parity": lambda game, x: jl.games.parity(
+        game, x["priority"], safe=x["safe"], num_priorities=4
+    ),
+    "reach": lambda game, x: jl.games.reach(game, "a", safe=x["safe"]),
+    "gr1": lambda game, x: jl.games.gr1(game, ["a"], ["b", "!a"], safe=x["safe"]),
     "recurrence": lambda game, x: "G F a",
     "either": lambda game, x: "F G a | G F b",
     "until": lambda game, x: "a U b",
@@ -140,8 +142,8 @@ def test_mean_payoffs_are_those_of_the_padded_game():
         reward = rng.integers(-3, 4, model.num_rows).astype(float)
         wide = np.zeros((COUNT, padded.num_actions))
         wide[model.host.state, column] = reward
-        found = jl.mean_payoff(jl.make_game(model, system), reward)
-        expected = jl.mean_payoff(jl.make_game(padded, system), wide)
+        found = jl.values.mean_payoff(jl.make_game(model, system), reward)
+        expected = jl.values.mean_payoff(jl.make_game(padded, system), wide)
         np.testing.assert_array_equal(found.value, expected.value)
         np.testing.assert_array_equal(column[np.asarray(found.policy)], expected.policy)
 
@@ -151,11 +153,11 @@ def test_mean_payoffs_are_those_of_the_padded_game():
 )
 def test_graphs_inside_jit_are_the_hosts(name):
     ask = {
-        "attractor": lambda m, x: jl.attractor(m, x),
-        "against chance": lambda m, x: jl.attractor(m, x, rule="forall", chance="all"),
-        "avoidable": lambda m, x: jl.avoidable(m, x),
-        "almost surely": lambda m, x: jl.almost_surely_reaching(m, x),
-        "end components": lambda m, x: jl.end_components(m, ~x),
+        "attractor": lambda m, x: jl.games.attractor(m, x),
+        "against chance": lambda m, x: jl.games.attractor(m, x, rule="forall", chance="all"),
+        "avoidable": lambda m, x: jl.games.avoidable(m, x),
+        "almost surely": lambda m, x: jl.games.almost_surely_reaching(m, x),
+        "end components": lambda m, x: jl.games.end_components(m, ~x),
     }[name]
     compiled, rng = jax.jit(ask), np.random.default_rng(3)
     model = games()[0][0].mdp

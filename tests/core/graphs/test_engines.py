@@ -71,15 +71,15 @@ def answers(case, kind):
     """Every answer about a graph or a game; ranks are masked where they mean nothing."""
     model, goal, allowed = case["model"], case["goal"], case["allowed"]
     found = {
-        f"attractor, {chance}": jl.attractor(
+        f"attractor, {chance}": jl.games.attractor(
             model, goal, allowed, rule=case["rule"], among=case["among"], chance=chance
         )
         for chance in ("some", "all")
     }
-    found["attractor"] = jl.attractor(model, goal)
-    found["avoidable"] = jl.avoidable(model, goal)
-    found["almost surely"] = jl.almost_surely_reaching(model, goal, allowed)
-    found["end components"] = jl.end_components(model, case["region"], allowed)
+    found["attractor"] = jl.games.attractor(model, goal)
+    found["avoidable"] = jl.games.avoidable(model, goal)
+    found["almost surely"] = jl.games.almost_surely_reaching(model, goal, allowed)
+    found["end components"] = jl.games.end_components(model, case["region"], allowed)
     found["bottom components"] = bottom_components(model, allowed)
     if kind in ("entry", "exit"):
         found["accepting"] = accepting_end_components(model)
@@ -181,48 +181,48 @@ def test_nothing_is_compiled_on_the_host():
         settled("final", product(world, "F a").final)
         settled("restrict", jl.restrict(lazy))
         for model in (world, to_dense(world), game):
-            settled("attractor", jl.attractor(model, goal, chance="all"))
-            settled("avoidable", jl.avoidable(model, goal))
-            settled("almost_surely_reaching", jl.almost_surely_reaching(model, goal))
-            settled("end_components", jl.end_components(model, ~goal))
+            settled("attractor", jl.games.attractor(model, goal, chance="all"))
+            settled("avoidable", jl.games.avoidable(model, goal))
+            settled("almost_surely_reaching", jl.games.almost_surely_reaching(model, goal))
+            settled("end_components", jl.games.end_components(model, ~goal))
         settled("accepting_end_components", accepting_end_components(lazy))
         uniform = np.full((*lazy.state_shape, 3), 1 / 3)
         settled("accepting_bottom_components", accepting_bottom_components(lazy, uniform))
-        reactive = jl.gr1(game, ["a"], ["b", "!a"])
+        reactive = jl.games.gr1(game, ["a"], ["b", "!a"])
         specs = (
-            jl.safety(game, "true"),
-            jl.reach(game, "a", safe="!b | a"),
-            jl.buchi(game, "a"),
-            jl.cobuchi(game, "a | b"),
+            jl.games.safety(game, "true"),
+            jl.games.reach(game, "a", safe="!b | a"),
+            jl.games.buchi(game, "a"),
+            jl.games.cobuchi(game, "a | b"),
             reactive,
             "F G a | G F b",
             "F a",
-            jl.parity(game, rng.integers(4, size=size)),
+            jl.games.parity(game, rng.integers(4, size=size)),
         )
         for spec in specs:
             found = settled("winning_region", jl.winning_region(game, spec))
             settled("realizable", found.realizable)
             settled("verify", jl.verify(found))
         settled("adversarial", jl.winning_region(game, "G F a", chance="adversarial"))
-        settled("almost_sure_buchi", jl.almost_sure_buchi(world, "a"))
+        settled("almost_sure_buchi", jl.games.almost_sure_buchi(world, "a"))
         easy = jl.make_game(
             from_dense(np.roll(np.eye(size), 1, 0)[:, None], label=label, propositions="ab"),
             np.ones(size, bool),
         )
         for spec, options in (
             ("G (a | !a)", {}),
-            (jl.buchi(easy, "a"), {"method": "rank"}),
-            (jl.buchi(easy, "a"), {"method": "counter", "bound": 20}),
-            (jl.parity(easy, 1 - label[:, 0]), {"method": "parity"}),
-            (jl.reach(easy, "a"), {}),
-            (jl.gr1(easy, ["a"], ["b"]), {"method": "rank"}),
+            (jl.games.buchi(easy, "a"), {"method": "rank"}),
+            (jl.games.buchi(easy, "a"), {"method": "counter", "bound": 20}),
+            (jl.games.parity(easy, 1 - label[:, 0]), {"method": "parity"}),
+            (jl.games.reach(easy, "a"), {}),
+            (jl.games.gr1(easy, ["a"], ["b"]), {"method": "rank"}),
             ("G F a & F b", {}),
         ):
             strategy = settled("permissive", jl.permissive_strategy(easy, spec, **options))
-            settled("apply_strategy", jl.apply_strategy(strategy))
+            settled("apply_strategy", jl.games.apply_strategy(strategy))
             available = np.asarray(strategy.game.available)
             policy = available / available.sum(-1, keepdims=True)
-            settled("shield", jl.shield_policy(policy, strategy.allowed))
+            settled("shield", jl.games.shield_policy(policy, strategy.allowed))
     assert len(set(done)) > 20
 
 
@@ -235,11 +235,11 @@ def test_a_model_of_ones_own_is_asked_by_its_primitives():
         state_shape, num_actions = (4,), 1
         available = jnp.ones((4, 1), bool)
 
-    @jl.exists_successor.register
+    @jl.models.exists_successor.register
     def _(model: Line, region):
         return jnp.append(region[1:], region[-1])[:, None]
 
     jax.tree_util.register_pytree_node(Line, lambda _: ((), None), lambda *_: Line())
-    found = jl.attractor(Line(), jnp.arange(4) == 2)
+    found = jl.games.attractor(Line(), jnp.arange(4) == 2)
     assert found.region.tolist() == [True, True, True, False]
-    assert jl.avoidable(Line(), jnp.arange(4) == 2).tolist() == [False, False, False, True]
+    assert jl.games.avoidable(Line(), jnp.arange(4) == 2).tolist() == [False, False, False, True]

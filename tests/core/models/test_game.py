@@ -64,7 +64,7 @@ def test_a_game_shows_its_model():
     rng = np.random.default_rng(1)
     lazy, _ = random_product(rng)
     mdp = as_mdp(reference.random_model(rng, 3, 2, 2), label=np.eye(3, 1), propositions=["a"])
-    for model in (mdp, jl.to_dense(mdp), lazy):
+    for model in (mdp, jl.models.to_dense(mdp), lazy):
         game = as_game(model)
         assert game.system.shape == game.state_shape == model.state_shape
         assert game.system.all()
@@ -85,16 +85,19 @@ def test_primitives_are_those_of_the_model():
     game = make_game(mdp, rng.random(5) < 0.5)
     value, region = jnp.asarray(rng.normal(size=5)), jnp.asarray(rng.random(5) < 0.5)
     policy = jnp.asarray(reference.random_policy(rng, model))
-    np.testing.assert_array_equal(jl.expectation(game, value), jl.expectation(mdp, value))
     np.testing.assert_array_equal(
-        jl.exists_successor(game, region), reference.exists_successor(model, np.asarray(region))
+        jl.models.expectation(game, value), jl.models.expectation(mdp, value)
     )
     np.testing.assert_array_equal(
-        jl.forall_successor(game, region), jl.forall_successor(mdp, region)
+        jl.models.exists_successor(game, region),
+        reference.exists_successor(model, np.asarray(region)),
+    )
+    np.testing.assert_array_equal(
+        jl.models.forall_successor(game, region), jl.models.forall_successor(mdp, region)
     )
     key = jax.random.key(0)
     for state in range(5):
-        one, other = (jl.sample_successor(x, key, state, 0) for x in (game, mdp))
+        one, other = (jl.models.sample_successor(x, key, state, 0) for x in (game, mdp))
         assert one == other
     np.testing.assert_array_equal(
         jl.policy_value(game, policy, jnp.ones((5, 2)), 0.9).value,
@@ -116,7 +119,7 @@ def test_a_game_is_deterministic_if_every_move_has_one_successor():
         assert is_deterministic(as_mdp(game.model))
     fair = jl.from_dense([[[0.5, 0.5]], [[1.0, 0]]])
     assert not is_deterministic(fair)
-    assert not is_deterministic(make_game(jl.to_dense(fair), [True, True]))
+    assert not is_deterministic(make_game(jl.models.to_dense(fair), [True, True]))
 
 
 # --- restriction ------------------------------------------------------------------------------
@@ -139,7 +142,7 @@ def check_restriction(found, model, system, states, allowed):
     """The part on some states, with their owners, moves and probabilities."""
     np.testing.assert_array_equal(found.model.system, system[states])
     np.testing.assert_array_equal(found.model.available, allowed[states])
-    dense = np.asarray(jl.to_dense(found.model.mdp).transition)
+    dense = np.asarray(jl.models.to_dense(found.model.mdp).transition)
     expected = model.transition[np.ix_(states, range(model.num_actions), states)]
     np.testing.assert_array_equal(dense, np.where(allowed[states][:, :, None], expected, 0))
 
@@ -238,7 +241,9 @@ def test_the_product_of_a_game_keeps_its_owners(label_on):
         for q in range(joint.state_shape[1]):
             np.testing.assert_array_equal(joint.system[:, q], play.system)
         value = jnp.asarray(rng.normal(size=joint.state_shape))
-        np.testing.assert_array_equal(jl.expectation(joint, value), jl.expectation(alone, value))
+        np.testing.assert_array_equal(
+            jl.models.expectation(joint, value), jl.models.expectation(alone, value)
+        )
         np.testing.assert_array_equal(joint.initial, alone.initial)
 
 

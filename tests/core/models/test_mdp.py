@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxltl import DenseMDP, from_dense, make_mdp, to_dense
+from jaxltl import DenseMDP, from_dense, make_mdp
+from jaxltl.models import to_dense
 from tests import reference
 from tests.support import as_mdp
 

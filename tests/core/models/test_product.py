@@ -17,7 +17,7 @@ def explicit_transition(lazy):
     """The product's transition matrix, read off the primitive one unit value at a time."""
     size = lazy.num_states
     units = jnp.eye(size).reshape(size, *lazy.state_shape)
-    columns = jax.jit(jax.vmap(lambda v: jl.expectation(lazy, v)))(units)
+    columns = jax.jit(jax.vmap(lambda v: jl.models.expectation(lazy, v)))(units)
     return np.moveaxis(np.asarray(columns).reshape(size, size, -1), 0, -1)
 
 
@@ -51,8 +51,8 @@ def test_the_two_readings_by_hand():
     value = jnp.array([[0.0, 1.0]] * 3)
     entry, leave = jl.product(world, wait), jl.product(world, wait, label_on="exit")
     # On entry g counts on the way from 0 to 1; on exit, on the way from 1 to 2.
-    assert jl.expectation(entry, value)[:, 0, 0].tolist() == [1, 0, 0]
-    assert jl.expectation(leave, value)[:, 0, 0].tolist() == [0, 1, 0]
+    assert jl.models.expectation(entry, value)[:, 0, 0].tolist() == [1, 0, 0]
+    assert jl.models.expectation(leave, value)[:, 0, 0].tolist() == [0, 1, 0]
     assert entry.initial_memory.tolist() == [0, 1, 0]
     assert leave.initial_memory.tolist() == [0, 0, 0]
 
@@ -68,7 +68,7 @@ def test_restriction_is_the_reachable_part(label_on):
         number = np.asarray(found.base_state) * lazy.num_memory + np.asarray(found.memory)
         np.testing.assert_array_equal(number, np.flatnonzero(reachable))
         np.testing.assert_array_equal(
-            jl.to_dense(found.model).transition,
+            jl.models.to_dense(found.model).transition,
             explicit.transition[reachable][:, :, reachable],
         )
         np.testing.assert_array_equal(found.model.initial, explicit.initial[reachable])
@@ -90,7 +90,7 @@ def test_restriction_to_another_start():
 def test_restriction_needs_successor_lists():
     lazy, _ = random_product(np.random.default_rng(3))
     with pytest.raises(ValueError, match="restrict needs successor lists"):
-        jl.restrict(lazy.replace(mdp=jl.to_dense(lazy.mdp)))
+        jl.restrict(lazy.replace(mdp=jl.models.to_dense(lazy.mdp)))
 
 
 # --- trajectories and policies that cross ------------------------------------------------------
@@ -103,7 +103,7 @@ def test_lifted_trajectories_are_runs_of_the_automaton(label_on):
     policy = jnp.asarray(reference.random_policy(rng, reference_world(lazy)))
     runs = jl.rollout(lazy.mdp, policy, jax.random.key(0), num_trajectories=20, num_steps=9)
     runs = runs.replace(length=jnp.arange(20) % 10)
-    lifted = jl.lift_trajectories(lazy, runs)
+    lifted = jl.models.lift_trajectories(lazy, runs)
     delta, letter = np.asarray(lazy.automaton.delta), np.asarray(lazy.letter)
     for n in range(20):
         q = int(lazy.automaton.initial)
@@ -176,7 +176,9 @@ def test_a_projected_policy_by_sampling():
 
         def step(carry, key):
             state, memory = carry
-            successor = jl.sample_successor(lazy.mdp, key, state, runner.action[state, memory])
+            successor = jl.models.sample_successor(
+                lazy.mdp, key, state, runner.action[state, memory]
+            )
             return (successor, runner.update(memory, state, successor)), None
 
         (_, memory), _ = jax.lax.scan(step, (state, memory), jax.random.split(key, 200))
@@ -216,7 +218,7 @@ def labelled_world():
 
 def test_formulas_texts_and_automata_are_the_same_task():
     world, text = labelled_world(), "!danger U goal"
-    automaton = jl.to_automaton(text, letters=jl.letters_of(world))
+    automaton = jl.to_automaton(text, letters=jl.models.letters_of(world))
     for task in (text, jl.parse_ltl(text), automaton):
         lazy = jl.product(world, task)
         np.testing.assert_array_equal(lazy.automaton.delta, automaton.delta)
@@ -226,8 +228,12 @@ def test_formulas_texts_and_automata_are_the_same_task():
 
 def test_letters_of_a_world():
     world = labelled_world()
-    assert set(jl.letters_of(world)) == {frozenset(), frozenset({"goal"}), frozenset({"danger"})}
-    assert set(jl.letters_of(world, ["goal"])) == {frozenset(), frozenset({"goal"})}
+    assert set(jl.models.letters_of(world)) == {
+        frozenset(),
+        frozenset({"goal"}),
+        frozenset({"danger"}),
+    }
+    assert set(jl.models.letters_of(world, ["goal"])) == {frozenset(), frozenset({"goal"})}
 
 
 def test_unknown_propositions_name_themselves_and_the_closest():
@@ -254,7 +260,7 @@ def test_products_are_batched_like_any_tree():
     pairs = [random_product(rng) for _ in range(5)]
     batch = stack([lazy for lazy, _ in pairs])
     value = jnp.asarray(rng.normal(size=(5, 3, 3)))
-    found = jax.jit(jax.vmap(jl.expectation))(batch, value)
+    found = jax.jit(jax.vmap(jl.models.expectation))(batch, value)
     for i, (_, explicit) in enumerate(pairs):
         expected = reference.expectation(explicit, np.asarray(value[i]).ravel())
         np.testing.assert_allclose(found[i].reshape(expected.shape), expected, atol=1e-14)

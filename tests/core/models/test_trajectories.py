@@ -36,7 +36,7 @@ def corridor():
     ],
 )
 def test_impossible_demonstrations_are_refused_at_their_step(sequences, message, dense):
-    world = jl.to_dense(corridor()) if dense else corridor()
+    world = jl.models.to_dense(corridor()) if dense else corridor()
     with pytest.raises(ValueError, match=message):
         jl.make_trajectories(world, sequences)
 

@@ -133,9 +133,9 @@ def test_a_model_of_ones_own_is_solved_by_its_primitives():
     def sides(x):
         return jnp.append(x[:1], x[:-1]).at[4].set(x[4]), jnp.append(x[1:], x[-1]).at[0].set(x[0])
 
-    jl.expectation.register(Walk, lambda _, x: (sum(sides(x)) / 2)[:, None])
-    jl.exists_successor.register(Walk, lambda _, x: jnp.logical_or(*sides(x))[:, None])
-    jl.forall_successor.register(Walk, lambda _, x: jnp.logical_and(*sides(x))[:, None])
+    jl.models.expectation.register(Walk, lambda _, x: (sum(sides(x)) / 2)[:, None])
+    jl.models.exists_successor.register(Walk, lambda _, x: jnp.logical_or(*sides(x))[:, None])
+    jl.models.forall_successor.register(Walk, lambda _, x: jnp.logical_and(*sides(x))[:, None])
     probability = np.full((5, 1, 2), 0.5)
     successor = np.array([[0, 0], [0, 2], [1, 3], [2, 4], [4, 4]])[:, None]
     induced_chain.register(Walk, lambda *_: make_mdp(successor, probability))

@@ -87,7 +87,7 @@ DISCOUNTED = {
         for method in ("newton", "value_iteration")
     },
     "boltzmann_value": Solver(
-        lambda m, x, **o: jl.boltzmann_value(m, x["reward"], x["discount"], **o),
+        lambda m, x, **o: jl.values.boltzmann_value(m, x["reward"], x["discount"], **o),
         ("reward", "discount"),
         stochastic=True,
     ),
@@ -102,7 +102,7 @@ DISCOUNTED = {
         for method in ("policy_iteration", "value_iteration", "strategy_iteration")
     },
     "strategy_value": Solver(
-        lambda m, x, **o: jl.strategy_value(
+        lambda m, x, **o: jl.values.strategy_value(
             game_of(m), x["policy"], x["reward"], x["discount"], **o
         ),
         ("reward", "discount", "policy"),

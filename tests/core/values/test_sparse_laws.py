@@ -68,10 +68,11 @@ SOLVERS = {
         for method in ("newton", "value_iteration")
     },
     "boltzmann_value": Solver(
-        lambda m, x: jl.boltzmann_value(m, x["reward"], x["discount"]), ("reward", "discount")
+        lambda m, x: jl.values.boltzmann_value(m, x["reward"], x["discount"]),
+        ("reward", "discount"),
     ),
     "boltzmann_value-newton": Solver(
-        lambda m, x: jl.boltzmann_value(m, x["reward"], x["discount"] / 3, method="newton"),
+        lambda m, x: jl.values.boltzmann_value(m, x["reward"], x["discount"] / 3, method="newton"),
         ("reward", "discount"),
     ),
     "occupancy_measure": Solver(
@@ -88,11 +89,11 @@ SOLVERS = {
         for method in ("policy_iteration", "value_iteration", "strategy_iteration")
     },
     "strategy_value": Solver(
-        lambda m, x: jl.strategy_value(game(m), x["policy"], x["reward"], x["discount"]),
+        lambda m, x: jl.values.strategy_value(game(m), x["policy"], x["reward"], x["discount"]),
         ("reward", "discount", "policy"),
     ),
     "strategy_value-environment": Solver(
-        lambda m, x: jl.strategy_value(
+        lambda m, x: jl.values.strategy_value(
             game(m), x["policy"], x["reward"], x["discount"], environment=x["policy"]
         ),
         ("reward", "discount", "policy"),
@@ -130,7 +131,7 @@ def example(seed: int = 0) -> Example:
     successor = np.concatenate([rng.choice(COUNT, w, replace=False) for w in count])
     probability = rng.random(start[-1]) + 0.05
     probability /= np.repeat(np.add.reduceat(probability, start[:-1]), count)
-    reward = jl.Rewards(*(rng.normal(size=n) for n in (COUNT, row_start[-1], start[-1])))
+    reward = jl.models.Rewards(*(rng.normal(size=n) for n in (COUNT, row_start[-1], start[-1])))
     model = jl.make_sparse(
         row_start,
         start,
@@ -331,7 +332,7 @@ def test_rows_and_weights_are_one_policy():
 
 def test_rewards_are_named_inside_jit():
     model = example().model
-    row = jl.row_reward(model, "gain")
+    row = jl.models.row_reward(model, "gain")
     solve = jax.jit(lambda m, r: jl.optimal_value(m, r, 0.9))
 
     @jax.jit
@@ -413,7 +414,7 @@ def test_products_are_solved_without_padding(label_on):
     assert_solutions_agree(soft, jl.soft_value(flat, reward, 0.9), 1e-10)
     np.testing.assert_allclose(against.value, jl.optimal_value(lazy, reward, 0.9).value, atol=1e-6)
     np.testing.assert_allclose(
-        visits.value @ jl.row_reward(flat, "gain"),
+        visits.value @ jl.models.row_reward(flat, "gain"),
         np.sum(flat.initial * host.value.ravel()),
         atol=1e-6,
     )

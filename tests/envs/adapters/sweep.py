@@ -38,7 +38,11 @@ def of_gymnax():
                 seen, after, reward, terminated, _ = own.step_env(key, state, action, params)
                 return after, seen, reward, terminated | own.is_truncated(after, params)
 
-            return (jl.from_gymnax(own, params), lambda key: own.reset_env(key, params)[::-1], step)
+            return (
+                jl.envs.from_gymnax(own, params),
+                lambda key: own.reset_env(key, params)[::-1],
+                step,
+            )
 
         yield name, make
 
@@ -59,7 +63,7 @@ def of_navix():
                 after = own.step(state, action)
                 return after, after.observation, after.reward, after.is_done()
 
-            return jl.from_navix(own), reset, step
+            return jl.envs.from_navix(own), reset, step
 
         yield name, make
 
@@ -80,7 +84,7 @@ def of_xminigrid():
                 after = own.step(params, state, action)
                 return after, after.observation, after.reward, after.last()
 
-            return jl.from_xminigrid(own, params), reset, step
+            return jl.envs.from_xminigrid(own, params), reset, step
 
         yield name, make
 
@@ -112,14 +116,14 @@ def of_jumanji():
                 inner = inner._env
             if "time_limit" in vars(inner):
                 inner.time_limit = LIMIT
-            env = jl.from_jumanji(own)
+            env = jl.envs.from_jumanji(own)
 
             def reset(key):
                 state, start = own.reset(key)
                 return state, start.observation
 
             def step(state, action, key):
-                if isinstance(env.actions, jl.Finite) and own.action_spec.shape:
+                if isinstance(env.actions, jl.environments.Finite) and own.action_spec.shape:
                     spec = own.action_spec
                     if hasattr(spec, "num_values"):
                         parts = np.ravel(spec.num_values).tolist()
@@ -151,7 +155,7 @@ def of_brax():
                 after = own.step(state.replace(info={**state.info}), action)
                 return after, after.obs, after.reward, after.done > 0
 
-            return jl.from_brax(own), reset, step
+            return jl.envs.from_brax(own), reset, step
 
         yield name, make
 
@@ -174,7 +178,11 @@ def of_craftax():
                 seen, after, reward, done, _ = own.step_env(key, state, action, params)
                 return after, seen, reward, done
 
-            return jl.from_craftax(own, params), lambda key: own.reset_env(key, params)[::-1], step
+            return (
+                jl.envs.from_craftax(own, params),
+                lambda key: own.reset_env(key, params)[::-1],
+                step,
+            )
 
         yield name, make
 
@@ -224,7 +232,7 @@ def of_pgx():
                     state.terminated | state.truncated,
                 )
 
-            return jl.from_pgx(own, others), reset, step
+            return jl.envs.from_pgx(own, others), reset, step
 
         yield name, make
 

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxltl import from_brax
 from jaxltl.core.environments.episodes import agent_of, run_episode
 from jaxltl.core.environments.time_limit import with_time_limit
+from jaxltl.envs import from_brax
 from tests.envs.adapters.harness import (  # noqa: F401
     both_ends,
     load,

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxltl import from_craftax
 from jaxltl.core.environments.environment import Finite
+from jaxltl.envs import from_craftax
 from tests.envs.adapters.harness import load, single_precision, walk  # noqa: F401
 
 

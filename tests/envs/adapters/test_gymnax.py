@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxltl import from_gymnax
 from jaxltl.core.environments.environment import Box, Finite
 from jaxltl.core.environments.episodes import agent_of, run_episode
+from jaxltl.envs import from_gymnax
 from tests.envs.adapters.harness import (  # noqa: F401
     both_ends,
     load,

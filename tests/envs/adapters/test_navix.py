@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxltl import from_navix
 from jaxltl.core.environments.environment import Finite
+from jaxltl.envs import from_navix
 from tests.envs.adapters.harness import (  # noqa: F401
     both_ends,
     load,

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxltl import from_pgx
 from jaxltl.core.environments.environment import Finite, random_action
+from jaxltl.envs import from_pgx
 from tests.envs.adapters.harness import load, same_as_own, single_precision, walk  # noqa: F401
 
 

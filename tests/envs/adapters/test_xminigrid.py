@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 import pytest
 
-from jaxltl import from_xminigrid
 from jaxltl.core.environments.environment import Finite
+from jaxltl.envs import from_xminigrid
 from tests.envs.adapters.harness import (  # noqa: F401
     both_ends,
     load,

@@ -79,7 +79,8 @@ def episode_evaluator(
     goes alone; searches such as ``cce`` need none.
 
     Example:
-      >>> from jaxltl import Timestep, agent_of, make_box, make_environment
+      >>> from jaxltl import make_environment
+      >>> from jaxltl.environments import Timestep, agent_of, make_box
       >>> def step(place, action, key):
       ...     return Timestep(place + action, -jnp.sum(place**2), False, cost=jnp.sum(action**2))
       >>> cart = make_environment(

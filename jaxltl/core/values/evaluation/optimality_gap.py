@@ -53,7 +53,8 @@ class OptimalityGap(NamedTuple):
         :class:`~jaxltl.core.environments.tabulate.Table`.
 
     Example:
-      >>> from jaxltl import Timestep, make_environment, tabulate
+      >>> from jaxltl import make_environment, tabulate
+      >>> from jaxltl.environments import Timestep
       >>> corridor = make_environment(
       ...     lambda key: jnp.int32(2),
       ...     lambda at, action, key: Timestep(jnp.clip(at + 2 * action - 1, 0, 4), 0.0, False),
@@ -101,7 +102,8 @@ def tabulate_policy(
     Not differentiable: the answer is a NumPy array.
 
     Example:
-      >>> from jaxltl import Timestep, make_environment, tabulate
+      >>> from jaxltl import make_environment, tabulate
+      >>> from jaxltl.environments import Timestep
       >>> corridor = make_environment(
       ...     lambda key: jnp.int32(2),
       ...     lambda at, action, key: Timestep(jnp.clip(at + 2 * action - 1, 0, 4), 0.0, False),
@@ -174,7 +176,8 @@ def optimality_gap(
     Concrete arrays only, on the host; not differentiable.
 
     Example:
-      >>> from jaxltl import Timestep, make_environment, tabulate
+      >>> from jaxltl import make_environment, tabulate
+      >>> from jaxltl.environments import Timestep
       >>> corridor = make_environment(
       ...     lambda key: jnp.int32(2),
       ...     lambda at, action, key: Timestep(jnp.clip(at + 2 * action - 1, 0, 4), 0.0, False),

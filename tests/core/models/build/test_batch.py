@@ -235,7 +235,7 @@ def test_pairs_are_those_of_lifted_trajectories(label_on):
     runs = jl.rollout(
         small_world(), jnp.full((6, 4), 0.25), jax.random.key(0), num_trajectories=20, num_steps=15
     )
-    lifted = jl.lift_trajectories(model, runs)
+    lifted = jl.models.lift_trajectories(model, runs)
     expected = np.zeros((15, model.num_states, 4))
     np.add.at(expected, (np.arange(15), np.asarray(lifted.state), np.asarray(lifted.action)), 1)
     found = demonstrated_counts(as_stacked(model), runs, horizon=15)

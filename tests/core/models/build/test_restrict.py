@@ -31,17 +31,17 @@ def questions(model, region, value, reward, policy, *, compiled=True):
     Those that are compiled in any case need not be asked twice.
     """
     attractor = jl.core.graphs.attractor
-    components = jl.end_components(model, jnp.ones(model.state_shape, bool))
+    components = jl.games.end_components(model, jnp.ones(model.state_shape, bool))
     solved = (
         {
-            "expectation": jl.expectation(model, value),
-            "exists": jl.exists_successor(model, region),
-            "forall": jl.forall_successor(model, region),
+            "expectation": jl.models.expectation(model, value),
+            "exists": jl.models.exists_successor(model, region),
+            "forall": jl.models.forall_successor(model, region),
             "least": least_successor(model, jnp.arange(region.size).reshape(region.shape)),
-            "pushforward": jl.pushforward(model, jnp.where(model.available, reward, 0)),
+            "pushforward": jl.models.pushforward(model, jnp.where(model.available, reward, 0)),
             "optimal": jl.optimal_value(model, reward, 0.9).value,
             "soft": jl.soft_value(model, reward, 0.9).policy,
-            "boltzmann": jl.boltzmann_value(model, reward, 0.5).policy,
+            "boltzmann": jl.values.boltzmann_value(model, reward, 0.5).policy,
             "policy": jl.policy_value(model, policy, reward, 0.9).value,
             "occupancy": jl.occupancy_measure(model, policy, 0.9).value,
         }

@@ -57,7 +57,9 @@ def alone(number, **options):
 
 def assert_same(found, expected):
     for x, y in zip(
-        jax.tree.leaves(jl.on_host(found)), jax.tree.leaves(jl.on_host(expected)), strict=True
+        jax.tree.leaves(jl.models.on_host(found)),
+        jax.tree.leaves(jl.models.on_host(expected)),
+        strict=True,
     ):
         x, y = (
             jax.random.key_data(z) if jnp.issubdtype(z.dtype, jax.dtypes.prng_key) else z

@@ -25,7 +25,13 @@ def whole(function):
 
 
 expectation, pushforward, exists_successor, forall_successor = map(
-    whole, (jl.expectation, jl.pushforward, jl.exists_successor, jl.forall_successor)
+    whole,
+    (
+        jl.models.expectation,
+        jl.models.pushforward,
+        jl.models.exists_successor,
+        jl.models.forall_successor,
+    ),
 )
 least_successor, transition_matrix, induced_chain, action_argmax, action_max = map(
     whole,
@@ -140,7 +146,7 @@ def test_samples_have_the_rows_frequencies(kind):
     s, a = np.argwhere((transition > 0).sum(-1) > 1)[0]
     keys = jax.random.split(jax.random.key(0), 20_000)
     draw = jax.jit(
-        jax.vmap(lambda key: jl.sample_successor(model, key, jnp.int32(s), jnp.int32(a)))
+        jax.vmap(lambda key: jl.models.sample_successor(model, key, jnp.int32(s), jnp.int32(a)))
     )
     frequency = np.bincount(draw(keys), minlength=explicit.num_states) / len(keys)
     # Five standard deviations of a frequency.
@@ -160,7 +166,7 @@ def test_expectation_and_pushforward_are_differentiable(kind):
     def both(x):
         changed = world.replace(**{field: x["probability"]})
         changed = model.replace(mdp=changed) if kind == "product" else changed
-        return jl.expectation(changed, x["value"]), jl.pushforward(changed, x["mass"])
+        return jl.models.expectation(changed, x["value"]), jl.models.pushforward(changed, x["mass"])
 
     assert_gradients(
         both,
@@ -204,11 +210,11 @@ def test_errors_name_the_argument():
         operators.policy_distribution(model, jnp.zeros(3, int))
     with pytest.raises(ValueError, match=r"policy has shape \(4,\); a stochastic .* \(4, 3\)"):
         operators.policy_distribution(model, jnp.zeros(4))
-    for function in (jl.expectation, jl.exists_successor, jl.forall_successor):
+    for function in (jl.models.expectation, jl.models.exists_successor, jl.models.forall_successor):
         with pytest.raises(TypeError, match="dict is not a model"):
             function({}, jnp.zeros(3))
     with pytest.raises(TypeError, match="dict is not a model"):
-        jl.sample_successor({}, jax.random.key(0), 0, 0)
+        jl.models.sample_successor({}, jax.random.key(0), 0, 0)
     with pytest.raises(TypeError, match="dict is not a model"):
         operators.induced_chain({}, jnp.zeros(3, int))
 
@@ -252,7 +258,7 @@ def test_expectation_of_rows_is_differentiable():
     model = random_sparse(rng, 5, most=3, width=4)
     point = {"probability": model.probability, "value": rng.normal(size=5)}
     assert_gradients(
-        lambda x: jl.expectation(model.replace(probability=x["probability"]), x["value"]),
+        lambda x: jl.models.expectation(model.replace(probability=x["probability"]), x["value"]),
         point,
         {name: rng.normal(size=x.shape) for name, x in point.items()},
     )
@@ -267,7 +273,7 @@ def test_draws_from_a_row_follow_its_probabilities():
     none[entries.stop - 1] = 0  # of a row that then sums to less than one
     count = 20_000
     keys = jax.random.split(jax.random.key(0), count)
-    draw = jax.jit(jax.vmap(jl.sample_successor, (None, 0, None, None)))
+    draw = jax.jit(jax.vmap(jl.models.sample_successor, (None, 0, None, None)))
     drawn = np.asarray(draw(model, keys, 0, row))
     found = np.bincount(drawn, minlength=6)[model.successor[entries]] / count
     assert found.sum() == 1

@@ -161,7 +161,7 @@ def test_boltzmann_values_are_enclosed_where_the_operator_contracts(cases, batch
     discounts = np.array([min(d, 0.6875) for *_, d in cases])
     assert discounts.max() * boltzmann_expansion(SHAPE[1]) < 1
     exact = smooth_reference(cases, discounts, "boltzmann", 600)
-    solution = jax.jit(jax.vmap(jl.boltzmann_value))(mdps, rewards, jnp.asarray(discounts))
+    solution = jax.jit(jax.vmap(jl.values.boltzmann_value))(mdps, rewards, jnp.asarray(discounts))
     assert_certified(solution, exact)
 
 
@@ -196,7 +196,7 @@ def test_bad_arguments_are_named():
     mdp = as_mdp(reference.random_model(np.random.default_rng(3), *SHAPE))
     reward, policy = jnp.zeros(SHAPE[:2]), jnp.zeros(5, int)
     shape = r"reward has shape \(5,\); expected \(5, 3\) or \(5, 3, 2\)"
-    for solve in (jl.optimal_value, jl.soft_value, jl.boltzmann_value):
+    for solve in (jl.optimal_value, jl.soft_value, jl.values.boltzmann_value):
         with pytest.raises(ValueError, match=shape):
             solve(mdp, jnp.zeros(5), 0.9)
     with pytest.raises(ValueError, match=shape):
@@ -208,9 +208,9 @@ def test_bad_arguments_are_named():
     with pytest.raises(ValueError, match="method='fast'; choose newton or value_iteration"):
         jl.soft_value(mdp, reward, 0.9, method="fast")
     with pytest.raises(ValueError, match="method='fast'; choose damped or newton"):
-        jl.boltzmann_value(mdp, reward, 0.9, method="fast")
+        jl.values.boltzmann_value(mdp, reward, 0.9, method="fast")
     with pytest.raises(ValueError, match="adjoint='none'; choose exact or approximate"):
-        jl.boltzmann_value(mdp, reward, 0.9, adjoint="none")
+        jl.values.boltzmann_value(mdp, reward, 0.9, adjoint="none")
 
 
 # --- the Boltzmann operator --------------------------------------------------------------------
@@ -231,7 +231,7 @@ def backup(model, reward, discount, value):
 
 
 def test_three_fixed_points_are_found():
-    found = jl.boltzmann_fixed_points(LOOP_OR_END, LOOP_REWARD, 0.99, jax.random.key(0))
+    found = jl.values.boltzmann_fixed_points(LOOP_OR_END, LOOP_REWARD, 0.99, jax.random.key(0))
     np.testing.assert_allclose([f.value[0] for f in found], [0.3345, 2.4703, 20.0], atol=1e-3)
     for solution in found:
         jl.check(solution, certified=False)
@@ -242,8 +242,8 @@ def test_three_fixed_points_are_found():
 
 
 def test_the_answer_depends_on_the_start_where_there_are_several():
-    low = jl.boltzmann_value(LOOP_OR_END, LOOP_REWARD, 0.99)
-    high = jl.boltzmann_value(LOOP_OR_END, LOOP_REWARD, 0.99, initial=jnp.array([15.0, 0.0]))
+    low = jl.values.boltzmann_value(LOOP_OR_END, LOOP_REWARD, 0.99)
+    high = jl.values.boltzmann_value(LOOP_OR_END, LOOP_REWARD, 0.99, initial=jnp.array([15.0, 0.0]))
     np.testing.assert_allclose([low.value[0], high.value[0]], [0.3345, 20.0], atol=1e-3)
 
 
@@ -261,7 +261,7 @@ def test_a_fixed_point_that_plain_iteration_misses():
     pair = sorted([value.tolist(), other.tolist()])
     np.testing.assert_allclose(pair, [[-3.273, -2.809], [-1.817, -4.320]], atol=1e-3)
 
-    solution = jl.boltzmann_value(CYCLE, jnp.asarray(CYCLE_REWARD), 0.9)
+    solution = jl.values.boltzmann_value(CYCLE, jnp.asarray(CYCLE_REWARD), 0.9)
     with pytest.raises(jl.NotConverged, match=r"UNCERTIFIED.*certified=False"):
         jl.check(solution)
     jl.check(solution, certified=False)
@@ -283,7 +283,9 @@ def test_random_models_beyond_contraction():
         jnp.full((150, 6), 1 / 6),
         jnp.zeros((150, 6, 0), bool),
     )
-    solution = jax.jit(jax.vmap(jl.boltzmann_value, (0, 0, None)))(dense, jnp.asarray(reward), 0.95)
+    solution = jax.jit(jax.vmap(jl.values.boltzmann_value, (0, 0, None)))(
+        dense, jnp.asarray(reward), 0.95
+    )
     value = np.asarray(solution.value)
     q = reward + 0.95 * np.einsum("nsat,nt->nsa", transition, value)
     residual = np.abs(reference.soft_maximum(q, available, "boltzmann") - value).max(axis=1)
@@ -347,7 +349,7 @@ def test_sensitivities_equal_the_explicit_equations(adjoint):
     cotangent = rng.normal(size=6)
 
     def answer(reward, probability):
-        solution = jl.boltzmann_value(
+        solution = jl.values.boltzmann_value(
             mdp.replace(probability=probability), reward, discount, adjoint=adjoint
         )
         return solution.value, solution.policy

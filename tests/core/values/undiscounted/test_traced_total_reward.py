@@ -339,7 +339,11 @@ def test_products_over_a_mesh():
 def test_rewards_by_name_and_of_states():
     """On a mesh of one device: a sparse model's names, and what a state earns."""
     sparse = jl.make_sparse(
-        None, [0, 2, 3], [0, 1, 1], [0.5, 0.5, 1.0], rewards={"steps": jl.Rewards(state=[1, 1])}
+        None,
+        [0, 2, 3],
+        [0, 1, 1],
+        [0.5, 0.5, 1.0],
+        rewards={"steps": jl.models.Rewards(state=[1, 1])},
     )
     world = shard(sparse, mesh_of(1))
     target = to_mesh(world, np.array([False, True]))

@@ -1,0 +1,27 @@
+from .automata import automaton as automaton
+from .curves import (
+    bands as bands,
+    curves as curves,
+    guarantees as guarantees,
+    lines as lines,
+    paths as paths,
+    sweep as sweep,
+)
+from .described import described as described
+from .episodes import (
+    draw_episode as draw_episode,
+    draw_episodes as draw_episodes,
+    play_episode as play_episode,
+)
+from .games import (
+    compare as compare,
+    game_moves as game_moves,
+    game_region as game_region,
+    game_values as game_values,
+)
+from .live import live_automaton as live_automaton, live_curve as live_curve, live_map as live_map
+from .maps import grid as grid, strategies as strategies
+from .models import model as model, solution as solution
+from .playback import playback as playback
+from .style import to_bytes as to_bytes
+from .worlds import temporal_gridworld as temporal_gridworld
