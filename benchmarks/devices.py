@@ -24,7 +24,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 import jaxltl as jl
 from benchmarks.lanes import delivery, mlirl_case
 from jaxltl.algos import cce, maximin_q, ppo
-from jaxltl.algos import exponential_family as families
+from jaxltl.algos.cce import exponential_family as families
 from jaxltl.envs import lqr
 from jaxltl.envs.networks import make_network
 from jaxltl.envs.robots import diagonal_reward, robots

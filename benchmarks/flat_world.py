@@ -19,7 +19,7 @@ import jax
 import numpy as np
 
 from jaxltl.algos import many_tasks, ppo
-from jaxltl.algos.schedules import Linear
+from jaxltl.algos.common.schedules import Linear
 from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.environments.environment import Environment, Finite
 from jaxltl.core.environments.sequence_task import (

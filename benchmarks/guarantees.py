@@ -20,7 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
 
-from jaxltl.algos import interval_learning, pac, rmax
+from jaxltl.algos import interval_learning, rmax
+from jaxltl.algos.common import pac
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import make_mdp
 from jaxltl.core.values.discounted.minimax import minimax_value

@@ -28,8 +28,8 @@ import optax
 from jax import lax
 
 from jaxltl.algos import ppo
-from jaxltl.algos.actor_critic import orthogonal
-from jaxltl.algos.schedules import Linear
+from jaxltl.algos.common.actor_critic import orthogonal
+from jaxltl.algos.common.schedules import Linear
 from jaxltl.envs.adapters.gymnax import from_gymnax
 
 

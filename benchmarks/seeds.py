@@ -14,7 +14,7 @@ import jax.numpy as jnp
 
 from benchmarks.timing import compare
 from jaxltl.algos import cce
-from jaxltl.algos import exponential_family as families
+from jaxltl.algos.cce import exponential_family as families
 from jaxltl.envs import lqr
 from jaxltl.envs.networks import make_network
 

@@ -25,7 +25,7 @@ from jax.tree_util import Partial
 
 import jaxltl as jl
 from jaxltl.algos import ppo
-from jaxltl.algos.schedules import Linear
+from jaxltl.algos.common.schedules import Linear
 from jaxltl.core.environments.environment import Timestep
 from jaxltl.core.environments.time_limit import with_time_limit
 from jaxltl.envs.robots import robots

@@ -315,7 +315,7 @@ def synthesize(
     """
     begin = time.perf_counter()
     _begin(f"solving {game_file}")
-    from jaxltl.algos.checkpoint import atomic_write
+    from jaxltl.algos.common.checkpoint import atomic_write
     from jaxltl.app import synthesize as synthesis
     from jaxltl.app.files.game import read_game
     from jaxltl.app.reports import synthesize as report
@@ -364,7 +364,7 @@ def _stages(names: tuple[str, ...]) -> Iterator[Callable[[str], None]]:
 
 
 def _write_synthesis(found: Any, out: Path, place: int | None, begin: float) -> dict[str, Any]:
-    from jaxltl.algos.checkpoint import atomic_write
+    from jaxltl.algos.common.checkpoint import atomic_write
     from jaxltl.app.reports import synthesize as report
     from jaxltl.app.reports.synthesize_page import page
 
@@ -536,7 +536,7 @@ def solve(
     questions = solving.asked_for(properties)
     if all(one.parsed is None for one in questions):
         raise ValueError("\n".join(str(one.error) for one in questions))
-    from jaxltl.algos.checkpoint import atomic_write
+    from jaxltl.algos.common.checkpoint import atomic_write
 
     # A place that cannot be written to must be known before the work, not after.
     written = contextlib.nullcontext() if strategy is None else atomic_write(strategy)
@@ -671,7 +671,7 @@ def reproduce(what: str, out: Path | None, seeds: int | None, as_json: bool) -> 
 
 
 def _write_pictures(pictures: list[tuple[str, bytes]], out: Path) -> None:
-    from jaxltl.algos.checkpoint import atomic_write
+    from jaxltl.algos.common.checkpoint import atomic_write
 
     out.mkdir(parents=True, exist_ok=True)
     for name, picture in pictures:

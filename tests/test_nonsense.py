@@ -22,7 +22,7 @@ from jaxltl.algos import (
     regions,
     trust_region,
 )
-from jaxltl.algos.exponential_family import diagonal_gaussian
+from jaxltl.algos.cce.exponential_family import diagonal_gaussian
 from jaxltl.core.automata.sequences import reach_avoid_sequences
 from jaxltl.core.environments import environment as en
 from jaxltl.core.environments import episodes as ep

@@ -72,8 +72,8 @@ def test_namespaces_come_when_they_are_asked_for():
     program = """
 import sys, jaxltl
 dir(jaxltl.algos), dir(jaxltl.io), dir(jaxltl.envs)
-assert "jax" not in sys.modules and "jaxltl.algos.schedules" not in sys.modules
-jaxltl.algos.schedules.Linear, jaxltl.io.read_hoa
+assert "jax" not in sys.modules and "jaxltl.algos.common.schedules" not in sys.modules
+jaxltl.algos.common.schedules.Linear, jaxltl.io.read_hoa
 assert "optax" not in sys.modules and "jaxltl.io.storm" not in sys.modules
 """
     done = subprocess.run(

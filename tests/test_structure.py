@@ -48,23 +48,6 @@ STOREYS = (
     "reproduce",
     "cli",
 )
-# What a private helper helps is one learner; these serve several.
-SHARED_BY_LEARNERS = (
-    "action_distributions",
-    "actor_critic",
-    "advantages",
-    "checkpoint",
-    "chunks",
-    "early_stopping",
-    "exponential_family",
-    "learner",
-    "moments",
-    "pac",
-    "play",
-    "schedules",
-    "settings",
-    "splitmix",
-)
 NO_JAX = (
     "core.array_types",
     "core.pretty_print",
@@ -153,25 +136,28 @@ def test_logic_automata_statistics_and_sparse_never_import_jax(name):
 
 
 @pytest.mark.parametrize("name", [n for n in MODULES if n.startswith("jaxltl.algos.")])
-def test_learners_never_import_one_another(name):
+def test_learners_import_themselves_and_common_modules_alone(name):
+    learner = name.split(".")[2]  # "common" is a folder of its own, which imports no learner
     others = [
         found
         for found in imports_any(name, ("jaxltl.algos",))
-        if found != "jaxltl.algos"
-        and found.split(".")[2] not in SHARED_BY_LEARNERS
-        and not found.split(".")[2].startswith("_")
+        if found != "jaxltl.algos" and found.split(".")[2] not in (learner, "common")
     ]
     assert not others
     assert not imports_any(name, ("jaxltl.cli", "jaxltl.plot", "jaxltl.reproduce", "matplotlib"))
 
 
-@pytest.mark.parametrize("name", [n for n in MODULES if n.startswith("jaxltl.algos._")])
-def test_a_private_helper_has_one_learner(name):
-    def learners(helper: str) -> set[str]:
-        users = {n for n in MODULES if helper in below(n)}
-        return {m for n in users for m in (learners(n) if "._" in n else {n})}
-
-    assert len(learners(name)) == 1, f"{sorted(learners(name))} import {name}"
+@pytest.mark.parametrize("name", MODULES)
+def test_private_modules_of_learners_stay_in_their_folder(name):
+    folder = name.rpartition(".")[0]
+    foreign = [
+        other
+        for other in below(name)
+        if other.startswith("jaxltl.algos.")
+        and other.rpartition(".")[2].startswith("_")
+        and other.rpartition(".")[0] != folder
+    ]
+    assert not foreign
 
 
 @pytest.mark.parametrize("name", [n for n in MODULES if n.startswith("jaxltl.envs.")])
@@ -184,9 +170,7 @@ def test_worlds_import_the_core_alone(name):
     assert not outside
 
 
-LEARNER_MODULES = [
-    n for n in MODULES if n.startswith("jaxltl.algos.") and not n.startswith("jaxltl.algos._")
-]
+LEARNER_MODULES = [n for n in MODULES if n.startswith("jaxltl.algos.") and "._" not in n]
 
 
 def public_callables(module):

@@ -8,7 +8,8 @@ Example: a policy of what is seen, here of which state it is, and of the task's 
 
   >>> import jax, jax.numpy as jnp
   >>> import jaxltl as jl
-  >>> from jaxltl.algos import behavioral_cloning as cloning, learner
+  >>> from jaxltl.algos import behavioral_cloning as cloning
+  >>> from jaxltl.algos.common import learner
   >>> world = jl.make_mdp(  # a start, from where one gets to a goal or into a trap
   ...     [[[1, 2], [0, 1]], [[1, 0], [0, 0]], [[2, 0], [0, 0]]],
   ...     [[[0.8, 0.2], [0.5, 0.5]], [[1, 0], [0, 0]], [[1, 0], [0, 0]]],
@@ -58,8 +59,8 @@ import optax
 from flax import linen as nn
 from flax import struct
 
-from jaxltl.algos import learner
-from jaxltl.algos.early_stopping import Best, stop_early
+from jaxltl.algos.common import learner
+from jaxltl.algos.common.early_stopping import Best, stop_early
 from jaxltl.core.models.build.batch import stack_models, stack_observations, training_counts
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.trajectories import Trajectories
@@ -188,7 +189,7 @@ class State:
       key, step: the root key and the number of steps made, ``int32[]``.
       parameters: of the network, a pytree.
       optimizer: optax's state.
-      best: what was learned, :class:`~jaxltl.algos.early_stopping.Best`:
+      best: what was learned, :class:`~jaxltl.algos.common.early_stopping.Best`:
         ``state.best.parameters``.
       stopped: ``bool[]``, whether patience has run out.
     """

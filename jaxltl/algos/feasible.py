@@ -62,8 +62,8 @@ from flax import struct
 from jax import lax
 from jax.tree_util import Partial
 
-from jaxltl.algos import learner
-from jaxltl.algos.schedules import Schedule, at
+from jaxltl.algos.common import learner
+from jaxltl.algos.common.schedules import Schedule, at
 from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.models.parametric.parametric import Ends, ParametricMDP
 from jaxltl.core.models.sparse import row_reward

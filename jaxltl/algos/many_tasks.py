@@ -56,10 +56,10 @@ from flax import struct
 from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 
-from jaxltl.algos import action_distributions
-from jaxltl.algos.actor_critic import dense
-from jaxltl.algos.moments import normalized
-from jaxltl.algos.settings import applied
+from jaxltl.algos.common import action_distributions
+from jaxltl.algos.common.actor_critic import dense
+from jaxltl.algos.common.moments import normalized
+from jaxltl.algos.common.settings import applied
 from jaxltl.core import validation
 from jaxltl.core.automata import sequences
 from jaxltl.core.automata.automaton import Automaton
@@ -89,7 +89,7 @@ class SequenceNetwork(nn.Module):
 
     Attributes:
       num_actions, shape, hidden, activation, initial_deviation: as of PPO's default network,
-        :class:`~jaxltl.algos.actor_critic.ActorCritic`; hidden layers read both parts.
+        :class:`~jaxltl.algos.common.actor_critic.ActorCritic`; hidden layers read both parts.
       events_seen: ``observation -> float[..., E]``, or None; hashable, such as a function of a
         module.
       by_name: whether, where `events_seen` is given, the observation and the sequence's rows are

@@ -9,7 +9,8 @@ Example: a reward of what is seen, here of which state it is, that plans in anot
 
   >>> import jax, jax.numpy as jnp
   >>> import jaxltl as jl
-  >>> from jaxltl.algos import learner, todirl
+  >>> from jaxltl.algos import todirl
+  >>> from jaxltl.algos.common import learner
   >>> world = jl.make_mdp(  # a start, from where one gets to a goal or into a trap
   ...     [[[1, 2], [0, 1]], [[1, 0], [0, 0]], [[2, 0], [0, 0]]],
   ...     [[[0.8, 0.2], [0.5, 0.5]], [[1, 0], [0, 0]], [[1, 0], [0, 0]]],
@@ -63,8 +64,8 @@ from flax import linen as nn
 from flax import struct
 from jax import lax
 
-from jaxltl.algos import learner
-from jaxltl.algos.early_stopping import Best, stop_early
+from jaxltl.algos.common import learner
+from jaxltl.algos.common.early_stopping import Best, stop_early
 from jaxltl.core.models.build.batch import narrow, stack_models, stack_observations, training_counts
 from jaxltl.core.models.build.batch import world as lane
 from jaxltl.core.models.build.restrict import with_allowed
@@ -216,7 +217,7 @@ class State:
       parameters: of the network, a pytree.
       value: ``float[W, S, Q]``, the soft value that the next solve starts from.
       optimizer: optax's state.
-      best: what was learned, :class:`~jaxltl.algos.early_stopping.Best`:
+      best: what was learned, :class:`~jaxltl.algos.common.early_stopping.Best`:
         ``state.best.parameters``.
       stopped: ``bool[]``, whether patience has run out.
     """

@@ -13,9 +13,9 @@ import jax.numpy as jnp
 from jax.tree_util import Partial
 
 from jaxltl.algos import cce, ppo, trust_region
-from jaxltl.algos.actor_critic import default_network
-from jaxltl.algos.exponential_family import diagonal_gaussian
-from jaxltl.algos.schedules import Linear
+from jaxltl.algos.cce.exponential_family import diagonal_gaussian
+from jaxltl.algos.common.actor_critic import default_network
+from jaxltl.algos.common.schedules import Linear
 from jaxltl.app.files.task_environment import EnvironmentTask
 from jaxltl.app.job import settings
 from jaxltl.core.environments.environment import Box, Environment, Finite, Timestep

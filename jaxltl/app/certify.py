@@ -308,7 +308,7 @@ def certify_and_write(
 
     Places that cannot be written to are known before the work, not after.
     """
-    from jaxltl.algos.checkpoint import atomic_write
+    from jaxltl.algos.common.checkpoint import atomic_write
 
     check_confidence(asked.confidence)
     if picture is not None and picture.suffix not in PICTURES:

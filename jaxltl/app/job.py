@@ -18,8 +18,8 @@ import numpy as np
 from jax.sharding import Mesh
 
 import jaxltl
-from jaxltl.algos.checkpoint import atomic_write
-from jaxltl.algos.chunks import Chunks, run_in_chunks, trace_lanes
+from jaxltl.algos.common.checkpoint import atomic_write
+from jaxltl.algos.common.chunks import Chunks, run_in_chunks, trace_lanes
 from jaxltl.app.drawing import Picture, drawing
 from jaxltl.app.files.task import Task
 from jaxltl.core.automata.automaton import Automaton
@@ -50,7 +50,7 @@ def run_seeds(
       algorithm: the learner's module.
       seeds: the first, and how many.
       mesh: devices that several seeds are learned on; the same in every process.
-      options: for :func:`~jaxltl.algos.chunks.run_in_chunks`.
+      options: for :func:`~jaxltl.algos.common.chunks.run_in_chunks`.
     """
     if seeds[1] == 1:
         mesh = None

@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from jaxltl.algos import learner, mlirl
+from jaxltl.algos import mlirl
+from jaxltl.algos.common import learner
 from jaxltl.app._learn_pictures import live as live
 from jaxltl.app._learn_pictures import pictures as pictures
 from jaxltl.app._learn_pictures import task_pictures as task_pictures

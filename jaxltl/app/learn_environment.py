@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from jaxltl.algos.checkpoint import atomic_write, read_arrays
+from jaxltl.algos.common.checkpoint import atomic_write, read_arrays
 from jaxltl.app._environment_learners import Method, make_method
 from jaxltl.app.drawing import Picture, drawing
 from jaxltl.app.environment_source import load_environment

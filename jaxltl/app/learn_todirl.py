@@ -19,7 +19,8 @@ import numpy as np
 from jax import lax
 from jax.sharding import Mesh
 
-from jaxltl.algos import learner, todirl
+from jaxltl.algos import todirl
+from jaxltl.algos.common import learner
 from jaxltl.app._todirl_guarantee import check_attainable, hold, is_weighable, likeliest
 from jaxltl.app._todirl_parts import (
     LENGTH,

@@ -107,7 +107,7 @@ def _done(
     place: Place,
     checkpoint: Path,
 ) -> dict[str, Any] | None:
-    from jaxltl.algos import checkpoint as files
+    from jaxltl.algos.common import checkpoint as files
 
     start = time.perf_counter()
     setup = place.together(lambda: job.prepare(task, seeds[0]))
@@ -147,7 +147,7 @@ def _done(
 
 def _claim(out: Path, task: Any, place: Place) -> None:
     """The directory of results; one that cannot be written to must be known before the work."""
-    from jaxltl.algos.checkpoint import atomic_write
+    from jaxltl.algos.common.checkpoint import atomic_write
 
     if place.is_first:
         make_directory(out)
@@ -211,7 +211,7 @@ def _write(
     pictures: list[tuple[Picture, Callable[[], bytes]]],
     live: list[tuple[Any, dict[str, Callable[[], bytes]]]],
 ) -> dict[str, Any]:
-    from jaxltl.algos.checkpoint import atomic_write
+    from jaxltl.algos.common.checkpoint import atomic_write
 
     result = {**job.summary(outcome), "fingerprint": mark}
     job.save(out, outcome)

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 import jaxltl
-from jaxltl.algos import checkpoint as files
+from jaxltl.algos.common import checkpoint as files
 from jaxltl.app.processes import Place, is_loss
 from jaxltl.app.run_job import make_directory
 from jaxltl.app.solve import MISTAKEN, NOT_CONVERGED, Asked, Result, load

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
-from jaxltl.algos.checkpoint import atomic_write
+from jaxltl.algos.common.checkpoint import atomic_write
 from jaxltl.core.validation import shown
 
 Compression = Literal["gzip", "xz"]

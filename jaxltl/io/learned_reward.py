@@ -35,7 +35,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxltl.algos import todirl
-from jaxltl.algos.checkpoint import atomic_write, read_arrays
+from jaxltl.algos.common.checkpoint import atomic_write, read_arrays
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.text import from_dict, to_dict
 from jaxltl.core.models.mdp import MDP

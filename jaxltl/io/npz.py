@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxltl.algos.checkpoint import atomic_write, read_arrays
+from jaxltl.algos.common.checkpoint import atomic_write, read_arrays
 from jaxltl.core.models.build.convert import to_sparse
 from jaxltl.core.models.build.padded import to_padded
 from jaxltl.core.models.game import Game, make_game

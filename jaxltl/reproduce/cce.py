@@ -14,8 +14,8 @@ import numpy as np
 import optax
 
 from jaxltl.algos import cce
-from jaxltl.algos import exponential_family as families
 from jaxltl.algos import trust_region as tr
+from jaxltl.algos.cce import exponential_family as families
 from jaxltl.app.job import plain
 from jaxltl.core.environments.environment import Environment, Timestep
 from jaxltl.envs import lqr

@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxltl.algos import learner
 from jaxltl.algos import mlirl as irl
-from jaxltl.algos.chunks import run_in_chunks
+from jaxltl.algos.common import learner
+from jaxltl.algos.common.chunks import run_in_chunks
 from jaxltl.app.job import plain
 from jaxltl.core.models.build.lifting import lift_policy
 from jaxltl.core.models.build.restrict import restrict

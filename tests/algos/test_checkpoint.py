@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxltl.algos import behavioral_cloning, checkpoint
-from jaxltl.algos.chunks import run_in_chunks
+from jaxltl.algos import behavioral_cloning
+from jaxltl.algos.common import checkpoint
+from jaxltl.algos.common.chunks import run_in_chunks
 from tests.algos.test_learner import assert_bitwise, start, toy_init, toy_step
 
 
@@ -119,7 +120,7 @@ def test_what_tells_fingerprints_apart():
 def test_another_process_finds_the_same_fingerprint():
     program = (
         "import jax; jax.config.update('jax_enable_x64', True)\n"
-        "from jaxltl.algos import checkpoint\n"
+        "from jaxltl.algos.common import checkpoint\n"
         "from tests.algos.test_checkpoint import outer\n"
         "print(checkpoint.fingerprint(x=outer(3), y=jax.numpy.arange(3)))"
     )

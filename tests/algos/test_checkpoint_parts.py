@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from jaxltl.algos import _checkpoint_parts as parts
+from jaxltl.algos.common import _checkpoint_parts as parts
 
 
 def written(path, array, cuts):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from jaxltl.algos import rmax
-from jaxltl.algos._data_evidence import data_evidence
+from jaxltl.algos.rmax._data_evidence import data_evidence
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import make_mdp
 from jaxltl.core.values.discounted.minimax import minimax_value, strategy_value

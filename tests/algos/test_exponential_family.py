@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from jaxltl.algos import exponential_family as ef
+from jaxltl.algos.cce import exponential_family as ef
 
 # Each compiled as a whole, which takes much less long than operation by operation.
 whole = SimpleNamespace(

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from jaxltl.algos import feasible as search
-from jaxltl.algos import learner
+from jaxltl.algos.common import learner
 from jaxltl.algos.feasible import Hparams, certify, evaluate, feasible, make_problem, within
 from jaxltl.core.models.parametric.parametric import make_parametric
 from jaxltl.core.models.sparse import Rewards, make_sparse

@@ -16,6 +16,7 @@ from scipy.sparse.csgraph import connected_components, shortest_path
 
 import jaxltl as jl
 from jaxltl.algos import mlirl, todirl
+from jaxltl.core.models.build.lifting import allowed_steps
 from tests import reference
 from tests.reference_logic import random_formula
 from tests.support import as_mdp
@@ -118,7 +119,7 @@ def random_demonstrations(rng, model, found):
     while len(rows) < wanted:
         pairs = walk(rng, model, found.best, follow)
         try:
-            mlirl.allowed_steps(allowed, jl.make_trajectories(model.mdp, [pairs]))
+            allowed_steps(allowed, jl.make_trajectories(model.mdp, [pairs]))
         except ValueError:
             continue
         rows.append(pairs)

@@ -8,8 +8,9 @@ import pytest
 from scipy.sparse.csgraph import connected_components
 
 import jaxltl as jl
-from jaxltl.algos import _interval_data, learner
 from jaxltl.algos import interval_learning as learning
+from jaxltl.algos.common import learner
+from jaxltl.algos.interval_learning import _interval_data
 from jaxltl.core.models.game import make_game
 from jaxltl.core.models.interval import make_interval
 from jaxltl.core.statistics.confidence_sets import intervals_from_counts

@@ -23,10 +23,8 @@ import jaxltl as jl
 from jaxltl.algos import (
     behavioral_cloning,
     cce,
-    checkpoint,
     feasible,
     interval_learning,
-    learner,
     maximin_q,
     mlirl,
     ppo,
@@ -34,8 +32,9 @@ from jaxltl.algos import (
     todirl,
     trust_region,
 )
-from jaxltl.algos.chunks import run_in_chunks
-from jaxltl.algos.exponential_family import diagonal_gaussian
+from jaxltl.algos.cce.exponential_family import diagonal_gaussian
+from jaxltl.algos.common import checkpoint, learner
+from jaxltl.algos.common.chunks import run_in_chunks
 from jaxltl.core.environments.environment import Timestep, make_box, make_environment
 from jaxltl.core.models.game import make_game
 from jaxltl.core.models.mdp import MDP

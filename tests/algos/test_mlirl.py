@@ -12,6 +12,7 @@ from jax.flatten_util import ravel_pytree
 
 import jaxltl as jl
 from jaxltl.algos import mlirl
+from jaxltl.algos.mlirl import _features
 from tests.support import assert_gradients
 
 UP, DOWN, LEFT, RIGHT = range(4)
@@ -37,7 +38,7 @@ def test_pair_counts_by_hand():
         (4, UP, 1),
     ):
         expected[s, a] = count
-    np.testing.assert_array_equal(mlirl.pair_counts(world, demonstrations), expected)
+    np.testing.assert_array_equal(_features.pair_counts(world, demonstrations), expected)
 
 
 def test_pair_counts_in_a_product_follow_the_memory():
@@ -47,8 +48,8 @@ def test_pair_counts_in_a_product_follow_the_memory():
     lifted = jl.models.lift_trajectories(lazy, demonstrations)
     traced = jax.jit(jl.models.lift_trajectories)(lazy, demonstrations)
     jax.tree.map(np.testing.assert_array_equal, lifted, traced)  # the host finds the same
-    counts = mlirl.pair_counts(lazy, lifted)
-    np.testing.assert_array_equal(counts, jax.jit(mlirl.pair_counts)(lazy, traced))
+    counts = _features.pair_counts(lazy, lifted)
+    np.testing.assert_array_equal(counts, jax.jit(_features.pair_counts)(lazy, traced))
     start = int(lazy.initial_memory[0])
     middle = int(lazy.initial_memory[1])
     expected = np.zeros((6, 3, 4))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import jaxltl as jl
-from jaxltl.algos import pac
+from jaxltl.algos.common import pac
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import MDP, from_dense, to_dense
 from jaxltl.core.models.ops import operators

@@ -13,13 +13,14 @@ import optax
 import pytest
 from jax.tree_util import Partial
 
-from jaxltl.algos import _ppo_collect as collecting
-from jaxltl.algos import _ppo_update as updating
-from jaxltl.algos import action_distributions as actions_of
-from jaxltl.algos import learner, ppo
-from jaxltl.algos.actor_critic import orthogonal
-from jaxltl.algos.moments import scale_of, updated_moments
-from jaxltl.algos.schedules import Linear
+from jaxltl.algos import ppo
+from jaxltl.algos.common import action_distributions as actions_of
+from jaxltl.algos.common import learner
+from jaxltl.algos.common.actor_critic import orthogonal
+from jaxltl.algos.common.moments import scale_of, updated_moments
+from jaxltl.algos.common.schedules import Linear
+from jaxltl.algos.ppo import _collect as collecting
+from jaxltl.algos.ppo import _update as updating
 from jaxltl.core.environments.environment import Finite, Timestep, make_box, make_environment
 from jaxltl.core.environments.episodes import run_episode
 from jaxltl.core.types import Status

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 import jaxltl as jl
-from jaxltl.algos import _optimistic_model, pac, rmax
+from jaxltl.algos import rmax
+from jaxltl.algos.common import pac
+from jaxltl.algos.rmax import _optimistic_model
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.types import Status
 from jaxltl.core.values.discounted.minimax import minimax_value

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxltl.algos import splitmix
+from jaxltl.algos.common import splitmix
 
 MASK = 2**32 - 1
 # Of the reference program in C: hash prospector, [16 21f0aaad 15 d35a2d97 15].

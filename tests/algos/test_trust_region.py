@@ -13,13 +13,13 @@ import scipy.optimize
 from jax.flatten_util import ravel_pytree
 from jax.tree_util import Partial
 
-from jaxltl.algos import _policy_networks as nets
 from jaxltl.algos import trust_region
-from jaxltl.algos._cpo_dual import Case, Dual, cpo_dual, cpo_weights
-from jaxltl.algos._trust_step import fisher_product, surrogate
-from jaxltl.algos._value_fit import advantages
-from jaxltl.algos.moments import Moments, scale_of, updated_moments
+from jaxltl.algos.common.moments import Moments, scale_of, updated_moments
 from jaxltl.algos.trust_region import Hparams
+from jaxltl.algos.trust_region import _policy_networks as nets
+from jaxltl.algos.trust_region._cpo_dual import Case, Dual, cpo_dual, cpo_weights
+from jaxltl.algos.trust_region._step import fisher_product, surrogate
+from jaxltl.algos.trust_region._value_fit import advantages
 from jaxltl.core.environments.environment import Timestep, make_box, make_environment
 from jaxltl.core.environments.episodes import run_episode
 from jaxltl.core.environments.time_limit import with_time_limit
@@ -640,7 +640,7 @@ def ended_step(ends, world, action, key):
 @jax.jit
 def estimated(state, batch):
     inputs = nets.normalized(state.moments, SMALL, batch.observation)
-    return trust_region._estimated(state, batch, inputs, SMALL)
+    return trust_region.learner._estimated(state, batch, inputs, SMALL)
 
 
 @jax.jit

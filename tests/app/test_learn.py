@@ -6,7 +6,9 @@ import jax
 import numpy as np
 import pytest
 
-from jaxltl.algos import _features, learner, mlirl
+from jaxltl.algos import mlirl
+from jaxltl.algos.common import learner
+from jaxltl.algos.mlirl import _features
 from jaxltl.app import learn
 from jaxltl.app.files.task import read_task
 from jaxltl.app.reports.learn import remarks

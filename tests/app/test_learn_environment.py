@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from jaxltl.algos import chunks
+from jaxltl.algos.common import chunks
 from jaxltl.app import learn_environment as job
 from jaxltl.app.environment_source import load_environment
 from jaxltl.app.files.task_environment import is_environment_task, read_task

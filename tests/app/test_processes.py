@@ -10,7 +10,7 @@ import jax
 import numpy as np
 import pytest
 
-from jaxltl.algos import checkpoint
+from jaxltl.algos.common import checkpoint
 from jaxltl.app._teller import told
 from jaxltl.app.processes import Asked, Launch, Place, launched
 from jaxltl.core.values.discounted.discounted import optimal_value
@@ -160,7 +160,7 @@ def is_whole(directory):
 
 def _like(path):
     """What the run saves, and what it is told apart by."""
-    from jaxltl.algos import chunks
+    from jaxltl.algos.common import chunks
 
     with jax.enable_x64(False):  # as the program
         step, states, goal = several.problem_and_state()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from jaxltl.algos import checkpoint
+from jaxltl.algos.common import checkpoint
 from jaxltl.app import solve_on_mesh
 from jaxltl.app.processes import Place
 from jaxltl.app.solve import asked_for

@@ -19,8 +19,9 @@ from jax.sharding import NamedSharding, PartitionSpec
 
 import jaxltl as jl
 from jaxltl import algos, envs
-from jaxltl.algos import behavioral_cloning, cce, learner, mlirl, ppo
-from jaxltl.algos.schedules import Linear
+from jaxltl.algos import behavioral_cloning, cce, mlirl, ppo
+from jaxltl.algos.common import learner
+from jaxltl.algos.common.schedules import Linear
 from jaxltl.core import pretty_print as show
 from jaxltl.core.types import Method
 from tests.support import replaced

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxltl as jl
-from jaxltl.algos import pac
+from jaxltl.algos.common import pac
 from jaxltl.core.games.objective import buchi
 from jaxltl.core.games.winning import solve
 from jaxltl.core.models.game import is_deterministic

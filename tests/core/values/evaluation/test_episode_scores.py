@@ -7,7 +7,7 @@ import pytest
 from jax.tree_util import Partial
 
 from jaxltl.algos import cce
-from jaxltl.algos.exponential_family import diagonal_gaussian
+from jaxltl.algos.cce.exponential_family import diagonal_gaussian
 from jaxltl.core.environments.environment import Timestep, make_box, make_environment
 from jaxltl.core.environments.episodes import agent_of, run_episode
 from jaxltl.core.environments.monitor import Verdict

@@ -1,0 +1,3 @@
+"""The constrained cross-entropy method."""
+
+from jaxltl.algos.cce.learner import *  # noqa: F403

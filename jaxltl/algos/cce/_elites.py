@@ -1,0 +1,172 @@
+"""Which samples of a population count, and how much (algorithm 2, steps 7 to 10)."""
+
+from __future__ import annotations
+
+import math
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jax import lax
+
+from jaxltl.algos.common.schedules import SLACK
+from jaxltl.core.pretty_print import brief
+
+
+@brief
+@struct.dataclass
+class Sample:
+    """One evaluated policy: ``float[D]``, its objective, costs ``float[C]``, and its excess.
+
+    `excess` is ``max_c (cost_c - limit_c) / scale_c``; `found` whether there is such a policy.
+    """
+
+    parameters: jax.Array
+    objective: jax.Array
+    cost: jax.Array
+    excess: jax.Array
+    found: jax.Array
+
+
+@brief
+@struct.dataclass
+class Pool:
+    """Evaluated policies: ``float[n, D]``, ``float[n]``, ``float[n, C]`` and which count."""
+
+    parameters: jax.Array
+    objective: jax.Array
+    cost: jax.Array
+    active: jax.Array
+
+
+def num_elites(rho: float, num_samples: int) -> int:
+    """``k = ceil(rho n)``, where a product that should be an integer is one.
+
+    Example:
+      >>> num_elites(0.07, 100), math.ceil(0.07 * 100)
+      (7, 8)
+    """
+    return math.ceil(rho * num_samples - SLACK)
+
+
+@brief
+@struct.dataclass
+class Elites:
+    """Who was chosen among n samples.
+
+    Attributes:
+      index: ``int32[num]``, the chosen ones, best first.
+      taken: ``bool[num]``, which of these count: the first k_l, if they can be used.
+      enough_feasible: whether at least k_l are feasible, so that the objective decided.
+      feasible, usable: ``bool[n]``.
+      excess: ``float[n]``, the largest normalised violation.
+    """
+
+    index: jax.Array
+    taken: jax.Array
+    enough_feasible: jax.Array
+    feasible: jax.Array
+    usable: jax.Array
+    excess: jax.Array
+
+
+def select(
+    objective: jax.Array,
+    cost: jax.Array,
+    limit: jax.Array,
+    *,
+    num: int,
+    count: jax.Array | int | None = None,
+    scale: jax.Array | float = 1.0,
+    active: jax.Array | bool = True,
+) -> Elites:
+    """The elites of algorithm 2, steps 7 to 10.
+
+    With at least k feasible samples the k of them with the highest objective; else the k with
+    the least ``max_c (cost_c - limit_c) / scale_c``, feasible or not. Of equals the earlier
+    sample is taken, so that there are always k, where the indicator of (4.4) takes all equals;
+    the two agree if there are none. A sample with an objective that is NaN or plus infinity,
+    or a cost that is NaN, comes last and is never taken.
+
+    Args:
+      objective: ``float[n]``.
+      cost: ``float[n, C]``.
+      limit: ``float[C]``.
+      num: how many are returned; static.
+      count: k_l, at most `num`; default `num`.
+      scale: ``float[C]`` or a number.
+      active: ``bool[n]``, which samples exist.
+
+    Example:
+      >>> cost = jnp.array([[0.0], [2.0], [1.0], [0.0]])
+      >>> objective = jnp.array([1.0, 9.0, 9.0, 2.0])
+      >>> select(objective, cost, jnp.zeros(1), num=2).index.tolist()
+      [3, 0]
+      >>> select(objective, cost, jnp.zeros(1), num=3).index.tolist()
+      [0, 3, 2]
+    """
+    count = num if count is None else count
+    usable = active & (objective < jnp.inf) & ~jnp.isnan(cost).any(-1)
+    feasible = usable & (cost <= limit).all(-1)
+    excess = jnp.max((cost - limit) / scale, axis=-1, initial=-jnp.inf)
+    enough = jnp.sum(feasible) >= count
+    rank = jnp.where(enough, objective, -excess)
+    # What cannot be used has to come after the worst that can, and -0 beside 0.
+    most = jnp.finfo(rank.dtype).max
+    rank = jnp.where(rank == 0, 0, jnp.clip(rank, -most, most))
+    rank = jnp.where(jnp.where(enough, feasible, usable), rank, -jnp.inf)
+    top, index = lax.top_k(rank, num)
+    taken = (top > -jnp.inf) & (jnp.arange(num) < count)
+    return Elites(index, taken, enough, feasible, usable, excess)
+
+
+def elite_weights(
+    objective: jax.Array,
+    taken: jax.Array,
+    enough_feasible: jax.Array,
+    *,
+    weighting: str = "until_feasible",
+    temperature: jax.Array | float = 1.0,
+) -> jax.Array:
+    """Weights of the elites, which sum to 1 (to 0 if none is taken).
+
+    Args:
+      objective: ``float[k]``, the elites'.
+      taken: ``bool[k]``.
+      enough_feasible: as :func:`select` tells.
+      weighting, temperature: see :class:`Hparams`.
+
+    Example:
+      >>> half = jnp.log(jnp.array([3.0, 1.0]))
+      >>> [round(x, 6) for x in elite_weights(half, jnp.ones(2, bool), jnp.bool_(True)).tolist()]
+      [0.75, 0.25]
+    """
+    least = jnp.finfo(objective.dtype).min
+    logit = jnp.clip(objective / temperature, least, -least)
+    if weighting != "literal":
+        by_objective = enough_feasible & (weighting == "until_feasible")
+        logit = jnp.where(by_objective, logit, 0)
+    top = jnp.max(jnp.where(taken, logit, least))
+    weight = jnp.where(taken, jnp.exp(jnp.where(taken, logit - top, 0)), 0)
+    return weight / jnp.maximum(jnp.sum(weight), 1)
+
+
+def rows_of(pool: Pool, index: jax.Array) -> Pool:
+    """The policies of an index; read as columns, for populations are computed that way round."""
+    return jax.tree.map(lambda x: x.T.at[..., index].get(mode="promise_in_bounds").T, pool)
+
+
+def better(
+    old: Sample,
+    fresh: Pool,
+    excess: jax.Array,
+    among: jax.Array,
+    score: jax.Array,
+    record: jax.Array,
+) -> Sample:
+    """The old sample, or that of the highest score if it beats the record."""
+    i = jnp.argmax(jnp.where(among, score, -jnp.inf))
+    one = rows_of(fresh, i)
+    new = Sample(one.parameters, one.objective, one.cost, excess[i], among[i])
+    beats = among[i] & (~old.found | (score[i] > record))
+    return jax.tree.map(lambda x, y: jnp.where(beats, x, y), new, old)

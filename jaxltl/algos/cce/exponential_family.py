@@ -1,0 +1,710 @@
+"""Natural exponential families, as the cross-entropy method needs them.
+
+A family is a frozen dataclass of ordinary parameters (a mean and a standard deviation, say).
+Densities are ``f_v(x) = exp(v . Gamma(x) - K(v))`` (dissertation, definition 2), and the *mean
+parameter* is ``m(v) = E_v[Gamma(x)] = grad K(v)``. The functions are open
+(``functools.singledispatch``): a family of one's own needs ``sufficient_statistics``,
+``mean_parameter``, ``from_mean_parameter``, ``log_density``, ``sample``, ``project``,
+``center`` and ``standard_deviation``; ``sample_antithetic``, ``widen`` and ``at_least`` are asked
+for by options only.
+
+``project`` moves the mean parameter without ever forming it. As ``E x^2 - (E x)^2`` the variance
+of a Gaussian with mean 3 and standard deviation 1e-3 comes out negative in single precision;
+here every variance is a sum of squares.
+
+Example:
+  >>> import jax, jax.numpy as jnp
+  >>> from jaxltl.algos.cce import exponential_family as families
+  >>> start = families.diagonal_gaussian(jnp.zeros(2), 1.0)
+  >>> def moved(key):  # halfway to eight draws of its own
+  ...     samples = families.sample(start, key, 8)
+  ...     family = families.project(start, samples, jnp.ones(8), rate=0.5)
+  ...     return family, families.log_density(family, samples)
+  >>> family, density = jax.eval_shape(moved, jax.random.key(0))
+  >>> family.mean.shape, density.shape
+  ((2,), (8,))
+  >>> families.standard_deviation(families.widen(start, 3.0)).tolist()
+  [2.0, 2.0]
+  >>> families.at_least(start, 4.0).variance.tolist()
+  [4.0, 4.0]
+  >>> first, second = families.mean_parameter(start)  # E x and E x^2
+  >>> second.tolist(), families.center(start).tolist()
+  ([1.0, 1.0], [0.0, 0.0])
+  >>> shapes = jax.eval_shape(lambda key: families.sufficient_statistics(
+  ...     start, families.sample_antithetic(start, key, 8)), jax.random.key(0))
+  >>> shapes[1].shape  # of mirrored pairs
+  (8, 2)
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import singledispatch
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import lax
+from jax.scipy.special import digamma, gammaln
+
+from jaxltl.algos.common import splitmix
+from jaxltl.core.pretty_print import brief
+
+
+@brief
+@struct.dataclass
+class DiagonalGaussian:
+    """Independent normal entries; ``Gamma(x) = (x, x^2)``.
+
+    Attributes:
+      mean: ``float[D]``.
+      variance: ``float[D]``.
+    """
+
+    mean: jax.Array
+    variance: jax.Array
+
+
+@brief
+@struct.dataclass
+class FullGaussian:
+    """Normal vectors with any covariance; ``Gamma(x) = (x, x x')``.
+
+    Attributes:
+      mean: ``float[D]``.
+      factor: ``float[D, D]``, lower triangular, the covariance being ``factor @ factor.T``.
+        Kept instead of the covariance, which rounding could make indefinite.
+    """
+
+    mean: jax.Array
+    factor: jax.Array
+
+
+@brief
+@struct.dataclass
+class Gamma:
+    """Independent gamma entries, which are positive; ``Gamma(x) = (x, log x)``.
+
+    Attributes:
+      shape: ``float[D]``.
+      rate: ``float[D]``; the mean is ``shape / rate``.
+    """
+
+    shape: jax.Array
+    rate: jax.Array
+
+
+Family = DiagonalGaussian | FullGaussian | Gamma
+
+
+def diagonal_gaussian(mean: chex.Array, std: chex.Array | float) -> DiagonalGaussian:
+    """A :class:`DiagonalGaussian` from ``float[D]`` and a standard deviation (or one for each).
+
+    Args:
+      mean: ``float[D]``.
+      std: positive, ``float[D]`` or one for all entries.
+
+    Returns:
+      :class:`DiagonalGaussian`.
+
+    Raises:
+      ValueError: `mean` is no vector, `std` does not fit it, or is not positive.
+
+    Example:
+      >>> diagonal_gaussian([0.0, 1.0], 0.5).variance.tolist()
+      [0.25, 0.25]
+    """
+    mean = _vector("mean", mean)
+    std = _like("std", std, mean)
+    _require_positive("std", std)
+    return DiagonalGaussian(mean, jnp.square(std))
+
+
+def full_gaussian(mean: chex.Array, covariance: chex.Array) -> FullGaussian:
+    """A :class:`FullGaussian` from ``float[D]`` and a positive definite ``float[D, D]``.
+
+    Args:
+      mean: ``float[D]``.
+      covariance: ``float[D, D]``.
+
+    Returns:
+      :class:`FullGaussian`.
+
+    Raises:
+      ValueError: a wrong shape, or a covariance that is not symmetric and positive definite.
+
+    Example:
+      >>> full_gaussian([0.0, 0.0], [[4.0, 2.0], [2.0, 2.0]]).factor.tolist()
+      [[2.0, 0.0], [1.0, 1.0]]
+    """
+    mean = _vector("mean", mean)
+    covariance = jnp.asarray(covariance, mean.dtype)
+    if covariance.shape != 2 * mean.shape:
+        raise ValueError(f"covariance has shape {covariance.shape}; expected {2 * mean.shape}.")
+    if not isinstance(covariance, jax.core.Tracer):
+        symmetric = bool(jnp.allclose(covariance, covariance.T))
+        if not symmetric or not bool(jnp.isfinite(jnp.linalg.cholesky(covariance)).all()):
+            raise ValueError("covariance is not symmetric and positive definite.")
+    return FullGaussian(mean, jnp.linalg.cholesky(covariance))
+
+
+def gamma(shape: chex.Array, rate: chex.Array | float) -> Gamma:
+    """A :class:`Gamma` from shapes ``float[D]`` and rates (or one for all).
+
+    Args:
+      shape: positive, ``float[D]``.
+      rate: positive, ``float[D]`` or one for all entries.
+
+    Returns:
+      :class:`Gamma`.
+
+    Raises:
+      ValueError: a wrong shape, or a number that is not positive.
+
+    Example:
+      >>> center(gamma([2.0, 3.0], 2.0)).tolist()
+      [1.0, 1.5]
+    """
+    shape = _vector("shape", shape)
+    rate = _like("rate", rate, shape)
+    _require_positive("shape", shape)
+    _require_positive("rate", rate)
+    return Gamma(shape, rate)
+
+
+def _vector(name: str, x: Any) -> jax.Array:
+    x = jnp.asarray(x)
+    x = x.astype(jnp.promote_types(x.dtype, jnp.float32))
+    if x.ndim != 1:
+        raise ValueError(f"{name} has shape {x.shape}; expected one axis, [D].")
+    return x
+
+
+def _like(name: str, x: Any, model: jax.Array) -> jax.Array:
+    x = jnp.asarray(x, model.dtype)
+    if x.shape not in ((), model.shape):
+        raise ValueError(f"{name} has shape {x.shape}; expected () or {model.shape}.")
+    return jnp.broadcast_to(x, model.shape)
+
+
+def _require_positive(name: str, x: jax.Array) -> None:
+    if isinstance(x, jax.core.Tracer):
+        return
+    given = np.asarray(x)
+    wrong = np.flatnonzero(~((given > 0) & np.isfinite(given)))
+    if wrong.size:
+        raise ValueError(
+            f"{name}[{wrong[0]}] = {float(given[wrong[0]])!r}; it must be positive and finite."
+        )
+
+
+# --- the protocol ---------------------------------------------------------------------------
+
+
+@singledispatch
+def sufficient_statistics(family: Any, samples: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """``Gamma(x)`` of each sample, as a pair of arrays.
+
+    Args:
+      family: says which; its values are not used.
+      samples: ``float[..., D]``.
+
+    Returns:
+      Two arrays, the second ``float[..., D, D]`` for a full Gaussian, else ``float[..., D]``.
+
+    Raises:
+      TypeError: there is no such family.
+    """
+    raise TypeError(_unknown(family))
+
+
+@singledispatch
+def mean_parameter(family: Any) -> tuple[jax.Array, jax.Array]:
+    """``m(v) = E_v[Gamma(x)]``, the mean of :func:`sufficient_statistics`.
+
+    Args:
+      family: any member.
+
+    Returns:
+      Two arrays, as :func:`sufficient_statistics` has them for one sample; differentiable.
+
+    Raises:
+      TypeError: there is no such family.
+    """
+    raise TypeError(_unknown(family))
+
+
+@singledispatch
+def from_mean_parameter(family: Any, eta: tuple[jax.Array, jax.Array]) -> Any:
+    """The member with a given mean parameter, ``m^{-1}(eta)``.
+
+    For checks and starts: variances are differences here, so use :func:`project` to move.
+
+    Args:
+      family: says which; its values are not used.
+      eta: as :func:`mean_parameter` returns.
+
+    Returns:
+      A member of the same family.
+
+    Raises:
+      TypeError: there is no such family.
+
+    Example:
+      >>> start = diagonal_gaussian([1.0, 2.0], 0.5)
+      >>> from_mean_parameter(start, mean_parameter(start)).variance.tolist()
+      [0.25, 0.25]
+    """
+    raise TypeError(_unknown(family))
+
+
+@singledispatch
+def log_density(family: Any, samples: jax.Array) -> jax.Array:
+    """``log f_v(x)``: ``float[...]`` from ``float[..., D]``. Differentiable in both.
+
+    Args:
+      family: any member.
+      samples: ``float[..., D]``.
+
+    Returns:
+      ``float[...]``, in nats.
+
+    Raises:
+      TypeError: there is no such family.
+    """
+    raise TypeError(_unknown(family))
+
+
+@singledispatch
+def sample(family: Any, key: chex.PRNGKey, num_samples: int) -> jax.Array:
+    """Independent draws, ``float[num_samples, D]``; `num_samples` is static.
+
+    Args:
+      family: any member.
+      key: a PRNG key.
+      num_samples: n; static.
+
+    Returns:
+      ``float[n, D]``.
+
+    Raises:
+      TypeError: there is no such family.
+    """
+    raise TypeError(_unknown(family))
+
+
+@singledispatch
+def sample_antithetic(family: Any, key: chex.PRNGKey, num_samples: int) -> jax.Array:
+    """Draws of which samples 2 i and 2 i + 1 mirror each other about the mean, ``[n, D]``.
+
+    Args:
+      family: any symmetric member.
+      key: a PRNG key.
+      num_samples: n; static.
+
+    Returns:
+      ``float[n, D]``.
+
+    Raises:
+      ValueError: the family is not symmetric.
+    """
+    raise ValueError(f"a {type(family).__name__} has no mirrored samples; set antithetic=False.")
+
+
+@singledispatch
+def project(family: Any, samples: jax.Array, weights: jax.Array, rate: jax.Array | float) -> Any:
+    """The mean parameter moved towards that of weighted samples (dissertation, (4.11))::
+
+        m(v') = rate * sum_i w_i Gamma(x_i) / sum_i w_i + (1 - rate) * m(v),
+
+    which is the member closest, by the cross entropy, to the mixture of the weighted samples and
+    ``f_v``. In centred form: variances are sums of squares, never differences.
+
+    Args:
+      family: ``f_v``.
+      samples: ``float[n, D]``.
+      weights: ``float[n]``, not negative, of positive sum.
+      rate: in [0, 1]. At 0 the family stays as it is, bit for bit but for a full Gaussian.
+
+    Returns:
+      ``f_v'``.
+
+    Raises:
+      TypeError: there is no such family.
+
+    Example:
+      >>> start = diagonal_gaussian([0.0], 1.0)
+      >>> moved = project(start, jnp.array([[1.0], [3.0]]), jnp.array([1.0, 1.0]), 0.5)
+      >>> moved.mean.tolist(), moved.variance.tolist()
+      ([1.0], [2.0])
+    """
+    raise TypeError(_unknown(family))
+
+
+@singledispatch
+def center(family: Any) -> jax.Array:
+    """``E_v[x]``, ``float[D]``.
+
+    Args:
+      family: any member.
+
+    Returns:
+      ``float[D]``.
+
+    Raises:
+      TypeError: there is no such family.
+    """
+    raise TypeError(_unknown(family))
+
+
+@singledispatch
+def standard_deviation(family: Any) -> jax.Array:
+    """Of each entry, ``float[D]``.
+
+    Args:
+      family: any member.
+
+    Returns:
+      ``float[D]``.
+
+    Raises:
+      TypeError: there is no such family.
+    """
+    raise TypeError(_unknown(family))
+
+
+@singledispatch
+def widen(family: Any, variance: jax.Array | float) -> Any:
+    """The same mean, and `variance` (a number or ``float[D]``) added to that of each entry.
+
+    Args:
+      family: any member.
+      variance: ``float[D]`` or one for all entries, at least 0.
+
+    Returns:
+      A member of the same family.
+
+    Raises:
+      TypeError: there is no such family.
+    """
+    raise TypeError(_unknown(family))
+
+
+@singledispatch
+def at_least(family: Any, variance: jax.Array | float) -> Any:
+    """The same mean, and a variance of at least a number, in every direction.
+
+    Args:
+      family: any member.
+      variance: a number of at least 0.
+
+    Returns:
+      A member of the same family.
+
+    Raises:
+      TypeError: there is no such family.
+    """
+    raise TypeError(_unknown(family))
+
+
+def _unknown(family: Any) -> str:
+    return (
+        f"{type(family).__name__} is not a family: pass a DiagonalGaussian, a FullGaussian "
+        "or a Gamma."
+    )
+
+
+def _normal(key: chex.PRNGKey, num_samples: int, like: jax.Array) -> jax.Array:
+    """Standard normal numbers, ``float[num_samples, D]``.
+
+    Only D streams are drawn from the key: a keyed hash of each number would cost more than small
+    policies cost to evaluate.
+    """
+    stream = splitmix.streams(key, (*like.shape, 1))
+    word = splitmix.words(stream, jnp.arange(num_samples, dtype=jnp.uint32))
+    # The middles of equal intervals of (-1, 1), as many as are exact.
+    kept = 32 if jnp.finfo(like.dtype).nmant >= 32 else jnp.finfo(like.dtype).nmant
+    middle = (word >> (32 - kept)).astype(like.dtype) + 0.5
+    noise = math.sqrt(2) * lax.erf_inv(middle * 2.0 ** (1 - kept) - 1)
+    return noise.T  # computed with the samples last, the longer axis where policies are small
+
+
+def _shares(weights: jax.Array) -> jax.Array:
+    return weights / jnp.sum(weights)
+
+
+# --- diagonal Gaussians ---------------------------------------------------------------------
+
+
+@sufficient_statistics.register
+def _(family: DiagonalGaussian, samples: jax.Array) -> tuple[jax.Array, jax.Array]:
+    return samples, jnp.square(samples)
+
+
+@mean_parameter.register
+def _(family: DiagonalGaussian) -> tuple[jax.Array, jax.Array]:
+    return family.mean, jnp.square(family.mean) + family.variance
+
+
+@from_mean_parameter.register
+def _(family: DiagonalGaussian, eta: tuple[jax.Array, jax.Array]) -> DiagonalGaussian:
+    return DiagonalGaussian(eta[0], eta[1] - jnp.square(eta[0]))
+
+
+@log_density.register
+def _(family: DiagonalGaussian, samples: jax.Array) -> jax.Array:
+    square = jnp.square(samples - family.mean) / family.variance
+    return -0.5 * jnp.sum(square + jnp.log(2 * math.pi * family.variance), axis=-1)
+
+
+@sample.register
+def _(family: DiagonalGaussian, key: chex.PRNGKey, num_samples: int) -> jax.Array:
+    noise = _normal(key, num_samples, family.mean)
+    return family.mean + jnp.sqrt(family.variance) * noise
+
+
+@project.register
+def _(
+    family: DiagonalGaussian, samples: jax.Array, weights: jax.Array, rate: jax.Array | float
+) -> DiagonalGaussian:
+    weights = _shares(weights)
+    offset = samples - family.mean
+    shift = weights @ offset
+    own = weights @ jnp.square(offset - shift)
+    # The variance of a mixture: the mean of the variances and the variance of the means.
+    variance = rate * own + (1 - rate) * family.variance + rate * (1 - rate) * jnp.square(shift)
+    return DiagonalGaussian(family.mean + rate * shift, variance)
+
+
+@center.register
+def _(family: DiagonalGaussian) -> jax.Array:
+    return family.mean
+
+
+@standard_deviation.register
+def _(family: DiagonalGaussian) -> jax.Array:
+    return jnp.sqrt(family.variance)
+
+
+@widen.register
+def _(family: DiagonalGaussian, variance: jax.Array | float) -> DiagonalGaussian:
+    return replace(family, variance=family.variance + variance)
+
+
+@at_least.register
+def _(family: DiagonalGaussian, variance: jax.Array | float) -> DiagonalGaussian:
+    return replace(family, variance=jnp.maximum(family.variance, variance))
+
+
+# --- full Gaussians -------------------------------------------------------------------------
+
+
+@sufficient_statistics.register
+def _(family: FullGaussian, samples: jax.Array) -> tuple[jax.Array, jax.Array]:
+    return samples, samples[..., :, None] * samples[..., None, :]
+
+
+@mean_parameter.register
+def _(family: FullGaussian) -> tuple[jax.Array, jax.Array]:
+    return family.mean, jnp.outer(family.mean, family.mean) + family.factor @ family.factor.T
+
+
+@from_mean_parameter.register
+def _(family: FullGaussian, eta: tuple[jax.Array, jax.Array]) -> FullGaussian:
+    return FullGaussian(eta[0], jnp.linalg.cholesky(eta[1] - jnp.outer(eta[0], eta[0])))
+
+
+@log_density.register
+def _(family: FullGaussian, samples: jax.Array) -> jax.Array:
+    offset = samples - family.mean
+    solve = jax.scipy.linalg.solve_triangular
+    white = solve(family.factor, offset.reshape(-1, offset.shape[-1]).T, lower=True)
+    square = jnp.sum(jnp.square(white), axis=0).reshape(offset.shape[:-1])
+    volume = jnp.sum(jnp.log(jnp.abs(jnp.diagonal(family.factor))))
+    return -0.5 * (square + offset.shape[-1] * math.log(2 * math.pi)) - volume
+
+
+@sample.register
+def _(family: FullGaussian, key: chex.PRNGKey, num_samples: int) -> jax.Array:
+    return family.mean + _normal(key, num_samples, family.mean) @ family.factor.T
+
+
+@project.register
+def _(
+    family: FullGaussian, samples: jax.Array, weights: jax.Array, rate: jax.Array | float
+) -> FullGaussian:
+    weights = _shares(weights)
+    rate = jnp.asarray(rate, family.mean.dtype)
+    offset = samples - family.mean
+    shift = weights @ offset
+    rows = [
+        jnp.sqrt(rate * weights)[:, None] * (offset - shift),
+        jnp.sqrt(1 - rate) * family.factor.T,
+        (jnp.sqrt(rate * (1 - rate)) * shift)[None],
+    ]
+    return FullGaussian(family.mean + rate * shift, _factor(jnp.concatenate(rows)))
+
+
+def _factor(rows: jax.Array) -> jax.Array:
+    """The lower factor of ``rows.T @ rows``, with a diagonal that is not negative."""
+    upper = jnp.linalg.qr(rows, mode="r")
+    return (jnp.where(jnp.diagonal(upper) < 0, -1, 1)[:, None] * upper).T
+
+
+@center.register
+def _(family: FullGaussian) -> jax.Array:
+    return family.mean
+
+
+@standard_deviation.register
+def _(family: FullGaussian) -> jax.Array:
+    return jnp.sqrt(jnp.sum(jnp.square(family.factor), axis=-1))
+
+
+@widen.register
+def _(family: FullGaussian, variance: jax.Array | float) -> FullGaussian:
+    more = jnp.broadcast_to(jnp.sqrt(jnp.asarray(variance, family.mean.dtype)), family.mean.shape)
+    return replace(family, factor=_factor(jnp.concatenate([family.factor.T, jnp.diag(more)])))
+
+
+@at_least.register
+def _(family: FullGaussian, variance: jax.Array | float) -> FullGaussian:
+    _, length, axes = jnp.linalg.svd(family.factor.T, full_matrices=False)
+    length = jnp.maximum(length, jnp.sqrt(jnp.asarray(variance, length.dtype)))
+    return replace(family, factor=_factor(length[:, None] * axes))
+
+
+def _mirrored(family: Any, key: chex.PRNGKey, num_samples: int) -> jax.Array:
+    half = sample(family, key, -(-num_samples // 2))
+    pairs = jnp.stack([half, 2 * center(family) - half], axis=1)
+    return pairs.reshape(-1, half.shape[-1])[:num_samples]
+
+
+sample_antithetic.register(DiagonalGaussian, _mirrored)
+sample_antithetic.register(FullGaussian, _mirrored)
+
+
+# --- gamma distributions --------------------------------------------------------------------
+
+
+@sufficient_statistics.register
+def _(family: Gamma, samples: jax.Array) -> tuple[jax.Array, jax.Array]:
+    return samples, jnp.log(samples)
+
+
+@mean_parameter.register
+def _(family: Gamma) -> tuple[jax.Array, jax.Array]:
+    return family.shape / family.rate, digamma(family.shape) - jnp.log(family.rate)
+
+
+@from_mean_parameter.register
+def _(family: Gamma, eta: tuple[jax.Array, jax.Array]) -> Gamma:
+    shape = _shape_of_gap(jnp.log(eta[0]) - eta[1])
+    return Gamma(shape, shape / eta[0])
+
+
+@log_density.register
+def _(family: Gamma, samples: jax.Array) -> jax.Array:
+    shape, rate = family.shape, family.rate
+    terms = shape * jnp.log(rate) - gammaln(shape) + (shape - 1) * jnp.log(samples)
+    return jnp.sum(terms - rate * samples, axis=-1)
+
+
+@sample.register
+def _(family: Gamma, key: chex.PRNGKey, num_samples: int) -> jax.Array:
+    dtype = family.shape.dtype
+    draws = jax.random.gamma(key, family.shape, (num_samples, *family.shape.shape), dtype)
+    # Tiny shapes draw numbers that round to zero, whose logarithm is not finite.
+    return jnp.maximum(draws / family.rate, jnp.finfo(dtype).tiny)
+
+
+@project.register
+def _(family: Gamma, samples: jax.Array, weights: jax.Array, rate: jax.Array | float) -> Gamma:
+    weights = _shares(weights)
+    old = family.shape / family.rate
+    mean = old + rate * (weights @ (samples - old))
+    # log E x - E log x of the mixture. The linear terms, which sum to zero, are taken out of
+    # the logarithms, so that only numbers that are not negative are added.
+    own = weights @ _convex_part((samples - mean) / mean)
+    rest = _gap(family.shape) + _convex_part((old - mean) / mean)
+    shape = _shape_of_gap(rate * own + (1 - rate) * rest)
+    shape = jnp.where(rate > 0, shape, family.shape)
+    return Gamma(shape, jnp.where(rate > 0, shape / mean, family.rate))
+
+
+def _convex_part(z: jax.Array) -> jax.Array:
+    """``z - log(1 + z)``, accurate near zero, for z > -1."""
+    small = jnp.abs(z) < 0.05
+    safe = jnp.where(small, z, 0)
+    series = jnp.zeros_like(z)
+    for n in range(13, 1, -1):
+        series = (-1) ** n / n + safe * series
+    least = -1 + jnp.finfo(z.dtype).epsneg
+    return jnp.where(small, safe * safe * series, z - jnp.log1p(jnp.maximum(z, least)))
+
+
+# Coefficients of 1/k^2, 1/k^4, ... in the asymptotic series of log k - digamma(k) - 1/(2k).
+_SERIES = (1 / 12, -1 / 120, 1 / 252, -1 / 240, 1 / 132, -691 / 32760, 1 / 12)
+
+
+def _gap(shape: jax.Array) -> jax.Array:
+    """``log k - digamma(k)``, positive and decreasing; as a difference it would cancel."""
+    bound = 4.0 if jnp.finfo(shape.dtype).bits < 64 else 10.0  # the series is exact above
+    large = shape > bound
+    inverse = 1 / jnp.where(large, shape, bound)
+    square = jnp.square(inverse)
+    series = jnp.zeros_like(shape)
+    for c in reversed(_SERIES):
+        series = square * (c + series)
+    small = jnp.where(large, bound, shape)
+    return jnp.where(large, inverse / 2 + series, jnp.log(small) - digamma(small))
+
+
+def _shape_of_gap(gap: jax.Array) -> jax.Array:
+    """The shape k with ``log k - digamma(k) = gap``, by Newton's method on logarithms.
+
+    ``log gap`` is nearly linear in ``log k``, of slope -1 at both ends, so that a few steps
+    from Minka's (2002) approximation suffice everywhere.
+    """
+    gap = jnp.maximum(gap, jnp.finfo(gap.dtype).tiny * 16)
+    start = (3 - gap + jnp.sqrt(jnp.square(gap - 3) + 24 * gap)) / (12 * gap)
+
+    def newton(_: Any, log_shape: jax.Array) -> jax.Array:
+        def log_gap(x: jax.Array) -> jax.Array:
+            return jnp.log(_gap(jnp.exp(x)))
+
+        value, slope = jax.jvp(log_gap, (log_shape,), (jnp.ones_like(log_shape),))
+        return log_shape - (value - jnp.log(gap)) / slope
+
+    return jnp.exp(lax.fori_loop(0, 5, newton, jnp.log(start)))
+
+
+@center.register
+def _(family: Gamma) -> jax.Array:
+    return family.shape / family.rate
+
+
+@standard_deviation.register
+def _(family: Gamma) -> jax.Array:
+    return jnp.sqrt(family.shape) / family.rate
+
+
+def _with_variance(family: Gamma, variance: jax.Array) -> Gamma:
+    mean = center(family)
+    return Gamma(jnp.square(mean) / variance, mean / variance)
+
+
+@widen.register
+def _(family: Gamma, variance: jax.Array | float) -> Gamma:
+    return _with_variance(family, jnp.square(standard_deviation(family)) + variance)
+
+
+@at_least.register
+def _(family: Gamma, variance: jax.Array | float) -> Gamma:
+    own = jnp.square(standard_deviation(family))
+    wider = _with_variance(family, jnp.maximum(own, variance))
+    return jax.tree.map(lambda x, y: jnp.where(own < variance, x, y), wider, family)

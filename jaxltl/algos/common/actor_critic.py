@@ -1,0 +1,359 @@
+"""Networks that act and judge: what a policy of PPO is made of, and how any such one is called.
+
+Example: networks of finitely many actions, of a box, and with a memory.
+
+  >>> import jax, jax.numpy as jnp
+  >>> import jaxltl as jl
+  >>> from jaxltl.algos.common import actor_critic as networks
+  >>> seen = jax.ShapeDtypeStruct((3,), float)
+  >>> few = networks.default_network(jl.environments.Finite(4))
+  >>> shapes = jax.eval_shape(lambda x: few.init_with_output(jax.random.key(0), x)[0], seen)
+  >>> shapes[0].shape, shapes[1].shape  # logits, and a value
+  ((4,), ())
+  >>> box = networks.ActorCritic(shape=(2,), hidden=(8,))
+  >>> (mean, log_deviation), value = jax.eval_shape(
+  ...     lambda x: box.init_with_output(jax.random.key(0), x)[0], seen)
+  >>> mean.shape, log_deviation.shape
+  ((2,), (2,))
+  >>> recurrent = networks.RecurrentActorCritic(num_actions=4, memory=5)
+  >>> memory = networks.initial_memory(recurrent)
+  >>> memory.shape
+  (5,)
+  >>> parameters = jax.eval_shape(
+  ...     lambda x: networks.fresh_parameters(jax.random.key(0), recurrent, memory, x), seen)
+  >>> "actor" in parameters and "critic" in parameters
+  True
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jaxltl.algos.common.settings import applied
+from jaxltl.core import validation
+from jaxltl.core.environments.environment import Finite, flat_observation
+from jaxltl.core.pretty_print import brief
+
+
+@brief
+class Output(NamedTuple):
+    """What a network says of one observation.
+
+    Attributes:
+      memory: after it; ``()`` for a network without.
+      action: the parameters of the distribution of actions: ``float[A]``, logits, where there are
+        finitely many; of a box a pair of arrays of an action's shape, mean and logarithm of the
+        standard deviation.
+      value: ``float[]``.
+    """
+
+    memory: Any
+    action: Any
+    value: jax.Array
+
+
+def orthogonal(scale: float) -> Any:
+    """An initialiser: a uniformly drawn matrix with orthonormal rows or columns, times a scale.
+
+    By Gram and Schmidt, twice over, and not by LAPACK's factorisation as in ``flax``: on few
+    processors several batched ones in one program, as seeds side by side ask for, may each hold the
+    thread that another waits for (jaxlib 0.10.1).
+
+    Args:
+      scale: of the rows or columns.
+
+    Returns:
+      ``(key, shape, dtype) -> float[shape]``, as ``flax.linen`` takes it, of matrices.
+
+    Example:
+      >>> shape = jax.eval_shape(lambda key: orthogonal(1.0)(key, (3, 2)), jax.random.key(0))
+      >>> shape.shape
+      (3, 2)
+    """
+
+    def start(key: Any, shape: Any, dtype: Any = None) -> jax.Array:
+        rows, columns = shape
+        most, least = max(rows, columns), min(rows, columns)
+        drawn = jax.random.normal(key, (least, most), dtype)
+
+        def add(i: Any, found: jax.Array) -> jax.Array:
+            row = drawn[i]
+            for _ in range(2):
+                row = row - (found @ row) @ found
+            return found.at[i].set(row / jnp.linalg.norm(row))
+
+        found = lax.fori_loop(0, least, add, jnp.zeros_like(drawn))
+        return scale * (found.T if rows == most else found)
+
+    return start
+
+
+def dense(width: int, scale: float, name: str) -> nn.Dense:
+    """A layer of a network, orthogonal at the start, of the floats that are the default.
+
+    Args:
+      width: how many numbers it returns.
+      scale: of its matrix at the start, see :func:`orthogonal`.
+      name: among the layers of a module.
+
+    Returns:
+      The layer, ``float[..., N] -> float[..., width]``.
+
+    Example:
+      >>> dense(4, 1.0, "hidden").features
+      4
+    """
+    return nn.Dense(
+        width, kernel_init=orthogonal(scale), param_dtype=jnp.result_type(float), name=name
+    )
+
+
+class _Layers(nn.Module):
+    """Dense layers and a last one without activation, orthogonal at the start."""
+
+    hidden: Sequence[int]
+    outputs: int
+    last_scale: float
+    activation: str
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        for i, width in enumerate(self.hidden):
+            x = getattr(nn, self.activation)(dense(width, np.sqrt(2), f"hidden_{i}")(x))
+        return dense(self.outputs, self.last_scale, "out")(x)
+
+
+def _heads(module: Any, x: jax.Array) -> tuple[Any, jax.Array]:
+    """Parameters of the actions and the value, by two networks of which neither reads the other."""
+    hidden = tuple(module.hidden)
+    outputs = module.num_actions or int(np.prod(module.shape))
+    scores = _Layers(hidden, outputs, 0.01, module.activation, name="actor")(x)
+    value = _Layers(hidden, 1, 1.0, module.activation, name="critic")(x)[0]
+    if module.num_actions:
+        return scores, value
+    start = nn.initializers.constant(np.log(module.initial_deviation))
+    spread = module.param("log_deviation", start, tuple(module.shape), jnp.result_type(float))
+    return (scores.reshape(module.shape), spread), value
+
+
+class ActorCritic(nn.Module):
+    """Two multilayer perceptrons on the flattened observation: one acts, the other judges.
+
+    Orthogonal at the start: of scale sqrt(2) in between, .01 where it acts, so that all actions are
+    alike at first, and 1 where it judges (Huang et al. 2022, details 2 and 3).
+
+    Attributes:
+      num_actions: A, if there are finitely many; else 0.
+      shape: of an action, if it is of a box. The standard deviation is a parameter of its own that
+        does not depend on the observation.
+      hidden: widths of the hidden layers of each.
+      activation: by its name in ``flax.linen``.
+      initial_deviation: of a box's actions, in units of half its width where it has bounds.
+    """
+
+    num_actions: int = 0
+    shape: Sequence[int] = ()
+    hidden: Sequence[int] = (64, 64)
+    activation: str = "tanh"
+    initial_deviation: float = 1.0
+
+    @nn.compact
+    def __call__(self, observation: Any) -> tuple[Any, jax.Array]:
+        return _heads(self, flat_observation(observation))
+
+
+class RecurrentActorCritic(nn.Module):
+    """A dense layer and a gated recurrent unit, whose memory an :class:`ActorCritic`'s heads read.
+
+    Attributes:
+      num_actions, shape, hidden, activation, initial_deviation: as there.
+      memory: the size of the memory.
+    """
+
+    num_actions: int = 0
+    shape: Sequence[int] = ()
+    hidden: Sequence[int] = (64,)
+    memory: int = 64
+    activation: str = "tanh"
+    initial_deviation: float = 1.0
+
+    def initial_memory(self) -> jax.Array:
+        """``float[memory]``, zeros."""
+        return jnp.zeros(self.memory, jnp.result_type(float))
+
+    @nn.compact
+    def __call__(self, memory: jax.Array, observation: Any) -> tuple[jax.Array, Any]:
+        x = dense(self.memory, np.sqrt(2), "input")(flat_observation(observation))
+        x = getattr(nn, self.activation)(x)
+        cell = nn.GRUCell(
+            self.memory,
+            recurrent_kernel_init=orthogonal(1.0),
+            param_dtype=jnp.result_type(float),
+            name="cell",
+        )
+        memory, x = cell(memory, x)
+        return memory, _heads(self, x)
+
+
+def default_network(actions: Any) -> ActorCritic:
+    """An :class:`ActorCritic` for some actions.
+
+    Args:
+      actions: :class:`~jaxltl.core.environments.environment.Finite`, or a
+        :class:`~jaxltl.core.environments.environment.Box`.
+
+    Returns:
+      The module, its hidden layers as they are by default.
+    """
+    if isinstance(actions, Finite):
+        return ActorCritic(num_actions=actions.num)
+    return ActorCritic(shape=actions.shape)
+
+
+def initial_memory(network: nn.Module, memory: Any = None) -> Any:
+    """What a network remembers before it has seen anything, a tree of arrays; ``()``: it cannot.
+
+    Args:
+      network: whose method ``initial_memory()`` says so, if it has one.
+      memory: in place of that; None: not given.
+
+    Returns:
+      A tree of arrays.
+
+    Raises:
+      ValueError: what is given are no numbers, or has not the shapes that the network's own has.
+    """
+    begin = getattr(network, "initial_memory", tuple)
+    if memory is None:
+        return jax.tree.map(jnp.asarray, begin())
+    try:
+        found = jax.tree.map(jnp.asarray, memory)
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(
+            f"memory is {validation.shown(memory)}; give a tree of arrays of numbers."
+        ) from None
+    own = begin() if hasattr(network, "initial_memory") else found
+    if jax.tree.map(jnp.shape, found) != jax.tree.map(jnp.shape, own):
+        raise ValueError(
+            f"memory has the shapes {jax.tree.map(jnp.shape, found)}, and that of the network "
+            f"{jax.tree.map(jnp.shape, own)}; give one of those shapes, or none."
+        )
+    return found
+
+
+def has_memory(problem: Any) -> bool:
+    """Whether the problem's network is recurrent.
+
+    Args:
+      problem: with a `memory`, such as PPO's.
+
+    Returns:
+      A truth value.
+
+    Example:
+      >>> from types import SimpleNamespace
+      >>> has_memory(SimpleNamespace(memory=())), has_memory(SimpleNamespace(memory=np.zeros(2)))
+      (False, True)
+    """
+    return bool(jax.tree.leaves(problem.memory))
+
+
+def evaluated(problem: Any, parameters: Any, memory: Any, observation: Any) -> Output:
+    """What the problem's network says of one observation.
+
+    Args:
+      problem: with a `network` and its `memory`, such as PPO's.
+      parameters: of the network.
+      memory: before the observation; ``()`` for a network without.
+      observation: of one world.
+
+    Returns:
+      :class:`Output`; differentiable in the parameters.
+
+    Example:
+      >>> from types import SimpleNamespace
+      >>> problem = SimpleNamespace(network=ActorCritic(num_actions=2, hidden=()), memory=())
+      >>> def first(key, seen):
+      ...     parameters = fresh_parameters(key, problem.network, (), seen)
+      ...     return evaluated(problem, parameters, (), seen)
+      >>> jax.eval_shape(first, jax.random.key(0), jnp.zeros(3)).action.shape
+      (2,)
+    """
+    if has_memory(problem):
+        memory, (action, value) = applied(problem.network, parameters, memory, observation)
+    else:
+        action, value = applied(problem.network, parameters, observation)
+    return Output(memory, action, value)
+
+
+def fresh_parameters(key: Any, network: nn.Module, memory: Any, observation: Any) -> Any:
+    """A network's parameters at its own random start.
+
+    Args:
+      key: a PRNG key.
+      network: the module.
+      memory: before anything is seen; ``()`` for a network without.
+      observation: of one world; its numbers do not matter.
+
+    Returns:
+      The parameters, a dict of dicts of arrays.
+    """
+    read = (memory, observation) if jax.tree.leaves(memory) else (observation,)
+    return network.init(key, *read).get("params", {})
+
+
+def require_network(network: Any, memory: Any, observation: Any, space: Any, finite: bool) -> None:
+    """Refuses a network that does not return what is to be returned.
+
+    Args:
+      network: the user's.
+      memory, observation: shapes of what it reads.
+      space: shape and type of one action; of finitely many, of the logits.
+      finite: whether there are finitely many.
+
+    Raises:
+      ValueError: naming what it returns and what it should.
+
+    Example:
+      >>> seen, logits = jax.ShapeDtypeStruct((3,), float), jax.ShapeDtypeStruct((2,), float)
+      >>> require_network(ActorCritic(num_actions=2), (), seen, logits, True)  # nothing to say
+    """
+    recurrent = bool(jax.tree.leaves(memory))
+    read = (memory, observation) if recurrent else (observation,)
+    wanted = "logits float[A]" if finite else "(mean, log_deviation)"
+    form = f"(memory, ({wanted}, value))" if recurrent else f"({wanted}, value)"
+    try:
+        found, variables = jax.eval_shape(
+            lambda *x: network.init_with_output(jax.random.key(0), *x), *read
+        )
+    except TypeError as problem:  # what a function says that is called with other arguments
+        remembers = "; for one that remembers, give memory, or let initial_memory() return it"
+        raise ValueError(
+            f"network cannot be called as network({'memory, ' * recurrent}observation): {problem}. "
+            f"Let it return {form}{'' if recurrent else remembers}."
+        ) from problem
+    if set(variables) - {"params"}:
+        raise ValueError(
+            f"network keeps {sorted(set(variables) - {'params'})} beside its parameters; leave out "
+            "what is not learned by gradients."
+        )
+
+    def shapes(tree: Any) -> Any:
+        return jax.tree.map(lambda x: x.shape, tree)
+
+    action = space.shape if finite else (space.shape, space.shape)
+    expected: Any = (action, ())
+    if recurrent:
+        expected = (shapes(memory), expected)
+    if shapes(found) != expected:
+        raise ValueError(
+            f"network returns shapes {shapes(found)} for one observation; expected {expected}, "
+            f"{form}. It reads a single observation: many are a vmap."
+        )

@@ -1,0 +1,382 @@
+"""Files of a learner's state: written whole or not at all, and read back bit for bit.
+
+With the state goes a fingerprint of what it was learned from: every array of the problem and of
+the settings by shape, dtype and a hash of its bytes, and every static field. A state of another
+problem is refused, though its shapes be the same.
+
+Of arrays that lie on the devices of several processes each writes its part, and the file names
+them. It is read onto any other mesh, by any number of processes, or by one without.
+
+Example:
+  >>> import os, tempfile
+  >>> import numpy as np
+  >>> from jaxltl.algos.common import checkpoint
+  >>> path = os.path.join(tempfile.mkdtemp(), "state.npz")
+  >>> state, given = {"step": np.int32(3)}, checkpoint.fingerprint(problem=np.arange(2))
+  >>> checkpoint.save(path, state, given)
+  >>> checkpoint.load(path, {"step": np.int32(0)}, given)["step"].item()
+  3
+  >>> try:
+  ...     checkpoint.load(path, state, checkpoint.fingerprint(problem=np.ones(2)))
+  ... except ValueError as error:
+  ...     print("does not belong to this run" in str(error))
+  True
+  >>> checkpoint.remove(path)
+  >>> os.path.exists(path)
+  False
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import hashlib
+import inspect
+import json
+import os
+import tempfile
+import types
+import zipfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxltl.algos.common import _checkpoint_parts as parts
+from jaxltl.core.models.ops.array_namespace import to_jax
+
+_GIVEN = "given"  # the fingerprint's name in the file
+_PARTS = "parts"  # the name of what is in other files
+
+
+@contextlib.contextmanager
+def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
+    """A binary file that appears under its name only when complete.
+
+    Args:
+      path: where it is to be.
+
+    Yields:
+      The file, open for bytes.
+
+    Raises:
+      ValueError: the place cannot be written to.
+
+    Example:
+      >>> import pathlib, tempfile
+      >>> path = pathlib.Path(tempfile.mkdtemp()) / "note"
+      >>> with atomic_write(path) as file:
+      ...     _ = file.write(b"all of it")
+      ...     path.exists()
+      False
+      >>> path.read_bytes()
+      b'all of it'
+    """
+    path = Path(path)
+    try:
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    except OSError as error:
+        raise ValueError(
+            f"cannot write {str(path)!r}: {error.strerror}; choose a directory that exists and is "
+            "writable."
+        ) from error
+    try:
+        with os.fdopen(handle, "wb") as file:
+            yield file
+        os.chmod(temporary, 0o666 & ~_umask())
+        os.replace(temporary, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            os.unlink(temporary)
+        raise
+
+
+def read_arrays(file: BinaryIO) -> dict[str, np.ndarray]:
+    """The arrays of an ``.npz`` file, by name; nothing in it is executed.
+
+    Args:
+      file: open for bytes.
+
+    Returns:
+      NumPy arrays.
+
+    Raises:
+      ValueError: it is none, or damaged. The message tells what is wrong and lacks the file's name.
+
+    Example:
+      >>> import io
+      >>> file = io.BytesIO()
+      >>> np.savez(file, x=np.arange(3))
+      >>> _ = file.seek(0)
+      >>> read_arrays(file)["x"].tolist()
+      [0, 1, 2]
+    """
+    start = file.read(6)
+    file.seek(0)
+    if start == np.lib.format.MAGIC_PREFIX:
+        raise ValueError(
+            "it holds a single array; numpy.savez(path, name=array) writes named ones."
+        )
+    arrays, what = {}, "it"
+    try:
+        if not start.startswith(b"PK"):
+            raise zipfile.BadZipFile
+        with np.load(file, allow_pickle=False) as archive:
+            for name in archive.files:
+                what = f"its array {name!r}"
+                arrays[name] = archive[name]
+                if not isinstance(arrays[name], np.ndarray):  # raw bytes, where it is no array
+                    raise zipfile.BadZipFile
+    except Exception as error:  # damaged bytes make numpy and zipfile raise almost anything
+        if "Object arrays" in str(error):
+            raise ValueError(
+                f"{what} holds Python objects, such as None; save numbers, truth values or texts."
+            ) from None
+        raise ValueError(
+            f"{what} is damaged, or not written by numpy.savez(path, name=array)."
+        ) from None
+    return arrays
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def save(path: str | os.PathLike[str], state: Any, given: Mapping[str, str] | None = None) -> None:
+    """Writes a learner's state as an ``.npz``, atomically.
+
+    In several processes all of them call it, with a directory that they share. What lies on the
+    devices of several is written by each, beside the file, which the first process writes last.
+
+    Args:
+      path: the file.
+      state: any tree of arrays.
+      given: :func:`fingerprint` of the problem and settings.
+
+    Raises:
+      ValueError: the place cannot be written to.
+    """
+    path, named = Path(path), [(name, _data(leaf)) for name, leaf in _named(state)]
+    apart = {name: leaf for name, leaf in named if parts.is_apart(leaf)}
+    before = parts.parts_of(path)
+    stored = parts.write(path, apart, atomic_write) if apart else {}
+    if jax.process_index() and any(parts.is_shared(leaf) for _, leaf in named):
+        return
+    arrays: dict[str, Any] = {_GIVEN: np.array(json.dumps(dict(given or {})))}
+    arrays |= {name: np.asarray(leaf) for name, leaf in named if name not in apart}
+    if stored:
+        arrays[_PARTS] = np.array(json.dumps({name: list(x) for name, x in stored.items()}))
+    with atomic_write(path) as file:
+        np.savez(file, **arrays)
+    kept = {file for x in stored.values() for *_, file, _ in x.pieces}
+    parts.remove([part for part in before if part.name not in kept])
+
+
+def remove(path: str | os.PathLike[str]) -> None:
+    """Removes a state that :func:`save` wrote, with its parts and what was begun and not finished.
+
+    No process may still be writing it.
+
+    Args:
+      path: the file; nothing is said of one that is not there.
+    """
+    path = Path(path)
+    parts.remove([path, *parts.parts_of(path), *parts.unfinished(path)])
+
+
+def load(path: str | os.PathLike[str], like: Any, given: Mapping[str, str] | None = None) -> Any:
+    """Reads a state saved by :func:`save`, bit for bit.
+
+    Args:
+      path: the file.
+      like: a state of the same learner and problem (for example from ``init``); a first axis of
+        length zero stands for one of any length. What lies on several devices there comes to lie
+        on them, whatever devices the state was saved from; each process reads what it needs.
+      given: as in :func:`save`, which has to be the same.
+
+    Returns:
+      A tree as `like`, with the arrays of the file.
+
+    Raises:
+      ValueError: the file is damaged, its arrays do not fit `like`, or it was saved for another
+        problem or with other settings.
+    """
+    with parts.reading(path) as others:
+        try:
+            # An open file of our own is closed even where a damaged archive is given up.
+            with open(path, "rb") as file:
+                arrays: dict[str, Any] = read_arrays(file)
+            before = json.loads(str(arrays.pop(_GIVEN)))
+            stored = json.loads(str(arrays.pop(_PARTS, "{}")))
+            arrays |= {name: parts.Stored(*x) for name, x in stored.items()}
+            leaves = [
+                _loaded(str(path), name, leaf, arrays.get(name), others)
+                for name, leaf in _named(like)
+            ]
+        except _Another as error:
+            raise ValueError(str(error)) from None
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{str(path)!r} is not a saved state: {error}") from error
+    _require_same(str(path), before, dict(given or {}))
+    return jax.tree.unflatten(jax.tree.structure(like), leaves)
+
+
+class _Another(Exception):
+    """An array that another learner or problem has."""
+
+
+def _loaded(path: str, name: str, leaf: Any, found: Any, others: parts.Parts) -> Any:
+    """An array where it is to be, from the file's or from the parts beside it."""
+    expected = _data(leaf)
+    if found is None or not _fits(found, expected):
+        is_ = "missing" if found is None else f"{found.dtype}{list(found.shape)}"
+        raise _Another(
+            f"{path!r} does not belong to this run: {name} is {is_}, expected "
+            f"{expected.dtype}{list(expected.shape)}. Delete the file to start afresh."
+        )
+    over = isinstance(expected, jax.Array) and len(expected.sharding.device_set) > 1
+    if over:
+
+        def block(index: Any) -> np.ndarray:
+            return others.read(found, index) if isinstance(found, parts.Stored) else found[index]
+
+        value = jax.make_array_from_callback(tuple(found.shape), expected.sharding, block)
+    else:
+        value = to_jax(others.read(found) if isinstance(found, parts.Stored) else found)
+    if expected is not leaf:
+        value = jax.random.wrap_key_data(value, impl=jax.random.key_impl(leaf))
+    return value
+
+
+def _fits(found: np.ndarray | parts.Stored, expected: jax.Array) -> bool:
+    shape = expected.shape
+    if shape[:1] == (0,):
+        shape = (*found.shape[:1], *shape[1:])
+    return tuple(found.shape) == shape and found.dtype == expected.dtype
+
+
+def _require_same(path: str, before: dict[str, str], now: dict[str, str]) -> None:
+    other = [name for name in {**before, **now} if before.get(name) != now.get(name)]
+    if other:
+        name = other[0]
+        raise ValueError(
+            f"{path!r} does not belong to this run: {name} was "
+            f"{before.get(name, 'not given')} and is {now.get(name, 'not given')}"
+            + (f" ({len(other)} differences)" if len(other) > 1 else "")
+            + ". Delete the file to start afresh, or go on with what it was made with."
+        )
+
+
+def _named(tree: Any) -> list[tuple[str, Any]]:
+    """Leaves with distinct file-safe names, whose numbers keep nested paths apart."""
+    leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
+    return [
+        (f"{i}{jax.tree_util.keystr(path)}".replace("/", "_"), _array_of(leaf))
+        for i, (path, leaf) in enumerate(leaves)
+    ]
+
+
+def _array_of(leaf: Any) -> Any:
+    """As ``jnp.asarray``, but NumPy's arrays stay on the host, where nothing is compiled."""
+    if not isinstance(leaf, np.ndarray):
+        return jnp.asarray(leaf)
+    return leaf.astype(jax.dtypes.canonicalize_dtype(leaf.dtype), copy=False)
+
+
+def _data(leaf: jax.Array) -> jax.Array:
+    is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+    return jax.random.key_data(leaf) if is_key else leaf
+
+
+# --- fingerprints ---------------------------------------------------------------------------
+
+
+def fingerprint(**given: Any) -> dict[str, str]:
+    """What is told apart of arguments, by place: types, static fields, and arrays by their bytes.
+
+    Functions count by their code, not by where they lie, so that another process finds the same.
+
+    Args:
+      given: trees of arrays, by names of one's own.
+
+    Returns:
+      By the place of each part, a text that tells it from others.
+
+    Example:
+      >>> one, two = (fingerprint(x=(np.arange(2), {"b": y})) for y in (0.5, 0.25))
+      >>> sorted(one), [name for name in one if one[name] != two[name]]
+      (['x[0]', "x[1]['b']"], ["x[1]['b']"])
+    """
+    return dict(pair for name, value in given.items() for pair in _described(name, value))
+
+
+def _described(name: str, value: Any) -> Iterator[tuple[str, str]]:
+    value = inspect.unwrap(value)  # what jax.jit wraps
+    if value is None or isinstance(value, bool | int | float | complex | str | bytes | np.dtype):
+        yield name, repr(value)
+    elif isinstance(value, jax.Array | np.ndarray | np.generic):
+        yield name, _array(value)
+    elif isinstance(value, Mapping):
+        for key in sorted(value, key=str):
+            yield from _described(f"{name}[{key!r}]", value[key])
+    elif isinstance(value, list | tuple):
+        names = getattr(value, "_fields", None)
+        for i, entry in enumerate(value):
+            yield from _described(f"{name}.{names[i]}" if names else f"{name}[{i}]", entry)
+    elif isinstance(value, functools.partial):  # JAX's are its children
+        for part in ("func", "args", "keywords"):
+            yield from _described(f"{name}.{part}", getattr(value, part))
+    elif isinstance(value, types.FunctionType):
+        yield from _function(name, value)
+    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+        yield name, _type(value)
+        for field in dataclasses.fields(value):
+            if field.name not in ("parent", "name"):  # of a flax module: where it hangs
+                yield from _described(f"{name}.{field.name}", getattr(value, field.name))
+    else:
+        leaves, structure = jax.tree.flatten(value)
+        yield name, _type(value) if jax.tree_util.treedef_is_leaf(structure) else str(structure)
+        if not jax.tree_util.treedef_is_leaf(structure):
+            yield from _described(name, leaves)
+
+
+def _array(value: Any) -> str:
+    """Shape, dtype and a hash of the bytes; small things also as they are."""
+    if isinstance(value, jax.Array):
+        value = _data(value)
+    array = np.asarray(value)
+    digest = hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()[:16]
+    shown = f" = {array.tolist()}" if array.size <= 4 else ""
+    return f"{array.dtype}{list(array.shape)}{shown} #{digest}"
+
+
+def _function(name: str, value: types.FunctionType) -> Iterator[tuple[str, str]]:
+    yield name, f"{value.__module__}.{value.__qualname__} #{_code(value.__code__)}"
+    for free, cell in zip(value.__code__.co_freevars, value.__closure__ or (), strict=True):
+        with contextlib.suppress(ValueError):  # a cell that is empty yet
+            held = inspect.unwrap(cell.cell_contents)
+            if isinstance(held, types.FunctionType):  # whose own cells may lead back here
+                yield f"{name}.{free}", _code(held.__code__)
+            else:
+                yield from _described(f"{name}.{free}", held)
+
+
+def _code(code: types.CodeType) -> str:
+    held = [_code(c) if isinstance(c, types.CodeType) else _constant(c) for c in code.co_consts]
+    return hashlib.sha256(code.co_code + repr((held, code.co_names)).encode()).hexdigest()[:16]
+
+
+def _constant(value: Any) -> str:
+    """Sets in an order that does not change from process to process."""
+    return repr(sorted(map(repr, value)) if isinstance(value, frozenset) else value)
+
+
+def _type(value: Any) -> str:
+    kind = value if isinstance(value, type) else type(value)
+    return f"{kind.__module__}.{kind.__qualname__}"

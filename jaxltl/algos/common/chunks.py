@@ -1,0 +1,225 @@
+"""Runs of a learner in compiled chunks, on the host: reports, saved states, and resuming bitwise.
+
+Example: half of what is lacking in each step, for two runs side by side.
+
+  >>> import jax, jax.numpy as jnp
+  >>> from flax import struct
+  >>> from jaxltl.algos.common.chunks import run_in_chunks
+  >>> @struct.dataclass
+  ... class State:
+  ...     step: jax.Array
+  ...     guess: jax.Array
+  >>> def step(state, problem, hparams):
+  ...     guess = state.guess + hparams * (problem - state.guess)
+  ...     return State(state.step + 1, guess), {"guess": guess}
+  >>> start = State(jnp.zeros(2, jnp.int32), jnp.zeros(2))
+  >>> chunks = run_in_chunks(step, start, 5.0, 0.5, num_steps=4, chunk=2, lanes=True)
+  >>> chunks.state.step.tolist(), chunks.step.tolist(), chunks.metrics["guess"].shape
+  ([4, 4], [1, 2, 3, 4], (4, 2))
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache, partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.sharding import Mesh
+from jax.tree_util import Partial
+
+from jaxltl.algos.common import checkpoint as files
+from jaxltl.algos.common._run_over_mesh import run_over_mesh
+from jaxltl.algos.common.learner import (
+    Progress,
+    Step,
+    Until,
+    block_lengths,
+    either,
+    run_blocks,
+    strong,
+)
+from jaxltl.core.models.mesh.lanes import on_host
+from jaxltl.core.models.ops.array_namespace import to_jax
+from jaxltl.core.validation import truth
+
+
+class Chunks(NamedTuple):
+    """What :func:`run_in_chunks` ends with.
+
+    Attributes:
+      state: where it ended; with lanes, a first axis of N.
+      metrics: of evenly spaced steps of each chunk, NumPy arrays with a first axis of rows, those
+        before an interruption included; with lanes ``[rows, N, ...]``.
+      step: ``int[rows]``, the number of the step that each row is of, from 1.
+      done: whether the condition was met; with lanes ``bool[N]``.
+    """
+
+    state: Any
+    metrics: Any
+    step: np.ndarray
+    done: np.ndarray
+
+
+def run_in_chunks(
+    step: Step,
+    state: Any,
+    problem: Any,
+    hparams: Any,
+    *,
+    num_steps: int,
+    until: Until | None = None,
+    keep: str = "after",
+    lanes: bool = False,
+    chunk: int | None = None,
+    max_rows: int = 10,
+    report: Callable[[int, Any], None] | None = None,
+    checkpoint: str | os.PathLike[str] | None = None,
+    mesh: Mesh | None = None,
+) -> Chunks:
+    """Steps in compiled chunks, with a report and a saved state after each.
+
+    Args:
+      step, problem: as for :func:`~jaxltl.algos.common.learner.run`.
+      state: where to start; with `lanes` of N runs side by side, with a first axis of N.
+      hparams: numbers; with `lanes` shared by the runs, or one for each, ``[N]``.
+      num_steps: the number of steps to reach: a state that has already made some
+        (``state.step``) makes only the rest.
+      until, keep: as for :func:`~jaxltl.algos.common.learner.run_until`. A run that has met the condition
+        stays where it is, so that none depends on the others; when all have, the loop ends.
+      lanes: whether there are N runs.
+      chunk: steps between reports; default `max_rows`, or a hundredth of `num_steps`.
+      max_rows: metrics are kept of at most so many steps of a chunk.
+      report: called with the number of steps and the newest metrics after each chunk.
+      checkpoint: a file that holds all of this after every chunk, written atomically. If it
+        exists, the run goes on from it, and ends with the same bits.
+      mesh: devices over which the lanes lie (:mod:`~jaxltl.core.models.mesh.lanes`). In several
+        processes each calls this with the same arguments, and has all of the result but the state,
+        which stays where it is. Checkpoints of other devices, or of none, are gone on from too.
+
+    Returns:
+      :class:`Chunks`.
+
+    Raises:
+      ValueError: the checkpoint belongs to another learner, problem or setting.
+    """
+    lanes = truth("lanes", lanes)
+    chunk = chunk or max(max_rows, -(-num_steps // 100))
+    num_lanes = len(state.step) if lanes else None
+    hparams = _spread(hparams, state) if lanes else hparams
+    until = until if until is None or isinstance(until, Partial) else Partial(until)
+    now = _begin(step, state, problem, hparams, num_lanes)
+    rows = jax.tree.map(lambda x: np.zeros((0, *x.shape), x.dtype), (now.count, now.metrics))
+    given: Any = None
+    if checkpoint is not None:
+        given = files.fingerprint(step=step, problem=problem, hparams=hparams)
+        if os.path.exists(checkpoint):
+            now, rows = files.load(checkpoint, (now, rows), given)
+    if mesh is None:
+        advance = partial(run_blocks, _lane_steps(step, keep, num_lanes))
+    else:
+        advance = run_over_mesh(mesh, run_blocks, _lane_steps(step, keep, None))
+    ended, made = on_host((now.done, now.count))
+    while made.max() < num_steps and not ended.all():
+        lengths = block_lengths(min(chunk, num_steps - int(made.max())), max_rows)
+        now, fresh = advance(strong(now), problem, (hparams, until), lengths)
+        rows = jax.tree.map(
+            lambda x, y: np.concatenate([x, y]), jax.device_get(rows), jax.device_get(fresh)
+        )
+        ended, made = on_host((now.done, now.count))
+        if checkpoint is not None:
+            files.save(checkpoint, (now, rows), given)
+        if report is not None:
+            report(int(made.max()), jax.tree.map(lambda x: x[-1], rows[1]))
+    step_of = np.asarray(rows[0])
+    return Chunks(
+        now.state, jax.tree.map(np.asarray, rows[1]), step_of[:, 0] if lanes else step_of, ended
+    )
+
+
+def _begin(step: Step, state: Any, problem: Any, hparams: Any, num_lanes: int | None) -> Progress:
+    """Before the first chunk; nothing is compiled for it."""
+    lanes = () if num_lanes is None else (num_lanes,)
+    shape = _metrics_of(step, state, problem, hparams, num_lanes)
+    metrics = jax.tree.map(lambda x: np.zeros((*lanes, *x.shape), x.dtype), shape)
+    count = np.asarray(on_host(state.step), np.int32)
+    return Progress(state, *to_jax((metrics, count, np.zeros(count.shape, bool))))
+
+
+def _metrics_of(step: Step, state: Any, problem: Any, hparams: Any, num_lanes: int | None) -> Any:
+    """Shapes of the metrics of one run, from a step's trace."""
+    one = (state, hparams)
+    if num_lanes is not None:
+        one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), one)
+    # As a program, whose trace is kept for the next run.
+    return jax.eval_shape(jax.jit(step), one[0], problem, one[1])[1]
+
+
+def trace_lanes(step: Step, state: Any, problem: Any, hparams: Any) -> None:
+    """Does of :func:`run_in_chunks` with lanes what takes only the shapes of the first states.
+
+    Args:
+      step, problem, hparams: as for :func:`run_in_chunks`.
+      state: of N runs side by side, or its shapes.
+
+    Example:
+      >>> from flax import struct
+      >>> @struct.dataclass
+      ... class State:
+      ...     step: jax.Array
+      ...     x: jax.Array
+      >>> def step(state, problem, hparams):
+      ...     return State(state.step + 1, state.x * hparams), {"x": state.x}
+      >>> trace_lanes(step, State(jnp.zeros(2, jnp.int32), jnp.ones(2)), (), 0.5)
+    """
+    _metrics_of(step, state, problem, _spread(hparams, state), len(state.step))
+
+
+@cache  # compiled once for each step, so it must stay the same function
+def _lane_steps(step: Step, keep: str, num_lanes: int | None) -> Step:
+    """A step of :class:`Progress`, of one run or of several; its rows are counts and metrics."""
+
+    def one(now: Progress, problem: Any, given: Any) -> tuple[Progress, Any]:
+        hparams, until = given
+
+        def go(now: Progress) -> Progress:
+            after, metrics = step(now.state, problem, hparams)
+            if until is None:
+                return replace(now, state=after, metrics=metrics)
+            done = jnp.asarray(until(now.state, after, metrics))
+            state = either(done, now.state, after) if keep == "before" else after
+            return replace(now, state=state, metrics=metrics, done=done)
+
+        new = go(now) if until is None else lax.cond(now.done, lambda x: x, go, now)
+        new = replace(new, count=now.count + 1)
+        return new, (new.count, new.metrics)
+
+    if num_lanes is None:
+        return one
+    if num_lanes > 1:
+        return jax.vmap(one, in_axes=(0, None, (0, None)))
+
+    def alone(now: Progress, problem: Any, given: Any) -> tuple[Progress, Any]:
+        # Without vmap, whose loops and branches take several times as long to compile.
+        first, hparams = jax.tree.map(lambda x: x[0], (now, given[0]))
+        return jax.tree.map(lambda x: x[None], one(first, problem, (hparams, given[1])))
+
+    return alone
+
+
+def _spread(hparams: Any, state: Any) -> Any:
+    """Numbers for each of N runs, floats in the precision of the states."""
+    size = len(state.step)
+    floats = [x.dtype for x in jax.tree.leaves(state) if jnp.issubdtype(x.dtype, jnp.floating)]
+
+    def one(x: Any) -> np.ndarray:
+        x = np.asarray(x)
+        x = x.astype(floats[0]) if floats and np.issubdtype(x.dtype, np.floating) else x
+        return np.broadcast_to(x, (size, *x.shape[1:]))
+
+    return to_jax(jax.tree.map(one, hparams))

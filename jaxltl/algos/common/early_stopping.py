@@ -1,0 +1,59 @@
+"""Learning that ends when held-out data have not been explained better for a while."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from jaxltl.algos.common.learner import choose
+from jaxltl.core.pretty_print import brief
+
+
+@brief
+@struct.dataclass
+class Best:
+    """The parameters with the best held-out likelihood; without held-out data the newest.
+
+    Attributes:
+      parameters: of the network, a pytree.
+      neg_log_likelihood: ``float[]``, held out, in nats a pair; NaN without held-out data.
+      step: ``int32[]``, the number of steps after which they were reached.
+    """
+
+    parameters: Any
+    neg_log_likelihood: jax.Array
+    step: jax.Array
+
+
+def stop_early(
+    state: Any, after: Any, held_out: jax.Array, judged: jax.Array, patience: jax.Array | int
+) -> tuple[Best, jax.Array]:
+    """The best parameters so far, and whether patience has run out.
+
+    Args:
+      state: before a step, with ``parameters``, ``step``, ``best`` and ``stopped``.
+      after: the parameters after it.
+      held_out: ``float[]``, negative log-likelihood of the parameters before it.
+      judged: ``bool[]``, whether there is held-out data.
+      patience: steps without anything better after which learning stops.
+
+    Returns:
+      :class:`Best`, and ``bool[]``.
+
+    Example:
+      >>> from types import SimpleNamespace
+      >>> best = Best(jnp.zeros(1), jnp.array(0.5), jnp.int32(2))
+      >>> state = SimpleNamespace(
+      ...     parameters=jnp.ones(1), step=jnp.int32(9), best=best, stopped=jnp.bool_(False))
+      >>> best, stopped = stop_early(state, jnp.full(1, 2.0), jnp.array(0.6), jnp.bool_(True), 5)
+      >>> best.parameters.tolist(), stopped.item()  # nothing better for seven steps
+      ([0.0], True)
+    """
+    better = judged & (held_out < state.best.neg_log_likelihood) & ~state.stopped
+    best = choose(better, Best(state.parameters, held_out, state.step), state.best)
+    newest = Best(after, jnp.full_like(held_out, jnp.nan), state.step + 1)
+    stopped = state.stopped | (judged & (state.step - best.step >= patience))
+    return choose(judged, best, newest), stopped

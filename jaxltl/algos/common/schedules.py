@@ -1,0 +1,258 @@
+"""Numbers that change from step to step, and the theorem's conditions on them (chapter 4).
+
+Example:
+  >>> from jaxltl.algos import cce
+  >>> from jaxltl.algos.common import schedules
+  >>> hparams = cce.Hparams(  # those of theorem 1
+  ...     rate=schedules.Polynomial(0.5, -0.7), num_samples=schedules.Polynomial(10, 0.5),
+  ...     weighting="literal")
+  >>> schedules.theorem_conditions(hparams, num_steps=90).holds
+  True
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from jaxltl.core.pretty_print import brief
+
+# Products such as .07 * 100 come out a little above the integer that they are.
+SLACK = 1e-9
+
+
+@brief
+@struct.dataclass
+class Polynomial:
+    """The schedule ``scale * (l + offset) ** power`` of the steps l = 1, 2, ...
+
+    A negative power decays. Numbers are traced.
+
+    Attributes:
+      scale, power: the numbers.
+      offset: added to the step; default 0.
+
+    Example:
+      >>> [round(float(at(Polynomial(0.5, -1.0), step)), 3) for step in range(3)]
+      [0.5, 0.25, 0.167]
+    """
+
+    scale: jax.Array | float
+    power: jax.Array | float
+    offset: jax.Array | float = 0.0
+
+
+@brief
+@struct.dataclass
+class Linear:
+    """From `first` in the first step in a straight line to `last` after `num_steps` steps.
+
+    Then it stays there. Numbers are traced.
+
+    Attributes:
+      first, last: the ends.
+      num_steps: steps of the way between them.
+
+    Example:
+      >>> [float(at(Linear(1.0, 0.0, 4), step)) for step in range(6)]
+      [1.0, 0.75, 0.5, 0.25, 0.0, 0.0]
+    """
+
+    first: jax.Array | float
+    last: jax.Array | float
+    num_steps: jax.Array | int
+
+    def __call__(self, l: jax.Array | int) -> jax.Array:  # noqa: E741
+        """The number in step l = 1, 2, ..."""
+        made = jnp.asarray(l, jnp.result_type(float)) - 1
+        share = jnp.clip(made / jnp.asarray(self.num_steps), 0, 1)
+        return self.first + (self.last - self.first) * share
+
+
+Schedule = Any  # a number, a Polynomial, or a pytree that is called with l = 1, 2, ...
+
+
+def is_schedule(given: Any) -> bool:
+    """Whether it is a schedule of the step, and no number: a tree of arrays, so that it is traced.
+
+    Args:
+      given: anything.
+
+    Returns:
+      A truth value.
+
+    Example:
+      >>> import math
+      >>> [is_schedule(x) for x in (Linear(1.0, 0.0, 4), Polynomial(1.0, -1.0), 0.5, math.exp)]
+      [True, True, False, False]
+    """
+    own = isinstance(given, Polynomial) or callable(given)
+    return own and not jax.tree_util.all_leaves([given])
+
+
+def at(schedule: Schedule, step: jax.Array | int) -> Any:
+    """A schedule's number in the step after `step` steps, l = step + 1.
+
+    Args:
+      schedule: a number, :class:`Polynomial`, :class:`Linear`, or a function of l in a pytree.
+      step: at least 0; may be traced.
+
+    Returns:
+      A number, as the schedule gives it; None of None.
+
+    Example:
+      >>> at(Linear(1.0, 0.0, 2), 1).item(), at(0.5, 1)
+      (0.5, 0.5)
+    """
+    l = jnp.asarray(step) + 1  # noqa: E741
+    if isinstance(schedule, Polynomial):
+        return schedule.scale * (l + jnp.asarray(schedule.offset)) ** jnp.asarray(schedule.power)
+    return schedule(l) if callable(schedule) else schedule
+
+
+@brief
+class Condition(NamedTuple):
+    """One of theorem 1's conditions.
+
+    Attributes:
+      name: in a few words.
+      holds: whether it does; None if that cannot be told.
+      reason: why.
+
+    Example:
+      >>> Condition("samples grow", False, "their number stays").holds
+      False
+    """
+
+    name: str
+    holds: bool | None
+    reason: str
+
+
+@brief
+class Conditions(NamedTuple):
+    """What :func:`theorem_conditions` tells.
+
+    Attributes:
+      holds: True if all conditions hold, False if one fails, else None.
+      failing: the names of those that fail.
+      conditions: all, with reasons.
+      assumed: what the theorem assumes of the problem, which settings cannot show.
+    """
+
+    holds: bool | None
+    failing: tuple[str, ...]
+    conditions: tuple[Condition, ...]
+    assumed: tuple[str, ...]
+
+
+_ASSUMED = (
+    "(1) the covariance of the sufficient statistics is positive definite",
+    "(2a) the differential equation (4.12) is continuous with unique solutions",
+    "(2c) the quantiles of H and U are unique",
+    "(2d) policies and distributions lie in compact sets",
+    "(2e) G is bounded and bounded away from 0, and H is bounded",
+    "(2f) the distribution stays in the interior of its set",
+)
+
+
+def theorem_conditions(hparams: Any, *, num_steps: int | None = None) -> Conditions:
+    """Whether the settings meet the conditions of theorem 1, on the host.
+
+    They are (assumption 2b): ``n_l`` grows as ``l^beta`` with beta > 0; ``alpha_l`` is positive,
+    decreases to 0 and has an infinite sum; ``lambda_l = O(l^-lambda)`` for some lambda > 0 with
+    ``beta + 2 lambda > 1``; and that the method is algorithm 2 as printed.
+
+    Args:
+      hparams: concrete numbers.
+      num_steps: the length of the run. `population` bounds n_l, so that the samples can grow
+        only for so long; None asks for ever.
+
+    Returns:
+      :class:`Conditions`.
+
+    Example:
+      >>> from jaxltl.algos.cce import Hparams
+      >>> theorem_conditions(Hparams(weighting="literal")).failing
+      ('samples grow', 'rate decreases', 'rate vanishes')
+      >>> hparams = Hparams(rate=Polynomial(0.5, -0.7), num_samples=Polynomial(10, 0.5),
+      ...                   weighting="literal")
+      >>> theorem_conditions(hparams, num_steps=90).holds
+      True
+    """
+    growth, samples = _samples_condition(hparams, num_steps)
+    decay, share = _share_condition(hparams.sample_share)
+    both = None if growth is None or decay is None else growth + 2 * decay > 1
+    found = (
+        samples,
+        *_rate_conditions(hparams.rate),
+        share,
+        Condition("beta + 2 lambda > 1", both, f"beta = {growth}, lambda = {decay}"),
+        Condition(
+            "weights are G", hparams.weighting == "literal", f"weighting={hparams.weighting!r}"
+        ),
+        *(
+            Condition(
+                f"no {name}", getattr(hparams, name) in (None, False), "not part of algorithm 2"
+            )
+            for name in ("elite_reuse", "antithetic", "variance_floor", "noise", "restart_below")
+        ),
+    )
+    failing = tuple(c.name for c in found if c.holds is False)
+    unknown = any(c.holds is None for c in found)
+    return Conditions(False if failing else None if unknown else True, failing, found, _ASSUMED)
+
+
+def _polynomial(schedule: Schedule) -> tuple[float, float, float] | None:
+    """Scale, power and offset, or None of a function."""
+    if isinstance(schedule, Polynomial):
+        return float(schedule.scale), float(schedule.power), float(schedule.offset)
+    return None if callable(schedule) else (float(schedule), 0.0, 0.0)
+
+
+_FUNCTION = "it is a function; its limits cannot be told"
+
+
+def _samples_condition(hparams: Any, num_steps: int | None) -> tuple[float | None, Condition]:
+    name = "samples grow"
+    if hparams.num_samples is None:
+        return 0.0, Condition(name, False, f"n_l is always {hparams.population}")
+    found = _polynomial(hparams.num_samples)
+    if found is None:
+        return None, Condition(name, None, f"num_samples: {_FUNCTION}")
+    scale, power, offset = found
+    if not (scale > 0 and power > 0):
+        return min(power, 0.0), Condition(name, False, f"n_l = {scale:g} l^{power:g}")
+    full = max(math.floor((hparams.population / scale) ** (1 / power) - offset + SLACK), 0)
+    reason = f"n_l ~ l^{power:g} until step {full}, then population={hparams.population}"
+    return power, Condition(name, num_steps is not None and num_steps <= full, reason)
+
+
+def _rate_conditions(rate: Schedule) -> list[Condition]:
+    names = ("rate in (0, 1]", "rate decreases", "rate vanishes", "rate has an infinite sum")
+    found = _polynomial(rate)
+    if found is None:
+        return [Condition(name, None, f"rate: {_FUNCTION}") for name in names]
+    scale, power, offset = found
+    first = scale * (1 + offset) ** power if offset > -1 else math.nan
+    decays = power < 0 and scale > 0
+    holds = (0 < first <= 1 and power <= 0, decays, decays, power >= -1 and scale > 0)
+    reason = f"alpha_l = {scale:g} (l + {offset:g})^{power:g}"
+    return [Condition(name, held, reason) for name, held in zip(names, holds, strict=True)]
+
+
+def _share_condition(share: Schedule) -> tuple[float | None, Condition]:
+    name = "sample share decays"
+    found = (0.0, 0.0, 0.0) if share is None else _polynomial(share)
+    if found is None:
+        return None, Condition(name, None, f"sample_share: {_FUNCTION}")
+    scale, power, offset = found
+    if scale == 0:  # of any order
+        return math.inf, Condition(name, True, "lambda_l = 0")
+    first = scale * (1 + offset) ** power if offset > -1 else math.nan
+    reason = f"lambda_l = {scale:g} (l + {offset:g})^{power:g}"
+    return -power, Condition(name, power < 0 and 0 <= first <= 1, reason)

@@ -1,0 +1,149 @@
+"""Steps along quasi-Newton directions, with one place where the loss is evaluated."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from jax import lax
+
+from jaxltl.algos.common import learner
+
+_MOST = 16  # evaluations for one step
+_DECREASE, _CURVATURE = 1e-4, 0.9  # Wolfe's constants
+_MEMORY = 10
+
+
+@struct.dataclass
+class Point:
+    """Parameters with the loss, its gradient and whatever else was found there."""
+
+    parameters: Any
+    loss: jax.Array
+    gradient: Any
+    parts: Any
+
+
+@struct.dataclass
+class Search:
+    """What goes from one step to the next.
+
+    Attributes:
+      point: where the last step ended.
+      direction: where the next step goes.
+      memory: optax's, of the last steps and gradients.
+      known: whether the point was evaluated yet.
+    """
+
+    point: Point
+    direction: Any
+    memory: Any
+    known: jax.Array
+
+
+class _Trial(NamedTuple):
+    base: Point
+    direction: Any
+    known: jax.Array
+    best: Point  # the lowest loss so far
+    moved: jax.Array  # whether that is another point than the base
+    size: jax.Array
+    low: jax.Array  # the largest step that was too short
+    high: jax.Array  # the least one that was too long
+    done: jax.Array
+    n: jax.Array
+
+
+def _directions() -> optax.GradientTransformation:
+    return optax.scale_by_lbfgs(memory_size=_MEMORY)
+
+
+def start(parameters: Any, point: Point) -> Search:
+    """Before anything was evaluated; `point` gives the shapes."""
+    zero = optax.tree.zeros_like(parameters)
+    # optax starts from weakly typed zeros, which a second run would compile anew for.
+    memory = learner.strong(_directions().init(parameters))
+    return Search(point, zero, memory, jnp.bool_(False))
+
+
+def step(evaluate: Callable[[Any, Point], Point], search: Search) -> tuple[Search, Point]:
+    """One step of L-BFGS (Liu and Nocedal 1989) to a point that satisfies Wolfe's conditions.
+
+    The step's size is bracketed and halved or doubled (Lewis and Overton 2013), which ends for
+    every smooth loss; where rounding hides a decrease, the slope is what counts (Hager and Zhang
+    2005). Parameters that give no number are too far.
+
+    Args:
+      evaluate: the point at some parameters, from there and the point before.
+      search: where to go on from.
+
+    Returns:
+      The search after the step, and the point before it.
+    """
+    eps = float(jnp.finfo(search.point.loss.dtype).eps)
+
+    def trial(k: _Trial) -> _Trial:
+        new = evaluate(_ahead(k.base, k.direction, k.size), k.base)
+        slope = optax.tree.vdot(k.base.gradient, k.direction)
+        ahead = optax.tree.vdot(new.gradient, k.direction)
+        lower = new.loss <= k.base.loss + _DECREASE * k.size * slope  # false for NaN
+        level = new.loss <= k.base.loss + 8 * eps * jnp.abs(k.base.loss)
+        lower |= level & (ahead <= (2 * _DECREASE - 1) * slope)
+        steep = ahead < _CURVATURE * slope
+        good = lower & ~steep
+        low = jnp.where(lower & steep, k.size, k.low)
+        high = jnp.where(lower, k.high, k.size)
+        size = jnp.where(jnp.isfinite(high), (low + high) / 2, 2 * low)
+        better = good | (new.loss < k.best.loss)
+        later = k._replace(
+            best=learner.either(better, new, k.best),
+            moved=k.moved | better,
+            size=size,
+            low=low,
+            high=high,
+            done=good | (k.n + 1 >= _MOST),
+            n=k.n + 1,
+        )
+        # The very first evaluation is of the start, and gives the first direction.
+        scale = -jnp.minimum(1, 1 / optax.tree.norm(new.gradient))
+        first = k._replace(
+            base=new,
+            best=new,
+            known=jnp.bool_(True),
+            direction=optax.tree.scale(scale, new.gradient),
+            size=jnp.ones_like(size),
+        )
+        return learner.either(k.known, later, first)
+
+    one = jnp.ones((), search.point.loss.dtype)
+    begin = _Trial(
+        search.point,
+        search.direction,
+        search.known,
+        search.point,
+        jnp.bool_(False),
+        jnp.where(search.known, one, 0),
+        0 * one,
+        jnp.inf * one,
+        jnp.bool_(False),
+        jnp.int32(0),
+    )
+    found = lax.while_loop(lambda k: ~k.done, trial, begin)
+    new = found.best
+    moved, memory = _directions().update(new.gradient, search.memory, new.parameters)
+    # A direction that does not descend, or a step that led nowhere, starts afresh.
+    fresh = ~(optax.tree.vdot(moved, new.gradient) > 0) | ~found.moved
+    scale = jnp.minimum(1, 1 / optax.tree.norm(new.gradient))
+    moved = learner.either(fresh, optax.tree.scale(scale, new.gradient), moved)
+    memory = learner.either(
+        fresh & ~jnp.isnan(new.loss), learner.strong(_directions().init(new.parameters)), memory
+    )
+    return Search(new, optax.tree.scale(-1, moved), memory, jnp.bool_(True)), found.base
+
+
+def _ahead(base: Point, direction: Any, size: jax.Array) -> Any:
+    return jax.tree.map(lambda x, d: x + size.astype(x.dtype) * d, base.parameters, direction)

@@ -1,0 +1,475 @@
+"""Maximum-likelihood inverse RL with side information in temporal logic (chapter 2).
+
+From demonstrations, learn a reward whose softmax policy makes them likely (2.4), in the
+world or in its product with a task, and trade the likelihood against the probability
+that the policy does the task (2.6).
+
+Example: learning from two runs that reach the goal, of which one tries again, by two features.
+
+  >>> import jax, numpy as np
+  >>> import jaxltl as jl
+  >>> from jaxltl.algos import mlirl
+  >>> from jaxltl.algos.common import learner
+  >>> world = jl.make_mdp(  # a start, from where one gets to a goal or into a trap
+  ...     [[[1, 2], [0, 1]], [[1, 0], [0, 0]], [[2, 0], [0, 0]]],
+  ...     [[[0.8, 0.2], [0.5, 0.5]], [[1, 0], [0, 0]], [[1, 0], [0, 0]]],
+  ...     available=[[True, True], [True, False], [True, False]], initial=[1, 0, 0],
+  ...     label=[[0, 0], [1, 0], [0, 1]], propositions=["g", "r"])
+  >>> shown = jl.make_trajectories(world, [[(0, 1), (0, 0), (1, 0)], [(0, 0), (1, 0)]])
+  >>> features = np.stack([np.eye(3, 2), np.ones((3, 2))], axis=-1)  # [S, A, F]
+  >>> problem = mlirl.make_problem(world, features, shown)
+  >>> hparams = mlirl.Hparams(discount=0.5, optimizer="adam")
+  >>> state, metrics = mlirl.train(jax.random.key(0), problem, hparams, num_steps=2)
+  >>> metrics.loss.shape, bool(metrics.loss[1] < metrics.loss[0])  # a row for each step
+  ((2,), True)
+  >>> mlirl.policy(state, problem, hparams).shape  # [S, A]
+  (3, 2)
+
+A run is made of steps, goes on from a state, and may end early:
+
+  >>> state = mlirl.init(jax.random.key(0), problem, hparams)  # train is init and run
+  >>> state, metrics = mlirl.run(state, problem, hparams, num_steps=2)  # step after step
+  >>> until = learner.gradient_vanishes(1e-6)  # for run_until and train_until
+  >>> state.step.item()
+  2
+  >>> solution = jax.eval_shape(mlirl.solve, state.parameters, problem, hparams)
+  >>> solution.value.shape  # mlirl.objective judges its policy
+  (3,)
+
+With side information the model is a product, ``jl.product(world, "!r U g")``, features are
+``[S, Q, A, F]``, such as :func:`task_features` makes them, and ``Hparams(mu=...)`` weighs the task.
+Many seeds are ``jax.vmap(lambda key: train(key, problem, hparams, num_steps=...))(keys)``; so are
+many settings, by ``vmap`` over the numbers of ``Hparams``. Resume by
+``run(state, problem, hparams, num_steps=...)``; end early by ``train_until``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax import struct
+from jax.flatten_util import ravel_pytree
+
+from jaxltl.algos.common import learner
+from jaxltl.algos.mlirl import _line_search as line_search
+from jaxltl.algos.mlirl._features import Features as Features
+from jaxltl.algos.mlirl._features import pair_counts
+from jaxltl.algos.mlirl._features import progress_states as progress_states
+from jaxltl.algos.mlirl._features import task_features as task_features
+from jaxltl.algos.mlirl._features import world_features as world_features
+from jaxltl.core.models.build.lifting import allowed_steps, lift_trajectories
+from jaxltl.core.models.build.restrict import with_allowed
+from jaxltl.core.models.mdp import MDP, DenseMDP
+from jaxltl.core.models.ops.array_namespace import to_jax
+from jaxltl.core.models.product import Product
+from jaxltl.core.models.trajectories import Trajectories
+from jaxltl.core.pretty_print import brief, history
+from jaxltl.core.types import Solution, Status, require_shape, worst
+from jaxltl.core.values.discounted.boltzmann import boltzmann_value
+from jaxltl.core.values.discounted.soft import policy_logits, soft_value
+from jaxltl.core.values.engine.iterate import in_turn
+from jaxltl.core.values.undiscounted.satisfaction import satisfaction_probability
+
+__all__ = [
+    "Features",
+    "Hparams",
+    "Metrics",
+    "Objective",
+    "Problem",
+    "Reward",
+    "State",
+    "init",
+    "linear_reward",
+    "make_problem",
+    "objective",
+    "policy",
+    "progress_states",
+    "run",
+    "run_until",
+    "solve",
+    "step",
+    "task_features",
+    "train",
+    "train_until",
+    "world_features",
+]
+
+Reward = Callable[[Any, jax.Array], jax.Array]
+
+
+def linear_reward(weights: jax.Array, features: jax.Array) -> jax.Array:
+    """``R(s, a) = sum_f theta_f F_f(s, a)``, the class of rewards of section 2.2.
+
+    Args:
+      weights: ``float[F]``, theta.
+      features: ``float[S, A, F]`` (``[S, Q, A, F]``).
+
+    Returns:
+      ``float[S, A]`` (``[S, Q, A]``); differentiable in both.
+
+    Example:
+      >>> linear_reward(jnp.array([1.0, 2.0]), jnp.array([[[3.0, 4.0]]])).tolist()
+      [[11.0]]
+    """
+    return features @ weights
+
+
+@brief
+@struct.dataclass
+class Problem:
+    """What is given: a model, features, demonstrations, and a class of rewards.
+
+    Attributes:
+      model: the world, or its product with the task.
+      features: ``float[S, A, F]`` (``[S, Q, A, F]``).
+      counts: ``float[S, A]`` (``[S, Q, A]``), how often each pair was demonstrated.
+      start: parameters around which learning starts, any pytree; ``float[F]`` if linear.
+      satisfaction_weight: ``float[S]``, of the states over which g sums the satisfaction.
+      reward: ``(parameters, features) -> float[S, A]``; static.
+    """
+
+    model: Any
+    features: jax.Array
+    counts: jax.Array
+    start: Any
+    satisfaction_weight: jax.Array
+    reward: Reward = struct.field(pytree_node=False, default=linear_reward)
+
+
+@brief
+@struct.dataclass
+class Hparams:
+    """How to learn. Numbers are traced, so new values do not recompile.
+
+    Attributes:
+      discount: in [0, 1).
+      mu: weight of the satisfaction term (2.6); None leaves it out (cases 1 and 2); default None.
+      l2: precision of the Gaussian prior on the parameters; default 1e-3.
+      learning_rate: for ``adam`` and ``sgd``; default 0.1.
+      start_scale: standard deviation of the noise added to ``Problem.start``; default 1.0.
+      policy: ``"boltzmann"`` (2.3) or ``"soft"``; static; default ``"boltzmann"``.
+      adjoint: ``"exact"``, or ``"approximate"`` for (2.7); static; default ``"exact"``.
+      optimizer: ``"lbfgs"``, ``"adam"``, ``"rmsprop"`` or ``"sgd"``, all optax's; static;
+        default ``"lbfgs"``.
+    """
+
+    discount: jax.Array | float
+    mu: jax.Array | float | None = None
+    l2: jax.Array | float = 1e-3
+    learning_rate: jax.Array | float = 0.1
+    start_scale: jax.Array | float = 1.0
+    policy: str = struct.field(pytree_node=False, default="boltzmann")
+    adjoint: str = struct.field(pytree_node=False, default="exact")
+    optimizer: str = struct.field(pytree_node=False, default="lbfgs")
+
+
+@brief
+@struct.dataclass
+class State:
+    """Parameters on their way, with the value that the next solve starts from.
+
+    Attributes:
+      key, step: the root key and the number of steps made, ``int32[]``.
+      parameters: of the reward, as ``Problem.start``; ``float[F]`` if linear.
+      value: ``float[S]`` (``[S, Q]``), of the reward at parameters that are near.
+      optimizer: optax's state, or that of the line search.
+    """
+
+    key: jax.Array
+    step: jax.Array
+    parameters: Any
+    value: jax.Array
+    optimizer: Any
+
+
+@brief(facts=partial(history, codes={"status": Status}))
+@struct.dataclass
+class Metrics:
+    """Figures of the parameters before a step; scalars, of a run ``[T]``.
+
+    Attributes:
+      loss: the objective, with prior and satisfaction term.
+      neg_log_likelihood: (2.4), in nats, over all demonstrated pairs.
+      satisfaction: weighted mean of the satisfaction probability, in [0, 1]; NaN without the term.
+      gradient_norm: Euclidean.
+      status: of the solvers of value and satisfaction; see :class:`~jaxltl.core.types.Status`.
+    """
+
+    loss: jax.Array
+    neg_log_likelihood: jax.Array
+    satisfaction: jax.Array
+    gradient_norm: jax.Array
+    status: jax.Array
+
+
+@brief(codes={"status": Status})
+class Objective(NamedTuple):
+    """What the loss at some parameters was made of.
+
+    Attributes:
+      neg_log_likelihood: ``float[]``, (2.4), in nats, over all demonstrated pairs.
+      satisfaction: ``float[]``, g of (2.6); NaN without the term.
+      value: ``float[S]`` (``[S, Q]``), from which the next solve may start.
+      status: ``int32[]``, of the solvers.
+    """
+
+    neg_log_likelihood: jax.Array
+    satisfaction: jax.Array
+    value: jax.Array
+    status: jax.Array
+
+
+def make_problem(
+    model: MDP | DenseMDP | Product,
+    features: jax.Array,
+    demonstrations: Trajectories,
+    *,
+    start: Any = None,
+    reward: Reward = linear_reward,
+    satisfaction_over: str | jax.Array = "initial",
+    allowed: jax.Array | None = None,
+) -> Problem:
+    """A checked :class:`Problem`.
+
+    Args:
+      model: the world (case 1) or a product (cases 2 and 3).
+      features: ``float[S, A, F]`` or ``float[S, Q, A, F]``.
+      demonstrations: in the world; lifted here if the model is a product.
+      start: initial parameters; default zero weights, one per feature.
+      reward: any differentiable reward of parameters and features, such as a flax
+        network's ``apply``.
+      satisfaction_over: the states over which g sums (2.6): ``"initial"`` (where the model
+        starts; the dissertation's prose), ``"all"`` (its formula), or weights ``float[S]``.
+      allowed: ``bool[S, A]`` (``[S, Q, A]``), the actions that policies choose from, such as those
+        that lose nothing of the task (:func:`~jaxltl.core.values.undiscounted.optimal_actions.optimal_actions`);
+        default all. Demonstrated steps that take others are left out:
+        :func:`~jaxltl.core.models.build.lifting.allowed_steps` tells which.
+
+    Returns:
+      :class:`Problem`.
+
+    Raises:
+      ValueError: features, weights or mask of the wrong shape, features that are not finite,
+        an unknown `satisfaction_over`, a reward of the wrong shape, demonstrations that are not the
+        world's, or one of which no step is allowed.
+    """
+    model = model if allowed is None else with_allowed(model, allowed)
+    actions = (*model.state_shape, model.num_actions)
+    features = jnp.asarray(features, model.dtype)
+    if features.shape[:-1] != actions:
+        raise ValueError(f"features have shape {features.shape}; expected {(*actions, 'F')}.")
+    if (wrong := ~np.isfinite(np.asarray(features))).any():
+        *pair, feature = np.argwhere(wrong)[0].tolist()
+        raise ValueError(f"feature {feature} at {tuple(pair)} is not finite.")
+    kept = allowed_steps(model, demonstrations)
+    if isinstance(model, Product):
+        demonstrations = lift_trajectories(model, demonstrations)
+    weight: Any = satisfaction_over
+    if isinstance(weight, str):
+        if weight not in ("initial", "all"):
+            raise ValueError(f'satisfaction_over={weight!r}; choose "initial", "all" or weights.')
+        starts = np.asarray(model.initial) > 0
+        weight = np.ones(model.state_shape) if weight == "all" else starts
+        weight = to_jax(weight.astype(model.dtype))
+    weight = jnp.asarray(weight, model.dtype)
+    require_shape("satisfaction_over", weight, model.state_shape)
+    start = np.zeros(features.shape[-1]) if start is None else start
+    start = jax.tree.map(lambda x: jnp.asarray(x, model.dtype), start)
+    shape = jax.eval_shape(reward, start, features).shape
+    if shape != actions:
+        raise ValueError(f"the reward has shape {shape}; expected {actions}.")
+    return Problem(
+        model=model,
+        features=features,
+        counts=pair_counts(model, demonstrations, kept),
+        start=start,
+        satisfaction_weight=weight,
+        reward=reward,
+    )
+
+
+def solve(
+    parameters: Any, problem: Problem, hparams: Hparams, initial: jax.Array | None = None
+) -> Solution:
+    """Value and policy of the reward at some parameters (2.3).
+
+    Args:
+      parameters: as ``Problem.start``.
+      problem, hparams: what and how.
+      initial: ``float[S]`` (``[S, Q]``), a value to start the Boltzmann iteration from.
+
+    Returns:
+      :class:`Solution`, `policy` ``float[S, A]`` (``[S, Q, A]``); both differentiable in the
+      parameters.
+
+    Raises:
+      ValueError: unknown kind of policy or adjoint.
+    """
+    return _solve(problem.reward(parameters, problem.features), problem, hparams, initial)
+
+
+def _solve(
+    reward: jax.Array, problem: Problem, hparams: Hparams, initial: jax.Array | None
+) -> Solution:
+    if hparams.policy == "soft":
+        if hparams.adjoint != "exact":
+            raise ValueError('adjoint="approximate" (2.7) belongs to the Boltzmann policy.')
+        return soft_value(problem.model, reward, hparams.discount)
+    if hparams.policy != "boltzmann":
+        raise ValueError(f"policy={hparams.policy!r}; choose boltzmann or soft.")
+    return boltzmann_value(
+        problem.model, reward, hparams.discount, initial=initial, adjoint=hparams.adjoint
+    )
+
+
+def objective(
+    parameters: Any, problem: Problem, hparams: Hparams, initial: jax.Array | None = None
+) -> tuple[jax.Array, Objective]:
+    """``J = -sum log pi(s, a) - mu g(y) + l2 / 2 |theta|^2``: (2.4), (2.6) and the prior.
+
+    Args:
+      parameters, problem, hparams, initial: as in :func:`solve`.
+
+    Returns:
+      The loss ``float[]``, and :class:`Objective`. Differentiable in the parameters: exactly, or as
+      in (2.7) with the policy held constant in the Bellman equation.
+
+    Raises:
+      ValueError: unknown kind of policy or adjoint, or a satisfaction term without a task.
+    """
+    # Once, so that the derivative goes back through it once.
+    reward = problem.reward(parameters, problem.features)
+    solution = _solve(reward, problem, hparams, initial)
+    logits = policy_logits(problem.model, reward, hparams.discount, solution.value)
+    log_policy = jax.nn.log_softmax(logits, axis=-1)
+    seen = problem.counts > 0
+    log_likelihood = jnp.sum(problem.counts * jnp.where(seen, log_policy, 0))
+    flat, _ = ravel_pytree(parameters)
+    loss = -log_likelihood + hparams.l2 / 2 * jnp.sum(flat * flat)
+    satisfaction, status = jnp.full((), jnp.nan, loss.dtype), solution.status
+    if hparams.mu is not None:
+        if not isinstance(problem.model, Product):
+            raise ValueError("mu weighs the satisfaction of a task: make the problem in a product.")
+        done = satisfaction_probability(problem.model, jax.nn.softmax(logits, axis=-1))
+        total = jnp.sum(problem.satisfaction_weight * done.value)
+        loss -= hparams.mu * total
+        satisfaction = total / jnp.sum(problem.satisfaction_weight)
+        # A policy that hardly ever leaves some states may have no certificate; what counts in
+        # learning is that its equation is solved.
+        solved = done.residual <= jnp.sqrt(jnp.finfo(loss.dtype).eps)
+        status = worst(status, jnp.where(solved, Status.CONVERGED, done.status))
+    return loss, Objective(-log_likelihood, satisfaction, solution.value, status)
+
+
+def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
+    """Parameters at ``problem.start`` plus noise of ``hparams.start_scale``; the key is kept.
+
+    Args:
+      key: a PRNG key, which the state keeps; ``vmap`` over keys for many seeds.
+      problem: of :func:`make_problem`.
+      hparams: :class:`Hparams`.
+
+    Returns:
+      :class:`State`, no step made.
+    """
+    flat, unravel = ravel_pytree(problem.start)
+    noise = jax.random.normal(learner.init_key(key), flat.shape, flat.dtype)
+    parameters = unravel(flat + hparams.start_scale * noise)
+    value = jnp.zeros(problem.model.state_shape, problem.model.dtype)
+    if hparams.optimizer == "lbfgs":
+        # Nothing is known yet; only the shapes are read.
+        zero = jnp.zeros((), value.dtype)
+        parts = Objective(zero, zero, value, jnp.int32(0))
+        optimizer = line_search.start(
+            parameters, line_search.Point(parameters, zero + jnp.inf, parameters, parts)
+        )
+    else:
+        optimizer = learner.strong(_optimizer(hparams).init(parameters))
+    return State(key, jnp.int32(0), parameters, value, optimizer)
+
+
+@jax.jit  # so that it is traced once, wherever it stands
+def _evaluate(
+    parameters: Any, problem: Problem, hparams: Hparams, initial: jax.Array
+) -> line_search.Point:
+    (loss, parts), gradient = jax.value_and_grad(objective, has_aux=True)(
+        parameters, problem, hparams, initial
+    )
+    return line_search.Point(parameters, loss, gradient, parts)
+
+
+def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
+    """One step of the optimiser on :func:`objective`; deterministic given the state.
+
+    Under ``vmap`` runs make their steps in turn: each takes as many evaluations as it needs.
+    A step is not differentiated through: :func:`objective` is what has derivatives.
+
+    Args:
+      state: of :func:`init` or of an earlier step; unchanged.
+      problem, hparams: as of :func:`init`.
+
+    Returns:
+      The next :class:`State`, and :class:`Metrics`, figures of the parameters before the step.
+    """
+    return in_turn(_step, state, problem, hparams)
+
+
+@jax.jit
+def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
+    if hparams.optimizer == "lbfgs":
+
+        def evaluate(parameters: Any, before: line_search.Point) -> line_search.Point:
+            return _evaluate(parameters, problem, hparams, _usable(before.parts))
+
+        optimizer, before = line_search.step(evaluate, state.optimizer)
+        parameters, value = optimizer.point.parameters, _usable(optimizer.point.parts)
+    else:
+        before = _evaluate(state.parameters, problem, hparams, state.value)
+        updates, optimizer = _optimizer(hparams).update(
+            before.gradient, state.optimizer, state.parameters
+        )
+        parameters, value = optax.apply_updates(state.parameters, updates), _usable(before.parts)
+    metrics = Metrics(
+        loss=before.loss,
+        neg_log_likelihood=before.parts.neg_log_likelihood,
+        satisfaction=before.parts.satisfaction,
+        gradient_norm=optax.tree.norm(before.gradient),
+        status=before.parts.status,
+    )
+    after = State(state.key, state.step + 1, parameters, value, optimizer)
+    return after, metrics
+
+
+def _usable(parts: Objective) -> jax.Array:
+    """The value, or zero where a solve failed, which would poison the next one's start."""
+    return jnp.where(parts.status < Status.NONFINITE, parts.value, 0)
+
+
+def _optimizer(hparams: Hparams) -> optax.GradientTransformationExtraArgs:
+    return learner.optimizer(hparams.optimizer, hparams.learning_rate)
+
+
+# The metrics, and so their gradient, are of the state before a step.
+run, train, run_until, train_until = learner.bind(init, step, keep="before")
+
+
+def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
+    """The softmax policy of the reward: ``float[S, A]``, in a product ``[S, Q, A]``.
+
+    :func:`solve` tells with it how well its value is known.
+
+    Args:
+      state: of one run; ``vmap`` over several.
+      problem, hparams: of the run.
+
+    Returns:
+      ``float[S, A]``, in a product ``[S, Q, A]``; zero at actions that are not available.
+    """
+    return solve(state.parameters, problem, hparams, state.value).policy

@@ -1,0 +1,306 @@
+"""Steps of many environments side by side, and the advantages that are estimated from them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jax import lax
+
+from jaxltl.algos.common import action_distributions as actions_of
+from jaxltl.algos.common import learner
+from jaxltl.algos.common.actor_critic import Output, evaluated
+from jaxltl.algos.common.advantages import generalized_advantages
+from jaxltl.algos.common.moments import Moments, normalized, scale_of, updated_moments
+from jaxltl.core.environments.environment import Timestep, allowed_in
+from jaxltl.core.models.mesh import lanes
+from jaxltl.core.pretty_print import brief
+
+
+@brief
+@struct.dataclass
+class Walkers:
+    """N environments on their way; all have a first axis of N.
+
+    Attributes:
+      world: where each is.
+      memory: of the network.
+      episode_return, episode_length: of the episode so far.
+      discounted: its rewards so far, each discounted to the present.
+    """
+
+    world: Any
+    memory: Any
+    episode_return: jax.Array
+    episode_length: jax.Array
+    discounted: jax.Array
+
+
+class Rows(NamedTuple):
+    """Steps that were made: ``[T, N, ...]``, or flattened, or some of them.
+
+    Attributes:
+      observation: before the step, as the network reads it.
+      start: whether an episode begins with it, so that the memory is the initial one.
+      allowed: ``bool[A]``, or None.
+      raw: the action that was drawn.
+      log_density: of it, when it was drawn.
+      value: that was expected.
+      advantage: of the action.
+    """
+
+    observation: Any
+    start: jax.Array
+    allowed: Any
+    raw: jax.Array
+    log_density: jax.Array
+    value: jax.Array
+    advantage: jax.Array
+
+
+class Told(NamedTuple):
+    """Figures of a collection, as in ``Metrics``."""
+
+    reward: jax.Array
+    cost: jax.Array
+    episodes: jax.Array
+    episode_return: jax.Array
+    episode_length: jax.Array
+    explained_variance: jax.Array
+    permitted: jax.Array
+    finite: jax.Array
+
+
+def _unless_nonfinite(moments: Moments, numbers: jax.Array) -> Moments:
+    """With a batch taken in, unless a number in it is not finite."""
+    new = updated_moments(moments, numbers)
+    fine = jnp.all(jnp.isfinite(new.mean)) & jnp.all(jnp.isfinite(new.squares))
+    return learner.choose(fine, new, moments)
+
+
+class _Path(NamedTuple):
+    """What is kept of each step, ``[T, N, ...]``."""
+
+    observation: Any
+    memory: Any
+    start: jax.Array
+    allowed: Any
+    raw: jax.Array
+    log_density: jax.Array
+    reward: jax.Array
+    cost: jax.Array
+    discount: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    last: Any
+    episode_return: jax.Array
+    episode_length: jax.Array
+
+
+def collected(
+    key: chex.PRNGKey, state: Any, problem: Any, hparams: Any
+) -> tuple[Any, Any, Rows, Told]:
+    """T steps of N environments: the state after them, what they began from, and what they tell."""
+    walkers, path = _walked(key, state, problem, hparams)
+    dtype = walkers.discounted.dtype
+    seen = normalized(state.moments, path.observation)
+    every = _evaluated_all(problem, state.parameters, path.memory, seen, 2)
+    end = jax.vmap(problem.environment.observe)(walkers.world)
+    final = _evaluated_all(
+        problem, state.parameters, walkers.memory, normalized(state.moments, end), 1
+    )
+    value, last = every.value.astype(dtype), final.value.astype(dtype)
+    following = jnp.concatenate([value[1:], last[None]])
+    cut = path.truncated & ~path.terminated
+    at_ends = lanes.apart(_at_ends, hparams.sharding, (1, 1, 1, None), 1)
+    following = at_ends(
+        cut, following, (every.memory, path.last), (problem, state.parameters, state.moments)
+    )
+    following = jnp.where(path.terminated, 0, following)
+    discount = jnp.asarray(hparams.discount, dtype) * path.discount.astype(dtype)
+    reward, ended = path.reward.astype(dtype), path.terminated | path.truncated
+    moments, returns = state.moments, state.return_moments
+    if returns is not None:
+        sums, walkers = _discounted_sums(walkers, reward, discount, ended)
+        returns = _unless_nonfinite(returns, sums)
+        reward = jnp.clip(reward / scale_of(returns), -10, 10)
+    if moments is not None:
+        moments = jax.tree.map(lambda x, m: _unless_nonfinite(m, x), path.observation, moments)
+    found = generalized_advantages(reward, value, following, discount, hparams.gae_lambda, ended)
+    rows = Rows(seen, path.start, path.allowed, path.raw, path.log_density, value, found)
+    number = ended.sum()
+    mean_of = jnp.where(number > 0, 1 / jnp.maximum(number, 1), jnp.nan).astype(dtype)
+    target = found + value
+    spread = jnp.var(target)
+    told = Told(
+        reward=path.reward.astype(dtype).mean(),
+        cost=path.cost.astype(dtype).mean(),
+        episodes=number.astype(jnp.int32),
+        episode_return=jnp.sum(jnp.where(ended, path.episode_return, 0)) * mean_of,
+        episode_length=jnp.sum(jnp.where(ended, path.episode_length, 0)) * mean_of,
+        explained_variance=jnp.where(
+            spread > 0, 1 - jnp.var(found) / jnp.where(spread > 0, spread, 1), jnp.nan
+        ),
+        permitted=jnp.bool_(True) if path.allowed is None else path.allowed.any(-1).all(),
+        finite=jnp.all(jnp.isfinite(found)),
+    )
+    after = replace(state, walkers=walkers, moments=moments, return_moments=returns)
+    return after, state.walkers.memory, rows, told
+
+
+def _discounted_sums(
+    walkers: Walkers, reward: jax.Array, discount: jax.Array, ended: jax.Array
+) -> tuple[jax.Array, Walkers]:
+    """``float[T, N]``, rewards of each episode so far, and the walkers who keep the last."""
+
+    def on(before: jax.Array, row: Any) -> tuple[jax.Array, jax.Array]:
+        reward, discount, ended = row
+        now = before + reward
+        return jnp.where(ended, 0, discount * now), now
+
+    last, sums = lax.scan(on, walkers.discounted, (reward, discount, ended))
+    return sums, replace(walkers, discounted=last)
+
+
+def _walked(key: chex.PRNGKey, state: Any, problem: Any, hparams: Any) -> tuple[Walkers, _Path]:
+    environment, size = problem.environment, (hparams.num_steps, hparams.num_envs)
+    noise_key, move_key, reset_key = jax.random.split(key, 3)
+    dtype = state.walkers.discounted.dtype
+    # All at once: on few numbers an operation takes as long as on many.
+    noise = actions_of.noise(noise_key, size, environment.actions, dtype)
+    keys = jax.random.split(move_key, size)
+    begin, pool = _starts(reset_key, environment, hparams)
+    step = (state.parameters, state.moments, problem, hparams, pool)
+    walk = lanes.apart(
+        partial(_walk, sharding=hparams.sharding), hparams.sharding, (0, 0, 1, 1, 1, None), (0, 1)
+    )
+    walkers, path = walk(lanes.ranks(hparams.sharding), state.walkers, begin, noise, keys, step)
+    return learner.strong(walkers), path
+
+
+def _walk(
+    rank: jax.Array,
+    walkers: Walkers,
+    begin: Any,
+    noise: Any,
+    keys: jax.Array,
+    given: Any,
+    *,
+    sharding: Any,
+) -> tuple[Walkers, _Path]:
+    """Steps of all environments, or of those of one device."""
+    parameters, moments, problem, hparams, pool = given
+    environment = problem.environment
+
+    def one(walker: Walkers, noise: jax.Array, key: chex.PRNGKey) -> Any:
+        observation = environment.observe(walker.world)
+        allowed = allowed_in(environment, walker.world)
+        seen = normalized(moments, observation)
+        said = evaluated(problem, parameters, walker.memory, seen)
+        raw = actions_of.drawn(environment.actions, said.action, allowed, noise)
+        density = actions_of.log_density(environment.actions, said.action, allowed, raw)
+        action = actions_of.as_action(environment.actions, raw, hparams.squash)
+        found = Timestep(*environment.step(walker.world, action, key))
+        terminated, truncated = (jnp.asarray(x, bool) for x in (found.terminated, found.truncated))
+        total = walker.episode_return + found.reward
+        length = walker.episode_length + 1
+        row = _Path(
+            observation,
+            walker.memory,
+            walker.episode_length == 0,
+            allowed,
+            raw,
+            density,
+            jnp.asarray(found.reward),
+            jnp.asarray(found.cost),
+            jnp.asarray(found.discount),
+            terminated,
+            truncated,
+            environment.observe(found.world),
+            total,
+            length,
+        )
+        return replace(walker, world=found.world, memory=said.memory), row
+
+    def restarted(walker: Walkers, fresh: Any, row: _Path) -> Walkers:
+        ended = row.terminated | row.truncated
+        world, memory = jax.tree.map(
+            lambda x, y: jnp.where(ended, x, y),
+            (fresh, problem.memory),
+            (walker.world, walker.memory),
+        )
+        return Walkers(
+            world,
+            memory,
+            jnp.where(ended, 0, row.episode_return),
+            jnp.where(ended, 0, row.episode_length),
+            walker.discounted,
+        )
+
+    def move(carry: Any, given: Any) -> Any:
+        walkers, used = carry
+        start, *chance = given
+        walkers, row = jax.vmap(one)(walkers, *chance)
+        ended = row.terminated | row.truncated
+        if pool is not None:
+            number, last = lanes.running_sum(ended, rank, sharding)
+            start = jax.tree.map(lambda x: x[(used + number - 1) % hparams.num_resets], pool)
+            used = (used + last) % hparams.num_resets
+        elif hparams.num_resets == 0:
+            start = jax.vmap(environment.reset)(start)
+        return (jax.vmap(restarted)(walkers, start, row), used), row
+
+    (walkers, _), path = lax.scan(move, (walkers, jnp.int32(0)), (begin, noise, keys))
+    return walkers, path
+
+
+def _starts(key: chex.PRNGKey, environment: Any, hparams: Any) -> tuple[Any, Any]:
+    """What each step begins episodes with, ``[T, N]`` worlds or keys; or all a pool of worlds."""
+    size, number = (hparams.num_steps, hparams.num_envs), hparams.num_resets
+    if number:
+        return None, jax.vmap(environment.reset)(jax.random.split(key, number))
+    keys = jax.random.split(key, size)
+    return (keys if number == 0 else jax.vmap(jax.vmap(environment.reset))(keys)), None
+
+
+def _evaluated_all(
+    problem: Any, parameters: Any, memory: Any, observation: Any, num_axes: int
+) -> Output:
+    """Of observations with so many leading axes, each with its memory."""
+    function: Any = partial(evaluated, problem, parameters)
+    for _ in range(num_axes):
+        function = jax.vmap(function)
+    return function(memory, observation)
+
+
+def _at_ends(cut: jax.Array, following: jax.Array, ends: Any, judge: Any) -> jax.Array:
+    """Values that follow, with those of the worlds where episodes were cut off put in.
+
+    They are few, so that only they are evaluated, some at a time.
+    """
+    size, some = cut.size, min(cut.size, max(cut.shape[1], 32))
+    problem, parameters, moments = judge
+    flat = jax.tree.map(lambda x: x.reshape(size, *x.shape[2:]), ends)
+    place = jnp.nonzero(cut.ravel(), size=size, fill_value=size)[0]
+    place = jnp.concatenate([place, jnp.full(some, size, place.dtype)])
+
+    def active(carry: Any, given: Any) -> jax.Array:
+        return carry[0] * some < given[0]
+
+    def body(carry: Any, given: Any) -> Any:
+        turn, values = carry
+        _, place, (memory, last), moments, parameters = given
+        chosen = lax.dynamic_slice(place, (turn * some,), (some,))
+        rows = jax.tree.map(lambda x: x[jnp.minimum(chosen, size - 1)], (memory, last))
+        found = _evaluated_all(problem, parameters, rows[0], normalized(moments, rows[1]), 1)
+        values = values.at[chosen].set(found.value.astype(values.dtype), mode="drop")
+        return turn + active(carry, given), values
+
+    given = cut.sum(), place, flat, moments, parameters
+    _, values = learner.while_active(active, body, (jnp.int32(0), following.ravel()), given)
+    return values.reshape(following.shape)

@@ -1,0 +1,181 @@
+"""The loss of proximal policy optimisation, and its descent over minibatches."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import optax
+from jax import lax
+
+from jaxltl.algos.common import action_distributions as actions_of
+from jaxltl.algos.common import learner
+from jaxltl.algos.common.actor_critic import Output, evaluated, has_memory
+from jaxltl.algos.common.schedules import at
+from jaxltl.algos.ppo._collect import Rows
+from jaxltl.core.models.mesh import lanes
+
+
+class Figures(NamedTuple):
+    """Of a minibatch before its update, or means over those that were made."""
+
+    policy_loss: jax.Array
+    value_loss: jax.Array
+    entropy: jax.Array
+    kl: jax.Array
+    clipped: jax.Array
+    gradient_norm: jax.Array
+
+
+class Limits(NamedTuple):
+    """Numbers of this step, schedules read off."""
+
+    clip: Any
+    value_clip: Any
+
+
+def descent(hparams: Any) -> optax.GradientTransformation:
+    """Adam without its learning rate, which is multiplied in where it is known."""
+    return optax.scale_by_adam(eps=hparams.adam_epsilon)
+
+
+def loss(
+    parameters: Any, rows: Rows, begun: Any, problem: Any, hparams: Any, limits: Limits
+) -> tuple[jax.Array, Figures]:
+    """What is minimised (Schulman et al. 2017, equation 9), and its parts::
+
+        mean of -min(r A, clip(r, 1 - c, 1 + c) A)
+              + value_weight (V - target)^2 / 2 - entropy_weight H,
+
+    with r the ratio of the new to the old probability of what was done, and A the advantage,
+    centred and scaled in this minibatch where that is asked for.
+
+    Args:
+      parameters: of the network.
+      rows: ``[N', ...]``, or of whole environments ``[T, N', ...]`` for a network with memory.
+      begun: its memories before the first of T steps.
+    """
+    actions = problem.environment.actions
+    said = _said(parameters, rows, begun, problem)
+    batched = jax.vmap if rows.value.ndim == 1 else lambda f: jax.vmap(jax.vmap(f))
+    density = batched(partial(actions_of.log_density, actions))(said.action, rows.allowed, rows.raw)
+    entropy = batched(partial(actions_of.entropy, actions, squash=hparams.squash))(
+        said.action, rows.allowed
+    ).mean()
+    change = density - rows.log_density
+    ratio, advantage = jnp.exp(change), rows.advantage
+    target = advantage + rows.value
+    if hparams.normalize_advantage:
+        advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+    near = jnp.clip(ratio, 1 - limits.clip, 1 + limits.clip)
+    gain = jnp.minimum(ratio * advantage, near * advantage).mean()
+    value = said.value.astype(rows.value.dtype)
+    error = (value - target) ** 2
+    if limits.value_clip is not None:
+        shift = jnp.clip(value - rows.value, -limits.value_clip, limits.value_clip)
+        error = jnp.maximum(error, (rows.value + shift - target) ** 2)
+    error = error.mean() / 2
+    total = -gain + hparams.value_weight * error - hparams.entropy_weight * entropy
+    return total, Figures(
+        policy_loss=-gain,
+        value_loss=error,
+        entropy=entropy,
+        kl=jnp.mean(ratio - 1 - change),
+        clipped=jnp.mean(jnp.abs(ratio - 1) > limits.clip, dtype=ratio.dtype),
+        gradient_norm=jnp.zeros_like(gain),
+    )
+
+
+def _said(parameters: Any, rows: Rows, begun: Any, problem: Any) -> Output:
+    say = jax.vmap(partial(evaluated, problem, parameters))
+    if not has_memory(problem):
+        return say((), rows.observation)
+
+    def on(memory: Any, row: Any) -> tuple[Any, Output]:
+        start, observation = row
+        memory = jax.vmap(lambda s, m: learner.choose(s, problem.memory, m))(start, memory)
+        said = say(memory, observation)
+        return said.memory, said._replace(memory=())
+
+    return lax.scan(on, begun, (rows.start, rows.observation))[1]
+
+
+class _Going(NamedTuple):
+    parameters: Any
+    optimizer: Any
+    stopped: jax.Array
+
+
+def improved(
+    key: chex.PRNGKey, state: Any, rows: Rows, begun: Any, problem: Any, hparams: Any
+) -> tuple[Any, Any, Figures, jax.Array, jax.Array]:
+    """Parameters and the optimiser's state after some epochs of minibatches.
+
+    An update whose gradient is not finite is left out, and so are all after the first minibatch
+    on which the policy is further from the old one than `target_kl`.
+
+    Returns:
+      parameters, optimizer, mean :class:`Figures`, how many updates were made, and how many were
+      left out because a number was not finite.
+    """
+    limits = Limits(at(hparams.clip, state.step), _at(hparams.value_clip, state.step))
+    rate = at(hparams.learning_rate, state.step)
+    recurrent, over = has_memory(problem), hparams.sharding
+    rows, begun = lanes.whole((rows, begun), over)  # any device may be asked for any of them
+    if not recurrent:
+        rows = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rows)
+    size = hparams.num_envs if recurrent else len(rows.value)
+    count = hparams.num_minibatches
+
+    def update(going: _Going, chosen: jax.Array) -> tuple[_Going, Any]:
+        some = jax.tree.map(lambda x: jnp.take(x, chosen, axis=int(recurrent)), rows)
+        memory = jax.tree.map(lambda x: x[chosen], begun) if recurrent else ()
+        some, memory = lanes.split(some, over, int(recurrent)), lanes.split(memory, over)
+        (_, told), slope = jax.value_and_grad(loss, has_aux=True)(
+            going.parameters, some, memory, problem, hparams, limits
+        )
+        slope, told = lanes.whole((slope, told), over)
+        norm = jnp.sqrt(sum(jnp.sum(x**2) for x in jax.tree.leaves(slope)))
+        told = told._replace(gradient_norm=norm)
+        stopped = going.stopped
+        if hparams.target_kl is not None:
+            stopped |= told.kl > hparams.target_kl
+        finite = jnp.isfinite(norm)
+        if hparams.max_gradient_norm is not None:
+            shorter = jnp.minimum(1, hparams.max_gradient_norm / jnp.maximum(norm, 1e-38))
+            slope = jax.tree.map(lambda x: x * shorter.astype(x.dtype), slope)
+        change, optimizer = descent(hparams).update(slope, going.optimizer)
+        parameters = jax.tree.map(
+            lambda x, u: x - (rate * u).astype(x.dtype), going.parameters, change
+        )
+        made = finite & ~stopped
+        new = learner.choose(made, (parameters, optimizer), (going.parameters, going.optimizer))
+        return _Going(new[0], new[1], stopped), (told, made, ~finite & ~stopped)
+
+    def epoch(going: _Going, key: chex.PRNGKey) -> tuple[_Going, Any]:
+        order = jax.random.permutation(key, size)
+        return lax.scan(update, going, order.reshape(count, -1))
+
+    going, (told, made, lost) = lax.scan(
+        epoch,
+        _Going(state.parameters, state.optimizer, jnp.bool_(False)),
+        jax.random.split(key, hparams.num_epochs),
+    )
+    number = made.sum()
+    mean = jax.tree.map(
+        lambda x: jnp.sum(jnp.where(made, x, 0)) / jnp.where(number > 0, number, jnp.nan), told
+    )
+    return (
+        going.parameters,
+        going.optimizer,
+        mean,
+        number.astype(jnp.int32),
+        lost.sum().astype(jnp.int32),
+    )
+
+
+def _at(schedule: Any, step: jax.Array) -> Any:
+    return None if schedule is None else at(schedule, step)
