@@ -139,23 +139,23 @@ class _Rows:
         Their rounding is a share of ``U + D`` that the unit covers: differences
         are right to two roundings, and a row has as many sums as terms.
         """
-        difference = _difference(high[self.target], low[self.target], high[self.of], low[self.of])
-        flow = self.weight * difference
+        apart = difference(high[self.target], low[self.target], high[self.of], low[self.of])
+        flow = self.weight * apart
         count = self.known.size
         end = self.leaving * high[self.owner]
         gap = np.bincount(self.row, flow, count) + (self.known - end)
         return gap, np.bincount(self.row, np.abs(flow), count) + (self.known + end)
 
 
-def _difference(high: Floats, low: Floats, other: Floats, other_low: Floats) -> Floats:
+def difference(high: Floats, low: Floats, other: Floats, other_low: Floats) -> Floats:
     """``(high + low) - (other + other_low)``, to two roundings (Knuth's sums without error)."""
-    large, rest = _two_sum(high, -other)
-    small, more = _two_sum(low, -other_low)
-    large, lost = _two_sum(large, small)
+    large, rest = two_sum(high, -other)
+    small, more = two_sum(low, -other_low)
+    large, lost = two_sum(large, small)
     return large + (lost + (rest + more))
 
 
-def _two_sum(a: Floats, b: Floats) -> tuple[Floats, Floats]:
+def two_sum(a: Floats, b: Floats) -> tuple[Floats, Floats]:
     total = a + b
     part = total - a
     return total, (a - (total - part)) + (b - part)
@@ -179,8 +179,8 @@ def _solution(rows: _Rows, chosen: Integers, solve: Solver) -> _Pair | None:
             step = float(np.abs(more).max(initial=0))
             if not step < found.step / 2:  # NaN is none either
                 break
-            high, lost = _two_sum(found.high, more)
-            found = _Pair(*_two_sum(high, found.low + lost), step)
+            high, lost = two_sum(found.high, more)
+            found = _Pair(*two_sum(high, found.low + lost), step)
     return found if np.isfinite(found.high).all() else None
 
 
@@ -191,7 +191,7 @@ def _levelled(pair: _Pair, level: float) -> tuple[Floats, Floats]:
         return high, low
     order = np.argsort(high, kind="stable")
     first, second = order[:-1], order[1:]
-    apart = np.abs(_difference(high[second], low[second], high[first], low[first]))
+    apart = np.abs(difference(high[second], low[second], high[first], low[first]))
     apart = apart > level * pair.step
     begin = np.concatenate([[0], np.flatnonzero(apart) + 1])
     one = order[np.repeat(begin, np.diff(begin, append=order.size))]

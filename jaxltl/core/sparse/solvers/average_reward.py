@@ -18,6 +18,8 @@ from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.sparse.graph.components import strong_components
 from jaxltl.core.sparse.graph.qualitative import Components, end_components, reaching, towards
 from jaxltl.core.sparse.linear.elimination import factors
+from jaxltl.core.sparse.linear.matrix_tree import share_of_values
+from jaxltl.core.sparse.linear.refinement import difference, two_sum
 from jaxltl.core.sparse.linear.topological_order import Edges, components_in_order
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.rows import spans, starts_of
@@ -28,17 +30,19 @@ _EPS = float(np.finfo(np.float64).eps)
 _LAZY = 0.5  # the share of a step by which value iteration moves, so that no period keeps it apart
 _SWEEPS = 400  # of value iteration before policies are solved for
 _JUDGED = 32  # sweeps after which it is seen whether more would do
+_PATIENCE = 64  # sweeps for each state before the last ones are judged: news passes all of them
 _EVERY = 8  # sweeps between two looks at the bounds
 _TURNS = 4  # of policies and of as many sweeps, before sweeps alone go on
 _ROUNDS = 60  # policies at most
 _LOOKS = 30  # steps after which it is asked where a policy is most often
-_REFINED = 3  # solves of one bias, each of what the last ones left
+_REFINED = 6  # solves of one bias, each of what the last ones left
 _ELIMINATED = 2_000_000  # states up to which they are
 _LINGERS = 1e12  # times the largest reward: biases that far apart are of states hardly ever left
 _IDLE = 6  # policies in a row that earn more by no more than
 _IDLE_SHARE = 1e-12  # of what the ones before did
 _NEAR = 1e-3  # of their range: the best ones
 _TINY = 1e-13
+_LOOSEST = 1e-3  # share up to which its powers are left out
 _FLOOR = 1e-6  # of the tolerance, times the largest reward: what counts where a gain is near zero
 
 
@@ -227,10 +231,16 @@ class _Part(NamedTuple):
         image += self.reward
         return self.mdp.over_choices(np.maximum, image) - v
 
-    def gain(self, v: Floats) -> tuple[Floats, Floats]:
+    def gain(self, v: Floats, low: Floats | None = None) -> tuple[Floats, Floats]:
         """``c + P v - v`` of each row and its rounding, by differences, which are often small."""
         mdp = self.mdp
-        step = mdp.probability * (v[mdp.successor] - v[mdp.state][mdp.row])
+        source, target = mdp.state[mdp.row], mdp.successor
+        ahead = (
+            v[target] - v[source]
+            if low is None
+            else difference(v[target], low[target], v[source], low[source])
+        )
+        step = mdp.probability * ahead
         slack = np.add.reduceat(np.abs(step), mdp.entry_start[:-1])
         return (
             self.reward + np.add.reduceat(step, mdp.entry_start[:-1]),
@@ -310,6 +320,39 @@ class _Gains:
         self.lower[which] = np.maximum(self.lower[which], low)
         self.upper[which] = np.minimum(self.upper[which], high)
 
+    def note_by_weights(
+        self, left: _Left, chosen: Integers, high: Floats, low: Floats, gain: float
+    ) -> None:
+        """Takes what a policy's bias, in two floats, shows of one component.
+
+        With costs ``c = r - min r`` and ``g = gain - min r``, a row has the balance
+        ``c - g + sum_t P_t (v_t - v_s)``. If that of each chosen row is at most a share e of the
+        sum of its absolute terms, the policy has the gain g for weights and costs that differ by e;
+        if no row has more, no policy has a greater one. As quotients of sums of their products
+        (:func:`~jaxltl.core.sparse.linear.matrix_tree.share_of_values`), gains of the true ones
+        differ by a small multiple of e, however far apart biases are.
+        """
+        part, which = left.part, left.which[0]
+        mdp, base = part.mdp, float(part.reward.min())
+        start, cost, earned = mdp.entry_start[:-1], part.reward - base, max(gain - base, 0.0)
+        source, target = mdp.state[mdp.row], mdp.successor
+        flow = mdp.probability * difference(high[target], low[target], high[source], low[source])
+        gap = (part.reward - gain) + np.add.reduceat(flow, start)
+        scale = cost + earned + np.add.reduceat(np.abs(flow), start)
+        share = np.abs(gap) / np.maximum(scale, 1e-300)
+        own = float(share[chosen].max())
+        every = max(own, float(share[gap > 0].max(initial=0)))
+        slack = part.unit * float(part.magnitude.max())
+        bounds = []
+        for side, error in ((-1, own), (1, every)):
+            error = share_of_values(error + 2 * part.unit, mdp.num_states)
+            far = gain + side * (error * earned + slack) if error < _LOOSEST else side * np.inf
+            bounds.append(far)
+        if bounds[0] > self.lower[which]:
+            self.lower[which] = bounds[0]
+            self.row[left.states] = part.row[chosen]
+        self.upper[which] = min(self.upper[which], bounds[1])
+
     def wide(self, left: _Left, tolerance: float) -> Booleans:
         """Whose bounds are wider than asked."""
         low, high = self.lower[left.which], self.upper[left.which]
@@ -321,7 +364,7 @@ def _gains(whole: _Part, tolerance: float, max_steps: int) -> _Gains:
     count, size = whole.start.size, whole.mdp.num_states
     known = _Gains(np.full(count, -np.inf), np.full(count, np.inf), np.zeros(size, np.int64))
     left = _Left(np.arange(count), np.arange(size), whole, np.zeros(size))
-    left = _swept(known, left, tolerance, min(_SWEEPS, max_steps), hasty=True)
+    left = _swept(known, left, tolerance, min(_SWEEPS, max_steps), patience=0)
     for turn in range(_TURNS):
         settled, v = np.zeros(left.which.size, bool), left.v.copy()
         for i in np.flatnonzero(left.part.size <= _ELIMINATED):
@@ -335,7 +378,8 @@ def _gains(whole: _Part, tolerance: float, max_steps: int) -> _Gains:
         if not left.which.size or max_steps <= _SWEEPS:
             break
         left = _swept(known, left, tolerance, _SWEEPS)
-    _swept(known, left, tolerance, max_steps - (_TURNS + 1) * _SWEEPS)
+    rest, patience = max_steps - (_TURNS + 1) * _SWEEPS, _PATIENCE * left.v.size
+    _swept(known, left, tolerance, rest, patience)
     return known
 
 
@@ -367,11 +411,11 @@ class _Left(NamedTuple):
 
 
 def _swept(
-    known: _Gains, left: _Left, tolerance: float, num_steps: int, *, hasty: bool = False
+    known: _Gains, left: _Left, tolerance: float, num_steps: int, patience: float = np.inf
 ) -> _Left:
     """Value iteration of all components at once, until each is narrow.
 
-    If `hasty`, also until it can be seen that the steps are too few for those that are left.
+    After `patience` sweeps it also ends where the steps are too few at the rate of convergence.
     """
     before: Floats | None = None
     done = 0
@@ -383,7 +427,7 @@ def _swept(
         left = left._replace(v=v)
         known.note(left)
         left = left.only(known.wide(left, tolerance))
-        if hasty and done % _JUDGED == 0 and left.which.size:
+        if done >= patience and done % _JUDGED == 0 and left.which.size:
             if (
                 before is not None
                 and (_steps_left(known, left, before, tolerance) > num_steps - done).all()
@@ -421,29 +465,30 @@ def _by_policies(known: _Gains, left: _Left, tolerance: float) -> Floats | None:
         if solved is None:
             return best
         v, chosen = solved
-        known.note(left._replace(v=v))
+        known.note(left._replace(v=v[0]))
+        known.note_by_weights(left, chosen, *v)
         if not known.wide(left, tolerance).any():
             return None
-        range_, more = float(np.ptp(v)), float(known.lower[left.which[0]]) - before
+        more = float(known.lower[left.which[0]]) - before
         idle = 0 if more > _IDLE_SHARE * abs(before) else idle + 1
         if idle > _IDLE:
             break
-        if range_ > _LINGERS * part.magnitude.max():
-            # Some states are left hardly ever: the rest goes to the best of these.
-            goal = v >= v.max() - _NEAR * range_
-            chosen = np.where(goal, chosen, towards(part.mdp, goal, np.ones(part.row.size, bool)))
-            continue
-        best = v
-        gain, slack = part.gain(v)
+        best, range_ = v[0], float(np.ptp(v[0]))
+        gain, slack = part.gain(v[0], v[1])
         better = part.mdp.over_choices(np.maximum, gain - slack) > (gain + slack)[chosen]
-        if not better.any():
+        if better.any():
+            chosen = np.where(better, part.first_best(gain - slack), chosen)
+        elif range_ > _LINGERS * part.magnitude.max():
+            # Some states are left hardly ever: the rest goes to the best of these.
+            goal = best >= best.max() - _NEAR * range_
+            chosen = np.where(goal, chosen, towards(part.mdp, goal, np.ones(part.row.size, bool)))
+        else:
             return None
-        chosen = np.where(better, part.first_best(gain - slack), chosen)
     return best
 
 
-def _bias(part: _Part, chosen: Integers) -> tuple[Floats, Integers] | None:
-    """A policy's bias v, for which ``c + P v - v`` is its gain, and the policy.
+def _bias(part: _Part, chosen: Integers) -> tuple[tuple[Floats, Floats, float], Integers] | None:
+    """A policy's bias v in two floats, its gain ``c + P v - v``, and the policy.
 
     Where it has several recurrent classes, it is first led to the one of the largest gain.
     """
@@ -468,13 +513,13 @@ def _bias(part: _Part, chosen: Integers) -> tuple[Floats, Integers] | None:
         heads = heads[[best]]
     recurrent = np.flatnonzero(label == heads[0])
     found = _cycle(part, chosen, np.arange(size), recurrent)
-    return None if found is None else (found[1], chosen)
+    return None if found is None else ((found[1], found[2], found[0]), chosen)
 
 
 def _cycle(
     part: _Part, chosen: Integers, states: Integers, recurrent: Integers | None = None
-) -> tuple[float, Floats] | None:
-    """The gain and bias of a chain with one recurrent class, through visits of one state.
+) -> tuple[float, Floats, Floats] | None:
+    """The gain and bias (in two floats) of a chain with one recurrent class, through visits of one state.
 
     What is earned between two visits, by how long that takes.
     """
@@ -503,12 +548,16 @@ def _cycle(
     if system is None:
         return None
     time, reward = system.solve(1 / leaves), part.reward[chosen[states]]
-    gain, v = 0.0, np.zeros(states.size)
-    for _ in range(_REFINED):
-        step = np.bincount(source, matrix.data * (v[matrix.indices] - v[source]), states.size)
-        earned = system.solve((reward - gain + step) / leaves)
-        share = earned[visited] / time[visited]
-        if not np.isfinite(earned).all() or not np.isfinite(share):
-            return None
-        gain, v = gain + float(share), v + earned - share * time
-    return gain, v - v[visited]
+    gain, high, low = 0.0, np.zeros(states.size), np.zeros(states.size)
+    target = matrix.indices
+    with np.errstate(all="ignore"):
+        for _ in range(_REFINED):
+            step = matrix.data * difference(high[target], low[target], high[source], low[source])
+            earned = system.solve((reward - gain + np.bincount(source, step, states.size)) / leaves)
+            share = earned[visited] / time[visited]
+            if not np.isfinite(earned).all() or not np.isfinite(share):
+                return None
+            gain += float(share)
+            high, lost = two_sum(high, earned - share * time)
+            high, low = two_sum(high, low + lost)
+    return gain, high - high[visited], low - low[visited]

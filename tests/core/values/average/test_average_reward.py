@@ -85,6 +85,46 @@ def test_bounds_enclose_the_best_of_all_policies(seed):
             assert low - 1e-12 <= x <= high + 1e-12
 
 
+def sticky_model(rng, num_states, digits, chain):
+    """Rows with self-loops near 1: other transitions have probabilities down to 10**-digits."""
+    start, successor, probability, row_start = [0], [], [], [0]
+    for s in range(num_states):
+        for _ in range(1 if chain else rng.integers(1, 4)):
+            others = [t for t in range(num_states) if t != s]
+            targets = rng.choice(others, rng.integers(1, 3), replace=False)
+            weight = 10.0 ** -rng.uniform(0, digits, targets.size) / targets.size
+            row = dict(zip(targets.tolist(), weight.tolist(), strict=True))
+            row[s] = 1 - sum(row.values())
+            successor += sorted(row)
+            probability += [row[t] for t in sorted(row)]
+            start.append(len(successor))
+        row_start.append(len(start) - 1)
+    return make_sparse(row_start, start, successor, probability)
+
+
+@pytest.mark.parametrize("seed", range(24))
+def test_self_loops_near_one_take_no_longer(seed):
+    rng = np.random.default_rng(seed)
+    model = sticky_model(rng, 4 if seed % 2 else 5, (9, 12, 15)[seed % 3], chain=not seed % 2)
+    reward = rng.uniform(-1 if seed % 4 > 1 else 0, 1, model.num_rows)
+    exact = [Fraction(float(x)) for x in reward]
+    matrix = exact_matrix(model)
+    for r, row in enumerate(matrix):  # the loop is what the other transitions leave
+        s = int(model.host.state[r])
+        row[s] = 1 - sum(x for t, x in enumerate(row) if t != s)
+    choices = [range(*model.row_start[s : s + 2]) for s in range(model.num_states)]
+    values = [
+        exact_average([matrix[r] for r in policy], [exact[r] for r in policy])
+        for policy in itertools.product(*choices)
+    ]
+    for objective, best in (("max", max), ("min", min)):
+        found = check(average_reward(model, Rewards(choice=reward), objective=objective))
+        assert found.num_steps < 5000  # value iteration takes 10**12
+        for low, high, x in zip(found.lower, found.upper, zip(*values, strict=True), strict=True):
+            assert Fraction(float(low)) <= best(x) <= Fraction(float(high))
+            assert high - low <= 2e-6
+
+
 @pytest.mark.parametrize("seed", range(12))
 def test_bounds_enclose_however_narrow(seed):
     """With nothing but rounding between them, of rows that sum to one but for theirs."""
