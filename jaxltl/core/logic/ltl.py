@@ -95,10 +95,16 @@ class Formula:
         return tuple(sorted({f.proposition for f in subformulas(self) if f.operator == "ap"}))
 
     def __str__(self) -> str:
-        texts: dict[Formula, str] = {}
-        for node in subformulas(self):
-            texts[node] = render(node, [texts[operand] for operand in node.operands])
-        return texts[self]
+        # Piece by piece: texts of all subformulas take quadratic memory where formulas are deep.
+        written: list[str] = []
+        waiting: list[str | Formula] = [self]
+        while waiting:
+            piece = waiting.pop()
+            if isinstance(piece, str):
+                written.append(piece)
+            else:
+                waiting.extend(reversed(_pieces(piece)))
+        return "".join(written)
 
     def __repr__(self) -> str:
         text = repr(str(self))
@@ -306,18 +312,25 @@ def proposition_text(name: str) -> str:
     return '"' + re.sub(r'(["\\])', r"\\\1", name) + '"'
 
 
-def render(formula: Formula, operand_texts: Sequence[str]) -> str:
-    """The text of a formula, given the texts of its operands."""
+def _pieces(formula: Formula) -> list[str | Formula]:
+    """The text of a formula as literal pieces and operands, from left to right."""
     if not formula.operands:
         atom = formula.operator == "ap"
-        return proposition_text(formula.proposition) if atom else formula.operator
-    grouped = [
-        f"({text})" if len(operand.operands) > 1 else text
-        for operand, text in zip(formula.operands, operand_texts, strict=True)
-    ]
-    if len(grouped) > 1:
-        return f" {formula.operator} ".join(grouped)
-    return formula.operator + ("" if formula.operator == "!" else " ") + grouped[0]
+        return [proposition_text(formula.proposition) if atom else formula.operator]
+    single = len(formula.operands) == 1
+    found: list[str | Formula] = []
+    for operand in formula.operands:
+        if found:
+            found.append(f" {formula.operator} ")
+        found += ["(", operand, ")"] if len(operand.operands) > 1 else [operand]
+    prefix = formula.operator + ("" if formula.operator == "!" else " ")
+    return [prefix, *found] if single else found
+
+
+def render(formula: Formula, operand_texts: Sequence[str]) -> str:
+    """The text of a formula, given the texts of its operands."""
+    texts = dict(zip(formula.operands, operand_texts, strict=True))
+    return "".join(x if isinstance(x, str) else texts[x] for x in _pieces(formula))
 
 
 # ---------------------------------------------------------------------------------------------

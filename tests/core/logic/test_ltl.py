@@ -1,6 +1,7 @@
 """Syntax, normal form, fragments and truth of linear temporal logic."""
 
 import random
+import tracemalloc
 
 import pytest
 
@@ -304,3 +305,19 @@ def test_fragments_are_dual():
 
 def test_constants():
     assert parse_ltl("1") == TRUE and parse_ltl("fAlSe") == FALSE
+
+
+@pytest.mark.parametrize("operator", ["X", "U", "->"])
+def test_the_text_of_a_deep_formula_takes_linear_memory(operator):
+    a, depth = Formula("ap", proposition="a"), 20_000
+    formula = a
+    for _ in range(depth):
+        formula = Formula(operator, (formula,) if operator == "X" else (a, formula))
+    tracemalloc.start()
+    try:
+        text = str(formula)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert text.count(operator) == depth and text.count("a") == depth * (operator != "X") + 1
+    assert peak < 20e6
