@@ -38,7 +38,7 @@ class Automaton:
     """A complete deterministic automaton; see `make_automaton` for checked construction.
 
     A word is accepted iff the least priority that its run reads infinitely often is even
-    (min-even parity, on transitions). The acceptance tells which priorities there are:
+    (min-even parity, on transitions). The acceptance determines the priorities:
 
     - `"cosafe"`: state q has priority 0 if it is final, else 1, and final states are absorbing:
       the run must reach one.
@@ -112,7 +112,7 @@ def make_automaton(
       final: `[Q]` booleans, absorbing as `acceptance` asks.
       accepting: `[Q]` or `[Q, L]` booleans, visited infinitely often (Buchi).
       priority: `[Q]` or `[Q, L]` integers from 0 up; the least one met infinitely often is even.
-      acceptance: `"cosafe"` or `"safety"` with `final`; else follows from what is given.
+      acceptance: `"cosafe"` or `"safety"` with `final`; otherwise derived from the other arguments.
       state_names: `[Q]` names, or none.
 
     Returns:
@@ -301,7 +301,7 @@ def run(automaton: Automaton, word: Iterable[Letter]) -> NDArray[np.int32]:
 
 
 def accepts_lasso(automaton: Automaton, prefix: Iterable[Letter], cycle: Iterable[Letter]) -> bool:
-    """Whether the automaton accepts the infinite word prefix·cycle^ω.
+    """True if the automaton accepts the infinite word prefix·cycle^ω.
 
     Args:
       automaton: the automaton.
@@ -377,7 +377,7 @@ def complement(automaton: Automaton) -> Automaton:
 
 
 def extent_text(automaton: Automaton) -> str:
-    """How many states and letters an automaton has, in words."""
+    """Numbers of states and letters as text."""
     counts = zip(automaton.delta.shape, ("state", "letter"), strict=True)
     sizes = ", ".join(f"{n} {name}{'' if n == 1 else 's'}" for n, name in counts)
     return f"{sizes} over {', '.join(automaton.propositions) or 'no propositions'}"

@@ -28,7 +28,7 @@ MAX_SUBSETS = 20_000  # parts examined in one decomposition before it is given u
 
 
 def holds(condition: Condition, colors: int) -> bool:
-    """Whether a condition holds of the set of colors that occur infinitely often.
+    """True if a condition holds of the set of colors that occur infinitely often.
 
     Args:
       condition: `("true",)`, `("false",)`, `("inf", i)`: color i occurs infinitely often,

@@ -42,7 +42,7 @@ def find_accepted(automaton: Automaton) -> Lasso | None:
 
 
 def is_empty(automaton: Automaton) -> bool:
-    """Whether the automaton accepts no word.
+    """True if the automaton accepts no word.
 
     Example:
       >>> from jaxltl import to_automaton
@@ -53,7 +53,7 @@ def is_empty(automaton: Automaton) -> bool:
 
 
 def is_universal(automaton: Automaton) -> bool:
-    """Whether the automaton accepts every word over its letters.
+    """True if the automaton accepts every word over its letters.
 
     Example:
       >>> from jaxltl import to_automaton
@@ -85,13 +85,13 @@ def find_difference(a: Task, b: Task) -> Lasso | None:
 
 
 def is_equivalent(a: Task, b: Task) -> bool:
-    """Whether two automata or formulas accept the same words over their joint letters, see `align`.
+    """True if two automata or formulas accept the same words over their joint letters; see `align`.
 
     Args:
       a, b: automata with any acceptance, formulas or their texts.
 
     Returns:
-      Whether they do; :func:`find_difference` gives a word that tells them apart.
+      True if they do; :func:`find_difference` returns a word in the symmetric difference.
 
     Raises:
       ValueError: if there is no joint letter, or too many.
@@ -113,11 +113,11 @@ def find_not_included(a: Task, b: Task) -> Lasso | None:
     and r. Neither acceptance has to be converted.
 
     Args:
-      a: the automaton whose words are questioned.
+      a: the automaton whose words are tested.
       b: the automaton that should accept them; both are aligned first, see `align`.
 
     Returns:
-      `(prefix, cycle)`, or None if `b` accepts whatever `a` accepts.
+      `(prefix, cycle)`, or None if the language of `a` is included in that of `b`.
 
     Raises:
       ValueError: if there is no joint letter, or too many.
@@ -131,10 +131,10 @@ def find_not_included(a: Task, b: Task) -> Lasso | None:
 
 
 def is_included(a: Task, b: Task) -> bool:
-    """Whether the second automaton accepts whatever the first accepts, over joint letters.
+    """True if the language of the first automaton is included in that of the second, over joint letters.
 
     Args:
-      a: the automaton whose words are questioned; or a formula, or its text.
+      a: the automaton whose words are tested; or a formula, or its text.
       b: the one that should accept them, likewise; both are aligned first, see `align`.
 
     Returns:

@@ -13,7 +13,7 @@ from jaxltl.core.automata.automaton import Automaton
 
 
 def minimize(automaton: Automaton) -> Automaton:
-    """The smallest automaton whose runs read the same priorities.
+    """Minimal automaton with the same priorities along every run.
 
     Unreachable states are dropped and equivalent ones merged, by `equivalence_classes`. Co-safe
     and safety automata of one language, over the same letters, give identical tables. A merged
@@ -28,7 +28,7 @@ def minimize(automaton: Automaton) -> Automaton:
 
 
 def quotient(automaton: Automaton, classes: NDArray[np.int32]) -> Automaton:
-    """The automaton whose states are classes of equivalent states.
+    """Quotient automaton by an equivalence of states.
 
     Args:
       automaton: the automaton.

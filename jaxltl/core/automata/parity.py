@@ -174,7 +174,7 @@ def components(table: Table) -> Integers:
 
 
 def is_weak(table: Table) -> bool:
-    """Whether no component has cycles of both verdicts; priorities must be the fewest."""
+    """True if no component has cycles of both verdicts; priorities must be the fewest."""
     component = components(table)
     inside = component[table.delta] == component[:, None]
     low = np.full(component.max() + 1, table.priority.max() + 1)
@@ -220,7 +220,7 @@ def _weak_minimal(table: Table) -> tuple[Table, Integers]:
 
 
 def _early(table: Table) -> Table:
-    """A weak automaton with verdicts told as early as they are certain, where that suffices.
+    """A weak automaton whose verdicts come as early as they are certain, where that suffices.
 
     Where every accepting cycle is among states that accept all words, only those are final: the
     language is co-safe. Where every rejecting cycle is among states that accept none, all
@@ -259,7 +259,7 @@ def language_classes(table: Table) -> Integers | None:
     differ = _distinguished(follow, left, right)
     apart = differ.reshape(count, count)
     apart |= apart.T
-    return np.asarray(np.argmin(apart, axis=1))  # the first state that is not told apart
+    return np.asarray(np.argmin(apart, axis=1))  # the first equivalent state
 
 
 def _distinguished(follow: Integers, left: Integers, right: Integers) -> NDArray[np.bool_]:
@@ -340,7 +340,7 @@ class _Pairs:
         self.left_priority, self.right_priority = priority[left], priority[right]
 
     def equal(self, initial: int, target: Integers) -> bool:
-        """Whether the table with each state q replaced by target[q] has the same language."""
+        """True if the table with each state q replaced by target[q] has the same language."""
         follow = self.number[self.follow, target[self.delta[self.right]]]
         start = self.number[initial, target[initial]]
         reached = reached_from(follow, start)

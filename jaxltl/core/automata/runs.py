@@ -191,7 +191,7 @@ def find_lasso(automata: Sequence[Automaton], wanted: Sequence[tuple[int, ...]])
 
 
 def some_loop(runs: Runs, wanted: Sequence[tuple[int, ...]]) -> bool:
-    """Whether some loop has one of the wanted parities."""
+    """True if some loop has one of the wanted parities."""
     return any(True for parities in wanted for _ in _loops(runs, parities))
 
 

@@ -1,6 +1,6 @@
-"""What an automaton still asks for, as sequences of what to reach and what to avoid on the way.
+"""Reach-avoid sequences of an automaton: letters to reach, and letters to avoid until then.
 
-Whoever has read a finite word stands in a state of the automaton, and satisfies the task along a
+A finite word leads to a state of the automaton; a continuation satisfies the task along a
 path from there into acceptance. Each move of such a path says: read one of *these* letters next,
 and none of *those* before it. Such sequences look the same for every formula, so that one agent
 that can follow them does formulas that it never saw (Jackermeier and Abate 2025, "DeepLTL").
@@ -141,7 +141,7 @@ class _Tables(NamedTuple):
 
 
 def _steps(tables: _Tables, stem: _Path, cycle: _Path, depth: int) -> NDArray[np.bool_]:
-    """What the moves of a path ask for, and what they avoid: bool `[2, D, E]`."""
+    """Letters to reach and to avoid along the moves of a path: bool `[2, D, E]`."""
     delta, priority, live, distance = tables
     least = min((m.priority for _, m in cycle), default=0)
     turns = -(-max(depth - len(stem), 0) // len(cycle)) if cycle else 0

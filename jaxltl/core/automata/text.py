@@ -169,7 +169,7 @@ def _final_states(automaton: Automaton) -> NDArray[np.bool_]:
 
 
 def _mark(automaton: Automaton, priority: int, accepting: str) -> str:
-    """What follows a transition, where acceptance is on transitions."""
+    """Acceptance marks of a transition, for acceptance on transitions."""
     if automaton.acceptance == "parity":
         return f" {{{priority}}}"
     return accepting if automaton.acceptance == "buchi" and priority == 0 else ""

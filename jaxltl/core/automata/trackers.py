@@ -1,6 +1,6 @@
 """Deterministic runs that follow the parts of a combination, side by side.
 
-A Sigma-2 formula holds iff from some point on what is left of it holds by its safety part alone,
+A Sigma-2 formula holds iff from some point on its residual holds by its safety part alone,
 with every `F U M` taken as false (Esparza, Kretinsky & Sickert 2020, the master theorem). Its
 tracker guesses that this point has come, follows that safety formula, and guesses again when it
 is refuted: the formula holds iff it guesses finitely often. Pi-2 formulas are negations.
@@ -19,7 +19,7 @@ from jaxltl.core.logic.normal_form import Combination, Part, is_pure, limit_part
 from jaxltl.core.logic.progression import Progression
 from jaxltl.core.logic.simplify import GREATEST, LEAST, negated
 
-_State: TypeAlias = tuple[int, int, int]  # what is left of the formula, the guess, the turn
+_State: TypeAlias = tuple[int, int, int]  # the residual formula, the guess, the turn
 _PROVEN, _REFUTED, _IDLE = -1, -2, -3
 
 
@@ -32,7 +32,7 @@ class Tracker:
     def __init__(self, part: Part) -> None:
         limits = limit_parts(part.formula) if part.kind == "limit" else ()
         self.often = limits[0].operator == "G" if limits else part.kind == "pi2"
-        # Limits are followed in turn: all of some G F f hold iff each turn ends.
+        # Limits are tracked round-robin: all of some G F f hold iff every turn ends.
         self.whole = None if limits else negated(part.formula) if self.often else part.formula
         self.turns = [negated(f) if self.often else f for f in limits]
         self.turns = [f.operands[0] for f in self.turns]
@@ -187,7 +187,7 @@ class _Product:
             truth, live = self.needed[status]
             if truth is None:
                 small = tuple(q if q < 0 or i in live else _IDLE for i, q in enumerate(state))
-                # A proven part that nothing depends on need not be told from a refuted one.
+                # A proven part that nothing depends on is equivalent to a refuted one.
             else:
                 small = tuple(q if q in (_PROVEN, _REFUTED) else _IDLE for q in state)
                 small = self.decided.setdefault(truth, small)

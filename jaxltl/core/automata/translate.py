@@ -78,7 +78,7 @@ def to_automaton(
       is named by the formula that is left to satisfy there.
 
     Raises:
-      ValueError: for a language without the acceptance asked for, more than 12 propositions
+      ValueError: for a language without the requested acceptance, more than 12 propositions
         without `letters`, a letter that is no collection, or too many states.
 
     Example:
@@ -346,7 +346,7 @@ def _lasso_text(lasso: tuple[list[frozenset[str]], list[frozenset[str]]]) -> str
 
 
 def _with_acceptance(formula: Formula, automaton: Automaton, acceptance: Acceptance) -> Automaton:
-    """The automaton with the acceptance that was asked for, if it can have it."""
+    """The automaton with the requested acceptance, if the language has one."""
     kind = automaton.acceptance
     if acceptance == "auto":
         return automaton

@@ -1,4 +1,4 @@
-"""What properties ask for that no formula says: bounds on steps and rewards, and sums."""
+"""Path formulas with bounds on steps or rewards, and reward objectives of properties."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Bounded:
 
 @dataclass(frozen=True)
 class Earned:
-    """What of a reward is asked for, where it is not the sum until a state is reached.
+    """A reward objective other than the reward until a target is reached.
 
     Attributes:
       kind: `"total"` (`C`), `"cumulative"` (`C<=k`: in the first k steps), `"instantaneous"`
@@ -72,7 +72,7 @@ class Earned:
 
 
 def unfolded(path: Bounded) -> Formula:
-    """The formula without bounds that says the same as one with a bound on steps.
+    """The equivalent formula without bounds, for a bound on steps.
 
     `a U[l,u] b` is `a & X(a U[l-1,u-1] b)`, and `a U<=u b` is `b | a & X(a U<=u-1 b)`; `R` dually.
 

@@ -1,4 +1,4 @@
-"""Where a Boolean formula over propositions holds in an array of labels."""
+"""Satisfaction of Boolean formulas over propositions in arrays of labels."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _BOOLEAN = frozenset(("true", "false", "ap", "!", "&", "|", "->", "<->", "xor"))
 
 
 def is_boolean(formula: Formula) -> bool:
-    """Whether a formula is without temporal operators, so that a single state decides it."""
+    """True if a formula is without temporal operators, so that a single state decides it."""
     return all(f.operator in _BOOLEAN for f in subformulas(formula))
 
 
@@ -23,7 +23,7 @@ def require_known(needed: Collection[str], known: Sequence[str], place: str) -> 
 
     Args:
       needed, known: names of propositions.
-      place: what mentions them, the subject of the message.
+      place: the subject of the message.
     """
     for name in needed:
         if name not in known:
@@ -44,7 +44,7 @@ def satisfying(
       label: ``bool[S, P]``.
       propositions: the P names.
       condition: a formula without temporal operators.
-      place: what is asked for, to begin an error with.
+      place: the subject of error messages.
 
     Returns:
       ``bool[S]``.
@@ -72,7 +72,7 @@ def satisfying(
     return np.array(truth, bool)[number]
 
 
-_COUNTED = 16  # columns up to which every combination has a counter of its own
+_COUNTED = 16  # columns up to which every combination has a counter
 
 
 def distinct_rows(rows: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:

@@ -216,7 +216,7 @@ def parse_ltl(text: str) -> Formula:
       The `Formula`; its ``str`` is text that is read as the same formula.
 
     Raises:
-      ValueError: with the column of the first error and what was expected there.
+      ValueError: with the column of the first error and the expected tokens.
 
     Example:
       >>> print(parse_ltl("GFa -> b U c && d"))
@@ -275,10 +275,10 @@ def _syntax_error(text: str, error: UnexpectedInput) -> str:
 
 
 def pointed(place: str, text: str, position: int, found: str, wanted: str) -> str:
-    """What is wrong at a position of a text, with a caret under it.
+    """Error message for a position of a text, with a caret under it.
 
     Args:
-      place: what read the text, the subject of the message.
+      place: the subject of the message.
       text: all of it.
       position: of the error.
       found, wanted: in words.
@@ -390,7 +390,7 @@ def offending_subformula(formula: Formula, fragment: Fragment) -> Formula | None
 
 
 def is_syntactically_cosafe(formula: Formula) -> bool:
-    """Whether the normal form uses only `X F U M`, so a finite prefix proves the formula.
+    """True if the normal form uses only `X F U M`, so a finite prefix proves the formula.
 
     Example:
       >>> is_syntactically_cosafe(parse_ltl("!(G a)")), is_syntactically_cosafe(parse_ltl("G a"))
@@ -400,7 +400,7 @@ def is_syntactically_cosafe(formula: Formula) -> bool:
 
 
 def is_syntactically_safe(formula: Formula) -> bool:
-    """Whether the normal form uses only `X G R W`, so a finite prefix refutes the formula.
+    """True if the normal form uses only `X G R W`, so a finite prefix refutes the formula.
 
     Example:
       >>> is_syntactically_safe(parse_ltl("!F a")), is_syntactically_safe(parse_ltl("F a"))
@@ -436,7 +436,7 @@ def as_letters(letters: Iterable[Letter], place: str) -> list[frozenset[str]]:
 def holds_on_lasso(
     formula: Formula | str, prefix: Iterable[Letter], cycle: Iterable[Letter]
 ) -> bool:
-    """Whether the infinite word prefix·cycle^ω satisfies the formula.
+    """True if the infinite word prefix·cycle^ω satisfies the formula.
 
     The truth of each subformula is computed at every position of the lasso, `U F M` as least and
     `R G W` as greatest solutions of their expansion laws, such as
@@ -463,7 +463,7 @@ def holds_on_lasso(
 def truth_on_lasso(
     formula: Formula | str, prefix: Iterable[Letter], cycle: Iterable[Letter]
 ) -> list[bool]:
-    """Whether the formula holds from each of the `n + m` positions on, see `holds_on_lasso`.
+    """Truth of the formula at each of the `n + m` positions, see `holds_on_lasso`.
 
     Example:
       >>> truth_on_lasso("a & X a", prefix=[], cycle=[{"a"}, {"a"}, set()])

@@ -46,19 +46,19 @@ def operators_below(formula: Formula) -> frozenset[str]:
 
 
 def is_pure(formula: Formula, absent: frozenset[str]) -> bool:
-    """Whether none of some operators occurs."""
+    """True if none of some operators occurs."""
     return not operators_below(formula) & absent
 
 
 @lru_cache(maxsize=1 << 14)
 def is_sigma2(formula: Formula) -> bool:
-    """Whether no `G R W` has an `F U M` below it."""
+    """True if no `G R W` has an `F U M` below it."""
     return all(is_pure(node, LEAST) for node in subformulas(formula) if node.operator in GREATEST)
 
 
 @lru_cache(maxsize=1 << 14)
 def is_pi2(formula: Formula) -> bool:
-    """Whether no `F U M` has a `G R W` below it."""
+    """True if no `F U M` has a `G R W` below it."""
     return all(is_pure(node, GREATEST) for node in subformulas(formula) if node.operator in LEAST)
 
 
@@ -82,7 +82,7 @@ def _outermost(formula: Formula, chosen: Callable[[Formula], bool]) -> Formula |
 
 
 class Rewriter:
-    """Rewrites formulas in at most so many steps, each a subformula looked at."""
+    """Rewrites formulas; `steps` bounds the number of subformulas that are visited."""
 
     def __init__(self, steps: int) -> None:
         self.steps = steps
@@ -344,7 +344,7 @@ def _joined_limits(operator: str, parts: list[Combination], grouped: bool) -> li
     """The parts, with limits joined that one tracker can follow.
 
     Those of propositional formulas need no state, so only `G F f | G F g = G F (f | g)` and its
-    dual join them; others of the dual kinds are followed in turn.
+    dual join them; others of the dual kinds are tracked round-robin.
     """
     outer, turning = ("F", "G") if operator == "&" else ("G", "F")
     inner = "G" if outer == "F" else "F"

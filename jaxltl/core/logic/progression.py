@@ -1,4 +1,4 @@
-"""What is left of a formula after a letter, on canonical diagrams.
+"""Formula progression: the residual formula after a letter, on canonical diagrams.
 
 The function `af` of Esparza, Kretinsky & Sickert 2020, "A unified translation of linear temporal
 logic to omega-automata": a formula after the letters read so far, up to propositional
@@ -34,7 +34,7 @@ class Progression:
       max_nodes: the number of diagrams at which to give up.
 
     Attributes:
-      representative: one letter of each class of letters that no formula tells apart.
+      representative: one letter of each class of equivalent letters.
       class_of: int `[L]`, the class of each letter.
     """
 
@@ -105,7 +105,7 @@ class Progression:
         return inverse.ravel(), first
 
     def _step(self, letter: set[str]) -> Callable[[int], int]:
-        """The function from the diagram of a formula to that of what is left after a letter.
+        """The function from the diagram of a formula to that of the residual formula after a letter.
 
         It replaces each variable by its own successor: `af(f U g) = af(g) | (af(f) & f U g)`.
         """

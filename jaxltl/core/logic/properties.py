@@ -16,7 +16,7 @@ from jaxltl.core.pretty_print import brief
 
 Relation = Literal["<", "<=", ">", ">="]
 
-MAX_UNFOLDED_STEPS = 100  # of a step bound inside of a formula, which becomes so many X
+MAX_UNFOLDED_STEPS = 100  # of a step bound inside a formula, which is unfolded into nested X
 
 
 @brief(facts=lambda self: [self.text])
@@ -29,7 +29,7 @@ class Property:
       operator: `"P"` (a probability), `"R"` (an expected reward), `"T"` (expected steps),
         `"LRA"` (the part of the time that a state formula holds in the long run), `"multi"`.
       objective: `"max"`, `"min"`, or None where it is not said.
-      nature: the second of two directions, `"max"` in `Pminmax`: what nature makes of the number
+      nature: the second of two directions, `"max"` in `Pminmax`: the direction in which nature optimises the number
         within intervals; None where only one is said, or none.
       relation, threshold: the comparison, None for `=?`.
       reward: for `"R"`, the name, or None for the only one that the model has.
@@ -57,7 +57,7 @@ class Property:
 
     @property
     def direction(self) -> Literal["max", "min"] | None:
-        """Which optimum answers it: a lower threshold for all policies is one on the minimum."""
+        """The optimum that decides it: a lower threshold for all policies is one on the minimum."""
         if self.objective is not None or self.relation is None:
             return self.objective
         return "min" if self.relation in (">", ">=") else "max"
@@ -75,7 +75,7 @@ def parse_properties(text: str) -> tuple[Property, ...]:
     or, outermost, on a reward (`F{"time"}<=5 "goal"`). Of a reward: `R{"name"}max=? [ F "goal" ]`,
     `[ C ]`, `[ C<=10 ]`, `[ I=5 ]`, `[ S ]` or `[ LRA ]`. Expected steps: `Tmin=? [ F "goal" ]`.
     Time in the long run: `LRAmax=? [ "up" ]`. Several at once: `multi(P, P, ...)`.
-    Where probabilities are intervals, what the policy makes of them comes first and what nature
+    Where probabilities are intervals, the direction of the policy comes first and that of nature
     does second: `Pmaxmin=?`, `R{"time"}minmax=?`.
 
     From tightest to loosest: `!`, `&`, `|`, `<=>`, `=>`, the prefixes `X F G`, then `U W R`, then
@@ -90,7 +90,7 @@ def parse_properties(text: str) -> tuple[Property, ...]:
       The properties, in their order.
 
     Raises:
-      ValueError: with the place of the first error and what was expected there.
+      ValueError: with the place of the first error and the expected tokens.
 
     Example:
       >>> (p,) = parse_properties('Pmax=? [ G F "a" & !"b" ]')
@@ -190,7 +190,7 @@ _STATE = "a state formula: labels in quotes, true, false, ! & | => <=>"
 
 
 class _Parser:
-    """Recursive descent; each method reads what it is named for."""
+    """Recursive-descent parser; each method reads the construct of its name."""
 
     def __init__(self, text: str) -> None:
         self.text = text

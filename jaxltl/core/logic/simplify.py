@@ -15,12 +15,12 @@ TEMPORAL = LEAST | GREATEST | {"X"}
 
 
 def conjunction(parts: Iterable[Formula]) -> Formula:
-    """`f & g & ...`, simplified; true if there are none."""
+    """`f & g & ...`, simplified; true if empty."""
     return flattened("&", parts, TRUE, FALSE)
 
 
 def disjunction(parts: Iterable[Formula]) -> Formula:
-    """`f | g | ...`, simplified; false if there are none."""
+    """`f | g | ...`, simplified; false if empty."""
     return flattened("|", parts, FALSE, TRUE)
 
 
@@ -62,7 +62,7 @@ def _without_implied(operator: str, pieces: list[Formula]) -> list[Formula] | No
 
 @lru_cache(maxsize=1 << 16)
 def implies(one: Formula, two: Formula) -> bool:
-    """Whether simple rules on normal forms show that every word of `one` satisfies `two`.
+    """True if simple rules on normal forms show that every word of `one` satisfies `two`.
 
     The rules are those of Somenzi & Bloem 2000, "Efficient Buchi automata from LTL formulae".
     """
@@ -133,14 +133,14 @@ def _opposite(formula: Formula) -> Formula | None:
 
 
 def is_limit(formula: Formula) -> bool:
-    """Whether the formula is `G F f` or `F G f`, so that no finite prefix matters to it."""
+    """True if the formula is `G F f` or `F G f`, so that no finite prefix matters to it."""
     below = formula.operands[0].operator if formula.operands else ""
     return (formula.operator, below) in (("G", "F"), ("F", "G"))
 
 
 @lru_cache(maxsize=1 << 14)
 def is_invariant(formula: Formula) -> bool:
-    """Whether the formula is a Boolean combination of limits: true now iff true later."""
+    """True if the formula is a Boolean combination of limits: true now iff true later."""
     if formula.operator in ("&", "|"):
         return all(is_invariant(part) for part in formula.operands)
     return is_limit(formula) or formula in (TRUE, FALSE)
