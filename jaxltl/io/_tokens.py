@@ -15,7 +15,7 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxltl.core.sparse.rows import spans
+from jaxltl.core.sparse.rows import concatenated_ranges
 
 Integers = NDArray[np.integer[Any]]
 Floats = NDArray[np.float64]
@@ -116,7 +116,7 @@ class Block:
     def joined(self, token: Integers) -> NDArray[np.uint8]:
         """The bytes of tokens, each with a blank after it."""
         length = self.end[token] - self.start[token] + 1
-        joined = self.data[spans(self.start[token], length)]
+        joined = self.data[concatenated_ranges(self.start[token], length)]
         joined[length.cumsum() - 1] = 32
         return joined
 

@@ -20,7 +20,7 @@ from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.interval import IntervalMDP, interval_rows
 from jaxltl.core.models.mdp import MDP, DenseMDP, from_dense, make_mdp
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
-from jaxltl.core.sparse.rows import starts_of
+from jaxltl.core.sparse.rows import offsets_from_counts
 from jaxltl.io._files import ALWAYS_ALLOWED, MAX_RATIO, raw_bytes
 from jaxltl.io._intervals import exact_part
 
@@ -201,8 +201,8 @@ def _padded_interval(arrays: Arrays) -> tuple[IntervalMDP, int]:
                 )
             options[key] = arrays[key][kept]
     found = interval_rows(
-        starts_of(available.sum(-1)),
-        starts_of(used.sum(-1)[state, action]),
+        offsets_from_counts(available.sum(-1)),
+        offsets_from_counts(used.sum(-1)[state, action]),
         successor[used],
         lower[used].astype(np.float64),
         upper[used].astype(np.float64),

@@ -11,7 +11,7 @@ from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import interval_rows
 from jaxltl.core.models.sparse import Rewards
 from jaxltl.core.pretty_print import brief
-from jaxltl.core.sparse.rows import starts_of
+from jaxltl.core.sparse.rows import offsets_from_counts
 from jaxltl.core.statistics.confidence_sets import Method, intervals_from_counts
 from jaxltl.core.values.interval.robust import robust_discounted_value
 
@@ -65,13 +65,13 @@ def data_evidence(
     moves = np.asarray(allowed) & region[:, None]
     used = moves[..., None] & (np.asarray(mdp.probability) > 0)
     s, a = np.nonzero(moves)
-    start = starts_of(used.sum(-1)[s, a])
+    start = offsets_from_counts(used.sum(-1)[s, a])
     reward = np.asarray(reward, np.float64)
     earned = np.broadcast_to(reward[..., None] if reward.ndim == 2 else reward, used.shape)
     count = np.asarray(counts)[used]
     sets = intervals_from_counts(count, confidence, method=method, entry_start=start)
     model = interval_rows(
-        starts_of(moves.sum(-1)[state]),
+        offsets_from_counts(moves.sum(-1)[state]),
         start,
         number[np.asarray(mdp.successor)[used]],
         sets.lower,

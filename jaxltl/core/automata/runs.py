@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core.automata.automaton import Automaton
-from jaxltl.core.sparse.graph.components import reached, strong_components
+from jaxltl.core.sparse.graph.components import forward_reachable, strong_components
 
 Lasso = tuple[list[frozenset[str]], list[frozenset[str]]]
 
@@ -306,4 +306,4 @@ def _path(
 def _reaching(delta: NDArray[np.int32], goal: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """bool `[N]`, the nodes that have a path to a goal."""
     sources = np.repeat(np.arange(len(delta)), delta.shape[1])
-    return reached(delta.ravel(), sources, goal)
+    return forward_reachable(delta.ravel(), sources, goal)

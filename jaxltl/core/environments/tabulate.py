@@ -25,7 +25,7 @@ from jaxltl.core.environments.time_limit import without_time_limit
 from jaxltl.core.models import facts
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
 from jaxltl.core.pretty_print import brief
-from jaxltl.core.sparse.rows import starts_of
+from jaxltl.core.sparse.rows import offsets_from_counts
 
 _BATCH = 1024  # worlds that are stepped at once, and fewer
 _BYTES = 2**26  # if what they lead to takes more than this
@@ -624,7 +624,7 @@ def _model(kind: _Kind, listed: _Listed, initial: np.ndarray, label: np.ndarray)
         rewards["cost"] = Rewards(transition=cost)
     number = np.concatenate([action, np.zeros(len(over), np.int64)])[order]
     return make_sparse(
-        starts_of(np.bincount(owner, minlength=num_states)),
+        offsets_from_counts(np.bincount(owner, minlength=num_states)),
         np.arange(len(owner) + 1) * width,
         successor,
         probability,

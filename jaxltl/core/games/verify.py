@@ -18,7 +18,7 @@ from jaxltl.core.models.game import as_game
 from jaxltl.core.models.mdp import DenseMDP, support
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief
-from jaxltl.core.sparse.graph.components import reached, strong_components
+from jaxltl.core.sparse.graph.components import forward_reachable, strong_components
 
 Booleans = NDArray[np.bool_]
 Integers = NDArray[np.integer[Any]]
@@ -385,7 +385,7 @@ def _almost_surely(play: _Play, goal: Booleans, inside: Booleans) -> Booleans:
         alive = _staying(play, inside, inside | goal)
         _trim(play, alive, inside)
         edge = alive[play.pair]
-        smaller = reached(play.target[edge], play.source[edge], goal) & inside
+        smaller = forward_reachable(play.target[edge], play.source[edge], goal) & inside
         if (smaller == inside).all():
             return inside | goal
         inside = smaller

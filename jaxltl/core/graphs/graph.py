@@ -28,7 +28,7 @@ from jaxltl.core.models.product import Product, reads
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.sparse.graph.product_graph import HostGraph
 from jaxltl.core.sparse.graph.row_graph import RowGraph
-from jaxltl.core.sparse.rows import rows_of, rows_of_matrix
+from jaxltl.core.sparse.rows import rows_from_padded, rows_from_dense
 
 
 @dataclass(frozen=True)
@@ -173,9 +173,9 @@ def host_graph(model: Any) -> HostGraph:
     world = lazy.mdp if isinstance(lazy, Product) else lazy
     available, used = np.asarray(world.available), support(world)
     if isinstance(world, DenseMDP):
-        rows = rows_of_matrix(used)
+        rows = rows_from_dense(used)
     else:
-        rows = rows_of(np.asarray(world.successor), used, world.num_states)
+        rows = rows_from_padded(np.asarray(world.successor), used, world.num_states)
     if world is lazy:
         letter = np.zeros(world.num_states, np.int32)
         return HostGraph(rows, available, letter[:, None], letter, True, world.state_shape)

@@ -27,7 +27,7 @@ from jaxltl.core.sparse.interval.l1_distance import Ball
 from jaxltl.core.sparse.interval.row_table import row_sums
 from jaxltl.core.sparse.interval.uncertainty_set import HostInterval
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import starts_of
+from jaxltl.core.sparse.rows import offsets_from_counts
 from jaxltl.core.validation import numbers, shown
 
 NEAR = 1e-6  # how far a row may miss a distribution and still be scaled to one
@@ -280,8 +280,8 @@ def make_interval(
     state, action = np.nonzero(available)
     initial = np.asarray(model.initial, np.float64)
     return interval_rows(
-        starts_of(available.sum(-1)),
-        starts_of(used.sum(-1)[state, action]),
+        offsets_from_counts(available.sum(-1)),
+        offsets_from_counts(used.sum(-1)[state, action]),
         np.asarray(model.successor)[used],
         lower[used],
         upper[used],
@@ -361,7 +361,7 @@ def interval_rows(
     if not (place[1:] > place[:-1]).all() and np.unique(place).size < place.size:
         every = [lower, upper] if ball is None else [lower, upper, ball[0]]
         row, successor, every, rewards = _merged(row, successor, every, rewards)
-        entry_start = starts_of(np.bincount(row, minlength=entry_start.size - 1))
+        entry_start = offsets_from_counts(np.bincount(row, minlength=entry_start.size - 1))
         lower, upper = every[:2]
         ball = None if ball is None else (every[2], ball[1])
     lower, upper = _scaled(starts, entry_start, row, lower, upper)

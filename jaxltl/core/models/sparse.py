@@ -19,7 +19,7 @@ from jaxltl.core.models.ops.array_namespace import is_traced
 from jaxltl.core.models.ops.kernels import gather, owners, segment
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import LARGE
+from jaxltl.core.sparse.rows import SCIPY_SIZE
 from jaxltl.core.validation import listed, numbers, shown
 
 _PADDED = (
@@ -556,7 +556,7 @@ def _canonical(
 
 def _sorted(entry_start: np.ndarray, successor: np.ndarray, row: np.ndarray) -> np.ndarray:
     """The entries in an order in which successors ascend in each row."""
-    if successor.size <= LARGE:
+    if successor.size <= SCIPY_SIZE:
         return np.lexsort((successor, row))
     from scipy.sparse import csr_array
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxltl.core.array_types import Floats, Integers
-from jaxltl.core.sparse.rows import spans
+from jaxltl.core.sparse.rows import concatenated_ranges
 
 # Nanoseconds: of an operation on slices and on an entry of them, and of a reduction, on each of its
 # spans and on an entry.
@@ -93,13 +93,13 @@ def choices_of(count: Integers) -> Choices:
     most = int(count.max(initial=1))
     having = count.size - np.bincount(count, minlength=most)[:most].cumsum()
     ranks = _ranks(having)
-    owner = spans(np.zeros(ranks, np.int64), having[:ranks])
+    owner = concatenated_ranges(np.zeros(ranks, np.int64), having[:ranks])
     rank = np.repeat(np.arange(ranks), having[:ranks])
     starts = [0, *having[:ranks].cumsum().tolist()]
     wide = int(having[ranks]) if ranks < having.size else 0
     left = sizes[:wide] - ranks
     owner = np.concatenate([owner, np.repeat(np.arange(wide), left)])
-    rank = np.concatenate([rank, ranks + spans(np.zeros(wide, np.int64), left)])
+    rank = np.concatenate([rank, ranks + concatenated_ranges(np.zeros(wide, np.int64), left)])
     return Choices(states, base[owner] + rank, owner, starts, left.cumsum() - left)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import spans, starts_of
+from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
 
 _WORTH = 8  # a model is contracted if more than one in so many of its states goes
 
@@ -33,7 +33,7 @@ class Contraction(NamedTuple):
     depth: int
 
 
-def without_chains(mdp: HostMDP, fixed: Booleans, cost: Floats | None) -> Contraction | None:
+def contract_chains(mdp: HostMDP, fixed: Booleans, cost: Floats | None) -> Contraction | None:
     """States that have one row with one successor become what they lead to.
 
     Args:
@@ -72,7 +72,7 @@ def without_chains(mdp: HostMDP, fixed: Booleans, cost: Floats | None) -> Contra
     number[kept] = np.arange(kept.size)
     node = number[end]
     count = np.diff(mdp.row_start)[kept]
-    row = spans(mdp.row_start[kept], count)
+    row = concatenated_ranges(mdp.row_start[kept], count)
     smaller, entry = _taken(mdp, row, count, node)
     spent = np.zeros(row.size)
     if cost is not None:
@@ -97,14 +97,17 @@ def _taken(
 ) -> tuple[HostMDP, Integers]:
     """The model of some rows whose successors are renamed, and the entries that it has."""
     width = np.diff(mdp.entry_start)[row]
-    entry = spans(mdp.entry_start[row], width)
+    entry = concatenated_ranges(mdp.entry_start[row], width)
     smaller = HostMDP(
-        starts_of(count), starts_of(width), node[mdp.successor[entry]], mdp.probability[entry]
+        offsets_from_counts(count),
+        offsets_from_counts(width),
+        node[mdp.successor[entry]],
+        mdp.probability[entry],
     )
     return smaller, entry
 
 
-def merged(mdp: HostMDP, component: Integers, inside: Booleans, cost: Floats) -> Contraction:
+def quotient(mdp: HostMDP, component: Integers, inside: Booleans, cost: Floats) -> Contraction:
     """Each end component becomes one state, with the rows that leave it.
 
     Args:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.pretty_print import brief
-from jaxltl.core.sparse.rows import Rows, spans
+from jaxltl.core.sparse.rows import Rows, concatenated_ranges
 
 
 @brief
@@ -64,12 +64,12 @@ class HostMDP:
         return np.repeat(np.arange(self.num_rows, dtype=np.int32), np.diff(self.entry_start))
 
     @cached_property
-    def standing(self) -> NDArray[np.bool_]:
+    def is_self_loop(self) -> NDArray[np.bool_]:
         """Whether a row leads to its own state alone, ``bool[R]``."""
         found: NDArray[np.bool_] = self.successor[self.entry_start[:-1]] == self.state
         count = np.diff(self.entry_start)
         several = np.flatnonzero(found & (count > 1))
-        entry = spans(self.entry_start[several], count[several])
+        entry = concatenated_ranges(self.entry_start[several], count[several])
         of = several.repeat(count[several])
         found[of[self.successor[entry] != self.state[of]]] = False
         return found

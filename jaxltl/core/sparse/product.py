@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from jaxltl.core.array_types import Booleans, Integers
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import spans, starts_of
+from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
 
 MAX_PAIRS = 2**31  # pairs of a state and a memory; a bit vector of them takes 2 GB
 _DENSE = 2**27  # pairs up to which the number of each is looked up in a table
@@ -20,7 +20,7 @@ _MAX_EDGES = 2**27  # of the whole product, that are written down for the search
 
 
 @brief
-class HostProduct(NamedTuple):
+class SparseProduct(NamedTuple):
     """What is reached of a product, numbered by world state first and memory next.
 
     Attributes:
@@ -51,7 +51,7 @@ class HostProduct(NamedTuple):
         return letter[self.base_state[self.host.state[self.host.row]]]
 
 
-def host_product(
+def sparse_product(
     host: HostMDP,
     delta: NDArray[Any],
     letter: Integers,
@@ -60,7 +60,7 @@ def host_product(
     *,
     on_entry: bool = True,
     still: Booleans | None = None,
-) -> HostProduct:
+) -> SparseProduct:
     """The part of the product that is reached from some pairs.
 
     A step leads from ``(s, q)`` to ``(t, delta[q, letter[t]])``, or to ``(t, delta[q, letter[s]])``
@@ -80,7 +80,7 @@ def host_product(
     Example:
       >>> from jaxltl import make_sparse
       >>> ring = make_sparse(None, [0, 1, 2], [1, 0], [1.0, 1.0]).host
-      >>> found = host_product(ring, np.array([[0, 1], [1, 1]]), np.array([0, 1]), [0], [0])
+      >>> found = sparse_product(ring, np.array([[0, 1], [1, 1]]), np.array([0, 1]), [0], [0])
       >>> found.base_state.tolist(), found.memory.tolist(), found.host.successor.tolist()
       ([0, 0, 1], [0, 1, 1], [2, 2, 1])
     """
@@ -103,10 +103,10 @@ def host_product(
     return _written(world, code, lambda x: np.searchsorted(code, x).astype(np.int32), start)
 
 
-def without_memory(host: HostMDP, state: Integers) -> HostProduct:
+def product_without_memory(host: HostMDP, state: Integers) -> SparseProduct:
     """The world itself as its product with an automaton of one state, reached or not."""
     number = np.arange(host.num_states, dtype=np.int32)
-    return HostProduct(
+    return SparseProduct(
         host,
         number,
         np.zeros_like(number),
@@ -146,7 +146,7 @@ def _reached(world: _World, start: Integers) -> Booleans:
         moving = ~world.still[memory]
         state, memory = state[moving], memory[moving]
         count = first_entry[state + 1] - first_entry[state]
-        entry = spans(first_entry[state], count)
+        entry = concatenated_ranges(first_entry[state], count)
         follower = world.after(
             host.successor[entry], np.repeat(state, count), np.repeat(memory, count)
         )
@@ -193,24 +193,26 @@ def _searched(world: _World, start: Integers) -> Booleans:
     return seen
 
 
-def _written(world: _World, code: Integers, number: Any, start: Integers) -> HostProduct:
+def _written(world: _World, code: Integers, number: Any, start: Integers) -> SparseProduct:
     """The rows of the pairs that are reached."""
     host = world.host
     state, memory = np.divmod(code, world.num_memory)
     still = world.still[memory]
     choices = np.where(still, 1, np.diff(host.row_start)[state])
-    base_row = spans(host.row_start[state], choices)
+    base_row = concatenated_ranges(host.row_start[state], choices)
     owner = np.repeat(np.arange(code.size), choices)
     width = np.where(still[owner], 1, np.diff(host.entry_start)[base_row])
-    entry = spans(host.entry_start[base_row], width)
+    entry = concatenated_ranges(host.entry_start[base_row], width)
     source = np.repeat(owner, width)
     follower = world.after(host.successor[entry], state[source], memory[source])
     alone = still[source]
     successor = number(np.where(alone, code[source], follower) if alone.any() else follower)
     probability = host.probability[entry]
     probability[alone] = 1.0
-    product = HostMDP(starts_of(choices), starts_of(width), successor, probability)
-    return HostProduct(
+    product = HostMDP(
+        offsets_from_counts(choices), offsets_from_counts(width), successor, probability
+    )
+    return SparseProduct(
         product,
         state.astype(np.int32),
         memory.astype(np.int32),

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from jaxltl.core.array_types import Booleans, Integers
 
-LARGE = 100_000  # entries from which importing SciPy pays
+SCIPY_SIZE = 100_000  # entries from which importing SciPy pays
 _FEW = 16  # columns up to which reducing them one by one beats a reduction over a short axis
 
 
@@ -52,14 +52,14 @@ class Rows:
         shape = (self.num_rows, self.num_states)
         return sparse.csr_array((data, self.successor, self.entry_start), shape=shape)
 
-    def lead_to(self, region: Booleans) -> Booleans:
+    def some_successor_in(self, region: Booleans) -> Booleans:
         """Whether some successor lies in a region: ``bool[R, ...]`` from ``bool[S, ...]``."""
         if not region.any():
             return np.zeros((self.num_rows, *region.shape[1:]), bool)
         if region.all():
             full = (self.count > 0).reshape(-1, *(1,) * (region.ndim - 1))
             return np.broadcast_to(full, (self.num_rows, *region.shape[1:])).copy()
-        if self.successor.size > LARGE:
+        if self.successor.size > SCIPY_SIZE:
             return self.matrix @ region.astype(self.matrix.dtype) > 0
         return self._reduce(np.logical_or, region, False)
 
@@ -81,17 +81,21 @@ class Rows:
 
     def take(self, rows: Integers) -> Rows:
         """Some of the rows, in the order asked for."""
-        if self.successor.size > LARGE:
+        if self.successor.size > SCIPY_SIZE:
             part = self.matrix[rows]
             return Rows(part.indptr, part.indices, self.num_states)
         count = self.count[rows]
         start: Integers = np.concatenate([[0], count.cumsum()])
-        return Rows(start, self.successor[spans(self.entry_start[rows], count)], self.num_states)
+        return Rows(
+            start,
+            self.successor[concatenated_ranges(self.entry_start[rows], count)],
+            self.num_states,
+        )
 
     @cached_property
     def predecessors(self) -> tuple[Integers, Integers]:
         """The rows into state t, one an entry: ``row[start[t] : start[t + 1]]``, in order."""
-        if self.successor.size > LARGE:
+        if self.successor.size > SCIPY_SIZE:
             columns = self.matrix.tocsc()
             return columns.indptr, columns.indices
         order = np.argsort(self.successor, kind="stable")
@@ -100,7 +104,7 @@ class Rows:
         return np.concatenate([[0], count.cumsum()]), row[order]
 
 
-def spans(start: Integers, count: Integers) -> Integers:
+def concatenated_ranges(start: Integers, count: Integers) -> Integers:
     """The numbers ``start[i], ..., start[i] + count[i] - 1`` of all spans in a row."""
     end = count.cumsum()
     found = (start - end + count).repeat(count)
@@ -108,10 +112,10 @@ def spans(start: Integers, count: Integers) -> Integers:
     return found
 
 
-def starts_of(count: Integers) -> Integers:
+def offsets_from_counts(count: Integers) -> Integers:
     """Where spans of so many begin, and where the last one ends: ``int32[N + 1]``, if that fits.
 
-    >>> starts_of(np.array([2, 0, 1])).tolist()
+    >>> offsets_from_counts(np.array([2, 0, 1])).tolist()
     [0, 2, 2, 3]
     """
     found: Any = np.zeros(count.size + 1, np.int64)
@@ -119,24 +123,24 @@ def starts_of(count: Integers) -> Integers:
     return found.astype(np.int32) if found[-1] < 2**31 else found
 
 
-def distinct(number: Integers, size: int) -> Integers:
+def sorted_unique(number: Integers, size: int) -> Integers:
     """Numbers below a size in order, each once.
 
-    >>> distinct(np.array([3, 1, 3]), 5).tolist()
+    >>> sorted_unique(np.array([3, 1, 3]), 5).tolist()
     [1, 3]
     """
     if number.size < size // 16:
         number = np.sort(number)
-        return number[changes(number)]
+        return number[group_starts(number)]
     mark = np.zeros(size, bool)
     mark[number] = True
     return np.flatnonzero(mark)
 
 
-def changes(number: Integers) -> Booleans:
+def group_starts(number: Integers) -> Booleans:
     """Whether each number is another one than the number before it: ``bool[N]``.
 
-    >>> changes(np.array([1, 1, 3])).tolist()
+    >>> group_starts(np.array([1, 1, 3])).tolist()
     [True, False, True]
     """
     found = np.ones(number.size, bool)
@@ -144,7 +148,7 @@ def changes(number: Integers) -> Booleans:
     return found
 
 
-def count_down(counter: Integers, number: Integers) -> None:
+def decrement(counter: Integers, number: Integers) -> None:
     """Takes one from a counter for each time that its number stands, in place."""
     if number.size < counter.size:
         np.subtract.at(counter, number, counter.dtype.type(1))  # another type is far slower
@@ -152,7 +156,7 @@ def count_down(counter: Integers, number: Integers) -> None:
         counter -= np.bincount(number, minlength=counter.size).astype(counter.dtype)
 
 
-def rows_of(successor: Integers, used: Booleans, num_states: int) -> Rows:
+def rows_from_padded(successor: Integers, used: Booleans, num_states: int) -> Rows:
     """Rows from padded lists.
 
     Args:
@@ -161,7 +165,7 @@ def rows_of(successor: Integers, used: Booleans, num_states: int) -> Rows:
       num_states: S.
 
     Example:
-      >>> rows = rows_of(np.array([[1, 7], [0, 1]]), np.array([[True, False], [True, True]]), 2)
+      >>> rows = rows_from_padded(np.array([[1, 7], [0, 1]]), np.array([[True, False], [True, True]]), 2)
       >>> rows.entry_start.tolist(), rows.successor.tolist()
       ([0, 1, 3], [1, 0, 1])
     """
@@ -175,7 +179,7 @@ def rows_of(successor: Integers, used: Booleans, num_states: int) -> Rows:
     return Rows(start, successor[used], num_states)
 
 
-def rows_of_matrix(used: Booleans) -> Rows:
+def rows_from_dense(used: Booleans) -> Rows:
     """Rows from a full support, ``bool[..., S]``."""
     flat = used.reshape(-1, used.shape[-1])
     start: Integers = np.concatenate([[0], flat.sum(-1).cumsum()])

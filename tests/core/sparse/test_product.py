@@ -8,7 +8,7 @@ import pytest
 from jaxltl.core.sparse import product as module
 from jaxltl.core.sparse.graph.accepting import accepting_region, towards
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.product import host_product
+from jaxltl.core.sparse.product import sparse_product
 
 
 def random_host(rng, num_states, most_rows=2, most_entries=3) -> HostMDP:
@@ -68,7 +68,7 @@ def test_products_are_what_a_search_finds(on_entry, way, monkeypatch):
         state = rng.integers(0, num_states, rng.integers(1, 3))
         memory = rng.integers(0, num_memory, state.size)
         still = rng.random(num_memory) < 0.3
-        found = host_product(mdp, delta, letter, state, memory, on_entry=on_entry, still=still)
+        found = sparse_product(mdp, delta, letter, state, memory, on_entry=on_entry, still=still)
         starts = list(zip(state.tolist(), memory.tolist(), strict=True))
         wanted = searched(mdp, delta, letter, starts, on_entry, still)
         pairs = list(zip(found.base_state.tolist(), found.memory.tolist(), strict=True))
@@ -99,7 +99,7 @@ def test_a_deep_product_is_handed_over():
         np.append(np.arange(1, size), 0).astype(np.int32),
         np.ones(size),
     )
-    found = host_product(mdp, np.array([[1], [0]]), np.zeros(size, int), [0], [0])
+    found = sparse_product(mdp, np.array([[1], [0]]), np.zeros(size, int), [0], [0])
     assert found.base_state.size == size  # an even ring: memory goes with the place
     assert (found.memory == found.base_state % 2).all()
     assert (found.host.successor == np.append(np.arange(1, size), 0)).all()
@@ -114,7 +114,7 @@ def test_products_beyond_all_bounds_are_refused():
         np.ones(size),
     )
     with pytest.raises(ValueError, match="smaller formula"):
-        host_product(mdp, np.zeros((4096, 1), int), np.zeros(size, int), [0], [0])
+        sparse_product(mdp, np.zeros((4096, 1), int), np.zeros(size, int), [0], [0])
 
 
 # --- acceptance -------------------------------------------------------------------------------

@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 
 from jaxltl.core.sparse import rows as host_rows
-from jaxltl.core.sparse.rows import first_action, rows_of, rows_of_matrix, some_action, spans
+from jaxltl.core.sparse.rows import (
+    concatenated_ranges,
+    first_action,
+    rows_from_dense,
+    rows_from_padded,
+    some_action,
+)
 
 NUM_STATES = 7
 
@@ -24,12 +30,14 @@ def test_reductions_equal_loops(large, wide, monkeypatch):
     rng = np.random.default_rng(0)
     for _ in range(20):
         successor, used = random_lists(rng, wide)
-        rows = rows_of(successor, used, NUM_STATES)
+        rows = rows_from_padded(successor, used, NUM_STATES)
         lists = [s[u] for s, u in zip(successor, used, strict=True)]
         assert rows.count.tolist() == [len(x) for x in lists]
         for shape in ((), (3,)):
             region = rng.random((NUM_STATES, *shape)) < rng.choice([0.0, 0.3, 1.0])
-            np.testing.assert_array_equal(rows.lead_to(region), [region[x].any(0) for x in lists])
+            np.testing.assert_array_equal(
+                rows.some_successor_in(region), [region[x].any(0) for x in lists]
+            )
             np.testing.assert_array_equal(rows.number_in(region), [region[x].sum(0) for x in lists])
             value = rng.integers(50, size=(NUM_STATES, *shape))
             least = [value[x].min(0) if len(x) else np.full(shape, 99) for x in lists]
@@ -48,18 +56,24 @@ def test_reductions_equal_loops(large, wide, monkeypatch):
 def test_full_lists_and_matrices():
     rng = np.random.default_rng(1)
     successor = rng.integers(NUM_STATES, size=(5, 3), dtype=np.int32)
-    rows = rows_of(successor, np.ones((5, 3), bool), NUM_STATES)
+    rows = rows_from_padded(successor, np.ones((5, 3), bool), NUM_STATES)
     assert rows.successor.tolist() == successor.ravel().tolist()
     assert rows.entry_start.tolist() == [0, 3, 6, 9, 12, 15]
     used = rng.random((4, 2, NUM_STATES)) < 0.3
-    rows = rows_of_matrix(used)
+    rows = rows_from_dense(used)
     region = rng.random(NUM_STATES) < 0.5
-    np.testing.assert_array_equal(rows.lead_to(region), (used & region).any(-1).ravel())
+    np.testing.assert_array_equal(rows.some_successor_in(region), (used & region).any(-1).ravel())
 
 
 def test_spans():
-    assert spans(np.array([5, 0, 9]), np.array([2, 0, 3])).tolist() == [5, 6, 9, 10, 11]
-    assert spans(np.array([], int), np.array([], int)).tolist() == []
+    assert concatenated_ranges(np.array([5, 0, 9]), np.array([2, 0, 3])).tolist() == [
+        5,
+        6,
+        9,
+        10,
+        11,
+    ]
+    assert concatenated_ranges(np.array([], int), np.array([], int)).tolist() == []
 
 
 @pytest.mark.parametrize("num_actions", [1, 2, 5, 16, 17, 40])

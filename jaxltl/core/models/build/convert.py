@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from jaxltl.core.validation import no_model
-from jaxltl.core.sparse.rows import spans, starts_of
+from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
 from jaxltl.core.models.mdp import MDP, DenseMDP, support
 from jaxltl.core.models.build.padded import to_padded as to_padded  # for whoever converts
 from jaxltl.core.models.product import Product, flat_successor
@@ -54,8 +54,8 @@ def to_sparse(model: Model) -> SparseMDP:
     state, action = np.nonzero(available)
     count = used.sum(-1)[state, action]
     return make_sparse(
-        starts_of(available.sum(-1)),
-        starts_of(count),
+        offsets_from_counts(available.sum(-1)),
+        offsets_from_counts(count),
         target,
         weight[s, a, k].astype(np.float64),
         initial=_distribution(model.initial),
@@ -84,7 +84,7 @@ def _product(model: Product) -> SparseMDP:
     # Rows of (s, q) are those of s, in order: state first, memory next, choice last.
     state, memory = np.divmod(np.arange(shape[0] * shape[1]), num_memory)
     choices = np.diff(host.row_start)[state]
-    row = spans(host.row_start[state], choices)
+    row = concatenated_ranges(host.row_start[state], choices)
     q = np.repeat(memory, choices)
     chosen = kept[row, q]
     per_state = np.bincount(
@@ -92,7 +92,7 @@ def _product(model: Product) -> SparseMDP:
     )
     row, q = row[chosen], q[chosen]
     width = np.diff(host.entry_start)[row]
-    entry = spans(host.entry_start[row], width)
+    entry = concatenated_ranges(host.entry_start[row], width)
     s_of, q_of = np.repeat(host.state[row], width), np.repeat(q, width)
     target = flat_successor(host.successor[entry], step, s_of, q_of, model.label_on)
     rewards = {
@@ -104,8 +104,8 @@ def _product(model: Product) -> SparseMDP:
         for name, x in world.rewards.items()
     }
     return make_sparse(
-        starts_of(per_state),
-        starts_of(width),
+        offsets_from_counts(per_state),
+        offsets_from_counts(width),
         target,
         host.probability[entry],
         initial=_distribution(model.initial).ravel(),

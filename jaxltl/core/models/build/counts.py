@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from jaxltl.core.validation import listed as listed_items
 from jaxltl.core.validation import numbers, one_of, shown
-from jaxltl.core.sparse.rows import starts_of
+from jaxltl.core.sparse.rows import offsets_from_counts
 from jaxltl.core.array_types import Integers
 from jaxltl.core.models import facts
 from jaxltl.core.models.mdp import MDP, DenseMDP, support
@@ -265,7 +265,7 @@ def places(model: MDP | DenseMDP | SparseMDP) -> Places:
         successor = np.nonzero(used)[2]
         if isinstance(model, MDP):
             successor = np.asarray(model.successor)[used]
-        start = starts_of(used.sum(-1)[state, action])
+        start = offsets_from_counts(used.sum(-1)[state, action])
         parts = state, action, start, successor, np.flatnonzero(used)
     else:
         raise ValueError(
@@ -446,7 +446,7 @@ def counted_model(
         name: _numbers(some, number, f"label {name!r}") for name, some in (labels or {}).items()
     }
     model = make_sparse(
-        starts_of(np.bincount(state)),
+        offsets_from_counts(np.bincount(state)),
         start,
         successor,
         _nominal(count, start),
@@ -480,7 +480,7 @@ def _entries(
     order = np.lexsort((successor, row))
     row, successor = row[order], successor[order]
     first = np.append(True, (np.diff(row) != 0) | (np.diff(successor) != 0))
-    start = starts_of(np.bincount(row[first]))
+    start = offsets_from_counts(np.bincount(row[first]))
     return start, successor[first], np.add.reduceat(count[order], np.flatnonzero(first))
 
 

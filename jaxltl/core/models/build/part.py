@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxltl.core.sparse.graph.components import reached
-from jaxltl.core.sparse.rows import spans, starts_of
+from jaxltl.core.sparse.graph.components import forward_reachable
+from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
 from jaxltl.core.models.sparse import Rewards, SparseMDP
 
 
@@ -32,7 +32,7 @@ def part_of(model: SparseMDP, states: np.ndarray, rows: np.ndarray) -> SparseMDP
     if (choices == 0).any():
         raise ValueError(f"no choice is left in state {kept[int(np.argmin(choices))]}; allow one.")
     width = np.diff(host.entry_start)[row]
-    entry = spans(host.entry_start[row], width)
+    entry = concatenated_ranges(host.entry_start[row], width)
 
     def taken(x: Any, index: np.ndarray) -> Any:
         return None if x is None else np.asarray(x)[index]
@@ -44,8 +44,8 @@ def part_of(model: SparseMDP, states: np.ndarray, rows: np.ndarray) -> SparseMDP
     initial = np.asarray(model.initial)[kept]
     return replace(
         model,
-        row_start=starts_of(choices),
-        entry_start=starts_of(width),
+        row_start=offsets_from_counts(choices),
+        entry_start=offsets_from_counts(width),
         successor=number[host.successor[entry]],
         probability=host.probability[entry],
         initial=initial / initial.sum() if initial.sum() else initial,
@@ -60,4 +60,4 @@ def reachable(model: SparseMDP, start: np.ndarray, rows: np.ndarray) -> np.ndarr
     """The states to which some rows lead from some states, these among them: ``bool[S]``."""
     host = model.host
     used = rows[host.row]
-    return reached(host.state[host.row[used]], host.successor[used], start)
+    return forward_reachable(host.state[host.row[used]], host.successor[used], start)

@@ -23,7 +23,7 @@ from jaxltl.core.models.mesh.sharded import RowTable, ShardedMDP
 from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import SparseMDP, check_entries, checked_starts, row_reward, scaled
 from jaxltl.core.pretty_print import brief
-from jaxltl.core.sparse.rows import spans, starts_of
+from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
 from jaxltl.core.validation import shown
 
 _WIDTHS = np.array(sorted({int(m * 2**e) for e in range(26) for m in (1, 1.5)} | {3}))
@@ -107,12 +107,12 @@ def shard(
     def part(start: int, stop: int) -> ModelPart:
         state = ordered[start:stop]
         choices = np.diff(host.row_start)[state]
-        row = spans(host.row_start[state], choices)
+        row = concatenated_ranges(host.row_start[state], choices)
         width = np.diff(host.entry_start)[row]
-        entry = spans(host.entry_start[row], width)
+        entry = concatenated_ranges(host.entry_start[row], width)
         return ModelPart(
-            row_start=starts_of(choices),
-            entry_start=starts_of(width),
+            row_start=offsets_from_counts(choices),
+            entry_start=offsets_from_counts(width),
             successor=place[host.successor[entry]],
             probability=host.probability[entry],
             action=column[row],

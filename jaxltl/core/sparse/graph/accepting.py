@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Integers
-from jaxltl.core.sparse.graph.qualitative import end_components, towards
+from jaxltl.core.sparse.graph.qualitative import end_components, shortest_path_rows
 from jaxltl.core.sparse.mdp import HostMDP
 
 
@@ -53,7 +53,7 @@ def accepting_region(mdp: HostMDP, priority: Integers) -> AcceptingRegion:
         new = wins[components.component] & components.region(mdp)
         inside = components.inside & new[mdp.state]
         some, first = mdp.first_choice(hit)
-        taken = np.where(some, first, towards(mdp, some, inside))
+        taken = np.where(some, first, shortest_path_rows(mdp, some, inside))
         region |= new
         row = np.where(new, taken, row)
     return AcceptingRegion(region, row.astype(np.int32))

@@ -8,7 +8,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Integers
-from jaxltl.core.sparse.rows import changes, count_down, distinct, first_action, some_action, spans
+from jaxltl.core.sparse.rows import (
+    group_starts,
+    decrement,
+    sorted_unique,
+    first_action,
+    some_action,
+    concatenated_ranges,
+)
 
 SWEEPS = 12  # times the size of the graph that sweeps may cost, before a worklist takes over
 ALL: Any = slice(None)
@@ -82,8 +89,8 @@ def _leads(search: Search, rows: Any, part: Any) -> Booleans:
     """The pairs of some world states that lead to the region: ``bool[N, Q, A]``."""
     graph = search.graph
     if search.chance == "some":
-        return graph.through(search.region, rows.lead_to, part)
-    return ~graph.through(~search.region, rows.lead_to, part)
+        return graph.through(search.region, rows.some_successor_in, part)
+    return ~graph.through(~search.region, rows.some_successor_in, part)
 
 
 def _join(search: Search, part: Any, new: Booleans, first: Integers) -> None:
@@ -131,7 +138,7 @@ def _worklist(search: Search) -> _Worklist:
     graph = search.graph
     before = search.region & (search.rank < search.round)  # the last round is the frontier
     if search.chance == "some":
-        lacking = ~graph.through(before, graph.rows.lead_to)
+        lacking = ~graph.through(before, graph.rows.some_successor_in)
         missing = np.ones(lacking.size, np.int32)
     else:
         missing = graph.through(~before, graph.rows.number_in).reshape(-1)
@@ -162,7 +169,7 @@ def _into(worklist: _Worklist, frontier: Integers) -> Integers:
     start, row = graph.rows.predecessors
     target, memory = np.divmod(frontier, graph.num_memory)
     count = start[target + 1] - start[target]
-    row = row[spans(start[target], count)]
+    row = row[concatenated_ranges(start[target], count)]
     if graph.num_memory == 1:
         return row
     s, a = np.divmod(row, graph.num_actions)
@@ -170,7 +177,7 @@ def _into(worklist: _Worklist, frontier: Integers) -> Integers:
     start, before = graph.memory_before
     code = graph.letter[read].astype(np.int64) * graph.num_memory + np.repeat(memory, count)
     count = start[code + 1] - start[code]
-    q = before[spans(start[code], count)]
+    q = before[concatenated_ranges(start[code], count)]
     return (
         np.repeat(s.astype(np.int64) * (graph.num_memory * graph.num_actions) + a, count)
         + q * graph.num_actions
@@ -180,18 +187,18 @@ def _into(worklist: _Worklist, frontier: Integers) -> Integers:
 def _join_pairs(worklist: _Worklist, pairs: Integers) -> Integers:
     """The states that join by pairs of which some more successors are in the region."""
     search, missing, waiting, remaining, _ = worklist
-    count_down(missing, pairs)
-    pair = distinct(pairs[waiting[pairs] & (missing[pairs] <= 0)], waiting.size)
+    decrement(missing, pairs)
+    pair = sorted_unique(pairs[waiting[pairs] & (missing[pairs] <= 0)], waiting.size)
     waiting[pair] = False
     state, a = np.divmod(pair, search.graph.num_actions)
-    count_down(remaining, state)
+    decrement(remaining, state)
     flat = [
         x.reshape(-1) for x in (search.rule, search.open, search.action, search.region, search.rank)
     ]
     rule, open_, action, region, rank = flat
     joins = (rule[state] | (remaining[state] == 0)) & open_[state]
     state, a = state[joins], a[joins]
-    first = changes(state)  # pairs are in order, so one state's stand together
+    first = group_starts(state)  # pairs are in order, so one state's stand together
     frontier = state[first]
     action[frontier] = a[first]
     open_[frontier], region[frontier], rank[frontier] = False, True, search.round

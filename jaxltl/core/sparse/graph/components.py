@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Integers
-from jaxltl.core.sparse.rows import LARGE
+from jaxltl.core.sparse.rows import SCIPY_SIZE
 
 
 def strong_components(source: Integers, target: Integers, num_nodes: int) -> Integers:
@@ -21,7 +21,7 @@ def strong_components(source: Integers, target: Integers, num_nodes: int) -> Int
       >>> strong_components(np.array([0, 1, 1]), np.array([1, 0, 2]), 3).tolist()
       [0, 0, 2]
     """
-    if max(source.size, num_nodes) <= LARGE // 4:
+    if max(source.size, num_nodes) <= SCIPY_SIZE // 4:
         label = _tarjan(source, target, num_nodes)
     else:
         from scipy.sparse import csgraph
@@ -34,10 +34,10 @@ def strong_components(source: Integers, target: Integers, num_nodes: int) -> Int
     return smallest[label]
 
 
-def reached(source: Integers, target: Integers, start: Booleans) -> Booleans:
+def forward_reachable(source: Integers, target: Integers, start: Booleans) -> Booleans:
     """The nodes to which edges lead from some starting ones, these among them: ``bool[N]``."""
     seen = start.copy()
-    if max(source.size, start.size) > LARGE // 4:
+    if max(source.size, start.size) > SCIPY_SIZE // 4:
         from scipy.sparse import csgraph
 
         # One search from a node of its own that leads to every start.

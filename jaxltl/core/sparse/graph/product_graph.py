@@ -19,7 +19,7 @@ from jaxltl.core.array_types import Booleans, Integers
 from jaxltl.core.sparse import rows as host_rows
 from jaxltl.core.sparse.graph.attractor import Search, attract
 from jaxltl.core.sparse.graph.components import strong_components
-from jaxltl.core.sparse.rows import Rows, spans
+from jaxltl.core.sparse.rows import Rows, concatenated_ranges
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class HostGraph:
 
     def exists(self, region: Booleans) -> Booleans:
         """Whether some successor lies in a region: ``bool[S, A]``; False where unavailable."""
-        found = self.through(region, self.rows.lead_to).reshape(*self.state_shape, -1)
+        found = self.through(region, self.rows.some_successor_in).reshape(*self.state_shape, -1)
         return found if self.allowed is None else found & self.available
 
     def forall(self, region: Booleans) -> Booleans:
@@ -122,7 +122,7 @@ class HostGraph:
         here = marked[:, self.letter].T
         if not self.on_entry:
             return here[:, :, None] & self.available
-        found = self.rows.lead_to(np.ascontiguousarray(here))
+        found = self.rows.some_successor_in(np.ascontiguousarray(here))
         found = found.reshape(-1, self.num_actions, self.num_memory).swapaxes(1, 2)
         return found if self.allowed is None else found & self.available
 
@@ -197,7 +197,7 @@ class HostGraph:
         row = (s[:, None] * num_actions + np.arange(num_actions)).ravel()
         count = self.rows.count[row]
         pair = np.repeat(np.arange(row.size), count)
-        target = self.rows.successor[spans(self.rows.entry_start[row], count)]
+        target = self.rows.successor[concatenated_ranges(self.rows.entry_start[row], count)]
         if num_memory == 1:
             return pair, target
         owner = pair // num_actions

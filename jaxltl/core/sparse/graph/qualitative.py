@@ -9,13 +9,19 @@ import numpy as np
 from jaxltl.core.array_types import Booleans, Integers
 from jaxltl.core.sparse.graph.components import strong_components
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import LARGE, changes, count_down, distinct, spans
+from jaxltl.core.sparse.rows import (
+    SCIPY_SIZE,
+    group_starts,
+    decrement,
+    sorted_unique,
+    concatenated_ranges,
+)
 
 _FEW = 24  # states of a frontier up to which Python's own loop beats NumPy's overhead
 _MANY = 64  # transitions into one of them from which it does not
 
 
-def reaching(mdp: HostMDP, goal: Booleans, rows: Booleans | None = None) -> Booleans:
+def backward_reachable(mdp: HostMDP, goal: Booleans, rows: Booleans | None = None) -> Booleans:
     """The states from which some path leads to a goal: where its largest probability is positive.
 
     Args:
@@ -32,14 +38,14 @@ def reaching(mdp: HostMDP, goal: Booleans, rows: Booleans | None = None) -> Bool
         kept = rows[row]
         source = source[kept]
         start = np.concatenate([[0], kept.cumsum()])[start]
-    return searched(start, source, goal)
+    return forward_search(start, source, goal)
 
 
-def searched(start: Integers, after: Integers, first: Booleans) -> Booleans:
+def forward_search(start: Integers, after: Integers, first: Booleans) -> Booleans:
     """All nodes that a search from some nodes meets; node i leads to ``after[start[i] : ...]``."""
     seen = first.copy()
     frontier = np.flatnonzero(first)
-    if after.size > LARGE // 4:
+    if after.size > SCIPY_SIZE // 4:
         from scipy import sparse
         from scipy.sparse import csgraph
 
@@ -52,7 +58,7 @@ def searched(start: Integers, after: Integers, first: Booleans) -> Booleans:
         seen[order[1:]] = True
         return seen
     while frontier.size:
-        new = after[spans(start[frontier], start[frontier + 1] - start[frontier])]
+        new = after[concatenated_ranges(start[frontier], start[frontier + 1] - start[frontier])]
         seen_new = np.zeros(first.size, bool)
         seen_new[new] = True
         seen_new &= ~seen
@@ -61,7 +67,7 @@ def searched(start: Integers, after: Integers, first: Booleans) -> Booleans:
     return seen
 
 
-def forced(
+def positive_under_all_policies(
     mdp: HostMDP, goal: Booleans, rows: Booleans | None = None, among: Booleans | None = None
 ) -> Booleans:
     """The states whose every row may lead on to a goal: its least probability is positive.
@@ -79,7 +85,7 @@ def forced(
       ``bool[S]``.
     """
     if mdp.is_chain and rows is None and among is None:
-        return reaching(mdp, goal)
+        return backward_reachable(mdp, goal)
     counts = np.diff(mdp.row_start)
     waiting = np.ones(mdp.num_rows, bool)
     left = counts.astype(np.int32)
@@ -110,18 +116,18 @@ class _Forced(NamedTuple):
     def many(self, frontier: Integers) -> Integers:
         """The states that join after a frontier."""
         start, pred = self.mdp.predecessors
-        row = pred[spans(start[frontier], start[frontier + 1] - start[frontier])]
+        row = pred[concatenated_ranges(start[frontier], start[frontier + 1] - start[frontier])]
         row = row[self.waiting[row]]
         if not row.size:
             return row
-        row = distinct(row, self.mdp.num_rows)
+        row = sorted_unique(row, self.mdp.num_rows)
         self.waiting[row] = False
         state = self.mdp.state[row]
-        count_down(self.left, state)
+        decrement(self.left, state)
         state = state[(self.left[state] == 0) & self.open[state]]
         self.open[state], self.region[state] = False, True
         # Rows are in order, so one state's stand together.
-        return state[changes(state)]
+        return state[group_starts(state)]
 
     def few(self, frontier: Integers) -> Integers:
         """The same by plain loops, while few states join at a time, as along a chain."""
@@ -153,7 +159,7 @@ class _Forced(NamedTuple):
         return np.array(todo, np.int64)
 
 
-def surely_reaching(
+def almost_sure_reachability(
     mdp: HostMDP, goal: Booleans, rows: Booleans | None = None
 ) -> tuple[Booleans, Booleans]:
     """The states from which some policy reaches a goal almost surely, and the rows it may take.
@@ -167,18 +173,18 @@ def surely_reaching(
       ``bool[S]``, and ``bool[R]``, the rows of these states that never leave them.
     """
     kept = np.ones(mdp.num_rows, bool) if rows is None else rows.copy()
-    inside = reaching(mdp, goal, rows)
+    inside = backward_reachable(mdp, goal, rows)
     while True:
         outside = ~inside
-        leaving = mdp.support.lead_to(outside)
+        leaving = mdp.support.some_successor_in(outside)
         kept &= ~leaving & inside[mdp.state]
-        found = reaching(mdp, goal & inside, kept)
+        found = backward_reachable(mdp, goal & inside, kept)
         if (found == inside).all():
             return inside, kept
         inside = found
 
 
-def towards(mdp: HostMDP, goal: Booleans, rows: Booleans) -> Integers:
+def shortest_path_rows(mdp: HostMDP, goal: Booleans, rows: Booleans) -> Integers:
     """A row by which each state may come nearer to a goal, among some rows: ``int32[S]``.
 
     The first row of states at the goal, and of those that cannot get there.
@@ -212,7 +218,7 @@ def _next_on_the_way(mdp: HostMDP, goal: Booleans, rows: Booleans) -> Integers:
     return np.where((before < 0) | (before == size - 1), -1, before)
 
 
-class Components(NamedTuple):
+class EndComponents(NamedTuple):
     """Maximal end components.
 
     Attributes:
@@ -232,7 +238,7 @@ class Components(NamedTuple):
 
 def end_components(
     mdp: HostMDP, states: Booleans | None = None, rows: Booleans | None = None
-) -> Components:
+) -> EndComponents:
     """The maximal end components of some states and rows (Baier and Katoen 2008, section 10.6.3).
 
     States that cannot stay are taken away first, so that components are looked for among few.
@@ -247,24 +253,24 @@ def end_components(
     kept = np.ones(mdp.num_rows, bool) if rows is None else rows.copy()
     if states is not None:
         kept &= states[mdp.state]
-    still = kept & mdp.standing
+    still = kept & mdp.is_self_loop
     found = _moving_components(mdp, kept & ~still)
     return found._replace(inside=found.inside | still)
 
 
-def _moving_components(mdp: HostMDP, kept: Booleans) -> Components:
+def _moving_components(mdp: HostMDP, kept: Booleans) -> EndComponents:
     """Those of some rows."""
     component = np.arange(mdp.num_states)
     inside = np.zeros(mdp.num_rows, bool)
     while True:
         candidates = np.zeros(mdp.num_states, bool)
         candidates[mdp.state[kept]] = True
-        candidates &= ~forced(mdp, ~candidates, kept)
+        candidates &= ~positive_under_all_policies(mdp, ~candidates, kept)
         row = np.flatnonzero(kept & candidates[mdp.state])
         if not row.size:
-            return Components(component, inside)
+            return EndComponents(component, inside)
         count = mdp.entry_start[row + 1] - mdp.entry_start[row]
-        entry = spans(mdp.entry_start[row], count)
+        entry = concatenated_ranges(mdp.entry_start[row], count)
         of, target = np.repeat(np.arange(row.size), count), mdp.successor[entry]
         leaves = np.bincount(of[~candidates[target]], minlength=row.size) > 0
         label = _labels(mdp.state[row], of, target, leaves, candidates)

@@ -12,7 +12,7 @@ from jaxltl.core.sparse.graph.components import strong_components
 from jaxltl.core.sparse.graph.product_graph import HostGraph
 from jaxltl.core.sparse.graph.qualitative import end_components
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import changes, count_down, distinct, spans
+from jaxltl.core.sparse.rows import group_starts, decrement, sorted_unique, concatenated_ranges
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class RowGraph:
 
     def exists(self, region: Booleans) -> Booleans:
         """Whether some successor lies in a region: ``bool[R]``."""
-        return self.host.support.lead_to(region)
+        return self.host.support.some_successor_in(region)
 
     def forall(self, region: Booleans) -> Booleans:
         """Whether all successors lie in a region: ``bool[R]``."""
@@ -71,16 +71,16 @@ class RowGraph:
         round_ = 0
         while frontier.size or (round_ == 0 and alone.size):
             round_ += 1
-            hit = pred[spans(start[frontier], start[frontier + 1] - start[frontier])]
-            count_down(lacking, hit)
-            hit = distinct(hit[waiting[hit] & (lacking[hit] <= 0)], host.num_rows)
+            hit = pred[concatenated_ranges(start[frontier], start[frontier + 1] - start[frontier])]
+            decrement(lacking, hit)
+            hit = sorted_unique(hit[waiting[hit] & (lacking[hit] <= 0)], host.num_rows)
             waiting[hit] = False
             state = host.state[hit]
-            count_down(left, state)
+            decrement(left, state)
             joins = (rule[state] | (left[state] == 0)) & open_[state]
             state, hit = state[joins], hit[joins]
             # Rows are in order, so one state's stand together.
-            first = changes(state)
+            first = group_starts(state)
             frontier = state[first]
             row[frontier] = hit[first]
             if round_ == 1:

@@ -9,8 +9,8 @@ import numpy as np
 from jaxltl.core.array_types import Floats, Integers
 from jaxltl.core.sparse.interval.reachability import Robust
 from jaxltl.core.sparse.interval.uncertainty_set import HostInterval
-from jaxltl.core.sparse.linear.elimination import factors
-from jaxltl.core.sparse.linear.topological_order import Edges, components_in_order
+from jaxltl.core.sparse.linear.elimination import factorize
+from jaxltl.core.sparse.linear.topological_order import Edges, ordered_components
 
 _EPS = float(np.finfo(np.float64).eps)
 _ROUNDS = 300
@@ -36,7 +36,7 @@ def discounted(
       tolerance: the width at which to stop.
     """
     mdp = model.mdp
-    label = components_in_order(Edges(mdp.entry_start[mdp.row_start], mdp.successor))
+    label = ordered_components(Edges(mdp.entry_start[mdp.row_start], mdp.successor))
     rate = float(discount[discount < 1].max(initial=0))
     # A step that is not discounted comes at most after each one that is.
     steps = (2 if (discount == 1).any() else 1) / (1 - rate)
@@ -111,5 +111,5 @@ def _solved(
     mdp = chain.fixed(p[entry])
     matrix = mdp.matrix.copy()
     matrix.data = matrix.data * discount[row][mdp.row]
-    system = factors(matrix, label, np.arange(mdp.num_states))
+    system = factorize(matrix, label, np.arange(mdp.num_states))
     return None if system is None else system.solve(earned)

@@ -14,7 +14,7 @@ from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.sparse.interval.l1_distance import Ball
 from jaxltl.core.sparse.interval.uncertainty_set import HostInterval
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import spans, starts_of
+from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
 
 
 class Spread(NamedTuple):
@@ -67,16 +67,16 @@ def spread(model: HostInterval, states: Booleans, lower: Floats, upper: Floats) 
     many = np.bincount(mdp.state[moved], minlength=mdp.num_states)
     count = np.where(states, 1, np.diff(mdp.row_start))
     rows = np.concatenate([count, np.ones(moved.size, np.int64)])
-    row_start = starts_of(rows)
+    row_start = offsets_from_counts(rows)
     row = np.full(int(row_start[-1]), -1)
     row[~np.repeat(np.append(states, np.zeros(moved.size, bool)), rows)] = np.append(own, moved)
     choosing = np.flatnonzero(row < 0)
     width = np.where(row < 0, 0, np.diff(mdp.entry_start)[row])
     width[choosing] = many[states]
-    starts = starts_of(width)
+    starts = offsets_from_counts(width)
     given = np.repeat(row >= 0, width)
     entry = np.full(given.size, -1)
-    entry[given] = spans(mdp.entry_start[row[row >= 0]], width[row >= 0])
+    entry[given] = concatenated_ranges(mdp.entry_start[row[row >= 0]], width[row >= 0])
     chosen = np.full(given.size, -1)
     chosen[~given] = moved
     successor = np.empty(given.size, np.int32)

@@ -13,13 +13,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
-from jaxltl.core.sparse.graph.qualitative import towards
+from jaxltl.core.sparse.graph.qualitative import shortest_path_rows
 from jaxltl.core.sparse.interval.row_table import Table
 from jaxltl.core.sparse.interval.uncertainty_set import HostInterval
-from jaxltl.core.sparse.linear.topological_order import Edges, components_in_order
+from jaxltl.core.sparse.linear.topological_order import Edges, ordered_components
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import spans, starts_of
-from jaxltl.core.sparse.solvers.mixing import spreads
+from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
+from jaxltl.core.sparse.solvers.mixing import expands_fast
 
 _EPS = float(np.finfo(np.float64).eps)
 _TINY = 1e-290
@@ -141,7 +141,7 @@ class Nodes:
         owner, target = mdp.state[mdp.row], self.node[mdp.successor]
         kept = (target != owner) & (target >= 0)
         count = np.bincount(owner[kept], minlength=self.size)
-        return components_in_order(Edges(starts_of(count), target[kept]))
+        return ordered_components(Edges(offsets_from_counts(count), target[kept]))
 
     @cached_property
     def mixes(self) -> bool:
@@ -151,10 +151,14 @@ class Nodes:
         first, to = self.part.mdp.entry_start[self.part.mdp.row_start], self.part.mdp.successor
 
         def follow(nodes: Any) -> Any:
-            after = self.node[to[spans(first[nodes], first[nodes + 1] - first[nodes])]]
+            after = self.node[
+                to[concatenated_ranges(first[nodes], first[nodes + 1] - first[nodes])]
+            ]
             return after[after >= 0]
 
-        return spreads(follow, np.array([self.size // 2]), self.size, min(_MET, self.size // 2))
+        return expands_fast(
+            follow, np.array([self.size // 2]), self.size, min(_MET, self.size // 2)
+        )
 
     def values(self, z: Floats) -> Floats:
         """What entries lead to."""
@@ -206,8 +210,10 @@ class Nodes:
         ends = np.where(self.known[mdp.successor] > 0, end, end + 1) if worth else end
         target = np.concatenate([np.where(target < 0, ends, target), [end, end + 1]])
         row_start = np.concatenate([mdp.row_start, mdp.num_rows + np.array([1, 2])])
-        graph = HostMDP(row_start, starts_of(width), target.astype(np.int32), np.ones(target.size))
-        row = towards(graph, np.arange(end + 2) == end, np.ones(graph.num_rows, bool))
+        graph = HostMDP(
+            row_start, offsets_from_counts(width), target.astype(np.int32), np.ones(target.size)
+        )
+        row = shortest_path_rows(graph, np.arange(end + 2) == end, np.ones(graph.num_rows, bool))
         return row[:-2].astype(np.int64), self.anything()
 
     def improved(

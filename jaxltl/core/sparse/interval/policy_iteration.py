@@ -19,8 +19,8 @@ from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.sparse.interval.nodes import Choice, Nodes
 from jaxltl.core.sparse.interval.systems import Systems
 from jaxltl.core.sparse.interval.uncertainty_set import HostInterval
-from jaxltl.core.sparse.rows import starts_of
-from jaxltl.core.sparse.solvers.policy_iteration import Enclosed
+from jaxltl.core.sparse.rows import offsets_from_counts
+from jaxltl.core.sparse.solvers.policy_iteration import Enclosure
 
 _EPS = float(np.finfo(np.float64).eps)
 _LEAST = 1e-270
@@ -82,7 +82,7 @@ class JointBound(NamedTuple):
     probability: Floats
     rounds: int
 
-    def enclosed(self, maximize: bool, tolerance: float, relative: bool) -> Enclosed | None:
+    def enclosed(self, maximize: bool, tolerance: float, relative: bool) -> Enclosure | None:
         """The optimum, if both bounds are proven and as near as asked."""
         if self.attained is None:
             return None
@@ -90,7 +90,7 @@ class JointBound(NamedTuple):
         scale = high if relative else 1.0
         if not (np.isfinite(high) & (high - low <= tolerance * scale)).all():
             return None
-        return Enclosed(np.clip(self.value, low, high), low, high, self.row, 0, 0.0, "")
+        return Enclosure(np.clip(self.value, low, high), low, high, self.row, 0, 0.0, "")
 
 
 def joint_bound(
@@ -369,7 +369,7 @@ def _nodes(problem: Joint, sign: int, against: bool) -> Nodes:
     row = np.flatnonzero(problem.open[mdp.state] & ~np.isnan(problem.cost))
     row = row[np.argsort(node[mdp.state[row]], kind="stable")]
     count = np.bincount(node[mdp.state[row]], minlength=heads.size)
-    part, entry = problem.model.of_rows(starts_of(count), row)
+    part, entry = problem.model.of_rows(offsets_from_counts(count), row)
     cost: Any = sign * problem.cost[row]
     return Nodes(
         part,

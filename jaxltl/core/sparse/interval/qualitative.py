@@ -13,9 +13,14 @@ import numpy as np
 
 from jaxltl.core.array_types import Booleans, Integers
 from jaxltl.core.sparse.graph.components import strong_components
-from jaxltl.core.sparse.graph.qualitative import Components, forced, reaching, towards
+from jaxltl.core.sparse.graph.qualitative import (
+    EndComponents,
+    positive_under_all_policies,
+    backward_reachable,
+    shortest_path_rows,
+)
 from jaxltl.core.sparse.interval.uncertainty_set import HostInterval
-from jaxltl.core.sparse.rows import count_down, distinct, spans
+from jaxltl.core.sparse.rows import decrement, sorted_unique, concatenated_ranges
 
 
 def compelled(
@@ -34,9 +39,9 @@ def compelled(
     """
     if model.firm:  # the graph is the same whatever nature picks
         if every and rows is None:
-            return forced(model.mdp, goal)
+            return positive_under_all_policies(model.mdp, goal)
         if not every:
-            return reaching(model.mdp, goal, rows)
+            return backward_reachable(model.mdp, goal, rows)
     return _compelled(model, goal, every, rows)[0]
 
 
@@ -50,7 +55,7 @@ def attracting(model: HostInterval, goal: Booleans, rows: Booleans | None = None
     """
     if model.firm:
         rows = np.ones(model.mdp.num_rows, bool) if rows is None else rows
-        return towards(model.mdp, goal, rows).astype(np.int64)
+        return shortest_path_rows(model.mdp, goal, rows).astype(np.int64)
     return _compelled(model, goal, False, rows)[1]
 
 
@@ -66,18 +71,18 @@ def _compelled(
     start, before = mdp.predecessors
     frontier: Integers = np.flatnonzero(region)
     while frontier.size:
-        row = before[spans(start[frontier], start[frontier + 1] - start[frontier])]
-        row = distinct(row[waiting[row]], mdp.num_rows)
+        row = before[concatenated_ranges(start[frontier], start[frontier + 1] - start[frontier])]
+        row = sorted_unique(row[waiting[row]], mdp.num_rows)
         row = row[model.must_enter(row, region)]
         waiting[row] = False
         state = mdp.state[row]
         if every:
-            count_down(left, state)
+            decrement(left, state)
             state = state[left[state] == 0]
         else:
             new = ~region[state]
             found[state[new]] = row[new]
-        frontier = distinct(state[~region[state]], mdp.num_states)
+        frontier = sorted_unique(state[~region[state]], mdp.num_states)
         region[frontier] = True
     return region, found
 
@@ -104,15 +109,15 @@ def decided(model: HostInterval, goal: Booleans, *, maximize: bool, helpful: boo
     """
     mdp = model.mdp
     if maximize and helpful:
-        zero = ~reaching(mdp, goal)
+        zero = ~backward_reachable(mdp, goal)
     elif maximize:
         zero = ~compelled(model, goal, every=False)
     elif helpful:
-        zero = ~forced(mdp, goal)
+        zero = ~positive_under_all_policies(mdp, goal)
     else:
         zero = ~compelled(model, goal, every=True)
     if not maximize and not helpful:
-        return Decided(zero, ~reaching(mdp, zero))
+        return Decided(zero, ~backward_reachable(mdp, zero))
     return Decided(zero, surely(model, goal, ~zero, maximize=maximize, helpful=helpful)[0])
 
 
@@ -131,7 +136,7 @@ def held(
     """
     mdp = model.mdp
     mine, other = (known.one, known.zero) if maximize else (known.zero, known.one)
-    rows = ~mdp.support.lead_to(~mine) & mine[mdp.state]
+    rows = ~mdp.support.some_successor_in(~mine) & mine[mdp.state]
     row = attracting(model, target, rows) if maximize else mdp.first_choice(rows)[1]
     keeps = model.may_stay(other) & other[mdp.state]
     return row.astype(np.int64), other[mdp.successor] | ~keeps[mdp.row]
@@ -158,20 +163,22 @@ def surely(
     while True:
         # Who cannot keep to the set goes all the way back, not by one step a round.
         inside = inside & ~(
-            compelled(model, ~inside, every=maximize) if helpful else forced(mdp, ~inside)
+            compelled(model, ~inside, every=maximize)
+            if helpful
+            else positive_under_all_policies(mdp, ~inside)
         )
-        kept = model.may_stay(inside) if helpful else ~mdp.support.lead_to(~inside)
+        kept = model.may_stay(inside) if helpful else ~mdp.support.some_successor_in(~inside)
         if maximize:
             kept &= inside[mdp.state]
             found = (
-                reaching(mdp, goal & inside, kept)
+                backward_reachable(mdp, goal & inside, kept)
                 if helpful
                 else compelled(model, goal & inside, every=False, rows=kept)
             )
         else:
             bad = np.zeros(mdp.num_states, bool)
             bad[mdp.state[~kept]] = True
-            found = forced(mdp, goal & inside, among=inside & ~bad)
+            found = positive_under_all_policies(mdp, goal & inside, among=inside & ~bad)
         if (found == inside).all():
             return inside, kept & inside[mdp.state]
         inside = found
@@ -179,7 +186,7 @@ def surely(
 
 def joint_components(
     model: HostInterval, states: Booleans | None = None, entries: Booleans | None = None
-) -> tuple[Components, Booleans]:
+) -> tuple[EndComponents, Booleans]:
     """The maximal end components that policy and nature can keep to together.
 
     Args:
@@ -199,7 +206,7 @@ def joint_components(
         kept = model.may_keep(used)
         used &= kept[mdp.row]
         if not kept.any():
-            return Components(np.arange(mdp.num_states), kept), used
+            return EndComponents(np.arange(mdp.num_states), kept), used
         alive = np.zeros(mdp.num_states, bool)
         alive[mdp.state[kept]] = True
         stays = ~_compelled(model, ~alive, True, kept)[0]
@@ -210,7 +217,7 @@ def joint_components(
             break
         used = now
     component = np.where(alive, label, np.arange(mdp.num_states))
-    return Components(component, kept), used
+    return EndComponents(component, kept), used
 
 
 class JointRegion(NamedTuple):
@@ -256,6 +263,6 @@ def joint_accepting(model: HostInterval, priority: Integers) -> JointRegion:
         keep = used & new[mdp.state[mdp.row]]
         inside = found.inside & new[mdp.state]
         way = HostInterval.fixed(model, np.where(keep | ~inside[mdp.row], chance, 0))
-        row = np.where(new, np.where(some, first, towards(way, some, inside)), row)
+        row = np.where(new, np.where(some, first, shortest_path_rows(way, some, inside)), row)
         chance = np.where(inside[mdp.row], model.within(keep), chance)
     return JointRegion(region, row, chance)

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
-from jaxltl.core.sparse.graph.qualitative import reaching, towards
+from jaxltl.core.sparse.graph.qualitative import backward_reachable, shortest_path_rows
 from jaxltl.core.sparse.interval.policy_iteration import Joint, joint_bound
 from jaxltl.core.sparse.interval.qualitative import (
     Decided,
@@ -27,7 +27,7 @@ from jaxltl.core.sparse.interval.qualitative import (
 from jaxltl.core.sparse.interval.uncertainty_set import HostInterval
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.solvers import reachability as optimal
-from jaxltl.core.sparse.solvers.policy_iteration import Enclosed
+from jaxltl.core.sparse.solvers.policy_iteration import Enclosure
 
 _EPS = float(np.finfo(np.float64).eps)
 _ROUNDS = 100
@@ -76,7 +76,7 @@ class _Solve(NamedTuple):
       tolerance, relative: the width asked for, and whether as a share of the value.
     """
 
-    exact: Callable[[HostMDP, Floats, bool], Enclosed]
+    exact: Callable[[HostMDP, Floats, bool], Enclosure]
     joint: Callable[[HostInterval, Floats, bool], Robust]
     cost: Floats
     tolerance: float
@@ -138,7 +138,7 @@ def _reachability(
 ) -> Robust:
     halted, row = model.halted(stop)
 
-    def exact(mdp: HostMDP, _: Floats, up: bool) -> Enclosed:
+    def exact(mdp: HostMDP, _: Floats, up: bool) -> Enclosure:
         return optimal.reachability(
             mdp, target, maximize=up, tolerance=tolerance / 2, depth=depth + terms(mdp)
         )
@@ -228,7 +228,7 @@ def _total_reward(
     finite, kept = _finite(halted, target, maximize=maximize, large=large)
     part, origin, entry = _restricted(halted, finite, kept)
 
-    def exact(mdp: HostMDP, earned: Floats, up: bool) -> Enclosed:
+    def exact(mdp: HostMDP, earned: Floats, up: bool) -> Enclosure:
         return optimal.total_reward(
             mdp, earned, ends, maximize=up, tolerance=tolerance / 2, depth=depth + terms(mdp)
         )
@@ -272,7 +272,7 @@ def _joint_reachability(
     up: bool,
     tolerance: float,
     depth: int,
-    exact: Callable[[HostMDP, Floats, bool], Enclosed],
+    exact: Callable[[HostMDP, Floats, bool], Enclosure],
 ) -> Robust:
     """Policy and nature together make the probability large, or small."""
     mdp = model.mdp
@@ -281,7 +281,7 @@ def _joint_reachability(
     row: Integers = mdp.row_start[:-1].astype(np.int64)
     chance = mdp.probability.copy()
     bound, rounds = one.astype(np.float64), 0
-    of: Enclosed | None = Enclosed(bound, bound, bound, row, 0, 0.0, "")
+    of: Enclosure | None = Enclosure(bound, bound, bound, row, 0, 0.0, "")
     component: Integers = np.arange(mdp.num_states)
     if open_.any():
         if up:
@@ -302,7 +302,9 @@ def _joint_reachability(
     rows = model.may_stay(keep) & keep[mdp.state]
     entries = keep[mdp.successor] & rows[mdp.row]
     chance = np.where(rows[mdp.row], model.within(entries), chance)
-    some = towards(model.fixed(chance), target, rows) if up else mdp.first_choice(rows)[1]
+    some = (
+        shortest_path_rows(model.fixed(chance), target, rows) if up else mdp.first_choice(rows)[1]
+    )
     row = np.where(keep, some, row)
     if of is None:
         chain, entry = model.chain(row)
@@ -355,17 +357,17 @@ def _joint_reward(
     up: bool,
     tolerance: float,
     depth: int,
-    exact: Callable[[HostMDP, Floats, bool], Enclosed],
+    exact: Callable[[HostMDP, Floats, bool], Enclosure],
 ) -> Robust:
     """Policy and nature together make the reward large, or small, in a model that surely ends."""
     mdp = model.mdp
     row: Integers = mdp.row_start[:-1].astype(np.int64)
     chance = mdp.probability.copy()
     bound, rounds = np.zeros(mdp.num_states), 0
-    of: Enclosed | None = Enclosed(bound, bound, bound, row, 0, 0.0, "")
+    of: Enclosure | None = Enclosure(bound, bound, bound, row, 0, 0.0, "")
     earning = np.zeros(mdp.num_states, bool)
     earning[mdp.state[cost > 0]] = True
-    open_ = ~target & (reaching(mdp, earning) if up else True)
+    open_ = ~target & (backward_reachable(mdp, earning) if up else True)
     component: Integers = np.arange(mdp.num_states)
     inside, used = (np.zeros(size, bool) for size in (mdp.num_rows, mdp.num_transitions))
     if open_.any():
@@ -395,12 +397,12 @@ _METHOD = "policy iteration with nature"
 
 
 def _pinned(
-    exact: Callable[[HostMDP, Floats, bool], Enclosed],
+    exact: Callable[[HostMDP, Floats, bool], Enclosure],
     model: HostInterval,
     p: Floats,
     cost: Floats,
     up: bool,
-) -> Enclosed:
+) -> Enclosure:
     """The policy's optimum where nature picks what is next to some distributions."""
     settled, able = model.settled(p)
     found = exact(model.fixed(settled), cost, up)
@@ -436,7 +438,7 @@ def _inner(
     taken = inside & moving[mdp.state]
     chance = np.where(taken[mdp.row], model.within(used & taken[mdp.row]), chance)
     goal = exits | ~held
-    return np.where(moving, towards(model.fixed(chance), goal, taken), row), chance
+    return np.where(moving, shortest_path_rows(model.fixed(chance), goal, taken), row), chance
 
 
 def _led_by_policy(model: HostInterval, row: Integers, solve: _Solve, sign: int) -> Robust:

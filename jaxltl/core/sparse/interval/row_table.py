@@ -13,7 +13,7 @@ import numpy as np
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.sparse.interval.exact_sums import SHARE, exact_sum
 from jaxltl.core.sparse.interval.l1_distance import Sorted, narrowed
-from jaxltl.core.sparse.rows import spans, starts_of
+from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
 
 _EPS = float(np.finfo(np.float64).eps)
 _NEAR = 2.0**-16  # of zero, sums that are done again
@@ -293,8 +293,8 @@ def row_sums(quantity: Floats, start: Integers, *more: Floats) -> Floats:
     near = near[np.diff(start)[near] + len(more) > 2]  # one addition has the right sign
     if near.size:
         width = np.diff(start)[near]
-        entry = spans(start[near], width)
-        for row, at, used in tables(starts_of(width)):
+        entry = concatenated_ranges(start[near], width)
+        for row, at, used in tables(offsets_from_counts(width)):
             terms = quantity[entry[at]]
             terms = terms if used is None else np.where(used, terms, 0)
             found[near[row]] = exact_sum(np.concatenate([[x[near[row]] for x in more], terms]))

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
-from jaxltl.core.sparse.graph.qualitative import reaching
+from jaxltl.core.sparse.graph.qualitative import backward_reachable
 from jaxltl.core.sparse.interval.uncertainty_set import HostInterval
 
 _EPS = float(np.finfo(np.float64).eps)
@@ -142,7 +142,7 @@ def total(
             break
     some = start != 0
     some[mdp.state[mdp.row[earned != 0]]] = True
-    off = np.where(reaching(mdp, some), error if num_steps else 0, 0)
+    off = np.where(backward_reachable(mdp, some), error if num_steps else 0, 0)
     return RobustSteps(value, off, row, chance, done)
 
 
@@ -166,8 +166,8 @@ def _some(maximize: bool) -> Any:
 def _entering(model: HostInterval, region: Booleans, surely: bool, helpful: bool) -> Booleans:
     """The rows by which a region is entered possibly, or surely, with nature for or against it."""
     if surely:
-        return model.may_stay(region) if helpful else ~model.mdp.support.lead_to(~region)
-    return model.mdp.support.lead_to(region) if helpful else ~model.may_stay(~region)
+        return model.may_stay(region) if helpful else ~model.mdp.support.some_successor_in(~region)
+    return model.mdp.support.some_successor_in(region) if helpful else ~model.may_stay(~region)
 
 
 def _within(

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from jaxltl.core.array_types import Floats, Integers
-from jaxltl.core.sparse.linear.elimination import Factors, factors
+from jaxltl.core.sparse.linear.elimination import Factors, factorize
 
 _DIRECT = 2000  # unknowns up to which each system is eliminated
 _LIKE = 10  # steps after which old factors do not help
@@ -71,7 +71,7 @@ class Systems:
     def _renew(self, matrix: Any) -> bool:
         every = np.arange(matrix.shape[0])
         if self.factors is None:
-            self.factors = factors(matrix, self.label(), every)
+            self.factors = factorize(matrix, self.label(), every)
         else:
             self.factors = self.factors._replace(rows=matrix).other(every)
         self.matrix = matrix

@@ -23,7 +23,7 @@ from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.interval.l1_distance import Ball, share_of
 from jaxltl.core.sparse.interval.row_table import Table, row_sums, tables
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import spans, starts_of
+from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
 
 _EPS = float(np.finfo(np.float64).eps)
 _READ = 2 * _EPS  # by how much a sum of decimals, or of what was rounded once, may miss one
@@ -158,7 +158,7 @@ class HostInterval:
             return np.zeros(0, bool)
         mdp = self.mdp
         count = mdp.entry_start[row + 1] - mdp.entry_start[row]
-        entry = spans(mdp.entry_start[row], count)
+        entry = concatenated_ranges(mdp.entry_start[row], count)
         start = count.cumsum() - count
         inside = region[mdp.successor[entry]]
         start, one = np.append(start, entry.size), np.ones(row.size)
@@ -229,7 +229,9 @@ class HostInterval:
         if kept.all():
             return HostMDP(mdp.row_start, mdp.entry_start, mdp.successor, probability)
         count = np.add.reduceat(kept.astype(np.int64), mdp.entry_start[:-1])
-        return HostMDP(mdp.row_start, starts_of(count), mdp.successor[kept], probability[kept])
+        return HostMDP(
+            mdp.row_start, offsets_from_counts(count), mdp.successor[kept], probability[kept]
+        )
 
     def chain(self, row: Integers) -> tuple[HostInterval, Integers]:
         """The intervals under a policy ``int[S]``, and which entries these are."""
@@ -240,8 +242,10 @@ class HostInterval:
         """Some rows in a new order, and which entries these are."""
         mdp = self.mdp
         width = np.diff(mdp.entry_start)[row]
-        entry = spans(mdp.entry_start[row], width)
-        part = HostMDP(row_start, starts_of(width), mdp.successor[entry], mdp.probability[entry])
+        entry = concatenated_ranges(mdp.entry_start[row], width)
+        part = HostMDP(
+            row_start, offsets_from_counts(width), mdp.successor[entry], mdp.probability[entry]
+        )
         ball = None if self.ball is None else self.ball.of(entry, row)
         return HostInterval(part, self.lower[entry], self.upper[entry], ball), entry
 
@@ -252,10 +256,10 @@ class HostInterval:
         if (stop - start == 1).all() and (mdp.successor[start] == np.flatnonzero(states)).all():
             return self, np.arange(mdp.num_rows)  # they do already
         count = np.where(states, 1, np.diff(mdp.row_start))
-        row = spans(mdp.row_start[:-1], count)
+        row = concatenated_ranges(mdp.row_start[:-1], count)
         loop = np.repeat(states, count)
         width = np.where(loop, 1, np.diff(mdp.entry_start)[row])
-        entry, start = spans(mdp.entry_start[row], width), starts_of(width)
+        entry, start = concatenated_ranges(mdp.entry_start[row], width), offsets_from_counts(width)
         first = start[:-1][loop]
         successor = mdp.successor[entry]
         lower, upper, chance = (x[entry] for x in (self.lower, self.upper, mdp.probability))
@@ -265,5 +269,5 @@ class HostInterval:
         if ball is not None:
             ball = ball.of(entry, row)
             ball.center[first] = 1
-        small = HostMDP(starts_of(count), start, successor, chance)
+        small = HostMDP(offsets_from_counts(count), start, successor, chance)
         return HostInterval(small, lower, upper, ball), row

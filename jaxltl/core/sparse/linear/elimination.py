@@ -107,7 +107,7 @@ class Factors(NamedTuple):
             if new is None:
                 return None
             if not swept and (new.factor is None or new.fill > _FILL * block.fill):
-                return factors(self.rows, self.label, chosen)
+                return factorize(self.rows, self.label, chosen)
             found.append(new._replace(fill=block.fill))
         return self._replace(blocks=tuple(found))
 
@@ -121,7 +121,7 @@ class Factors(NamedTuple):
             if (
                 swept
                 and nodes.size > _LAST
-                and order_of(matrix[nodes][:, nodes], self.label[nodes]) is None
+                and elimination_order(matrix[nodes][:, nodes], self.label[nodes]) is None
             ):
                 return None
             new = _block(self.rows, self.label, nodes, chosen, sparing=swept or block.sparing)
@@ -131,7 +131,7 @@ class Factors(NamedTuple):
         return self._replace(blocks=tuple(found))
 
 
-def factors(rows: Any, label: Integers, chosen: Integers) -> Factors | None:
+def factorize(rows: Any, label: Integers, chosen: Integers) -> Factors | None:
     """The system of a policy.
 
     Args:
@@ -144,7 +144,7 @@ def factors(rows: Any, label: Integers, chosen: Integers) -> Factors | None:
     """
     matrix, size = rows[chosen], np.bincount(label)
     if min(_between(matrix, label, size)) <= _MOST_BETWEEN:
-        order = order_of(matrix, label, _WORK)
+        order = elimination_order(matrix, label, _WORK)
         one = None if order is None else _block(rows, label, order, chosen)
         if order is not None and one is None:
             return None
@@ -152,7 +152,7 @@ def factors(rows: Any, label: Integers, chosen: Integers) -> Factors | None:
             return Factors(rows, label, (one,))
     found = []
     for nodes in _parts(label, size):
-        order = order_of(matrix[nodes][:, nodes], label[nodes], _WORK)
+        order = elimination_order(matrix[nodes][:, nodes], label[nodes], _WORK)
         kept = nodes if order is None else nodes[order]
         block = _block(rows, label, kept, chosen, swept=order is None)
         if block is None:
@@ -179,7 +179,7 @@ def _between(matrix: Any, label: Integers, size: Integers) -> tuple[int, int]:
     return int(size[target[between]].sum()), int(size[source[between]].sum())
 
 
-def order_of(matrix: Any, label: Integers, work: float = np.inf) -> Integers | None:
+def elimination_order(matrix: Any, label: Integers, work: float = np.inf) -> Integers | None:
     """By component, and in each one after its neighbours; None where that would not help.
 
     Args:

@@ -42,7 +42,7 @@ _PROOFS = 4  # that are tried
 _THREADS = 2**20  # transitions from which two blocks are swept at once
 
 
-class Cut(NamedTuple):
+class RowBlocks(NamedTuple):
     """Rows in blocks of states, in both precisions.
 
     Attributes:
@@ -61,7 +61,7 @@ class Cut(NamedTuple):
     width: int
 
 
-class Sums(NamedTuple):
+class BlockProblem(NamedTuple):
     """``x = opt_r (cost_r + P_r y)`` on some nodes, where y is x or what is known.
 
     Attributes:
@@ -73,7 +73,7 @@ class Sums(NamedTuple):
       rows: ``bool[R]``, the rows that may be taken; default all.
     """
 
-    cut: Cut
+    cut: RowBlocks
     open: Booleans
     live: Booleans
     near: Floats
@@ -82,7 +82,7 @@ class Sums(NamedTuple):
     rows: Booleans | None = None
 
 
-class Relaxed(NamedTuple):
+class SweptBounds(NamedTuple):
     """What was found and proven; of nodes that are not open it says nothing.
 
     Attributes:
@@ -100,9 +100,9 @@ class Relaxed(NamedTuple):
     time: float
 
 
-def cut(
+def row_blocks(
     row_start: Integers, entry_start: Integers, column: Integers, weight: Floats, columns: int
-) -> Cut:
+) -> RowBlocks:
     """Rows, cut into blocks.
 
     Args:
@@ -134,11 +134,11 @@ def cut(
         (weight.astype(np.float64, copy=False), column, entry_start),
         shape=(entry_start.size - 1, columns),
     )
-    return Cut(row_start, matrix, node, single, double, int(count[0]) if same else 0)
+    return RowBlocks(row_start, matrix, node, single, double, int(count[0]) if same else 0)
 
 
-def relaxed(
-    sums: Sums,
+def solve_by_sweeps(
+    sums: BlockProblem,
     *,
     sign: int,
     tolerance: float,
@@ -147,7 +147,7 @@ def relaxed(
     start: Floats | None = None,
     time: float | None = None,
     most: int = 150,
-) -> Relaxed | None:
+) -> SweptBounds | None:
     """The optimal sums by sweeps.
 
     Args:
@@ -174,7 +174,7 @@ def relaxed(
 
 def _relaxed(
     search: _Search, tolerance: float, relative: bool, start: Floats | None, time: float | None
-) -> Relaxed | None:
+) -> SweptBounds | None:
     sums = search.sums
     value: Any = sums.far.astype(np.float32)
     live = np.flatnonzero(sums.live)
@@ -206,7 +206,7 @@ def _relaxed(
 class _Search:
     """Sweeps, which are counted. Two blocks at a time read the same and then are written."""
 
-    sums: Sums
+    sums: BlockProblem
     sign: int
     unit: float
     most: int
@@ -371,7 +371,7 @@ class _Search:
         needed = _MARGIN * (1 + _LEFT) / (1 - _STAYS) + 1  # times of it, of which bounds differ
         return max(0.9 * tolerance * share / needed, 32 * self.unit * max(size, 1e-300))
 
-    def prove(self, value: Values, extra: float) -> Relaxed | None:
+    def prove(self, value: Values, extra: float) -> SweptBounds | None:
         """The bound that a policy attains, the one beyond which nothing is, and the policy."""
         sums, sign, unit = self.sums, self.sign, self.unit
         nodes = sums.open.size
@@ -397,9 +397,9 @@ class _Search:
         if not (sign * near[:nodes] <= sign * image - slack)[live].all():
             return None
         near = np.where(live, near[:nodes], image - sign * slack)
-        return Relaxed(near, far, row, self.sweeps, float(time.max(initial=0)))
+        return SweptBounds(near, far, row, self.sweeps, float(time.max(initial=0)))
 
-    def excess(self, found: Relaxed, tolerance: float, relative: bool) -> float:
+    def excess(self, found: SweptBounds, tolerance: float, relative: bool) -> float:
         """How many times the tolerance bounds are apart, more than those of what is known are."""
         known = np.abs(self.sums.far - self.sums.near)[~self.sums.live].max(initial=0)
         width = np.abs(found.far - found.near)[self.sums.open] - known

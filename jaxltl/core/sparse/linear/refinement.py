@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxltl.core.array_types import Floats, Integers
-from jaxltl.core.sparse.graph.qualitative import searched
+from jaxltl.core.sparse.graph.qualitative import forward_search
 from jaxltl.core.sparse.linear.matrix_tree import System, share_of_values
 from jaxltl.core.sparse.linear.topological_order import Edges
 
@@ -118,7 +118,7 @@ def _proven(
     share = share_of_values(_share(over, scale) + 2 * unit, chosen.size)
     own = system.matrix[chosen]
     back = Edges(own.indptr, own.indices).reverse()
-    leaves = searched(back.start, back.target, system.leaving[chosen] > 0)
+    leaves = forward_search(back.start, back.target, system.leaving[chosen] > 0)
     if not share <= _MOST or not (value >= 0).all() or not leaves.all():
         return None
     return Refined(value, share, chosen, rounds)

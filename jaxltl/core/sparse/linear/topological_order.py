@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Integers
-from jaxltl.core.sparse.rows import count_down, distinct, spans
+from jaxltl.core.sparse.rows import decrement, sorted_unique, concatenated_ranges
 
 _ROUNDS = 16  # levels, and
 _NODES = 64  # so many nodes for a further one, until elimination is faster
@@ -50,7 +50,7 @@ class Levels(NamedTuple):
     start: list[int]
 
 
-def peel(back: Edges, number: Integers, among: Booleans) -> Levels:
+def topological_levels(back: Edges, number: Integers, among: Booleans) -> Levels:
     """The nodes that lead, through others of their kind, to nothing that is left.
 
     Args:
@@ -70,14 +70,14 @@ def peel(back: Edges, number: Integers, among: Booleans) -> Levels:
         start.append(start[-1] + frontier.size)
         among[frontier] = False
         first = back.start[frontier]
-        source = back.target[spans(first, back.start[frontier + 1] - first)]
-        count_down(number, source)
-        frontier = distinct(source[(number[source] == 0) & among[source]], number.size)
+        source = back.target[concatenated_ranges(first, back.start[frontier + 1] - first)]
+        decrement(number, source)
+        frontier = sorted_unique(source[(number[source] == 0) & among[source]], number.size)
     none: Any = np.zeros(0, np.int64)
     return Levels(np.concatenate(found) if found else none, start)
 
 
-def components_in_order(edges: Edges) -> Integers:
+def ordered_components(edges: Edges) -> Integers:
     """Numbers of strongly connected components, ``int[N]``: no edge leads to a greater one."""
     from scipy import sparse
     from scipy.sparse import csgraph

@@ -17,20 +17,20 @@ from numpy.typing import NDArray
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.sparse.graph.qualitative import (
-    Components,
+    EndComponents,
     end_components,
-    surely_reaching,
-    towards,
+    almost_sure_reachability,
+    shortest_path_rows,
 )
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import spans, starts_of
-from jaxltl.core.sparse.solvers.policy_iteration import Transient, optimum
+from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
+from jaxltl.core.sparse.solvers.policy_iteration import ShortestPathProblem, optimum
 
 _EPS = float(np.finfo(np.float64).eps)
 _ROUNDS = 100
 
 
-class Sums(NamedTuple):
+class WeightedProblem(NamedTuple):
     """A model with several objectives, all to be made large.
 
     Attributes:
@@ -51,7 +51,7 @@ class Sums(NamedTuple):
     ended: Booleans
 
 
-class Ends(NamedTuple):
+class FinalComponents(NamedTuple):
     """Where runs may end: end components without cost, by the sets of what is satisfied there.
 
     Attributes:
@@ -65,12 +65,12 @@ class Ends(NamedTuple):
     inside: list[Booleans]
 
 
-def ends(sums: Sums) -> Ends | None:
+def final_components(sums: WeightedProblem) -> FinalComponents | None:
     """Where runs may end; None if some initial state is not surely left for there."""
     mdp = sums.mdp
     free = (sums.cost == 0).all(0) & sums.ended[mdp.state]
     homes = end_components(mdp, rows=free)
-    inside, rows = surely_reaching(mdp, homes.region(mdp))
+    inside, rows = almost_sure_reachability(mdp, homes.region(mdp))
     if (sums.start > 0)[~inside].any():
         return None
     count = len(sums.priority)
@@ -83,7 +83,7 @@ def ends(sums: Sums) -> Ends | None:
             if region.any():
                 sets.append(wanted)
                 found.append(region)
-    return Ends(rows, np.array(sets, bool).reshape(len(sets), count), found)
+    return FinalComponents(rows, np.array(sets, bool).reshape(len(sets), count), found)
 
 
 def _satisfying(mdp: HostMDP, priority: NDArray[Any], rows: Booleans) -> Booleans:
@@ -104,7 +104,7 @@ def _satisfying(mdp: HostMDP, priority: NDArray[Any], rows: Booleans) -> Boolean
         rows = found.inside & ~bad
 
 
-class Weighed(NamedTuple):
+class WeightedOptimum(NamedTuple):
     """The best of a weighted sum.
 
     Attributes:
@@ -118,9 +118,14 @@ class Weighed(NamedTuple):
     home: Booleans
 
 
-def weigh(
-    sums: Sums, where: Ends, sure: Floats, gain: Floats, cost: Floats, tolerance: float
-) -> Weighed:
+def weighted_optimum(
+    sums: WeightedProblem,
+    where: FinalComponents,
+    sure: Floats,
+    gain: Floats,
+    cost: Floats,
+    tolerance: float,
+) -> WeightedOptimum:
     """The largest weighted sum over all policies that surely end.
 
     Args:
@@ -147,7 +152,7 @@ def weigh(
     size = float(share @ np.abs(high)) + float(np.abs(worth).max(initial=0))
     total += 4 * _EPS * size * (1 + first.size)
     weight, home = _policy(mdp, where, free, best, quotient, row)
-    return Weighed(total, weight, home)
+    return WeightedOptimum(total, weight, home)
 
 
 class _Quotient(NamedTuple):
@@ -169,7 +174,7 @@ class _Quotient(NamedTuple):
 
 
 def _quotient(
-    mdp: HostMDP, rows: Booleans, free: Components, best: Integers, worth: Floats
+    mdp: HostMDP, rows: Booleans, free: EndComponents, best: Integers, worth: Floats
 ) -> _Quotient:
     used = np.zeros(mdp.num_states, bool)
     used[mdp.state[rows]] = True
@@ -185,16 +190,16 @@ def _quotient(
     end = heads.size
     owner = np.concatenate([node[mdp.state[row]], stops, [end]])
     width = np.concatenate([np.diff(mdp.entry_start)[row], np.ones(stops.size + 1, np.int64)])
-    entry = spans(mdp.entry_start[row], width[: row.size])
+    entry = concatenated_ranges(mdp.entry_start[row], width[: row.size])
     target = np.concatenate([node[mdp.successor[entry]], np.full(stops.size + 1, end)])
     chance = np.concatenate([mdp.probability[entry], np.ones(stops.size + 1)])
     known = np.concatenate([np.zeros(row.size), worth[best[stop[stops]]], [0.0]])
     origin = np.concatenate([row, np.full(stops.size + 1, -1)])
     order = np.argsort(owner, kind="stable")
-    taken = spans((width.cumsum() - width)[order], width[order])
+    taken = concatenated_ranges((width.cumsum() - width)[order], width[order])
     small = HostMDP(
-        starts_of(np.bincount(owner, minlength=end + 1)),
-        starts_of(width[order]),
+        offsets_from_counts(np.bincount(owner, minlength=end + 1)),
+        offsets_from_counts(width[order]),
         target[taken].astype(np.int32),
         chance[taken],
     )
@@ -211,16 +216,16 @@ def _solved(
     loss = np.where(moves, spent[own], 0)
     end = np.arange(mdp.num_states) == mdp.num_states - 1
     none = np.zeros(mdp.num_states)
-    first = towards(mdp, end, np.ones(mdp.num_rows, bool)).astype(np.int64)
+    first = shortest_path_rows(mdp, end, np.ones(mdp.num_rows, bool)).astype(np.int64)
     if not loss.any():
-        problem = Transient(mdp, ~end, none, gain, first=first)
+        problem = ShortestPathProblem(mdp, ~end, none, gain, first=first)
         found = optimum(problem, maximize=True, tolerance=tolerance, relative=False)
         return found.upper, found.row
     if not (gain[moves] > 0).any():
         most = quotient.known.max()
         lost = np.where(moves, loss, most - quotient.known)
         lost[-1] = 0
-        problem = Transient(mdp, ~end, none, lost, first=first)
+        problem = ShortestPathProblem(mdp, ~end, none, lost, first=first)
         found = optimum(problem, maximize=False, tolerance=tolerance, relative=False)
         return most - found.lower, found.row
     return _signed(mdp, end, gain - loss, np.abs(gain) + loss, first, tolerance)
@@ -238,8 +243,8 @@ def _signed(
 
     Every step earns a little more than it does, so that the value is one that no step exceeds.
     """
-    from jaxltl.core.sparse.linear.elimination import factors
-    from jaxltl.core.sparse.linear.topological_order import Edges, components_in_order
+    from jaxltl.core.sparse.linear.elimination import factorize
+    from jaxltl.core.sparse.linear.topological_order import Edges, ordered_components
 
     inner = np.flatnonzero(~end)
     rows = np.flatnonzero(~end[mdp.state])
@@ -249,7 +254,7 @@ def _signed(
     unit = (2 * int(np.diff(mdp.entry_start).max()) + 8) * _EPS
     chosen, policy = first[inner], first
     begins = matrix.indptr[np.append(starts, rows.size)]
-    solver = factors(matrix, components_in_order(Edges(begins, matrix.indices)), chosen)
+    solver = factorize(matrix, ordered_components(Edges(begins, matrix.indices)), chosen)
     extra = 0.0
     for _ in range(_ROUNDS):
         if solver is None:
@@ -278,7 +283,12 @@ def _signed(
 
 
 def _policy(
-    mdp: HostMDP, where: Ends, free: Components, best: Integers, quotient: _Quotient, row: Integers
+    mdp: HostMDP,
+    where: FinalComponents,
+    free: EndComponents,
+    best: Integers,
+    quotient: _Quotient,
+    row: Integers,
 ) -> tuple[Floats, Booleans]:
     """The weights of rows of a policy on nodes, and the states where it ends."""
     region = free.region(mdp)
@@ -297,7 +307,7 @@ def _policy(
     goal = home.copy()
     moving = np.flatnonzero(~stops & (own >= 0))
     goal[mdp.state[own[moving]]] = True
-    found = towards(mdp, goal, free.inside & region[mdp.state])
+    found = shortest_path_rows(mdp, goal, free.inside & region[mdp.state])
     exits = np.zeros(mdp.num_states, bool)
     exits[mdp.state[own[moving]]] = True
     at = exits & (own >= 0) & (mdp.state[np.maximum(own, 0)] == np.arange(mdp.num_states))

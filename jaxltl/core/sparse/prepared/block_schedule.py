@@ -14,8 +14,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Integers
-from jaxltl.core.sparse.linear.topological_order import Edges, components_in_order, peel
-from jaxltl.core.sparse.rows import spans
+from jaxltl.core.sparse.linear.topological_order import (
+    Edges,
+    ordered_components,
+    topological_levels,
+)
+from jaxltl.core.sparse.rows import concatenated_ranges
 
 # What entries lead to besides nodes: the value one, what is reached, and what is lost.
 ONE, GOAL, LOST = -1, -2, -3
@@ -229,7 +233,7 @@ def _edges(nodes: Nodes) -> Edges:
 def _peeled(back: Edges, number: Integers, among: Booleans) -> list[Integers]:
     found: list[Integers] = []
     while True:
-        more = peel(back, number, among)
+        more = topological_levels(back, number, among)
         if not more.node.size:
             return found
         found += [more.node[a:b] for a, b in pairwise(more.start)]
@@ -240,13 +244,13 @@ def _layers(edges: Edges, core: Integers) -> list[Integers]:
     number: Any = np.full(edges.num_nodes, -1, np.int64)
     number[core] = np.arange(core.size)
     width = edges.start[core + 1] - edges.start[core]
-    target = number[edges.target[spans(edges.start[core], width)]]
+    target = number[edges.target[concatenated_ranges(edges.start[core], width)]]
     source = np.repeat(np.arange(core.size), width)
     leaves = np.zeros(core.size, bool)
     leaves[source[target < 0]] = True
     source, target = source[target >= 0], target[target >= 0]
     start = np.concatenate([[0], np.bincount(source, minlength=core.size).cumsum()])
-    label = components_in_order(Edges(start, target))
+    label = ordered_components(Edges(start, target))
     same = label[source] == label[target]
     leaves[source[~same]] = True
     layer = _distances(source[same], target[same], leaves, label)
@@ -271,7 +275,7 @@ def _distances(source: Integers, target: Integers, leaves: Booleans, label: Inte
     layer[frontier], steps = 0, 0
     while frontier.size:
         steps += 1
-        found = before[spans(start[frontier], start[frontier + 1] - start[frontier])]
+        found = before[concatenated_ranges(start[frontier], start[frontier + 1] - start[frontier])]
         found = found[layer[found] < 0]
         layer[found] = steps
         frontier = np.unique(found)

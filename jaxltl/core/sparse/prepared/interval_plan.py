@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
-from jaxltl.core.sparse.graph.qualitative import reaching, towards
+from jaxltl.core.sparse.graph.qualitative import backward_reachable, shortest_path_rows
 from jaxltl.core.sparse.interval.qualitative import (
     Decided,
     attracting,
@@ -25,7 +25,7 @@ from jaxltl.core.sparse.interval.qualitative import (
 from jaxltl.core.sparse.interval.row_table import row_sums
 from jaxltl.core.sparse.interval.uncertainty_set import HostInterval
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import starts_of
+from jaxltl.core.sparse.rows import offsets_from_counts
 
 
 class Answers(NamedTuple):
@@ -81,13 +81,13 @@ def plan_reachability(
         rows = halted.may_stay(mine) & mine[mdp.state]
         within = mine[mdp.successor] | ~rows[mdp.row]
         way = halted.fixed(np.where(rows[mdp.row], halted.within(within), mdp.probability))
-        row = towards(way, target, rows) if maximize else mdp.first_choice(rows)[1]
+        row = shortest_path_rows(way, target, rows) if maximize else mdp.first_choice(rows)[1]
     else:
         row, within = held(halted, target, Decided(zero, one), maximize=maximize)
     open_ = ~(zero | one)
     if maximize:
         every = np.ones(mdp.num_rows, bool)
-        out = towards(mdp, one, every) if helpful else attracting(halted, one, every)
+        out = shortest_path_rows(mdp, one, every) if helpful else attracting(halted, one, every)
         row = np.where(open_, out, row)
     left = _Left(
         halted,
@@ -116,7 +116,7 @@ def plan_total_reward(
     if maximize and large:
         finite = decided(asked, target, maximize=False, helpful=False).one
         kept = finite[mdp.state]
-        nothing = finite & ~reaching(mdp, paying)
+        nothing = finite & ~backward_reachable(mdp, paying)
     else:
         finite, kept = surely(
             asked, target, np.ones(target.size, bool), maximize=not maximize, helpful=not large
@@ -138,8 +138,10 @@ def plan_total_reward(
             out = attracting(halted, target, kept)
         else:
             inside &= halted.may_stay(nothing)
-            row = np.where(nothing, towards(_keeping(halted, within, inside), target, inside), row)
-            out = towards(_keeping(halted, used, kept), target, kept)
+            row = np.where(
+                nothing, shortest_path_rows(_keeping(halted, within, inside), target, inside), row
+            )
+            out = shortest_path_rows(_keeping(halted, used, kept), target, kept)
         row = np.where(nothing, row, out)
     known = np.where(nothing, 0, np.where(finite, np.nan, np.inf))
     open_ = np.isnan(known)
@@ -167,7 +169,9 @@ def _for_nothing(
     taken = rows.copy()
     taken[first[~some]] = True
     row = np.flatnonzero(taken)
-    part, entry = model.of_rows(starts_of(np.bincount(mdp.state[row], minlength=some.size)), row)
+    part, entry = model.of_rows(
+        offsets_from_counts(np.bincount(mdp.state[row], minlength=some.size)), row
+    )
     asked = _Asking(part.mdp, part.lower, part.upper, log=log, origin=entry)
     return surely(asked, target, finite & some, maximize=True, helpful=not large)[0]
 

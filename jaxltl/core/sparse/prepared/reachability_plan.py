@@ -11,12 +11,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
-from jaxltl.core.sparse.contraction import without_chains
-from jaxltl.core.sparse.graph.qualitative import forced, reaching, surely_reaching
+from jaxltl.core.sparse.contraction import contract_chains
+from jaxltl.core.sparse.graph.qualitative import (
+    positive_under_all_policies,
+    backward_reachable,
+    almost_sure_reachability,
+)
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.prepared.block_schedule import GOAL, LOST, ONE, Nodes, Schedule, schedule
-from jaxltl.core.sparse.rows import spans
-from jaxltl.core.sparse.solvers.reachability import Reduced, leaving_by
+from jaxltl.core.sparse.rows import concatenated_ranges
+from jaxltl.core.sparse.solvers.reachability import ReducedProblem, quotient_policy
 
 
 class Loops(NamedTuple):
@@ -83,7 +87,7 @@ class _Entries(NamedTuple):
     source: Integers
 
 
-def plan_optimum(reduced: Reduced, cost: Floats | None) -> Plan:
+def plan_optimum(reduced: ReducedProblem, cost: Floats | None) -> Plan:
     """The plan of an optimum, or of a chain.
 
     Args:
@@ -152,8 +156,8 @@ def _entries(mdp: HostMDP, small: HostMDP, origin: Integers, rows: Integers) -> 
     width = np.diff(small.entry_start)[rows]
     return _Entries(
         np.repeat(np.arange(rows.size), width),
-        small.successor[spans(small.entry_start[rows], width)],
-        spans(mdp.entry_start[origin[rows]], width),
+        small.successor[concatenated_ranges(small.entry_start[rows], width)],
+        concatenated_ranges(mdp.entry_start[origin[rows]], width),
     )
 
 
@@ -186,14 +190,14 @@ def _with_costs(
     )
 
 
-def _own(reduced: Reduced, codes: Integers) -> tuple[Integers, Integers]:
+def _own(reduced: ReducedProblem, codes: Integers) -> tuple[Integers, Integers]:
     """The nodes whose rows states take, and the rows of the others."""
     mdp, whole, part = reduced.mdp, reduced.whole, reduced.part
     mine = mdp.state[whole.row[whole.mdp.row_start[:-1]]]  # the state that each node is
     chosen: Any = reduced.row
     node: Any = np.arange(mine.size)
     if part is not None and reduced.components is not None:
-        chosen = leaving_by(whole.mdp, reduced.components, part.row[reduced.row][part.node])
+        chosen = quotient_policy(whole.mdp, reduced.components, part.row[reduced.row][part.node])
         node = part.node
     if reduced.sure is not None and reduced.sure_row is not None:
         chosen = np.where(reduced.sure, reduced.sure_row, chosen)
@@ -205,7 +209,7 @@ def _own(reduced: Reduced, codes: Integers) -> tuple[Integers, Integers]:
     return own, row
 
 
-def _circles(reduced: Reduced) -> Circles | None:
+def _circles(reduced: ReducedProblem) -> Circles | None:
     """The states of end components that are open; elsewhere rows are known."""
     components, whole, part = reduced.components, reduced.whole, reduced.part
     if components is None or part is None or reduced.problem is None:
@@ -226,7 +230,7 @@ def _circles(reduced: Reduced) -> Circles | None:
         whole.row[rows],
         number[mdp.state[rows]],
         np.repeat(np.arange(rows.size), width),
-        number[mdp.successor[spans(mdp.entry_start[rows], width)]],
+        number[mdp.successor[concatenated_ranges(mdp.entry_start[rows], width)]],
     )
 
 
@@ -243,7 +247,7 @@ def plan_policy(mdp: HostMDP, target: Booleans, stay: Booleans | None, cost: Flo
     fixed = target | blocked
     if cost is not None:
         fixed |= mdp.over_choices(np.maximum, cost) > 0
-    whole = without_chains(mdp, fixed, None)
+    whole = contract_chains(mdp, fixed, None)
     small = mdp if whole is None else whole.mdp
     node = np.arange(mdp.num_states) if whole is None else whole.node
     origin = np.arange(mdp.num_rows) if whole is None else whole.row
@@ -251,12 +255,12 @@ def plan_policy(mdp: HostMDP, target: Booleans, stay: Booleans | None, cost: Flo
     goal[node[target]], dead[node[blocked]] = True, True
     if cost is None:
         before = ~(goal | dead)[small.state]
-        lost = ~reaching(small, goal, before)
-        some = dead | ~forced(small, goal, among=~dead)
-        reached = goal | ~reaching(small, some, before)
+        lost = ~backward_reachable(small, goal, before)
+        some = dead | ~positive_under_all_policies(small, goal, among=~dead)
+        reached = goal | ~backward_reachable(small, some, before)
         codes = np.where(reached, ONE, LOST)
     else:
-        lost = ~surely_reaching(small, goal, np.ones(small.num_rows, bool))[0]
+        lost = ~almost_sure_reachability(small, goal, np.ones(small.num_rows, bool))[0]
         reached, codes = goal, np.where(goal, GOAL, LOST)
     open_ = ~(lost | reached)
     found = _entries(mdp, small, origin, np.flatnonzero(open_[small.state]))

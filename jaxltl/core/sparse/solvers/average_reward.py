@@ -16,14 +16,19 @@ import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.sparse.graph.components import strong_components
-from jaxltl.core.sparse.graph.qualitative import Components, end_components, reaching, towards
-from jaxltl.core.sparse.linear.elimination import factors
+from jaxltl.core.sparse.graph.qualitative import (
+    EndComponents,
+    end_components,
+    backward_reachable,
+    shortest_path_rows,
+)
+from jaxltl.core.sparse.linear.elimination import factorize
 from jaxltl.core.sparse.linear.matrix_tree import share_of_values
 from jaxltl.core.sparse.linear.refinement import difference, two_sum
-from jaxltl.core.sparse.linear.topological_order import Edges, components_in_order
+from jaxltl.core.sparse.linear.topological_order import Edges, ordered_components
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import spans, starts_of
-from jaxltl.core.sparse.solvers.policy_iteration import Transient, optimum
+from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
+from jaxltl.core.sparse.solvers.policy_iteration import ShortestPathProblem, optimum
 from jaxltl.core.sparse.solvers.step_bounded import backup_unit
 
 _EPS = float(np.finfo(np.float64).eps)
@@ -131,7 +136,7 @@ def _stopped(
     relative = shift == 0 and bool((worth[worth > 0] > _TINY * worth.max()).all())
     known = np.concatenate([np.zeros(size), worth - shift])
     open_ = np.arange(mdp.num_states) < size
-    problem = Transient(mdp, open_, known, np.zeros(mdp.num_rows))
+    problem = ShortestPathProblem(mdp, open_, known, np.zeros(mdp.num_rows))
     found = optimum(
         problem,
         maximize=sign > 0,
@@ -152,10 +157,10 @@ def _all_to(mdp: HostMDP, states: Integers, row: Integers) -> Integers:
     inside[states] = True
     if inside.all():
         return row
-    return np.where(inside, row, towards(mdp, inside, np.ones(mdp.num_rows, bool)))
+    return np.where(inside, row, shortest_path_rows(mdp, inside, np.ones(mdp.num_rows, bool)))
 
 
-def _routed(mdp: HostMDP, found: Components, taken: Integers, row: Integers) -> Integers:
+def _routed(mdp: HostMDP, found: EndComponents, taken: Integers, row: Integers) -> Integers:
     """Rows of states from those of nodes, -1 for components to stop in."""
     region = found.region(mdp)
     moves = taken >= 0
@@ -165,7 +170,7 @@ def _routed(mdp: HostMDP, found: Components, taken: Integers, row: Integers) -> 
     row = np.where(at_exit, taken, row)
     inner = moves & region & ~at_exit
     if inner.any():
-        row = np.where(inner, towards(mdp, exits, found.inside), row)
+        row = np.where(inner, shortest_path_rows(mdp, exits, found.inside), row)
     return row
 
 
@@ -183,22 +188,27 @@ class _Stopping(NamedTuple):
     origin: Integers
 
 
-def _with_stops(mdp: HostMDP, found: Components, leaders: Integers) -> _Stopping:
+def _with_stops(mdp: HostMDP, found: EndComponents, leaders: Integers) -> _Stopping:
     heads = np.flatnonzero(found.component == np.arange(mdp.num_states))
     node = np.searchsorted(heads, found.component)
     stops = np.arange(leaders.size) + heads.size
     row = np.flatnonzero(~found.inside)
     owner = np.concatenate([node[mdp.state[row]], node[leaders], stops])
     width = np.concatenate([np.diff(mdp.entry_start)[row], np.ones(2 * stops.size, np.int64)])
-    entry = spans(mdp.entry_start[row], width[: row.size])
+    entry = concatenated_ranges(mdp.entry_start[row], width[: row.size])
     successor = np.concatenate([node[mdp.successor[entry]], stops, stops]).astype(np.int32)
     probability = np.concatenate([mdp.probability[entry], np.ones(2 * stops.size)])
     origin = np.concatenate([row, np.full(2 * stops.size, -1)])
     order = np.argsort(owner, kind="stable")
     begin = (width.cumsum() - width)[order]
-    entry = spans(begin, width[order])
+    entry = concatenated_ranges(begin, width[order])
     count = np.bincount(owner, minlength=heads.size + stops.size)
-    small = HostMDP(starts_of(count), starts_of(width[order]), successor[entry], probability[entry])
+    small = HostMDP(
+        offsets_from_counts(count),
+        offsets_from_counts(width[order]),
+        successor[entry],
+        probability[entry],
+    )
     return _Stopping(node, small, origin[order])
 
 
@@ -276,10 +286,13 @@ def _part(
     row = np.flatnonzero(inside & (number[mdp.state] >= 0))
     row = row[np.argsort(number[mdp.state[row]], kind="stable")]
     width = np.diff(mdp.entry_start)[row]
-    entry = spans(mdp.entry_start[row], width)
+    entry = concatenated_ranges(mdp.entry_start[row], width)
     count = np.bincount(number[mdp.state[row]], minlength=states.size)
     small = HostMDP(
-        starts_of(count), starts_of(width), number[mdp.successor[entry]], mdp.probability[entry]
+        offsets_from_counts(count),
+        offsets_from_counts(width),
+        number[mdp.successor[entry]],
+        mdp.probability[entry],
     )
     return _Part(
         small,
@@ -481,7 +494,9 @@ def _by_policies(known: _Gains, left: _Left, tolerance: float) -> Floats | None:
         elif range_ > _LINGERS * part.magnitude.max():
             # Some states are left hardly ever: the rest goes to the best of these.
             goal = best >= best.max() - _NEAR * range_
-            chosen = np.where(goal, chosen, towards(part.mdp, goal, np.ones(part.row.size, bool)))
+            chosen = np.where(
+                goal, chosen, shortest_path_rows(part.mdp, goal, np.ones(part.row.size, bool))
+            )
         else:
             return None
     return best
@@ -508,8 +523,8 @@ def _bias(part: _Part, chosen: Integers) -> tuple[tuple[Floats, Floats, float], 
         goal = label == heads[best]
         taken = np.zeros(mdp.num_rows, bool)
         taken[chosen] = True
-        goal = reaching(mdp, goal, taken)
-        chosen = np.where(goal, chosen, towards(mdp, goal, np.ones(mdp.num_rows, bool)))
+        goal = backward_reachable(mdp, goal, taken)
+        chosen = np.where(goal, chosen, shortest_path_rows(mdp, goal, np.ones(mdp.num_rows, bool)))
         heads = heads[[best]]
     recurrent = np.flatnonzero(label == heads[0])
     found = _cycle(part, chosen, np.arange(size), recurrent)
@@ -543,8 +558,8 @@ def _cycle(
     cut = matrix.copy()
     cut.data = np.where(loops | (matrix.indices == visited), 0, matrix.data / leaves[source])
     cut.eliminate_zeros()
-    label = components_in_order(Edges(cut.indptr, cut.indices))
-    system = factors(cut, label, np.arange(states.size))
+    label = ordered_components(Edges(cut.indptr, cut.indices))
+    system = factorize(cut, label, np.arange(states.size))
     if system is None:
         return None
     time, reward = system.solve(1 / leaves), part.reward[chosen[states]]

@@ -9,7 +9,7 @@ import numpy as np
 from jaxltl.core.array_types import Floats
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.solvers.mixing import optimum
-from jaxltl.core.sparse.solvers.policy_iteration import Enclosed, Transient
+from jaxltl.core.sparse.solvers.policy_iteration import Enclosure, ShortestPathProblem
 
 _EPS = float(np.finfo(np.float64).eps)
 
@@ -23,7 +23,7 @@ def discounted_value(
     maximize: bool,
     tolerance: float,
     depth: int = 0,
-) -> Enclosed:
+) -> Enclosure:
     """``V = opt_r (reward_r + discount * P_r V)``, enclosed.
 
     Args:
@@ -41,7 +41,7 @@ def discounted_value(
     open_[-1] = False
     # What every step earns at least is earned for ever, and the rest is at least 0.
     cost = np.append(reward - least, 0)
-    problem = Transient(ending, open_, np.zeros(open_.size), cost, depth=depth)
+    problem = ShortestPathProblem(ending, open_, np.zeros(open_.size), cost, depth=depth)
     found = optimum(problem, maximize=maximize, tolerance=tolerance, relative=False)
     always = least / (1 - discount)
     value, lower, upper = (x[:-1] + always for x in (found.value, found.lower, found.upper))
@@ -49,7 +49,7 @@ def discounted_value(
     terms = int(np.diff(mdp.entry_start).max()) + depth + 4
     lost = terms * float(magnitude.max()) / (1 - discount)
     slack = 4 * _EPS * (np.abs(found.value[:-1]) + abs(always) + lost)
-    return Enclosed(
+    return Enclosure(
         value,
         lower - slack,
         upper + slack,

@@ -15,15 +15,21 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
-from jaxltl.core.sparse.contraction import merged
+from jaxltl.core.sparse.contraction import quotient
 from jaxltl.core.sparse.graph.bitsets import LARGEST, BitSets, bit_graph, decided, pack
 from jaxltl.core.sparse.graph.qualitative import end_components
-from jaxltl.core.sparse.linear.gauss_seidel import Cut, Relaxed, Sums, cut, relaxed
-from jaxltl.core.sparse.linear.topological_order import Edges, components_in_order
+from jaxltl.core.sparse.linear.gauss_seidel import (
+    BlockProblem,
+    RowBlocks,
+    SweptBounds,
+    row_blocks,
+    solve_by_sweeps,
+)
+from jaxltl.core.sparse.linear.topological_order import Edges, ordered_components
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import starts_of
-from jaxltl.core.sparse.solvers.mixing import spreads
-from jaxltl.core.sparse.solvers.reachability import leaving_by
+from jaxltl.core.sparse.rows import offsets_from_counts
+from jaxltl.core.sparse.solvers.mixing import expands_fast
+from jaxltl.core.sparse.solvers.reachability import quotient_policy
 
 _EPS = float(np.finfo(np.float64).eps)
 _TINY = 1e-290
@@ -32,7 +38,7 @@ _MET = 4096  # lead to so many, where the graph is shallow and sweeps end soon
 _MOST = 2**27  # transitions of a component that is written out, at most
 
 
-class World(NamedTuple):
+class PaddedProduct(NamedTuple):
     """A padded world beside an automaton, whose letters are read where states are entered.
 
     Attributes:
@@ -54,7 +60,7 @@ class World(NamedTuple):
     allowed: Booleans | None = None
 
 
-class Layered(NamedTuple):
+class LayeredBounds(NamedTuple):
     """An optimum, enclosed.
 
     Attributes:
@@ -72,30 +78,35 @@ class Layered(NamedTuple):
 class _Rows:
     """The world's rows, their actions, and in blocks."""
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: PaddedProduct) -> None:
         available, used = world.available, world.used
         self.regular = bool(available.all() and used.all())
         num_states, num_actions, width = used.shape
         if self.regular:
             count = np.full(num_states, num_actions)
-            starts = np.arange(0, used.size + 1, width, dtype=starts_of(count * width).dtype)
+            starts = np.arange(
+                0, used.size + 1, width, dtype=offsets_from_counts(count * width).dtype
+            )
             column, weight = world.successor.reshape(-1), world.probability.reshape(-1)
             self.action = np.tile(np.arange(num_actions, dtype=np.int32), num_states)
         else:
             kept = used & available[:, :, None]
-            count, starts = available.sum(1), starts_of(kept.sum(2)[available])
+            count, starts = available.sum(1), offsets_from_counts(kept.sum(2)[available])
             column, weight = world.successor[kept], world.probability[kept]
             self.action = np.nonzero(available)[1].astype(np.int32)
         self.available = available
         self.host = HostMDP(
-            starts_of(count), starts, column.astype(np.int32, copy=False), weight.astype(np.float64)
+            offsets_from_counts(count),
+            starts,
+            column.astype(np.int32, copy=False),
+            weight.astype(np.float64),
         )
 
     @cached_property
-    def cut(self) -> Cut:
+    def cut(self) -> RowBlocks:
         """Of all rows."""
         host = self.host
-        return cut(
+        return row_blocks(
             host.row_start, host.entry_start, host.successor, host.probability, host.num_states
         )
 
@@ -104,7 +115,9 @@ class _Rows:
         return choices.reshape(-1) if self.regular else choices[self.available]
 
 
-def layered(world: World, target: Booleans, *, maximize: bool, tolerance: float) -> Layered | None:
+def layered_reachability(
+    world: PaddedProduct, target: Booleans, *, maximize: bool, tolerance: float
+) -> LayeredBounds | None:
     """The largest or smallest probability of reaching a target.
 
     Args:
@@ -130,20 +143,22 @@ def layered(world: World, target: Booleans, *, maximize: bool, tolerance: float)
     return search.found() if search.solve() else None
 
 
-def _mixes(world: World) -> bool:
+def _mixes(world: PaddedProduct) -> bool:
     """Whether few steps from some state lead to many others."""
     size = world.letter.size
 
     def follow(states: Any) -> Any:
         return world.successor[states][world.used[states]]
 
-    return any(spreads(follow, np.array([i * size // _STARTS]), size, _MET) for i in range(_STARTS))
+    return any(
+        expands_fast(follow, np.array([i * size // _STARTS]), size, _MET) for i in range(_STARTS)
+    )
 
 
 class _Search:
     """Bounds by memory, ``float64[Q, S]``, that are filled in component after component."""
 
-    def __init__(self, world: World, sets: BitSets, sign: int, tolerance: float) -> None:
+    def __init__(self, world: PaddedProduct, sets: BitSets, sign: int, tolerance: float) -> None:
         self.world, self.sets, self.sign, self.tolerance = world, sets, sign, tolerance
         num_memory = world.delta.shape[0]
         self.near = np.stack([self.has(sets.one, q) for q in range(num_memory)]).astype(float)
@@ -169,7 +184,7 @@ class _Search:
         """Fills in all components; whether that succeeded."""
         num_memory = self.world.delta.shape[0]
         read = np.unique(self.world.letter)
-        label = components_in_order(
+        label = ordered_components(
             Edges(
                 np.arange(0, num_memory * read.size + 1, read.size),
                 self.world.delta[:, read].ravel().astype(np.int32),
@@ -214,18 +229,18 @@ class _Search:
         """The relative rounding of one backup."""
         return (4 * self.world.used.shape[2] + 16) * _EPS
 
-    def found(self) -> Layered:
+    def found(self) -> LayeredBounds:
         """The bounds as they were asked for."""
         low, high = (self.near, self.far) if self.sign > 0 else (self.far, self.near)
         # Products too small for a float to hold are lost; relative errors do not count them.
         open_ = low != high
         low = np.where(open_, np.clip(low - _TINY, 0, 1), low)
         high = np.where(open_, np.clip(high + _TINY, 0, 1), high)
-        return Layered(low.T, high.T, self.action, self.sweeps)
+        return LayeredBounds(low.T, high.T, self.action, self.sweeps)
 
 
 class _Problem(NamedTuple):
-    """What is asked of a component: :class:`Sums`, and where end components are.
+    """What is asked of a component: :class:`BlockProblem`, and where end components are.
 
     Attributes:
       host: as many states as there are columns; the first ones are nodes.
@@ -237,7 +252,7 @@ class _Problem(NamedTuple):
     """
 
     host: HostMDP
-    cut: Cut | None
+    cut: RowBlocks | None
     open: Booleans
     live: Booleans
     near: Floats
@@ -282,10 +297,10 @@ def _together(search: _Search, part: Integers) -> _Problem:
     entries = np.concatenate([x[host.successor] for x in column])
     width = np.concatenate([np.tile(np.diff(host.entry_start), part.size), np.ones(ends, int)])
     written = HostMDP(
-        starts_of(
+        offsets_from_counts(
             np.concatenate([np.tile(np.diff(host.row_start), part.size), np.ones(ends, int)])
         ),
-        starts_of(width),
+        offsets_from_counts(width),
         np.concatenate([entries, np.arange(nodes, nodes + ends, dtype=np.int32)]),
         np.concatenate([np.tile(host.probability, part.size), np.ones(ends)]),
     )
@@ -306,14 +321,14 @@ def _together(search: _Search, part: Integers) -> _Problem:
 
 def _solved(
     problem: _Problem, sign: int, budget: float, unit: float, guess: tuple[Floats, float] | None
-) -> Relaxed | None:
+) -> SweptBounds | None:
     """Bounds of the nodes, and their rows."""
     host = problem.host
     circles = None
     if problem.stays.any():
         # Rows that stay in the component of the automaton, and where they can be taken for ever.
         here = problem.stays & problem.inner
-        rows = problem.stays[host.state] & ~host.support.lead_to(~here)
+        rows = problem.stays[host.state] & ~host.support.some_successor_in(~here)
         if problem.rows is not None:
             rows &= problem.rows
         circles = end_components(host, problem.stays, rows)
@@ -321,17 +336,17 @@ def _solved(
             circles = None
     if circles is None:
         blocks = problem.cut or _cut(host)
-        sums = Sums(
+        sums = BlockProblem(
             blocks, problem.open, problem.live, problem.near, problem.far, None, problem.rows
         )
         start, time = (None, None) if guess is None else guess
-        return relaxed(
+        return solve_by_sweeps(
             sums, sign=sign, tolerance=budget, relative=False, unit=unit, start=start, time=time
         )
-    part = merged(host, circles.component, circles.inside, np.zeros(host.num_rows))
+    part = quotient(host, circles.component, circles.inside, np.zeros(host.num_rows))
     leader = np.flatnonzero(circles.component == np.arange(host.num_states))
     mask = None if problem.rows is None else problem.rows[part.row]
-    sums = Sums(
+    sums = BlockProblem(
         _cut(part.mdp),
         problem.open[leader],
         problem.live[leader],
@@ -340,12 +355,14 @@ def _solved(
         None,
         mask,
     )
-    found = relaxed(sums, sign=sign, tolerance=budget, relative=False, unit=unit)
+    found = solve_by_sweeps(sums, sign=sign, tolerance=budget, relative=False, unit=unit)
     if found is None:
         return None
-    row = leaving_by(host, circles, part.row[found.row][part.node])
+    row = quotient_policy(host, circles, part.row[found.row][part.node])
     return found._replace(near=found.near[part.node], far=found.far[part.node], row=row)
 
 
-def _cut(host: HostMDP) -> Cut:
-    return cut(host.row_start, host.entry_start, host.successor, host.probability, host.num_states)
+def _cut(host: HostMDP) -> RowBlocks:
+    return row_blocks(
+        host.row_start, host.entry_start, host.successor, host.probability, host.num_states
+    )

@@ -8,11 +8,16 @@ from typing import Any
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats
-from jaxltl.core.sparse.linear.gauss_seidel import Relaxed, Sums, cut, relaxed
+from jaxltl.core.sparse.linear.gauss_seidel import (
+    SweptBounds,
+    BlockProblem,
+    row_blocks,
+    solve_by_sweeps,
+)
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import changes, spans
+from jaxltl.core.sparse.rows import group_starts, concatenated_ranges
 from jaxltl.core.sparse.solvers import policy_iteration as transient
-from jaxltl.core.sparse.solvers.policy_iteration import Enclosed, Transient
+from jaxltl.core.sparse.solvers.policy_iteration import Enclosure, ShortestPathProblem
 
 _EPS = float(np.finfo(np.float64).eps)
 _TINY = 1e-290
@@ -23,7 +28,9 @@ _SOME = 400  # open states from which they are where half of them are met
 _FEW = 5  # within so many
 
 
-def optimum(problem: Transient, *, maximize: bool, tolerance: float, relative: bool) -> Enclosed:
+def optimum(
+    problem: ShortestPathProblem, *, maximize: bool, tolerance: float, relative: bool
+) -> Enclosure:
     """:func:`jaxltl.core.sparse.solvers.policy_iteration.optimum`, by sweeps where a model mixes well."""
     size = int(np.count_nonzero(problem.open))
     met, steps = (_MET, _STEPS) if size >= _LARGE else (min(_MET, size // 2), _FEW)
@@ -35,8 +42,8 @@ def optimum(problem: Transient, *, maximize: bool, tolerance: float, relative: b
 
 
 def by_sweeps(
-    problem: Transient, *, maximize: bool, tolerance: float, relative: bool
-) -> Enclosed | None:
+    problem: ShortestPathProblem, *, maximize: bool, tolerance: float, relative: bool
+) -> Enclosure | None:
     """The same by sweeps; None where these take too long."""
     mdp, sign = problem.mdp, 1 if maximize else -1
     weight, rows = _without_loops(problem)
@@ -45,8 +52,8 @@ def by_sweeps(
     cost: Any = problem.cost if rows is None else np.where(rows, problem.cost, 0)
     if not cost.any():
         cost = None
-    sums = Sums(
-        cut(mdp.row_start, mdp.entry_start, mdp.successor, weight, mdp.num_states),
+    sums = BlockProblem(
+        row_blocks(mdp.row_start, mdp.entry_start, mdp.successor, weight, mdp.num_states),
         problem.open,
         problem.open,
         problem.known,
@@ -54,11 +61,11 @@ def by_sweeps(
         cost,
         rows,
     )
-    found = relaxed(sums, sign=sign, tolerance=tolerance, relative=relative, unit=unit)
+    found = solve_by_sweeps(sums, sign=sign, tolerance=tolerance, relative=relative, unit=unit)
     return None if found is None else _enclosed(problem, found, sign)
 
 
-def _enclosed(problem: Transient, found: Relaxed, sign: int) -> Enclosed:
+def _enclosed(problem: ShortestPathProblem, found: SweptBounds, sign: int) -> Enclosure:
     low, high = (found.near, found.far) if sign > 0 else (found.far, found.near)
 
     def everywhere(x: Floats) -> Floats:
@@ -70,7 +77,7 @@ def _enclosed(problem: Transient, found: Relaxed, sign: int) -> Enclosed:
     row = np.where(problem.open, found.row, problem.mdp.row_start[:-1])
     # The operator carries the bounds towards each other, so the value by half of what is between.
     left = (high - value) / np.maximum(value, 1)
-    return Enclosed(
+    return Enclosure(
         value,
         low,
         high,
@@ -81,7 +88,7 @@ def _enclosed(problem: Transient, found: Relaxed, sign: int) -> Enclosed:
     )
 
 
-def _without_loops(problem: Transient) -> tuple[Floats, Booleans | None]:
+def _without_loops(problem: ShortestPathProblem) -> tuple[Floats, Booleans | None]:
     """Weights by which rows sum to one where they loop, and the rows that lead elsewhere."""
     mdp = problem.mdp
     loop = np.flatnonzero(mdp.successor == mdp.state[mdp.row])
@@ -90,10 +97,10 @@ def _without_loops(problem: Transient) -> tuple[Floats, Booleans | None]:
     weight = mdp.probability.copy()
     weight[loop] = 0
     of = mdp.row[loop]
-    first = loop[changes(of)]  # a row may repeat its successors
+    first = loop[group_starts(of)]  # a row may repeat its successors
     row = mdp.row[first]
     width = np.diff(mdp.entry_start)[row]
-    entry = spans(mdp.entry_start[row], width)
+    entry = concatenated_ranges(mdp.entry_start[row], width)
     rest = np.add.reduceat(weight[entry], width.cumsum() - width)
     weight[first] = np.maximum(1 - rest, 0)
     rows = np.ones(mdp.num_rows, bool) if problem.rows is None else problem.rows.copy()
@@ -106,13 +113,13 @@ def _spreads(mdp: HostMDP, open_: Booleans, met: int = _MET, steps: int = _STEPS
     node, first = np.flatnonzero(open_), mdp.entry_start[mdp.row_start]
 
     def follow(states: Any) -> Any:
-        after = mdp.successor[spans(first[states], first[states + 1] - first[states])]
+        after = mdp.successor[concatenated_ranges(first[states], first[states + 1] - first[states])]
         return after[open_[after]]
 
-    return spreads(follow, node[node.size // 2 : node.size // 2 + 1], open_.size, met, steps)
+    return expands_fast(follow, node[node.size // 2 : node.size // 2 + 1], open_.size, met, steps)
 
 
-def spreads(
+def expands_fast(
     follow: Callable[[Any], Any],
     start: Any,
     num_states: int,

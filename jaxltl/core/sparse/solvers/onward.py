@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from jaxltl.core.array_types import Floats, Integers
-from jaxltl.core.sparse.rows import changes, spans
+from jaxltl.core.sparse.rows import group_starts, concatenated_ranges
 
 _ROUND = 3000  # entries that a round costs besides those that it reads
 _WORK = 40  # times the entries of the system that all rounds may cost,
@@ -20,7 +20,7 @@ _ROUNDS = 100  # and so many rounds
 _LEAST = 0.01  # of the largest gain: less is not carried on
 
 
-def carried_on(
+def propagate_improvements(
     matrix: Any,
     known: Floats,
     owner: Integers,
@@ -59,15 +59,15 @@ def carried_on(
         if not better.size:
             return chosen
         better = better[np.lexsort((-gain[better], state[better]))]
-        better = better[changes(state[better])]
+        better = better[group_starts(state[better])]
         front = state[better]
         value[front], chosen[front] = image[better], rows[better]
         least = max(least, _LEAST * float(gain[better].max()))
-        rows = np.unique(back.indices[spans(back.indptr[front], into[front])])
+        rows = np.unique(back.indices[concatenated_ranges(back.indptr[front], into[front])])
         count = matrix.indptr[rows + 1] - matrix.indptr[rows]
         left -= int(count.sum()) + _ROUND
         if left < 0 or not rows.size:
             return chosen
-        entry = spans(matrix.indptr[rows], count)
+        entry = concatenated_ranges(matrix.indptr[rows], count)
         reads = matrix.data[entry] * value[matrix.indices[entry]]
         image = known[rows] + np.bincount(np.repeat(np.arange(rows.size), count), reads, rows.size)

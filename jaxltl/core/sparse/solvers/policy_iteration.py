@@ -17,15 +17,20 @@ import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.sparse.choice_order import Choices, choices_of
-from jaxltl.core.sparse.graph.qualitative import searched
-from jaxltl.core.sparse.linear.elimination import Factors, factors, order_of
+from jaxltl.core.sparse.graph.qualitative import forward_search
+from jaxltl.core.sparse.linear.elimination import Factors, factorize, elimination_order
 from jaxltl.core.sparse.linear.fractions import LARGEST, exact_optimum
 from jaxltl.core.sparse.linear.matrix_tree import System, share_of_values
 from jaxltl.core.sparse.linear.refinement import refined
-from jaxltl.core.sparse.linear.topological_order import Edges, Levels, components_in_order, peel
+from jaxltl.core.sparse.linear.topological_order import (
+    Edges,
+    Levels,
+    ordered_components,
+    topological_levels,
+)
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import LARGE, spans, starts_of
-from jaxltl.core.sparse.solvers.onward import carried_on
+from jaxltl.core.sparse.rows import SCIPY_SIZE, concatenated_ranges, offsets_from_counts
+from jaxltl.core.sparse.solvers.onward import propagate_improvements
 
 _EPS = float(np.finfo(np.float64).eps)
 _TINY = 1e-290
@@ -39,7 +44,7 @@ _MAX_ROUNDS = 300
 _GOOD = 0.1  # bounds so narrow that their policy is one to begin with
 
 
-class Transient(NamedTuple):
+class ShortestPathProblem(NamedTuple):
     """A problem whose every policy that counts leaves all of its states.
 
     What a row leads to besides itself is taken to be all that it leads to, in these proportions:
@@ -65,7 +70,7 @@ class Transient(NamedTuple):
     depth: int = 0
 
 
-class Enclosed(NamedTuple):
+class Enclosure(NamedTuple):
     """Certified values of an optimum, or of a chain.
 
     Attributes:
@@ -110,12 +115,12 @@ class _System(NamedTuple):
     def taken(self, node: Integers) -> _System:
         """The rows of some nodes, in their order; targets stay as they are numbered."""
         count = np.diff(self.row_start)[node]
-        row = spans(self.row_start[node], count)
+        row = concatenated_ranges(self.row_start[node], count)
         width = np.diff(self.entry_start)[row]
-        entry = spans(self.entry_start[row], width)
+        entry = concatenated_ranges(self.entry_start[row], width)
         return _System(
-            starts_of(count),
-            starts_of(width),
+            offsets_from_counts(count),
+            offsets_from_counts(width),
             self.target[entry],
             self.weight[entry],
             self.row[row],
@@ -125,7 +130,9 @@ class _System(NamedTuple):
         )
 
 
-def optimum(problem: Transient, *, maximize: bool, tolerance: float, relative: bool) -> Enclosed:
+def optimum(
+    problem: ShortestPathProblem, *, maximize: bool, tolerance: float, relative: bool
+) -> Enclosure:
     """The optimal sums, enclosed.
 
     Args:
@@ -146,13 +153,13 @@ def optimum(problem: Transient, *, maximize: bool, tolerance: float, relative: b
     edges = _edges(system)
     back, among = edges.reverse(), np.ones(n, bool)
     number = np.diff(edges.start).astype(np.int32)
-    below = peel(back, number, among)
+    below = topological_levels(back, number, among)
     _sweep(system, below, bounds, chosen, sign)
     grown = (len(below.start) - 1) * unit
     _widen(bounds, below.node, sign, grown)
     rounds, method = 0, "levels"
     if among.any():
-        above = peel(edges, _number_left(back, among), among)
+        above = topological_levels(edges, _number_left(back, among), among)
         core = np.flatnonzero(among)
         if core.size:
             found = _solve_core(
@@ -171,14 +178,14 @@ def optimum(problem: Transient, *, maximize: bool, tolerance: float, relative: b
 
 
 def _found(
-    problem: Transient,
+    problem: ShortestPathProblem,
     system: _System,
     bounds: Floats,
     chosen: Integers,
     sign: int,
     rounds: int,
     method: str,
-) -> Enclosed:
+) -> Enclosure:
     near, far, value = bounds
     low, high = (near, far) if sign > 0 else (far, near)
     # Products too small for a float to hold are lost; relative errors do not count them.
@@ -193,7 +200,7 @@ def _found(
 
     row = problem.mdp.row_start[:-1].astype(np.int64)
     row[system.node] = system.row[chosen]
-    return Enclosed(
+    return Enclosure(
         everywhere(value),
         everywhere(low),
         everywhere(high),
@@ -213,7 +220,7 @@ def _residual(system: _System, value: Floats, sign: int) -> float:
     return float((np.abs(best - value) / np.maximum(value, 1)).max())
 
 
-def _system(problem: Transient) -> _System:
+def _system(problem: ShortestPathProblem) -> _System:
     mdp = problem.mdp
     kept = problem.open[mdp.state]
     if problem.rows is not None:
@@ -224,7 +231,7 @@ def _system(problem: Transient) -> _System:
     if row.size == mdp.num_rows:
         target, weight, of = mdp.successor, mdp.probability, mdp.row
     else:
-        entry = spans(mdp.entry_start[row], width)
+        entry = concatenated_ranges(mdp.entry_start[row], width)
         target, weight = mdp.successor[entry], mdp.probability[entry]
         of = np.repeat(np.arange(row.size, dtype=np.int32), width)
     state = mdp.state[row]
@@ -259,14 +266,14 @@ def _system(problem: Transient) -> _System:
     count = np.bincount(of, minlength=row.size)
     # What is known comes first in a row where it is something, or where the row is empty else.
     some = (known != 0) | (count == 0)
-    start = starts_of(count + some)
+    start = offsets_from_counts(count + some)
     first = start[:-1][some]
     targets, weights = np.empty(start[-1], np.int32), np.empty(start[-1])
     inside = np.ones(start[-1], bool)
     inside[first] = False
     targets[first], weights[first] = node.size, known[some]
     targets[inside], weights[inside] = number[target], weight
-    row_start = starts_of(np.bincount(number[state], minlength=node.size))
+    row_start = offsets_from_counts(np.bincount(number[state], minlength=node.size))
     return _System(row_start, start, targets, weights, row, node, leaving, widest)
 
 
@@ -286,7 +293,7 @@ def _number_left(back: Edges, among: Booleans) -> Integers:
 
 def _backup(system: _System, value: Floats) -> Floats:
     """``c_r + P_r x`` of each row."""
-    if system.target.size > LARGE:
+    if system.target.size > SCIPY_SIZE:
         from scipy import sparse
 
         arrays = system.weight, system.target, system.entry_start
@@ -400,10 +407,10 @@ def _circles(
 
     count = np.diff(system.row_start)[core]
     choices = choices_of(count)
-    row, owner = spans(system.row_start[core], count)[choices.order], choices.owner
+    row, owner = concatenated_ranges(system.row_start[core], count)[choices.order], choices.owner
     core = core[choices.states]
     width = np.diff(system.entry_start)[row]
-    entry = spans(system.entry_start[row], width)
+    entry = concatenated_ranges(system.entry_start[row], width)
     number: Any = np.full(system.num_nodes + 1, -1, np.int32)
     number[core] = np.arange(core.size)
     target, weight = number[system.target[entry]], system.weight[entry]
@@ -415,7 +422,7 @@ def _circles(
     known: Any = np.bincount(of[outer], earned, row.size)
     below = outer & (system.target[entry] != system.num_nodes)
     leaving: Any = np.bincount(of[below], weight[below], row.size) + system.leaving[row]
-    start = starts_of(np.bincount(of[inner], minlength=row.size))
+    start = offsets_from_counts(np.bincount(of[inner], minlength=row.size))
     shape = (row.size, core.size)
     matrix = sparse.csr_array((weight[inner], target[inner], start), shape=shape)
     matrix.sum_duplicates()
@@ -433,17 +440,17 @@ def _solve_core(
     bounds: Floats,
     errors: tuple[float, float],
     sign: int,
-    problem: Transient,
+    problem: ShortestPathProblem,
     tolerance: float,
     relative: bool,
 ) -> _Core:
     """Policy iteration of the problem whose every step costs a little more."""
     unit = sum(errors)  # the shares by which a backup may err, and what is known outside
     circles, core, edges = _circles(system, core, bounds, sign)
-    label = components_in_order(edges)
+    label = ordered_components(edges)
     proper = partial(_proper, circles, _way_out(circles, system, core, problem))
     chosen = proper(_greedy(circles, 0.0, np.zeros(core.size), _FIRST_SWEEPS))
-    first, solver = chosen, factors(circles.matrix, label, chosen)
+    first, solver = chosen, factorize(circles.matrix, label, chosen)
     aim = (_AIM_CHAIN if circles.is_chain else _AIM) * tolerance
     extra, rounds = None, 0
     best: _Core | None = None
@@ -467,7 +474,7 @@ def _solve_core(
             if rounds <= _HASTY and not circles.is_chain:
                 chosen = proper(_greedy(circles, sign * extra, value, _SWEEPS))
             else:
-                chosen = carried_on(
+                chosen = propagate_improvements(
                     circles.matrix,
                     circles.known + sign * extra,
                     circles.owner,
@@ -532,7 +539,7 @@ def _refined(
     """The same of a core that takes very long to end, by refinement beyond double precision."""
 
     def solver_of(rows: Integers) -> Any:
-        solver = factors(circles.matrix, label, rows)
+        solver = factorize(circles.matrix, label, rows)
         return None if solver is None else (solver.eliminated(rows) or solver).solve
 
     unit, grown = errors
@@ -564,7 +571,7 @@ def _in_fractions(
     del tolerance
     if core.size > LARGEST:
         return None
-    order = order_of(circles.matrix[chosen], label)
+    order = elimination_order(circles.matrix[chosen], label)
     if order is None:
         return None
     found = exact_optimum(_system_of(circles), chosen, order, circles.sign)
@@ -577,7 +584,7 @@ def _in_fractions(
 
 
 def _way_out(
-    circles: _Circles, system: _System, core: Integers, problem: Transient
+    circles: _Circles, system: _System, core: Integers, problem: ShortestPathProblem
 ) -> Integers | None:
     """Rows by which the core is left almost surely, where some policies never leave."""
     if problem.first is None or circles.is_chain:
@@ -610,7 +617,7 @@ def _greedy(circles: _Circles, extra: float, value: Floats, sweeps: int) -> Inte
 
 def _getting_out(rows: Any, leaves: Booleans) -> Booleans:
     back = Edges(rows.indptr, rows.indices).reverse()
-    return searched(back.start, back.target, leaves)
+    return forward_search(back.start, back.target, leaves)
 
 
 def _extra(time: Floats, value: Floats, unit: float, aim: float, relative: bool) -> float:

@@ -12,23 +12,23 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
-from jaxltl.core.sparse.contraction import Contraction, merged, without_chains
+from jaxltl.core.sparse.contraction import Contraction, quotient, contract_chains
 from jaxltl.core.sparse.graph.qualitative import (
-    Components,
+    EndComponents,
     end_components,
-    forced,
-    reaching,
-    surely_reaching,
-    towards,
+    positive_under_all_policies,
+    backward_reachable,
+    almost_sure_reachability,
+    shortest_path_rows,
 )
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.solvers.mixing import optimum
-from jaxltl.core.sparse.solvers.policy_iteration import Enclosed, Transient
+from jaxltl.core.sparse.solvers.policy_iteration import Enclosure, ShortestPathProblem
 
 _EPS = float(np.finfo(np.float64).eps)
 
 
-class Reduced(NamedTuple):
+class ReducedProblem(NamedTuple):
     """What the graph leaves of a question.
 
     Attributes:
@@ -47,8 +47,8 @@ class Reduced(NamedTuple):
     mdp: HostMDP
     whole: Contraction
     part: Contraction | None
-    components: Components | None
-    problem: Transient | None
+    components: EndComponents | None
+    problem: ShortestPathProblem | None
     known: Floats
     row: Integers
     sure: Booleans | None
@@ -60,11 +60,11 @@ class Reduced(NamedTuple):
 class _Left(NamedTuple):
     """The same without what came before: a problem or None, and what is known."""
 
-    problem: Transient | None
+    problem: ShortestPathProblem | None
     known: Floats
     row: Integers
     part: Contraction | None = None
-    components: Components | None = None
+    components: EndComponents | None = None
     sure: Booleans | None = None
     sure_row: Integers | None = None
 
@@ -77,7 +77,7 @@ def reachability(
     stay: Booleans | None = None,
     tolerance: float = 1e-6,
     depth: int = 0,
-) -> Enclosed:
+) -> Enclosure:
     """The largest or smallest probability of reaching a target through states where one may stay.
 
     Args:
@@ -100,10 +100,10 @@ def reduce_reachability(
     maximize: bool,
     stay: Booleans | None = None,
     depth: int = 0,
-) -> Reduced:
+) -> ReducedProblem:
     """What the graph leaves of :func:`reachability`, with the same arguments."""
     blocked = np.zeros(mdp.num_states, bool) if stay is None else ~stay & ~target
-    whole = without_chains(mdp, target | blocked, None) or _identity(mdp)
+    whole = contract_chains(mdp, target | blocked, None) or _identity(mdp)
     small = whole.mdp
     goal, dead = (np.zeros(small.num_states, bool) for _ in range(2))
     goal[whole.node[target]], dead[whole.node[blocked]] = True, True
@@ -123,8 +123,10 @@ def _identity(mdp: HostMDP) -> Contraction:
     )
 
 
-def _reduced(mdp: HostMDP, whole: Contraction, left: _Left, most: float, maximize: bool) -> Reduced:
-    return Reduced(
+def _reduced(
+    mdp: HostMDP, whole: Contraction, left: _Left, most: float, maximize: bool
+) -> ReducedProblem:
+    return ReducedProblem(
         mdp,
         whole,
         left.part,
@@ -139,12 +141,12 @@ def _reduced(mdp: HostMDP, whole: Contraction, left: _Left, most: float, maximiz
     )
 
 
-def _solved(reduced: Reduced, tolerance: float) -> Enclosed:
+def _solved(reduced: ReducedProblem, tolerance: float) -> Enclosure:
     """What was asked, of the states of the model."""
     found = _enclosed(reduced, tolerance)
     part = reduced.part
     if part is not None and reduced.components is not None:
-        row = leaving_by(reduced.whole.mdp, reduced.components, part.row[found.row][part.node])
+        row = quotient_policy(reduced.whole.mdp, reduced.components, part.row[found.row][part.node])
         if reduced.sure is not None and reduced.sure_row is not None:
             row = np.where(reduced.sure, reduced.sure_row, row)
         found = found._replace(
@@ -156,11 +158,11 @@ def _solved(reduced: Reduced, tolerance: float) -> Enclosed:
     return _expanded(reduced.mdp, reduced.whole, found)
 
 
-def _enclosed(reduced: Reduced, tolerance: float) -> Enclosed:
+def _enclosed(reduced: ReducedProblem, tolerance: float) -> Enclosure:
     """What was asked, of the nodes."""
     known, most, problem = reduced.known, reduced.most, reduced.problem
     if problem is None:
-        return Enclosed(known, known, known, reduced.row, 0, 0.0, "the graph")
+        return Enclosure(known, known, known, reduced.row, 0, 0.0, "the graph")
     found = optimum(
         problem, maximize=reduced.maximize, tolerance=tolerance, relative=not np.isfinite(most)
     )
@@ -173,10 +175,10 @@ def _enclosed(reduced: Reduced, tolerance: float) -> Enclosed:
             np.minimum(found.upper, most),
         )
     )
-    return Enclosed(value, lower, upper, row, found.rounds, found.residual, found.method)
+    return Enclosure(value, lower, upper, row, found.rounds, found.residual, found.method)
 
 
-def _expanded(mdp: HostMDP, whole: Contraction, found: Enclosed) -> Enclosed:
+def _expanded(mdp: HostMDP, whole: Contraction, found: Enclosure) -> Enclosure:
     """What was found for nodes, for states, with what these earn on the way."""
     if whole.node.size == whole.mdp.num_states:
         return found
@@ -193,15 +195,15 @@ def _expanded(mdp: HostMDP, whole: Contraction, found: Enclosed) -> Enclosed:
         lower = (lower + earned * (1 - share)) * (1 - _EPS)
         upper = (upper + earned * (1 + share)) * (1 + _EPS)
         value = value + earned
-    return Enclosed(value, lower, upper, row, found.rounds, found.residual, found.method)
+    return Enclosure(value, lower, upper, row, found.rounds, found.residual, found.method)
 
 
 def _smallest(mdp: HostMDP, goal: Booleans, dead: Booleans, depth: int) -> _Left:
     """The least probability of reaching a goal before anything dead."""
     outside = goal | dead
-    zero = dead | ~forced(mdp, goal, among=~dead)
-    one = goal | ~reaching(mdp, zero, _rows_of(mdp, ~outside))
-    stays = ~mdp.support.lead_to(~zero) & zero[mdp.state]
+    zero = dead | ~positive_under_all_policies(mdp, goal, among=~dead)
+    one = goal | ~backward_reachable(mdp, zero, _rows_of(mdp, ~outside))
+    stays = ~mdp.support.some_successor_in(~zero) & zero[mdp.state]
     return _between(mdp, zero, one, mdp.first_choice(stays)[1].astype(np.int64), depth)
 
 
@@ -210,7 +212,7 @@ def _between(mdp: HostMDP, zero: Booleans, one: Booleans, row: Integers, depth: 
     open_, known = ~(zero | one), one.astype(np.float64)
     if not open_.any():
         return _Left(None, known, row)
-    problem = Transient(mdp, open_, known, np.zeros(mdp.num_rows), depth=depth)
+    problem = ShortestPathProblem(mdp, open_, known, np.zeros(mdp.num_rows), depth=depth)
     return _Left(problem, known, row)
 
 
@@ -222,7 +224,7 @@ def _largest(mdp: HostMDP, goal: Booleans, dead: Booleans, depth: int) -> _Left:
     """The largest probability of reaching a goal before anything dead."""
     outside = goal | dead
     open_ = ~outside
-    zero = ~reaching(mdp, goal, _rows_of(mdp, open_))
+    zero = ~backward_reachable(mdp, goal, _rows_of(mdp, open_))
     open_ &= ~zero
     components = end_components(mdp, open_)
     if components.inside.any():
@@ -231,10 +233,10 @@ def _largest(mdp: HostMDP, goal: Booleans, dead: Booleans, depth: int) -> _Left:
 
 
 def _merged(
-    mdp: HostMDP, goal: Booleans, zero: Booleans, components: Components, depth: int
+    mdp: HostMDP, goal: Booleans, zero: Booleans, components: EndComponents, depth: int
 ) -> _Left:
     """The same with end components as one state each, from which the best row leaves."""
-    part = merged(mdp, components.component, components.inside, np.zeros(mdp.num_rows))
+    part = quotient(mdp, components.component, components.inside, np.zeros(mdp.num_rows))
     small = part.mdp
     goal_, zero_ = (np.zeros(small.num_states, bool) for _ in range(2))
     goal_[part.node[goal]], zero_[part.node[zero]] = True, True
@@ -242,7 +244,7 @@ def _merged(
     return left._replace(part=part, components=components)
 
 
-def leaving_by(mdp: HostMDP, components: Components, row: Integers) -> Integers:
+def quotient_policy(mdp: HostMDP, components: EndComponents, row: Integers) -> Integers:
     """A policy that goes round in an end component until it is where the given row leaves."""
     states = np.flatnonzero(components.region(mdp))
     exits = np.zeros(mdp.num_states, bool)
@@ -250,7 +252,7 @@ def leaving_by(mdp: HostMDP, components: Components, row: Integers) -> Integers:
     found: Any = mdp.row_start[:-1].astype(np.int64)
     own = mdp.state[row] == np.arange(mdp.num_states)
     found[own] = row[own]
-    ranked = towards(mdp, exits, components.inside)
+    ranked = shortest_path_rows(mdp, exits, components.inside)
     inner = np.zeros(mdp.num_states, bool)
     inner[states] = True
     inner &= ~exits
@@ -260,9 +262,9 @@ def leaving_by(mdp: HostMDP, components: Components, row: Integers) -> Integers:
 
 def _largest_apart(mdp: HostMDP, goal: Booleans, zero: Booleans, depth: int) -> _Left:
     """The same where every policy leaves the open states almost surely."""
-    one = ~forced(mdp, zero, among=~goal)
+    one = ~positive_under_all_policies(mdp, zero, among=~goal)
     # From where the probability is one, rows that keep it so.
-    stays = ~mdp.support.lead_to(~one) & one[mdp.state]
+    stays = ~mdp.support.some_successor_in(~one) & one[mdp.state]
     return _between(mdp, zero, one, mdp.first_choice(stays)[1].astype(np.int64), depth)
 
 
@@ -274,7 +276,7 @@ def total_reward(
     maximize: bool,
     tolerance: float = 1e-6,
     depth: int = 0,
-) -> Enclosed:
+) -> Enclosure:
     """The largest or smallest expected reward until a target is reached.
 
     Infinite where the target is not reached almost surely: for the largest, under some policy;
@@ -301,7 +303,7 @@ def reduce_total_reward(
     maximize: bool,
     kept: Booleans | None = None,
     depth: int = 0,
-) -> Reduced:
+) -> ReducedProblem:
     """What the graph leaves of :func:`total_reward`, with the same arguments.
 
     Args:
@@ -309,7 +311,7 @@ def reduce_total_reward(
       kept: ``bool[S]``, states that are no part of a chain.
     """
     fixed = target if kept is None else target | kept
-    whole = without_chains(mdp, fixed, reward) or _identity(mdp)._replace(cost=reward)
+    whole = contract_chains(mdp, fixed, reward) or _identity(mdp)._replace(cost=reward)
     whole = whole._replace(depth=whole.depth + depth)
     small = whole.mdp
     goal = np.zeros(small.num_states, bool)
@@ -320,13 +322,13 @@ def reduce_total_reward(
 
 
 def _most(mdp: HostMDP, cost: Floats, goal: Booleans, depth: int) -> _Left:
-    never = ~forced(mdp, goal)
+    never = ~positive_under_all_policies(mdp, goal)
     before = _rows_of(mdp, ~goal)
-    infinite = reaching(mdp, never, before)
+    infinite = backward_reachable(mdp, never, before)
     goal = _nothing(mdp, cost, goal, infinite)
     # Where it is infinite: rows to where the target can be avoided, and there rows that avoid it.
-    avoids = ~mdp.support.lead_to(~never) & never[mdp.state]
-    row = np.where(never, mdp.first_choice(avoids)[1], towards(mdp, never, before))
+    avoids = ~mdp.support.some_successor_in(~never) & never[mdp.state]
+    row = np.where(never, mdp.first_choice(avoids)[1], shortest_path_rows(mdp, never, before))
     return _finite(mdp, cost, goal, infinite, row, depth)
 
 
@@ -337,7 +339,7 @@ def _nothing(mdp: HostMDP, cost: Floats, goal: Booleans, infinite: Booleans) -> 
         return goal
     some = np.zeros(mdp.num_states, bool)
     some[mdp.state[earning]] = True
-    return ~(reaching(mdp, some, ~goal[mdp.state]) | infinite)
+    return ~(backward_reachable(mdp, some, ~goal[mdp.state]) | infinite)
 
 
 def _finite(
@@ -355,12 +357,12 @@ def _finite(
     known = np.where(infinite, np.inf, 0.0)
     if not open_.any():
         return _Left(None, known, row)
-    problem = Transient(mdp, open_, np.zeros(mdp.num_states), cost, rows, first, depth)
+    problem = ShortestPathProblem(mdp, open_, np.zeros(mdp.num_states), cost, rows, first, depth)
     return _Left(problem, known, row)
 
 
 def _least(mdp: HostMDP, cost: Floats, goal: Booleans, depth: int) -> _Left:
-    finite, rows = surely_reaching(mdp, goal, np.isfinite(cost) | goal[mdp.state])
+    finite, rows = almost_sure_reachability(mdp, goal, np.isfinite(cost) | goal[mdp.state])
     rows &= ~goal[mdp.state]
     if mdp.is_chain:
         row: Any = mdp.row_start[:-1].astype(np.int64)
@@ -368,19 +370,19 @@ def _least(mdp: HostMDP, cost: Floats, goal: Booleans, depth: int) -> _Left:
         return _finite(mdp, cost, goal, ~finite, row, depth, rows)
     # What can surely be done for nothing is worth nothing.
     free = rows & (cost == 0)
-    nothing, stays = surely_reaching(mdp, goal, free | goal[mdp.state])
-    row = towards(mdp, goal, stays)
+    nothing, stays = almost_sure_reachability(mdp, goal, free | goal[mdp.state])
+    row = shortest_path_rows(mdp, goal, stays)
     circles = end_components(mdp, finite & ~nothing, free)
     if not circles.inside.any():
-        first = towards(mdp, nothing, rows)
+        first = shortest_path_rows(mdp, nothing, rows)
         return _finite(mdp, cost, nothing, ~finite, row, depth, rows, first)
     # Where going round costs nothing, states are one.
-    part = merged(mdp, circles.component, circles.inside, cost)
+    part = quotient(mdp, circles.component, circles.inside, cost)
     small = part.mdp
     goal_, finite_ = (np.zeros(small.num_states, bool) for _ in range(2))
     goal_[part.node[nothing]], finite_[part.node[finite]] = True, True
     kept = rows[part.row] & ~circles.inside[part.row]
-    first = towards(small, goal_, kept)
+    first = shortest_path_rows(small, goal_, kept)
     left = _finite(
         small, part.cost, goal_, ~finite_, small.row_start[:-1].astype(np.int64), depth, kept, first
     )
@@ -389,7 +391,7 @@ def _least(mdp: HostMDP, cost: Floats, goal: Booleans, depth: int) -> _Left:
 
 def reward_forever(
     mdp: HostMDP, reward: Floats, *, maximize: bool, tolerance: float = 1e-6, depth: int = 0
-) -> Enclosed:
+) -> Enclosure:
     """The largest or smallest expected reward in all.
 
     The largest is infinite where an end component that earns can be reached; other end components
@@ -407,14 +409,14 @@ def reward_forever(
         earning = reward > 0
         never = ~_kept_away(mdp, earning)
         found = total_reward(mdp, reward, never, maximize=False, tolerance=tolerance, depth=depth)
-        quiet = never[mdp.state] & ~earning & ~mdp.support.lead_to(~never)
+        quiet = never[mdp.state] & ~earning & ~mdp.support.some_successor_in(~never)
         return found._replace(row=np.where(never, mdp.first_choice(quiet)[1], found.row))
     components = end_components(mdp)
     earns = np.zeros(mdp.num_states, bool)
     earns[components.component[mdp.state[components.inside & (reward > 0)]]] = True
     rich = earns[components.component]
-    infinite = reaching(mdp, rich)
-    part = merged(mdp, components.component, components.inside, reward)
+    infinite = backward_reachable(mdp, rich)
+    part = quotient(mdp, components.component, components.inside, reward)
     small = part.mdp
     left = np.zeros(small.num_states, bool)  # nodes that some row leaves
     left[small.state[~components.inside[part.row]]] = True
@@ -423,7 +425,7 @@ def reward_forever(
     row = small.row_start[:-1].astype(np.int64)
     rest = _finite(small, part.cost, ~left, infinite_, row, depth)
     found = _enclosed(_reduced(mdp, part, rest, np.inf, True), tolerance)
-    leaving = leaving_by(mdp, components, part.row[found.row][part.node])
+    leaving = quotient_policy(mdp, components, part.row[found.row][part.node])
     endless = _earning(mdp, components, rich, reward)
     return found._replace(
         value=found.value[part.node],
@@ -436,19 +438,19 @@ def reward_forever(
 def _kept_away(mdp: HostMDP, rows: Booleans) -> Booleans:
     """The states from which no policy surely avoids some rows for ever: ``bool[S]``."""
     nothing = np.zeros(mdp.num_states, bool)
-    return forced(mdp, nothing, ~rows)
+    return positive_under_all_policies(mdp, nothing, ~rows)
 
 
-def _earning(mdp: HostMDP, components: Components, rich: Booleans, reward: Floats) -> Integers:
+def _earning(mdp: HostMDP, components: EndComponents, rich: Booleans, reward: Floats) -> Integers:
     """A policy that gets to components that earn, and earns there for ever."""
     paid = components.inside & (reward > 0)
     some, first = mdp.first_choice(paid)
-    inner = towards(mdp, some, components.inside)
-    outer = towards(mdp, rich, np.ones(mdp.num_rows, bool))
+    inner = shortest_path_rows(mdp, some, components.inside)
+    outer = shortest_path_rows(mdp, rich, np.ones(mdp.num_rows, bool))
     return np.where(some, first, np.where(rich, inner, outer))
 
 
-def worst_width(found: Enclosed, *, relative: bool) -> float:
+def worst_width(found: Enclosure, *, relative: bool) -> float:
     """The widest enclosure, as a share of the value where that is asked for."""
     low, high = found.lower, found.upper
     finite = np.isfinite(high)

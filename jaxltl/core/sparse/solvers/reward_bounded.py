@@ -15,9 +15,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
-from jaxltl.core.sparse.graph.qualitative import end_components, reaching, towards
+from jaxltl.core.sparse.graph.qualitative import (
+    end_components,
+    backward_reachable,
+    shortest_path_rows,
+)
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import spans
+from jaxltl.core.sparse.rows import concatenated_ranges
 from jaxltl.core.sparse.solvers.step_bounded import backup_unit
 
 _LEVELS = 10**7  # amounts of reward at most
@@ -160,7 +164,7 @@ def _shape(
     mdp: HostMDP, target: Booleans, open_: Booleans, cost: Integers, maximal: bool
 ) -> _Shape:
     free = np.maximum.reduceat(cost, mdp.entry_start[:-1]) == 0
-    member = reaching(mdp, target, open_[mdp.state]) & open_
+    member = backward_reachable(mdp, target, open_[mdp.state]) & open_
     found = end_components(mdp, member if maximal else open_, free)
     inside = found.inside
     if not maximal:
@@ -182,7 +186,7 @@ def _parts(
     from scipy import sparse
 
     count = np.diff(mdp.entry_start)[shape.row]
-    entry = spans(mdp.entry_start[shape.row], count)
+    entry = concatenated_ranges(mdp.entry_start[shape.row], count)
     row = np.repeat(np.arange(shape.row.size), count)
     goal, probability = mdp.successor[entry], mdp.probability[entry]
     found = []
@@ -211,7 +215,7 @@ def _policy(mdp: HostMDP, shape: _Shape, chosen: Integers) -> Integers:
         goal[mdp.state[row]] = True
         within = np.zeros(mdp.num_states, bool)
         within[mdp.state[shape.inside]] = True
-        found = np.where(within & ~goal, towards(mdp, goal, shape.inside), found)
+        found = np.where(within & ~goal, shortest_path_rows(mdp, goal, shape.inside), found)
     return found
 
 

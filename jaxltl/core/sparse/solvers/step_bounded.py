@@ -16,10 +16,10 @@ import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.sparse.choice_order import Choices, choices_of
-from jaxltl.core.sparse.graph.qualitative import forced, reaching
+from jaxltl.core.sparse.graph.qualitative import positive_under_all_policies, backward_reachable
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import distinct, spans, starts_of
-from jaxltl.core.sparse.solvers.policy_iteration import Enclosed
+from jaxltl.core.sparse.rows import sorted_unique, concatenated_ranges, offsets_from_counts
+from jaxltl.core.sparse.solvers.policy_iteration import Enclosure
 from jaxltl.core.sparse.solvers.reachability import reachability, reward_forever, total_reward
 
 UNDERFLOW = 1e-300  # more than all that is lost where numbers are too small
@@ -175,7 +175,7 @@ def backup_on(mdp: HostMDP, places: Integers, operation: Any) -> Backup:
     """The :class:`Backup` of some states, ascending."""
     count = np.diff(mdp.row_start)[places]
     choices = choices_of(count)
-    row = spans(mdp.row_start[places], count)[choices.order]
+    row = concatenated_ranges(mdp.row_start[places], count)[choices.order]
     whole = places.size == mdp.num_states and choices.is_chain
     taken = mdp.matrix if whole else mdp.matrix[row]
     places = places[choices.states]
@@ -275,7 +275,7 @@ class _Limit:
         self.num_steps, self.maximize = num_steps, maximize
 
     @cached_property
-    def found(self) -> Enclosed:
+    def found(self) -> Enclosure:
         """The unbounded probability."""
         return reachability(
             self.mdp,
@@ -297,13 +297,13 @@ class _Limit:
             row = self.found.row
             mdp = HostMDP(
                 np.arange(mdp.num_states + 1),
-                starts_of(np.diff(mdp.entry_start)[row]),
+                offsets_from_counts(np.diff(mdp.entry_start)[row]),
                 *(
-                    x[spans(mdp.entry_start[row], np.diff(mdp.entry_start)[row])]
+                    x[concatenated_ranges(mdp.entry_start[row], np.diff(mdp.entry_start)[row])]
                     for x in (mdp.successor, mdp.probability)
                 ),
             )
-        ended = ~self.open | ~forced(mdp, self.target, among=self.open)
+        ended = ~self.open | ~positive_under_all_policies(mdp, self.target, among=self.open)
         time = total_reward(mdp, np.ones(mdp.num_rows), ended, maximize=True, tolerance=0.1)
         twice = max(2 * float(time.upper.max()), 1)
         halvings = self.num_steps // math.ceil(twice) if twice < self.num_steps else 0
@@ -332,8 +332,10 @@ def _near(mdp: HostMDP, target: Booleans, open_: Booleans, num_steps: int) -> Bo
     seen = target.copy()
     frontier: Integers = np.flatnonzero(target)
     for _ in range(num_steps):
-        state = mdp.state[pred[spans(start[frontier], start[frontier + 1] - start[frontier])]]
-        state = distinct(state, mdp.num_states)
+        state = mdp.state[
+            pred[concatenated_ranges(start[frontier], start[frontier + 1] - start[frontier])]
+        ]
+        state = sorted_unique(state, mdp.num_states)
         frontier = state[open_[state] & ~seen[state]]
         if not frontier.size:
             break
@@ -353,7 +355,11 @@ def _within(
     region = target
     choose = np.logical_or if choose_some else np.logical_and
     for _ in range(num_steps):
-        rows = ~mdp.support.lead_to(~region) if surely else mdp.support.lead_to(region)
+        rows = (
+            ~mdp.support.some_successor_in(~region)
+            if surely
+            else mdp.support.some_successor_in(region)
+        )
         new = target | (open_ & mdp.over_choices(choose, rows))
         if (new == region).all():
             break
@@ -432,7 +438,7 @@ def total(
         value[places], off[places] = (low + high) / 2, np.maximum(high - low, 0) / 2 + UNDERFLOW
     some = start != 0
     some[mdp.state[magnitude > 0]] = True
-    off = np.where(reaching(mdp, some) & (num_steps > 0), off, 0)
+    off = np.where(backward_reachable(mdp, some) & (num_steps > 0), off, 0)
     if every is not None:
         return Steps(value, off, _policies(mdp, backup, every, num_steps), found.num_steps)
     row = backup.greedy(cost, found.before)

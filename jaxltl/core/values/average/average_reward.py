@@ -9,7 +9,11 @@ import numpy as np
 from jaxltl.core.models.build.convert import to_sparse
 from jaxltl.core.sparse.solvers.average_reward import average
 from jaxltl.core.types import Solution
-from jaxltl.core.values.undiscounted.step_bounded import enclosed, finite_reward, optimum_of
+from jaxltl.core.values.undiscounted.step_bounded import (
+    solution_from_error,
+    finite_reward,
+    reduction_for,
+)
 
 
 def average_reward(
@@ -63,14 +67,14 @@ def average_reward(
             "choice of nature."
         )
     model = to_sparse(model)
-    sign = 1 if optimum_of(objective) is np.maximum else -1
+    sign = 1 if reduction_for(objective) is np.maximum else -1
     earned, magnitude = finite_reward(model, reward)
     found = average(
         model.host, sign * earned, magnitude, tolerance=tolerance, max_steps=max_steps, sign=sign
     )
     small = 1e-6 if (earned >= 0).all() else 1e-3
     error = np.maximum(found.upper - found.value, found.value - found.lower)
-    return enclosed(
+    return solution_from_error(
         sign * found.value,
         error,
         found.row.astype(np.int32),

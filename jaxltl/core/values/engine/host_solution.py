@@ -17,7 +17,7 @@ from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.solvers import reachability as optimal
 from jaxltl.core.sparse.solvers.discounted import discounted_value
-from jaxltl.core.sparse.solvers.policy_iteration import Enclosed
+from jaxltl.core.sparse.solvers.policy_iteration import Enclosure
 from jaxltl.core.types import (
     Method,
     Solution,
@@ -39,8 +39,8 @@ def status_between(
     return Status.CONVERGED if narrow.all() else Status.PRECISION
 
 
-def solution_of(
-    model: Any, sparse: SparseMDP, found: Enclosed, tolerance: float, *, relative: bool
+def solution_from_enclosure(
+    model: Any, sparse: SparseMDP, found: Enclosure, tolerance: float, *, relative: bool
 ) -> Solution:
     """A solution with the model's shapes; bounds in its precision, rounded outwards.
 
@@ -109,7 +109,7 @@ class Chain(NamedTuple):
         return np.add.reduceat(taken, row_start[:-1])
 
 
-def chain_of(model: Any, sparse: SparseMDP, policy: Any) -> Chain:
+def induced_chain(model: Any, sparse: SparseMDP, policy: Any) -> Chain:
     """The Markov chain of a policy.
 
     Args:
@@ -157,7 +157,7 @@ def _weights(model: Any, sparse: SparseMDP, policy: np.ndarray) -> np.ndarray:
     return flat[sparse.host.state, np.asarray(sparse.action)].astype(np.float64)
 
 
-def given_policy(solution: Solution, policy: Any) -> Solution:
+def with_given_policy(solution: Solution, policy: Any) -> Solution:
     """A solution with the policy that it is of, where one was given."""
     if policy is None:
         return solution
@@ -187,11 +187,13 @@ def reachability(
     asked = default_tolerance(model) if tolerance is None else float(tolerance)
     host, depth = sparse.host, 0
     if policy is not None:
-        host, _, depth = chain_of(model, sparse, policy)
+        host, _, depth = induced_chain(model, sparse, policy)
     found = optimal.reachability(
         host, target, maximize=objective == "max", stay=stay, tolerance=asked, depth=depth
     )
-    return given_policy(solution_of(model, sparse, found, asked, relative=False), policy)
+    return with_given_policy(
+        solution_from_enclosure(model, sparse, found, asked, relative=False), policy
+    )
 
 
 def discounted(
@@ -210,7 +212,7 @@ def discounted(
     largest = float(np.abs(earned).max()) / (1 - float(discount))
     asked = 1e-8 * max(largest, 1e-300) if tolerance is None else 2 * float(tolerance)
     if policy is not None:
-        chain = chain_of(model, sparse, policy)
+        chain = induced_chain(model, sparse, policy)
         earned, magnitude = (chain.mean(x, host.row_start) for x in (earned, magnitude))
         host, depth = chain.mdp, chain.depth
     found = discounted_value(
@@ -228,7 +230,7 @@ def discounted(
         "status": np.int32(status),
     }
     parts = {name: x.reshape(model.state_shape) if np.ndim(x) else x for name, x in parts.items()}
-    return given_policy(Solution(**parts, method=Method(found.method)), policy)
+    return with_given_policy(Solution(**parts, method=Method(found.method)), policy)
 
 
 def default_tolerance(model: Any) -> float:

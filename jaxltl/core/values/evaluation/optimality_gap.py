@@ -21,17 +21,17 @@ from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.models.ops.operators import is_deterministic
 from jaxltl.core.models.product import product
 from jaxltl.core.pretty_print import brief
-from jaxltl.core.sparse.product import host_product
+from jaxltl.core.sparse.product import sparse_product
 from jaxltl.core.sparse.solvers import step_bounded as host
 from jaxltl.core.types import Solution
 from jaxltl.core.values import facts
-from jaxltl.core.values.engine.host_solution import chain_of
+from jaxltl.core.values.engine.host_solution import induced_chain
 from jaxltl.core.values.undiscounted.sparse_satisfaction import (
-    as_sparse,
+    sparse_mdp_of_product,
     at_states,
     product_satisfaction,
 )
-from jaxltl.core.values.undiscounted.step_bounded import enclosed
+from jaxltl.core.values.undiscounted.step_bounded import solution_from_error
 
 _BATCH = 4096  # pairs of a world and a memory that are shown to an agent at once
 _SUM = 1e-4  # by how much a network's distribution may miss one; it is scaled
@@ -247,7 +247,7 @@ def _bounded(
 ) -> tuple[Any, Any]:
     """The agent's probability and the best within so many steps, from each beginning."""
     base, decisions, letter = table.model.host, verdicts(task), np.asarray(model.letter)
-    found = host_product(
+    found = sparse_product(
         base,
         np.asarray(task.delta),
         letter,
@@ -270,8 +270,8 @@ def _bounded(
         found.host,
         fixed,
     )
-    written = as_sparse(found)
-    chain = chain_of(written, written, weight)
+    written = sparse_mdp_of_product(found)
+    chain = induced_chain(written, written, weight)
     own = host.until(chain.mdp, target, going, steps, np.maximum)
     # The chain's numbers are rounded before the sweeps begin.
     unit = host.backup_unit(chain.mdp) + chain.depth * float(np.finfo(np.float64).eps)
@@ -279,8 +279,8 @@ def _bounded(
     error = np.where(own.error > 0, wide, 0)
     at = found.start
     return (
-        enclosed(own.value[at], error[at], None, own.num_steps, highest=1),
-        enclosed(
+        solution_from_error(own.value[at], error[at], None, own.num_steps, highest=1),
+        solution_from_error(
             best.value[at], best.error[at], found.base_row[best.row[at]], best.num_steps, highest=1
         ),
     )

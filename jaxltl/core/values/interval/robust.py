@@ -18,7 +18,7 @@ from jaxltl.core.sparse.interval.uncertainty_set import HostInterval
 from jaxltl.core.types import Method, Solution, require_shape
 from jaxltl.core.validation import numbers, shown
 from jaxltl.core.values.engine.host_solution import status_between
-from jaxltl.core.values.undiscounted.step_bounded import states
+from jaxltl.core.values.undiscounted.step_bounded import state_mask
 
 TOLERANCE = 1e-6
 
@@ -114,9 +114,9 @@ def robust_reachability(
     asked = width_asked(tolerance)
     sides = sides_of(model, policy, objective, nature)
     model = sides.model
-    target = sides.states(states(model.nominal, target, "target"))
+    target = sides.states(state_mask(model.nominal, target, "target"))
     if stay is not None:
-        stay = sides.states(states(model.nominal, stay, "stay")) | sides.added
+        stay = sides.states(state_mask(model.nominal, stay, "stay")) | sides.added
     found = interval_values.reachability(
         sides.host,
         target,
@@ -172,7 +172,7 @@ def robust_total_reward(
     asked = width_asked(tolerance)
     sides = sides_of(model, policy, objective, nature)
     model = sides.model
-    target = sides.states(states(model.nominal, target, "target"))
+    target = sides.states(state_mask(model.nominal, target, "target"))
     earned = sides.rows(interval_reward(model, reward))
     found = interval_values.total_reward(
         sides.host, earned, target, maximize=sides.maximize, large=sides.helpful, tolerance=asked
@@ -382,7 +382,7 @@ class Sides(NamedTuple):
         """``bool[S']``, the states that were not there."""
         return np.arange(self.host.mdp.num_states) >= self.model.num_states
 
-    def states(self, quantity: np.ndarray) -> np.ndarray:
+    def state_mask(self, quantity: np.ndarray) -> np.ndarray:
         """``bool[S']``, nothing of what is new."""
         return np.append(quantity, np.zeros(np.count_nonzero(self.added), bool))
 

@@ -21,11 +21,14 @@ from jaxltl.core.sparse.interval.qualitative import joint_accepting
 from jaxltl.core.sparse.interval.reachability import Robust, reachability
 from jaxltl.core.sparse.interval.uncertainty_set import HostInterval
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.product import HostProduct, host_product
+from jaxltl.core.sparse.product import SparseProduct, sparse_product
 from jaxltl.core.types import Method, Solution, Status, require_shape, row_tolerance
 from jaxltl.core.values import facts
 from jaxltl.core.values.interval.robust import Sides, host_sides, width_asked, world_of
-from jaxltl.core.values.undiscounted.sparse_satisfaction import automaton_of, starting_states
+from jaxltl.core.values.undiscounted.sparse_satisfaction import (
+    automaton_and_letters,
+    starting_states,
+)
 
 
 @brief(facts=facts.satisfaction)
@@ -53,7 +56,7 @@ class RobustSatisfaction(NamedTuple):
     solution: Solution
     automaton: Automaton
     letter: np.ndarray
-    product: HostProduct
+    product: SparseProduct
     value: np.ndarray
 
 
@@ -98,7 +101,7 @@ def robust_satisfaction(
     """
     model, system = world_of(model)
     asked = width_asked(tolerance)
-    automaton, letter = automaton_of(model.nominal, task)
+    automaton, letter = automaton_and_letters(model.nominal, task)
     states = starting_states(model, states)
     yes, no = universal_states(automaton), ~live_states(automaton)
     initial = np.broadcast_to(automaton.initial, states.shape)
@@ -255,14 +258,14 @@ def _pairs(
     memory: Integers,
     still: Booleans,
     on_entry: bool,
-) -> tuple[HostProduct, HostInterval]:
+) -> tuple[SparseProduct, HostInterval]:
     """What is reached of the product, with its intervals."""
     mdp = model.nominal.host
     # Entries travel by number, from 1; a loop of what stands still has 1 too.
     numbered = HostMDP(
         mdp.row_start, mdp.entry_start, mdp.successor, np.arange(1.0, mdp.num_transitions + 1)
     )
-    found = host_product(numbered, delta, letter, state, memory, on_entry=on_entry, still=still)
+    found = sparse_product(numbered, delta, letter, state, memory, on_entry=on_entry, still=still)
     entry = found.host.probability.astype(np.int64) - 1
     loop = found.still[found.host.state[found.host.row]]
     chance, lower, upper = (
@@ -277,7 +280,7 @@ def _pairs(
 
 
 def _fixed(
-    model: Product, product: HostProduct, host: HostInterval, policy: np.ndarray, helpful: bool
+    model: Product, product: SparseProduct, host: HostInterval, policy: np.ndarray, helpful: bool
 ) -> Sides:
     """The product under a policy of the world's rows and the memory, in which nature chooses."""
     world: Any = model.mdp

@@ -10,12 +10,12 @@ from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.models.interval import IntervalMDP, refuse_ball, require_interval
 from jaxltl.core.models.ops.operators import is_deterministic
 from jaxltl.core.pretty_print import brief
-from jaxltl.core.sparse.graph.qualitative import reaching
+from jaxltl.core.sparse.graph.qualitative import backward_reachable
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.types import Solution
 from jaxltl.core.validation import numbers, shown
 from jaxltl.core.values.interval.robust import require_direction
-from jaxltl.core.values.undiscounted.step_bounded import states
+from jaxltl.core.values.undiscounted.step_bounded import state_mask
 
 
 @brief
@@ -89,8 +89,8 @@ def robust_sensitivity(
             f"solution is {shown(solution)}; give what a solver of interval models "
             "returned, reachability_probability, say."
         )
-    goal = states(model.nominal, target, "target")
-    passed = np.ones(goal.size, bool) if stay is None else states(model.nominal, stay, "stay")
+    goal = state_mask(model.nominal, target, "target")
+    passed = np.ones(goal.size, bool) if stay is None else state_mask(model.nominal, stay, "stay")
     weight = numbers("initial", model.initial if initial is None else initial)
     value, policy = np.asarray(solution.value, np.float64), np.asarray(solution.policy)
     if weight.shape != goal.shape or value.shape != goal.shape:
@@ -125,7 +125,7 @@ def _visits(chain: HostMDP, goal: Booleans, stay: Booleans, weight: Floats) -> F
     from scipy.sparse import csc_array, eye_array
     from scipy.sparse.linalg import splu
 
-    open_ = reaching(chain, goal, stay[chain.state]) & stay & ~goal
+    open_ = backward_reachable(chain, goal, stay[chain.state]) & stay & ~goal
     states: Integers = np.flatnonzero(open_)
     found = np.zeros(goal.size)
     if not (weight[states] != 0).any():

@@ -14,7 +14,11 @@ from jaxltl.core.sparse.interval.step_bounded import RobustSteps
 from jaxltl.core.types import Method, Solution
 from jaxltl.core.validation import whole
 from jaxltl.core.values.interval.robust import entry_reward, require_direction
-from jaxltl.core.values.undiscounted.step_bounded import enclosed, state_reward, states
+from jaxltl.core.values.undiscounted.step_bounded import (
+    solution_from_error,
+    state_reward,
+    state_mask,
+)
 
 
 def robust_next_probability(
@@ -45,7 +49,7 @@ def robust_next_probability(
       [0.5, 1.0]
     """
     nature = require_direction(nature, objective)
-    chosen = states(require_interval(model).nominal, target, "target")
+    chosen = state_mask(require_interval(model).nominal, target, "target")
     return _solution(
         interval_bounded.next_step(
             model.host, chosen, maximize=objective == "max", helpful=nature == "max"
@@ -90,8 +94,8 @@ def robust_bounded_reachability(
       [0.9375, 1.0]
     """
     nature, steps = require_direction(nature, objective), whole("num_steps", num_steps)
-    goal = states(require_interval(model).nominal, target, "target")
-    free = np.ones_like(goal) if stay is None else states(model.nominal, stay, "stay")
+    goal = state_mask(require_interval(model).nominal, target, "target")
+    free = np.ones_like(goal) if stay is None else state_mask(model.nominal, stay, "stay")
     return _solution(
         interval_bounded.until(
             model.host, goal, free, steps, maximize=objective == "max", helpful=nature == "max"
@@ -193,7 +197,7 @@ def _earned(
 def _solution(found: RobustSteps, highest: float = 1) -> Solution:
     """What sweeps found, enclosed."""
     nature: Any = found.probability
-    solution = enclosed(
+    solution = solution_from_error(
         found.value, found.error, found.row.astype(np.int32), found.num_steps, highest=highest
     )
     return replace(solution, nature=nature, method=Method("step by step"))

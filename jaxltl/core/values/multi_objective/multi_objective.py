@@ -16,14 +16,19 @@ from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.graph.qualitative import end_components
 from jaxltl.core.sparse.multi_objective import pareto_front as frontier
-from jaxltl.core.sparse.multi_objective.weighted_sum import Ends, Sums, ends, weigh
-from jaxltl.core.sparse.product import HostProduct
+from jaxltl.core.sparse.multi_objective.weighted_sum import (
+    FinalComponents,
+    WeightedProblem,
+    final_components,
+    weighted_optimum,
+)
+from jaxltl.core.sparse.product import SparseProduct
 from jaxltl.core.sparse.solvers import reachability as optimal
 from jaxltl.core.types import Status
 from jaxltl.core.validation import listed, shown
-from jaxltl.core.values.engine.host_solution import chain_of
-from jaxltl.core.values.multi_objective.objectives import Objective, Part, sums_of
-from jaxltl.core.values.undiscounted.sparse_satisfaction import as_sparse
+from jaxltl.core.values.engine.host_solution import induced_chain
+from jaxltl.core.values.multi_objective.objectives import Objective, Part, weighted_problem
+from jaxltl.core.values.undiscounted.sparse_satisfaction import sparse_mdp_of_product
 from jaxltl.core.values.undiscounted.step_bounded import TOLERANCE
 
 __all__ = [
@@ -70,7 +75,7 @@ class Front(NamedTuple):
     normals: np.ndarray
     bounds: np.ndarray
     policies: tuple[np.ndarray, ...]
-    product: HostProduct
+    product: SparseProduct
 
 
 @brief
@@ -363,7 +368,7 @@ def multi_objective(
     return search.best(free[0], wanted, max_points)
 
 
-def nearest_of(
+def nearest_mixture(
     front: Front, share: np.ndarray, thresholds: np.ndarray, signs: np.ndarray
 ) -> NearestMixture:
     """What a mixture of a front's policies attains, and misses of thresholds.
@@ -392,16 +397,16 @@ class _Search:
         if not objectives:
             raise ValueError("there is no objective; give at least one.")
         self.parts: list[Part]
-        self.sums: Sums
-        self.sums, self.parts, self.product = sums_of(self.model, objectives)
-        where = ends(self.sums)
+        self.sums: WeightedProblem
+        self.sums, self.parts, self.product = weighted_problem(self.model, objectives)
+        where = final_components(self.sums)
         if where is None:
             names = " and ".join(str(p.number + 1) for p in self.parts if p.kind == "cost")
             raise ValueError(
                 f"the expected reward of objective {names or 1} is infinite under every policy: "
                 "what it counts goes on for ever, or its target is not reached almost surely."
             )
-        self.where: Ends = where
+        self.where: FinalComponents = where
         self._require_finite()
         self.signs = np.array([p.sign for p in self.parts])
         self.tolerance = tolerance
@@ -455,7 +460,7 @@ class _Search:
         }
         for part, w in zip(self.parts, normal, strict=True):
             weights[part.kind][part.place] = w
-        found = weigh(
+        found = weighted_optimum(
             self.sums,
             self.where,
             weights["sure"],
@@ -480,8 +485,8 @@ class _Search:
         self, weight: np.ndarray, home: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """What a policy attains, with bounds, all to be made large."""
-        sums, sparse = self.sums, as_sparse(self.product)
-        chain = chain_of(sparse, sparse, weight)
+        sums, sparse = self.sums, sparse_mdp_of_product(self.product)
+        chain = induced_chain(sparse, sparse, weight)
         inside = (weight > 0) & home[sums.mdp.state]
         component = end_components(sums.mdp, rows=inside).component
         found = []
@@ -593,7 +598,7 @@ class _Search:
                 lower, np.stack(self.normals), np.array(self.bounds), index, enough, self.scale
             )
             share = found.share if np.isfinite(found.lower) else share
-        return nearest_of(self.front(), share, self.signs * wanted, self.signs)
+        return nearest_mixture(self.front(), share, self.signs * wanted, self.signs)
 
     def best(self, index: int, wanted: np.ndarray, max_points: int) -> ConstrainedOptimum:
         """The best value of one objective, the others being at least something."""

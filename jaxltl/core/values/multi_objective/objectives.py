@@ -11,11 +11,11 @@ import numpy as np
 from jaxltl.core.automata.runs import live_states, universal_states
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief
-from jaxltl.core.sparse.multi_objective.weighted_sum import Sums
-from jaxltl.core.sparse.product import HostProduct, host_product
+from jaxltl.core.sparse.multi_objective.weighted_sum import WeightedProblem
+from jaxltl.core.sparse.product import SparseProduct, sparse_product
 from jaxltl.core.values import facts
-from jaxltl.core.values.undiscounted.sparse_satisfaction import automaton_of
-from jaxltl.core.values.undiscounted.step_bounded import finite_reward, states
+from jaxltl.core.values.undiscounted.sparse_satisfaction import automaton_and_letters
+from jaxltl.core.values.undiscounted.step_bounded import finite_reward, state_mask
 
 _MOST = 8  # probabilities at once, of which all sets are looked at
 
@@ -99,9 +99,9 @@ class _Tracker(NamedTuple):
     verdict: np.ndarray | None
 
 
-def sums_of(
+def weighted_problem(
     model: SparseMDP, objectives: Sequence[Objective]
-) -> tuple[Sums, list[Part], HostProduct]:
+) -> tuple[WeightedProblem, list[Part], SparseProduct]:
     """The objectives as sums on the model beside what they remember, as far as it is reached."""
     rewards = [_checked(model, i, o) for i, o in enumerate(objectives)]
     trackers = [_tracker(model, o, r is not None) for o, r in zip(objectives, rewards, strict=True)]
@@ -145,7 +145,7 @@ def sums_of(
     start[product.start] = initial[initial > 0]
     shape = (-1, mdp.num_rows)
     return (
-        Sums(
+        WeightedProblem(
             mdp,
             start,
             np.array(found["sure"], np.int64).reshape(shape),
@@ -188,7 +188,7 @@ def _checked(model: SparseMDP, index: int, objective: Objective) -> np.ndarray |
 def _tracker(model: SparseMDP, objective: Objective, is_reward: bool) -> _Tracker | None:
     opposite = objective.direction == "min"
     if objective.formula is not None:
-        automaton, letter = automaton_of(model, objective.formula)
+        automaton, letter = automaton_and_letters(model, objective.formula)
         yes, no = universal_states(automaton), ~live_states(automaton)
         return _Tracker(
             automaton.delta,
@@ -201,12 +201,12 @@ def _tracker(model: SparseMDP, objective: Objective, is_reward: bool) -> _Tracke
     if is_reward and objective.target is None:
         return None
     if objective.avoid is not None:
-        target, opposite = states(model, objective.avoid, "avoid"), not opposite
+        target, opposite = state_mask(model, objective.avoid, "avoid"), not opposite
     else:
-        target = states(model, objective.target, "target")
+        target = state_mask(model, objective.target, "target")
     letter = target.astype(np.int64)
     if objective.stay is not None:
-        letter[~states(model, objective.stay, "stay") & ~target] = 2
+        letter[~state_mask(model, objective.stay, "stay") & ~target] = 2
     # Open, met, missed.
     delta = np.array([[0, 1, 2], [1, 1, 1], [2, 2, 2]])
     decided = np.array([False, True, True])
@@ -224,7 +224,7 @@ def _tracker(model: SparseMDP, objective: Objective, is_reward: bool) -> _Tracke
 
 def _product(
     model: SparseMDP, trackers: list[_Tracker], all_end: bool
-) -> tuple[HostProduct, np.ndarray]:
+) -> tuple[SparseProduct, np.ndarray]:
     """The model beside all trackers, and the memory of each in each joint one, ``int[J, n]``."""
     first = np.flatnonzero(np.asarray(model.initial) > 0)
     letters: Any = np.zeros((model.num_states, len(trackers)), np.int64)
@@ -260,11 +260,11 @@ def _product(
     for i, x in enumerate(trackers):
         still &= x.decided[known[:, i]]
     memory = np.array([codes[tuple(x)] for x in begin.tolist()])
-    return host_product(model.host, delta, letter, first, memory, still=still), known
+    return sparse_product(model.host, delta, letter, first, memory, still=still), known
 
 
 def _priorities(
-    product: HostProduct, tracker: _Tracker, memory: np.ndarray, still: np.ndarray
+    product: SparseProduct, tracker: _Tracker, memory: np.ndarray, still: np.ndarray
 ) -> np.ndarray:
     """The least priority that each row reads, ``int[R']``."""
     mdp = product.host

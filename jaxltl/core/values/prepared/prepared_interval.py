@@ -22,7 +22,7 @@ from jaxltl.core.sparse.prepared.interval_plan import (
     plan_reachability,
     plan_total_reward,
 )
-from jaxltl.core.sparse.rows import spans
+from jaxltl.core.sparse.rows import concatenated_ranges
 from jaxltl.core.types import Method, Solution, Status, require_shape, status_code
 from jaxltl.core.validation import numbers, shown, whole
 from jaxltl.core.values import facts
@@ -38,7 +38,7 @@ from jaxltl.core.values.interval.contest import (
     system,
 )
 from jaxltl.core.values.interval.robust import interval_reward, require_direction, width_asked
-from jaxltl.core.values.undiscounted.step_bounded import states
+from jaxltl.core.values.undiscounted.step_bounded import state_mask
 
 _LOOSE = 1e-6  # how far ends may miss a distribution, as in the models
 
@@ -161,8 +161,8 @@ def prepare_interval(
     if stay is not None and reward is not None:
         raise ValueError("expected rewards are until the target alone: leave stay out.")
     nature = require_direction(nature, objective)
-    target = states(model.nominal, target, "target")
-    stay = None if stay is None else states(model.nominal, stay, "stay")
+    target = state_mask(model.nominal, target, "target")
+    stay = None if stay is None else state_mask(model.nominal, stay, "stay")
     host: HostInterval = model.host
     entry: Any = np.arange(model.num_transitions)
     if policy is not None:
@@ -209,8 +209,8 @@ def _prepared(
     rows = plan.rows
     count = np.diff(mdp.entry_start)[rows]
     width = int(count.max(initial=1))
-    place = np.repeat(np.arange(rows.size), count), spans(np.zeros_like(count), count)
-    mine = spans(mdp.entry_start[rows], count)
+    place = np.repeat(np.arange(rows.size), count), concatenated_ranges(np.zeros_like(count), count)
+    mine = concatenated_ranges(mdp.entry_start[rows], count)
     nowhere = whole.num_transitions
     table, target = (np.full((rows.size, width), x, np.int32) for x in (nowhere, size))
     kept = plan.used[mine]

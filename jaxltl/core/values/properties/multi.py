@@ -22,7 +22,7 @@ from jaxltl.core.values.multi_objective.multi_objective import (
     Objective,
     Pareto,
     multi_objective,
-    nearest_of,
+    nearest_mixture,
 )
 from jaxltl.core.values.properties.solve_property import TOLERANCE
 
@@ -102,7 +102,7 @@ def _missing(prop: Property, loose: Achievable | ConstrainedOptimum) -> NearestM
     thresholds = np.array(
         [-s * np.inf if x is None else x for x, s in zip(wanted, signs, strict=True)]
     )
-    return nearest_of(loose.front, loose.share, thresholds, signs)
+    return nearest_mixture(loose.front, loose.share, thresholds, signs)
 
 
 def _solved(

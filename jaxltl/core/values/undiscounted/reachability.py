@@ -38,7 +38,7 @@ from jaxltl.core.models.ops.operators import (
 from jaxltl.core.models.ops.successor_tables import action_columns, table
 from jaxltl.core.models.product import Product
 from jaxltl.core.sparse.solvers import dense_reachability as host
-from jaxltl.core.sparse.solvers.layered_reachability import World, layered
+from jaxltl.core.sparse.solvers.layered_reachability import PaddedProduct, layered_reachability
 from jaxltl.core.sparse.solvers.shortest_path import quickest
 from jaxltl.core.types import Solution, Status, require_shape, status_code
 from jaxltl.core.values.engine.certificates import m_matrix_error, refuse, rounding_unit
@@ -244,7 +244,7 @@ def _by_layers(model: Any, target: Any, tolerance: Any, objective: str) -> Solut
         return None
     eps = float(np.finfo(np.dtype(model.dtype)).eps)
     width = max(4 * eps, 1e-11) if tolerance is None else 2 * float(tolerance) - 4 * eps
-    beside = World(
+    beside = PaddedProduct(
         np.asarray(world.successor),
         support(world),
         np.asarray(world.probability),
@@ -255,7 +255,9 @@ def _by_layers(model: Any, target: Any, tolerance: Any, objective: str) -> Solut
     )
     if not width > 0:
         return None
-    found = layered(beside, np.asarray(target), maximize=objective == "max", tolerance=width)
+    found = layered_reachability(
+        beside, np.asarray(target), maximize=objective == "max", tolerance=width
+    )
     if found is None:
         return None
     half = (found.upper - found.lower) / 2

@@ -17,11 +17,16 @@ from jaxltl.core.models.product import Product
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.graph.accepting import accepting_region
-from jaxltl.core.sparse.product import HostProduct, host_product, without_memory
+from jaxltl.core.sparse.product import SparseProduct, sparse_product, product_without_memory
 from jaxltl.core.sparse.solvers.reachability import reachability
 from jaxltl.core.types import Solution, require_shape
 from jaxltl.core.values import facts
-from jaxltl.core.values.engine.host_solution import Chain, chain_of, default_tolerance, solution_of
+from jaxltl.core.values.engine.host_solution import (
+    Chain,
+    induced_chain,
+    default_tolerance,
+    solution_from_enclosure,
+)
 from jaxltl.core.values.undiscounted.complement import opposite_event
 
 
@@ -48,7 +53,7 @@ class Satisfaction(NamedTuple):
     solution: Solution
     automaton: Automaton
     letter: np.ndarray
-    product: HostProduct
+    product: SparseProduct
     row: np.ndarray
 
 
@@ -99,7 +104,7 @@ def sparse_satisfaction(
         raise ValueError(f'objective={objective!r}; it must be "max" or "min".')
     if label_on not in ("entry", "exit"):
         raise ValueError(f'label_on={label_on!r}; it must be "entry" or "exit".')
-    automaton, letter = automaton_of(model, task)
+    automaton, letter = automaton_and_letters(model, task)
     states = starting_states(model, states)
     yes, no = universal_states(automaton), ~live_states(automaton)
     on_entry = label_on == "entry"
@@ -132,7 +137,7 @@ def starting_states(model: Any, states: Any) -> np.ndarray:
 
 
 def _best(
-    product: HostProduct,
+    product: SparseProduct,
     automaton: Automaton,
     letter: np.ndarray,
     yes: np.ndarray,
@@ -161,9 +166,9 @@ def _best(
         aim = "max"
     else:
         aim = objective if not opposite else {"max": "min", "min": "max"}[objective]
-    whole = as_sparse(product)
+    whole = sparse_mdp_of_product(product)
     asked = default_tolerance(whole) if tolerance is None else float(tolerance)
-    found = solution_of(
+    found = solution_from_enclosure(
         whole,
         whole,
         reachability(product.host, goal, maximize=aim == "max", tolerance=asked, depth=depth),
@@ -214,7 +219,7 @@ def product_satisfaction(
     letter, shape = np.asarray(model.letter), model.state_shape
     on_entry = model.label_on == "entry"
     state, memory = (x.ravel() for x in np.indices(shape))
-    product = host_product(world.host, automaton.delta, letter, state, memory, on_entry=on_entry)
+    product = sparse_product(world.host, automaton.delta, letter, state, memory, on_entry=on_entry)
     depth = 0
     if policy is not None:
         chain = _chain(product, model, policy)
@@ -242,10 +247,10 @@ def product_satisfaction(
     return replace(found, **parts)
 
 
-def _chain(product: HostProduct, model: Product, policy: Any) -> Chain:
+def _chain(product: SparseProduct, model: Product, policy: Any) -> Chain:
     """The chain of a policy of the world's rows."""
     policy = np.asarray(policy)
-    written = as_sparse(product)
+    written = sparse_mdp_of_product(product)
     memory = product.memory[product.host.state]
     if is_deterministic(policy):
         require_shape("policy", policy, model.state_shape)
@@ -255,7 +260,7 @@ def _chain(product: HostProduct, model: Product, policy: Any) -> Chain:
         world: Any = model.mdp
         require_shape("policy", policy, (world.num_rows, model.num_memory))
         weight = policy[product.base_row, memory]
-    return chain_of(written, written, weight)
+    return induced_chain(written, written, weight)
 
 
 def _product(
@@ -265,17 +270,17 @@ def _product(
     states: np.ndarray,
     on_entry: bool,
     still: np.ndarray,
-) -> HostProduct:
+) -> SparseProduct:
     if still.size == 1 and not still.any():
-        return without_memory(model.host, states)
+        return product_without_memory(model.host, states)
     initial = np.broadcast_to(automaton.initial, states.shape)
     memory = automaton.delta[initial, letter[states]] if on_entry else initial
-    return host_product(
+    return sparse_product(
         model.host, automaton.delta, letter, states, memory, on_entry=on_entry, still=still
     )
 
 
-def automaton_of(model: SparseMDP, task: Task) -> tuple[Automaton, np.ndarray]:
+def automaton_and_letters(model: SparseMDP, task: Task) -> tuple[Automaton, np.ndarray]:
     """The automaton of a task over the letters of a model, and the letter of each state."""
     if not isinstance(task, Automaton):
         task = as_formula(task)
@@ -293,7 +298,7 @@ def automaton_of(model: SparseMDP, task: Task) -> tuple[Automaton, np.ndarray]:
     return automaton, index[number]
 
 
-def as_sparse(product: HostProduct) -> SparseMDP:
+def sparse_mdp_of_product(product: SparseProduct) -> SparseMDP:
     """A product as a model without labels, that starts where its runs do."""
     host = product.host
     initial = np.zeros(host.num_states)

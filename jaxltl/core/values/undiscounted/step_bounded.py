@@ -46,19 +46,19 @@ def next_probability(model: Any, target: Any, *, objective: str = "max") -> Solu
       ([0.25, 1.0], [0, 2])
     """
     model, operation = _problem(model, objective)
-    mdp, target = model.host, states(model, target, "target")
+    mdp, target = model.host, state_mask(model, target, "target")
     # One step of "until" in which the target counts only once it is entered.
     image = mdp.expectation(target.astype(np.float64))
     value = mdp.over_choices(operation, image)
     choose = np.logical_or if operation is np.maximum else np.logical_and
-    positive = mdp.over_choices(choose, mdp.support.lead_to(target))
-    sure = mdp.over_choices(choose, ~mdp.support.lead_to(~target))
+    positive = mdp.over_choices(choose, mdp.support.some_successor_in(target))
+    sure = mdp.over_choices(choose, ~mdp.support.some_successor_in(~target))
     error = value * host.relative_error(host.backup_unit(mdp), 1)
     value = np.where(sure, 1, np.where(positive, value, 0))
     _, row = mdp.first_choice(
         image == np.repeat(mdp.over_choices(operation, image), np.diff(mdp.row_start))
     )
-    return enclosed(value, np.where(sure | ~positive, 0, error), row, 1, highest=1)
+    return solution_from_error(value, np.where(sure | ~positive, 0, error), row, 1, highest=1)
 
 
 def bounded_reachability(
@@ -101,10 +101,10 @@ def bounded_reachability(
       [0.875, 1.0]
     """
     model, operation = _problem(model, objective, num_steps)
-    target = states(model, target, "target")
-    stay = np.ones_like(target) if stay is None else states(model, stay, "stay")
+    target = state_mask(model, target, "target")
+    stay = np.ones_like(target) if stay is None else state_mask(model, stay, "stay")
     found = host.until(model.host, target, stay, num_steps, operation, by_step)
-    return enclosed(found.value, found.error, found.row, found.num_steps, highest=1)
+    return solution_from_error(found.value, found.error, found.row, found.num_steps, highest=1)
 
 
 def cumulative_reward(
@@ -137,7 +137,7 @@ def cumulative_reward(
     earned, magnitude = finite_reward(model, reward)
     zero = np.zeros(model.num_states)
     found = host.total(model.host, earned, magnitude, zero, num_steps, operation, by_step)
-    return enclosed(found.value, found.error, found.row, found.num_steps)
+    return solution_from_error(found.value, found.error, found.row, found.num_steps)
 
 
 def instantaneous_reward(
@@ -172,7 +172,7 @@ def instantaneous_reward(
     start = state_reward(model, reward)
     zero = np.zeros(model.num_rows)
     found = host.total(model.host, zero, zero, start, num_step, operation, by_step)
-    return enclosed(found.value, found.error, found.row, found.num_steps)
+    return solution_from_error(found.value, found.error, found.row, found.num_steps)
 
 
 def reward_bounded_reachability(
@@ -218,8 +218,8 @@ def reward_bounded_reachability(
       [0.875, 1.0]
     """
     model, operation = _problem(model, objective)
-    mdp, target = model.host, states(model, target, "target")
-    stay = np.ones_like(target) if stay is None else states(model, stay, "stay")
+    mdp, target = model.host, state_mask(model, target, "target")
+    stay = np.ones_like(target) if stay is None else state_mask(model, stay, "stay")
     if not 0 <= bound < math.inf:
         raise ValueError(f"bound={bound}; it must be finite and not negative.")
     cost = _entry_reward(model, reward_parts(model, reward))
@@ -232,7 +232,7 @@ def reward_bounded_reachability(
     units, most = in_units(np.where((stay & ~target)[mdp.state[mdp.row]], cost, 0), bound)
     found = bounded_cost(mdp, target, stay, units, most, operation is np.maximum, by_level)
     error = np.where(found.open, found.error, 0)
-    return enclosed(found.value, error, found.row, most + 1, highest=1)
+    return solution_from_error(found.value, error, found.row, most + 1, highest=1)
 
 
 # --- what these and other host solvers share -----------------------------------------------------
@@ -240,10 +240,10 @@ def reward_bounded_reachability(
 
 def _problem(model: Any, objective: str, num_steps: int = 0) -> tuple[SparseMDP, Any]:
     whole("num_steps", num_steps)
-    return to_sparse(model), optimum_of(objective)
+    return to_sparse(model), reduction_for(objective)
 
 
-def optimum_of(objective: str) -> Any:
+def reduction_for(objective: str) -> Any:
     """``np.maximum`` or ``np.minimum``.
 
     Raises:
@@ -254,7 +254,7 @@ def optimum_of(objective: str) -> Any:
     return np.maximum if objective == "max" else np.minimum
 
 
-def states(model: SparseMDP, given: Any, name: str) -> np.ndarray:
+def state_mask(model: SparseMDP, given: Any, name: str) -> np.ndarray:
     """A set of states as ``bool[S]``, given so (in the model's shape) or by a label."""
     if isinstance(given, str):
         return np.asarray(model.states_where(given), bool)
@@ -332,7 +332,7 @@ def _entry_reward(model: SparseMDP, given: Rewards) -> np.ndarray:
     return found
 
 
-def enclosed(
+def solution_from_error(
     value: np.ndarray,
     error: Any,
     policy: Any,

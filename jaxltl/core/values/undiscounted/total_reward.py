@@ -19,11 +19,11 @@ from jaxltl.core.models.sparse import Rewards, SparseMDP, row_reward
 from jaxltl.core.sparse.solvers import reachability as optimal
 from jaxltl.core.types import Solution, require_shape
 from jaxltl.core.values.engine.host_solution import (
-    chain_of,
+    induced_chain,
     default_tolerance,
-    given_policy,
+    with_given_policy,
     is_sparse,
-    solution_of,
+    solution_from_enclosure,
 )
 from jaxltl.core.values.interval.robust import refuse_nature, robust_total_reward
 from jaxltl.core.values.undiscounted.traced_total_reward import total_reward_by_sweeps
@@ -116,7 +116,7 @@ def total_reward(
     asked = default_tolerance(model) if tolerance is None else float(tolerance)
     host, depth, maximize = sparse.host, 0, objective == "max"
     if policy is not None:
-        chain = chain_of(model, sparse, policy)
+        chain = induced_chain(model, sparse, policy)
         earned = chain.mean(earned, host.row_start)
         host, depth = chain.mdp, chain.depth
     if target is None:
@@ -127,7 +127,9 @@ def total_reward(
         found = optimal.total_reward(
             host, earned, target, maximize=maximize, tolerance=asked, depth=depth
         )
-    return given_policy(solution_of(model, sparse, found, asked, relative=True), policy)
+    return with_given_policy(
+        solution_from_enclosure(model, sparse, found, asked, relative=True), policy
+    )
 
 
 def _earned(model: Any, sparse: SparseMDP, reward: Any) -> np.ndarray:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxltl.core.sparse.graph import components
-from jaxltl.core.sparse.graph.components import reached, strong_components
+from jaxltl.core.sparse.graph.components import forward_reachable, strong_components
 
 
 @pytest.mark.parametrize("large", [-1, 10**9])
@@ -25,7 +25,7 @@ def test_components_and_searches_equal_the_closure(large, monkeypatch):
         np.testing.assert_array_equal(found, both.argmax(1))
         sizes |= set(both.sum(1).tolist())
         start = rng.random(num_nodes) < 0.3
-        np.testing.assert_array_equal(reached(source, target, start), reach[start].any(0))
+        np.testing.assert_array_equal(forward_reachable(source, target, start), reach[start].any(0))
     assert sizes >= {1, 2, 3, 4}
 
 

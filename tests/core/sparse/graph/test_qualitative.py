@@ -61,19 +61,23 @@ def test_searches():
         allowed = graph.available & (rng.random(graph.available.shape) < 0.8)
         kept = on_rows(sparse, allowed)
         for mask, pairs in ((None, None), (kept, allowed)):
-            found = sparse_graph.reaching(host, goal, mask)
+            found = sparse_graph.backward_reachable(host, goal, mask)
             np.testing.assert_array_equal(found, attract(graph, goal, pairs).region)
-            found, stays = sparse_graph.surely_reaching(host, goal, mask)
+            found, stays = sparse_graph.almost_sure_reachability(host, goal, mask)
             np.testing.assert_array_equal(found, surely(graph, goal, pairs).region)
-            inside = found[host.state] & ~host.support.lead_to(~found)
+            inside = found[host.state] & ~host.support.some_successor_in(~found)
             np.testing.assert_array_equal(stays, inside if mask is None else inside & mask)
-        np.testing.assert_array_equal(sparse_graph.forced(host, goal), ~avoid(graph, goal))
+        np.testing.assert_array_equal(
+            sparse_graph.positive_under_all_policies(host, goal), ~avoid(graph, goal)
+        )
         among = rng.random(host.num_states) < 0.8
         slow = goal.copy()
         for _ in range(host.num_states):
-            hit = host.support.lead_to(slow) | ~kept
+            hit = host.support.some_successor_in(slow) | ~kept
             slow |= among & host.over_choices(np.logical_and, hit)
-        np.testing.assert_array_equal(sparse_graph.forced(host, goal, kept, among), slow)
+        np.testing.assert_array_equal(
+            sparse_graph.positive_under_all_policies(host, goal, kept, among), slow
+        )
 
 
 @pytest.mark.usefixtures("way")

@@ -8,8 +8,8 @@ from jaxltl.core.models.sparse import make_sparse
 from jaxltl.core.sparse.linear import elimination
 from jaxltl.core.sparse.linear import fractions as exact
 from jaxltl.core.sparse.linear import topological_order as levels
-from jaxltl.core.sparse.linear.elimination import factors
-from jaxltl.core.sparse.linear.topological_order import Edges, components_in_order
+from jaxltl.core.sparse.linear.elimination import factorize
+from jaxltl.core.sparse.linear.topological_order import Edges, ordered_components
 from jaxltl.core.sparse.solvers.reachability import reachability
 
 
@@ -23,7 +23,7 @@ def random_rows(rng, size, components):
             rows[r, t] = rng.random()
     matrix = sparse.csr_array(0.9 * rows / np.maximum(rows.sum(1), 1)[:, None])
     every = sparse.csr_array(matrix[::2] + matrix[1::2])
-    return matrix, components_in_order(Edges(every.indptr, every.indices))
+    return matrix, ordered_components(Edges(every.indptr, every.indices))
 
 
 @pytest.mark.parametrize("way", ("together", "by degree", "apart", "swept", "some swept"))
@@ -45,7 +45,7 @@ def test_solutions(way, monkeypatch):
         found = None
         for _ in range(3):
             chosen = 2 * np.arange(size) + rng.integers(0, 2, size)
-            found = factors(rows, label, chosen) if found is None else found.other(chosen)
+            found = factorize(rows, label, chosen) if found is None else found.other(chosen)
             b = rng.random(size)
             expected = np.linalg.solve(np.eye(size) - rows[chosen].toarray(), b)
             np.testing.assert_allclose(found.solve(b), expected, rtol=1e-10)
@@ -101,7 +101,7 @@ def test_nothing_fills_between_large_components():
     host = rings(4000, np.random.default_rng(0))
     matrix = host.matrix[:-1][:, :-1]
     label = (np.arange(8000) < 4000).astype(int)
-    found = factors(matrix, label, np.arange(8000))
+    found = factorize(matrix, label, np.arange(8000))
     assert found.method == "policy iteration by elimination" and len(found.blocks) == 2
     assert found.fill < 10 * 8000
     b = np.random.default_rng(1).random(8000)

@@ -136,7 +136,7 @@ def test_what_mixes_slowly_is_left_to_others():
     ).host
     open_ = (np.arange(size) > 0) & (np.arange(size) < size - 1)
     goal = (np.arange(size) == 0).astype(float)
-    problem = transient.Transient(host, open_, goal, np.zeros(size))
+    problem = transient.ShortestPathProblem(host, open_, goal, np.zeros(size))
     assert mixing.by_sweeps(problem, maximize=True, tolerance=1e-8, relative=False) is None
     found = mixing.optimum(problem, maximize=True, tolerance=1e-8, relative=False)
     np.testing.assert_allclose(found.value, 1 - np.arange(size) / (size - 1), atol=1e-8)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from jaxltl.core.sparse.solvers.onward import carried_on
+from jaxltl.core.sparse.solvers.onward import propagate_improvements
 
 
 def value_of(matrix, known, chosen):
@@ -21,7 +21,9 @@ def test_along_a_chain_one_call_is_enough():
     )
     known = np.where(np.arange(2 * size) % 2 == 0, wait, 1.0)
     owner = np.repeat(np.arange(size), 2)
-    chosen = carried_on(matrix, known, owner, np.full(size, wait), 2 * np.arange(size), -1, 1e-9)
+    chosen = propagate_improvements(
+        matrix, known, owner, np.full(size, wait), 2 * np.arange(size), -1, 1e-9
+    )
     np.testing.assert_array_equal(chosen, 2 * np.arange(size) + 1)
 
 
@@ -35,7 +37,7 @@ def test_no_state_is_worse_off(sign):
         matrix, known = sparse.csr_array(0.95 * rows), rng.random(size * most)
         chosen = most * np.arange(size)
         before = value_of(matrix, known, chosen)
-        after = carried_on(
+        after = propagate_improvements(
             matrix, known, np.repeat(np.arange(size), most), before, chosen, sign, 1e-12
         )
         np.testing.assert_array_equal(after // most, np.arange(size))

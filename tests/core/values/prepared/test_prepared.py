@@ -12,7 +12,7 @@ from jaxltl.core.models.sparse import make_sparse
 from jaxltl.core.sparse.prepared import block_schedule as schedule
 from jaxltl.core.sparse.solvers import reachability as optimal
 from jaxltl.core.types import Status
-from jaxltl.core.values.engine.host_solution import chain_of
+from jaxltl.core.values.engine.host_solution import induced_chain
 from jaxltl.core.values.prepared.prepared import prepare, solve_prepared
 from tests.sparse_models import random_sparse
 from tests.support import lane
@@ -74,7 +74,7 @@ def by_host(model, target, stay, reward, maximize):
 
 
 def of_policy(model, policy, target, stay, reward):
-    chain = chain_of(model, model, policy)
+    chain = induced_chain(model, model, policy)
     if reward is None:
         return optimal.reachability(chain.mdp, target, maximize=True, stay=stay, depth=chain.depth)
     paid = chain.mean(reward, model.row_start)
