@@ -110,8 +110,8 @@ def run(size: int = 10, num_chains: tuple[int, ...] = (1024, 4096, 16384)) -> li
     game = safe_robots(size)
     reward = np.asarray(diagonal_reward(game), float)
     exact = exact_value(game, reward)
-    measured = maximin_q.recurrent_states(maximin_q.make_problem(game, reward))
-    problem = maximin_q.make_problem(game, reward, exact=exact, measured=measured)
+    problem = maximin_q.make_problem(game, reward)
+    problem = maximin_q.with_exact_value(problem, exact, maximin_q.recurrent_states(problem))
     play = make_peer(game, reward)
     play(10)
     rows = []

@@ -274,9 +274,14 @@ def lacking_in_class(kind, text):
     return lacks
 
 
+# Documented once for all learners, in jaxltl.algos.common.learner.
+PROTOCOL = ("init", "step", "run", "train", "run_until", "train_until", "policy", "measure")
+
+
 def lacking(path):
     """What the text of a public thing lacks, in words."""
     thing, name = EVERYTHING[path], path.rpartition(".")[2]
+    of_protocol = path.startswith("jaxltl.algos.") and name in (*PROTOCOL, "State", "Metrics")
     if isinstance(thing, functools.partial) or not (
         inspect.isfunction(inspect.unwrap(thing)) or isinstance(thing, type)
     ):
@@ -288,10 +293,10 @@ def lacking(path):
     lacks = [] if text.split("\n\n")[0].rstrip().endswith((".", ":", "``", "?")) else ["a sentence"]
     if isinstance(thing, type):
         lacks += lacking_in_class(thing, text)
-    else:
+    elif not of_protocol:
         lacks += lacking_in_function(inspect.unwrap(thing), text, name not in PUBLIC)
     examples = examples_in(text)
-    if not examples and not shown_in_module(path):
+    if not examples and not of_protocol and not shown_in_module(path):
         lacks.append("an example")
     if any(x.want.count("\n") > 8 or len(max(x.want.split("\n"), key=len)) > 99 for x in examples):
         lacks.append("an example that shows no more than is read")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import jax
@@ -113,8 +112,8 @@ def _example_1(size: int) -> tuple[dict[str, Any], dict[str, Any]]:
     found, synthesis_seconds = _timed(synthesize)
     game = found.model
     exact = _value(game)
-    problem = maximin_q.make_problem(game, diagonal_reward(game), exact=exact)
-    problem = replace(problem, measured=maximin_q.recurrent_states(problem))
+    problem = maximin_q.make_problem(game, diagonal_reward(game))
+    problem = maximin_q.with_exact_value(problem, exact, maximin_q.recurrent_states(problem))
     hparams = maximin_q.Hparams(discount=DISCOUNT, num_chains=1024, moves_per_step=16)
     (state, metrics), learning_seconds = _timed(lambda: _learn(problem, hparams))
     system = np.asarray(game.system)

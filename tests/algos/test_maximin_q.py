@@ -98,7 +98,7 @@ def exact_problem(size: int, **options: Any) -> maximin_q.Problem:
     measured = maximin_q.recurrent_states(problem)
     if problem.method == "maximin":
         measured = measured & safe.part.system
-    return maximin_q.make_problem(safe.part, safe.reward, exact=exact, measured=measured, **options)
+    return maximin_q.with_exact_value(problem, exact, measured)
 
 
 @pytest.mark.slow
@@ -179,12 +179,8 @@ def test_the_largest_published_example_is_learned():
 def test_restarts_reach_states_without_predecessors():
     safe = safe_robots(3)
     everywhere = np.full(safe.part.num_states, 1 / safe.part.num_states)
-    problem = maximin_q.make_problem(
-        safe.part,
-        safe.reward,
-        start=everywhere,
-        exact=minimax_value(safe.part, safe.reward, 0.9),
-    )
+    problem = maximin_q.make_problem(safe.part, safe.reward, start=everywhere)
+    problem = maximin_q.with_exact_value(problem, minimax_value(safe.part, safe.reward, 0.9))
     hparams = maximin_q.Hparams(discount=0.9, num_chains=256, restart=0.05)
     state, metrics = train(problem, hparams, 120)
     assert metrics.visited[-1] == safe.part.available.sum()
@@ -405,7 +401,7 @@ def test_starts_are_drawn_as_given():
 # --- stopping ------------------------------------------------------------------------------------
 
 
-def test_a_run_ends_when_the_value_rests():
+def test_a_run_ends_when_the_value_is_stable():
     problem = exact_problem(3)
     hparams = maximin_q.Hparams(discount=0.9, num_chains=64, moves_per_step=64)
 
@@ -416,7 +412,7 @@ def test_a_run_ends_when_the_value_rests():
             hparams,
             check_every=20,
             num_steps=num_steps,
-            until=maximin_q.value_rests(tolerance),
+            until=maximin_q.value_is_stable(tolerance),
         )
 
     done = check(stop(1e-5, 2000))
@@ -436,7 +432,7 @@ def test_a_run_ends_when_the_value_rests():
         early.state,
         problem,
         hparams,
-        until=maximin_q.value_rests(1e-5),
+        until=maximin_q.value_is_stable(1e-5),
         num_steps=2000,
         check_every=20,
     )
@@ -453,7 +449,7 @@ def test_a_rest_before_all_is_seen_does_not_end_the_run():
     problem = maximin_q.make_problem(mdp, reward)
     hparams = maximin_q.Hparams(discount=0.5, num_chains=1, moves_per_step=4)
     done = maximin_q.train_until(
-        jax.random.key(0), problem, hparams, until=maximin_q.value_rests(1e-6), num_steps=100
+        jax.random.key(0), problem, hparams, until=maximin_q.value_is_stable(1e-6), num_steps=100
     )
     assert done.status == Status.CONVERGED
     assert done.num_steps >= length // 4
@@ -465,7 +461,7 @@ def test_values_that_are_not_numbers_are_told():
     problem = maximin_q.make_problem(mdp, [[1.0]])
     hparams = maximin_q.Hparams(discount=float("nan"), num_chains=2, moves_per_step=2)
     done = maximin_q.train_until(
-        jax.random.key(0), problem, hparams, until=maximin_q.value_rests(1e-3), num_steps=100
+        jax.random.key(0), problem, hparams, until=maximin_q.value_is_stable(1e-3), num_steps=100
     )
     assert done.status == Status.NONFINITE
     assert done.num_steps < 100
@@ -537,8 +533,6 @@ def only(*rows):
             "environment: the row of state 1",
         ),
         (TURNS, np.zeros((2, 2)), {"environment": np.ones((2, 1))}, "environment has shape"),
-        (TURNS, np.zeros((2, 2)), {"exact": [0.0]}, "exact has shape"),
-        (TURNS, np.zeros((2, 2)), {"exact": [0.0, 0.0], "measured": [True]}, "measured has shape"),
         (TURNS, np.zeros((2, 2)), {"method": "sarsa"}, 'choose "generalized" or "maximin"'),
         (
             TURNS,
@@ -565,6 +559,16 @@ def test_bad_problems_are_refused(model, reward, options, message):
         maximin_q.make_problem(model, reward, **options)
 
 
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [(([0.0],), "exact has shape"), (([0.0, 0.0], [True]), "measured has shape")],
+)
+def test_bad_exact_values_are_refused(given, message):
+    problem = maximin_q.make_problem(TURNS, np.zeros((2, 2)))
+    with pytest.raises(ValueError, match=message):
+        maximin_q.with_exact_value(problem, *given)
+
+
 def test_masks_allow_only_what_there_is():
     mdp = make_mdp([[[0], [0]], [[1], [1]]], np.ones((2, 2, 1)), available=only([1, 0], [1, 1]))
     with pytest.raises(ValueError, match="state 0 has no action 1"):
@@ -581,7 +585,7 @@ def test_masks_allow_only_what_there_is():
         (TWO, {"per": "round"}, "per='round'; choose"),
         (TWO, {"num_chains": 0}, "num_chains=0"),
         (TWO, {"moves_per_step": 0}, "moves_per_step=0"),
-        (SPLIT, {}, "step_size=None replaces old values"),
+        (SPLIT, {}, "step_size=None is for deterministic games"),
         (TWO, {"step_power": 1.0}, "step_power needs a step_size"),
     ],
 )

@@ -1,29 +1,51 @@
-"""What learners that play share: checked rewards and distributions, and draws from them."""
+"""Explicit games for learners by simulation: validated inputs, and sampling inside ``jit``."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from numpy.typing import ArrayLike, NDArray
 
-from jaxltl.core.models.game import Game
+from jaxltl.core.models.game import Game, as_padded_game
+from jaxltl.core.models.mdp import MDP
 from jaxltl.core.types import require_shape
 
 # --- on the host ----------------------------------------------------------------------------
 
 
-def check_reward(game: Game, reward: Any) -> jax.Array:
-    """The checked reward, zero where there is no move; equal successors share one reward."""
+def explicit_game(game: object) -> Game:
+    """A game on a padded MDP; raises ValueError if its model is of another kind."""
+    game = as_padded_game(game)
+    if not isinstance(game.mdp, MDP):
+        raise ValueError(
+            f"the game's model is a {type(game.mdp).__name__}; learning plays in an explicit MDP: "
+            "pass restrict(game).model, or convert it."
+        )
+    return game
+
+
+def start_distribution(game: Game, start: ArrayLike | None) -> NDArray[np.float64]:
+    """The checked distribution over initial states, ``float64[S]``; default the game's."""
+    found = np.asarray(game.initial if start is None else start, float)
+    require_shape("start", found, (game.num_states,))
+    check_distributions("start", found[None], np.ones((1, game.num_states), bool))
+    return found
+
+
+def uniform_rows(mask: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """The uniform distribution over the actions of each row; zero for rows without any."""
+    return mask / np.maximum(mask.sum(-1, keepdims=True), 1)
+
+
+def check_reward(game: Game, reward: ArrayLike) -> jax.Array:
+    """The checked reward; zero where there is no action, averaged over equal successors."""
     reward = np.asarray(reward, float)
     used = np.asarray(game.mdp.probability) > 0
     if reward.ndim == 2:
-        require_shape("reward", reward, used.shape[:2])
         used = np.asarray(game.available)
-    else:
-        require_shape("reward", reward, used.shape)
+    require_shape("reward", reward, used.shape)
     wrong = np.argwhere(used & ~np.isfinite(reward))
     if wrong.size:
         raise ValueError(
@@ -32,7 +54,7 @@ def check_reward(game: Game, reward: Any) -> jax.Array:
         )
     reward = np.where(used, reward, 0)
     if reward.ndim == 3:
-        # Only the successor is seen, not which entry of the list it came from.
+        # Only the successor is observed, not its place in the list.
         successor, weight = np.asarray(game.mdp.successor), np.asarray(game.mdp.probability)
         same = (successor[..., :, None] == successor[..., None, :]) * weight[..., None, :]
         total = same.sum(-1)
@@ -42,57 +64,70 @@ def check_reward(game: Game, reward: Any) -> jax.Array:
 
 
 def check_distributions(
-    name: str, rows: np.ndarray, support: np.ndarray, skip: np.ndarray | bool = False
+    name: str,
+    rows: NDArray[np.float64],
+    support: NDArray[np.bool_],
+    skip: NDArray[np.bool_] | bool = False,
 ) -> None:
-    """Raises unless rows are distributions over a support, but for some rows."""
+    """Raises ValueError unless each row, but for those skipped, is a distribution on its support."""
     bad = ~np.isfinite(rows).all(-1) | (rows < 0).any(-1) | ((rows > 0) & ~support).any(-1)
     bad |= np.abs(rows.sum(-1) - 1) > 1e-6
     bad &= ~np.asarray(skip)
     if bad.any():
-        where = f" of state {int(np.argmax(bad))}" if len(rows) > 1 else ""
         raise ValueError(
-            f"{name}: the row{where} is no distribution over available moves: entries must be "
-            "at least 0, zero at others, and sum to 1."
+            f"{name}: the row of state {int(np.argmax(bad))} is no distribution over available "
+            "actions: entries must be at least 0, zero at other actions, and sum to 1."
             if len(rows) > 1
             else f"{name} is no distribution: entries must be at least 0 and sum to 1."
         )
 
 
-def cumulative(distribution: np.ndarray) -> np.ndarray:
-    """``uint32[S]`` for :func:`draw`: cumulative weights in units of ``2 ** -31``."""
+def environment_policy(
+    mask: NDArray[np.bool_], system: NDArray[np.bool_], environment: ArrayLike
+) -> NDArray[np.float64]:
+    """A checked policy ``float64[S, A]`` of the environment; rows of the system are uniform."""
+    environment = np.asarray(environment, float)
+    require_shape("environment", environment, mask.shape)
+    rows = np.where(system[:, None], uniform_rows(mask), environment)
+    check_distributions("environment", rows, mask, system)
+    return rows
+
+
+def cumulative(distribution: NDArray[np.float64]) -> NDArray[np.uint32]:
+    """Cumulative weights in units of ``2 ** -31``, ``uint32[S]``, for :func:`draw`."""
     total = np.rint(np.cumsum(distribution) * 2.0**31)
     last = np.flatnonzero(distribution > 0)[-1]
     total[last:] = 2.0**31
     return np.minimum(total, 2.0**31).astype(np.uint32)
 
 
-# --- for chains, compiled -------------------------------------------------------------------
+# --- inside jit -----------------------------------------------------------------------------
 
 
 def draw(table: jax.Array, words: jax.Array) -> jax.Array:
     """States drawn from a table of :func:`cumulative` weights by 32 random bits each.
 
-    The first entry above half of the word, by halving: ``searchsorted`` to the right, which the
-    last entry, ``2 ** 31``, is never passed by. Two halvings a pass: a pass costs more than they
-    do, and more of them would be computed anew by whatever reads the state.
+    ``searchsorted`` to the right by bisection; the last entry, ``2 ** 31``, exceeds every word's
+    upper half. Two bisections an iteration: the loop costs more than they do, and if it were
+    unrolled, XLA would recompute them in each consumer of the state.
     """
     point, size = words >> 1, len(table)
 
-    def halve_twice(i: jax.Array, first: jax.Array) -> jax.Array:
+    def bisect_twice(i: jax.Array, first: jax.Array) -> jax.Array:
         for step in (2 * i, 2 * i + 1):
-            half = ((size - 1 >> step) + 1) // 2  # of those that it may be, from the first
+            half = ((size - 1 >> step) + 1) // 2  # of the remaining candidates
             beyond = take(table, first + jnp.maximum(half, 1) - 1) <= point
             first = jnp.where(beyond, first + half, first)
         return first
 
     passes = -(-(size - 1).bit_length() // 2)
-    return lax.fori_loop(0, passes, halve_twice, jnp.zeros(point.shape, jnp.int32))
+    return lax.fori_loop(0, passes, bisect_twice, jnp.zeros(point.shape, jnp.int32))
 
 
 def observed_reward(
     game: Game, reward: jax.Array, state: jax.Array, action: jax.Array, successor: jax.Array
 ) -> jax.Array:
-    """The rewards of the transitions made, and of no others: one for each chain."""
+    """Rewards of observed transitions, one for each chain."""
     pair = state * game.num_actions + action
     if reward.ndim == 2:
         return take(reward.ravel(), pair)
@@ -103,13 +138,12 @@ def observed_reward(
 def successor_slot(
     game: Game, state: jax.Array, action: jax.Array, successor: jax.Array
 ) -> jax.Array:
-    """Where each successor stands in its list: the first place, or 0 if it is not there."""
+    """The first place of each successor in its list; 0 if it is not there."""
     mdp = game.mdp
     listed = mdp.successor[state, action] == successor[..., None]
-    found = listed & (mdp.probability[state, action] > 0)
-    return jnp.argmax(found, axis=-1).astype(jnp.int32)
+    return jnp.argmax(listed & (mdp.probability[state, action] > 0), axis=-1).astype(jnp.int32)
 
 
-def take(x: jax.Array, index: Any) -> jax.Array:
-    """Entries at places that are known to exist, without checks of bounds."""
+def take(x: jax.Array, index: jax.Array | tuple[jax.Array, ...]) -> jax.Array:
+    """Entries at indices known to be in bounds, without checks."""
     return x.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)

@@ -1,62 +1,48 @@
-"""Q-learning in turn-based games with unknown rewards (dissertation, section 5.4.2).
+"""Q-learning for two-player games with unknown rewards (dissertation, section 5.4.2).
 
-The system maximises, the environment minimises, and both play only moves that a mask
-allows, for example a permissive strategy's. Many chains play at once and share one table.
-A reward is read only of a move that was made.
+The system maximises and the environment minimises the discounted reward; both choose among the
+actions that a mask allows, such as a permissive strategy's. Parallel chains share one table.
 
-Two methods, chosen by ``make_problem(..., method=...)``. Generalized Q-learning for
-alternating Markov games (Littman and Szepesvari 1996) keeps a value for each move of
-either player::
+Generalized Q-learning for alternating Markov games (Littman and Szepesvari 1996), the default,
+has an entry for each state and action of either player::
 
     Q(s, a) <- (1 - alpha) Q(s, a) + alpha (r + g(s) V(t)),    s -a-> t,
-    V(t) = max_a Q(t, a) where the system moves, min_a Q(t, a) where the environment does,
+    V(t) = max_a Q(t, a) where the system moves, min_a Q(t, a) where the environment moves,
 
-with ``g(s) = discount`` at the system's states, and at the environment's 1 if the discount
-is paid per system move. Maximin Q-learning, a variation of minimax-Q (Littman 1994), keeps
-a value for each system move and answer, where turns strictly alternate::
+with ``g(s) = discount`` at the system's states, and 1 at the environment's unless every move is
+discounted. Maximin Q-learning, a variant of minimax-Q (Littman 1994) for strictly alternating
+turns, has an entry for each action of the system and each answer::
 
     Q(s, a, o) <- (1 - alpha) Q(s, a, o) + alpha (r + g(s) (r' + g(e) V(t))),  s -a-> e -o-> t,
     V(s) = max_a min_o Q(s, a, o).
 
-Both converge to the minimax value if every allowed move is made infinitely often and
-either the game is deterministic and ``alpha = 1``, or ``alpha`` decays as is usual.
+Both converge to the minimax value if every allowed action is taken infinitely often and either the
+game is deterministic and ``alpha = 1``, or ``alpha`` decays as usual in stochastic approximation.
 
-Example: in one state the system may stay or go to the other, which pays.
+Example: in one state the system may stay or move to the other state, where it is paid.
 
   >>> import jax
   >>> import jaxltl as jl
   >>> from jaxltl.algos import maximin_q
   >>> game = jl.make_game(jl.from_dense([[[1.0, 0], [0, 1.0]], [[0, 1.0], [0, 1.0]]]), [True, True])
   >>> problem = maximin_q.make_problem(game, [[0.0, 0.0], [1.0, 1.0]])
-  >>> hparams = maximin_q.Hparams(discount=0.5, restart=0.5, num_chains=4, moves_per_step=8)
-  >>> state, metrics = maximin_q.train(jax.random.key(0), problem, hparams, num_steps=10)
-  >>> [round(v, 3) for v in state.value.tolist()], metrics.violations[-1].item()
-  ([1.0, 2.0], 0)
-  >>> maximin_q.policy(state, problem, hparams).tolist()
-  [1, 0]
-  >>> maximin_q.recurrent_states(problem).tolist()  # nobody leaves the second
+  >>> maximin_q.recurrent_states(problem).tolist()
   [False, True]
-
-A run is made of steps, goes on from a state, and may end early:
-
-  >>> state = maximin_q.init(jax.random.key(0), problem, hparams)  # train is init and run
-  >>> state, metrics = maximin_q.run(state, problem, hparams, num_steps=10)  # step after step
-  >>> until = maximin_q.value_rests(1e-6)  # for run_until and train_until
-  >>> state.step.item()
-  10
-  >>> maximin_q.measure(state, problem, hparams).moves.item()  # of 4 chains, 8 a step
-  320.0
-
-Many seeds are ``jax.vmap(lambda key: train(key, problem, hparams, num_steps=...))(keys)``; so are
-many settings, by ``vmap`` over the numbers of ``Hparams``. End when
-the value rests by ``train_until(..., until=value_rests(1e-6), check_every=...)``.
+  >>> problem = maximin_q.with_exact_value(problem, [1.0, 2.0])
+  >>> hparams = maximin_q.Hparams(discount=0.5, restart=0.5, num_chains=4, moves_per_step=8)
+  >>> learned = maximin_q.train_until(jax.random.key(0), problem, hparams, num_steps=100,
+  ...                                 until=maximin_q.value_is_stable(1e-6))
+  >>> [round(v, 3) for v in learned.state.value.tolist()], learned.metrics.violations.item()
+  ([1.0, 2.0], 0)
+  >>> maximin_q.policy(learned.state, problem, hparams).tolist()
+  [1, 0]
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import chex
 import jax
@@ -65,59 +51,47 @@ import numpy as np
 from flax import struct
 from jax import lax
 from jax.tree_util import Partial
+from numpy.typing import ArrayLike, NDArray
 
-from jaxltl.algos.common import learner, splitmix
+from jaxltl.algos import learner, splitmix
+from jaxltl.algos.maximin_q.learner._chains import MOST_ACTIONS, alias_table, draw_alias
 from jaxltl.algos.common.play import (
-    check_distributions,
     check_reward,
     cumulative,
     draw,
+    environment_policy,
+    explicit_game,
+    observed_reward,
+    start_distribution,
     take,
+    uniform_rows,
 )
-from jaxltl.algos.maximin_q._chains import Table, alias_table, finite, move, reduce_last
 from jaxltl.core.graphs.end_components import bottom_components
 from jaxltl.core.models.build.restrict import restrict
-from jaxltl.core.models.game import Game, as_padded_game
-from jaxltl.core.models.mdp import MDP
-from jaxltl.core.models.ops.operators import action_argmax
+from jaxltl.core.models.game import Game
+from jaxltl.core.models.ops.operators import action_argmax, sample_successor
 from jaxltl.core.pretty_print import brief, history
 from jaxltl.core.types import Status, require_shape, status_code
 
-__all__ = [
-    "Hparams",
-    "Metrics",
-    "Problem",
-    "State",
-    "init",
-    "make_problem",
-    "measure",
-    "policy",
-    "recurrent_states",
-    "run",
-    "run_until",
-    "step",
-    "train",
-    "train_until",
-    "value",
-    "value_rests",
-]
+MOST_VISITS = 2**30  # counted; a step adds at most as many again
+_UNROLLED = 16  # actions up to which a maximum over them is unrolled, several times faster
 
 
 @brief
 @struct.dataclass
 class Problem:
-    """A game to play, with what the learner may not see before it plays.
+    """A game with rewards that the learner observes only along its transitions.
 
     Attributes:
       game: on an explicit MDP, such as ``restrict`` returns.
-      reward: ``float[S, A]`` or ``float[S, A, K]``, read only along moves that are made.
-      allowed: ``bool[S, A]``: the mask at the system's states, all moves at the environment's.
-      behavior: ``float[S, A]``, how moves are drawn where they are not greedy.
-      start: ``float[S]``, where chains begin and begin anew.
-      exact: ``float[S]``, the true value if it is known, to measure the error; else None.
+      reward: ``float[S, A]`` or ``float[S, A, K]``.
+      allowed: ``bool[S, A]``: the mask at the system's states, all actions at the environment's.
+      behavior: ``float[S, A]``, the exploring policy of both players.
+      start: ``float[S]``, distribution over the chains' initial states.
+      exact: ``float[S]``, the minimax value, to measure the error; or None.
       measured: ``bool[S]``, the states over which the error is measured; None with `exact`.
       behavior_table: ``uint32[S, A]``, `behavior` as alias tables.
-      start_table: ``uint32[S]``, `start` as cumulative thresholds.
+      start_table: ``uint32[S]``, `start` as cumulative weights.
       method: ``"generalized"`` or ``"maximin"``; static.
     """
 
@@ -126,39 +100,39 @@ class Problem:
     allowed: jax.Array
     behavior: jax.Array
     start: jax.Array
-    exact: Any
-    measured: Any
+    exact: jax.Array | None
+    measured: jax.Array | None
     behavior_table: jax.Array
     start_table: jax.Array
     method: str = struct.field(pytree_node=False, default="generalized")
+
+    @property
+    def is_maximin(self) -> bool:
+        """Whether the table has an entry for each answer of the environment."""
+        return self.method == "maximin"
 
 
 @brief
 @struct.dataclass
 class Hparams:
-    """How to learn. Numbers are traced, so new values do not recompile; None is static.
+    """Settings; numbers are traced, None is static.
 
     Attributes:
       discount: in [0, 1).
-      step_size: alpha; None is 1 for games without chance, where the new value replaces
-        the old one, which is fastest; default None.
-      step_power: with omega in (1/2, 1], the n-th visit of a pair has the step size
-        ``alpha / n ** omega``; None: always alpha. Near 1 the old is forgotten very slowly
-        (Even-Dar and Mansour 2003). Default None.
-      epsilon: the system plays greedily with probability ``1 - epsilon``; None: never;
-        default None.
-      environment_epsilon: the same for the environment, which is then adversarial; default None.
-      epsilon_decay: both epsilons are multiplied by ``epsilon_decay ** step``; default 1.0.
-      epsilon_min: and are at least this; default 0.0.
-      restart: the probability with which a chain starts anew at the beginning of a step;
-        default 0.0.
-      initial_value: of every entry of the table. The environment's untried moves count.
-        Default 0.0.
-      per: ``"system_move"`` or ``"move"``: which moves pay the discount; static;
+      step_size: alpha in (0, 1]; None: 1, for deterministic games; default None.
+      step_power: omega in (1/2, 1]: the n-th visit of an entry has the step size
+        ``alpha / n ** omega``. Near 1 early targets are forgotten very slowly (Even-Dar and Mansour
+        2003). None: constant alpha; default None.
+      epsilon: the system is greedy with probability ``1 - epsilon``; None: never; default None.
+      environment_epsilon: the same of the environment, which is then adversarial; default None.
+      epsilon_decay: factor of both epsilons per step; default 1.0.
+      epsilon_min: lower bound of both epsilons; default 0.0.
+      restart: probability that a chain restarts at the beginning of a step; default 0.0.
+      initial_value: of every entry. Untried answers of the environment count. Default 0.0.
+      per: which moves are discounted, ``"system_move"`` or ``"move"``; static;
         default ``"system_move"``.
-      num_chains: static; default 1024.
-      moves_per_step: of each chain; static. A step reports once, so few moves cost more each.
-        Default 64.
+      num_chains: parallel chains; static; default 1024.
+      moves_per_step: moves of each chain in a step; static. Default 64.
     """
 
     discount: jax.Array | float
@@ -178,22 +152,22 @@ class Hparams:
 @brief
 @struct.dataclass
 class State:
-    """A table on its way, and the chains that fill it.
+    """The table, and the chains that update it.
 
     Attributes:
-      key: of the whole run.
+      key: root key of the run.
       step: ``int32[]``, steps made.
-      q: ``float[S, A]``, or ``float[S, A, A]`` of a system state, its move and the answer;
-        minus infinity at system moves that are not allowed, plus infinity at the
-        environment's, so that maxima and minima pass over them.
-      visits: ``int32`` like `q`, how often each entry was updated, counted up to 2^30.
+      q: ``float[S, A]``, or ``float[S, A, A]`` over the system's states, actions and answers;
+        minus infinity where the system and plus infinity where the environment has no allowed
+        action, the neutral elements of maxima and minima.
+      visits: ``int32`` like `q`, updates of each entry, counted up to 2^30.
       value: ``float[S]``, of `q`.
-      residual: ``float[]``, the largest change of `value` in the last step.
-      violations: ``int32[]``, moves made that were not allowed, of all chains. It stays zero.
-      position: ``int32[num_chains]``, where the chains are.
-      pending: ``int32[num_chains]``, the system's move ``s * A + a`` that waits for its
-        answer, or -1; None unless the method is maximin.
-      held: ``float[num_chains]``, the reward of that move; None likewise.
+      residual: ``float[]``, largest change of `value` in the last step.
+      violations: ``int32[]``, actions outside of the mask that were taken: zero.
+      position: ``int32[num_chains]``, states of the chains.
+      pending: ``int32[num_chains]``, the system's pair ``s * A + a`` that awaits its answer, or
+        -1; None unless the method is maximin.
+      pending_reward: ``float[num_chains]``, the reward of that pair; None likewise.
     """
 
     key: jax.Array
@@ -204,8 +178,8 @@ class State:
     residual: jax.Array
     violations: jax.Array
     position: jax.Array
-    pending: Any
-    held: Any
+    pending: jax.Array | None
+    pending_reward: jax.Array | None
 
 
 @brief(facts=partial(history, codes={"status": Status}))
@@ -214,13 +188,13 @@ class Metrics:
     """Figures after a step; scalars, of a run ``[T]``.
 
     Attributes:
-      residual: the largest change of the value in the step.
-      moves: made so far by all chains, as a float.
+      residual: largest change of the value in the step.
+      moves: of all chains since the beginning, as a float.
       visited: distinct entries of the table that were updated.
-      violations: moves made so far that were not allowed.
-      error: the largest error over the measured states; NaN where the value is not known.
-      status: NONFINITE if a value is no number, else CONVERGED: that it is the game's value is
-        not known; see :func:`value_rests`.
+      violations: actions outside of the mask that were taken.
+      error: largest error over the measured states; NaN if the value is unknown.
+      status: NONFINITE if a value is not finite, else CONVERGED, which does not certify the value;
+        see :func:`value_is_stable`.
     """
 
     residual: jax.Array
@@ -236,153 +210,130 @@ class Metrics:
 
 def make_problem(
     game: Any,
-    reward: chex.Array,
+    reward: ArrayLike,
     *,
-    allowed: chex.Array | None = None,
-    environment: chex.Array | None = None,
-    start: chex.Array | None = None,
-    exact: chex.Array | None = None,
-    measured: chex.Array | None = None,
-    method: str = "generalized",
+    allowed: ArrayLike | None = None,
+    environment: ArrayLike | None = None,
+    start: ArrayLike | None = None,
+    method: Literal["generalized", "maximin"] = "generalized",
 ) -> Problem:
-    """A checked :class:`Problem`, on the host.
+    """A checked :class:`Problem`.
 
     Args:
       game: a Game on an explicit MDP, or an MDP, in which the system always moves.
-      reward: ``float[S, A]`` or ``float[S, A, K]``, of the moves of both players.
+      reward: ``float[S, A]`` or ``float[S, A, K]``, of the actions of both players.
       allowed: ``bool[S, A]``, such as a permissive strategy's mask; default the available
-        moves. Only the system's states count: the environment is free.
-      environment: ``float[S, A]``, how the environment plays where it is not greedy;
-        default uniformly. Only its own states count. The value that is learned is a
-        minimum over all its moves, so it should try them all.
-      start: ``float[S]``, a distribution over the states where chains begin; default the
-        game's.
-      exact: ``float[S]``, the true value, to measure the error.
-      measured: ``bool[S]``, where to measure it, such as :func:`recurrent_states`; default
-        wherever a move is allowed (with maximin: at the system's states).
+        actions. Read at the system's states only.
+      environment: ``float[S, A]``, exploring policy of the environment; default uniform. It should
+        try every action, because the learned value is a minimum over all of them.
+      start: ``float[S]``, distribution of the chains' initial states; default the game's.
       method: ``"generalized"`` or ``"maximin"``.
 
     Returns:
       :class:`Problem`.
 
     Raises:
-      ValueError: a wrong shape, a reward that is not finite, a mask that allows a move
-        that does not exist or none in a state that can be reached, rows or a start that
-        are no distributions, or a game that does not fit the method.
-
-    Example:
-      >>> from jaxltl import from_dense
-      >>> mdp = from_dense([[[1.0, 0], [0, 1.0]], [[0, 1.0], [0, 1.0]]])
-      >>> problem = make_problem(mdp, [[0.0, 0.0], [1.0, 1.0]], allowed=[[False, True]] * 2)
-      >>> problem.allowed.tolist(), problem.method
-      ([[False, True], [False, True]], 'generalized')
+      ValueError: a wrong shape, a reward that is not finite, a mask that allows an unavailable
+        action or none in a reachable state, rows or a start that are no distributions, or a game
+        that does not fit the method.
     """
     if method not in ("generalized", "maximin"):
         raise ValueError(f'method={method!r}; choose "generalized" or "maximin".')
-    game = as_padded_game(game)
-    if not isinstance(game.mdp, MDP):
-        raise ValueError(
-            f"the game's model is a {type(game.mdp).__name__}; learning plays in an explicit MDP: "
-            "pass restrict(game).model, or convert it."
-        )
-    shape, system = (game.num_states, game.num_actions), np.asarray(game.system)
-    if shape[1] > 256:
-        raise ValueError(f"the game has {shape[1]} actions; drawing moves works up to 256.")
-    mask = _mask(game, system, allowed)
-    start = np.asarray(game.initial if start is None else start, float)
-    require_shape("start", start, shape[:1])
-    check_distributions("start", start[None], np.ones((1, shape[0]), bool))
+    game = explicit_game(game)
+    if game.num_actions > MOST_ACTIONS:
+        raise ValueError(f"the game has {game.num_actions} actions; at most {MOST_ACTIONS} work.")
+    system, mask = np.asarray(game.system), _mask(game, allowed)
+    start = start_distribution(game, start)
     reachable = np.asarray(restrict(game, start, allowed=mask).base_state)
     if method == "maximin":
-        _check_alternating(game, system, reachable)
-    behavior = _behavior(mask, system, environment)
-    if exact is not None:
-        exact = jnp.asarray(exact, game.dtype)
-        require_shape("exact", exact, shape[:1])
-        default = mask.any(-1) & (system if method == "maximin" else True)
-        measured = jnp.asarray(default if measured is None else measured, bool)
-        require_shape("measured", measured, shape[:1])
+        _check_alternating(game, reachable)
+    behavior = (
+        uniform_rows(mask) if environment is None else environment_policy(mask, system, environment)
+    )
     return Problem(
         game=game,
         reward=check_reward(game, reward),
         allowed=jnp.asarray(mask),
         behavior=jnp.asarray(behavior, game.dtype),
         start=jnp.asarray(start, game.dtype),
-        exact=exact,
-        measured=None if exact is None else measured,
+        exact=None,
+        measured=None,
         behavior_table=jnp.asarray(alias_table(behavior)),
         start_table=jnp.asarray(cumulative(start)),
         method=method,
     )
 
 
-def recurrent_states(problem: Problem) -> jax.Array:
-    """States that chains without restarts visit infinitely often, if nobody plays greedily.
-
-    They are the bottom components of the reachable part, ``bool[S]``; on the host.
+def with_exact_value(
+    problem: Problem, exact: ArrayLike, measured: ArrayLike | None = None
+) -> Problem:
+    """The `problem` with its known value, against which ``Metrics.error`` is measured.
 
     Args:
       problem: of :func:`make_problem`.
+      exact: ``float[S]``, the minimax value.
+      measured: ``bool[S]``, the states of the error, such as :func:`recurrent_states`; default
+        all with an allowed action (with maximin: of the system).
 
     Returns:
-      ``bool[S]``, for ``make_problem(..., measured=...)``.
+      :class:`Problem`.
+
+    Raises:
+      ValueError: a wrong shape.
+    """
+    exact = jnp.asarray(exact, problem.game.dtype)
+    if measured is None:
+        measured = problem.allowed.any(-1) & (problem.game.system | (not problem.is_maximin))
+    measured = jnp.asarray(measured, bool)
+    for name, array in (("exact", exact), ("measured", measured)):
+        require_shape(name, array, problem.start.shape)
+    return replace(problem, exact=exact, measured=measured)
+
+
+def recurrent_states(problem: Problem) -> jax.Array:
+    """The states of bottom strongly connected components under the exploring policy: ``bool[S]``.
+
+    Chains of the `problem` without restarts and greedy moves visit exactly these infinitely often.
     """
     part = restrict(problem.game, problem.start, allowed=problem.behavior > 0)
     inside = bottom_components(part.model, part.model.available).inside.any(-1)
-    found = np.zeros(problem.game.num_states, bool)
-    found[np.asarray(part.base_state)[np.asarray(inside)]] = True
-    return jnp.asarray(found)
+    recurrent = np.zeros(problem.game.num_states, bool)
+    recurrent[np.asarray(part.base_state)[np.asarray(inside)]] = True
+    return jnp.asarray(recurrent)
 
 
-def _mask(game: Game, system: np.ndarray, allowed: Any) -> np.ndarray:
-    available = np.asarray(game.available)
+def _mask(game: Game, allowed: ArrayLike | None) -> NDArray[np.bool_]:
+    """Actions of both players: allowed ones of the system, available ones of the environment."""
+    system, available = np.asarray(game.system)[:, None], np.asarray(game.available)
     if allowed is None:
         return available
-    allowed = np.asarray(allowed)
-    require_shape("allowed", allowed, available.shape)
-    if allowed.dtype != bool:
-        raise ValueError(f"allowed has dtype {allowed.dtype}; it must be bool.")
-    wrong = np.argwhere(allowed & ~available & system[:, None])
+    mask = np.asarray(allowed)
+    require_shape("allowed", mask, available.shape)
+    if mask.dtype != bool:
+        raise ValueError(f"allowed has dtype {mask.dtype}; it must be bool.")
+    wrong = np.argwhere(mask & ~available & system)
     if wrong.size:
-        raise ValueError(
-            f"allowed: state {wrong[0][0]} has no action {wrong[0][1]}; allow available "
-            "actions only."
-        )
-    return np.where(system[:, None], allowed, available)
+        s, a = wrong[0]
+        raise ValueError(f"allowed: state {s} has no action {a}; allow available actions only.")
+    return np.where(system, mask, available)
 
 
-def _behavior(mask: np.ndarray, system: np.ndarray, environment: Any) -> np.ndarray:
-    """Uniform over allowed moves, or the environment's rows where it moves."""
-    evenly = mask / np.maximum(mask.sum(-1, keepdims=True), 1)
-    if environment is None:
-        return evenly
-    environment = np.asarray(environment, float)
-    require_shape("environment", environment, mask.shape)
-    rows = np.where(system[:, None], evenly, environment)
-    check_distributions("environment", rows, mask, system)
-    return rows
-
-
-def _check_alternating(game: Game, system: np.ndarray, reachable: np.ndarray) -> None:
+def _check_alternating(game: Game, reachable: NDArray[np.integer]) -> None:
+    """Raises ValueError unless turns alternate and the system's actions are deterministic."""
+    system = np.asarray(game.system)
     used = np.asarray(game.mdp.probability) > 0
-    owner = system[np.asarray(game.mdp.successor)]
-    again = np.argwhere((used & (owner == system[:, None, None]))[reachable])
-    if again.size:
-        raise ValueError(
-            f"method='maximin' needs strictly alternating turns, but in state "
-            f"{reachable[again[0][0]]} action {again[0][1]} leads to a state of the same player; "
-            "use method='generalized'."
-        )
-    chance = np.argwhere(((used.sum(-1) > 1) & system[:, None])[reachable])
-    if chance.size:
-        raise ValueError(
-            f"method='maximin' needs system moves with one successor, but in state "
-            f"{reachable[chance[0][0]]} action {chance[0][1]} has several; use "
-            "method='generalized'."
-        )
-
-
-_MOST_VISITS = 2**30  # counted; a step adds at most as many again
+    same = used & (system[np.asarray(game.mdp.successor)] == system[:, None, None])
+    random = (used.sum(-1) > 1) & system[:, None]
+    for wrong, requirement, reason in (
+        (same, "strictly alternating turns", "leads to a state of the same player"),
+        (random, "system actions with one successor", "has several"),
+    ):
+        place = np.argwhere(wrong[reachable])
+        if place.size:
+            raise ValueError(
+                f"method='maximin' needs {requirement}, but in state {reachable[place[0][0]]} "
+                f"action {place[0][1]} {reason}; use method='generalized'."
+            )
 
 
 # --- the learner ----------------------------------------------------------------------------
@@ -390,30 +341,15 @@ _MOST_VISITS = 2**30  # counted; a step adds at most as many again
 
 @jax.jit
 def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
-    """A table of ``hparams.initial_value``, and chains at states drawn from the start.
-
-    Args:
-      key: a PRNG key, which the state keeps; ``vmap`` over keys for many seeds.
-      problem: of :func:`make_problem`.
-      hparams: :class:`Hparams`.
-
-    Returns:
-      :class:`State`, no step made.
-
-    Raises:
-      ValueError: unknown `per`, no chain or move, or no step size for a game with chance.
-    """
+    """A table of ``hparams.initial_value``, and chains at initial states."""
     _check(problem, hparams)
-    dtype, system = problem.game.dtype, problem.game.system
-    legal = problem.allowed
-    if problem.method == "maximin":
+    dtype, is_system, num_chains = problem.game.dtype, problem.game.system, hparams.num_chains
+    legal, neutral = problem.allowed, jnp.where(is_system, -jnp.inf, jnp.inf)[:, None]
+    if problem.is_maximin:
         legal = _answers(problem)
-        worst = jnp.where(problem.allowed & system[:, None], jnp.inf, -jnp.inf)[..., None]
-    else:
-        worst = jnp.where(system, -jnp.inf, jnp.inf)[:, None]
-    q = jnp.where(legal, jnp.asarray(hparams.initial_value, dtype), worst.astype(dtype))
-    words = jax.random.bits(learner.init_key(key), (hparams.num_chains,), jnp.uint32)
-    waiting = problem.method == "maximin"
+        neutral = jnp.where(problem.allowed & is_system[:, None], jnp.inf, -jnp.inf)[..., None]
+    q = jnp.where(legal, jnp.asarray(hparams.initial_value, dtype), neutral.astype(dtype))
+    words = jax.random.bits(learner.init_key(key), (num_chains,), jnp.uint32)
     return State(
         key=key,
         step=jnp.int32(0),
@@ -423,82 +359,59 @@ def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
         residual=jnp.asarray(jnp.inf, dtype),
         violations=jnp.int32(0),
         position=draw(problem.start_table, words),
-        pending=jnp.full(hparams.num_chains, -1, jnp.int32) if waiting else None,
-        held=jnp.zeros(hparams.num_chains, dtype) if waiting else None,
+        pending=jnp.full(num_chains, -1, jnp.int32) if problem.is_maximin else None,
+        pending_reward=jnp.zeros(num_chains, dtype) if problem.is_maximin else None,
     )
 
 
 def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
-    """``moves_per_step`` moves of every chain.
+    """``moves_per_step`` moves of every chain, each followed by an update of the table.
 
-    The chains move together: all read the table, then all write. Where m of them make the
-    same move from one state, all m take the step size a of its next visit, and together
-    do what m visits in turn would do with the mean of their targets::
+    All chains read the table, then all write. If m of them update one entry, they share the step
+    size a of its next visit, which equals m updates in sequence with the mean of their targets::
 
         Q <- (1 - a)^m Q + (1 - (1 - a)^m) mean.
-
-    Cost: a few nanoseconds for each move and allowed action, without arrays of their number.
-
-    Args:
-      state: of :func:`init` or of an earlier step; unchanged.
-      problem, hparams: as of :func:`init`.
-
-    Returns:
-      The next :class:`State`, and :class:`Metrics`, figures after the step.
     """
     _check(problem, hparams)
-    start_key, action_key, successor_key = (
+    restart_key, action_key, successor_key = (
         jax.random.fold_in(learner.step_key(state), i) for i in range(3)
     )
-    state = _restart(start_key, state, problem, hparams)
-    stream = splitmix.streams(action_key, (hparams.num_chains,))
-    table = Table(
-        state.q.ravel(),
-        state.visits.ravel(),
-        state.position,
-        take(problem.game.system, state.position),
-        state.pending,
-        state.held,
-        state.violations,
+    state = _restart(restart_key, state, problem, hparams)
+    sampling = _Sampling(
+        stream=splitmix.streams(action_key, (hparams.num_chains,)),
+        successor_key=successor_key,
+        epsilons=_epsilons(state.step, hparams),
     )
-    one = partial(move, problem, hparams, _epsilons(state.step, hparams), stream, successor_key)
+
+    def move(chains: _Chains, i: jax.Array) -> tuple[_Chains, None]:
+        return _move(chains, i, problem, hparams, sampling), None
+
+    flat = replace(state, q=state.q.ravel(), visits=state.visits.ravel())
     count = jnp.arange(hparams.moves_per_step, dtype=jnp.uint32)
-    table, _ = lax.scan(lambda t, i: (one(t, i), None), table, count)
-    q = table.q.reshape(state.q.shape)
+    (flat, _), _ = lax.scan(move, (flat, take(problem.game.system, state.position)), count)
+    q = flat.q.reshape(state.q.shape)
     updated = value(q, problem)
-    residual = jnp.max(jnp.abs(updated - state.value))
-    state = State(
-        key=state.key,
+    after = replace(
+        flat,
         step=state.step + 1,
         q=q,
-        visits=jnp.minimum(table.visits, _MOST_VISITS).reshape(q.shape),
+        visits=jnp.minimum(flat.visits, MOST_VISITS).reshape(q.shape),
         value=updated,
-        residual=residual,
-        violations=jnp.minimum(table.violations, _MOST_VISITS),
-        position=table.position,
-        pending=table.pending,
-        held=table.held,
+        residual=jnp.max(jnp.abs(updated - state.value)),
+        violations=jnp.minimum(flat.violations, MOST_VISITS),
     )
-    return state, measure(state, problem, hparams)
+    return after, measure(after, problem, hparams)
 
 
 run, train, run_until, train_until = learner.bind(init, step)
 
 
 def measure(state: State, problem: Problem, hparams: Hparams) -> Metrics:
-    """The :class:`Metrics` of a state.
-
-    Args:
-      state, problem, hparams: of a run.
-
-    Returns:
-      :class:`Metrics`, scalars.
-    """
+    """The :class:`Metrics` of a `state`."""
     dtype = problem.game.dtype
     error, finite = jnp.asarray(jnp.nan, dtype), jnp.all(jnp.isfinite(state.value))
     if problem.exact is not None:
-        gap = jnp.abs(state.value - problem.exact)
-        error = jnp.max(jnp.where(problem.measured, gap, 0))
+        error = jnp.max(jnp.where(problem.measured, jnp.abs(state.value - problem.exact), 0))
     return Metrics(
         residual=state.residual,
         moves=state.step.astype(dtype) * (hparams.num_chains * hparams.moves_per_step),
@@ -509,73 +422,192 @@ def measure(state: State, problem: Problem, hparams: Hparams) -> Metrics:
     )
 
 
-def value_rests(tolerance: chex.Numeric) -> learner.Until:
-    """A condition for :func:`run_until`: no state's value has changed by more than a tolerance.
+def value_is_stable(tolerance: chex.Numeric) -> learner.Until:
+    """A condition for ``run_until``: no value changed by more than `tolerance`, no entry is new.
 
-    A move that was made for the first time counts as a change. That the value rests is evidence
-    of convergence and no proof of it: the longer the window, ``check_every``, the better the
-    evidence.
-
-    Args:
-      tolerance: in units of the value, at least 0; traced.
-
-    Returns:
-      A condition, for ``until``.
+    Evidence of convergence, not a proof; a longer window ``check_every`` gives better evidence.
     """
-    return Partial(_value_rests, tolerance)
+    return Partial(_value_is_stable, tolerance)
 
 
-def _value_rests(tolerance: Any, before: State, after: State, metrics: Metrics) -> jax.Array:
+def _value_is_stable(tolerance: Any, before: State, after: State, metrics: Metrics) -> jax.Array:
     change = jnp.max(jnp.abs(after.value - before.value))
-    unseen = jnp.any((before.visits == 0) & (after.visits > 0))
-    # A run whose values are no numbers ends too, with the status that says so.
-    return ((change <= tolerance) & ~unseen) | jnp.isnan(change)
+    new = jnp.any((before.visits == 0) & (after.visits > 0))
+    return ((change <= tolerance) & ~new) | jnp.isnan(change)  # a run of NaN ends: NONFINITE
 
 
 def value(q: jax.Array, problem: Problem) -> jax.Array:
-    """The value of each state by a table: ``float[S]``.
+    """The value ``float[S]`` by a table `q` of a `problem`.
 
-    Zero where no move is allowed, and at the environment's states with maximin, whose
-    table holds none for them.
-
-    Args:
-      q: ``float[S, A]``, or ``float[S, A, A]`` with maximin; ``state.q``.
-      problem: of it.
-
-    Returns:
-      ``float[S]``, in units of the reward.
+    Zero where no action is allowed, and with maximin at the environment's states.
     """
-    if problem.method == "maximin":
-        return finite(reduce_last(jnp.maximum, reduce_last(jnp.minimum, q)))
-    least, most = reduce_last(jnp.minimum, q), reduce_last(jnp.maximum, q)
-    return finite(jnp.where(problem.game.system, most, least))
+    actions = _action_values(q)
+    least, most = _reduce(jnp.minimum, actions), _reduce(jnp.maximum, actions)
+    return _finite(jnp.where(problem.game.system, most, least))
 
 
 def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
-    """Each player's first best move by the table, ``int32[S]``.
+    """The greedy action of each player, ``int32[S]``; 0 where no action is allowed.
 
-    With maximin the environment's moves are its first ones: its best answer depends on the
-    system's move, and is the minimum of ``state.q[s, a]``.
-
-    Args:
-      state: of one run; ``vmap`` over several.
-      problem, hparams: of the run.
-
-    Returns:
-      ``int32[S]``; 0 where no move is allowed.
+    With maximin, action 0 of the environment's states stands for no answer: the best one, the
+    minimum of ``state.q[s, a]``, depends on the system's action.
     """
     del hparams
-    if problem.method == "maximin":
-        worst = jnp.where(problem.game.system[:, None], state.q.min(-1), 0)
-        return action_argmax(worst, problem.allowed)[1]
     sign = jnp.where(problem.game.system, 1, -1)[:, None]
-    return action_argmax(sign * state.q, problem.allowed)[1]
+    return action_argmax(sign * _action_values(state.q), problem.allowed)[1]
 
 
-def _restart(key, state: State, problem, hparams) -> State:
-    """Some chains start anew, and forget a move that waits for its answer."""
+# --- one move of all chains -------------------------------------------------------------------
 
-    def redraw(position, pending):
+_Chains = tuple[State, jax.Array]  # a state whose tables are flat, and where the system moves
+
+
+@struct.dataclass
+class _Sampling:
+    """Randomness of one step; an epsilon of None means never greedy."""
+
+    stream: splitmix.Stream
+    successor_key: jax.Array
+    epsilons: tuple[jax.Array | None, jax.Array | None]
+
+
+def _move(
+    chains: _Chains, i: jax.Array, problem: Problem, hparams: Hparams, sampling: _Sampling
+) -> _Chains:
+    """The i-th move of every chain, and the update of the table."""
+    state, is_system = chains
+    game, source = problem.game, state.position
+    action = _choose(chains, i, problem, sampling)
+    pair = source * game.num_actions + action
+    key = jax.random.fold_in(sampling.successor_key, i)
+    target = _sample(game, key, source, action)
+    reward = observed_reward(game, problem.reward, source, action, target)
+    discount = jnp.asarray(hparams.discount, state.q.dtype)
+    environment_discount = discount if hparams.per == "move" else jnp.ones_like(discount)
+    target_is_system = take(game.system, target)
+    ahead = _value_at(state.q, target, target_is_system, problem)
+    entry, pending, pending_reward = pair, None, None
+    if problem.is_maximin:
+        answered = ~is_system & (state.pending >= 0)
+        # Only an answer completes an entry; others are out of bounds and dropped.
+        entry = jnp.where(answered, state.pending * game.num_actions + action, state.q.size)
+        goal = state.pending_reward + discount * (reward + environment_discount * ahead)
+        pending, pending_reward = jnp.where(is_system, pair, -1), jnp.where(is_system, reward, 0)
+    else:
+        mine = is_system.astype(discount.dtype)
+        goal = reward + (mine * discount + (1 - mine) * environment_discount) * ahead
+    q, visits = _update(state, entry, goal, hparams, "drop" if problem.is_maximin else _IN_BOUNDS)
+    forbidden = jnp.sum(~take(problem.allowed.ravel(), pair), dtype=jnp.int32)
+    moved = replace(
+        state,
+        q=q,
+        visits=visits,
+        violations=state.violations + forbidden,
+        position=target,
+        pending=pending,
+        pending_reward=pending_reward,
+    )
+    return moved, target_is_system
+
+
+_IN_BOUNDS = "promise_in_bounds"
+
+
+def _update(
+    state: State, entry: jax.Array, goal: jax.Array, hparams: Hparams, mode: str
+) -> tuple[jax.Array, jax.Array]:
+    """The flat table and its visits after all chains have written."""
+    q, visits = state.q, state.visits
+    if hparams.step_size is None:
+        # In a deterministic game all chains at one entry have the same target.
+        return q.at[entry].set(goal, mode=mode), visits.at[entry].add(1, mode=mode)
+    inside = jnp.minimum(entry, q.size - 1)
+    before, old = take(visits, inside), take(q, inside)
+    visits = visits.at[entry].add(1, mode=mode)
+    together = (take(visits, inside) - before).astype(q.dtype)
+    size = jnp.asarray(hparams.step_size, q.dtype)
+    if hparams.step_power is not None:
+        size = size * (1 + before.astype(q.dtype)) ** -jnp.asarray(hparams.step_power, q.dtype)
+    share = (1 - (1 - size) ** together) / together
+    return q.at[entry].add(share * (goal - old), mode=mode), visits
+
+
+def _choose(chains: _Chains, i: jax.Array, problem: Problem, sampling: _Sampling) -> jax.Array:
+    """Each chain's action: greedy with the probability of its player, else by behavior."""
+    state, is_system = chains
+    words = splitmix.words(sampling.stream, 2 * i)
+    action = draw_alias(problem.behavior_table, state.position, words)
+    if sampling.epsilons == (None, None):
+        return action
+    best, known = _greedy(chains, problem)
+    drawn = splitmix.uniform(splitmix.words(sampling.stream, 2 * i + 1), state.q.dtype)
+    mine, theirs = (jnp.inf if e is None else e for e in sampling.epsilons)
+    return jnp.where(known & (drawn >= jnp.where(is_system, mine, theirs)), best, action)
+
+
+def _greedy(chains: _Chains, problem: Problem) -> tuple[jax.Array, jax.Array]:
+    """Each chain's greedy action, and whether the table determines one."""
+    state, is_system = chains
+    num_actions = problem.game.num_actions
+    rows, known = state.q.reshape(-1, num_actions), jnp.ones(is_system.shape, bool)
+    if problem.is_maximin:
+        mine = take(state.q.reshape(-1, num_actions, num_actions), state.position).min(-1)
+        row = jnp.where(is_system[:, None], mine, take(rows, jnp.maximum(state.pending, 0)))
+        known = is_system | (state.pending >= 0)
+    else:
+        row = take(rows, state.position)
+    return action_argmax(jnp.where(is_system[:, None], row, -row), jnp.bool_(True))[1], known
+
+
+def _value_at(q: jax.Array, state: jax.Array, is_system: jax.Array, problem: Problem) -> jax.Array:
+    """Values of the chains' states by a flat table, without computing those of all states.
+
+    The player differs from chain to chain at random: multiplying by signs is faster than selecting.
+    """
+    num_actions = problem.game.num_actions
+    if problem.is_maximin:
+        block = take(q.reshape(-1, num_actions, num_actions), state)
+        return _finite(_reduce(jnp.maximum, _action_values(block)))
+    sign = 2 * is_system.astype(q.dtype) - 1
+    if num_actions > _UNROLLED:
+        return sign * jnp.max(sign[:, None] * take(q.reshape(-1, num_actions), state), axis=-1)
+    best = sign * take(q, state * num_actions)
+    for a in range(1, num_actions):
+        best = jnp.maximum(best, sign * take(q, state * num_actions + a))
+    return sign * best
+
+
+def _action_values(q: jax.Array) -> jax.Array:
+    """Values ``float[S, A]`` of actions: with maximin, by the worst answer."""
+    return _reduce(jnp.minimum, q) if q.ndim == 3 else q
+
+
+def _reduce(function: jnp.ufunc, x: jax.Array) -> jax.Array:
+    """A reduction over the last axis, unrolled if that is short."""
+    if x.shape[-1] > _UNROLLED:
+        return function.reduce(x, axis=-1)
+    result = x[..., 0]
+    for i in range(1, x.shape[-1]):
+        result = function(result, x[..., i])
+    return result
+
+
+def _finite(x: jax.Array) -> jax.Array:
+    return jnp.where(jnp.isinf(x), 0, x)
+
+
+def _sample(game: Game, key: jax.Array, state: jax.Array, action: jax.Array) -> jax.Array:
+    """Successors of all chains; a deterministic game needs no keys."""
+    if game.num_successors == 1:
+        return jax.vmap(sample_successor, (None, None, 0, 0))(game, key, state, action)
+    keys = jax.random.split(key, state.shape[0])
+    return jax.vmap(sample_successor, (None, 0, 0, 0))(game, keys, state, action)
+
+
+def _restart(key: jax.Array, state: State, problem: Problem, hparams: Hparams) -> State:
+    """Chains restart with probability ``restart``, and drop their pending action."""
+
+    def redraw(position: jax.Array, pending: jax.Array | None) -> Any:
         words = jax.random.bits(key, (2, hparams.num_chains), jnp.uint32)
         anew = splitmix.uniform(words[0], state.value.dtype) < hparams.restart
         pending = None if pending is None else jnp.where(anew, -1, pending)
@@ -587,10 +619,10 @@ def _restart(key, state: State, problem, hparams) -> State:
     return replace(state, position=position, pending=pending)
 
 
-def _epsilons(step, hparams) -> tuple[Any, Any]:
-    """Both players' probabilities of not being greedy; None: never greedy."""
+def _epsilons(step: jax.Array, hparams: Hparams) -> tuple[jax.Array | None, jax.Array | None]:
+    """Both players' epsilons at a step."""
 
-    def at(epsilon):
+    def at(epsilon: jax.Array | float | None) -> jax.Array | None:
         if epsilon is None:
             return None
         decayed = epsilon * jnp.asarray(hparams.epsilon_decay) ** step
@@ -600,7 +632,7 @@ def _epsilons(step, hparams) -> tuple[Any, Any]:
 
 
 def _answers(problem: Problem) -> jax.Array:
-    """Which answers each system move leaves to the environment: ``bool[S, A, A]``."""
+    """The environment's answers to each action of the system: ``bool[S, A, A]``."""
     mdp = problem.game.mdp
     k = jnp.argmax(mdp.probability, axis=-1)[..., None]
     between = jnp.take_along_axis(mdp.successor, k, axis=-1)[..., 0]
@@ -609,22 +641,21 @@ def _answers(problem: Problem) -> jax.Array:
 
 
 def _check(problem: Problem, hparams: Hparams) -> None:
+    """Raises ValueError for static settings that are out of range or do not fit the game."""
     if hparams.per not in ("move", "system_move"):
         raise ValueError(f'per={hparams.per!r}; choose "move" or "system_move".')
-    if hparams.num_chains < 1 or hparams.moves_per_step < 1:
+    chains, moves = hparams.num_chains, hparams.moves_per_step
+    if chains < 1 or moves < 1:
+        raise ValueError(f"num_chains={chains}, moves_per_step={moves}; both must be at least 1.")
+    if chains * moves > MOST_VISITS:
         raise ValueError(
-            f"num_chains={hparams.num_chains}, moves_per_step={hparams.moves_per_step}; both "
-            "must be at least 1."
-        )
-    if hparams.num_chains * hparams.moves_per_step > _MOST_VISITS:
-        raise ValueError(
-            f"num_chains={hparams.num_chains} times moves_per_step={hparams.moves_per_step} is "
-            f"more than {_MOST_VISITS} moves; make them in several steps."
+            f"num_chains={chains} times moves_per_step={moves} is more than {MOST_VISITS} moves; "
+            "make them in several steps."
         )
     if hparams.step_size is None and problem.game.num_successors > 1:
         raise ValueError(
-            "step_size=None replaces old values, which is for games without chance (lists of "
-            "one successor); give a number, and a step_power to converge."
+            "step_size=None is for deterministic games (one successor for each action); give a "
+            "number, and a step_power to converge."
         )
     if hparams.step_size is None and hparams.step_power is not None:
         raise ValueError("step_power needs a step_size to start from; give step_size=1.0.")
