@@ -1,24 +1,23 @@
-"""Probably approximately correct learning of games: the constants, the bounds and the strategy.
+"""PAC constants, error bounds and epsilon-optimal strategies for stochastic Buchi games.
 
-The theory behind R-max in turn-based stochastic Buchi games (dissertation, chapter 6; Brafman
-and Tennenholtz 2002). `epsilon` is the loss that is to be had in the end, `reward_bound` bounds
-the rewards, which are not negative, and the discount is paid at every move.
+The theory of R-max (Brafman and Tennenholtz 2002) for turn-based stochastic games with an
+almost-sure Buchi objective (dissertation, chapter 6). Throughout, `epsilon` is the loss of value
+that the final strategy may have, rewards lie in ``[0, reward_bound]``, and every move is discounted
+by g, the `discount`; S and A count states and actions.
 
-The constants may be astronomical, so they are floats, and no intermediate result leaves the
-range of the dtype unless the constant itself does. All arguments may be traced.
+The constants may be astronomical, so they are floats, and intermediate results stay in the range of
+the dtype if the constant does. Arguments broadcast and may be traced; constants and bounds are
+differentiable in them where they are not clipped.
 
-The constants are functions of numbers and differentiable in them, where they are not cut off; games
-and strategies are made of concrete arrays.
-
-Example: how often a pair is to be tried in a game of 144 states, by theorem 6.
+Example: the visits of each pair that theorem 6 requires in a game of 144 states.
 
   >>> from jaxltl.algos.common import pac
   >>> numbers = dict(epsilon=1e-4, discount=0.6, reward_bound=1.0)
-  >>> print(f"{float(pac.visits(**numbers, failure=0.1, num_states=144, num_actions=6)):.2g}")
-  1.4e+19
-  >>> p = pac.exploration(**numbers)  # of any move, good or bad
+  >>> print(f"{float(pac.visits(**numbers, failure=0.1, num_states=144, num_actions=6)):.4e}")
+  1.4193e+19
+  >>> p = pac.exploration(**numbers)
   >>> gap = pac.hat_gap(p, pac.action_tolerance(1e-4, 0.6), 0.6, 1.0)
-  >>> round(float(gap / 1e-4), 6)  # a sixth of what may be lost
+  >>> round(float(gap / 1e-4), 6)  # a sixth of epsilon
   0.166667
 """
 
@@ -39,25 +38,17 @@ from jaxltl.core.types import Solution, require_shape
 
 
 def horizon(epsilon: chex.Numeric, discount: chex.Numeric, reward_bound: chex.Numeric) -> jax.Array:
-    """Moves after which what may still be paid is worth at most ``epsilon / 6``: N.
+    """The number N of moves after which all later rewards are worth at most ``epsilon / 6``.
 
-    ``N = log(epsilon (1 - g)^2 / (6 R)) / log g`` (dissertation, section 6.6.2), not rounded,
-    and at least 1. In the optimistic model a move pays up to ``R / (1 - g)``.
-
-    Args:
-      epsilon: positive.
-      discount: g, in (0, 1).
-      reward_bound: R, positive.
-
-    Returns:
-      ``float[]``, or as the arguments broadcast.
+    ``N = log(epsilon (1 - g)^2 / (6 R)) / log g`` for the `discount` g and the `reward_bound` R
+    (section 6.6.2), not rounded, at least 1. In the optimistic model a move pays up to R / (1 - g).
 
     Example:
       >>> round(float(horizon(1e-4, 0.6, 1.0)), 3)
       25.125
     """
     epsilon, discount, reward_bound = _floats(epsilon, discount, reward_bound)
-    # A sum of logarithms, since the product of small numbers may be zero.
+    # A sum of logarithms, since the product of small numbers may underflow.
     log_tail = jnp.log(epsilon) + 2 * jnp.log1p(-discount) - jnp.log(reward_bound) - jnp.log(6.0)
     return jnp.maximum(log_tail / jnp.log(discount), 1)
 
@@ -68,17 +59,10 @@ def accuracy(
     reward_bound: chex.Numeric,
     num_states: chex.Numeric,
 ) -> jax.Array:
-    """How well each transition probability has to be known: delta of algorithm 5, line 8.
+    """The required accuracy delta of transition probabilities (algorithm 5, line 8).
 
-    ``delta = epsilon (1 - g)^2 / (6 R S N)`` with N of :func:`horizon`, so that
-    :func:`approximation_gap` is ``epsilon / 6``. (In the dissertation N is written out.)
-
-    Args:
-      epsilon, discount, reward_bound: as in :func:`horizon`.
-      num_states: S.
-
-    Returns:
-      A float, or as the arguments broadcast.
+    ``delta = epsilon (1 - g)^2 / (6 R S N)`` for the `discount` g, the `reward_bound` R, S the
+    `num_states` and N of :func:`horizon`, so that :func:`approximation_gap` is ``epsilon / 6``.
 
     Example:
       >>> print(f"{float(accuracy(1e-4, 0.6, 1.0, 144)):.4g}")
@@ -88,8 +72,8 @@ def accuracy(
     epsilon, discount, reward_bound, num_states = _floats(
         epsilon, discount, reward_bound, num_states
     )
-    left = 1 - discount
-    return epsilon / reward_bound / num_states / steps / 6 * left * left
+    rest = 1 - discount
+    return epsilon / reward_bound / num_states / steps / 6 * rest * rest
 
 
 def hoeffding_visits(
@@ -98,19 +82,12 @@ def hoeffding_visits(
     num_states: chex.Numeric,
     num_actions: chex.Numeric,
 ) -> jax.Array:
-    """Visits after which all estimates of probabilities are good at once (lemma 11).
+    """The visits K after which all estimated probabilities are accurate at once (lemma 11).
 
-    ``K = log(2 A S^2 / failure) / (2 deviation^2)``: by Hoeffding's inequality and the union
-    over all ``S^2 A`` transitions, every relative frequency after K visits of its pair is within
-    `deviation` of the probability, but for a chance of at most `failure`.
-
-    Args:
-      deviation: positive.
-      failure: in (0, 1).
-      num_states, num_actions: S and A.
-
-    Returns:
-      A float, not rounded; infinite where the dtype ends.
+    ``K = log(2 A S^2 / failure) / (2 deviation^2)``, not rounded, for S `num_states` and A
+    `num_actions`: by Hoeffding's inequality and the union bound over all ``S^2 A`` transitions,
+    every relative frequency is within `deviation` of its probability except with probability
+    `failure`.
 
     Example:
       >>> round(float(hoeffding_visits(0.01, 0.1, 10, 2)))
@@ -131,24 +108,11 @@ def visits(
     num_states: chex.Numeric,
     num_actions: chex.Numeric,
 ) -> jax.Array:
-    """Visits after which a pair with several successors counts as known: K of algorithm 5.
+    """The visits K after which a pair with several successors is known (algorithm 5).
 
-    ``K = log(4 A S^2 / failure) / (2 delta^2)``: :func:`hoeffding_visits` at the deviation
-    delta of :func:`accuracy`, with half of `failure`; the other half is for the exploration
-    that takes longer than expected. A pair with one successor is known after one visit.
-
-    Args:
-      epsilon, discount, reward_bound: as in :func:`horizon`.
-      failure: the chance of not learning what is promised, in (0, 1): the dissertation's
-        delta_c, one minus the confidence.
-      num_states, num_actions: S and A.
-
-    Returns:
-      A float, or as the arguments broadcast.
-
-    Example:
-      >>> print(f"{float(visits(1e-4, 0.1, 0.6, 1.0, 144, 6)):.4e}")
-      1.4193e+19
+    :func:`hoeffding_visits` at the deviation of :func:`accuracy` for `epsilon`, `discount`,
+    `reward_bound`, `num_states` and `num_actions`, with half of `failure`, the dissertation's
+    delta_c; the other half covers exploration that takes longer than expected.
     """
     (failure,) = _floats(failure)
     delta = accuracy(epsilon, discount, reward_bound, num_states)
@@ -156,15 +120,9 @@ def visits(
 
 
 def action_tolerance(epsilon: chex.Numeric, discount: chex.Numeric) -> jax.Array:
-    """How far below the best a move may be that the strategy plays freely: eps_1.
+    """The tolerance ``eps_1 = epsilon (1 - g) / 12`` of near-optimal actions, g the `discount`.
 
-    ``eps_1 = epsilon (1 - g) / 12`` (algorithm 5, line 8).
-
-    Args:
-      epsilon, discount: as in :func:`horizon`.
-
-    Returns:
-      A float, or as the arguments broadcast.
+    Algorithm 5, line 8.
     """
     epsilon, discount = _floats(epsilon, discount)
     return epsilon / 12 * (1 - discount)
@@ -173,16 +131,10 @@ def action_tolerance(epsilon: chex.Numeric, discount: chex.Numeric) -> jax.Array
 def exploration(
     epsilon: chex.Numeric, discount: chex.Numeric, reward_bound: chex.Numeric
 ) -> jax.Array:
-    """The probability of playing any allowed move, good or bad: p of algorithm 5, line 8.
+    """The probability p of a uniformly drawn allowed action (algorithm 5, line 8).
 
-    ``p = epsilon (1 - g)^3 / (12 R)``, and at most 1. With :func:`action_tolerance` it makes
-    :func:`hat_gap` ``epsilon / 6``.
-
-    Args:
-      epsilon, discount, reward_bound: as in :func:`horizon`.
-
-    Returns:
-      A float, or as the arguments broadcast.
+    ``p = epsilon (1 - g)^3 / (12 R)``, at most 1, for the `discount` g and the `reward_bound` R.
+    With :func:`action_tolerance` it makes :func:`hat_gap` equal to ``epsilon / 6``.
     """
     epsilon, discount, reward_bound = _floats(epsilon, discount, reward_bound)
     return jnp.minimum(epsilon / reward_bound / 12 * (1 - discount) ** 3, 1)
@@ -197,20 +149,11 @@ def mixing_gap(
     discount: chex.Numeric,
     reward_bound: chex.Numeric,
 ) -> jax.Array:
-    """What rare bad moves and frequent nearly best ones cost at most (lemma 7).
+    """The largest loss of a strategy that mixes near-optimal and arbitrary actions (lemma 7).
 
     ``max(V* - V) <= p R / (1 - g)^2 + tolerance / (1 - g)`` for the worst-case value V of a
-    strategy that, wherever the system moves, plays moves that are more than `tolerance` below
-    the best with probability at most p.
-
-    Args:
-      probability: p, in [0, 1].
-      tolerance: at least 0.
-      discount: g, in [0, 1).
-      reward_bound: R; the rewards are in [0, R].
-
-    Returns:
-      A float, or as the arguments broadcast.
+    strategy that plays actions more than `tolerance` below the best with `probability` at most p;
+    g is the `discount` and R the `reward_bound`.
 
     Example:
       >>> round(float(mixing_gap(0.01, 0.1, 0.5, 1.0)), 6)
@@ -219,8 +162,8 @@ def mixing_gap(
     probability, tolerance, discount, reward_bound = _floats(
         probability, tolerance, discount, reward_bound
     )
-    left = 1 - discount
-    return probability * reward_bound / left / left + tolerance / left
+    rest = 1 - discount
+    return probability * reward_bound / rest / rest + tolerance / rest
 
 
 def hat_gap(
@@ -229,17 +172,10 @@ def hat_gap(
     discount: chex.Numeric,
     reward_bound: chex.Numeric,
 ) -> jax.Array:
-    """What strategies of the hat game cost at most in the optimistic model (lemma 8).
+    """The largest loss of hat-game strategies in the optimistic model (lemma 8).
 
-    ``p R / (1 - g)^3 + tolerance / (1 - g)``: :func:`mixing_gap`, where a move that is not
-    yet known pays ``R / (1 - g)``.
-
-    Args:
-      probability, tolerance, discount, reward_bound: as in :func:`mixing_gap`, R the bound
-        of the true rewards.
-
-    Returns:
-      A float, or as the arguments broadcast.
+    ``p R / (1 - g)^3 + tolerance / (1 - g)``: :func:`mixing_gap` of `probability`, `tolerance`,
+    `discount` and `reward_bound`, where an unknown action pays ``R / (1 - g)``.
     """
     discount, reward_bound = _floats(discount, reward_bound)
     return mixing_gap(probability, tolerance, discount, reward_bound / (1 - discount))
@@ -252,19 +188,11 @@ def approximation_gap(
     discount: chex.Numeric,
     reward_bound: chex.Numeric,
 ) -> jax.Array:
-    """How much inexact probabilities change what is paid in a number of moves (lemma 12).
+    """The largest change of an N-step value by inexact probabilities (lemma 12).
 
-    ``R S N deviation / (1 - g)^2``, for any strategies of both players, if the rewards are in
-    ``[0, R / (1 - g)]`` and no probability changes by more than `deviation`.
-
-    Args:
-      deviation: at least 0.
-      num_states: S.
-      num_steps: N, the moves that are counted.
-      discount, reward_bound: g and R.
-
-    Returns:
-      A float, or as the arguments broadcast.
+    ``R S N deviation / (1 - g)^2`` for any strategies of both players, if rewards lie in
+    ``[0, R / (1 - g)]`` and no probability changes by more than `deviation`; S is `num_states`, N
+    `num_steps`, g the `discount` and R the `reward_bound`.
 
     Example:
       >>> round(float(approximation_gap(1e-6, 10, 20, 0.5, 1.0)), 9)
@@ -273,23 +201,16 @@ def approximation_gap(
     deviation, num_states, num_steps, discount, reward_bound = _floats(
         deviation, num_states, num_steps, discount, reward_bound
     )
-    left = 1 - discount
-    return deviation * num_steps * num_states * reward_bound / left / left
+    rest = 1 - discount
+    return deviation * num_steps * num_states * reward_bound / rest / rest
 
 
 def epsilon_optimal_states(optimal: Solution, value: Solution, epsilon: chex.Numeric) -> jax.Array:
-    """Where a strategy is certainly within `epsilon` of the best: ``bool[S]``.
+    """The states in which a strategy is certified to be `epsilon`-optimal: ``bool[S]``.
 
-    Decided on the certified bounds, ``value.lower >= optimal.upper - epsilon``, so that a
-    True is proved, and a False may only mean that the bounds are too wide.
-
-    Args:
-      optimal: of :func:`~jaxltl.core.values.discounted.minimax.minimax_value`.
-      value: of :func:`~jaxltl.core.values.discounted.minimax.strategy_value`.
-      epsilon: at least 0.
-
-    Returns:
-      ``bool[S]``, in a product ``[S, Q]``.
+    ``value.lower >= optimal.upper - epsilon`` for the certified bounds of the `optimal` value
+    (``minimax_value``) and the strategy's `value` (``strategy_value``): True is proved, False may
+    only mean that the bounds are too wide.
 
     Example:
       >>> from types import SimpleNamespace
@@ -305,19 +226,11 @@ def epsilon_optimal_states(optimal: Solution, value: Solution, epsilon: chex.Num
 
 
 def near_optimal(q: chex.Array, allowed: chex.Array, tolerance: chex.Numeric) -> jax.Array:
-    """The allowed moves that are within a tolerance of the best one: ``bool[S, A]``.
+    """The `allowed` actions within a `tolerance` of the best one: ``bool[S, A]``.
 
-    ``A*(s) = {a : max_b Q(s, b) - Q(s, a) <= tolerance}`` (dissertation, definition 5).
-    Where Q has an error of at most e, a tolerance of ``t - 2 e`` keeps only moves that are
+    ``A*(s) = {a : max_b Q(s, b) - Q(s, a) <= tolerance}`` (definition 5) for action values `q`,
+    ``float[S, A]``. If Q has an error of at most e, a tolerance of ``t - 2 e`` keeps only actions
     within t of the best by the exact values, and ``t + 2 e`` keeps all of those.
-
-    Args:
-      q: ``float[S, A]``, the system's action values; only those of allowed moves are read.
-      allowed: ``bool[S, A]``.
-      tolerance: at least 0, a scalar.
-
-    Returns:
-      ``bool[S, A]``, nowhere empty where a move is allowed.
 
     Example:
       >>> q = jnp.array([[1.0, 0.95, 0.5, 2.0]])
@@ -326,27 +239,17 @@ def near_optimal(q: chex.Array, allowed: chex.Array, tolerance: chex.Numeric) ->
     """
     q, allowed = jnp.asarray(q), jnp.asarray(allowed)
     best = action_max(q, allowed)[..., None]
-    # Where the best is infinite the difference is not a number.
+    # If the best is infinite, the difference is NaN.
     return allowed & ((best - q <= tolerance) | (q == best))
 
 
 def hat_strategy(near: chex.Array, allowed: chex.Array, exploration: chex.Numeric) -> jax.Array:
-    """Nearly best moves, with all allowed ones now and then: ``float[S, A]``.
+    """The mixture of uniform strategies over allowed and near-optimal actions: ``float[S, A]``.
 
-    ``sigma(s, .) = p uniform(allowed(s)) + (1 - p) uniform(near(s))``: what the uniform strategy
-    of :func:`hat_game` plays (dissertation, remark 4 and algorithm 4, line 12). If the allowed
-    moves are those that stay in the almost-sure region then all of them keep a positive
-    probability, so it wins almost surely (lemma 6), and by lemma 8 it is nearly optimal.
-
-    Args:
-      near: ``bool[S, A]``, of :func:`near_optimal`.
-      allowed: ``bool[S, A]``, which includes `near`.
-      exploration: p, a scalar in (0, 1], see :func:`exploration`.
-
-    Returns:
-      ``float[S, A]``; rows sum to one up to rounding, and are zero where nothing is allowed.
-
-    Differentiable in `exploration`.
+    ``sigma(s, .) = p uniform(allowed(s)) + (1 - p) uniform(near(s))`` with p the `exploration`
+    (remark 4; algorithm 4, line 12), for masks `near` and `allowed`, ``bool[S, A]``. If `allowed`
+    are the actions that stay in the almost-sure winning region, the strategy wins almost surely
+    (lemma 6) and is near-optimal (lemma 8). Rows without allowed actions are zero.
 
     Example:
       >>> near, allowed = jnp.array([[True, False]]), jnp.array([[True, True]])
@@ -358,18 +261,13 @@ def hat_strategy(near: chex.Array, allowed: chex.Array, exploration: chex.Numeri
 
 
 def hat_game(game: Game, near: chex.Array, exploration: chex.Numeric) -> Game:
-    """The game whose strategies all play nearly best moves most of the time (algorithm 4).
+    """The hat game, every strategy of which mostly plays near-optimal actions (algorithm 4).
 
-    A state s of the system has one move, number A, which draws a copy of it: with probability
-    p the state ``S + s``, which has all moves of s, else ``2 S + s``, which has the nearly best
-    ones. Copies of the environment's states are unreachable; they move as it does. Copies show
-    the label of their state. Runs take one move more at each state of the system, so values
-    with a discount do not carry over, but almost-sure winning does (lemma 9).
-
-    Args:
-      game: an explicit game whose moves stay where the system wins almost surely.
-      near: ``bool[S, A]``, of :func:`near_optimal`; read at the system's states.
-      exploration: p, a scalar in (0, 1).
+    A system state s has one action, number A, which draws a copy of s: with probability p, the
+    `exploration`, state ``S + s``, which has all actions of s, else ``2 S + s``, which has those of
+    `near`, ``bool[S, A]``. Copies keep labels; those of environment states are unreachable. Plays
+    take an additional move at each system state of `game`, so discounted values do not carry over,
+    but almost-sure winning does (lemma 9).
 
     Returns:
       A Game with ``3 S`` states, ``A + 1`` actions and at least two successors.
@@ -411,31 +309,23 @@ def hat_game(game: Game, near: chex.Array, exploration: chex.Numeric) -> Game:
     )
     probability = probability.at[:num_states, num_actions, :2].set(jnp.stack([p, 1 - p]))
     kept = available[:, :, None]
-    return Game(
-        replace(
-            mdp,
-            successor=jnp.where(kept, successor, 0),
-            probability=jnp.where(kept, probability, 0),
-            available=available,
-            initial=jnp.pad(mdp.initial, (0, 2 * num_states)),
-            label=jnp.tile(mdp.label, (3, 1)),
-        ),
-        jnp.tile(game.system, 3),
+    mdp = replace(
+        mdp,
+        successor=jnp.where(kept, successor, 0),
+        probability=jnp.where(kept, probability, 0),
+        available=available,
+        initial=jnp.pad(mdp.initial, (0, 2 * num_states)),
+        label=jnp.tile(mdp.label, (3, 1)),
     )
+    return Game(mdp, jnp.tile(game.system, 3))
 
 
 def recover_hat_strategy(hat: Game, strategy: chex.Array) -> jax.Array:
-    """What a strategy of the hat game plays in the game itself (algorithm 4, line 12).
+    """The strategy ``float[S, A]`` of the game that a hat-game strategy induces.
 
-    ``sigma(s, a) = p hat_sigma(S + s, a) + (1 - p) hat_sigma(2 S + s, a)`` at the system's
-    states, with p of the hat game; the environment's rows are copied.
-
-    Args:
-      hat: a game of :func:`hat_game`, with ``3 S`` states and ``A + 1`` actions.
-      strategy: ``float[3 S, A + 1]``.
-
-    Returns:
-      ``float[S, A]``.
+    ``sigma(s, a) = p hat_sigma(S + s, a) + (1 - p) hat_sigma(2 S + s, a)`` (algorithm 4, line 12)
+    at the system's states, for a `strategy` ``float[3 S, A + 1]`` of a game `hat` of
+    :func:`hat_game`; the environment's rows are copied.
 
     Raises:
       ValueError: the strategy has the wrong shape.
@@ -456,11 +346,11 @@ def recover_hat_strategy(hat: Game, strategy: chex.Array) -> jax.Array:
     return jnp.where(hat.system[:num_states, None], mixed, own)
 
 
-def _uniform(moves: chex.Array) -> jax.Array:
-    weight = jnp.asarray(moves, jnp.result_type(float))
+def _uniform(mask: chex.Array) -> jax.Array:
+    weight = jnp.asarray(mask, jnp.result_type(float))
     return weight / jnp.maximum(weight.sum(axis=-1, keepdims=True), 1)
 
 
 def _floats(*numbers: chex.Numeric) -> list[jax.Array]:
-    """Each as a float, an integer too, whose square might overflow."""
+    """Floats of all arguments: the square of an integer might overflow."""
     return [jnp.asarray(x, jnp.result_type(x, float)) for x in numbers]
