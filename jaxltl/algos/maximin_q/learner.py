@@ -53,8 +53,8 @@ from jax import lax
 from jax.tree_util import Partial
 from numpy.typing import ArrayLike, NDArray
 
-from jaxltl.algos import learner, splitmix
-from jaxltl.algos.maximin_q.learner._chains import MOST_ACTIONS, alias_table, draw_alias
+from jaxltl.algos.common import learner, splitmix
+from jaxltl.algos.maximin_q._chains import MOST_ACTIONS, alias_table, draw_alias
 from jaxltl.algos.common.play import (
     check_reward,
     cumulative,
