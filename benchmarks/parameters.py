@@ -24,7 +24,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxltl.algos.feasible import feasible, make_problem
+from jaxltl.algos.feasible import Budget, feasible, make_problem
 from jaxltl.io.parametric import read_parametric
 
 # Of the networks, by K, what the literature asks for.
@@ -97,8 +97,7 @@ def ours(path: Path, threshold: float, chosen: Any) -> tuple[dict[str, Any], Any
             threshold,
             starts=chosen.starts,
             key=jax.random.key(key),
-            num_steps=chosen.steps,
-            enough=enough,
+            budget=Budget(num_steps=chosen.steps, num_proofs=enough),
         )
 
     first, found = seconds(lambda: search(0))
@@ -109,7 +108,7 @@ def ours(path: Path, threshold: float, chosen: Any) -> tuple[dict[str, Any], Any
         "states": model.model.num_states,
         "parameters": len(model.parameters),
         "proven": int(found.feasible.sum()),
-        "least_proven": min(int(x.feasible.sum()) for _, x in again),
+        "least_prove": min(int(x.feasible.sum()) for _, x in again),
         "steps": [float(np.median(found.num_steps)), int(found.num_steps.max())],
         "compile": first - whole,
         "all": whole,

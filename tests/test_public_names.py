@@ -126,18 +126,19 @@ def test_types_of_public_things_are_public():
 
 
 def defined_in(module):
-    """The public functions and classes that a module defines, and callables that it has built."""
+    """Public functions and classes of a module, or of the modules of a package that it lists."""
     for name, found in vars(module).items():
         if name.startswith("_") or not callable(found) or typing.get_origin(found) is not None:
             continue
-        if getattr(found, "__module__", None) == module.__name__:
+        home = f"{getattr(found, '__module__', None)}."
+        if home.startswith(f"{module.__name__}.") and "._" not in home:
             yield name, found
 
 
 def everything_public():
     """By where it is defined: each public name, and in namespaces what their modules define."""
     found = {path_of(thing, name): thing for name, thing in PUBLIC.items()}
-    for path in NAMESPACES:
+    for path in (*NAMESPACES, "jaxltl.algos.common"):
         space = importlib.import_module(path)
         for name in space.__all__:
             thing = getattr(space, name)
@@ -196,9 +197,10 @@ def source_and_makers(module):
         for path, thing in EVERYTHING.items()
         if path.startswith(f"{module}.")
     ]
+    texts = {module, *(str(getattr(thing, "__module__", module)) for _, thing in beside)}
     source = "".join(
         x.source
-        for thing in [sys.modules[module], *(thing for _, thing in beside)]
+        for thing in [*(sys.modules[text] for text in texts), *(thing for _, thing in beside)]
         for x in examples_in(inspect.getdoc(thing) or "")
     )
     return source, {
@@ -294,7 +296,7 @@ def lacking(path):
     if isinstance(thing, type):
         lacks += lacking_in_class(thing, text)
     elif not of_protocol:
-        lacks += lacking_in_function(inspect.unwrap(thing), text, name not in PUBLIC)
+        lacks += lacking_in_function(inspect.unwrap(thing), text, PUBLIC.get(name) is not thing)
     examples = examples_in(text)
     if not examples and not of_protocol and not shown_in_module(path):
         lacks.append("an example")

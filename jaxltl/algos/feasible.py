@@ -21,7 +21,7 @@ Example: a head of one coin, then a tail of another; their biases are parameters
   ...     return jnp.array([p, 1 - p, 1 - q, q, 1, 1])
   >>> model = jl.make_parametric(chain, numbers, [0.1, 0.2], [0.9, 0.8], parameters=["p", "q"])
   >>> problem = search.make_problem(model, "both", bound=">=")
-  >>> found = search.feasible(problem, 0.7, starts=4)
+  >>> found = search.feasible(problem, 0.7, starts=4, budget=search.Budget(num_steps=100))
   >>> found.feasible.all().item(), sorted(found.valuation())
   (True, ['p', 'q'])
   >>> search.within(problem, 0.25, 0.5).low.tolist()
@@ -143,6 +143,13 @@ class Budget:
     num_proofs: int | None = None
     tolerance: float = 1e-6
 
+    def __post_init__(self) -> None:
+        """Raises ValueError if a number is out of range."""
+        whole("num_steps", self.num_steps, least=1, most=learner.MOST)
+        if self.num_proofs is not None:
+            whole("num_proofs", self.num_proofs, least=1)
+        width_asked(self.tolerance)
+
 
 @brief
 @struct.dataclass
@@ -152,6 +159,10 @@ class Best:
     Attributes:
       parameters: ``float[D]``.
       value: ``float[]``, a probability, or in units of the reward.
+
+    Example:
+      >>> Best(jnp.full(2, jnp.nan), jnp.array(jnp.nan)).parameters.shape
+      (2,)
     """
 
     parameters: jax.Array
@@ -515,14 +526,11 @@ def feasible(
     threshold = number("threshold", threshold)
     hparams = instance("hparams", Hparams() if hparams is None else hparams, Hparams, "Hparams")
     budget = instance("budget", Budget() if budget is None else budget, Budget, "a Budget")
-    width_asked(budget.tolerance)
-    if budget.num_proofs is not None:
-        whole("num_proofs", budget.num_proofs, least=1)
     key = jax.random.key(0) if key is None else key
     # A little beyond the threshold, so that rounding does not decide.
     beyond = 1e3 * float(jnp.finfo(problem.low.dtype).eps) * abs(threshold)
     goal = np.asarray(threshold + problem.sign * beyond, problem.low.dtype)
-    most = np.int32(whole("num_steps", budget.num_steps, least=1, most=learner.MOST))
+    most = np.int32(budget.num_steps)
     points = None
     if np.ndim(starts) == 0:
         keys = jax.random.split(key, whole("starts", starts, least=1, most=learner.MOST))

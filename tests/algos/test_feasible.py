@@ -14,7 +14,7 @@ import pytest
 
 from jaxltl.algos import feasible as search
 from jaxltl.algos.common import learner
-from jaxltl.algos.feasible import Hparams, certify, evaluate, feasible, make_problem, within
+from jaxltl.algos.feasible import Budget, Hparams, certify, evaluate, feasible, make_problem, within
 from jaxltl.core.models.parametric.parametric import make_parametric
 from jaxltl.core.models.sparse import Rewards, make_sparse
 from jaxltl.core.types import Status
@@ -99,7 +99,7 @@ def test_a_quarter_is_the_most_that_a_head_and_a_tail_have(tmp_path):
 
     with counted_traces() as traced:
         none = feasible(problem, 0.25 + 1e-9, starts=40)
-        easy = feasible(problem, 0.01, starts=40, num_steps=3)
+        easy = feasible(problem, 0.01, starts=40, budget=Budget(num_steps=3))
         other = feasible(within(problem, 0.1, 0.2), 0.1599, starts=40)
     assert not traced, "thresholds, boxes and numbers of steps are arguments"
     assert not none.feasible.any() and (none.num_steps == 200).all()
@@ -130,7 +130,7 @@ def test_walks_with_circles():
     found = feasible(problem, 0.9, starts=20)
     assert found.feasible.all() and (found.parameters[:, 0] >= least).all()
     # From where the probability is 1e-6 too: steps are measured by the odds.
-    low = feasible(problem, 0.999, starts=np.array([[0.01], [0.02]]), num_steps=40)
+    low = feasible(problem, 0.999, starts=np.array([[0.01], [0.02]]), budget=Budget(num_steps=40))
     assert low.feasible.all()
     longest = make_problem(model, "over", reward="steps", bound=">=")
     found = feasible(longest, 8.999, starts=20)
@@ -177,7 +177,7 @@ def test_keys_and_starts_decide():
     for x, y in zip(jax.tree.leaves(one), jax.tree.leaves(same), strict=True):
         np.testing.assert_array_equal(x, y)
     assert (one.parameters != other.parameters).any()
-    alone = feasible(problem, 0.9, starts=np.array([[0.3], [0.95]]), num_steps=200)
+    alone = feasible(problem, 0.9, starts=np.array([[0.3], [0.95]]), budget=Budget(num_steps=200))
     assert alone.num_steps[1] == 1 and alone.parameters[1] == 0.95, "it is there already"
     assert alone.num_steps[0] > 1
 
@@ -313,7 +313,7 @@ def test_points_without_a_model_are_left_again():
     found = feasible(problem, 0.0369, starts=starts)
     assert found.feasible.all() and found.num_steps[1] == 1
     assert (abs(found.parameters - 1 / 3) < 0.04).all() and (found.upper <= 1 / 27 + 1e-9).all()
-    stopped = feasible(problem, 0.0369, starts=starts, num_steps=1)
+    stopped = feasible(problem, 0.0369, starts=starts, budget=Budget(num_steps=1))
     assert stopped.status.tolist() == [
         Status.INVALID,
         Status.CONVERGED,
@@ -372,7 +372,7 @@ def test_a_search_that_is_wrong_claims_nothing(tmp_path):
     problem = make_problem(coins(tmp_path).over(1e-3, 1 - 1e-3), "goal", bound=">=")
     points = jnp.array([[0.5], [0.1], [0.5], [0.4999]])
     said = forged(problem, points, jnp.array([0.25, 0.25, 0.1, jnp.nan]))
-    found = search._proven(problem, 0.2, said, 1e-6)
+    found = search._prove(problem, 0.2, said, Budget())
     assert found.feasible.tolist() == [True, False, False, False]
     assert found.status.tolist() == [
         Status.CONVERGED,
@@ -392,14 +392,14 @@ def test_a_search_that_is_wrong_claims_nothing(tmp_path):
         bound=">=",
     )
     said = forged(thirds, jnp.array([[1.0]]), jnp.array([1 / 3]))
-    found = search._proven(thirds, 1 / 3, said, 1e-6)
+    found = search._prove(thirds, 1 / 3, said, Budget())
     assert found.status.tolist() == [Status.PRECISION] and not found.feasible.any()
 
 
-def test_as_many_are_proven_as_are_enough():
+def test_as_many_are_prove_as_are_enough():
     problem = make_problem(ruin(), "won", bound=">=")
     every = feasible(problem, 0.9, starts=20)
-    some = feasible(problem, 0.9, starts=20, enough=3)
+    some = feasible(problem, 0.9, starts=20, budget=Budget(num_proofs=3))
     best = np.argsort(-every.value, kind="stable")[:3]
     assert set(np.flatnonzero(some.feasible)) == set(best)
     np.testing.assert_array_equal(some.parameters, every.parameters)
@@ -415,8 +415,8 @@ def test_points_that_are_no_model_after_all_are_told(tmp_path, monkeypatch):
         raise ValueError("some transitions are gone")
 
     monkeypatch.setattr(search, "certify", refuse)
-    found = search._proven(
-        problem, 0.2, forged(problem, jnp.array([[0.5]]), jnp.array([0.25])), 1e-6
+    found = search._prove(
+        problem, 0.2, forged(problem, jnp.array([[0.5]]), jnp.array([0.25])), Budget()
     )
     assert found.status.tolist() == [Status.INVALID] and not found.feasible.any()
 
@@ -465,8 +465,6 @@ def test_questions_that_are_none(tmp_path, changed, message):
         (np.nan, {}, "threshold=nan; give a finite number"),
         (np.inf, {}, "threshold=inf"),
         (0.2, {"starts": 0}, "starts=0; it must be at least 1"),
-        (0.2, {"num_steps": 0}, "num_steps=0; it must be"),
-        (0.2, {"enough": 0}, "enough=0; it must be"),
         (0.2, {"starts": np.array([0.5])}, r"starts has shape \(1,\); expected \(N, 1\)"),
         (
             0.2,
@@ -478,7 +476,7 @@ def test_questions_that_are_none(tmp_path, changed, message):
         (0.2, {"hparams": Hparams(optimizer="newton")}, "optimizer='newton'; choose one of"),
     ],
 )
-def test_searches_that_are_none(tmp_path, threshold, changed, message):
+def test_bad_searches_are_refused(tmp_path, threshold, changed, message):
     problem = make_problem(coins(tmp_path).over(0.1, 0.9), "goal", bound=">=")
     with pytest.raises(ValueError, match=message):
         feasible(problem, threshold, **changed)
@@ -487,3 +485,16 @@ def test_searches_that_are_none(tmp_path, threshold, changed, message):
 def test_a_model_without_a_box():
     with pytest.raises(ValueError, match="NoneType has no box of parameters"):
         make_problem(None, "goal", bound=">=")
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"num_steps": 0}, "num_steps=0; it must be"),
+        ({"num_proofs": 0}, "num_proofs=0; it must be"),
+        ({"tolerance": -1.0}, "tolerance"),
+    ],
+)
+def test_bad_budgets_are_refused(changed, message):
+    with pytest.raises(ValueError, match=message):
+        Budget(**changed)

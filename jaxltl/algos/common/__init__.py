@@ -4,6 +4,16 @@ import importlib
 import pkgutil
 from types import ModuleType
 
+__all__ = [
+    "actor_critic",
+    "checkpoint",
+    "chunks",
+    "early_stopping",
+    "learner",
+    "pac",
+    "schedules",
+]
+
 
 def __getattr__(name: str) -> ModuleType:
     if name.startswith("_") or name not in __dir__():
