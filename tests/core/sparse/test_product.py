@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from jaxltl.core.sparse import product as module
-from jaxltl.core.sparse.graph.accepting import accepting_region, towards
+from jaxltl.core.sparse.graph.accepting import accepting_region
+from jaxltl.core.sparse.graph.qualitative import shortest_path_rows
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.product import sparse_product
 
@@ -210,7 +211,7 @@ def test_ways_lead_nearer():
             for r in np.flatnonzero(rows):
                 near = distance[mdp.successor[_entries(mdp, r)]].min() + 1
                 distance[mdp.state[r]] = min(distance[mdp.state[r]], near)
-        taken = towards(mdp, goal, rows)
+        taken = shortest_path_rows(mdp, goal, rows)
         assert (mdp.state[taken] == np.arange(7)).all()
         for s in np.flatnonzero(~goal & (distance < 99)):
             assert rows[taken[s]]
