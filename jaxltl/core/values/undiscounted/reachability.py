@@ -32,6 +32,7 @@ from jaxltl.core.models.ops.operators import (
     expectation,
     following,
     is_deterministic,
+    is_representable,
     require_policy,
     valid_policy,
 )
@@ -615,7 +616,9 @@ def _optimize(model, sets: Sets, components, tolerance, max_steps, start, *, obj
         upper=upper,
         residual=residual,
         num_steps=n,
-        status=status_code(bounds.half <= goal, jnp.isfinite(residual)),
+        status=status_code(
+            bounds.half <= goal, jnp.isfinite(residual), valid=is_representable(model)
+        ),
     )
     solution = jax.tree.map(lax.stop_gradient, solution)
 
