@@ -33,7 +33,7 @@ calls = {
     "winning_region": lambda: jl.winning_region(game, jl.games.buchi(game, "g")),
     "verify": lambda: jl.verify(jl.winning_region(game, jl.games.buchi(game, "g"))),
     "permissive_strategy": lambda: jl.permissive_strategy(game, jl.games.safety(game, "!r")),
-    "end_components": lambda: jl.games.end_components(world, np.ones(world.num_states, bool)),
+    "end_components": lambda: jl.graphs.end_components(world, np.ones(world.num_states, bool)),
     "minimax_value": lambda: jl.minimax_value(game, some, 0.9),
     "optimal_value": lambda: jl.optimal_value(world, some, 0.9),
     "soft_value": lambda: jl.soft_value(world, some, 0.9),

@@ -74,7 +74,7 @@ def worlds(size: int) -> dict[str, Any]:
     task = jl.task_environment(world, f"{_SAFE} & {_PATROL}", reward="eventual", discount=_DISCOUNT)
     meeting = np.asarray(game.mdp.label)[:, game.mdp.propositions.index("collision")]
     task = task.replace(step=Partial(_counted, task.step, meeting))
-    shielded = jl.environments.shield_environment(task, strategy, Partial(_state))
+    shielded = jl.games.shield_environment(task, strategy, Partial(_state))
     return {
         "unshielded": with_time_limit(task, _EPISODE),
         "shielded": with_time_limit(shielded, _EPISODE),

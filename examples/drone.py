@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxltl import Environment, make_environment
-from jaxltl.environments import Timestep, make_box
+from jaxltl.core.environments import Timestep, make_box
 
 FIELDS = {"base": (0.0, 0.0), "field": (0.7, 0.4), "well": (-0.6, 0.5)}
 NEAR = 0.35

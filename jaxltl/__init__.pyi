@@ -2,15 +2,19 @@
 __version__: str
 
 from . import algos as algos
-from . import data as data
-from . import environments as environments
 from . import envs as envs
-from . import games as games
 from . import io as io
-from . import logic as logic
-from . import models as models
 from . import plot as plot
-from . import values as values
+from .core import (
+    automata as automata,
+    environments as environments,
+    games as games,
+    graphs as graphs,
+    logic as logic,
+    models as models,
+    statistics as statistics,
+    values as values,
+)
 from .core.automata.automaton import Automaton as Automaton
 from .core.automata.translate import to_automaton as to_automaton
 from .core.environments.environment import (

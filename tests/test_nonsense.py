@@ -144,7 +144,7 @@ def things(folder):
         ),
         (jl.values.prepare_interval, {**asked, "stay": None, "reward": None, "policy": None}),
         (
-            jl.data.intervals_from_counts,
+            jl.statistics.intervals_from_counts,
             {
                 "counts": [1, 2, 3, 4],
                 "confidence": 0.9,
@@ -181,9 +181,9 @@ def things(folder):
                 "actions": None,
             },
         ),
-        (jl.data.counts_on, {"model": sparse, "counts": counts}),
+        (jl.models.counts_on, {"model": sparse, "counts": counts}),
         (
-            jl.data.counted_model,
+            jl.models.counted_model,
             {
                 "counts": counts,
                 "initial": "0",
@@ -203,7 +203,7 @@ def things(folder):
         ),
         (jl.read_log, {"path": folder / "log.csv", "states": None, "actions": None}),
         (
-            jl.data.read_labels,
+            jl.io.read_labels,
             {
                 "path": folder / "labels.csv",
                 "states": ["0", "1", "2"],
@@ -211,7 +211,7 @@ def things(folder):
             },
         ),
         (jl.learn_guarantee, {**told, "rows": None, "num_claims": None, "tolerance": 1e-6}),
-        (jl.data.guarantee_curve, {**told, "sizes": [1, 2], "seed": 0}),
+        (jl.values.guarantee_curve, {**told, "sizes": [1, 2], "seed": 0}),
         (jl.solve_property, {"model": model, "prop": 'Pmaxmin=? [F "a"]', "states": None}),
         (
             jl.make_parametric,
@@ -375,7 +375,7 @@ def simulated():
         ),
         (share_estimate, {"count": 1, "total": 2, "failure": 0.05}),
         (
-            jl.environments.episode_evaluator,
+            jl.values.episode_evaluator,
             {
                 "environment": task,
                 "agent": lambda numbers: agent,
@@ -387,7 +387,7 @@ def simulated():
             },
         ),
         (
-            jl.environments.tabulate_policy,
+            jl.values.tabulate_policy,
             {
                 "policy": lambda seen, memory: jnp.int32(0),
                 "environment": world,
@@ -555,10 +555,10 @@ def taught(world, key):
         (jl.environments.environment_of, {"model": coin, **told}),
         (jl.environments.environment_of, {"model": robots(2), **told}),
         (
-            jl.environments.shield_environment,
+            jl.games.shield_environment,
             {"strategy": jl.permissive_strategy(coin, "F a"), **safe},
         ),
-        (jl.environments.shield_environment, {"strategy": np.ones((2, 1), bool), **safe}),
+        (jl.games.shield_environment, {"strategy": np.ones((2, 1), bool), **safe}),
         (robots, {"size": 3}),
         (partial(grid_game, "a..\n..b"), {"system_stays": True, "environment_stays": False}),
         (partial(make_network, "2-3-1"), {"biases": True}),
@@ -755,7 +755,7 @@ def test_good_input_is_taken(tmp_path):
             "ask what does .*robust_bounded_reachability",
         ),
         (lambda m: jl.models.to_dense(m), "or give its nominal model, model.nominal"),
-        (lambda m: jl.games.attractor(m, m.states_where("a")), "IntervalMDP has intervals"),
+        (lambda m: jl.graphs.attractor(m, m.states_where("a")), "IntervalMDP has intervals"),
         (lambda m: jl.make_interval(m, m.lower, m.upper), "of an interval model, its nominal one"),
     ],
 )
@@ -778,7 +778,7 @@ def test_who_asks_of_intervals_what_is_not_solved(call, message):
 def test_claims_thresholds_and_steps():
     counts = {"counts": [[1, 2, 3]], "confidence": 0.9}
     with pytest.raises(ValueError, match="num_claims=inf; it must be a whole number"):
-        jl.data.intervals_from_counts(**counts, num_claims=np.inf)
+        jl.statistics.intervals_from_counts(**counts, num_claims=np.inf)
     world = jl.make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
     problem = interval_learning.make_problem(world, "true")
     for steps in (None, "x", np.nan, [1]):
@@ -797,7 +797,7 @@ def test_a_log_of_a_world_whose_slips_repeat_a_successor(tmp_path):
     assert counts.count.tolist() == [2, 1]
     assert jl.learn_guarantee(world, counts, "true", 0.9).bound == 1
     with pytest.raises(ValueError, match="convert a model whose rows repeat a successor by to_sp"):
-        jl.data.counts_on(world, counts)
+        jl.models.counts_on(world, counts)
     path.write_text("state,action,next\n1,0,0\n")
     with pytest.raises(ValueError, match="line 2"):
         jl.read_log(path, world)

@@ -17,10 +17,10 @@ from collections import Counter
 import pytest
 
 import jaxltl
+from jaxltl import core
 
-# Modules of the top level that list names of several modules of the core.
-TOPICS = ("logic", "models", "values", "games", "environments", "data")
-# Packages that import what they list on first use.
+# Packages of the core, and of the top level, that import the names in their stubs on first use.
+TOPICS = core.__all__
 NAMESPACES = ("jaxltl.algos", "jaxltl.envs", "jaxltl.io", "jaxltl.plot")
 MOST_NAMES = 80
 PUBLIC = {
@@ -34,6 +34,7 @@ DOCUMENTED = (
     "jaxltl.algos",
     "jaxltl.envs.temporal_gridworld",
     "jaxltl.core.models.protocols",
+    "jaxltl.core.types",
     "jaxltl.core.sparse.product",
     "jaxltl.core.sparse.mdp",
     "jaxltl.core.logic.bounded",
@@ -46,7 +47,7 @@ DOCUMENTED = (
 def test_the_top_level_is_short_and_listed_in_namespaces():
     assert len(jaxltl.__all__) <= MOST_NAMES
     listed = {name for topic in TOPICS for name in getattr(jaxltl, topic).__all__}
-    listed |= {*jaxltl.envs.__all__, *jaxltl.io.__all__}
+    listed |= {*jaxltl.envs.__all__, *jaxltl.io.__all__, *vars(core.types)}
     for name in jaxltl.__all__:
         assert name in listed or inspect.ismodule(getattr(jaxltl, name)), name
     assert {*jaxltl.__all__} <= {*dir(jaxltl)}

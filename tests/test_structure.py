@@ -17,12 +17,6 @@ from jax.tree_util import Partial
 import jaxltl
 
 ROOT = Path(jaxltl.__file__).parent
-# Modules of the top level, which list names of the core.
-NAMESPACES = tuple(
-    f"jaxltl.{path.stem}"
-    for path in ROOT.glob("*.py")
-    if path.stem not in ("__init__", "__main__", "cli")
-)
 MODULES = {
     ".".join(path.relative_to(ROOT.parent).with_suffix("").parts): path
     for path in sorted(ROOT.rglob("*.py"))
@@ -103,7 +97,7 @@ def below(name: str) -> frozenset[str]:
 
 
 def test_every_module_has_a_storey():
-    top = ("jaxltl.__main__", *NAMESPACES)
+    top = ("jaxltl.__main__",)
     homeless = [n for n in MODULES if storey(n) is None and n not in top]
     assert not homeless, "give it a folder of the tree"
 
@@ -186,7 +180,7 @@ def public_callables(module):
             yield name, found
 
 
-@pytest.mark.parametrize("name", [*NAMESPACES, *LEARNER_MODULES])
+@pytest.mark.parametrize("name", LEARNER_MODULES)
 def test_what_is_called_has_help_of_its_own(name):
     lent = {inspect.getdoc(functools.partial), inspect.getdoc(Partial), None, ""}
     bare = [

@@ -111,15 +111,18 @@ def _checked(name: str, value: Any) -> None:
         LOG.warning("the public name %s has no docstring", name, type="reference")
 
 
-# Modules of the top level that list names of the core, and the titles of their pages.
+# Packages of the core that list public names, and the titles of their pages.
 TOPICS = {
-    "logic": "Logic and automata",
+    "logic": "Temporal logic and properties",
+    "automata": "Automata",
+    "statistics": "Statistics",
     "models": "Models",
+    "environments": "Environments and monitors",
+    "graphs": "Graphs",
     "values": "Values and probabilities",
     "games": "Games",
-    "environments": "Environments and evaluation",
-    "data": "Data",
 }
+SHARED = ("Solution", "Status", "check", "NotConverged")  # of all solvers, in core/types.py
 
 
 def topics() -> dict[str, tuple[str, list[tuple[str, Any]]]]:
@@ -127,9 +130,13 @@ def topics() -> dict[str, tuple[str, list[tuple[str, Any]]]]:
     listed = {}
     for space, title in TOPICS.items():
         module = getattr(jaxltl, space)
+        names = [*module.__all__, *(SHARED if space == "values" else ())]
         entries = [
-            (f"jaxltl.{x}" if x in jaxltl.__all__ else f"jaxltl.{space}.{x}", getattr(module, x))
-            for x in module.__all__
+            (
+                f"jaxltl.{x}" if x in jaxltl.__all__ else f"jaxltl.{space}.{x}",
+                getattr(module, x, None) or getattr(jaxltl, x),
+            )
+            for x in names
         ]
         listed[title] = (module.__doc__, entries)
     return listed

@@ -1,1 +1,5 @@
 """The mathematics: models, automata, products, and the solvers on them."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

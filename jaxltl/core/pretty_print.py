@@ -24,6 +24,7 @@ READ = 2**20  # entries of an array up to which its values are read
 _LIST = 6  # entries that are shown one by one
 _HEAD = 60  # characters of an object inside of another
 _DRAWN = 300_000  # characters of a picture in a notebook
+_DRAWING = "jaxltl.plot.notebook"  # registers the pictures of types
 
 Facts = Callable[[Any], Iterable[str]]
 Class = TypeVar("Class", bound=type)
@@ -390,7 +391,7 @@ def picture(value: object) -> str | None:
 def _svg(self: Any) -> str | None:
     """The picture that notebooks show; None, so that they show text, where there is none."""
     try:
-        importlib.import_module("jaxltl.plot.notebook")  # registers what draws; matplotlib is slow
+        importlib.import_module(_DRAWING)  # on first use, since matplotlib is slow to import
         found = picture(self)
     except Exception:  # nobody who looks at an object wants to hear of its picture
         return None

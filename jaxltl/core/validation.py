@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxltl.core.array_types import Booleans, Floats, Integers
+from jaxltl.core.array_types import Floats, Integers
 
 _SHOWN = 60  # characters
 
@@ -33,31 +33,9 @@ def numbers(name: str, given: Any) -> Floats:
       ValueError: lower is ['x']; give numbers.
     """
     try:
-        if np.asarray(given).dtype.kind != "c":
-            return np.asarray(given, np.float64)
+        return np.asarray(given, np.float64)
     except (TypeError, ValueError, OverflowError):
-        pass
-    raise ValueError(f"{name} is {shown(given)}; give numbers.")
-
-
-def booleans(name: str, given: Any) -> Booleans:
-    """An array of truth values, also given as the numbers 0 and 1.
-
-    Raises:
-      ValueError: an entry is something else.
-
-    Example:
-      >>> booleans("available", [["yes"]])
-      Traceback (most recent call last):
-      ValueError: available is [['yes']]; give True or False for each entry.
-    """
-    try:
-        found = np.asarray(given)
-    except ValueError:  # ragged
-        found = np.asarray(None)
-    if found.dtype != bool and (found.dtype.kind not in "iuf" or not np.isin(found, (0, 1)).all()):
-        raise ValueError(f"{name} is {shown(given)}; give True or False for each entry.")
-    return found.astype(bool)
+        raise ValueError(f"{name} is {shown(given)}; give numbers.") from None
 
 
 def wholes(name: str, given: Any) -> Integers:

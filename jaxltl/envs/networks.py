@@ -328,7 +328,7 @@ def network_agent(network: Network, environment: Environment) -> Partial:
 
     Example:
       >>> from jaxltl import make_environment
-      >>> from jaxltl.environments import Timestep
+      >>> from jaxltl.core.environments import Timestep
       >>> world = make_environment(
       ...     lambda key: jnp.ones(2), lambda x, a, key: Timestep(x, 0.0, False), lambda x: x,
       ...     actions=3)

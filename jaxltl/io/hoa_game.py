@@ -390,7 +390,7 @@ def write_hoa_game(
 
     Example:
       >>> from jaxltl import from_dense, make_game
-      >>> from jaxltl.games import parity
+      >>> from jaxltl.core.games import parity
       >>> world = from_dense([[[0, 1.0], [1, 0]], [[1.0, 0], [1, 0]]], initial=[1, 0])
       >>> game = make_game(world, [True, False])
       >>> text = write_hoa_game(game, parity(game, [0, 1]))

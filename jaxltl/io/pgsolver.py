@@ -282,7 +282,7 @@ def write_pgsolver(
     Example:
       >>> import pathlib, tempfile
       >>> from jaxltl import from_dense, make_game
-      >>> from jaxltl.games import parity
+      >>> from jaxltl.core.games import parity
       >>> world = from_dense([[[0, 1.0], [1, 0]], [[1.0, 0], [1, 0]]], initial=[1, 0])
       >>> game = make_game(world, [True, False])
       >>> path = pathlib.Path(tempfile.mkdtemp()) / "game.pg"

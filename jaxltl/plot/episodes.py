@@ -3,7 +3,7 @@
 Example:
   >>> import jax.numpy as jnp, numpy as np
   >>> from jaxltl import make_environment
-  >>> from jaxltl.environments import Episode, Timestep, make_box
+  >>> from jaxltl.core.environments import Episode, Timestep, make_box
   >>> def step(world, action, key):
   ...     return Timestep({"place": world["place"] + action}, 0.0, False)
   >>> walk = make_environment(

@@ -22,7 +22,7 @@ WORLD = """
 import jax
 import jax.numpy as jnp
 from jaxltl import make_environment
-from jaxltl.environments import Timestep, make_box
+from jaxltl.core.environments import Timestep, make_box
 
 
 def corridor(length=3, boxed=False, horizon=8, ends=True):

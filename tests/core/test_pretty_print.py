@@ -67,8 +67,8 @@ def made():
     game = jl.envs.grid_game("a.\n.b")
     region = np.arange(32) < 20
     objective = jl.games.Parity(np.zeros(32, np.int32), region, ~region, 2)
-    estimate = jl.environments.Estimate(0.5, 0.25, 0.75, 0.01, "exact")
-    evaluation = jl.environments.Evaluation(
+    estimate = jl.values.Estimate(0.5, 0.25, 0.75, 0.01, "exact")
+    evaluation = jl.values.Evaluation(
         estimate,
         None,
         None,
@@ -100,7 +100,7 @@ def made():
         horizon=7,
     )
     satisfaction = jl.values.sparse_satisfaction(coin, "F lost")
-    sure = jl.data.ConfidenceSets(
+    sure = jl.statistics.ConfidenceSets(
         np.zeros(3),
         np.array([0.5, 0.25, 1]),
         np.zeros(3),
@@ -129,7 +129,7 @@ def made():
         environment,
         satisfaction,
         sure,
-        jl.logic.make_monitor(automaton),
+        jl.environments.make_monitor(automaton),
         jl.make_trajectories(world, [[(15, 0), (10, 0)], [(15, 3)]]),
         jl.FiniteMemoryPolicy(
             np.zeros((20, 3), np.int32), np.zeros(20, np.int32), np.zeros((20, 3), np.int32)
@@ -164,7 +164,7 @@ def made():
             np.float32(1e-7),
             np.int32(0),
         ),
-        jl.environments.OptimalityGap(
+        jl.values.OptimalityGap(
             np.arange(2),
             np.ones(2),
             solution,
@@ -176,7 +176,7 @@ def made():
             (0.9, 0.95),
             "keyless",
         ),
-        jl.data.DataGuarantee(0.9, 0.95, 0.99, satisfaction, rough, sure, np.zeros(4)),
+        jl.values.DataGuarantee(0.9, 0.95, 0.99, satisfaction, rough, sure, np.zeros(4)),
         jl.environments.Table(
             coin, np.arange(3), np.zeros(1, int), np.zeros(3, bool), np.ones(3, bool), 9
         ),
@@ -285,7 +285,7 @@ def brief_classes():
 
 def test_every_public_type_shows_itself():
     public = {getattr(jl, name) for name in jl.__all__}
-    others = {jl.logic.Formula, jl.Status, jl.logic.Verdict, jl.NotConverged, Method}
+    others = {jl.logic.Formula, jl.Status, jl.environments.Verdict, jl.NotConverged, Method}
     plain = {x for x in public if isinstance(x, type)} - others - {*brief_classes().values()}
     assert not plain
     for module in algos.__all__:

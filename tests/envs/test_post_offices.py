@@ -121,8 +121,8 @@ def test_what_is_learned_by_a_plain_reading():
 def test_the_automaton_says_what_the_formula_says():
     automaton = surveillance()
     formula = jl.to_automaton("G F p1 & G F p2")
-    assert jl.logic.is_equivalent(automaton, formula)
-    assert not jl.logic.is_equivalent(automaton, jl.to_automaton("G F p1"))
+    assert jl.automata.is_equivalent(automaton, formula)
+    assert not jl.automata.is_equivalent(automaton, jl.to_automaton("G F p1"))
     assert automaton.acceptance == "buchi"
     assert automaton.state_names[int(automaton.initial)] == "q1"
     np.testing.assert_array_equal(automaton.delta[3], automaton.delta[0])

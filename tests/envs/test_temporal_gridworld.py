@@ -215,7 +215,7 @@ def test_starts_without_a_way_are_found():
 def test_feasibility_agrees_with_the_attractor(task, slip, label_on):
     world = tg.make_world(WALLED, 0, shape=(7, 6), slip=slip)
     model = jl.product(world.mdp, task, label_on=label_on)
-    can = np.asarray(jl.games.attractor(model, model.final, model.available).region)
+    can = np.asarray(jl.graphs.attractor(model, model.final, model.available).region)
     if label_on == "exit":  # as the generator reads
         found = tg._can_finish(
             *(

@@ -1,1 +1,5 @@
 """Deterministic automata of formulas, and questions about their languages. No JAX here."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -44,7 +44,7 @@ def simplify(automaton: Automaton) -> Automaton:
     cycle's verdict is that of its component, the automaton is minimal too.
 
     Example:
-      >>> from jaxltl.logic import make_automaton
+      >>> from jaxltl.core.automata import make_automaton
       >>> twice = make_automaton([[1, 1], [0, 0]], 0, [[False], [True]], ["a"],
       ...                        accepting=[[False, True], [False, True]])
       >>> small = simplify(twice)

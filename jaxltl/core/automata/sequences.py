@@ -40,7 +40,7 @@ class Sequences:
     Example:
       >>> import jaxltl as jl
       >>> task = jl.to_automaton("F b", letters=[{}, {"b"}])
-      >>> found = jl.logic.reach_avoid_sequences(task, [[0], [1]], ("b",), depth=1, most=1)
+      >>> found = jl.automata.reach_avoid_sequences(task, [[0], [1]], ("b",), depth=1, most=1)
       >>> found.reach[0, 0].tolist(), found.length.tolist()
       ([[False, True]], [[1], [0]])
     """

@@ -35,7 +35,7 @@ class Verdict(enum.IntEnum):
 
     Example:
       >>> import jaxltl as jl
-      >>> jl.logic.verdict(jl.to_automaton("G a"), [{"a"}, set()]).name
+      >>> jl.environments.verdict(jl.to_automaton("G a"), [{"a"}, set()]).name
       'VIOLATED'
     """
 

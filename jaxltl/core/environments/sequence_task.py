@@ -79,7 +79,7 @@ class SequenceWorld(NamedTuple):
       world: the inner one.
       sequence: what was asked for.
       stage: ``int32[]``, the steps that are done.
-      verdict: ``int32[]``, a :class:`~jaxltl.logic.Verdict`.
+      verdict: ``int32[]``, a :class:`~jaxltl.environments.Verdict`.
     """
 
     world: Any

@@ -404,7 +404,7 @@ def stack_tasks(environments: Sequence[Environment]) -> Environment:
 
     Example:
       >>> from jaxltl import from_dense
-      >>> from jaxltl.environments import environment_of
+      >>> from jaxltl.core.environments import environment_of
       >>> walk = environment_of(from_dense(
       ...     [[[.5, .5]], [[.5, .5]]], label=[[0], [1]], propositions=["a"]))
       >>> both = stack_tasks([task_environment(walk, "F a"), task_environment(walk, "G F a")])

@@ -105,7 +105,7 @@ def shield_environment(
 
     Example:
       >>> from jaxltl import from_dense, permissive_strategy
-      >>> from jaxltl.environments import environment_of
+      >>> from jaxltl.core.environments import environment_of
       >>> model = from_dense([[[1.0, 0], [0, 1.0]], [[0, 1.0], [0, 0]]],
       ...                    label=[[0], [1]], propositions=["crash"], initial=[1, 0])
       >>> safe = shield_environment(environment_of(model), permissive_strategy(model, "G !crash"))

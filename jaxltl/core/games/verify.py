@@ -82,7 +82,7 @@ def verify(winning: Any) -> Verification:
     Example:
       >>> from types import SimpleNamespace
       >>> from jaxltl import from_dense
-      >>> from jaxltl.games import reach
+      >>> from jaxltl.core.games import reach
       >>> world = from_dense([[[1.0, 0], [0, 1.0]], [[0, 1.0], [0, 1.0]]])
       >>> found = SimpleNamespace(
       ...     game=world, objective=reach(world, np.array([False, True])),

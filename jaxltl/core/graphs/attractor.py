@@ -36,7 +36,7 @@ class Attractor(NamedTuple):
       >>> fork = jl.from_dense([[[0, 0.5, 0.5], [1, 0, 0]], [[0, 1, 0], [0, 0, 0]],
       ...                       [[0, 0, 1], [0, 0, 0]]])
       >>> goal = np.array([False, True, False])
-      >>> found = jl.games.attractor(fork, goal)
+      >>> found = jl.graphs.attractor(fork, goal)
       >>> found.region.tolist(), found.action[0].tolist(), found.rank[:2].tolist()
       ([True, True, False], 0, [1, 0])
     """

@@ -26,7 +26,7 @@ class EndComponents(NamedTuple):
       >>> import jaxltl as jl
       >>> fork = jl.from_dense([[[0, 0.5, 0.5], [1, 0, 0]], [[0, 1, 0], [0, 0, 0]],
       ...                       [[0, 1, 0], [0, 0, 0]]])
-      >>> found = jl.games.end_components(fork, np.array([True, False, True]))
+      >>> found = jl.graphs.end_components(fork, np.array([True, False, True]))
       >>> found.component.tolist(), found.inside.tolist()
       ([0, 1, 2], [[False, True], [False, False], [False, False]])
     """

@@ -10,14 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from numpy.typing import DTypeLike
 
 from jaxltl.core.models import facts
 from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
-from jaxltl.core.models.ops.underflow import target_dtype, underflow_text, underflows
 from jaxltl.core.models.protocols import Model
 from jaxltl.core.pretty_print import brief
-from jaxltl.core.validation import booleans, listed, no_model, numbers, shown
+from jaxltl.core.validation import listed, no_model, numbers, shown
 
 
 @brief(facts=facts.padded, drawn=True)
@@ -142,21 +140,11 @@ def support(world: Model) -> np.ndarray:
     """Which successors are possible, ``bool[S, A, K]``, on the host; none where unavailable."""
     if not isinstance(world, MDP | DenseMDP):
         raise ValueError(no_model(world))
-    weight = np.asarray(world.transition if isinstance(world, DenseMDP) else world.probability)
-    used, available = weight > 0, np.asarray(world.available)
+    weight = world.transition if isinstance(world, DenseMDP) else world.probability
+    used, available = np.asarray(weight) > 0, np.asarray(world.available)
     if not available.all():
         used &= available[..., None]
-    dtype = target_dtype(weight.dtype)
-    small = used & (weight < jnp.finfo(dtype).tiny)
-    if small.any():
-        _raise_underflow(weight, small, dtype)
     return used
-
-
-def _raise_underflow(probability: np.ndarray, small: np.ndarray, dtype: np.dtype) -> None:
-    s, a, k = np.argwhere(small)[0]
-    text = underflow_text(probability[s, a, k], dtype)
-    raise ValueError(f"state {s}, action {a}: probability (entry {k}) {text}.")
 
 
 def make_mdp(
@@ -198,7 +186,7 @@ def make_mdp(
       (2, 1)
     """
     successor = np.asarray(successor)
-    probability = numbers("probability", probability)
+    probability = np.asarray(probability)
     if probability.ndim != 3 or successor.shape != probability.shape:
         raise ValueError(
             f"successor has shape {successor.shape} and probability {probability.shape}; "
@@ -227,16 +215,13 @@ def make_mdp(
     scale = _row_scale(probability.sum(axis=-1, dtype=np.float64), available)
     dtype = jnp.result_type(float)
     used &= available[:, :, None]
-    probability = np.where(used, probability * scale[:, :, None], 0)
-    if (small := underflows(probability, dtype)) is not None:
-        _raise_underflow(probability, small, dtype)
-    probability = probability.astype(dtype)
+    probability = np.where(used, probability * scale[:, :, None], 0).astype(dtype)
     label, names = checked_label(label, propositions, num_states)
     return MDP(
         successor=to_jax(np.where(used, successor, 0).astype(np.int32)),
         probability=to_jax(probability),
         available=to_jax(available),
-        initial=to_jax(checked_initial(initial, num_states, dtype).astype(dtype)),
+        initial=to_jax(checked_initial(initial, num_states).astype(dtype)),
         label=to_jax(label),
         propositions=names,
     )
@@ -269,7 +254,7 @@ def from_dense(
       >>> mdp.successor.shape, mdp.propositions, mdp.label[:, 0].tolist()
       ((2, 1, 2), ('goal',), [False, True])
     """
-    transition = numbers("transition", transition)
+    transition = np.asarray(transition)
     if transition.ndim != 3 or transition.shape[0] != transition.shape[2]:
         raise ValueError(f"transition has shape {transition.shape}; it must be [S, A, S].")
     _check_probability(transition)
@@ -316,7 +301,6 @@ def to_dense(mdp: MDP) -> DenseMDP:
         empty = jnp.zeros(shape, mdp.dtype)
         transition = empty.at[*place, mdp.successor].add(mdp.probability)
     else:
-        support(mdp)  # refuses probabilities that underflow
         transition = np.zeros(shape, mdp.dtype)
         np.add.at(transition, (*place, np.asarray(mdp.successor)), np.asarray(mdp.probability))
     return DenseMDP(
@@ -350,7 +334,7 @@ def _row_scale(total: np.ndarray, available: np.ndarray) -> np.ndarray:
 
 
 def _checked_available(available: chex.Array, shape: tuple[int, int]) -> np.ndarray:
-    available = booleans("available", available)
+    available = np.asarray(available, bool)
     if available.shape != shape:
         raise ValueError(f"available has shape {available.shape}; expected {shape}.")
     stuck = ~available.any(axis=1)
@@ -362,14 +346,19 @@ def _checked_available(available: chex.Array, shape: tuple[int, int]) -> np.ndar
     return available
 
 
-def checked_initial(
-    initial: chex.Array | None, num_states: int, dtype: DTypeLike = np.float64
-) -> np.ndarray:
-    """A checked initial distribution ``float64[S]`` that sums to 1; None: the uniform one.
+def checked_initial(initial: chex.Array | None, num_states: int) -> np.ndarray:
+    """An initial distribution, checked, on the host.
+
+    Args:
+      initial: ``float[S]``, a distribution within 1e-6; None for the uniform one.
+      num_states: S.
+
+    Returns:
+      ``float64[S]``, which sums to one.
 
     Raises:
-      ValueError: a wrong shape, a probability that is negative, NaN or too small for `dtype`, or a
-        sum that is not 1 within 1e-6.
+      ValueError: a wrong shape, a probability that is negative or NaN, with its state, or a sum
+        that is not 1.
     """
     if initial is None:
         return np.full(num_states, 1 / num_states)
@@ -379,11 +368,7 @@ def checked_initial(
     refuse_negative(initial)
     if abs(initial.sum() - 1) > 1e-6:
         raise ValueError(f"the initial distribution sums to {initial.sum():.9g}, not 1.")
-    initial = initial / initial.sum()
-    if (small := underflows(initial, dtype)) is not None:
-        s = int(np.argmax(small))
-        raise ValueError(f"initial probability of state {s} {underflow_text(initial[s], dtype)}.")
-    return initial
+    return initial / initial.sum()
 
 
 def refuse_negative(initial: np.ndarray, *, first: int = 0) -> None:
@@ -430,7 +415,7 @@ def checked_label(
                 f"states where each holds, {{{names[0]!r}: [...]}}."
             )
         label = np.zeros((num_states, 0), bool)
-    label = booleans("label", label)
+    label = np.asarray(label, bool)
     if label.shape != (num_states, len(names)):
         raise ValueError(
             f"label has shape {label.shape}; expected ({num_states}, {len(names)}): "

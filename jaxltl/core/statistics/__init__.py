@@ -1,1 +1,5 @@
 """Statistical bounds: binomial, empirical Bernstein, and confidence sets of transition probabilities."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -64,7 +64,7 @@ class ConfidenceSets:
 
     Example:
       >>> import jaxltl as jl
-      >>> found = jl.data.intervals_from_counts([[90, 10]], confidence=0.95)
+      >>> found = jl.statistics.intervals_from_counts([[90, 10]], confidence=0.95)
       >>> found.num_samples.tolist(), bool((found.lower[0] < [0.9, 0.1]).all())
       ([100], True)
     """

@@ -1,1 +1,5 @@
 """Values and probabilities with their evidence, and their implicit derivatives."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,5 +1,6 @@
 """Listed worlds against the models that they are of, and against a search by a queue."""
 
+import importlib
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -309,7 +310,7 @@ def test_another_layout_is_not_compiled_anew():
 
 
 def compiles(run):
-    from jaxltl.core.environments import tabulate as module
+    module = importlib.import_module("jaxltl.core.environments.tabulate")
 
     functions = [module._followers, module._codes, module._labeled, module._resets]
     before = [f._cache_size() for f in functions]

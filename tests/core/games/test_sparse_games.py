@@ -153,11 +153,11 @@ def test_mean_payoffs_are_those_of_the_padded_game():
 )
 def test_graphs_inside_jit_are_the_hosts(name):
     ask = {
-        "attractor": lambda m, x: jl.games.attractor(m, x),
-        "against chance": lambda m, x: jl.games.attractor(m, x, rule="forall", chance="all"),
-        "avoidable": lambda m, x: jl.games.avoidable(m, x),
-        "almost surely": lambda m, x: jl.games.almost_surely_reaching(m, x),
-        "end components": lambda m, x: jl.games.end_components(m, ~x),
+        "attractor": lambda m, x: jl.graphs.attractor(m, x),
+        "against chance": lambda m, x: jl.graphs.attractor(m, x, rule="forall", chance="all"),
+        "avoidable": lambda m, x: jl.graphs.avoidable(m, x),
+        "almost surely": lambda m, x: jl.graphs.almost_surely_reaching(m, x),
+        "end components": lambda m, x: jl.graphs.end_components(m, ~x),
     }[name]
     compiled, rng = jax.jit(ask), np.random.default_rng(3)
     model = games()[0][0].mdp

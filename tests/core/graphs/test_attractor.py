@@ -46,7 +46,7 @@ def check_progress(model, goal, allowed, found):
 @pytest.mark.parametrize("rule", ["exists", "forall"])
 def test_attractors_equal_naive_sweeps(cases, mdps, rule):
     for mdp, (model, goal, allowed, _) in zip(mdps, cases, strict=True):
-        found = jl.games.attractor(mdp, goal, allowed, rule=rule)
+        found = jl.graphs.attractor(mdp, goal, allowed, rule=rule)
         expected = reference.attractor(model, goal, allowed, rule)
         np.testing.assert_array_equal(found.region, expected)
         if rule == "exists":
@@ -55,7 +55,7 @@ def test_attractors_equal_naive_sweeps(cases, mdps, rule):
 
 def test_avoidable_sets_equal_memoryless_policies(cases, mdps):
     for mdp, (model, goal, *_) in zip(mdps, cases, strict=True):
-        found = jl.games.avoidable(mdp, goal)
+        found = jl.graphs.avoidable(mdp, goal)
         support = model.transition > 0
         expected = np.zeros(5, bool)
         for policy in reference.memoryless_policies(model.available):
@@ -67,7 +67,7 @@ def test_avoidable_sets_equal_memoryless_policies(cases, mdps):
 
 def test_almost_sure_sets_equal_memoryless_policies(cases, mdps):
     for mdp, (model, goal, allowed, _) in zip(mdps, cases, strict=True):
-        found = jl.games.almost_surely_reaching(mdp, goal, allowed)
+        found = jl.graphs.almost_surely_reaching(mdp, goal, allowed)
         region = np.asarray(found.region)
         np.testing.assert_array_equal(
             region, reference.almost_surely_reaching(model, goal, allowed)
@@ -82,7 +82,7 @@ def test_almost_sure_sets_equal_memoryless_policies(cases, mdps):
 def test_end_components_equal_all_subsets(cases, mdps):
     sizes = set()
     for mdp, (model, _, _, region) in zip(mdps, cases, strict=True):
-        found = jl.games.end_components(mdp, region)
+        found = jl.graphs.end_components(mdp, region)
         number, actions = reference.end_components(model, region)
         np.testing.assert_array_equal(found.inside, actions)
         np.testing.assert_array_equal(found.component, number)
@@ -108,7 +108,7 @@ def test_representations_agree(kind, label_on, monkeypatch):
             expected = reference.attractor(explicit, goal, allowed, rule)
             for sweeps in (48, 0):
                 monkeypatch.setattr(host_attract, "SWEEPS", sweeps)
-                found = jl.games.attractor(model, goal_, allowed_, rule=rule)
+                found = jl.graphs.attractor(model, goal_, allowed_, rule=rule)
                 np.testing.assert_array_equal(found.region.ravel(), expected)
                 if rule == "exists":
                     flat = jax.tree.map(np.ravel, found)
@@ -117,12 +117,12 @@ def test_representations_agree(kind, label_on, monkeypatch):
         expected = reference.almost_surely_reaching(explicit, goal, allowed) if small else None
         for sweeps in (48, 0):
             monkeypatch.setattr(host_attract, "SWEEPS", sweeps)
-            found = jl.games.almost_surely_reaching(model, goal_, allowed_)
+            found = jl.graphs.almost_surely_reaching(model, goal_, allowed_)
             if small:
                 np.testing.assert_array_equal(found.region, expected)
             check_progress(explicit, goal, allowed, jax.tree.map(np.ravel, found))
             region = rng.random(shape) < 0.9
-            eager = jl.games.end_components(model, region)
+            eager = jl.graphs.end_components(model, region)
             if small:
                 number, actions = reference.end_components(explicit, np.ravel(region))
                 np.testing.assert_array_equal(eager.component.ravel(), number)
@@ -142,17 +142,17 @@ def test_a_long_chain_is_finished_on_the_host(rule):
     mdp = long_chain(length)
     goal = np.arange(length) == length - 1
     allowed = np.array([True, False]) & np.ones((length, 2), bool) if rule == "forall" else None
-    found = jl.games.attractor(mdp, goal, allowed, rule=rule)
+    found = jl.graphs.attractor(mdp, goal, allowed, rule=rule)
     assert found.region.all()
     assert not found.action[:-1].any(), "moving on makes progress, staying does not"
     assert found.rank.tolist() == list(range(length - 1, -1, -1))
-    assert jl.games.avoidable(mdp, goal).tolist() == [True] * (length - 1) + [False]
-    assert jl.games.almost_surely_reaching(mdp, goal).region.all()
+    assert jl.graphs.avoidable(mdp, goal).tolist() == [True] * (length - 1) + [False]
+    assert jl.graphs.almost_surely_reaching(mdp, goal).region.all()
 
 
 def test_end_components_of_a_whole_chain_of_loops():
     mdp = long_chain(5)
-    found = jl.games.end_components(mdp, np.ones(5, bool))
+    found = jl.graphs.end_components(mdp, np.ones(5, bool))
     assert found.component.tolist() == [0, 1, 2, 3, 4]
     assert found.inside.tolist() == [[False, True]] * 4 + [[True, True]]
 
@@ -160,10 +160,10 @@ def test_end_components_of_a_whole_chain_of_loops():
 def test_a_state_without_allowed_actions():
     mdp = long_chain(3)
     goal, none = np.array([False, False, True]), np.zeros((3, 2), bool)
-    assert jl.games.attractor(mdp, goal, none).region.tolist() == [False, False, True]
-    assert jl.games.attractor(mdp, goal, none, rule="forall").region.all(), "vacuously attracted"
+    assert jl.graphs.attractor(mdp, goal, none).region.tolist() == [False, False, True]
+    assert jl.graphs.attractor(mdp, goal, none, rule="forall").region.all(), "vacuously attracted"
 
 
 def test_unknown_rule():
     with pytest.raises(ValueError, match="rule='some'; choose exists or forall"):
-        jl.games.attractor(long_chain(2), np.zeros(2, bool), rule="some")
+        jl.graphs.attractor(long_chain(2), np.zeros(2, bool), rule="some")

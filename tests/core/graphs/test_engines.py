@@ -71,15 +71,15 @@ def answers(case, kind):
     """Every answer about a graph or a game; ranks are masked where they mean nothing."""
     model, goal, allowed = case["model"], case["goal"], case["allowed"]
     found = {
-        f"attractor, {chance}": jl.games.attractor(
+        f"attractor, {chance}": jl.graphs.attractor(
             model, goal, allowed, rule=case["rule"], among=case["among"], chance=chance
         )
         for chance in ("some", "all")
     }
-    found["attractor"] = jl.games.attractor(model, goal)
-    found["avoidable"] = jl.games.avoidable(model, goal)
-    found["almost surely"] = jl.games.almost_surely_reaching(model, goal, allowed)
-    found["end components"] = jl.games.end_components(model, case["region"], allowed)
+    found["attractor"] = jl.graphs.attractor(model, goal)
+    found["avoidable"] = jl.graphs.avoidable(model, goal)
+    found["almost surely"] = jl.graphs.almost_surely_reaching(model, goal, allowed)
+    found["end components"] = jl.graphs.end_components(model, case["region"], allowed)
     found["bottom components"] = bottom_components(model, allowed)
     if kind in ("entry", "exit"):
         found["accepting"] = accepting_end_components(model)
@@ -181,10 +181,10 @@ def test_nothing_is_compiled_on_the_host():
         settled("final", product(world, "F a").final)
         settled("restrict", jl.restrict(lazy))
         for model in (world, to_dense(world), game):
-            settled("attractor", jl.games.attractor(model, goal, chance="all"))
-            settled("avoidable", jl.games.avoidable(model, goal))
-            settled("almost_surely_reaching", jl.games.almost_surely_reaching(model, goal))
-            settled("end_components", jl.games.end_components(model, ~goal))
+            settled("attractor", jl.graphs.attractor(model, goal, chance="all"))
+            settled("avoidable", jl.graphs.avoidable(model, goal))
+            settled("almost_surely_reaching", jl.graphs.almost_surely_reaching(model, goal))
+            settled("end_components", jl.graphs.end_components(model, ~goal))
         settled("accepting_end_components", accepting_end_components(lazy))
         uniform = np.full((*lazy.state_shape, 3), 1 / 3)
         settled("accepting_bottom_components", accepting_bottom_components(lazy, uniform))
@@ -240,6 +240,6 @@ def test_a_model_of_ones_own_is_asked_by_its_primitives():
         return jnp.append(region[1:], region[-1])[:, None]
 
     jax.tree_util.register_pytree_node(Line, lambda _: ((), None), lambda *_: Line())
-    found = jl.games.attractor(Line(), jnp.arange(4) == 2)
+    found = jl.graphs.attractor(Line(), jnp.arange(4) == 2)
     assert found.region.tolist() == [True, True, True, False]
-    assert jl.games.avoidable(Line(), jnp.arange(4) == 2).tolist() == [False, False, False, True]
+    assert jl.graphs.avoidable(Line(), jnp.arange(4) == 2).tolist() == [False, False, False, True]

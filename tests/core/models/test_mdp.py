@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxltl import DenseMDP, from_dense, make_mdp
-from jaxltl.models import to_dense
+from jaxltl.core.models import to_dense
 from tests import reference
 from tests.support import as_mdp
 

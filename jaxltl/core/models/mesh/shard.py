@@ -20,7 +20,6 @@ from jaxltl.core.models.build.convert import to_sparse
 from jaxltl.core.models.build.padded import action_of
 from jaxltl.core.models.mesh.lanes import automatic, axes_of, on_host
 from jaxltl.core.models.mesh.sharded import RowTable, ShardedMDP
-from jaxltl.core.models.ops.underflow import target_dtype, underflow_text, underflows
 from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import SparseMDP, check_entries, checked_starts, row_reward, scaled
 from jaxltl.core.pretty_print import brief
@@ -195,13 +194,12 @@ def to_mesh(model: ShardedMDP, quantity: Any, fill: Any = 0) -> jax.Array:
       >>> to_mesh(model, np.array([1.0, 2.0])).shape
       (2,)
     """
-    quantity, index = np.asarray(quantity), model.number
+    quantity = np.asarray(quantity)
+    if quantity.dtype == np.float64:
+        quantity = quantity.astype(model.dtype)
+    index = model.number
     if quantity.shape[:1] != (model.num_given,):
         index = _rows_of(model, quantity.shape)
-    if quantity.dtype.kind == "f":
-        if index is model.row or quantity.ndim > 1:
-            _refuse_underflow(quantity, model.dtype)
-        quantity = quantity.astype(model.dtype)
     sharding, found = model.sharding, {}
     for piece in index.addressable_shards:
         number = np.asarray(piece.data)
@@ -212,12 +210,6 @@ def to_mesh(model: ShardedMDP, quantity: Any, fill: Any = 0) -> jax.Array:
     return jax.make_array_from_single_device_arrays(
         shape, sharding, [jax.device_put(x, device) for device, x in found.items()]
     )
-
-
-def _refuse_underflow(weight: np.ndarray, dtype: np.dtype) -> None:
-    if (small := underflows(weight, dtype)) is not None:
-        place = np.argwhere(small)[0].tolist()
-        raise ValueError(f"the weight at {place} {underflow_text(weight[tuple(place)], dtype)}.")
 
 
 def _rows_of(model: ShardedMDP, shape: tuple[int, ...]) -> jax.Array:
@@ -456,8 +448,7 @@ def _checked(part: Any, layout: _Layout, d: int, num_labels: int) -> _Range:
     found = part(start, stop)
     if not isinstance(found, ModelPart):
         raise ValueError(f"part({start}, {stop}) is {shown(found)}; it must return a ModelPart.")
-    successor = np.asarray(found.successor)
-    probability = validation.numbers("probability", found.probability)
+    successor, probability = np.asarray(found.successor), np.asarray(found.probability, np.float64)
     entry_start = checked_starts("entry_start", found.entry_start, successor.size, "transitions")
     row_start = found.row_start
     if row_start is None:
@@ -466,25 +457,13 @@ def _checked(part: Any, layout: _Layout, d: int, num_labels: int) -> _Range:
     count = row_start.size - 1
     if count != stop - start:
         raise ValueError(f"part({start}, {stop}) has {count} states; it must have {stop - start}.")
-    dtype = target_dtype(np.float64)
     check_entries(
-        row_start,
-        entry_start,
-        successor,
-        probability,
-        first=start,
-        num_states=layout.num_given,
-        dtype=dtype,
+        row_start, entry_start, successor, probability, first=start, num_states=layout.num_given
     )
     probability = scaled(row_start, entry_start, probability, first=start)
     owner = np.repeat(np.arange(count), np.diff(row_start))
     action = np.arange(owner.size) - row_start[owner] if found.action is None else found.action
     initial = np.full(count, 1 / layout.num_given) if found.initial is None else found.initial
-    if (small := underflows(np.asarray(initial, np.float64), dtype)) is not None:
-        s = int(np.argmax(small))
-        raise ValueError(
-            f"initial probability of state {start + s} {underflow_text(initial[s], dtype)}."
-        )
     label = np.zeros((count, num_labels), bool) if found.label is None else found.label
     for name, x, shape in (
         ("action", action, (owner.size,)),

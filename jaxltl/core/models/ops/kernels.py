@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
-from jaxltl.core.models.ops.underflow import is_positive
 
 # Transitions of a state up to which what is summed over them is written out, so that XLA fuses
 # it into one pass and with what reads single actions; beyond, programs would grow too large.
@@ -117,12 +116,12 @@ def stacked(columns: Sequence[jax.Array]) -> jax.Array:
 
 def hits(weight: jax.Array, inside: jax.Array) -> jax.Array:
     """Whether a successor of positive weight lies in a region."""
-    return is_positive(weight) & inside
+    return (weight > 0) & inside
 
 
 def only_real(weight: jax.Array, value: jax.Array) -> jax.Array:
     """The value where a successor has positive weight, else the largest of its dtype."""
-    return jnp.where(is_positive(weight), value, largest(value.dtype))
+    return jnp.where(weight > 0, value, largest(value.dtype))
 
 
 def largest(dtype: Any) -> Any:

@@ -80,7 +80,7 @@ def episode_evaluator(
 
     Example:
       >>> from jaxltl import make_environment
-      >>> from jaxltl.environments import Timestep, agent_of, make_box
+      >>> from jaxltl.core.environments import Timestep, agent_of, make_box
       >>> def step(place, action, key):
       ...     return Timestep(place + action, -jnp.sum(place**2), False, cost=jnp.sum(action**2))
       >>> cart = make_environment(

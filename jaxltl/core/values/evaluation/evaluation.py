@@ -49,13 +49,13 @@ class EpisodeTotals(NamedTuple):
       cost: sum of the costs.
       length: ``int32``, steps made.
       terminated, truncated: how it ended; neither if it was cut off.
-      verdict: ``int32``, the task's :class:`~jaxltl.logic.Verdict` at the end; None without a task.
+      verdict: ``int32``, the task's :class:`~jaxltl.environments.Verdict` at the end; None without a task.
       visits: ``int32``, accepting readings, that of the first label included; None without.
       discounted_visits: the k-th reading, from 0, counts ``discount ** k``.
 
     Example:
       >>> from jaxltl import from_dense
-      >>> from jaxltl.environments import agent_of, environment_of
+      >>> from jaxltl.core.environments import agent_of, environment_of
       >>> clock = environment_of(from_dense([[[0.0, 1.0]], [[1.0, 0.0]]]))
       >>> agent = agent_of(lambda observation, key: jnp.int32(0))
       >>> keys = jax.random.split(jax.random.key(0), 4)
@@ -201,7 +201,7 @@ class Evaluation:
 
     Example:
       >>> from jaxltl import from_dense
-      >>> from jaxltl.environments import agent_of, environment_of
+      >>> from jaxltl.core.environments import agent_of, environment_of
       >>> from jaxltl.core.environments.task_environment import task_environment
       >>> coin = from_dense(
       ...     [[[.0, .6, .4]], [[.0, 1., .0]], [[.0, .0, 1.]]], initial=[1, 0, 0],
@@ -332,7 +332,7 @@ def evaluate(
 
     Example:
       >>> from jaxltl import from_dense, task_environment
-      >>> from jaxltl.environments import agent_of, environment_of
+      >>> from jaxltl.core.environments import agent_of, environment_of
       >>> coin = from_dense(
       ...     [[[.0, .6, .4]], [[.0, 1., .0]], [[.0, .0, 1.]]], initial=[1, 0, 0],
       ...     label=[[0, 0], [1, 0], [0, 1]], propositions=["heads", "tails"])

@@ -54,7 +54,7 @@ class OptimalityGap(NamedTuple):
 
     Example:
       >>> from jaxltl import make_environment, tabulate
-      >>> from jaxltl.environments import Timestep
+      >>> from jaxltl.core.environments import Timestep
       >>> corridor = make_environment(
       ...     lambda key: jnp.int32(2),
       ...     lambda at, action, key: Timestep(jnp.clip(at + 2 * action - 1, 0, 4), 0.0, False),
@@ -103,7 +103,7 @@ def tabulate_policy(
 
     Example:
       >>> from jaxltl import make_environment, tabulate
-      >>> from jaxltl.environments import Timestep
+      >>> from jaxltl.core.environments import Timestep
       >>> corridor = make_environment(
       ...     lambda key: jnp.int32(2),
       ...     lambda at, action, key: Timestep(jnp.clip(at + 2 * action - 1, 0, 4), 0.0, False),
@@ -177,7 +177,7 @@ def optimality_gap(
 
     Example:
       >>> from jaxltl import make_environment, tabulate
-      >>> from jaxltl.environments import Timestep
+      >>> from jaxltl.core.environments import Timestep
       >>> corridor = make_environment(
       ...     lambda key: jnp.int32(2),
       ...     lambda at, action, key: Timestep(jnp.clip(at + 2 * action - 1, 0, 4), 0.0, False),

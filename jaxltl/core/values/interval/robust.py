@@ -163,7 +163,7 @@ def robust_total_reward(
     ends.
 
     Example:
-      >>> from jaxltl.models import interval_rows
+      >>> from jaxltl.core.models import interval_rows
       >>> coin = interval_rows(None, [0, 2, 3], [0, 1, 1], [0.25, 0.5, 1], [0.5, 0.75, 1])
       >>> found = robust_total_reward(coin, [1.0, 0.0], [False, True], objective="min")
       >>> found.value.round(6).tolist(), found.nature.tolist()  # tosses, if nature is against it
@@ -212,7 +212,7 @@ def robust_discounted_value(
     Concrete arrays only, on the host; not differentiable.
 
     Example:
-      >>> from jaxltl.models import interval_rows
+      >>> from jaxltl.core.models import interval_rows
       >>> coin = interval_rows(None, [0, 2, 3], [0, 1, 1], [0.25, 0.5, 1], [0.5, 0.75, 1])
       >>> found = robust_discounted_value(coin, [1.0, 0.0], 0.5)
       >>> found.value.round(6).tolist(), found.nature.tolist()
@@ -262,7 +262,7 @@ def robust_expectation(
     Concrete arrays only, on the host; not differentiable.
 
     Example:
-      >>> from jaxltl.models import interval_rows
+      >>> from jaxltl.core.models import interval_rows
       >>> model = interval_rows(None, [0, 2, 3], [0, 1, 1], [.25, .5, 1], [.5, .75, 1])
       >>> robust_expectation(model, [0.0, 4.0])[0].tolist()
       [2.0, 4.0]

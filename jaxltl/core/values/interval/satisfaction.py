@@ -45,7 +45,7 @@ class RobustSatisfaction(NamedTuple):
       value: ``float64[N]``, in each of them.
 
     Example:
-      >>> from jaxltl.models import interval_rows
+      >>> from jaxltl.core.models import interval_rows
       >>> model = interval_rows(None, [0, 2, 3, 4], [1, 2, 1, 2], [.4, .3, 1, 1], [.7, .6, 1, 1],
       ...                       initial=[1, 0, 0], label=[[0], [1], [0]], propositions=["a"])
       >>> found = robust_satisfaction(model, "F a")
@@ -93,7 +93,7 @@ def robust_satisfaction(
     Concrete arrays only, on the host; not differentiable.
 
     Example:
-      >>> from jaxltl.models import interval_rows
+      >>> from jaxltl.core.models import interval_rows
       >>> model = interval_rows(None, [0, 2, 3, 4], [1, 2, 1, 2], [.4, .3, 1, 1], [.7, .6, 1, 1],
       ...                       initial=[1, 0, 0], label=[[0], [1], [0]], propositions=["a"])
       >>> robust_satisfaction(model, "F G a").solution.value.tolist()

@@ -73,7 +73,7 @@ def robust_sensitivity(
 
     Example:
       >>> from jaxltl import make_interval, make_sparse
-      >>> from jaxltl.values import robust_reachability
+      >>> from jaxltl.core.values import robust_reachability
       >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
       >>> model = make_interval(coin, [0.4, 0.3, 1, 1], [0.7, 0.6, 1, 1])
       >>> goal = [False, True, False]

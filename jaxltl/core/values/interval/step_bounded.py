@@ -43,7 +43,7 @@ def robust_next_probability(
     Concrete arrays only, on the host; not differentiable.
 
     Example:
-      >>> from jaxltl.models import interval_rows
+      >>> from jaxltl.core.models import interval_rows
       >>> coin = interval_rows(None, [0, 2, 3], [0, 1, 1], [0.25, 0.5, 1], [0.5, 0.75, 1])
       >>> robust_next_probability(coin, [False, True]).value.tolist()
       [0.5, 1.0]
@@ -88,7 +88,7 @@ def robust_bounded_reachability(
     Concrete arrays only, on the host; not differentiable.
 
     Example:
-      >>> from jaxltl.models import interval_rows
+      >>> from jaxltl.core.models import interval_rows
       >>> coin = interval_rows(None, [0, 2, 3], [0, 1, 1], [0.25, 0.5, 1], [0.5, 0.75, 1])
       >>> robust_bounded_reachability(coin, [False, True], 2, nature="max").value.tolist()
       [0.9375, 1.0]
@@ -131,7 +131,7 @@ def robust_cumulative_reward(
     Concrete arrays only, on the host; not differentiable.
 
     Example:
-      >>> from jaxltl.models import interval_rows
+      >>> from jaxltl.core.models import interval_rows
       >>> coin = interval_rows(None, [0, 2, 3], [0, 1, 1], [0.25, 0.5, 1], [0.5, 0.75, 1])
       >>> robust_cumulative_reward(coin, [1.0, 0.0], 2, nature="max").value.tolist()
       [1.5, 0.0]
@@ -167,7 +167,7 @@ def robust_instantaneous_reward(
     Concrete arrays only, on the host; not differentiable.
 
     Example:
-      >>> from jaxltl.models import interval_rows
+      >>> from jaxltl.core.models import interval_rows
       >>> coin = interval_rows(None, [0, 2, 3], [0, 1, 1], [0.25, 0.5, 1], [0.5, 0.75, 1])
       >>> robust_instantaneous_reward(coin, [1.0, 0.0], 2, nature="max").value.tolist()
       [0.25, 0.0]

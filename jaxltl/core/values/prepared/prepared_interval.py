@@ -71,7 +71,7 @@ class PreparedInterval:
       circling: whether who gets out may stay for ever, static.
 
     Example:
-      >>> from jaxltl.models import interval_rows
+      >>> from jaxltl.core.models import interval_rows
       >>> coin = interval_rows(None, [0, 2, 3, 4], [1, 2, 1, 2], [.4, .3, 1, 1], [.7, .6, 1, 1])
       >>> prepared = prepare_interval(coin, [False, True, False])
       >>> prepared.objective, prepared.nature, prepared.size, prepared.node.tolist()
@@ -296,7 +296,7 @@ def solve_prepared_interval(
     order of each row's successors held fixed: where neither is tied, that is the derivative.
 
     Example:
-      >>> from jaxltl.models import interval_rows
+      >>> from jaxltl.core.models import interval_rows
       >>> coin = interval_rows(None, [0, 2, 3, 4], [1, 2, 1, 2], [.4, .3, 1, 1], [.7, .6, 1, 1])
       >>> prepared = prepare_interval(coin, [False, True, False])
       >>> value = jax.jit(lambda low: solve_prepared_interval(prepared, lower=low).value[0])

@@ -32,7 +32,6 @@ from jaxltl.core.models.ops.operators import (
     expectation,
     following,
     is_deterministic,
-    is_representable,
     require_policy,
     valid_policy,
 )
@@ -616,9 +615,7 @@ def _optimize(model, sets: Sets, components, tolerance, max_steps, start, *, obj
         upper=upper,
         residual=residual,
         num_steps=n,
-        status=status_code(
-            bounds.half <= goal, jnp.isfinite(residual), valid=is_representable(model)
-        ),
+        status=status_code(bounds.half <= goal, jnp.isfinite(residual)),
     )
     solution = jax.tree.map(lax.stop_gradient, solution)
 

@@ -37,7 +37,6 @@ from jaxltl.core.models.ops.operators import (
     action_mean,
     expectation,
     following,
-    is_representable,
     valid_policy,
 )
 from jaxltl.core.models.ops.successor_tables import action_columns, table
@@ -180,7 +179,7 @@ def total_reward_by_sweeps(
         jnp.where(finite, x, jnp.where(earns, jnp.inf, bad))
         for x, bad in ((value, jnp.nan), (found.lower, -jnp.inf), (found.upper, jnp.inf))
     )
-    none = status_code(earns, earns, valid=is_representable(model))
+    none = status_code(earns, earns)
     solution = Solution(
         value=value,
         policy=chosen,

@@ -31,7 +31,7 @@ def questions(model, region, value, reward, policy, *, compiled=True):
     Those that are compiled in any case need not be asked twice.
     """
     attractor = jl.core.graphs.attractor
-    components = jl.games.end_components(model, jnp.ones(model.state_shape, bool))
+    components = jl.graphs.end_components(model, jnp.ones(model.state_shape, bool))
     solved = (
         {
             "expectation": jl.models.expectation(model, value),

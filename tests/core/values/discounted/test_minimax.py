@@ -10,11 +10,11 @@ import pytest
 
 from jaxltl import Status, check, from_dense, optimal_value, policy_value, restrict
 from jaxltl.core.graphs.attractor import attractor
+from jaxltl.core.models import to_dense
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.mdp import make_mdp
 from jaxltl.core.values.average.mean_payoff import mean_payoff
 from jaxltl.core.values.discounted.minimax import minimax_value, strategy_value
-from jaxltl.models import to_dense
 from tests import reference
 from tests import reference_game_value as brute
 from tests.support import (

@@ -1,70 +1,65 @@
-"""Models: MDPs, games, interval and parametric models, products, and their placement on devices."""
-
-from jaxltl.core.models.build.batch import (
-    lift_memory as lift_memory,
-    stack_products as stack_products,
+from .build.batch import lift_memory as lift_memory, stack_products as stack_products
+from .build.convert import to_padded as to_padded, to_sparse as to_sparse
+from .build.counts import (
+    TransitionCounts as TransitionCounts,
+    counted_model as counted_model,
+    counts_on as counts_on,
+    make_counts as make_counts,
 )
-from jaxltl.core.models.build.convert import to_padded as to_padded, to_sparse as to_sparse
-from jaxltl.core.models.build.lifting import (
+from .build.lifting import (
     FiniteMemoryPolicy as FiniteMemoryPolicy,
     lift_policy as lift_policy,
     lift_trajectories as lift_trajectories,
     project_policy as project_policy,
     project_trajectories as project_trajectories,
 )
-from jaxltl.core.models.build.restrict import (
+from .build.restrict import (
     Restriction as Restriction,
     restrict as restrict,
     with_allowed as with_allowed,
 )
-from jaxltl.core.models.game import Game as Game, make_game as make_game
-from jaxltl.core.models.interval import (
+from .game import Game as Game, make_game as make_game
+from .interval import (
     IntervalMDP as IntervalMDP,
     interval_rows as interval_rows,
     make_interval as make_interval,
 )
-from jaxltl.core.models.mdp import (
+from .mdp import (
     DenseMDP as DenseMDP,
     MDP as MDP,
     from_dense as from_dense,
     make_mdp as make_mdp,
     to_dense as to_dense,
 )
-from jaxltl.core.models.mesh.lanes import on_host as on_host, vmap_over_mesh as vmap_over_mesh
-from jaxltl.core.models.mesh.shard import (
+from .mesh.lanes import on_host as on_host, vmap_over_mesh as vmap_over_mesh
+from .mesh.shard import (
     ModelPart as ModelPart,
     from_mesh as from_mesh,
     model_from_parts as model_from_parts,
     shard as shard,
     to_mesh as to_mesh,
 )
-from jaxltl.core.models.mesh.sharded import ShardedMDP as ShardedMDP
-from jaxltl.core.models.ops.operators import (
+from .mesh.sharded import ShardedMDP as ShardedMDP
+from .ops.operators import (
     exists_successor as exists_successor,
     expectation as expectation,
     forall_successor as forall_successor,
     pushforward as pushforward,
     sample_successor as sample_successor,
 )
-from jaxltl.core.models.parametric.parametric import (
+from .parametric.parametric import (
     ParametricMDP as ParametricMDP,
     make_parametric as make_parametric,
 )
-from jaxltl.core.models.product import (
-    Product as Product,
-    letters_of as letters_of,
-    product as product,
-)
-from jaxltl.core.models.sparse import (
+from .product import Product as Product, letters_of as letters_of, product as product
+from .sparse import (
     Rewards as Rewards,
     SparseMDP as SparseMDP,
     make_sparse as make_sparse,
     row_reward as row_reward,
 )
-from jaxltl.core.models.trajectories import (
+from .trajectories import (
     Trajectories as Trajectories,
     make_trajectories as make_trajectories,
     rollout as rollout,
 )
-
-__all__ = sorted(name for name in dir() if not name.startswith("_"))

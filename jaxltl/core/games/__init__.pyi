@@ -1,0 +1,28 @@
+from .objective import (
+    GR1 as GR1,
+    Parity as Parity,
+    buchi as buchi,
+    cobuchi as cobuchi,
+    generalized_buchi as generalized_buchi,
+    gr1 as gr1,
+    parity as parity,
+    reach as reach,
+    safety as safety,
+    states_where as states_where,
+)
+from .permissive import (
+    Permissive as Permissive,
+    apply_strategy as apply_strategy,
+    permissive_strategy as permissive_strategy,
+    shield_policy as shield_policy,
+)
+from .shielded_environment import (
+    ShieldedWorld as ShieldedWorld,
+    shield_environment as shield_environment,
+)
+from .verify import Verification as Verification, verify as verify
+from .winning import (
+    Winning as Winning,
+    almost_sure_buchi as almost_sure_buchi,
+    winning_region as winning_region,
+)

@@ -1,0 +1,4 @@
+from .confidence_sets import (
+    ConfidenceSets as ConfidenceSets,
+    intervals_from_counts as intervals_from_counts,
+)

@@ -1,0 +1,103 @@
+from .average.average_reward import average_reward as average_reward
+from .average.mean_payoff import mean_payoff as mean_payoff
+from .discounted.boltzmann import (
+    boltzmann_fixed_points as boltzmann_fixed_points,
+    boltzmann_value as boltzmann_value,
+)
+from .discounted.discounted import optimal_value as optimal_value, policy_value as policy_value
+from .discounted.minimax import minimax_value as minimax_value, strategy_value as strategy_value
+from .discounted.occupancy import (
+    feature_expectation as feature_expectation,
+    occupancy_measure as occupancy_measure,
+)
+from .discounted.soft import soft_value as soft_value
+from .evaluation.data_guarantee import (
+    DataGuarantee as DataGuarantee,
+    guarantee_curve as guarantee_curve,
+    learn_guarantee as learn_guarantee,
+)
+from .evaluation.episode_scores import episode_evaluator as episode_evaluator
+from .evaluation.evaluation import (
+    EpisodeTotals as EpisodeTotals,
+    Estimate as Estimate,
+    Evaluation as Evaluation,
+    evaluate as evaluate,
+)
+from .evaluation.optimality_gap import (
+    OptimalityGap as OptimalityGap,
+    optimality_gap as optimality_gap,
+    tabulate_policy as tabulate_policy,
+)
+from .interval.robust import (
+    robust_discounted_value as robust_discounted_value,
+    robust_expectation as robust_expectation,
+    robust_reachability as robust_reachability,
+    robust_total_reward as robust_total_reward,
+)
+from .interval.satisfaction import (
+    RobustSatisfaction as RobustSatisfaction,
+    robust_satisfaction as robust_satisfaction,
+)
+from .interval.sensitivity import (
+    Sensitivity as Sensitivity,
+    robust_sensitivity as robust_sensitivity,
+)
+from .interval.step_bounded import (
+    robust_bounded_reachability as robust_bounded_reachability,
+    robust_cumulative_reward as robust_cumulative_reward,
+    robust_instantaneous_reward as robust_instantaneous_reward,
+    robust_next_probability as robust_next_probability,
+)
+from .multi_objective.multi_objective import (
+    Achievable as Achievable,
+    ConstrainedOptimum as ConstrainedOptimum,
+    Front as Front,
+    NearestMixture as NearestMixture,
+    Pareto as Pareto,
+    achievable as achievable,
+    multi_objective as multi_objective,
+    pareto as pareto,
+)
+from .multi_objective.objectives import Objective as Objective
+from .prepared.prepared import (
+    Prepared as Prepared,
+    prepare as prepare,
+    solve_prepared as solve_prepared,
+)
+from .prepared.prepared_interval import (
+    PreparedInterval as PreparedInterval,
+    prepare_interval as prepare_interval,
+    solve_prepared_interval as solve_prepared_interval,
+)
+from .properties.solve_property import (
+    Answer as Answer,
+    PropertyStrategy as PropertyStrategy,
+    solve_property as solve_property,
+)
+from .undiscounted.hitting_time import hitting_time as hitting_time
+from .undiscounted.optimal_actions import (
+    OptimalActions as OptimalActions,
+    optimal_actions as optimal_actions,
+)
+from .undiscounted.performance import (
+    Performance as Performance,
+    task_performance as task_performance,
+    task_performances as task_performances,
+)
+from .undiscounted.reachability import reachability_probability as reachability_probability
+from .undiscounted.satisfaction import (
+    optimal_satisfaction as optimal_satisfaction,
+    satisfaction_probability as satisfaction_probability,
+)
+from .undiscounted.sparse_satisfaction import (
+    Satisfaction as Satisfaction,
+    sparse_satisfaction as sparse_satisfaction,
+)
+from .undiscounted.step_bounded import (
+    bounded_reachability as bounded_reachability,
+    cumulative_reward as cumulative_reward,
+    instantaneous_reward as instantaneous_reward,
+    next_probability as next_probability,
+    reward_bounded_reachability as reward_bounded_reachability,
+)
+from .undiscounted.total_reward import total_reward as total_reward
