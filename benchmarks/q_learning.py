@@ -15,7 +15,7 @@ import numpy as np
 from benchmarks.timing import compare
 from jaxltl.algos import maximin_q
 from jaxltl.core.graphs.attractor import attractor
-from jaxltl.core.models.build.restrict import restrict
+from jaxltl.core.models.construct.restrict import restrict
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.ops.operators import forall_successor
 from jaxltl.envs.robots import diagonal_reward, robots

@@ -18,7 +18,7 @@ from benchmarks.timing import compare, once
 from jaxltl.algos import todirl
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.translate import to_automaton
-from jaxltl.core.models.build.batch import stack_products
+from jaxltl.core.models.construct.batch import stack_products
 from jaxltl.core.models.ops.operators import expectation, transition_matrix
 from jaxltl.core.models.product import Product, product
 from jaxltl.core.values.discounted.soft import policy_logits, soft_value

@@ -28,15 +28,15 @@ from .core.games.permissive import permissive_strategy as permissive_strategy
 from .core.games.verify import verify as verify
 from .core.games.winning import winning_region as winning_region
 from .core.logic.ltl import parse_ltl as parse_ltl
-from .core.models.build.batch import stack_products as stack_products
-from .core.models.build.convert import to_padded as to_padded, to_sparse as to_sparse
-from .core.models.build.counts import make_counts as make_counts
-from .core.models.build.lifting import (
+from .core.models.construct.batch import stack_products as stack_products
+from .core.models.construct.convert import to_padded as to_padded, to_sparse as to_sparse
+from .core.models.construct.counts import make_counts as make_counts
+from .core.models.construct.lifting import (
     FiniteMemoryPolicy as FiniteMemoryPolicy,
     lift_policy as lift_policy,
     project_policy as project_policy,
 )
-from .core.models.build.restrict import restrict as restrict, with_allowed as with_allowed
+from .core.models.construct.restrict import restrict as restrict, with_allowed as with_allowed
 from .core.models.game import Game as Game, make_game as make_game
 from .core.models.interval import IntervalMDP as IntervalMDP, make_interval as make_interval
 from .core.models.mdp import (

@@ -61,7 +61,7 @@ from flax import struct
 
 from jaxltl.algos.common import learner
 from jaxltl.algos.common.early_stopping import Best, stop_early
-from jaxltl.core.models.build.batch import stack_models, stack_observations, training_counts
+from jaxltl.core.models.construct.batch import stack_models, stack_observations, training_counts
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.pretty_print import brief, history

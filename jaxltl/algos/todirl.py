@@ -66,9 +66,14 @@ from jax import lax
 
 from jaxltl.algos.common import learner
 from jaxltl.algos.common.early_stopping import Best, stop_early
-from jaxltl.core.models.build.batch import narrow, stack_models, stack_observations, training_counts
-from jaxltl.core.models.build.batch import world as lane
-from jaxltl.core.models.build.restrict import with_allowed
+from jaxltl.core.models.construct.batch import (
+    narrow,
+    stack_models,
+    stack_observations,
+    training_counts,
+)
+from jaxltl.core.models.construct.batch import world as lane
+from jaxltl.core.models.construct.restrict import with_allowed
 from jaxltl.core.models.ops.successor_tables import Predecessors, predecessors
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.trajectories import Trajectories

@@ -24,7 +24,7 @@ from jaxltl.app.explorer import (
 from jaxltl.app.guarantee import left_out
 from jaxltl.app.job import automaton_picture, over_seeds, short_name
 from jaxltl.core.environments.monitor import Verdict, verdicts
-from jaxltl.core.models.build.restrict import restrict
+from jaxltl.core.models.construct.restrict import restrict
 from jaxltl.core.models.product import Product
 from jaxltl.core.values.undiscounted.mixture import from_starts
 

@@ -25,7 +25,7 @@ from jaxltl.app.explorer import (
 )
 from jaxltl.app.job import automaton_picture, over_seeds, short_name
 from jaxltl.core.environments.monitor import Verdict, verdicts
-from jaxltl.core.models.build.batch import lift_memory
+from jaxltl.core.models.construct.batch import lift_memory
 from jaxltl.core.models.trajectories import Trajectories, make_trajectories
 from jaxltl.envs.gridworld import ACTIONS
 

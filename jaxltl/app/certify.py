@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxltl.core.models.build.counts import TransitionCounts, counted_model, counts_on
+from jaxltl.core.models.construct.counts import TransitionCounts, counted_model, counts_on
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.statistics.confidence_sets import check_confidence
 from jaxltl.core.types import Status
@@ -76,7 +76,7 @@ def read_evidence(
     Args:
       log, labels, model: files.
       initial, terminal: names of states.
-      graph: what is known of successors; see :func:`~jaxltl.core.models.build.counts.counted_model`.
+      graph: what is known of successors; see :func:`~jaxltl.core.models.construct.counts.counted_model`.
       option: how an option stands where it was given, for messages.
 
     Returns:

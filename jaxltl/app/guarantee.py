@@ -11,7 +11,7 @@ import numpy as np
 from jaxltl.app.files.task import World
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.environments.monitor import Verdict, verdicts
-from jaxltl.core.models.build.lifting import memory_along
+from jaxltl.core.models.construct.lifting import memory_along
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.types import Solution

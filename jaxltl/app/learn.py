@@ -52,7 +52,7 @@ from jaxltl.app.job import (
 )
 from jaxltl.app.job import fingerprint as fingerprint
 from jaxltl.app.job import postfix as postfix
-from jaxltl.core.models.build.lifting import lift_policy
+from jaxltl.core.models.construct.lifting import lift_policy
 from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.models.product import Product, product
 from jaxltl.core.models.trajectories import Trajectories

@@ -64,9 +64,9 @@ from jaxltl.app.job import fingerprint as fingerprint
 from jaxltl.app.job import postfix as postfix
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.synchronize import synchronize
-from jaxltl.core.models.build.batch import lift_memory, narrow, stack_products
-from jaxltl.core.models.build.lifting import allowed_steps
-from jaxltl.core.models.build.restrict import with_allowed
+from jaxltl.core.models.construct.batch import lift_memory, narrow, stack_products
+from jaxltl.core.models.construct.lifting import allowed_steps
+from jaxltl.core.models.construct.restrict import with_allowed
 from jaxltl.core.models.ops.operators import action_mean, expectation
 from jaxltl.core.models.product import Product, product
 from jaxltl.core.types import Solution, Status, status_code

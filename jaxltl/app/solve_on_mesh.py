@@ -20,7 +20,7 @@ from jaxltl.app.run_job import make_directory
 from jaxltl.app.solve import MISTAKEN, NOT_CONVERGED, Asked, Result, load
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.logic.properties import Property
-from jaxltl.core.models.build.state_formulas import BUILT_IN, label_columns
+from jaxltl.core.models.construct.state_formulas import BUILT_IN, label_columns
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.mesh.lanes import on_host
 from jaxltl.core.models.mesh.shard import shard, to_mesh

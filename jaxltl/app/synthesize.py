@@ -18,7 +18,7 @@ from jaxltl.core.games.permissive import Permissive, apply_strategy, permissive_
 from jaxltl.core.games.verify import Verification, verify
 from jaxltl.core.games.winning import Winning, adversarial_chance, objective_at, winning_region
 from jaxltl.core.graphs.attractor import attractor
-from jaxltl.core.models.build.restrict import Restriction, restrict
+from jaxltl.core.models.construct.restrict import Restriction, restrict
 from jaxltl.core.models.game import Game
 
 Progress = Callable[[str], None]

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxltl.core.automata.automaton import Automaton, make_automaton
-from jaxltl.core.models.build.restrict import restrict
+from jaxltl.core.models.construct.restrict import restrict
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.mdp import make_mdp
 from jaxltl.core.models.product import product

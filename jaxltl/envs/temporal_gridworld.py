@@ -27,7 +27,7 @@ from jaxltl.core.automata.automaton import Automaton, letter_index
 from jaxltl.core.automata.translate import Task, to_automaton
 from jaxltl.core.logic.labels import require_known
 from jaxltl.core.logic.ltl import Formula, parse_ltl
-from jaxltl.core.models.build.lifting import project_trajectories
+from jaxltl.core.models.construct.lifting import project_trajectories
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.ops import operators
 from jaxltl.core.models.ops.array_namespace import to_jax

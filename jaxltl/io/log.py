@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core import validation
-from jaxltl.core.models.build.convert import to_sparse
-from jaxltl.core.models.build.counts import (
+from jaxltl.core.models.construct.convert import to_sparse
+from jaxltl.core.models.construct.counts import (
     Places,
     TransitionCounts,
     in_order,
@@ -65,9 +65,9 @@ def read_log(
         the log, by number if all are integers, else by alphabet.
 
     Returns:
-      :class:`~jaxltl.core.models.build.counts.TransitionCounts`.
-      :func:`~jaxltl.core.models.build.counts.counts_on` puts it beside the probabilities of a model, and
-      :func:`~jaxltl.core.models.build.counts.counted_model` makes a model of it.
+      :class:`~jaxltl.core.models.construct.counts.TransitionCounts`.
+      :func:`~jaxltl.core.models.construct.counts.counts_on` puts it beside the probabilities of a model, and
+      :func:`~jaxltl.core.models.construct.counts.counted_model` makes a model of it.
 
     Raises:
       ValueError: naming the file and the line: the file cannot be read, is no such table, has an
@@ -131,7 +131,7 @@ def read_labels(
 
     Returns:
       The states of each label, in the order of the file, as
-      :func:`~jaxltl.core.models.build.counts.counted_model` takes them.
+      :func:`~jaxltl.core.models.construct.counts.counted_model` takes them.
 
     Raises:
       ValueError: naming the file and the line, as :func:`read_log`.

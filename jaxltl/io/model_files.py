@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from jaxltl.core.models.build.convert import to_sparse
+from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.sparse import SparseMDP
@@ -98,7 +98,7 @@ def write_model(path: str | os.PathLike[str], model: Any) -> None:
 
     Args:
       path: the file.
-      model: a model that :func:`~jaxltl.core.models.build.convert.to_sparse` takes, a
+      model: a model that :func:`~jaxltl.core.models.construct.convert.to_sparse` takes, a
         :class:`~jaxltl.core.models.game.Game` over one, or an
         :class:`~jaxltl.core.models.interval.IntervalMDP`.
 

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.algos.common.checkpoint import atomic_write, read_arrays
-from jaxltl.core.models.build.convert import to_sparse
-from jaxltl.core.models.build.padded import to_padded
+from jaxltl.core.models.construct.convert import to_sparse
+from jaxltl.core.models.construct.padded import to_padded
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.interval import IntervalMDP, interval_rows
 from jaxltl.core.models.mdp import MDP, DenseMDP, from_dense, make_mdp
@@ -318,7 +318,7 @@ def write_npz(path: str | os.PathLike[str], model: Any) -> None:
 
     Args:
       path: the file.
-      model: a model that :func:`~jaxltl.core.models.build.convert.to_sparse` takes, a game over one, or
+      model: a model that :func:`~jaxltl.core.models.construct.convert.to_sparse` takes, a game over one, or
         an interval model.
 
     Raises:

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from jaxltl.core.automata.automaton import Automaton, make_automaton
 from jaxltl.core.logic.labels import satisfying
 from jaxltl.core.logic.ltl import Formula, Letter, parse_ltl, proposition_text
-from jaxltl.core.models.build.convert import to_sparse
+from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.product import Product, expected_reads
 from jaxltl.core.models.sparse import SparseMDP

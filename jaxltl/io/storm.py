@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from jaxltl.core.models.build.convert import to_sparse
+from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.sparse import SparseMDP
@@ -70,7 +70,7 @@ def to_stormpy(model: Any) -> Any:
     Of an initial distribution Storm has the states where it is positive.
 
     Args:
-      model: a model that :func:`~jaxltl.core.models.build.convert.to_sparse` takes, a Game over one, or
+      model: a model that :func:`~jaxltl.core.models.construct.convert.to_sparse` takes, a Game over one, or
         an :class:`~jaxltl.core.models.interval.IntervalMDP`.
 
     Returns:

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxltl.core.models.build.convert import to_sparse
+from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.interval import IntervalMDP, interval_rows, refuse_ball
 from jaxltl.core.models.mdp import checked_initial
@@ -214,7 +214,7 @@ def write_umb(
 
     Args:
       path: the file.
-      model: a model that :func:`~jaxltl.core.models.build.convert.to_sparse` takes, an interval model,
+      model: a model that :func:`~jaxltl.core.models.construct.convert.to_sparse` takes, an interval model,
         whose rewards are written as intervals of one point, or a game over a model.
       compression: "gzip", "xz", None for none, or by the end of the name: xz for ``.xz``, else
         gzip.

@@ -16,8 +16,8 @@ from jaxltl.algos import mlirl as irl
 from jaxltl.algos.common import learner
 from jaxltl.algos.common.chunks import run_in_chunks
 from jaxltl.app.job import plain
-from jaxltl.core.models.build.lifting import lift_policy
-from jaxltl.core.models.build.restrict import restrict
+from jaxltl.core.models.construct.lifting import lift_policy
+from jaxltl.core.models.construct.restrict import restrict
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.product import Product, product
 from jaxltl.core.models.trajectories import Trajectories, make_trajectories

@@ -18,7 +18,7 @@ from jaxltl.algos.common import learner, pac
 from jaxltl.app.job import plain
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.games.winning import almost_sure_buchi
-from jaxltl.core.models.build.restrict import restrict
+from jaxltl.core.models.construct.restrict import restrict
 from jaxltl.core.models.ops.operators import expectation
 from jaxltl.core.types import check
 from jaxltl.core.values.discounted.minimax import minimax_value, strategy_value

@@ -18,7 +18,7 @@ from jaxltl.app.job import plain
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.synchronize import synchronize
 from jaxltl.core.automata.translate import to_automaton
-from jaxltl.core.models.build.batch import lift_memory, stack_products
+from jaxltl.core.models.construct.batch import lift_memory, stack_products
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.trajectories import Trajectories, make_trajectories
 from jaxltl.core.values.undiscounted.performance import task_performances

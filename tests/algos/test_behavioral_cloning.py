@@ -12,7 +12,7 @@ import pytest
 
 import jaxltl as jl
 from jaxltl.algos import behavioral_cloning as bc
-from jaxltl.core.models.build.batch import stack_products, world
+from jaxltl.core.models.construct.batch import stack_products, world
 
 SMALL = bc.DensePolicy(hidden=(16,))
 

@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components, shortest_path
 
 import jaxltl as jl
 from jaxltl.algos import mlirl, todirl
-from jaxltl.core.models.build.lifting import allowed_steps
+from jaxltl.core.models.construct.lifting import allowed_steps
 from tests import reference
 from tests.reference_logic import random_formula
 from tests.support import as_mdp

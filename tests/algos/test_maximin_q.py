@@ -14,7 +14,7 @@ import pytest
 from jaxltl.algos import maximin_q
 from jaxltl.algos.maximin_q._chains import alias_table
 from jaxltl.core.graphs.attractor import attractor
-from jaxltl.core.models.build.restrict import restrict
+from jaxltl.core.models.construct.restrict import restrict
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.mdp import make_mdp, to_dense
 from jaxltl.core.models.ops.operators import forall_successor

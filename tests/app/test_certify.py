@@ -8,7 +8,7 @@ import pytest
 from click.testing import CliRunner
 
 from jaxltl.cli import main
-from jaxltl.core.models.build.counts import counted_model
+from jaxltl.core.models.construct.counts import counted_model
 from jaxltl.core.values.evaluation.data_guarantee import learn_guarantee
 from jaxltl.io.log import read_labels, read_log
 

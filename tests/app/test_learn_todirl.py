@@ -11,7 +11,7 @@ from jaxltl.app import learn_todirl
 from jaxltl.app.files.task import method_of
 from jaxltl.app.files.task_todirl import cell_observations, load_automata, load_scenes, read_task
 from jaxltl.app.reports import learn_todirl as report_todirl
-from jaxltl.core.models.build.batch import stack_products
+from jaxltl.core.models.construct.batch import stack_products
 from jaxltl.core.models.mdp import from_dense
 from jaxltl.envs import temporal_gridworld
 from jaxltl.io.colored_world import save_world, write_world

@@ -8,7 +8,7 @@ import pytest
 from jaxltl.app.files.task import load_demonstrations, load_world, read_task
 from jaxltl.app.logged import guaranteed
 from jaxltl.app.reports.learn import remarks
-from jaxltl.core.models.build.counts import counted_model
+from jaxltl.core.models.construct.counts import counted_model
 from jaxltl.core.models.product import product
 from jaxltl.core.values.evaluation.data_guarantee import learn_guarantee
 from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction

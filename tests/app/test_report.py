@@ -16,7 +16,7 @@ from jaxltl.app import explorer as exploring
 from jaxltl.app.drawing import Picture, draw, drawing
 from jaxltl.app.explorer import START, Layer, TooLarge, curves, demonstrated_runs, learned_runs
 from jaxltl.app.reports.live import Said, live_page
-from jaxltl.core.models.build.lifting import lift_trajectories
+from jaxltl.core.models.construct.lifting import lift_trajectories
 from jaxltl.core.models.product import product
 from jaxltl.core.models.trajectories import make_trajectories
 from jaxltl.envs.gridworld import ACTIONS, gridworld

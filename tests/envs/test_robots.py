@@ -7,7 +7,7 @@ import pytest
 
 import jaxltl as jl
 from jaxltl.core.graphs.attractor import attractor
-from jaxltl.core.models.build.restrict import restrict
+from jaxltl.core.models.construct.restrict import restrict
 from jaxltl.core.models.game import is_deterministic
 from jaxltl.core.models.ops import operators
 from jaxltl.envs.robots import (

@@ -12,7 +12,7 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from jaxltl.core.models.build.counts import counts_on
+from jaxltl.core.models.construct.counts import counts_on
 from jaxltl.core.models.mdp import make_mdp
 from jaxltl.core.models.sparse import make_sparse
 from jaxltl.io import _columns, log

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxltl.core.automata.automaton import letter_index
-from jaxltl.core.models.build.convert import to_sparse
+from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.mdp import make_mdp
 from jaxltl.core.models.product import product
 from jaxltl.core.models.sparse import Rewards, row_reward

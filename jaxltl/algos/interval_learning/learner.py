@@ -74,7 +74,7 @@ from jaxltl.core.automata.translate import Task
 from jaxltl.core.graphs.acceptance import accepting_bottom_components, accepting_end_components
 from jaxltl.core.graphs.attractor import almost_surely_reaching, attractor
 from jaxltl.core.graphs.end_components import bottom_components, end_components
-from jaxltl.core.models.build.convert import to_padded, to_sparse
+from jaxltl.core.models.construct.convert import to_padded, to_sparse
 from jaxltl.core.models.game import as_game
 from jaxltl.core.models.mdp import support
 from jaxltl.core.models.ops.array_namespace import to_jax

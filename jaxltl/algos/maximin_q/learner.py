@@ -67,7 +67,7 @@ from jaxltl.algos.common.play import (
     uniform_rows,
 )
 from jaxltl.core.graphs.end_components import bottom_components
-from jaxltl.core.models.build.restrict import restrict
+from jaxltl.core.models.construct.restrict import restrict
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.ops.operators import action_argmax, sample_successor
 from jaxltl.core.pretty_print import brief, history

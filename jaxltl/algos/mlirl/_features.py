@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxltl.core.models.build.lifting import lift_trajectories
+from jaxltl.core.models.construct.lifting import lift_trajectories
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.ops.array_namespace import namespace, to_jax
 from jaxltl.core.models.ops.operators import expectation

@@ -64,8 +64,8 @@ from jaxltl.algos.mlirl._features import pair_counts
 from jaxltl.algos.mlirl._features import progress_states as progress_states
 from jaxltl.algos.mlirl._features import task_features as task_features
 from jaxltl.algos.mlirl._features import world_features as world_features
-from jaxltl.core.models.build.lifting import allowed_steps, lift_trajectories
-from jaxltl.core.models.build.restrict import with_allowed
+from jaxltl.core.models.construct.lifting import allowed_steps, lift_trajectories
+from jaxltl.core.models.construct.restrict import with_allowed
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.models.product import Product
@@ -250,7 +250,7 @@ def make_problem(
       allowed: ``bool[S, A]`` (``[S, Q, A]``), the actions that policies choose from, such as those
         that lose nothing of the task (:func:`~jaxltl.core.values.undiscounted.optimal_actions.optimal_actions`);
         default all. Demonstrated steps that take others are left out:
-        :func:`~jaxltl.core.models.build.lifting.allowed_steps` tells which.
+        :func:`~jaxltl.core.models.construct.lifting.allowed_steps` tells which.
 
     Returns:
       :class:`Problem`.

@@ -16,7 +16,7 @@ from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.games.objective import Parity
 from jaxltl.core.games.winning import objective_at, task_game
 from jaxltl.core.logic.ltl import Formula
-from jaxltl.core.models.build.restrict import restrict
+from jaxltl.core.models.construct.restrict import restrict
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.types import require_shape

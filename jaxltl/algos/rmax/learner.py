@@ -81,7 +81,7 @@ from jaxltl.core.games.objective import Parity, buchi
 from jaxltl.core.games.winning import solve
 from jaxltl.core.graphs.attractor import attractor
 from jaxltl.core.logic.ltl import Formula
-from jaxltl.core.models.build.restrict import restrict
+from jaxltl.core.models.construct.restrict import restrict
 from jaxltl.core.models.game import Game, as_padded_game
 from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.models.ops.operators import forall_successor

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxltl.app.files import tables
 from jaxltl.core.games.objective import Parity
-from jaxltl.core.models.build.padded import action_of, to_padded
+from jaxltl.core.models.construct.padded import action_of, to_padded
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.mdp import MDP

@@ -20,8 +20,8 @@ from jaxltl.app.files import tables
 from jaxltl.app.files.tables import COUNT, NAMES, TEXT, Rule, choice, is_list, is_number, number_in
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.logic.labels import satisfying
-from jaxltl.core.models.build.counts import listed
-from jaxltl.core.models.build.lifting import project_trajectories
+from jaxltl.core.models.construct.counts import listed
+from jaxltl.core.models.construct.lifting import project_trajectories
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.trajectories import Trajectories, make_trajectories

@@ -22,7 +22,7 @@ from jaxltl.core.games.winning import objective_at, on_states, solve_parity
 from jaxltl.core.graphs.attractor import attract
 from jaxltl.core.graphs.graph import graph_of
 from jaxltl.core.logic.ltl import Formula
-from jaxltl.core.models.build.restrict import Restriction, restrict
+from jaxltl.core.models.construct.restrict import Restriction, restrict
 from jaxltl.core.models.game import Game, as_padded_game
 from jaxltl.core.models.mesh.sharded import refuse_sharded
 from jaxltl.core.models.ops import operators
@@ -169,11 +169,11 @@ def apply_strategy(strategy: Permissive) -> Restriction:
       strategy: of :func:`permissive_strategy`, winning from some initial state.
 
     Returns:
-      A :class:`~jaxltl.core.models.build.restrict.Restriction`; ``base_state`` and ``memory`` number the
+      A :class:`~jaxltl.core.models.construct.restrict.Restriction`; ``base_state`` and ``memory`` number the
       states of ``strategy.game``.
 
     Raises:
-      ValueError: as of :func:`~jaxltl.core.models.build.restrict.restrict`.
+      ValueError: as of :func:`~jaxltl.core.models.construct.restrict.restrict`.
 
     Example:
       >>> import jaxltl as jl

@@ -21,7 +21,7 @@ from jaxltl.core.games.objective import GR1, Parity, States, buchi
 from jaxltl.core.graphs.attractor import attract
 from jaxltl.core.graphs.graph import Graph, graph_of, take
 from jaxltl.core.logic.ltl import Formula
-from jaxltl.core.models.build.restrict import restrict
+from jaxltl.core.models.construct.restrict import restrict
 from jaxltl.core.models.compiled.compiled import compiled_form
 from jaxltl.core.models.game import Game, as_game, as_padded_game
 from jaxltl.core.models.mdp import make_mdp, support
@@ -84,7 +84,7 @@ def winning_region(
     Args:
       game: a Game; any other model is the game in which the system always moves. Actions in one
         on a sparse model are rows, in its product with a task those of
-        :func:`~jaxltl.core.models.build.convert.to_sparse`.
+        :func:`~jaxltl.core.models.construct.convert.to_sparse`.
       spec: an objective on the game's states (see :mod:`jaxltl.core.games.objective`), or a
         formula or an automaton, which is put beside the game (``label_on="exit"``).
       chance: ``"random"``: by the model's probabilities; ``"adversarial"``: the environment

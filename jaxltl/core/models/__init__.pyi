@@ -1,19 +1,19 @@
-from .build.batch import lift_memory as lift_memory, stack_products as stack_products
-from .build.convert import to_padded as to_padded, to_sparse as to_sparse
-from .build.counts import (
+from .construct.batch import lift_memory as lift_memory, stack_products as stack_products
+from .construct.convert import to_padded as to_padded, to_sparse as to_sparse
+from .construct.counts import (
     TransitionCounts as TransitionCounts,
     counted_model as counted_model,
     counts_on as counts_on,
     make_counts as make_counts,
 )
-from .build.lifting import (
+from .construct.lifting import (
     FiniteMemoryPolicy as FiniteMemoryPolicy,
     lift_policy as lift_policy,
     lift_trajectories as lift_trajectories,
     project_policy as project_policy,
     project_trajectories as project_trajectories,
 )
-from .build.restrict import (
+from .construct.restrict import (
     Restriction as Restriction,
     restrict as restrict,
     with_allowed as with_allowed,

@@ -13,7 +13,7 @@ import numpy as np
 from flax import struct
 
 from jaxltl.core.models import facts
-from jaxltl.core.models.build.padded import to_padded
+from jaxltl.core.models.construct.padded import to_padded
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.mdp import support
 from jaxltl.core.models.ops import operators
@@ -170,7 +170,7 @@ def as_game(model: Model) -> Game:
 
 
 def as_padded_game(model: Model) -> Game:
-    """The same, where sparse models are padded (:func:`~jaxltl.core.models.build.padded.to_padded`)."""
+    """The same, where sparse models are padded (:func:`~jaxltl.core.models.construct.padded.to_padded`)."""
     game = as_game(model)
     if isinstance(game.mdp, SparseMDP):
         game = replace(game, mdp=to_padded(game.mdp))

@@ -89,7 +89,7 @@ class Product:
       letter: ``int32[S]``, the automaton's letter that each world state shows.
       label_on: which label a step reads; static.
       allowed: ``bool[S, Q, A]``, the actions to which the world's are narrowed, or None; see
-        :func:`~jaxltl.core.models.build.restrict.with_allowed`.
+        :func:`~jaxltl.core.models.construct.restrict.with_allowed`.
 
     Example:
       >>> import jaxltl as jl

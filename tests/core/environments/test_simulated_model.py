@@ -10,7 +10,7 @@ from jaxltl.core.environments.episodes import agent_of, run_episode
 from jaxltl.core.environments.simulated_model import environment_of
 from jaxltl.core.environments.tabulate import tabulate
 from jaxltl.core.environments.task_environment import task_environment
-from jaxltl.core.models.build.convert import to_sparse
+from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.game import make_game
 from jaxltl.core.models.mdp import to_dense
 from jaxltl.core.models.product import product

@@ -17,7 +17,7 @@ from jaxltl.core.environments.task_environment import task_environment
 from jaxltl.core.games.permissive import permissive_strategy
 from jaxltl.core.games.shielded_environment import ShieldedWorld, shield_environment
 from jaxltl.core.games.winning import winning_region
-from jaxltl.core.models.build.convert import to_sparse
+from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.mdp import from_dense
 from jaxltl.core.models.product import product
 from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction

@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from jaxltl.core.models.build.restrict import restrict, with_allowed
+from jaxltl.core.models.construct.restrict import restrict, with_allowed
 from jaxltl.core.models.game import make_game
 from jaxltl.core.models.interval import interval_rows, make_interval
 from jaxltl.core.models.mdp import from_dense

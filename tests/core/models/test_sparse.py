@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from jaxltl.core.automata.translate import to_automaton
-from jaxltl.core.models.build.convert import to_padded, to_sparse
+from jaxltl.core.models.construct.convert import to_padded, to_sparse
 from jaxltl.core.models.mdp import MDP, make_mdp, support, to_dense
 from jaxltl.core.models.product import product
 from jaxltl.core.models.sparse import Rewards, make_sparse, row_reward

@@ -5,8 +5,8 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from jaxltl.core.models.build.convert import to_padded, to_sparse
-from jaxltl.core.models.build.restrict import restrict, with_allowed
+from jaxltl.core.models.construct.convert import to_padded, to_sparse
+from jaxltl.core.models.construct.restrict import restrict, with_allowed
 from jaxltl.core.models.mdp import to_dense
 from jaxltl.core.models.product import product
 from jaxltl.core.models.sparse import make_sparse

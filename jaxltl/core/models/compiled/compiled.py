@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxltl.core.models.build.convert import to_sparse
+from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mesh.sharded import ShardedMDP, is_sharded
 from jaxltl.core.models.ops.array_namespace import is_traced
@@ -30,7 +30,7 @@ def compiled_form(model: Model, reward: Any = None) -> tuple[Any, Any]:
     """A model and a reward for solvers that are compiled; all but sparse ones as they are.
 
     A product of a sparse model is written out: its states are numbered ``s * Q + q``, and its rows
-    are those of :func:`~jaxltl.core.models.build.convert.to_sparse`, inside ``jit`` too.
+    are those of :func:`~jaxltl.core.models.construct.convert.to_sparse`, inside ``jit`` too.
 
     Args:
       model: a model or a game.

@@ -16,8 +16,8 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxltl.core import validation
 from jaxltl.core.models import facts
-from jaxltl.core.models.build.convert import to_sparse
-from jaxltl.core.models.build.padded import action_of
+from jaxltl.core.models.construct.convert import to_sparse
+from jaxltl.core.models.construct.padded import action_of
 from jaxltl.core.models.mesh.lanes import automatic, axes_of, on_host
 from jaxltl.core.models.mesh.sharded import RowTable, ShardedMDP
 from jaxltl.core.models.protocols import Model
@@ -84,7 +84,7 @@ def shard(
 
     Returns:
       :class:`~jaxltl.core.models.mesh.sharded.ShardedMDP`. An action of it is an action of the model,
-      of a sparse one what it is in :func:`~jaxltl.core.models.build.padded.to_padded`.
+      of a sparse one what it is in :func:`~jaxltl.core.models.construct.padded.to_padded`.
 
     Raises:
       ValueError: the model, the axis or the order is none.

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxltl.core.models.build.convert import to_sparse
+from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.sparse.solvers.average_reward import average
 from jaxltl.core.types import Solution
 from jaxltl.core.values.undiscounted.step_bounded import (

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxltl.core.models.build.padded import padded_rows
+from jaxltl.core.models.construct.padded import padded_rows
 from jaxltl.core.models.compiled.compiled import compiled_form, in_shape_of
 from jaxltl.core.models.game import Game, as_game, as_padded_game, is_deterministic
 from jaxltl.core.models.mesh.sharded import refuse_sharded

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxltl.core.models.build.convert import to_sparse
+from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.compiled.compiled import flat_policy
 from jaxltl.core.models.compiled.compiled import is_sparse as is_sparse
 from jaxltl.core.models.ops.array_namespace import is_traced, to_jax

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from jaxltl.core.automata.translate import Task
-from jaxltl.core.models.build.convert import to_sparse
-from jaxltl.core.models.build.counts import TransitionCounts, counts_on
+from jaxltl.core.models.construct.convert import to_sparse
+from jaxltl.core.models.construct.counts import TransitionCounts, counts_on
 from jaxltl.core.models.interval import IntervalMDP, make_interval
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief
@@ -81,7 +81,7 @@ def learn_guarantee(
 
     Args:
       model: its graph, labels and initial distribution count; its probabilities do not. See
-        :func:`~jaxltl.core.models.build.counts.counted_model` for one that is made of a log.
+        :func:`~jaxltl.core.models.construct.counts.counted_model` for one that is made of a log.
       counts: of its transitions, matched by name; or ``int[T]``, beside its entries.
       task: a formula, its text or an automaton.
       confidence: in (0, 1), of everything that is returned at once.

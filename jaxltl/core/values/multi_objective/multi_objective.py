@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxltl.core.models.build.convert import to_sparse
+from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.graph.qualitative import end_components

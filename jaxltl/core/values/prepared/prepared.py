@@ -13,7 +13,7 @@ import numpy as np
 from flax import struct
 from jax import lax
 
-from jaxltl.core.models.build.convert import to_sparse
+from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.mesh.sharded import refuse_sharded
 from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
 from jaxltl.core.models.ops.operators import is_deterministic
@@ -111,7 +111,7 @@ def prepare(
     equal shape, later states first, so that one pass solves what has no circles.
 
     Args:
-      model: a concrete SparseMDP, or what :func:`~jaxltl.core.models.build.convert.to_sparse` takes.
+      model: a concrete SparseMDP, or what :func:`~jaxltl.core.models.construct.convert.to_sparse` takes.
       target: ``bool[S]``.
       stay: ``bool[S]``, the states that may be passed before; default all. Not with a reward.
       reward: asks for the expected total reward until the target and not for the probability of

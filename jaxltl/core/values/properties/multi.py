@@ -12,7 +12,7 @@ from jaxltl.core.logic.bounded import Bounded, unfolded
 from jaxltl.core.logic.labels import is_boolean
 from jaxltl.core.logic.ltl import TRUE, Formula
 from jaxltl.core.logic.properties import MAX_UNFOLDED_STEPS, Property, parse_property
-from jaxltl.core.models.build.state_formulas import states_satisfying
+from jaxltl.core.models.construct.state_formulas import states_satisfying
 from jaxltl.core.models.sparse import SparseMDP, row_reward
 from jaxltl.core.types import Status
 from jaxltl.core.values.multi_objective.multi_objective import (

@@ -13,7 +13,7 @@ from jaxltl.core.logic.bounded import Bounded, Earned, unfolded
 from jaxltl.core.logic.labels import is_boolean
 from jaxltl.core.logic.ltl import TRUE, Formula
 from jaxltl.core.logic.properties import MAX_UNFOLDED_STEPS, Property, parse_property
-from jaxltl.core.models.build.state_formulas import states_satisfying
+from jaxltl.core.models.construct.state_formulas import states_satisfying
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief

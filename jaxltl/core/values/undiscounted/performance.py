@@ -23,7 +23,7 @@ from jax import lax
 from jaxltl.core.graphs.acceptance import accepting_bottom_components
 from jaxltl.core.graphs.graph import TracedGraph, graph_of, take
 from jaxltl.core.graphs.reaching import max_sets, min_sets, policy_sets
-from jaxltl.core.models.build.batch import is_stacked, num_worlds
+from jaxltl.core.models.construct.batch import is_stacked, num_worlds
 from jaxltl.core.models.ops.array_namespace import namespace, to_jax
 from jaxltl.core.models.ops.operators import (
     action_mean,
@@ -282,7 +282,7 @@ def task_performances(
     relative error is bounded whatever the chain (O'Cinneide 1993).
 
     Args:
-      models: stacked products, see :func:`~jaxltl.core.models.build.batch.stack_products`.
+      models: stacked products, see :func:`~jaxltl.core.models.construct.batch.stack_products`.
       policies: ``float[W, S, Q, A]`` or ``int32[W, S, Q]``; without W the same in every world.
       tolerance: as in :func:`task_performance`.
       batch: worlds that are in memory at once.

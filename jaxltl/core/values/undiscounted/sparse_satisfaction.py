@@ -11,7 +11,7 @@ from jaxltl.core.automata.automaton import Automaton, letter_index
 from jaxltl.core.automata.runs import live_states, universal_states
 from jaxltl.core.automata.translate import Task, to_automaton
 from jaxltl.core.logic.ltl import as_formula
-from jaxltl.core.models.build.state_formulas import letters_of
+from jaxltl.core.models.construct.state_formulas import letters_of
 from jaxltl.core.models.ops.operators import is_deterministic
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.sparse import SparseMDP

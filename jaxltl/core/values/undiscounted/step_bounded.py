@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxltl.core.models.build.convert import to_sparse
+from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.sparse import Rewards, SparseMDP, reward_parts, row_reward
 from jaxltl.core.sparse.solvers import step_bounded as host
 from jaxltl.core.sparse.solvers.reward_bounded import bounded_cost, in_units

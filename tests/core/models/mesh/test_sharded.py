@@ -9,7 +9,7 @@ import pytest
 
 from jaxltl.core.games.objective import safety
 from jaxltl.core.games.permissive import permissive_strategy
-from jaxltl.core.models.build.convert import to_padded, to_sparse
+from jaxltl.core.models.construct.convert import to_padded, to_sparse
 from jaxltl.core.models.mdp import make_mdp, to_dense
 from jaxltl.core.models.mesh.lanes import on_host
 from jaxltl.core.models.mesh.shard import ModelPart, from_mesh, model_from_parts, shard, to_mesh

@@ -18,7 +18,7 @@ from jaxltl.core.graphs.end_components import (
     end_components,
 )
 from jaxltl.core.graphs.graph import host_graph
-from jaxltl.core.models.build.convert import to_padded, to_sparse
+from jaxltl.core.models.construct.convert import to_padded, to_sparse
 from jaxltl.core.sparse import rows
 from jaxltl.core.sparse.graph import qualitative as sparse_graph
 from jaxltl.core.sparse.mdp import HostMDP

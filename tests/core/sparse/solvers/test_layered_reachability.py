@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from jaxltl.core.models.build.restrict import with_allowed
+from jaxltl.core.models.construct.restrict import with_allowed
 from jaxltl.core.sparse.solvers import layered_reachability as layers
 from jaxltl.core.sparse.solvers.dense_reachability import policy_row
 from jaxltl.core.values.undiscounted import reachability

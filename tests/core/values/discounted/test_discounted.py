@@ -7,7 +7,7 @@ import pytest
 
 import jaxltl as jl
 from jaxltl import Status
-from jaxltl.core.models.build.batch import stack_products
+from jaxltl.core.models.construct.batch import stack_products
 from jaxltl.core.values.discounted.boltzmann import boltzmann_expansion
 from jaxltl.core.values.discounted.discounted import expected_reward
 from jaxltl.core.values.discounted.soft import soft_value

@@ -5,7 +5,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from jaxltl.core.models.build.counts import make_counts
+from jaxltl.core.models.construct.counts import make_counts
 from jaxltl.core.models.interval import make_interval
 from jaxltl.core.models.sparse import make_sparse
 from jaxltl.core.values.evaluation.data_guarantee import guarantee_curve, learn_guarantee, safe_mean

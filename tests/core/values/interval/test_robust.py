@@ -5,7 +5,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from jaxltl.core.models.build.restrict import restrict, with_allowed
+from jaxltl.core.models.construct.restrict import restrict, with_allowed
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP, interval_rows, make_interval
 from jaxltl.core.models.product import product

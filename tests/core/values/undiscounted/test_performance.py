@@ -13,7 +13,7 @@ import pytest
 import jaxltl as jl
 from jaxltl import Status
 from jaxltl.core.automata.automaton import make_automaton
-from jaxltl.core.models.build.batch import stack_models, stack_products, world
+from jaxltl.core.models.construct.batch import stack_models, stack_products, world
 from jaxltl.core.types import Solution
 from jaxltl.core.values.undiscounted import performance as tp
 from tests import reference

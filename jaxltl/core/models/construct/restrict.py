@@ -11,11 +11,11 @@ import jax
 import numpy as np
 
 from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
-from jaxltl.core.models.build.convert import to_sparse
+from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.mdp import MDP, DenseMDP, make_mdp, support
-from jaxltl.core.models.build.part import part_of, reachable
+from jaxltl.core.models.construct.part import part_of, reachable
 from jaxltl.core.models.product import Product, flat_successor
 from jaxltl.core.validation import no_model
 from jaxltl.core.models.protocols import ActionModel, Model, ModelT

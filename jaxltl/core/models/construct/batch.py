@@ -20,10 +20,10 @@ from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.translate import Task, to_automaton
 from jaxltl.core.logic.ltl import Formula, parse_ltl
 from jaxltl.core.models.ops.array_namespace import is_traced, namespace, to_jax
-from jaxltl.core.models.build.lifting import allowed_steps, memory_along
+from jaxltl.core.models.construct.lifting import allowed_steps, memory_along
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.product import Product, letters_of, product
-from jaxltl.core.models.build.restrict import with_allowed
+from jaxltl.core.models.construct.restrict import with_allowed
 from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.trajectories import Trajectories, make_trajectories, require_states
 

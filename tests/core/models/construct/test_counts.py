@@ -5,9 +5,8 @@ import collections
 import numpy as np
 import pytest
 
-from jaxltl.core.statistics.confidence_sets import intervals_from_counts
-from jaxltl.core.models.build.convert import to_sparse
-from jaxltl.core.models.build.counts import (
+from jaxltl.core.models.construct.convert import to_sparse
+from jaxltl.core.models.construct.counts import (
     action_names,
     counted_model,
     counts_on,
@@ -19,6 +18,7 @@ from jaxltl.core.models.game import make_game
 from jaxltl.core.models.interval import make_interval
 from jaxltl.core.models.mdp import from_dense, make_mdp, to_dense
 from jaxltl.core.models.sparse import make_sparse
+from jaxltl.core.statistics.confidence_sets import intervals_from_counts
 from tests.sparse_models import random_sparse
 
 

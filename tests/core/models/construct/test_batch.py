@@ -10,7 +10,7 @@ import pytest
 import jaxltl as jl
 from jaxltl.core.automata.automaton import accepts_lasso, run
 from jaxltl.core.automata.synchronize import synchronize
-from jaxltl.core.models.build.batch import (
+from jaxltl.core.models.construct.batch import (
     as_stacked,
     demonstrated_counts,
     is_stacked,

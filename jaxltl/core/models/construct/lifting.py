@@ -118,7 +118,7 @@ def allowed_steps(model: ActionModel, trajectories: Trajectories) -> np.ndarray:
 
     Args:
       model: the world, or a product, perhaps narrowed by
-        :func:`~jaxltl.core.models.build.restrict.with_allowed`.
+        :func:`~jaxltl.core.models.construct.restrict.with_allowed`.
       trajectories: of the world.
 
     Raises:

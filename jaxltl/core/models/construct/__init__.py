@@ -1,0 +1,1 @@
+"""Construction of models: conversion, restriction, lifting, batches of products, and counts."""
