@@ -380,6 +380,8 @@ def extent_text(automaton: Automaton) -> str:
     """Numbers of states and letters as text."""
     counts = zip(automaton.delta.shape, ("state", "letter"), strict=True)
     sizes = ", ".join(f"{n} {name}{'' if n == 1 else 's'}" for n, name in counts)
+    if automaton.letters.shape[-1] != len(automaton.propositions):  # returned by a program
+        return f"{sizes} over {automaton.letters.shape[-1]} propositions"
     return f"{sizes} over {', '.join(automaton.propositions) or 'no propositions'}"
 
 

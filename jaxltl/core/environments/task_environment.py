@@ -13,14 +13,13 @@ padded to one shape by :func:`stack_tasks`, run in one vmapped program.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
 import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 
@@ -39,7 +38,7 @@ from jaxltl.core.environments.monitor import Verdict, lasting_verdicts, verdicts
 from jaxltl.core.environments.task_reward import Pay, pay_of
 from jaxltl.core.logic.labels import require_known
 from jaxltl.core.logic.ltl import Formula
-from jaxltl.core.models.product import Names
+from jaxltl.core.models.ops.annotated_pytree import register_annotated_pytree
 from jaxltl.core.pretty_print import brief
 
 ENDINGS = ("repeat", "violated", "undecided")
@@ -101,7 +100,7 @@ class TaskObservation(NamedTuple):
 
 
 @brief
-@struct.dataclass
+@dataclass(frozen=True)
 class TaskTables:
     """A task over the labels of a world, as arrays; made by :func:`make_task_tables`.
 
@@ -119,7 +118,7 @@ class TaskTables:
       potential: ``float[Q]``, of shaping; zero for none.
       learner_discount: ``float[]``, with which shaping reckons.
       embedding: ``float[Q, ...]``, how a state is shown, or None: one-hot.
-      text: what is left of the formula in each state; static.
+      state_names: the residual formula of each state, `[Q]` texts, or empty; not part of the tree.
 
     Example:
       >>> tables = make_task_tables("F goal", ["wall", "goal"])
@@ -140,7 +139,15 @@ class TaskTables:
     potential: Any
     learner_discount: Any
     embedding: Any
-    text: Names = struct.field(pytree_node=False)
+    state_names: tuple[str, ...] = ()
+
+
+register_annotated_pytree(
+    TaskTables,
+    arrays=[field.name for field in fields(TaskTables) if field.name != "state_names"],
+    static=(),
+    text={"state_names": ()},
+)
 
 
 def make_task_tables(
@@ -214,7 +221,7 @@ def make_task_tables(
         potential=pay.potential.astype(number),
         learner_discount=np.asarray(learner_discount, number),
         embedding=None if shown is None else shown.astype(number),
-        text=Names(automaton.state_names),
+        state_names=automaton.state_names,
     )
 
 
@@ -451,7 +458,7 @@ def what_is_left(task: Environment | TaskTables | Automaton, memory: Any) -> str
         names, count = task.state_names, len(task.delta)
     else:
         tables = task if isinstance(task, TaskTables) else task_tables(task)
-        (names,), count = tables.text.texts, tables.delta.shape[-2]
+        names, count = tables.state_names, tables.delta.shape[-2]
     state = validation.whole("memory", memory)
     if not 0 <= state < count:
         raise ValueError(f"memory={state}; the automaton has the states 0..{count - 1}.")
@@ -624,6 +631,7 @@ def _padded(tables: Sequence[TaskTables]) -> list[TaskTables]:
             discount=grow(t.discount, *sizes),
             potential=grow(t.potential, num_memory),
             embedding=None if t.embedding is None else grow(t.embedding, num_memory),
+            state_names=(),
         )
         for t in tables
     ]

@@ -24,53 +24,19 @@ from jaxltl.core.models import facts
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.ops import kernels, operators
+from jaxltl.core.models.ops.annotated_pytree import register_annotated_pytree
 from jaxltl.core.models.ops.array_namespace import namespace, to_jax
 from jaxltl.core.models.protocols import LabelledModel
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.validation import shown
 
 
-class Names:
-    """The texts of an automaton. All are equal to a compiled program, which reads none of them."""
-
-    def __init__(self, *texts: Any) -> None:
-        self.texts = texts
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Names)
-
-    def __hash__(self) -> int:
-        return 0
-
-
-_TABLES = ("delta", "initial", "priority", "letters")
-
-
-def _tables(automaton: Automaton) -> tuple[list[Any], Any]:
-    names = Names(automaton.propositions, automaton.state_names)
-    return [getattr(automaton, name) for name in _TABLES], (automaton.acceptance, names)
-
-
-def _tables_with_keys(automaton: Automaton) -> tuple[list[Any], Any]:
-    tables, rest = _tables(automaton)
-    keys = [jax.tree_util.GetAttrKey(name) for name in _TABLES]
-    return list(zip(keys, tables, strict=True)), rest
-
-
-def _automaton(rest: Any, tables: Any) -> Automaton:
-    acceptance, names = rest
-    propositions, state_names = names.texts
-    return Automaton(
-        **dict(zip(_TABLES, tables, strict=True)),
-        propositions=propositions,
-        acceptance=acceptance,
-        state_names=state_names,
-    )
-
-
-# So formulas whose automata have one shape share compiled programs. (What such a program returns of
-# an automaton has the names of the one that it was compiled for.)
-jax.tree_util.register_pytree_with_keys(Automaton, _tables_with_keys, _automaton, _tables)
+register_annotated_pytree(
+    Automaton,
+    arrays=("delta", "initial", "priority", "letters"),
+    static=("acceptance",),
+    text={"propositions": (), "state_names": ()},
+)
 
 
 @brief(facts=facts.product, drawn=True)

@@ -280,6 +280,16 @@ def test_what_is_left_of_a_formula():
         what_is_left(walk(), 0)
 
 
+def test_programs_and_stacks_show_no_text_of_another_formula():
+    tasks = [task_environment(walk(), f"F {name}") for name in "ab"]
+    returned = jax.jit(lambda task: task)
+    for task in tasks:
+        assert what_is_left(returned(task), 0) == "state 0 of 2"
+    assert returned._cache_size() == 1
+    assert what_is_left(jax.tree.map(np.asarray, tasks[1]), 0) == "F b"
+    assert task_tables(stack_tasks(tasks)).state_names == ()
+
+
 # --- what is drawn --------------------------------------------------------------------------------
 
 

@@ -292,3 +292,17 @@ def test_two_formulas_of_one_shape_share_a_program():
     assert [m.automaton.propositions for m in models] == [("a",), ("b",)]
     again = jax.tree.map(lambda x: x, models[1])
     assert again.automaton.state_names == models[1].automaton.state_names
+
+
+def test_programs_return_no_text_of_another_formula():
+    world = jl.gridworld("a . b\n. . .", slip=0.1)
+    first, second = (jl.product(world, task) for task in ("F a", "F b"))
+    returned = jax.jit(lambda model: model)
+    for model in (first, second):
+        found = returned(model).automaton
+        assert found.propositions == () and found.state_names == ()
+        assert "1 propositions" in repr(found)
+    assert returned._cache_size() == 1
+    shape = jax.eval_shape(lambda model: model, second)
+    assert shape.automaton.propositions == ()
+    assert jax.tree.map(np.asarray, second).automaton.propositions == ("b",)

@@ -1,0 +1,80 @@
+"""Pytrees annotated with text that compiled programs do not depend on.
+
+The names of propositions and formulas are no part of a program: formulas whose automata have one
+shape share it. So text is carried beside the arrays and is equal to any other text, and it is
+dropped wherever the arrays are traced. A program cannot read it, and the trees that it returns have
+none, rather than that of the formula for which the program was compiled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any, TypeVar
+
+import jax
+
+ClassT = TypeVar("ClassT")
+
+
+class _Text:
+    """Values of text fields, equal to all others, since programs are the same for all."""
+
+    def __init__(self, values: tuple[Any, ...]) -> None:
+        self.values = values
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Text)
+
+    def __hash__(self) -> int:
+        return 0
+
+
+def register_annotated_pytree(
+    cls: type[ClassT], arrays: Iterable[str], static: Iterable[str], text: Mapping[str, Any]
+) -> type[ClassT]:
+    """Registers a dataclass as a pytree with text.
+
+    Args:
+      cls: the dataclass.
+      arrays: names of the fields that hold arrays, or None.
+      static: names of the fields that are part of the structure and compared by value.
+      text: for each text field its value in trees of traced arrays.
+
+    Example:
+      >>> from dataclasses import dataclass
+      >>> @dataclass
+      ... class Task:
+      ...     value: float
+      ...     formula: str
+      >>> _ = register_annotated_pytree(Task, ["value"], [], {"formula": ""})
+      >>> jax.tree.map(lambda x: 2 * x, Task(1.0, "F a"))
+      Task(value=2.0, formula='F a')
+      >>> jax.jit(lambda task: task)(Task(1.0, "F a")).formula
+      ''
+    """
+    arrays, static, names = tuple(arrays), tuple(static), tuple(text)
+
+    def flatten(tree: ClassT) -> tuple[list[Any], Any]:
+        values = tuple(getattr(tree, name) for name in static)
+        return [getattr(tree, name) for name in arrays], (
+            values,
+            _Text(tuple(getattr(tree, name) for name in names)),
+        )
+
+    def flatten_with_keys(tree: ClassT) -> tuple[list[Any], Any]:
+        leaves, rest = flatten(tree)
+        keys = map(jax.tree_util.GetAttrKey, arrays)
+        return list(zip(keys, leaves, strict=True)), rest
+
+    def unflatten(rest: Any, leaves: Iterable[Any]) -> ClassT:
+        values, shown = rest
+        leaves = tuple(leaves)
+        traced = any(isinstance(x, jax.core.Tracer) for x in leaves)
+        return cls(
+            **dict(zip(arrays, leaves, strict=True)),
+            **dict(zip(static, values, strict=True)),
+            **(text if traced else dict(zip(names, shown.values, strict=True))),
+        )
+
+    jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
+    return cls
