@@ -41,7 +41,7 @@ def run() -> list[dict[str, Any]]:
     hparams = rmax.Hparams(discount=0.6, reward_bound=1.0, epsilon=1e-4, restart=1 / 50)
     train = jax.jit(
         lambda key, p, h: rmax.train_until(
-            key, p, h, until=rmax.strategy_rests(_REST), num_steps=10**6
+            key, p, h, until=rmax.strategy_is_stable(_REST), num_steps=10**6
         )
     )
     keys = jax.random.split(jax.random.key(0), _SEEDS)

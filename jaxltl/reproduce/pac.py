@@ -101,7 +101,7 @@ def figures(
         "figure17": _figure_17(model, known["quantity"]),
         "figure18": {
             "reachable": np.asarray(evidence.reachable)[system],
-            "learned": np.asarray(evidence.worst.value)[system],
+            "learned": np.asarray(evidence.worst_case.value)[system],
             **{k: np.asarray(v)[system] for k, v in known["values"].items()},
         },
         "figure19": _figure_19(model, known["winning"], evidence),
@@ -237,7 +237,7 @@ def _judged(
                 "moves": one.state.moves,
                 "updates": one.state.num_updates,
                 "eps_optimal_states": jnp.sum(evidence.epsilon_optimal & asked),
-                "eps_optimal_states_met": jnp.sum(evidence.epsilon_optimal_met & asked),
+                "eps_optimal_states_met": jnp.sum(evidence.epsilon_optimal_played & asked),
                 "always_almost_sure": bool(one.state.always_almost_sure & evidence.almost_sure),
             }
         )

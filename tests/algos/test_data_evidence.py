@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from jaxltl.algos import rmax
-from jaxltl.algos.rmax._data_evidence import data_evidence
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import make_mdp
 from jaxltl.core.values.discounted.minimax import minimax_value, strategy_value
@@ -23,8 +22,9 @@ def test_bounds_hold_and_close_in():
     rng = np.random.default_rng(0)
     for _ in range(8):
         game = random_game(rng)
-        probability, every = np.asarray(game.mdp.probability), np.ones((5, 2), bool)
+        probability = np.asarray(game.mdp.probability)
         earned = rng.random((5, 2, 3))
+        problem = rmax.make_problem(game, np.ones(5, bool), earned)
         play = rng.dirichlet(np.ones(2), 5)
         mean = (probability * earned).sum(-1)
         optimal = minimax_value(game, mean, 0.8).value
@@ -32,7 +32,7 @@ def test_bounds_hold_and_close_in():
         gap = np.inf
         for size in (0, 10, 1000, 100_000):
             counts = np.stack([[rng.multinomial(size, p) for p in rows] for rows in probability])
-            found = data_evidence(game, every, np.ones(5, bool), earned, counts, play, 0.8, 0.99)
+            found = rmax.data_evidence(problem, counts, play, 0.8, confidence=0.99)
             assert (found.secured <= worst + 1e-6).all()
             assert (found.optimal >= optimal - 1e-6).all()
             assert found.num_samples == 10 * size
@@ -50,6 +50,6 @@ def test_a_learner_says_what_its_counts_guarantee():
     state, _ = rmax.train(jax.random.key(0), problem, hparams, num_steps=30)
     found = rmax.evidence(state, problem, hparams, confidence=0.9)
     assert found.data.num_samples == int(state.counts.sum())
-    assert (found.data.secured <= np.asarray(found.worst.value) + 1e-6).all()
+    assert (found.data.secured <= np.asarray(found.worst_case.value) + 1e-6).all()
     assert (found.data.optimal >= np.asarray(found.optimal.value) - 1e-6).all()
     assert rmax.evidence(state, problem, hparams).data is None

@@ -34,7 +34,7 @@ def settings(**changed):
 def learn(key, problem, hparams, moves, num_steps=100_000):
     """Until the strategy has rested for so many moves."""
     return rmax.train_until(
-        key, problem, hparams, until=rmax.strategy_rests(moves), num_steps=num_steps
+        key, problem, hparams, until=rmax.strategy_is_stable(moves), num_steps=num_steps
     )
 
 
@@ -266,9 +266,9 @@ def test_with_restarts_nearly_all_states_become_optimal():
         assert mine.sum() == 54
         assert found.almost_sure
         assert np.asarray(found.epsilon_optimal)[mine].sum() >= 52
-        assert np.asarray(found.epsilon_optimal_met)[mine].sum() >= 52
+        assert np.asarray(found.epsilon_optimal_played)[mine].sum() >= 52
         np.testing.assert_array_equal(
-            np.asarray(found.worst.lower) >= np.asarray(found.optimal.upper) - 1e-4,
+            np.asarray(found.worst_case.lower) >= np.asarray(found.optimal.upper) - 1e-4,
             found.epsilon_optimal,
         )
 
@@ -291,7 +291,7 @@ def test_the_printed_update_fails_where_the_corrected_one_does_not():
         hparams = settings(known_after=50, update=update, restart=0.0)
         learned = learn(jax.random.key(0), problem, hparams, 20_000)
         found = rmax.evidence(learned.state, problem, hparams)
-        worth[update] = float(found.worst.value[0])
+        worth[update] = float(found.worst_case.value[0])
         assert float(found.optimal.value[0]) == pytest.approx(1.25)
         assert bool(found.epsilon_optimal[0]) == (update == "every")
     assert worth["every"] == pytest.approx(1.25, abs=1e-4)
@@ -325,7 +325,7 @@ def test_a_formula_on_a_markov_decision_process():
     found = rmax.evidence(learned.state, problem, hparams)
     assert found.almost_sure
     assert found.epsilon_optimal[found.reachable].mean() > 0.8
-    np.testing.assert_allclose(found.worst.value, found.met.value, atol=1e-3)
+    np.testing.assert_allclose(found.worst_case.value, found.played.value, atol=1e-3)
 
 
 @pytest.mark.slow
@@ -342,14 +342,16 @@ def test_the_adversary_plays_the_minimax_answer():
     learned = learn(jax.random.key(0), problem, settings(), 5000)
     evidence = rmax.evidence(learned.state, problem, settings())
     mine = np.asarray(evidence.reachable & problem.game.system)
-    assert np.asarray(evidence.epsilon_optimal_met)[mine].sum() >= 30
+    assert np.asarray(evidence.epsilon_optimal_played)[mine].sum() >= 30
     never = theirs[:, None] & np.asarray(problem.allowed) & (np.asarray(problem.environment) == 0)
     assert (np.asarray(learned.state.known_at)[never] == -1).all()
 
 
 def test_the_constants_of_the_theorem_are_used():
     hparams = settings()
-    assert float(_optimistic_model.enough(example(), hparams)) == pytest.approx(1.4193e19, rel=1e-4)
+    assert float(_optimistic_model.required_visits(example(), hparams)) == pytest.approx(
+        1.4193e19, rel=1e-4
+    )
     explore = float(_optimistic_model.exploration(example(), hparams))
     assert explore == pytest.approx(5.33333e-7, rel=1e-5)
     state = rmax.init(jax.random.key(0), example(), hparams)
@@ -379,7 +381,7 @@ def test_lanes_of_different_settings_are_as_if_alone():
         moves_per_step=10,
     )
     keys = jax.random.split(jax.random.key(0), 2)
-    train = partial(rmax.train_until, until=rmax.strategy_rests(200), num_steps=2000)
+    train = partial(rmax.train_until, until=rmax.strategy_is_stable(200), num_steps=2000)
     nested = jax.jit(jax.vmap(jax.vmap(train, (None, None, axes)), (0, None, None)))(
         keys, problem, hparams
     )
@@ -449,10 +451,12 @@ def test_a_start_outside_the_region_is_told():
         propositions=["goal"],
     )
     reward = np.zeros((3, 2))
-    with pytest.raises(ValueError, match=r"1 of the states .* region: 2\. .*environment can keep"):
+    with pytest.raises(
+        ValueError, match=r"1 of the initial states .* region: 2\. .*environment can keep"
+    ):
         rmax.make_problem(mdp, np.array([False, True, False]), reward)
     game = Game(mdp, jnp.array([False, True, True]))
-    with pytest.raises(ValueError, match=r"2 of the states .* region: 0 .*, 2"):
+    with pytest.raises(ValueError, match=r"2 of the initial states .* region: 0 .*, 2"):
         rmax.make_problem(game, "F goal", reward)
     rmax.make_problem(mdp, "F goal", reward, start=[1, 0, 0])
 

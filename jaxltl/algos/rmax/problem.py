@@ -1,0 +1,218 @@
+"""Problems of R-max: a game, its product with the task's automaton, and the winning region."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from numpy.typing import ArrayLike, NDArray
+
+from jaxltl.algos.common.play import (
+    check_reward,
+    cumulative,
+    environment_policy,
+    explicit_game,
+    start_distribution,
+    uniform_rows,
+)
+from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.games.objective import Parity, buchi
+from jaxltl.core.games.winning import objective_at, solve, task_game
+from jaxltl.core.logic.ltl import Formula
+from jaxltl.core.models.construct.restrict import restrict
+from jaxltl.core.models.game import Game
+from jaxltl.core.models.ops.array_namespace import to_jax
+from jaxltl.core.models.ops.operators import forall_successor
+from jaxltl.core.models.protocols import Model
+from jaxltl.core.pretty_print import brief
+from jaxltl.core.types import require_shape
+from jaxltl.core.values.discounted.minimax import minimax_value
+
+
+@brief
+@struct.dataclass
+class Problem:
+    """A game with a Buchi objective and a reward; made by :func:`make_problem`.
+
+    Attributes:
+      game: explicit, each successor of an action listed once.
+      reward: ``float[S, A]`` or ``[S, A, K]``, observed one transition at a time.
+      accepting: ``bool[S]``, to be visited infinitely often.
+      region: ``bool[S]``, the almost-sure winning region.
+      allowed: ``bool[S, A]``, the actions that surely stay in the region; none outside of it.
+      environment: ``float[S, A]``, the policy of the environment.
+      start: ``float[S]``, initial distribution; `start_table` its cumulative weights.
+      base_state, memory: ``int32[S]``, the state of the given game and of the task's automaton.
+    """
+
+    game: Game
+    reward: jax.Array
+    accepting: jax.Array
+    region: jax.Array
+    allowed: jax.Array
+    environment: jax.Array
+    start: jax.Array
+    start_table: jax.Array
+    base_state: jax.Array
+    memory: jax.Array
+
+
+def make_problem(
+    game: Model,
+    spec: ArrayLike | Parity | Automaton | Formula | str,
+    reward: ArrayLike,
+    *,
+    environment: ArrayLike | str = "random",
+    discount: float | None = None,
+    start: ArrayLike | None = None,
+) -> Problem:
+    """A checked :class:`Problem`: the product with the task's automaton, and its winning region.
+
+    Args:
+      game: a Game, or an MDP, in which the system always moves.
+      spec: accepting states ``bool[S]``, an objective, or a formula or automaton, whose product
+        with the game reads labels on exit. A deterministic Buchi condition or weaker.
+      reward: ``float[S, A]`` or ``float[S, A, K]`` on the given game, for actions of both players.
+      environment: ``"random"``; ``"adversarial"``: optimal against an optimal system, by the
+        `discount`; or a policy ``int32[S]`` or ``float[S, A]`` on the given game.
+      discount: of the adversarial environment only.
+      start: ``float[S]``, on the given game; default its initial distribution.
+
+    Returns:
+      :class:`Problem`; of a product, its reachable part.
+
+    Raises:
+      ValueError: a wrong shape, a policy or start that is no distribution, a reward that is not
+        finite, a task that is no Buchi condition, or a start outside of the region.
+    """
+    game = explicit_game(game)
+    reward = np.asarray(reward, float)
+    shape = game.mdp.probability.shape
+    require_shape("reward", reward, shape if reward.ndim == 3 else shape[:2])
+    joint = _joint_game(game, spec, start_distribution(game, start))
+    played = _merge_successors(joint.game)
+    observed = check_reward(joint.game, reward[joint.base_state])
+    accepting = to_jax(joint.accepting)
+    region = solve(played, buchi(played, accepting)).region
+    _require_start_in(region, joint)
+    problem = Problem(
+        game=played,
+        reward=observed,
+        accepting=accepting,
+        region=region,
+        allowed=_safe_actions(played, region),
+        environment=jnp.zeros(()),
+        start=played.initial,
+        start_table=to_jax(cumulative(np.asarray(played.initial, float))),
+        base_state=to_jax(joint.base_state.astype(np.int32)),
+        memory=to_jax(joint.memory.astype(np.int32)),
+    )
+    rows = _environment_rows(problem, game, environment, discount)
+    return replace(problem, environment=to_jax(np.asarray(rows, played.dtype)))
+
+
+@dataclass(frozen=True)
+class _JointGame:
+    """An explicit game, its accepting states, and the origin of each state."""
+
+    game: Game
+    accepting: NDArray[np.bool_]
+    base_state: NDArray[np.integer]
+    memory: NDArray[np.integer]
+
+
+def _joint_game(
+    game: Game, spec: ArrayLike | Parity | Automaton | Formula | str, start: NDArray[np.float64]
+) -> _JointGame:
+    """The given game, or the reachable part of its product with an automaton."""
+    game = Game(game.mdp.replace(initial=jnp.asarray(start, game.dtype)), game.system)
+    if isinstance(spec, Automaton | Formula | str):
+        joint, objective = task_game(game, spec)
+        part = restrict(joint)
+        base, memory = np.asarray(part.base_state), np.asarray(part.memory)
+        number = jnp.asarray(base * joint.state_shape[1] + memory)
+        return _JointGame(part.model, _accepting(objective_at(objective, number)), base, memory)
+    if isinstance(spec, Parity):
+        accepting = _accepting(spec)
+    else:
+        accepting = np.asarray(spec)
+        require_shape("spec", accepting, (game.num_states,))
+    base = np.arange(game.num_states)
+    return _JointGame(game, accepting.astype(bool), base, np.zeros_like(base))
+
+
+def _accepting(objective: Parity) -> NDArray[np.bool_]:
+    """The accepting states of a Buchi condition: priority 0, or won already."""
+    if objective.num_priorities > 2:
+        raise ValueError(
+            f"the task needs {objective.num_priorities} priorities, and only conditions met by "
+            "visiting states infinitely often can be learned; strengthen it, for example to G F."
+        )
+    won = np.asarray(objective.won)
+    return ((np.asarray(objective.priority) == 0) | won) & ~np.asarray(objective.lost)
+
+
+def _merge_successors(game: Game) -> Game:
+    """The game with each successor of an action listed once, as only successors are observed."""
+    successor, weight = np.asarray(game.mdp.successor), np.asarray(game.mdp.probability)
+    same = (successor[..., :, None] == successor[..., None, :]) & (weight[..., None, :] > 0)
+    first = same.argmax(-1) == np.arange(successor.shape[-1])
+    merged = np.where(first & (weight > 0), (same * weight[..., None, :]).sum(-1), 0)
+    mdp = game.mdp.replace(
+        successor=jnp.asarray(np.where(merged > 0, successor, 0), jnp.int32),
+        probability=jnp.asarray(merged, game.dtype),
+    )
+    return Game(mdp, game.system)
+
+
+@jax.jit
+def _safe_actions(game: Game, region: jax.Array) -> jax.Array:
+    """Actions inside the region; the system's must surely stay in it."""
+    inside = game.available & region[:, None]
+    return inside & (~game.system[:, None] | forall_successor(game, region))
+
+
+def _require_start_in(region: jax.Array, joint: _JointGame) -> None:
+    """Raises ValueError naming initial states outside of the winning region."""
+    outside = np.flatnonzero((np.asarray(joint.game.initial) > 0) & ~np.asarray(region))
+    if outside.size == 0:
+        return
+    named = ", ".join(
+        f"{joint.base_state[i]}"
+        + (f" (automaton state {joint.memory[i]})" if joint.memory.any() else "")
+        for i in outside[:5]
+    ) + (", ..." if outside.size > 5 else "")
+    raise ValueError(
+        f"{outside.size} of the initial states lie outside of the almost-surely winning region: "
+        f"{named}. From there the task is lost, or the environment can keep the accepting states "
+        "from being visited again with positive probability (winning_region(...).counter_action "
+        "shows how); start elsewhere, or weaken the task."
+    )
+
+
+def _environment_rows(
+    problem: Problem, game: Game, environment: ArrayLike | str, discount: float | None
+) -> NDArray[np.floating]:
+    """The environment's policy in the joint game; zero at the system's states."""
+    mask, system = np.asarray(problem.game.available), np.asarray(problem.game.system)
+    if isinstance(environment, str) and environment == "random":
+        rows = uniform_rows(mask)
+    elif isinstance(environment, str) and environment == "adversarial" and discount is not None:
+        optimal = minimax_value(problem.game, problem.reward, discount, allowed=problem.allowed)
+        rows = np.eye(mask.shape[1])[np.asarray(optimal.policy)]
+    elif isinstance(environment, str):
+        raise ValueError(
+            f"environment={environment!r}; choose random, adversarial (with discount=), or give a "
+            "policy."
+        )
+    else:
+        rows = np.asarray(environment)
+        if rows.ndim == 1:
+            require_shape("environment", rows, (game.num_states,))
+            rows = np.eye(mask.shape[1])[rows]
+        require_shape("environment", rows, game.available.shape)
+        rows = environment_policy(mask, system, rows[np.asarray(problem.base_state)])
+    return np.where(system[:, None], 0, rows)
