@@ -23,6 +23,7 @@ from jaxltl.algos import (
     trust_region,
 )
 from jaxltl.algos.cce.exponential_family import diagonal_gaussian
+from jaxltl.core import validation
 from jaxltl.core.automata.sequences import reach_avoid_sequences
 from jaxltl.core.environments import environment as en
 from jaxltl.core.environments import episodes as ep
@@ -32,7 +33,6 @@ from jaxltl.core.environments.time_limit import with_time_limit
 from jaxltl.core.sparse.interval.l1_ball import l1_expectation
 from jaxltl.core.statistics.confidence_sets import samples_needed
 from jaxltl.core.statistics.empirical_bernstein import bounded_mean
-from jaxltl.core.validation import listed, number, one_of, whole
 from jaxltl.core.values.evaluation.evaluation import share_estimate
 from jaxltl.core.values.interval.robust import robust_reachability, robust_total_reward
 from jaxltl.core.values.multi_objective.multi_objective import multi_objective
@@ -777,12 +777,12 @@ def test_who_asks_of_intervals_what_is_not_solved(call, message):
 
 def test_claims_thresholds_and_steps():
     counts = {"counts": [[1, 2, 3]], "confidence": 0.9}
-    with pytest.raises(ValueError, match="num_claims=inf; it must be a whole number"):
+    with pytest.raises(ValueError, match="num_claims=inf; it must be an integer"):
         jl.statistics.intervals_from_counts(**counts, num_claims=np.inf)
     world = jl.make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
     problem = interval_learning.make_problem(world, "true")
     for steps in (None, "x", np.nan, [1]):
-        with pytest.raises(ValueError, match=r"num_steps=.*whole number of at least 1"):
+        with pytest.raises(ValueError, match=r"num_steps=.*integer of at least 1"):
             interval_learning.train(
                 jax.random.key(0), problem, interval_learning.Hparams(), num_steps=steps
             )
@@ -804,18 +804,18 @@ def test_a_log_of_a_world_whose_slips_repeat_a_successor(tmp_path):
 
 
 def test_words_and_numbers():
-    assert whole("n", 3.0) == 3
-    assert number("x", "0.5") == 0.5
-    assert one_of("bound", "<=", (">=", "<=")) == "<="
-    assert listed("names", "ab") == ["a", "b"]
+    assert validation.integer("n", 3.0) == 3
+    assert validation.finite_number("x", "0.5") == 0.5
+    assert validation.choice("bound", "<=", (">=", "<=")) == "<="
+    assert validation.sequence("names", "ab") == ["a", "b"]
     for given, message in (
         (2, "n=2; it must be at least 3"),
         (9, "n=9; it must be at most 8"),
-        (3.5, "whole number of at least 3"),
+        (3.5, "integer of at least 3"),
         (True, "at least 3"),
     ):
         with pytest.raises(ValueError, match=message):
-            whole("n", given, least=3, most=8)
+            validation.integer("n", given, least=3, most=8)
     for given in (None, np.inf, [1.0], "x"):
         with pytest.raises(ValueError, match=r"give a finite number|give numbers"):
-            number("x", given)
+            validation.finite_number("x", given)

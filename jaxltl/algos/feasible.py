@@ -63,7 +63,7 @@ from jaxltl.core.models.sparse import SparseMDP, row_reward
 from jaxltl.core.pretty_print import brief, history
 from jaxltl.core.sparse.solvers import reachability as optimal
 from jaxltl.core.types import Status, require_shape
-from jaxltl.core.validation import instance, number, one_of, shown, whole
+from jaxltl.core import validation
 from jaxltl.core.values.interval.robust import width_asked
 from jaxltl.core.values.prepared.prepared import Prepared, prepare, solve_prepared
 from jaxltl.core.values.prepared.prepared_chain import evaluate_prepared, is_direct
@@ -145,9 +145,9 @@ class Budget:
 
     def __post_init__(self) -> None:
         """Raises ValueError if a number is out of range."""
-        whole("num_steps", self.num_steps, least=1, most=learner.MOST)
+        validation.integer("num_steps", self.num_steps, least=1, most=learner.MOST)
         if self.num_proofs is not None:
-            whole("num_proofs", self.num_proofs, least=1)
+            validation.integer("num_proofs", self.num_proofs, least=1)
         width_asked(self.tolerance)
 
 
@@ -240,10 +240,12 @@ def make_problem(
         infinite at every point because the target is not reached almost surely.
     """
     if not isinstance(bound, str) or bound not in (">=", "<="):
-        raise ValueError(f'bound={shown(bound)}; it must be ">=" or "<=".')
-    one_of("objective", objective, ("max", "min"))
+        raise ValueError(f'bound={validation.shorten(bound)}; it must be ">=" or "<=".')
+    validation.choice("objective", objective, ("max", "min"))
     if reward is not None and not isinstance(reward, str):
-        raise ValueError(f"reward is {shown(reward)}; give the name of a reward of the model.")
+        raise ValueError(
+            f"reward is {validation.shorten(reward)}; give the name of a reward of the model."
+        )
     if not isinstance(model, ParametricMDP):
         raise ValueError(
             f"{type(model).__name__} has no box of parameters; give what "
@@ -302,7 +304,9 @@ def require_problem(problem: object) -> None:
       ValueError: problem is 0.5; give what make_problem returns.
     """
     if not isinstance(problem, Problem):
-        raise ValueError(f"problem is {shown(problem)}; give what make_problem returns.")
+        raise ValueError(
+            f"problem is {validation.shorten(problem)}; give what make_problem returns."
+        )
 
 
 def _in_search_precision(problem: Problem) -> Problem:
@@ -523,9 +527,13 @@ def feasible(
         the box.
     """
     require_problem(problem)
-    threshold = number("threshold", threshold)
-    hparams = instance("hparams", Hparams() if hparams is None else hparams, Hparams, "Hparams")
-    budget = instance("budget", Budget() if budget is None else budget, Budget, "a Budget")
+    threshold = validation.finite_number("threshold", threshold)
+    hparams = validation.instance(
+        "hparams", Hparams() if hparams is None else hparams, Hparams, "Hparams"
+    )
+    budget = validation.instance(
+        "budget", Budget() if budget is None else budget, Budget, "a Budget"
+    )
     key = jax.random.key(0) if key is None else key
     # A little beyond the threshold, so that rounding does not decide.
     beyond = 1e3 * float(jnp.finfo(problem.low.dtype).eps) * abs(threshold)
@@ -533,7 +541,9 @@ def feasible(
     most = np.int32(budget.num_steps)
     points = None
     if np.ndim(starts) == 0:
-        keys = jax.random.split(key, whole("starts", starts, least=1, most=learner.MOST))
+        keys = jax.random.split(
+            key, validation.integer("starts", starts, least=1, most=learner.MOST)
+        )
     else:
         points = problem.model.inside_of("start", starts).astype(problem.low.dtype)
         keys = jax.random.split(key, len(points))

@@ -181,7 +181,11 @@ def make_plan(
     """
     automaton = task if isinstance(task, Automaton) else to_automaton(task)
     found = sequences.reach_avoid_sequences(
-        automaton, events, validation.names("propositions", propositions), depth=depth, most=most
+        automaton,
+        events,
+        validation.distinct_names("propositions", propositions),
+        depth=depth,
+        most=most,
     )
     return Plan(found.reach, found.avoid, found.length)
 
@@ -198,7 +202,7 @@ def stack_plans(plans: Sequence[Plan]) -> Plan:
     Raises:
       ValueError: no plan, or plans of different depths or events.
     """
-    plans = validation.listed("plans", plans)
+    plans = validation.sequence("plans", plans)
     for plan in plans:
         validation.instance("plans", plan, Plan, "a list of those of make_plan")
     shapes = [np.shape(plan.reach) for plan in plans]
@@ -277,8 +281,8 @@ def sequence_agent(
             "actions", actions, Finite | Box, "the environment's, environment.actions"
         )
     how = _How(
-        validation.one_of("squash", squash, action_distributions.SQUASHES),
-        validation.truth("sampled", sampled),
+        validation.choice("squash", squash, action_distributions.SQUASHES),
+        validation.boolean("sampled", sampled),
     )
     begin = Choice(jnp.int32(-1), jnp.int32(0), jnp.asarray(0.0))
     return Agent(Partial(_act, how, actions, as_partial(network, "network"), plan), begin)
@@ -314,9 +318,9 @@ def sequence_policy(
     """
     validation.instance("plan", plan, Plan, "one of make_plan")
     if not (isinstance(memory, jax.Array) and jnp.issubdtype(memory.dtype, jnp.integer)):
-        memory = validation.whole("memory", memory)
+        memory = validation.integer("memory", memory)
     actions, values = _judged(
-        validation.called("network", network), plan, observation, jnp.asarray(memory)
+        validation.function("network", network), plan, observation, jnp.asarray(memory)
     )
     _actions_of(actions)
     return jax.nn.softmax(actions[jnp.argmax(values)])
@@ -480,13 +484,13 @@ def train_in_stages(
     Raises:
       ValueError: no problem, or a number of thresholds that does not fit.
     """
-    problems = validation.listed("problems", problems)
+    problems = validation.sequence("problems", problems)
     for name, function in (("init", init), ("run", run), ("report", report)):
         if function is not None or name != "report":
-            validation.called(name, function)
+            validation.function(name, function)
     count = len(problems)
-    num_chunks = validation.whole("num_chunks", num_chunks, least=1)
-    bars = validation.numbers("enough", enough)
+    num_chunks = validation.integer("num_chunks", num_chunks, least=1)
+    bars = validation.float_array("enough", enough)
     bars = np.full(max(count - 1, 0), bars) if bars.ndim == 0 else bars
     if count == 0 or bars.shape != (count - 1,) or np.isnan(bars).any():
         raise ValueError(

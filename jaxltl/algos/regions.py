@@ -38,8 +38,7 @@ from jaxltl.core.models.interval import IntervalMDP, make_interval
 from jaxltl.core.models.parametric.parametric import box_of
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.interval import reachability as interval_values
-from jaxltl.core.validation import numbers, shown
-from jaxltl.core.validation import whole as count
+from jaxltl.core import validation
 from jaxltl.core.values.undiscounted.mixture import safe_ends
 
 ACCEPTED, REJECTED, OPEN = 1, -1, 0
@@ -191,7 +190,7 @@ def prove_regions(
 
     Concrete arrays only, on the host; not differentiable.
     """
-    threshold, max_boxes = _limit(threshold), count("max_boxes", max_boxes, least=1)
+    threshold, max_boxes = _limit(threshold), validation.integer("max_boxes", max_boxes, least=1)
     low, high = _box(problem, low, high)
     size = np.where(high > low, high - low, 1.0)
     todo, done, looked = deque([(low, high)]), [], 0
@@ -216,14 +215,20 @@ def prove_regions(
 
 def _require_problem(problem: Any) -> None:
     if not all(hasattr(problem, name) for name in ("model", "objective", "bound")):
-        raise ValueError(f"problem is {shown(problem)}; give what feasible.make_problem returns.")
+        raise ValueError(
+            f"problem is {validation.shorten(problem)}; give what feasible.make_problem returns."
+        )
 
 
 def _limit(threshold: Any) -> float:
     """A number, which may be infinite."""
-    found = numbers("threshold", threshold)
+    found = validation.float_array("threshold", threshold)
     if found.ndim or np.isnan(found):
-        what = "the threshold is NaN" if not found.ndim else f"threshold={shown(threshold)}"
+        what = (
+            "the threshold is NaN"
+            if not found.ndim
+            else f"threshold={validation.shorten(threshold)}"
+        )
         raise ValueError(f"{what}; give a number.")
     return float(found)
 
@@ -249,9 +254,12 @@ def prove_around(
     Concrete arrays only, on the host; not differentiable.
     """
     _require_problem(problem)
-    threshold, num_halvings = _limit(threshold), count("num_halvings", num_halvings, most=1000)
+    threshold, num_halvings = (
+        _limit(threshold),
+        validation.integer("num_halvings", num_halvings, most=1000),
+    )
     model = problem.model
-    (point,) = model.inside_of("point", numbers("point", point)[None])
+    (point,) = model.inside_of("point", validation.float_array("point", point)[None])
     sides = model.high - model.low
     found, share, move = None, 1.0, 0.5
     for _ in range(num_halvings):

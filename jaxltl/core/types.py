@@ -1,9 +1,10 @@
-"""What every solver returns, and how a caller insists that it converged."""
+"""Solutions of solvers, their statuses, and the check that they converged."""
 
 from __future__ import annotations
 
 import enum
 from collections.abc import Iterator
+from functools import reduce
 from typing import Any, TypeVar
 
 import chex
@@ -13,31 +14,39 @@ import numpy as np
 from flax import struct
 
 from jaxltl.core.pretty_print import apart, array, brief, coded, is_array, lanes, span, told
+from jaxltl.core.validation import RANGES
 
 SolutionT = TypeVar("SolutionT", bound="Solution")
 
 
 class Status(enum.IntEnum):
-    """How a solver ended, the more severe the greater. One code per lane under ``vmap``.
+    """How a solver or a learner ended, ordered by severity. One code per lane under ``vmap``.
 
-    - ``CONVERGED``: the certified bounds are as narrow as asked.
-    - ``UNCERTIFIED``: the residual is as small as asked, but no bound on the error is known.
-    - ``PRECISION``: rounding alone keeps the bounds wider than asked.
-    - ``MAX_STEPS``: it was stopped, or cannot get nearer.
+    - ``CONVERGED``: certified; the bounds are as narrow as the tolerance.
+    - ``COMPLETED``: a learner's numbers are finite, or its stopping condition holds; no claim of
+      optimality.
+    - ``UNCERTIFIED``: the residual is below the tolerance, but no bound on the error is known.
+    - ``PRECISION``: rounding errors alone keep the bounds wider than the tolerance.
+    - ``MAX_STEPS``: stopped by `max_steps`, or without further progress.
     - ``NONFINITE``: NaN or infinity where a number should be.
-    - ``INVALID``: a policy that is no distribution over available actions.
+    - ``INVALID`` and above: an argument is invalid; the member names it. Concrete invalid arguments
+      raise ValueError, so these occur inside ``jit`` only.
 
     Example:
-      >>> [status.name for status in Status if status > Status.MAX_STEPS]
+      >>> [status.name for status in Status if Status.MAX_STEPS < status <= Status.INVALID]
       ['NONFINITE', 'INVALID']
     """
 
     CONVERGED = 0
-    UNCERTIFIED = 1
-    PRECISION = 2
-    MAX_STEPS = 3
-    NONFINITE = 4
-    INVALID = 5
+    COMPLETED = 1
+    UNCERTIFIED = 2
+    PRECISION = 3
+    MAX_STEPS = 4
+    NONFINITE = 5
+    INVALID = 6
+    INVALID_POLICY = 7
+    INVALID_DISCOUNT = 8
+    INVALID_OPTION = 9
 
 
 _REMEDY = {
@@ -45,12 +54,20 @@ _REMEDY = {
     "small residual in place of a bound",
     Status.PRECISION: "rounding alone exceeds the tolerance; loosen it, or use float64",
     Status.MAX_STEPS: "raise max_steps, loosen tolerance, or use float64",
-    Status.NONFINITE: "look for NaN or infinity in the reward, the policy or the discount",
+    Status.NONFINITE: "look for NaN or infinity in the reward, the policy or the model",
+}
+_INVALID = {
+    Status.INVALID: "an argument is invalid: probabilities, bounds or hyperparameters are out of "
+    "range; call the function outside jit for the details",
+    Status.INVALID_POLICY: "the policy is not a distribution over available actions",
+    Status.INVALID_DISCOUNT: f"the discount is out of range; it must be {RANGES['discount']}",
+    Status.INVALID_OPTION: "an option is out of range: "
+    + ", ".join(f"{x} must be {RANGES[x]}" for x in ("tolerance", "max_steps")),
 }
 
 
 class NotConverged(RuntimeError):
-    """A solver's answer was asked for and its status says that there is none; by :func:`check`.
+    """A solver did not converge; raised by :func:`check`.
 
     Example:
       >>> import jaxltl as jl
@@ -66,29 +83,6 @@ class NotConverged(RuntimeError):
     """
 
 
-class Method:
-    """How an answer was found, in words. All are equal, so that solutions are of one kind.
-
-    >>> str(Method("the graph")), Method("levels") == Method("")
-    ('the graph', True)
-    """
-
-    def __init__(self, text: str = "") -> None:
-        self.text = text
-
-    def __str__(self) -> str:
-        return self.text
-
-    def __repr__(self) -> str:
-        return repr(self.text)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Method)
-
-    def __hash__(self) -> int:
-        return 0
-
-
 def _facts(solution: Any) -> Iterator[str]:
     more = solution.status.shape
     yield (
@@ -101,7 +95,7 @@ def _facts(solution: Any) -> Iterator[str]:
     steps = span(solution.num_steps)
     yield "1 step" if steps == "1" else f"{steps} steps"
     yield f"residual {span(solution.residual)}"
-    yield f"by {solution.method}" if str(solution.method) else ""
+    yield f"by {solution.method}" if solution.method else ""
     yield f"policy {array(solution.policy)}" if is_array(solution.policy) else ""
     yield f"nature {array(solution.nature)}" if is_array(solution.nature) else ""
 
@@ -109,22 +103,21 @@ def _facts(solution: Any) -> Iterator[str]:
 @brief(facts=_facts, drawn=True)
 @struct.dataclass
 class Solution:
-    """A solver's answer with its evidence.
+    """The solution of a solver, with its evidence.
 
     Shapes are those of the model's states: ``[S]``, or ``[S, Q]`` for a product.
 
     Attributes:
       value: the quantity that the solver is named for.
-      policy: the policy that belongs to the value: ``int32[S]`` where it is
-        deterministic, ``float[S, A]`` where it is stochastic.
-      lower, upper: a certified enclosure of the true value, or infinite.
-      residual: how far the value is from satisfying its equation (sup norm).
-      num_steps: applications of the operator that were spent.
-      status: an array of :class:`Status` codes.
-      method: how it was found, where there were several ways; static.
-      nature: of interval models, ``float[T]``: the distribution that nature picks for each choice,
-        so that someone else can check. Where it is against the policy, no policy does better than
-        the value if nature keeps to it; where it is for it, both attain the value together.
+      policy: ``int32[S]`` if deterministic, ``float[S, A]`` if stochastic.
+      lower, upper: certified bounds on the true value; infinite without a certificate.
+      residual: violation of the value's equation (sup norm).
+      num_steps: number of operator applications.
+      status: :class:`Status` codes.
+      method: the algorithm, if there are several; static.
+      nature: of interval models, ``float[T]``: the distribution that nature chooses for each row.
+        No policy exceeds the value against an adversarial nature that uses it; policy and a
+        cooperative nature attain the value together.
 
     Example:
       >>> import jaxltl as jl
@@ -144,25 +137,21 @@ class Solution:
     residual: jax.Array
     num_steps: jax.Array
     status: jax.Array
-    method: Method = struct.field(pytree_node=False, default=Method())
+    method: str = struct.field(pytree_node=False, default="")
     nature: jax.Array | None = None
 
 
 def check(solution: SolutionT, *, certified: bool = True) -> SolutionT:
-    """Returns `solution` if every lane converged; a host-side gate, not for use inside ``jit``.
+    """Returns `solution` if every lane converged; on the host, not inside ``jit``.
 
     Args:
-      solution: one, or a batch.
-      certified: insist on bounds; False accepts ``UNCERTIFIED``, a small residual, too.
-
-    Returns:
-      The solution that was given. Values are read, so that derivatives are taken of the solver's
-      own call.
+      solution: one solution or a batch; or what a learner's run returns.
+      certified: whether to insist on bounds; if False, ``UNCERTIFIED`` is accepted too.
 
     Raises:
-      NotConverged: some lane did not converge. The message names the status, the
-        first such lane, the residual and what to do.
-      ValueError: a policy was none, with the state and its row; or called on traced values.
+      NotConverged: some lane did not converge. The message names the status, the first such lane,
+        the residual and the remedy.
+      ValueError: an argument of the solver was invalid, or `solution` is traced.
 
     Example:
       >>> import jaxltl as jl
@@ -177,17 +166,19 @@ def check(solution: SolutionT, *, certified: bool = True) -> SolutionT:
             "call it outside jit and vmap, or read solution.status inside."
         )
     status = np.asarray(solution.status)
-    failed = np.flatnonzero(status.ravel() > (Status.CONVERGED if certified else 1))
+    failed = np.flatnonzero(
+        status.ravel() > (Status.COMPLETED if certified else Status.UNCERTIFIED)
+    )
     if failed.size:
         lane = int(failed[0])
         code = Status(int(status.ravel()[lane]))
         where = f" in lane {lane} ({failed.size} of {status.size} lanes)" if status.ndim else ""
-        if code == Status.INVALID:
-            lanes = np.asarray(solution.policy).reshape(status.size, -1)
-            shape = np.shape(solution.policy)[status.ndim :]
-            policy = lanes[lane].reshape(shape)
-            what = _invalid_weights(policy) if policy.ndim == 1 else _invalid_row(policy)
-            raise ValueError(f"{what}{where}.")
+        if code >= Status.INVALID:
+            policy = getattr(solution, "policy", None)
+            reason = _INVALID[code]
+            if code == Status.INVALID_POLICY and policy is not None:
+                reason = _invalid_policy(np.asarray(policy), status.shape, lane)
+            raise ValueError(f"{reason}{where}.")
         residual = np.asarray(solution.residual).ravel()[lane]
         raise NotConverged(
             f"the solver ended with {code.name}{where}, residual {residual:.3g}, after "
@@ -204,14 +195,14 @@ def status_code(
     certified: chex.Array | bool = True,
     valid: chex.Array | bool = True,
 ) -> jax.Array:
-    """The :class:`Status` of a solver that has ended, as ``int32``.
+    """The :class:`Status` code of a solver that has ended, as ``int32``.
 
     Args:
-      converged: whether it reached what was asked.
-      finite: whether there are numbers where numbers should be.
-      exhausted: whether the bounds are as narrow as rounding lets them be.
-      certified: whether what converged is a bound, not just a residual.
-      valid: whether what it was given is allowed.
+      converged: the bounds, or the residual, meet the tolerance.
+      finite: all numbers are finite.
+      exhausted: the bounds are as narrow as rounding allows.
+      certified: `converged` refers to bounds, not only to a residual.
+      valid: the arguments are valid.
     """
     code = jnp.where(exhausted, Status.PRECISION, Status.MAX_STEPS)
     code = jnp.where(converged, jnp.where(certified, Status.CONVERGED, Status.UNCERTIFIED), code)
@@ -223,22 +214,19 @@ def worst(*statuses: chex.Array, axis: int | None = None) -> jax.Array:
     """The most severe of several statuses; of one batch, along an axis or of all of it."""
     if len(statuses) == 1:
         return jnp.max(statuses[0], axis=axis)
-    found = statuses[0]
-    for status in statuses[1:]:
-        found = jnp.maximum(found, status)
-    return found
-
-
-# --- policies that are none -----------------------------------------------------------------
+    return reduce(jnp.maximum, statuses)
 
 
 def row_tolerance(dtype: Any) -> float:
-    """How far from one the sum of a policy's row may be."""
+    """Largest admitted deviation from one of the sum of a policy's row."""
     return max(1e-6, 128 * float(jnp.finfo(dtype).eps))
 
 
-def _invalid_row(policy: np.ndarray) -> str:
-    """What is wrong with the first row that is no distribution; NaN marks what is unavailable."""
+def _invalid_policy(policy: np.ndarray, batch: tuple[int, ...], lane: int) -> str:
+    """Describes the first invalid row of one lane's policy; NaN marks unavailable actions."""
+    policy = policy.reshape(-1, *policy.shape[len(batch) :])[lane]
+    if policy.ndim == 1:
+        return _invalid_weights(policy)
     rows = policy.reshape(-1, policy.shape[-1])
     bad = ~(np.abs(rows.sum(-1) - 1) <= row_tolerance(rows.dtype)) | ~(rows >= 0).all(-1)
     state = int(np.argmax(bad))
@@ -246,7 +234,7 @@ def _invalid_row(policy: np.ndarray) -> str:
 
 
 def _invalid_weights(policy: np.ndarray) -> str:
-    """What is wrong with weights ``[R]`` of a sparse model's choices; the states are not known."""
+    """Describes what is invalid in weights ``[R]`` of a sparse model's rows."""
     if (bad := ~(policy >= 0)).any():
         row = int(np.argmax(bad))
         return (
@@ -257,9 +245,9 @@ def _invalid_weights(policy: np.ndarray) -> str:
 
 
 def describe_row(row: np.ndarray, state: tuple[Any, ...]) -> str:
-    """What is wrong with the row of a policy, in words."""
+    """Describes what is invalid in a policy's row of a state."""
     where = int(state[0]) if len(state) == 1 else tuple(int(i) for i in state)
-    shown = "[" + ", ".join(f"{x:.4g}" for x in row) + "]"
+    weights = "[" + ", ".join(f"{x:.4g}" for x in row) + "]"
     if np.isnan(row).any():
         what = f"takes action {int(np.argmax(np.isnan(row)))}, which is not available (or is NaN)"
     elif (row < 0).any():
@@ -267,7 +255,7 @@ def describe_row(row: np.ndarray, state: tuple[Any, ...]) -> str:
     else:
         what = f"sums to {row.sum():.6g}, not 1"
     return (
-        f"the policy's row {shown} of state {where} {what}; give each state a distribution "
+        f"the policy's row {weights} of state {where} {what}; give each state a distribution "
         "over its available actions"
     )
 

@@ -1,207 +1,322 @@
-"""What callers give: numbers, whole numbers and words, or a ValueError that says what to give."""
+"""Validation of arguments: raises ValueError with the expected type and range.
+
+The ranges of scalar arguments are declared once, in `RANGES`, for all solvers and learners. A
+concrete number outside its range is a ValueError (:func:`require_in_range`); of a traced one
+:meth:`Range.contains` is a traced flag, from which solvers and learners set an invalid status.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from jaxltl.core.array_types import Floats, Integers
+from jaxltl.core.array_types import Booleans, Floats, Integers
 
-_SHOWN = 60  # characters
-
-
-def shown(given: Any) -> str:
-    """What was given, for messages."""
-    if isinstance(given, np.ndarray) and given.size <= _SHOWN:
-        given = given.tolist()
-    text = " ".join(repr(given).split())
-    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
+_MAX_REPR = 60  # characters of a value in an error message
+_INEXACT = 2.0**53  # integers from here on are not all floats
 
 
-def numbers(name: str, given: Any) -> Floats:
-    """An array of numbers, in double precision.
+@dataclass(frozen=True)
+class Range:
+    """An interval of valid numbers; NaN is in none.
+
+    >>> str(Range(0, 1, open_above=True)), str(Range(1, integer=True))
+    ('at least 0 and below 1', 'an integer of at least 1')
+    """
+
+    low: float = -math.inf
+    high: float = math.inf
+    open_below: bool = False
+    open_above: bool = False
+    integer: bool = False
+
+    def contains(self, value: Any) -> Any:
+        """Membership, elementwise; works on NumPy arrays, JAX arrays and tracers alike."""
+        above = value > self.low if self.open_below else value >= self.low
+        below = value < self.high if self.open_above else value <= self.high
+        return above & below & (value == value // 1) if self.integer else above & below
+
+    def __str__(self) -> str:
+        ends = [f"{'above' if self.open_below else 'at least'} {self.low:g}"]
+        if self.high == math.inf:
+            ends += ["finite"] if self.open_above else []
+        else:
+            ends.append(f"{'below' if self.open_above else 'at most'} {self.high:g}")
+        return ("an integer of " if self.integer else "") + " and ".join(ends)
+
+
+RANGES = {
+    "discount": Range(0, 1, open_above=True),
+    "tolerance": Range(0, open_above=True),
+    "max_steps": Range(0, integer=True),
+    "evaluation_sweeps": Range(0, integer=True),
+    "confidence": Range(0, 1, open_below=True, open_above=True),
+    "mu": Range(0, open_above=True),
+}
+
+
+def is_concrete(value: Any) -> bool:
+    """Whether a scalar's value is known: it is not traced by JAX."""
+    try:
+        np.asarray(value)
+    except TypeError:  # what JAX raises for tracers
+        return False
+    return True
+
+
+def require_in_range(name: str, value: Any, valid: Range | None = None) -> None:
+    """Raises ValueError unless `value` is one real number in its range.
+
+    Of a traced value shape and dtype are checked; the range is checked by `contains` inside jit.
+
+    Args:
+      name: of the argument.
+      value: a number or a scalar array.
+      valid: its range; default the one that `RANGES` declares for the name.
 
     Raises:
-      ValueError: some of it is no number.
+      ValueError: with the value and the range.
 
     Example:
-      >>> numbers("lower", ["x"])
+      >>> require_in_range("discount", 1.5)
+      Traceback (most recent call last):
+      ValueError: discount=1.5; it must be at least 0 and below 1.
+    """
+    valid = RANGES[name] if valid is None else valid
+    known = is_concrete(value)
+    array = np.asarray(value) if known else value
+    if array.ndim or array.dtype.kind in "cOSU":
+        raise ValueError(
+            f"{name}={shorten(value)}; it must be one real number, {valid} (vmap over many)."
+        )
+    if known and not valid.contains(array):
+        raise ValueError(f"{name}={shorten(array)}; it must be {valid}.")
+
+
+def require_real(name: str, value: Any) -> None:
+    """Raises ValueError if an array is complex.
+
+    >>> require_real("reward", np.array([1j]))
+    Traceback (most recent call last):
+    ValueError: reward is complex128[1]; give real numbers.
+    """
+    dtype = getattr(value, "dtype", None)
+    if getattr(dtype, "kind", None) == "c":
+        raise ValueError(f"{name} is {dtype}{list(np.shape(value))}; give real numbers.")
+
+
+def shorten(value: Any) -> str:
+    """The representation of a value, abbreviated for error messages."""
+    if isinstance(value, np.ndarray) and value.size <= _MAX_REPR:
+        value = value.tolist()
+    text = " ".join(repr(value).split())
+    return text if len(text) <= _MAX_REPR else f"{text[:_MAX_REPR]}..."
+
+
+def float_array(name: str, value: Any) -> Floats:
+    """Converts to an array in double precision.
+
+    Raises:
+      ValueError: an element is not a real number.
+
+    Example:
+      >>> float_array("lower", ["x"])
       Traceback (most recent call last):
       ValueError: lower is ['x']; give numbers.
     """
     try:
-        return np.asarray(given, np.float64)
+        if np.asarray(value).dtype.kind != "c":
+            return np.asarray(value, np.float64)
     except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"{name} is {shown(given)}; give numbers.") from None
+        pass
+    raise ValueError(f"{name} is {shorten(value)}; give numbers.")
 
 
-def wholes(name: str, given: Any) -> Integers:
-    """An array of whole numbers.
-
-    Raises:
-      ValueError: some of it is none, or too large to be told from the next one.
-    """
-    found = numbers(name, given)
-    if not (np.abs(found) < 2.0**53).all() or (found != np.floor(found)).any():
-        raise ValueError(f"{name} is {shown(given)}; give whole numbers.")
-    return found.astype(np.int64)
-
-
-def number(name: str, given: Any) -> float:
-    """One finite number.
+def boolean_array(name: str, value: Any) -> Booleans:
+    """Converts to a Boolean array; the numbers 0 and 1 are accepted.
 
     Raises:
-      ValueError: it is something else, NaN or infinite.
-    """
-    found = numbers(name, np.nan if given is None else given)
-    if found.ndim or not np.isfinite(found):
-        raise ValueError(f"{name}={shown(given)}; give a finite number.")
-    return float(found)
-
-
-def whole(name: str, given: Any, *, least: int = 0, most: int = 2**63 - 1) -> int:
-    """One whole number.
-
-    Raises:
-      ValueError: it is something else, or out of its range.
+      ValueError: an element is something else.
 
     Example:
-      >>> whole("num_steps", 1.5, least=1)
+      >>> boolean_array("available", [["yes"]])
       Traceback (most recent call last):
-      ValueError: num_steps=1.5; it must be a whole number of at least 1.
+      ValueError: available is [['yes']]; give True or False for each entry.
     """
     try:
-        found = int(given)
-        fits = np.ndim(given) == 0 and bool(found == given)
-    except (TypeError, ValueError, OverflowError):
-        found, fits = 0, False
-    if not fits:
-        raise ValueError(f"{name}={shown(given)}; it must be a whole number of at least {least}.")
-    if found < least or found > most:
-        bound = f"at least {least}" if found < least else f"at most {most}"
-        raise ValueError(f"{name}={shown(given)}; it must be {bound}.")
-    return found
+        array = np.asarray(value)
+    except ValueError:  # ragged
+        array = np.asarray(None)
+    if array.dtype != bool and (array.dtype.kind not in "iuf" or not np.isin(array, (0, 1)).all()):
+        raise ValueError(f"{name} is {shorten(value)}; give True or False for each entry.")
+    return array.astype(bool)
 
 
-def one_of(name: str, given: Any, known: Sequence[str]) -> str:
-    """One of some words.
+def integer_array(name: str, value: Any) -> Integers:
+    """Converts to an array of integers.
 
     Raises:
-      ValueError: it is none of them.
+      ValueError: an element is not an integer below ``2 ** 53`` in magnitude.
     """
-    if not isinstance(given, str) or given not in known:
-        raise ValueError(f"{name}={shown(given)}; choose one of {', '.join(known)}.")
-    return given
+    array = float_array(name, value)
+    if not (np.abs(array) < _INEXACT).all() or (array != np.floor(array)).any():
+        raise ValueError(f"{name} is {shorten(value)}; give integers.")
+    return array.astype(np.int64)
 
 
-def truth(name: str, given: Any) -> bool:
-    """True or False, also as NumPy and JAX have it.
+def finite_number(name: str, value: Any) -> float:
+    """Converts to a float.
 
     Raises:
-      ValueError: it is something else, or several of them.
+      ValueError: the value is not one finite number.
+    """
+    array = float_array(name, np.nan if value is None else value)
+    if array.ndim or not np.isfinite(array):
+        raise ValueError(f"{name}={shorten(value)}; give a finite number.")
+    return float(array)
+
+
+def integer(name: str, value: Any, *, least: int = 0, most: int = 2**63 - 1) -> int:
+    """Converts to an int from `least` to `most`.
+
+    Raises:
+      ValueError: the value is not one integer, or out of range.
 
     Example:
-      >>> truth("flat", [True, False])
+      >>> integer("num_steps", 1.5, least=1)
+      Traceback (most recent call last):
+      ValueError: num_steps=1.5; it must be an integer of at least 1.
+    """
+    try:
+        number = int(value)
+        exact = np.ndim(value) == 0 and bool(number == value)
+    except (TypeError, ValueError, OverflowError):
+        number, exact = 0, False
+    if not exact:
+        raise ValueError(f"{name}={shorten(value)}; it must be an integer of at least {least}.")
+    if number < least or number > most:
+        bound = f"at least {least}" if number < least else f"at most {most}"
+        raise ValueError(f"{name}={shorten(value)}; it must be {bound}.")
+    return number
+
+
+def choice(name: str, value: Any, known: Sequence[str]) -> str:
+    """Returns `value` if it is one of some words.
+
+    Raises:
+      ValueError: it is not, with the words to choose from.
+    """
+    if not isinstance(value, str) or value not in known:
+        raise ValueError(f"{name}={shorten(value)}; choose one of {', '.join(known)}.")
+    return value
+
+
+def boolean(name: str, value: Any) -> bool:
+    """Converts a Boolean of Python, NumPy or JAX to bool.
+
+    Raises:
+      ValueError: the value is not one concrete Boolean.
+
+    Example:
+      >>> boolean("flat", [True, False])
       Traceback (most recent call last):
       ValueError: flat=[True, False]; give True or False.
     """
-    kind = getattr(given, "dtype", None)
-    if isinstance(given, bool) or (kind == np.bool_ and np.ndim(given) == 0):
-        with contextlib.suppress(TypeError):  # one that is traced, and not known yet
-            return bool(given)
-    raise ValueError(f"{name}={shown(given)}; give True or False.")
+    kind = getattr(value, "dtype", None)
+    if isinstance(value, bool) or (kind == np.bool_ and np.ndim(value) == 0):
+        with contextlib.suppress(TypeError):  # a tracer
+            return bool(value)
+    raise ValueError(f"{name}={shorten(value)}; give True or False.")
 
 
-def share(name: str, given: Any, *, ends: tuple[bool, bool] = (True, True)) -> float:
-    """One number from 0 to 1.
-
-    Args:
-      name, given: as they are told.
-      ends: whether 0 and 1 are.
+def fraction(name: str, value: Any, *, ends: tuple[bool, bool] = (True, True)) -> float:
+    """Converts to a float from 0 to 1; `ends` are whether 0 and 1 are valid.
 
     Raises:
-      ValueError: it is something else.
+      ValueError: the value is not such a number.
 
     Example:
-      >>> share("confidence", 1, ends=(False, False))
+      >>> fraction("confidence", 1, ends=(False, False))
       Traceback (most recent call last):
       ValueError: confidence=1; it must be above 0 and below 1.
     """
-    found = number(name, given)
-    if not (0 <= found <= 1) or (found == 0 and not ends[0]) or (found == 1 and not ends[1]):
-        low, high = "at least" if ends[0] else "above", "at most" if ends[1] else "below"
-        raise ValueError(f"{name}={shown(given)}; it must be {low} 0 and {high} 1.")
-    return found
+    number = finite_number(name, value)
+    valid = Range(0, 1, open_below=not ends[0], open_above=not ends[1])
+    if not valid.contains(number):
+        raise ValueError(f"{name}={shorten(value)}; it must be {valid}.")
+    return number
 
 
-def called(name: str, given: Any) -> Callable[..., Any]:
-    """A function.
-
-    Raises:
-      ValueError: it cannot be called.
-    """
-    if not callable(given):
-        raise ValueError(f"{name} is {shown(given)}; give a function.")
-    return given
-
-
-def instance(name: str, given: Any, kind: Any, remedy: str) -> Any:
-    """Something of a type, or of one of several.
+def function(name: str, value: Any) -> Callable[..., Any]:
+    """Returns `value` if it is callable.
 
     Raises:
-      ValueError: it is of another one.
+      ValueError: it is not.
     """
-    if not isinstance(given, kind):
-        found = "an array" if hasattr(given, "aval") else type(given).__name__
+    if not callable(value):
+        raise ValueError(f"{name} is {shorten(value)}; give a function.")
+    return value
+
+
+def instance(name: str, value: Any, kind: Any, remedy: str) -> Any:
+    """Returns `value` if it is an instance of a type, or of one of several.
+
+    Raises:
+      ValueError: it is not, with `remedy` as what to give.
+    """
+    if not isinstance(value, kind):
+        found = "an array" if hasattr(value, "aval") else type(value).__name__
         raise ValueError(f"{name} is {found}; give {remedy}.")
-    return given
+    return value
 
 
-def listed(name: str, given: Any) -> list[Any]:
-    """What can be gone through, one by one; of a text its letters.
-
-    Raises:
-      ValueError: it cannot.
-    """
-    if isinstance(given, Iterable):
-        with contextlib.suppress(TypeError):  # an array without axes
-            return list(given)
-    raise ValueError(f"{name} is {shown(given)}; give a list.")
-
-
-def names(name: str, given: Any) -> tuple[str, ...]:
-    """Texts, none of them twice.
+def sequence(name: str, value: Any) -> list[Any]:
+    """Converts an iterable to a list; a text becomes the list of its letters.
 
     Raises:
-      ValueError: something else, or one that is given twice.
+      ValueError: the value is not iterable.
     """
-    found = listed(name, given)
+    if isinstance(value, Iterable):
+        with contextlib.suppress(TypeError):  # a scalar array
+            return list(value)
+    raise ValueError(f"{name} is {shorten(value)}; give a list.")
+
+
+def distinct_names(name: str, value: Any) -> tuple[str, ...]:
+    """Converts an iterable of distinct strings to a tuple.
+
+    Raises:
+      ValueError: an element is not a string, or occurs twice.
+    """
+    found = sequence(name, value)
     for one in found:
         if not isinstance(one, str) or found.count(one) > 1:
             raise ValueError(
-                f"{name}: {shown(one)} is no name, or is given twice; give each its name."
+                f"{name}: {shorten(one)} is not a string, or occurs twice; give distinct names."
             )
     return tuple(found)
 
 
-def no_model(model: Any) -> str:
-    """Why something is no model with known probabilities, and what to give, for a message."""
+def unsupported_model(model: Any) -> str:
+    """The error message for a model without exact probabilities on one device."""
     name = type(model).__name__
     if hasattr(model, "nominal"):
         return (
-            f"{name} has intervals for its probabilities, which this does not take; ask what does "
-            "(reachability_probability, total_reward, robust_discounted_value, "
-            "robust_satisfaction, robust_bounded_reachability), or give its nominal model, "
-            "model.nominal, whose probabilities are one choice of nature."
+            f"{name} has intervals for its probabilities, which are not supported here; use a "
+            "solver that supports them (reachability_probability, total_reward, "
+            "robust_discounted_value, robust_satisfaction, robust_bounded_reachability), or give "
+            "its nominal model, model.nominal, whose probabilities are one choice of nature."
         )
     if hasattr(model, "num_exchanged"):
         return (
-            f"{name} lies on a mesh of devices, where this is not to be had: give it the model on "
-            "one. Over a mesh there are discounted, soft, Boltzmann and minimax values, occupancy, "
-            "reachability, total rewards, formulas, end components and winning regions."
+            f"{name} lies on a mesh of devices, which is not supported here: give the model on one "
+            "device. Over a mesh there are discounted, soft, Boltzmann and minimax values, "
+            "occupancy, reachability, total rewards, formulas, end components and winning regions."
         )
     return (
         f"{name} has no transitions; give an MDP, a DenseMDP, a SparseMDP, or a product of one of "

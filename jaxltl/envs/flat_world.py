@@ -122,31 +122,31 @@ def flat_world(
       >>> world.labels(here).tolist()
       [False, False, False, False, False, False, False]
     """
-    rows = [tuple(validation.listed("discs", row)) for row in validation.listed("discs", discs)]
+    rows = [tuple(validation.sequence("discs", row)) for row in validation.sequence("discs", discs)]
     if not all(len(row) == 4 and isinstance(row[0], str) for row in rows):
         raise ValueError(
-            f"discs is {validation.shown(discs)}; give (colour, x, y, radius) of each."
+            f"discs is {validation.shorten(discs)}; give (colour, x, y, radius) of each."
         )
     names = tuple(sorted({name for name, *_ in rows}))
     numbers = (
-        validation.numbers("discs", [row[1:] for row in rows]).astype(np.float32).reshape(-1, 3)
+        validation.float_array("discs", [row[1:] for row in rows]).astype(np.float32).reshape(-1, 3)
     )
     if not len(numbers) or not np.isfinite(numbers).all() or not (numbers[:, 2] > 0).all():
         raise ValueError(
             "flat_world: discs are (colour, x, y, radius), at least one, with radii above zero."
         )
     extent, time_step = (
-        validation.number("extent", extent),
-        validation.number("time_step", time_step),
+        validation.finite_number("extent", extent),
+        validation.finite_number("time_step", time_step),
     )
-    num_starts = validation.whole("num_starts", num_starts, least=1, most=2**26)
-    seed, discrete = validation.whole("seed", seed), validation.truth("discrete", discrete)
+    num_starts = validation.integer("num_starts", num_starts, least=1, most=2**26)
+    seed, discrete = validation.integer("seed", seed), validation.boolean("discrete", discrete)
     if not (0 < extent < 1e6 and 0 < time_step < 1e6):
         raise ValueError(
             f"extent={extent}, time_step={time_step}; both must be positive, and below a million."
         )
     if start is not None and not (
-        np.shape(place := validation.numbers("start", start)) == (2,)
+        np.shape(place := validation.float_array("start", start)) == (2,)
         and np.abs(place).max() <= extent
     ):
         raise ValueError(f"start={start!r}; give a place (x, y) within {extent} of the middle.")
@@ -252,13 +252,13 @@ def events_around(
       >>> look(jnp.array([-1.0, -1.2])).astype(int).sum(0).tolist()  # in the yellow disc
       [0, 0, 0, 0, 0, 0, 1]
     """
-    scene, rows = discs_of(environment), validation.numbers("events", events).astype(bool)
+    scene, rows = discs_of(environment), validation.float_array("events", events).astype(bool)
     if rows.ndim != 2 or not len(rows) or rows.shape[1] != len(environment.propositions):
         raise ValueError(
             f"events has shape {list(rows.shape)}; give Booleans "
             f"[E, {len(environment.propositions)}], a column for each colour."
         )
-    far = validation.numbers("radii", radii)
+    far = validation.float_array("radii", radii)
     if far.ndim != 1 or not ((far > 0) & np.isfinite(far)).all():
         raise ValueError(f"radii={far.tolist()}; give distances, all positive.")
     discs = [
@@ -275,7 +275,7 @@ def events_around(
         tuple(discs),
         float(scene.extent),
         tuple(far.tolist()),
-        validation.whole("directions", directions, least=1, most=2**10),
+        validation.integer("directions", directions, least=1, most=2**10),
     )
 
 

@@ -107,14 +107,14 @@ def letter_world(
       (('a', 'b', 'c'), (7, 7, 13), 75)
     """
     names, starts = _names(letters), None
-    connected, flat = validation.truth("connected", connected), validation.truth("flat", flat)
+    connected, flat = validation.boolean("connected", connected), validation.boolean("flat", flat)
     copies, num_maps = (
-        validation.whole("copies", copies),
-        validation.whole("num_maps", num_maps, most=2**24),
+        validation.integer("copies", copies),
+        validation.integer("num_maps", num_maps, most=2**24),
     )
-    size, seed = validation.whole("size", size, most=2**10), validation.whole("seed", seed)
+    size, seed = validation.integer("size", size, most=2**10), validation.integer("seed", seed)
     num_maps = (
-        max(num_maps, 1) if not connected else validation.whole("num_maps", num_maps, least=1)
+        max(num_maps, 1) if not connected else validation.integer("num_maps", num_maps, least=1)
     )
     if layout is None:
         if start is not None:
@@ -136,7 +136,7 @@ def letter_world(
         if start is None and not len(empty):
             raise ValueError("layout: no cell is empty; say where to begin, start=0.")
         if start is not None:
-            start = validation.whole("start", start, most=size * size - 1)
+            start = validation.integer("start", start, most=size * size - 1)
         places = (empty if start is None else np.array([start])).astype(np.int32)
         reset, starts = Partial(_begin, letter, places), Partial(_starts, letter, places)
     views, count = _views(size), len(names)
@@ -156,7 +156,7 @@ def letter_world(
 
 def _names(letters: int | Sequence[str]) -> tuple[str, ...]:
     if not isinstance(letters, int | np.integer):
-        return validation.names("letters", letters)
+        return validation.distinct_names("letters", letters)
     if not 1 <= letters <= len(_NAMES):
         raise ValueError(f"letters={letters}; it must be 1 to {len(_NAMES)}, or their names.")
     return tuple(_NAMES[:letters])

@@ -454,7 +454,7 @@ def simulate(
       ((10, 30), (10, 30, 2))
     """
     _check_fits(world, network)
-    settings = _Static((num_trajectories, validation.truth("absorbing", absorbing)))
+    settings = _Static((num_trajectories, validation.boolean("absorbing", absorbing)))
     return _simulate(network, settings, world, jnp.asarray(parameters), key)
 
 
@@ -530,7 +530,7 @@ def evaluator(
         score = jax.tree_util.Partial(_table_4, _Static(int(task)))
     else:
         score = task if isinstance(task, jax.tree_util.Partial) else jax.tree_util.Partial(task)
-    absorbing = absorbing is not None and validation.truth("absorbing", absorbing)
+    absorbing = absorbing is not None and validation.boolean("absorbing", absorbing)
     settings = _Static((int(num_trajectories), absorbing))
     return jax.tree_util.Partial(_evaluate, network, settings, world, score)
 

@@ -90,7 +90,7 @@ def as_environment(
     """
     if np.ndim(task) or task not in nav.TASKS:
         raise ValueError(f"task={task!r}; choose 1, 2, 3 or 4.")
-    stays = task == 1 if absorbing is None else validation.truth("absorbing", absorbing)
+    stays = task == 1 if absorbing is None else validation.boolean("absorbing", absorbing)
     settings = _Settings(
         jnp.int32(task), jnp.bool_(stays), np.dtype(dtype or jnp.result_type(float))
     )

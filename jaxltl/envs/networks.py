@@ -96,7 +96,7 @@ def make_network(
     for place, name in (("hidden", hidden), ("output", output)):
         if name not in ACTIVATIONS:
             raise ValueError(f"{place}={name!r}; choose among {', '.join(ACTIVATIONS)}.")
-    return Network(numbers, hidden, output, validation.truth("biases", biases))
+    return Network(numbers, hidden, output, validation.boolean("biases", biases))
 
 
 def num_parameters(sizes: Sequence[int], biases: bool = True) -> int:

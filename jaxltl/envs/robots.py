@@ -135,8 +135,8 @@ def grid_game(
       ['system_turn', 'environment_b', 'system_a']
     """
     world = gridworld(text, slip=slip, legend=legend, wall=wall)
-    system_stays = validation.truth("system_stays", system_stays)
-    environment_stays = validation.truth("environment_stays", environment_stays)
+    system_stays = validation.boolean("system_stays", system_stays)
+    environment_stays = validation.boolean("environment_stays", environment_stays)
     position = places(text, wall=wall)
     rows_columns = parse_map(text).shape
     cells = np.ravel_multi_index(tuple(position.T), rows_columns)

@@ -119,12 +119,12 @@ def zone_world(
       >>> world.propositions, world.observations.shape, world.actions.shape
       (('green', 'yellow', 'blue', 'magenta'), (75,), (2,))
     """
-    names = validation.names("colors", colors)
+    names = validation.distinct_names("colors", colors)
     zones, num_maps = (
-        validation.whole("zones", zones),
-        validation.whole("num_maps", num_maps, most=2**20),
+        validation.integer("zones", zones),
+        validation.integer("num_maps", num_maps, most=2**20),
     )
-    seed = validation.whole("seed", seed)
+    seed = validation.integer("seed", seed)
     for name, number in (
         ("radius", radius),
         ("extent", extent),
@@ -133,7 +133,7 @@ def zone_world(
         ("num_maps", num_maps),
         ("colors", len(names)),
     ):
-        if not 0 < validation.number(name, number) < 1e7:
+        if not 0 < validation.finite_number(name, number) < 1e7:
             raise ValueError(
                 f"zone_world: {name}={number}; it must be positive, and below ten million."
             )

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
 from jaxltl.algos.common.checkpoint import atomic_write
-from jaxltl.core.validation import shown
+from jaxltl.core import validation
 
 Compression = Literal["gzip", "xz"]
 
@@ -42,7 +42,7 @@ def read_bytes(path: str | os.PathLike[str], limit: int = MAX_BYTES) -> bytes:
 
 def _check_path(path: Any) -> None:
     if not isinstance(path, str | os.PathLike):  # numbers would be files that are open already
-        raise ValueError(f"path is {shown(path)}; give the name of a file.")
+        raise ValueError(f"path is {validation.shorten(path)}; give the name of a file.")
 
 
 def raw_bytes(path: str | os.PathLike[str], limit: int = MAX_BYTES) -> bytes:

@@ -91,7 +91,7 @@ def read_log(
         known = places(to_sparse(model) if isinstance(model, MDP | DenseMDP) else model)
         states, actions = known.states, known.actions
     if not isinstance(count, str):
-        raise ValueError(f"count={validation.shown(count)}; give the name of a column.")
+        raise ValueError(f"count={validation.shorten(count)}; give the name of a column.")
     numbers = _names("states", states), _names("actions", actions)
     name, total, size = str(path), 0, 0
     held = [np.zeros((4, 0), np.int64)]
@@ -144,7 +144,7 @@ def read_labels(
       {'goal': ('bay', 'hall'), 'warm': ('bay',)}
     """
     _check_columns(columns, 2)
-    known = set() if states is None else set(map(str, validation.listed("states", states)))
+    known = set() if states is None else set(map(str, validation.sequence("states", states)))
     found: dict[str, dict[str, bool]] = {}
     for lines in read_columns(path, columns):
         for fields in lines.times:
@@ -158,11 +158,11 @@ def read_labels(
 
 
 def _check_columns(columns: Sequence[str], number: int) -> None:
-    names = validation.listed("columns", columns)
+    names = validation.sequence("columns", columns)
     different = all(isinstance(x, str) for x in names) and len(set(names)) == number
     if isinstance(columns, str) or len(names) != number or not different:
         raise ValueError(
-            f"columns={validation.shown(columns)}; give {number} names, all different."
+            f"columns={validation.shorten(columns)}; give {number} names, all different."
         )
 
 
@@ -175,7 +175,7 @@ class _Names:
 
 
 def _names(what: str, names: Sequence[str] | None) -> _Names:
-    every = [] if names is None else list(map(str, validation.listed(what, names)))
+    every = [] if names is None else list(map(str, validation.sequence(what, names)))
     number = {x: i for i, x in enumerate(every)}
     if len(number) < len(every):
         twice = next(x for i, x in enumerate(every) if number[x] != i)

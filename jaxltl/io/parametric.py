@@ -22,7 +22,7 @@ from jaxltl.core.models.parametric.ranges import ranges
 from jaxltl.core.models.parametric.rational import Rationals, make_rationals
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
 from jaxltl.core.pretty_print import brief
-from jaxltl.core.validation import number, shown
+from jaxltl.core import validation
 from jaxltl.io._drn_body import names_of, read_body, read_header, rewards_of
 from jaxltl.io._files import read_bytes
 from jaxltl.io._tokens import Block, Integers, Text, as_fraction, numbered, refuse
@@ -114,14 +114,16 @@ class ParametricModel:
             probabilities of a row are none.
         """
         if not isinstance(values, Mapping):
-            raise ValueError(f"values is {shown(values)}; give a number for each name, in a dict.")
+            raise ValueError(
+                f"values is {validation.shorten(values)}; give a number for each name, in a dict."
+            )
         if set(values) != set(self.parameters):
             raise ValueError(
                 f"values are given for {', '.join(sorted(values)) or 'nothing'}; the "
                 f"parameters are {', '.join(self.parameters) or 'none'}."
             )
         for name, x in values.items():
-            number(f"values[{name!r}]", x)
+            validation.finite_number(f"values[{name!r}]", x)
         point = tuple(Fraction(values[name]) for name in self.parameters)
         try:
             value = np.array([float(f.at(point)) for f in self.functions])

@@ -23,7 +23,6 @@ from jaxltl.algos import behavioral_cloning, cce, mlirl, ppo
 from jaxltl.algos.common import learner
 from jaxltl.algos.common.schedules import Linear
 from jaxltl.core import pretty_print as show
-from jaxltl.core.types import Method
 from tests.support import replaced
 
 MAP = """
@@ -285,7 +284,7 @@ def brief_classes():
 
 def test_every_public_type_shows_itself():
     public = {getattr(jl, name) for name in jl.__all__}
-    others = {jl.logic.Formula, jl.Status, jl.environments.Verdict, jl.NotConverged, Method}
+    others = {jl.logic.Formula, jl.Status, jl.environments.Verdict, jl.NotConverged}
     plain = {x for x in public if isinstance(x, type)} - others - {*brief_classes().values()}
     assert not plain
     for module in algos.__all__:
@@ -357,7 +356,7 @@ def test_lanes_are_counted_with_their_statuses():
     one = made()["Solution"]
     four = jax.tree.map(lambda x: np.stack([np.asarray(x)] * 4), one)
     four = four.replace(
-        status=np.array([0, 3, 0, 0]), upper=np.where(np.arange(4)[:, None] == 2, np.inf, 1.0)
+        status=np.array([0, 4, 0, 0]), upper=np.where(np.arange(4)[:, None] == 2, np.inf, 1.0)
     )
     text = told(four)
     assert "4 lanes: 3 CONVERGED, 1 MAX_STEPS" in text
@@ -413,7 +412,7 @@ def test_rows_of_figures_are_told_by_the_last():
         loss=np.array([3.0, 2.0, 0.25]),
         held_out=np.array([1, 1, np.nan]),
         gradient_norm=np.ones(3),
-        status=np.array([0, 0, 4]),
+        status=np.array([0, 0, 5]),
     )
     assert told(rows) == (
         "Metrics( the last of 3 rows, loss=0.25, held_out=nan, gradient_norm=1, "

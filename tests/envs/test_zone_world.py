@@ -134,7 +134,7 @@ def test_zones_and_robot_are_apart():
         ({"zones": 9}, "hardly fit"),
         ({"zones": 4}, "hardly fit"),
         ({"extent": 0.5}, "hardly fit"),
-        ({"colors": ("red", "red")}, "'red' is no name, or is given twice"),
+        ({"colors": ("red", "red")}, "'red' is not a string, or occurs twice"),
     ],
 )
 def test_what_does_not_fit_is_named(options, said):

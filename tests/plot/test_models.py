@@ -6,7 +6,6 @@ from matplotlib.patches import Rectangle
 
 import jaxltl as jl
 from jaxltl import plot
-from jaxltl.core.types import Method
 from jaxltl.envs.robots import places, robots
 from jaxltl.envs.text_map import parse_map
 from jaxltl.plot.models import board_of_robots, map_of
@@ -16,7 +15,7 @@ MAPS = ["b.#y", "a\nb\n.", "ab.\n.#c\n..d\n#..", "..\n..", ". goal_left\n. #"]
 
 def solved(value, policy, **options):
     return jl.Solution(
-        value, policy, value, value, np.float64(0), np.int32(1), np.int32(0), Method(), **options
+        value, policy, value, value, np.float64(0), np.int32(1), np.int32(0), "", **options
     )
 
 

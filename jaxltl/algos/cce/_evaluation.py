@@ -17,7 +17,7 @@ from jaxltl.core.types import require_shape
 
 def per_cost(name: str, value: Any, num_costs: int) -> np.ndarray:
     """One number for each cost, of one for all or of as many."""
-    value = validation.numbers(name, value)
+    value = validation.float_array(name, value)
     if value.ndim:
         require_shape(name, value, (num_costs,))
     return np.broadcast_to(value, (num_costs,))

@@ -584,7 +584,7 @@ def assess(
     Raises:
       ValueError: fewer than two evaluations, or what is not of this search.
     """
-    num_evaluations = validation.whole("num_evaluations", num_evaluations, most=2**31 - 1)
+    num_evaluations = validation.integer("num_evaluations", num_evaluations, most=2**31 - 1)
     if num_evaluations < 2:
         raise ValueError(
             f"num_evaluations={num_evaluations}; a confidence interval needs at least 2."
@@ -593,7 +593,7 @@ def assess(
     shape = families.center(problem.family).shape
     if not hasattr(parameters, "dtype") or jnp.shape(parameters) != shape:
         raise ValueError(
-            f"parameters is {validation.shown(parameters)}; give those of one policy, float{[*shape]}, "
+            f"parameters is {validation.shorten(parameters)}; give those of one policy, float{[*shape]}, "
             "such as cce.policy(state, problem, hparams). Many are a vmap."
         )
     return _assessed(problem, parameters, require_key(key), num_evaluations)
@@ -741,10 +741,10 @@ def _require_state(state: State, problem: Problem) -> None:
 def _check(problem: Problem, hparams: Hparams) -> None:
     _require_ours(problem, hparams)
     for name in ("elite_reuse", "antithetic"):
-        validation.truth(name, getattr(hparams, name))
-    validation.one_of("weighting", hparams.weighting, WEIGHTINGS)
-    rho = validation.number("rho", hparams.rho)
-    population = validation.whole("population", hparams.population, least=1, most=2**31 - 1)
+        validation.boolean(name, getattr(hparams, name))
+    validation.choice("weighting", hparams.weighting, WEIGHTINGS)
+    rho = validation.finite_number("rho", hparams.rho)
+    population = validation.integer("population", hparams.population, least=1, most=2**31 - 1)
     if isinstance(hparams.rho, str) or not 0 < rho < 1 or rho * population < 1 - SLACK:
         raise ValueError(
             f"rho={hparams.rho} of population={hparams.population} leaves no elite, or all; give "

@@ -237,7 +237,7 @@ def initial_memory(network: nn.Module, memory: Any = None) -> Any:
         found = jax.tree.map(jnp.asarray, memory)
     except (TypeError, ValueError, OverflowError):
         raise ValueError(
-            f"memory is {validation.shown(memory)}; give a tree of arrays of numbers."
+            f"memory is {validation.shorten(memory)}; give a tree of arrays of numbers."
         ) from None
     own = begin() if hasattr(network, "initial_memory") else found
     if jax.tree.map(jnp.shape, found) != jax.tree.map(jnp.shape, own):

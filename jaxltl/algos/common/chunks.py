@@ -46,7 +46,7 @@ from jaxltl.algos.common.learner import (
 )
 from jaxltl.core.models.mesh.lanes import on_host
 from jaxltl.core.models.ops.array_namespace import to_jax
-from jaxltl.core.validation import truth
+from jaxltl.core import validation
 
 
 class Chunks(NamedTuple):
@@ -108,7 +108,7 @@ def run_in_chunks(
     Raises:
       ValueError: the checkpoint belongs to another learner, problem or setting.
     """
-    lanes = truth("lanes", lanes)
+    lanes = validation.boolean("lanes", lanes)
     chunk = chunk or max(max_rows, -(-num_steps // 100))
     num_lanes = len(state.step) if lanes else None
     hparams = _spread(hparams, state) if lanes else hparams

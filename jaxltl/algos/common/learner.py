@@ -61,7 +61,7 @@ from jax.tree_util import Partial
 from jaxltl.algos.common.settings import require_arrays
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.types import Status, worst
-from jaxltl.core.validation import called, whole
+from jaxltl.core import validation
 
 Init = Callable[..., Any]
 Step = Callable[..., tuple[Any, Any]]
@@ -134,7 +134,7 @@ def run(
       ValueError: num_steps or max_rows is not positive.
     """
     num_steps, max_rows = (
-        x if isinstance(x, int) else whole(name, x, least=1)
+        x if isinstance(x, int) else validation.integer(name, x, least=1)
         for name, x in (("num_steps", num_steps), ("max_rows", max_rows))
     )
     if num_steps < 1 or max_rows < 1:
@@ -248,8 +248,8 @@ def run_until(
         raise ValueError('idle=True goes with check_every=1 and keep="after".')
     for name, number in {"num_steps": num_steps, "check_every": check_every}.items():
         if not isinstance(number, jax.Array):
-            whole(name, number, least=1, most=MOST)
-    until = until if isinstance(until, Partial) else Partial(called("until", until))
+            validation.integer(name, number, least=1, most=MOST)
+    until = until if isinstance(until, Partial) else Partial(validation.function("until", until))
     require_arrays(state=state, problem=problem, hparams=hparams, until=until)
     most = jnp.asarray(num_steps, jnp.int32)
     return _run_until(step, state, problem, hparams, until, most, check_every, keep, idle)

@@ -52,7 +52,7 @@ def require_numbers(
         )
         if np.ndim(number) or not real:  # a whole number that is too large is an object
             raise ValueError(
-                f"{name}={validation.shown(number)}; give one number"
+                f"{name}={validation.shorten(number)}; give one number"
                 f"{', or a Partial(function) of the step' if name in schedules else ''}. Many "
                 "settings are a vmap."
             )
@@ -78,7 +78,9 @@ def require_arrays(**trees: Any) -> None:
         for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
             if not _is_array(leaf):
                 place = f"{name}{jax.tree_util.keystr(path)}"
-                raise ValueError(f"{place} is {validation.shown(leaf)}; give a number or an array.")
+                raise ValueError(
+                    f"{place} is {validation.shorten(leaf)}; give a number or an array."
+                )
 
 
 def _is_array(leaf: Any) -> bool:
@@ -112,7 +114,7 @@ def applied(network: nn.Module, parameters: Any, *read: Any) -> Any:
     """
     if not isinstance(parameters, Mapping):
         raise ValueError(
-            f"the parameters are {validation.shown(parameters)}; give the dict of those of the "
+            f"the parameters are {validation.shorten(parameters)}; give the dict of those of the "
             f"{type(network).__name__}, such as state.parameters."
         )
     try:

@@ -352,13 +352,13 @@ def _require_ours(problem: Problem, hparams: Hparams) -> None:
 def _check(problem: Problem, hparams: Hparams) -> None:
     _require_ours(problem, hparams)
     for name in ("num_envs", "num_steps", "num_epochs", "num_minibatches"):
-        validation.whole(name, getattr(hparams, name), least=1, most=2**31 - 1)
+        validation.integer(name, getattr(hparams, name), least=1, most=2**31 - 1)
     if hparams.num_resets is not None:
-        validation.whole("num_resets", hparams.num_resets, most=2**31 - 1)
-    validation.one_of("squash", hparams.squash, actions_of.SQUASHES)
+        validation.integer("num_resets", hparams.num_resets, most=2**31 - 1)
+    validation.choice("squash", hparams.squash, actions_of.SQUASHES)
     for name in ("normalize_advantage", "normalize_observation", "normalize_reward"):
-        validation.truth(name, getattr(hparams, name))
-    validation.whole(
+        validation.boolean(name, getattr(hparams, name))
+    validation.integer(
         "num_envs times num_steps", hparams.num_envs * hparams.num_steps, most=2**31 - 1
     )
     recurrent = has_memory(problem)

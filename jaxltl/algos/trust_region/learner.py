@@ -346,11 +346,11 @@ def make_problem(
             "episodes that never end: neither the environment nor horizon says after how many "
             "steps; give horizon, or with_time_limit(environment, num_steps)."
         )
-    horizon = validation.whole("horizon", horizon, least=1, most=2**31 - 1)
+    horizon = validation.integer("horizon", horizon, least=1, most=2**31 - 1)
     if limit is not None:
         known = isinstance(limit, jax.Array)
         limit = jnp.asarray(
-            limit if known else validation.numbers("limit", limit), jnp.result_type(float)
+            limit if known else validation.float_array("limit", limit), jnp.result_type(float)
         )
         require_shape("limit", limit, ())
     return Problem(environment=environment, limit=limit, horizon=horizon)
@@ -400,7 +400,7 @@ def _require_observed(state: State, observation: jax.Array) -> None:
     size = state.moments.mean.shape
     if not hasattr(observation, "dtype") or jnp.shape(observation)[-1:] != size:
         raise ValueError(
-            f"observation is {validation.shown(observation)}; the policy was trained on vectors "
+            f"observation is {validation.shorten(observation)}; the policy was trained on vectors "
             f"float[..., {size[0]}], as flat_observation makes of an environment's."
         )
 
@@ -408,18 +408,18 @@ def _require_observed(state: State, observation: jax.Array) -> None:
 def _check(problem: Problem, hparams: Hparams) -> None:
     _require_ours(problem, hparams)
     require_numbers(hparams, _RANGES, optional=["penalty"])
-    validation.whole("value_epochs", hparams.value_epochs, most=2**31 - 1)
-    validation.truth("normalize", hparams.normalize)
-    validation.one_of("method", hparams.method, METHODS)
+    validation.integer("value_epochs", hparams.value_epochs, most=2**31 - 1)
+    validation.boolean("normalize", hparams.normalize)
+    validation.choice("method", hparams.method, METHODS)
     if hparams.method == "cpo" and problem.limit is None:
         raise ValueError('method="cpo" needs a limit: pass one to make_problem, or use "trpo".')
     if hparams.method == "cpo" and hparams.penalty is not None:
         raise ValueError('penalty is for method="trpo": CPO finds its own multiplier.')
     for name in ("num_trajectories", "cg_steps", "search_steps", "fisher_stride", "value_batches"):
-        validation.whole(name, getattr(hparams, name), least=1, most=2**31 - 1)
+        validation.integer(name, getattr(hparams, name), least=1, most=2**31 - 1)
     for name in ("hidden", "value_hidden"):
-        for width in validation.listed(name, getattr(hparams, name)):
-            validation.whole(f"{name}: a width", width, least=1, most=2**31 - 1)
+        for width in validation.sequence(name, getattr(hparams, name)):
+            validation.integer(f"{name}: a width", width, least=1, most=2**31 - 1)
     samples = hparams.num_trajectories * problem.horizon
     if hparams.value_batches > samples:
         raise ValueError(f"value_batches={hparams.value_batches} of {samples} samples; use fewer.")
@@ -534,9 +534,9 @@ def rollout(
     """
     _require_ours(problem, hparams)
     _require_state(state)
-    number = validation.whole("num_trajectories", num_trajectories, least=1, most=2**31 - 1)
+    number = validation.integer("num_trajectories", num_trajectories, least=1, most=2**31 - 1)
     return _rollout(
-        require_key(key), state, problem, hparams, number, validation.truth("sampled", sampled)
+        require_key(key), state, problem, hparams, number, validation.boolean("sampled", sampled)
     )
 
 

@@ -104,11 +104,11 @@ def reach_avoid_sequences(
       [[0, 1, 0, 0], [0, 0, 0, 0]]
     """
     depth, most = (
-        validation.whole(name, number, least=1, most=2**16)
+        validation.integer(name, number, least=1, most=2**16)
         for name, number in (("depth", depth), ("most", most))
     )
     validation.instance("automaton", automaton, Automaton, "one of to_automaton")
-    propositions = validation.names("propositions", propositions)
+    propositions = validation.distinct_names("propositions", propositions)
     delta, priority = _on_events(automaton, events, propositions)
     live, done = live_states(automaton), universal_states(automaton)
     tables = _Tables(delta, priority, live, _distances(delta, priority, live, done))
@@ -160,7 +160,7 @@ def _on_events(
     automaton: Automaton, events: ArrayLike, propositions: tuple[str, ...]
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """The automaton's tables with a column for each event: int32 `[Q, E]`, twice."""
-    rows = validation.numbers("events", events).astype(bool)
+    rows = validation.float_array("events", events).astype(bool)
     if rows.ndim != 2 or rows.shape[1] != len(propositions) or not len(rows):
         raise ValueError(
             f"events has shape {list(rows.shape)}; give Booleans [E, {len(propositions)}], a "

@@ -126,7 +126,7 @@ def make_box(
         kind = jnp.dtype(jnp.result_type(float) if dtype is None else dtype)
     except (TypeError, ValueError):
         raise ValueError(
-            f"make_box: dtype={validation.shown(dtype)}; give a type of numbers."
+            f"make_box: dtype={validation.shorten(dtype)}; give a type of numbers."
         ) from None
     if kind.kind not in "biuf":
         raise ValueError(f"make_box: dtype={kind.name}; give a type of numbers.")
@@ -262,9 +262,9 @@ def make_environment(
       >>> corridor.actions.num, corridor.observations.shape
       (2, (1,))
     """
-    names = validation.names("propositions", propositions)
+    names = validation.distinct_names("propositions", propositions)
     if horizon is not None:
-        horizon = validation.whole("horizon", horizon, least=1)
+        horizon = validation.integer("horizon", horizon, least=1)
     if isinstance(actions, int | np.integer):
         actions = Finite(int(actions))
     if not isinstance(actions, Finite | Box):
@@ -302,7 +302,9 @@ def make_environment(
 
 def as_partial(function: Callable[..., Any], name: str = "function") -> Partial:
     """A function as a tree of arrays, which those that ``jit`` compiles take as an argument."""
-    return function if isinstance(function, Partial) else Partial(validation.called(name, function))
+    return (
+        function if isinstance(function, Partial) else Partial(validation.function(name, function))
+    )
 
 
 def require_environment(environment: Any) -> Environment:
@@ -318,7 +320,7 @@ def require_key(key: Any) -> chex.PRNGKey:
     dtype = getattr(key, "dtype", None)
     typed = dtype is not None and jax.dtypes.issubdtype(dtype, jax.dtypes.prng_key)
     if not (typed and key.shape == ()) and not (dtype == np.uint32 and key.ndim == 1):
-        raise ValueError(f"key is {validation.shown(key)}; give a single one, jax.random.key(0).")
+        raise ValueError(f"key is {validation.shorten(key)}; give a single one, jax.random.key(0).")
     return key
 
 

@@ -152,7 +152,7 @@ def run_episode(
       >>> found.reward.tolist(), bool(found.terminated)
       ([1.0, 0.0, 0.0, 0.0, 0.0], True)
     """
-    num_steps = validation.whole("num_steps", num_steps, least=1, most=2**31 - 1)
+    num_steps = validation.integer("num_steps", num_steps, least=1, most=2**31 - 1)
     environment, agent = require_environment(environment), require_agent(agent)
     begin, path = begin_episode(require_key(key), environment, agent)
 

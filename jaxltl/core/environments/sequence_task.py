@@ -113,8 +113,8 @@ def events_of(propositions: Ordered[str], at_most: int = 1) -> np.ndarray:
       >>> events_of(["a", "b"]).astype(int).tolist()
       [[0, 0], [1, 0], [0, 1]]
     """
-    width = len(validation.names("propositions", propositions))
-    at_most = min(validation.whole("at_most", at_most), width)
+    width = len(validation.distinct_names("propositions", propositions))
+    at_most = min(validation.integer("at_most", at_most), width)
     rows = [held for n in range(at_most + 1) for held in combinations(range(width), n)]
     events = np.zeros((len(rows), width), bool)
     for row, held in zip(events, rows, strict=True):
@@ -172,7 +172,7 @@ def sequence_sampler(
       ((2, 4), False)
     """
     rows = {"length": length, "reach": reach, "avoid": avoid}
-    found = {name: validation.numbers(name, row) for name, row in rows.items()}
+    found = {name: validation.float_array(name, row) for name, row in rows.items()}
     for name, row in found.items():
         if row.ndim != 1 or not (np.isfinite(row) & (row >= 0)).all() or not row.sum() > 0:
             raise ValueError(
@@ -289,7 +289,10 @@ def sequence_environment(
     marks, steps = make_box(0, 1, shape, bool), make_box(0, np.inf, (), np.int32)
     told: Any = Sequence(marks, marks, steps)  # type: ignore[arg-type]
     numbers = np.array(
-        [validation.number("violation", violation), validation.number("progress", progress)]
+        [
+            validation.finite_number("violation", violation),
+            validation.finite_number("progress", progress),
+        ]
     )
     return replace(
         inner,

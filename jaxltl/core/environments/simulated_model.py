@@ -133,7 +133,9 @@ def _earned(reward: jax.Array, state: jax.Array, action: jax.Array, after: jax.A
 def _opponent(model: MDP | DenseMDP, system: np.ndarray, policy: ArrayLike | None) -> np.ndarray:
     """The logarithm of what it plays."""
     available = np.asarray(model.available)
-    plays = available.astype(float) if policy is None else validation.numbers("opponent", policy)
+    plays = (
+        available.astype(float) if policy is None else validation.float_array("opponent", policy)
+    )
     if plays.shape != available.shape or not np.isfinite(plays).all() or (plays < 0).any():
         raise ValueError(
             f"opponent has shape {list(plays.shape)}; give weights "

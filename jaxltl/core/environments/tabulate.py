@@ -123,8 +123,8 @@ def tabulate(
       [False, False, False, False, True]
     """
     inner, limit = without_time_limit(environment)
-    max_states = validation.whole("max_states", max_states, least=1)
-    num_keys = validation.whole("num_keys", num_keys, least=1, most=2**20)
+    max_states = validation.integer("max_states", max_states, least=1)
+    num_keys = validation.integer("num_keys", num_keys, least=1, most=2**20)
     if not isinstance(inner.actions, Finite):
         raise ValueError("tabulate: the actions are a box; only finitely many can be listed.")
     key = jax.random.key(0) if key is None else require_key(key)

@@ -179,8 +179,8 @@ def make_task_tables(
       >>> make_task_tables("F goal", ["wall", "goal"]).weight.tolist()
       [0, 1]
     """
-    validation.one_of("ending", ending, ENDINGS)
-    propositions = validation.names("propositions", propositions)
+    validation.choice("ending", ending, ENDINGS)
+    propositions = validation.distinct_names("propositions", propositions)
     automaton = formula if isinstance(formula, Automaton) else to_automaton(formula)
     if not isinstance(formula, Automaton):
         require_known(automaton.propositions, propositions, f"the formula {str(formula)!r}")
@@ -198,7 +198,7 @@ def make_task_tables(
     )
     weight = np.zeros(len(propositions), np.int32)
     weight[list(reading.columns)] = 1 << np.arange(len(reading.columns))
-    shown = None if embedding is None else validation.numbers("embedding", embedding)
+    shown = None if embedding is None else validation.float_array("embedding", embedding)
     if shown is not None and (
         shown.ndim < 2 or len(shown) != len(decisions) or shown.dtype.kind not in "biuf"
     ):
@@ -386,7 +386,7 @@ def stack_tables(tables: Sequence[TaskTables]) -> TaskTables:
     Raises:
       ValueError: none, or tasks over different propositions or with embeddings of different width.
     """
-    tables = validation.listed("tables", tables)
+    tables = validation.sequence("tables", tables)
     if not tables:
         raise ValueError("there is no task; give at least one.")
     for one in tables:
@@ -418,7 +418,7 @@ def stack_tasks(environments: Sequence[Environment]) -> Environment:
       >>> jax.vmap(lambda e, key: e.reset(key).memory, (0, None))(both, jax.random.key(0)).shape
       (2,)
     """
-    environments = validation.listed("environments", environments)
+    environments = validation.sequence("environments", environments)
     if not environments:
         raise ValueError("there is no environment; give at least one.")
     padded = _padded([task_tables(e) for e in environments])
@@ -459,7 +459,7 @@ def what_is_left(task: Environment | TaskTables | Automaton, memory: Any) -> str
     else:
         tables = task if isinstance(task, TaskTables) else task_tables(task)
         names, count = tables.state_names, tables.delta.shape[-2]
-    state = validation.whole("memory", memory)
+    state = validation.integer("memory", memory)
     if not 0 <= state < count:
         raise ValueError(f"memory={state}; the automaton has the states 0..{count - 1}.")
     return names[state] if state < len(names) else f"state {state} of {count}"

@@ -106,20 +106,20 @@ def pay_of(
     Raises:
       ValueError: a reward that does not fit the automaton, or numbers outside their ranges.
     """
-    reward = validation.one_of("reward", reward, REWARDS)
+    reward = validation.choice("reward", reward, REWARDS)
     name = _BY_KIND[automaton.acceptance] if reward == "auto" else reward
     _require_fit(automaton, name)
     shaped = shaping is not None
     final = name in ("reach", "keep")
     if discount is None:
         discount = 1.0 if final and not shaped else _DEFAULT
-    discount = validation.number("discount", discount)
+    discount = validation.finite_number("discount", discount)
     if not 0 < discount <= 1 or (discount == 1 and not final):
         raise ValueError(
             f"discount={discount}; the reward {name!r} needs one above 0 and "
             f"{'at most' if final else 'below'} 1."
         )
-    learner_discount = validation.share("learner_discount", learner_discount, ends=(False, True))
+    learner_discount = validation.fraction("learner_discount", learner_discount, ends=(False, True))
     rank = _ranks(automaton)
     accepting = rank % 2 == 0
     if final:
@@ -166,7 +166,7 @@ def _stopping(
 ) -> tuple[np.ndarray, np.ndarray]:
     """What a reading earns and by what it discounts, if it stops as often as its rank says."""
     ratio = 1 - discount if ratio is None else ratio
-    ratio = validation.share("ratio", ratio, ends=(False, False))
+    ratio = validation.fraction("ratio", ratio, ends=(False, False))
     stops = (1 - discount) * ratio ** (rank - rank.min())
     if name == "eventual":
         stops = np.where(rank == 0, stops, 0)

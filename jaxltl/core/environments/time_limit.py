@@ -40,7 +40,7 @@ def with_time_limit(environment: Environment, num_steps: int) -> Environment:
       >>> with_time_limit(coin, 10).horizon
       10
     """
-    num_steps = validation.whole("num_steps", num_steps, least=1, most=2**31 - 1)
+    num_steps = validation.integer("num_steps", num_steps, least=1, most=2**31 - 1)
     inner = require_environment(environment)
     return replace(
         inner,

@@ -22,7 +22,7 @@ from jaxltl.core.models.ops.choices import choice_shape, choices
 from jaxltl.core.models.protocols import Model, base_model
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief
-from jaxltl.core.validation import no_model
+from jaxltl.core import validation
 
 
 @brief(facts=facts.game, drawn=True)
@@ -164,7 +164,7 @@ def as_game(model: Model) -> Game:
     """A game as solvers take it; any other model as the game in which the system always moves."""
     if not isinstance(model, Game):
         if not hasattr(model, "state_shape"):
-            raise ValueError(no_model(model))
+            raise ValueError(validation.unsupported_model(model))
         model = Game(model, to_jax(np.ones(model.state_shape, bool)))
     return model
 

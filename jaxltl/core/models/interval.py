@@ -28,7 +28,7 @@ from jaxltl.core.sparse.interval.row_table import row_sums
 from jaxltl.core.sparse.interval.uncertainty_set import HostInterval
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.rows import offsets_from_counts
-from jaxltl.core.validation import numbers, shown
+from jaxltl.core import validation
 
 NEAR = 1e-6  # how far a row may miss a distribution and still be scaled to one
 # Names under which numbers of entries travel with the entries, and radii with the rows.
@@ -245,7 +245,7 @@ def make_interval(
             f"{type(model).__name__} takes no intervals; give an MDP or a SparseMDP "
             "(of an interval model, its nominal one)."
         )
-    lower, upper = numbers("lower", lower), numbers("upper", upper)
+    lower, upper = validation.float_array("lower", lower), validation.float_array("upper", upper)
     shape = np.shape(model.probability)
     for name, ends in (("lower", lower), ("upper", upper), ("center", center)):
         if ends is not None and np.shape(ends) != shape:
@@ -334,7 +334,7 @@ def interval_rows(
       (3, [0.7, 0.6, 1.0, 1.0])
     """
     entry_start, successor = np.asarray(entry_start), np.asarray(successor)
-    lower, upper = numbers("lower", lower), numbers("upper", upper)
+    lower, upper = validation.float_array("lower", lower), validation.float_array("upper", upper)
     ball = _ball(center, radius, successor.shape, entry_start.size - 1)
     if not lower.shape == upper.shape == successor.shape:
         raise ValueError(
@@ -355,7 +355,9 @@ def interval_rows(
     row = np.repeat(np.arange(num_rows), np.diff(entry_start))
     _check_ends(starts, row, successor, lower, upper)
     if rewards is not None and not isinstance(rewards, Mapping):
-        raise ValueError(f"rewards is {shown(rewards)}; give a dict of Rewards by name.")
+        raise ValueError(
+            f"rewards is {validation.shorten(rewards)}; give a dict of Rewards by name."
+        )
     rewards = {} if rewards is None else dict(rewards)
     place = row * np.int64(starts.size) + successor.astype(np.int64)
     if not (place[1:] > place[:-1]).all() and np.unique(place).size < place.size:
@@ -394,7 +396,10 @@ def _ball(
     if center is None or radius is None:
         given = "radius" if center is None else "center"
         raise ValueError(f"{given} is given alone; a ball has a center and a radius.")
-    center, radius = numbers("center", center), numbers("radius", radius)
+    center, radius = (
+        validation.float_array("center", center),
+        validation.float_array("radius", radius),
+    )
     if center.shape != entries or radius.shape != (num_rows,):
         raise ValueError(
             f"center has shape {center.shape} and radius {radius.shape}; expected "

@@ -15,7 +15,7 @@ from jaxltl.core.models import facts
 from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
 from jaxltl.core.models.protocols import Model
 from jaxltl.core.pretty_print import brief
-from jaxltl.core.validation import listed, no_model, numbers, shown
+from jaxltl.core import validation
 
 
 @brief(facts=facts.padded, drawn=True)
@@ -139,7 +139,7 @@ class DenseMDP:
 def support(world: Model) -> np.ndarray:
     """Which successors are possible, ``bool[S, A, K]``, on the host; none where unavailable."""
     if not isinstance(world, MDP | DenseMDP):
-        raise ValueError(no_model(world))
+        raise ValueError(validation.unsupported_model(world))
     weight = world.transition if isinstance(world, DenseMDP) else world.probability
     used, available = np.asarray(weight) > 0, np.asarray(world.available)
     if not available.all():
@@ -292,7 +292,7 @@ def to_dense(mdp: MDP) -> DenseMDP:
       [[[0.5, 0.5]], [[0.0, 1.0]]]
     """
     if not hasattr(mdp, "num_actions") or not hasattr(mdp, "successor"):
-        raise ValueError(no_model(mdp))
+        raise ValueError(validation.unsupported_model(mdp))
     num_states, num_actions = mdp.num_states, mdp.num_actions
     shape = num_states, num_actions, num_states
     place = np.arange(num_states)[:, None, None], np.arange(num_actions)[:, None]
@@ -362,7 +362,7 @@ def checked_initial(initial: chex.Array | None, num_states: int) -> np.ndarray:
     """
     if initial is None:
         return np.full(num_states, 1 / num_states)
-    initial = numbers("initial", initial)
+    initial = validation.float_array("initial", initial)
     if initial.shape != (num_states,):
         raise ValueError(f"initial has shape {initial.shape}; expected ({num_states},).")
     refuse_negative(initial)
@@ -402,9 +402,9 @@ def checked_label(
       ValueError: names that are not distinct or not those of the label, names without a label, a
         wrong shape, or a state that does not exist.
     """
-    names = tuple(listed("propositions", propositions))
+    names = tuple(validation.sequence("propositions", propositions))
     if not all(isinstance(x, str) for x in names) or len(set(names)) != len(names):
-        raise ValueError(f"propositions {shown(names)} are not distinct.")
+        raise ValueError(f"propositions {validation.shorten(names)} are not distinct.")
     if isinstance(label, Mapping):
         return _label_by_name(label, names or tuple(label), num_states)
     if label is None:

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from jaxltl.core import validation
 from jaxltl.core.automata.automaton import Automaton, letter_index
 from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.logic.labels import distinct_rows, require_known
@@ -28,7 +29,6 @@ from jaxltl.core.models.ops.annotated_pytree import register_annotated_pytree
 from jaxltl.core.models.ops.array_namespace import namespace, to_jax
 from jaxltl.core.models.protocols import LabelledModel
 from jaxltl.core.pretty_print import brief
-from jaxltl.core.validation import shown
 
 
 register_annotated_pytree(
@@ -218,7 +218,9 @@ def product(
         require_known(formula.propositions, world.propositions, "the task")
         task = to_automaton(formula, letters=letters_of(world, formula.propositions))
     if not isinstance(task, Automaton):
-        raise ValueError(f"task is {shown(task)}; give a formula, its text, or an automaton.")
+        raise ValueError(
+            f"task is {validation.shorten(task)}; give a formula, its text, or an automaton."
+        )
     require_known(task.propositions, world.propositions, "the task")
     column = [world.propositions.index(p) for p in task.propositions]
     labels = label_rows(world)

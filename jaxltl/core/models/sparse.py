@@ -20,7 +20,7 @@ from jaxltl.core.models.ops.kernels import gather, owners, segment
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.rows import SCIPY_SIZE
-from jaxltl.core.validation import listed, numbers, shown
+from jaxltl.core import validation
 
 _PADDED = (
     "this takes models that are padded: give to_padded(model). Sparse models have choices "
@@ -255,7 +255,7 @@ def _listed(names: Mapping[str, Any]) -> str:
 
 
 def _shaped(model: SparseMDP, reward: Any) -> Rewards:
-    reward = reward if isinstance(reward, jax.Array) else numbers("reward", reward)
+    reward = reward if isinstance(reward, jax.Array) else validation.float_array("reward", reward)
     for size, name in _sizes(model):
         if reward.shape == (size,):
             return Rewards(**{name: reward})
@@ -374,8 +374,8 @@ def sparse_part(
     )
     for of, each in (("rewards", rewards), ("valuation", valuation)):
         if each is not None and not isinstance(each, Mapping):
-            raise ValueError(f"{of} is {shown(each)}; give a dict, by name.")
-    action_names = tuple(listed("action_names", action_names))
+            raise ValueError(f"{of} is {validation.shorten(each)}; give a dict, by name.")
+    action_names = tuple(validation.sequence("action_names", action_names))
     sizes = here, num_rows, successor.size
     rewards = {
         name: _checked_rewards(name, x, sizes, begins) for name, x in (rewards or {}).items()
@@ -480,7 +480,7 @@ def _checked_rewards(
     name: str, reward: Rewards, sizes: tuple[int, int, int], begins: tuple[int, int, int]
 ) -> Rewards:
     if not isinstance(reward, Rewards):
-        raise ValueError(f"reward {name!r} is {shown(reward)}; give Rewards.")
+        raise ValueError(f"reward {name!r} is {validation.shorten(reward)}; give Rewards.")
     parts: dict[str, Any] = {}
     for part, size, first in zip(("state", "choice", "transition"), sizes, begins, strict=True):
         given = getattr(reward, part)

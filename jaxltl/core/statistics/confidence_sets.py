@@ -23,7 +23,7 @@ from jaxltl.core.statistics.binomial import (
     frequency,
     hoeffding,
 )
-from jaxltl.core.validation import number, one_of, whole
+from jaxltl.core import validation
 
 Method = Literal["clopper-pearson", "hoeffding", "weissman", "anytime"]
 
@@ -244,10 +244,10 @@ def samples_needed(
     """
     _check_method(method)
     check_confidence(confidence)
-    if not 0 < number("width", width) < 1:
+    if not 0 < validation.finite_number("width", width) < 1:
         raise ValueError(f"width={width}; it must lie strictly between 0 and 1.")
-    num_claims = whole("num_claims", num_claims, least=1)
-    num_outcomes = whole("num_outcomes", num_outcomes, least=2)
+    num_claims = validation.integer("num_claims", num_claims, least=1)
+    num_outcomes = validation.integer("num_outcomes", num_outcomes, least=2)
     failure = (1 - confidence) / num_claims
 
     def widest(total: int) -> float:
@@ -274,7 +274,7 @@ def samples_needed(
 
 
 def _check_method(method: str) -> None:
-    one_of("method", method, get_args(Method))
+    validation.choice("method", method, get_args(Method))
 
 
 def check_confidence(confidence: float) -> None:
@@ -359,7 +359,7 @@ def _outcomes(num_outcomes: Any, listed: Integers, shape: tuple[int, ...]) -> In
 def _claims(given: int | None, made: int) -> int:
     if given is None:
         return made
-    found = whole("num_claims", given)
+    found = validation.integer("num_claims", given)
     if found < made:
         raise ValueError(f"num_claims={given}; the rows make {made}, and no fewer can be counted.")
     return found

@@ -41,13 +41,13 @@ def bounded_mean(
       >>> [round(end, 3) for end in ends]
       [0.242, 0.258]
     """
-    x = np.atleast_1d(validation.numbers("numbers", numbers))
-    failure = validation.share("failure", failure, ends=(False, False))
+    x = np.atleast_1d(validation.float_array("numbers", numbers))
+    failure = validation.fraction("failure", failure, ends=(False, False))
     if planned is not None:
-        planned = validation.whole("planned", planned, least=1)
+        planned = validation.integer("planned", planned, least=1)
     if x.ndim != 1 or np.isnan(x).any():
         raise ValueError(
-            f"numbers is {validation.shown(numbers)}; give one axis of them, none NaN."
+            f"numbers is {validation.shorten(numbers)}; give one axis of them, none NaN."
         )
     x = np.clip(x, 0, 1)
     count = np.arange(1, x.size + 1)

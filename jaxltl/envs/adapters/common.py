@@ -83,7 +83,7 @@ def params_of(root: str, params: Any, own: Any) -> Any:
         return own
     if not isinstance(params, type(own)):
         raise ValueError(
-            f"from_{root}: params is {validation.shown(params)}; give a {type(own).__qualname__}, such "
+            f"from_{root}: params is {validation.shorten(params)}; give a {type(own).__qualname__}, such "
             "as the environment's own with params.replace(...), or None for its own."
         )
     return params

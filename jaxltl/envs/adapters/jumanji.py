@@ -99,7 +99,7 @@ def from_jumanji(
     held, endless, parts = Held(env), Held(_without_limit(env)), _parts(env)
     limit = next((x.time_limit for x in layers(env, "_env") if "time_limit" in vars(x)), None)
     limit = None if limit is None else int(limit)
-    if validation.truth("in_turn", in_turn):
+    if validation.boolean("in_turn", in_turn):
         if not parts:
             raise ValueError(
                 f"from_jumanji: in_turn=True, but an action of {type(env).__name__} has no parts "

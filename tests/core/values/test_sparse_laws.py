@@ -297,7 +297,8 @@ def test_what_is_not_certified_has_not_converged(name):
             assert one.status == Status.CONVERGED, case
             assert (one.lower <= one.value).all() and (one.value <= one.upper).all(), case
             continue
-        expected = Status.INVALID if of == "policy" else Status.NONFINITE
+        reasons = {"policy": Status.INVALID_POLICY, "discount": Status.INVALID_DISCOUNT}
+        expected = reasons.get(of, Status.NONFINITE)
         assert one.status == expected, case
         assert not np.isfinite(one.upper).any(), case
 
@@ -327,7 +328,7 @@ def test_rows_and_weights_are_one_policy():
         assert_solutions_agree(one, other)
     wrong = with_row(rows, 0, rows[1]).astype(int)
     found = compiled("policy_value")(numbers(model), {**inputs, "policy": wrong})
-    assert found.status == Status.INVALID
+    assert found.status == Status.INVALID_POLICY
 
 
 def test_rewards_are_named_inside_jit():

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxltl.core.validation import no_model
+from jaxltl.core import validation
 from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
 from jaxltl.core.models.mdp import MDP, DenseMDP, support
 from jaxltl.core.models.construct.padded import to_padded as to_padded  # for whoever converts
@@ -44,7 +44,7 @@ def to_sparse(model: Model) -> SparseMDP:
     if isinstance(model, Product):
         return _product(model)
     if not isinstance(model, MDP | DenseMDP):
-        raise ValueError(no_model(model))
+        raise ValueError(validation.unsupported_model(model))
     used, available = support(model), np.asarray(model.available)
     s, a, k = np.nonzero(used)
     if isinstance(model, DenseMDP):

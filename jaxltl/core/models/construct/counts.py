@@ -11,8 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxltl.core.validation import listed as listed_items
-from jaxltl.core.validation import numbers, one_of, shown
+from jaxltl.core import validation
 from jaxltl.core.sparse.rows import offsets_from_counts
 from jaxltl.core.array_types import Integers
 from jaxltl.core.models import facts
@@ -137,7 +136,7 @@ def _checked_names(what: str, names: Sequence[str] | None, least: int) -> tuple[
         if least > _MOST_ENTRIES:
             raise ValueError(f"{what} go up to {least - 1}; number them from 0, without gaps.")
         return tuple(map(str, range(least)))
-    names = tuple(map(str, listed_items(what, names)))
+    names = tuple(map(str, validation.sequence(what, names)))
     if len(names) < least:
         raise ValueError(f"there are {len(names)} names of {what}; number {least - 1} has none.")
     if len(set(names)) < len(names):
@@ -421,9 +420,11 @@ def counted_model(
       ([0.7, 0.3, 1.0], [7, 3, 9], [False, True])
     """
     _require_counts(counts)
-    one_of("graph", graph, ("seen", "complete"))
+    validation.choice("graph", graph, ("seen", "complete"))
     if labels is not None and not isinstance(labels, Mapping):
-        raise ValueError(f"labels is {shown(labels)}; give the states of each label, in a dict.")
+        raise ValueError(
+            f"labels is {validation.shorten(labels)}; give the states of each label, in a dict."
+        )
     number = {name: i for i, name in enumerate(counts.states)}
     stays = np.zeros(len(number), bool)
     stays[_numbers(terminal, number, "terminal")] = True
@@ -494,7 +495,7 @@ def _nominal(count: Integers, start: Integers) -> NDArray[np.float64]:
 def _require_counts(counts: Any) -> None:
     if not isinstance(counts, TransitionCounts):
         raise ValueError(
-            f"counts is {shown(counts)}; give TransitionCounts, as make_counts and "
+            f"counts is {validation.shorten(counts)}; give TransitionCounts, as make_counts and "
             "read_log return them."
         )
 
@@ -508,7 +509,7 @@ def _variable(names: tuple[str, ...]) -> NDArray[Any]:
 def _numbers(names: Iterable[Any], number: Mapping[str, int], what: str) -> list[int]:
     """Of states, by name."""
     found = []
-    for name in [names] if isinstance(names, str | int) else listed_items(what, names):
+    for name in [names] if isinstance(names, str | int) else validation.sequence(what, names):
         if str(name) not in number:
             raise ValueError(
                 f"{what}: there is no state {str(name)!r}; there are {listed(tuple(number))}."
@@ -519,6 +520,10 @@ def _numbers(names: Iterable[Any], number: Mapping[str, int], what: str) -> list
 
 def _initial(initial: Any, number: Mapping[str, int]) -> NDArray[np.float64]:
     found = np.zeros(len(number))
-    weight = numbers("initial", list(initial.values())) if isinstance(initial, Mapping) else 1.0
+    weight = (
+        validation.float_array("initial", list(initial.values()))
+        if isinstance(initial, Mapping)
+        else 1.0
+    )
     found[_numbers(initial, number, "initial")] = weight
     return found if isinstance(initial, Mapping) else found / max(found.sum(), 1)

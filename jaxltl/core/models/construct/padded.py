@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaxltl.core.validation import no_model
+from jaxltl.core import validation
 from jaxltl.core.models.mdp import MDP, make_mdp
 from jaxltl.core.models.sparse import SparseMDP
 
@@ -14,7 +14,7 @@ _LARGEST = 8 * 2**30  # bytes of the largest model that is padded
 def action_of(model: SparseMDP) -> np.ndarray:
     """The action that each row of a sparse model becomes when it is padded, ``int[R]``."""
     if not isinstance(model, SparseMDP):
-        raise ValueError(no_model(model))
+        raise ValueError(validation.unsupported_model(model))
     host = model.host
     if model.action is not None and not model.action_names:
         return np.asarray(model.action)

@@ -17,7 +17,7 @@ from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.mdp import MDP, DenseMDP, make_mdp, support
 from jaxltl.core.models.construct.part import part_of, reachable
 from jaxltl.core.models.product import Product, flat_successor
-from jaxltl.core.validation import no_model
+from jaxltl.core import validation
 from jaxltl.core.models.protocols import ActionModel, Model, ModelT
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief
@@ -53,7 +53,7 @@ def _with_allowed(model: Model, allowed: chex.Array) -> Model:
     if isinstance(model, SparseMDP):
         return _with_rows(model, allowed)
     if not isinstance(model, MDP | DenseMDP | Product | Game):
-        raise ValueError(no_model(model))
+        raise ValueError(validation.unsupported_model(model))
     shape = (*model.state_shape, model.num_actions)
     if np.shape(allowed) != shape or allowed.dtype != bool:
         raise ValueError(

@@ -24,7 +24,6 @@ from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import SparseMDP, check_entries, checked_starts, row_reward, scaled
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
-from jaxltl.core.validation import shown
 
 _WIDTHS = np.array(sorted({int(m * 2**e) for e in range(26) for m in (1, 1.5)} | {3}))
 _PADDED = 1.25  # times the transitions that one table of all rows may hold
@@ -157,7 +156,9 @@ def model_from_parts(
       (10, 1)
     """
     if not isinstance(num_states, int | np.integer) or num_states < 1:
-        raise ValueError(f"num_states is {shown(num_states)}; give a whole number of at least 1.")
+        raise ValueError(
+            f"num_states is {validation.shorten(num_states)}; give a whole number of at least 1."
+        )
     return _assembled(part, None, int(num_states), mesh, axis, tuple(propositions))
 
 
@@ -447,7 +448,9 @@ def _checked(part: Any, layout: _Layout, d: int, num_labels: int) -> _Range:
     start, stop = layout.span(d)
     found = part(start, stop)
     if not isinstance(found, ModelPart):
-        raise ValueError(f"part({start}, {stop}) is {shown(found)}; it must return a ModelPart.")
+        raise ValueError(
+            f"part({start}, {stop}) is {validation.shorten(found)}; it must return a ModelPart."
+        )
     successor, probability = np.asarray(found.successor), np.asarray(found.probability, np.float64)
     entry_start = checked_starts("entry_start", found.entry_start, successor.size, "transitions")
     row_start = found.row_start

@@ -23,7 +23,7 @@ from jaxltl.core.models.ops import kernels, operators
 from jaxltl.core.models.product import label_rows, shown_by
 from jaxltl.core.models.protocols import Model
 from jaxltl.core.pretty_print import brief
-from jaxltl.core.validation import no_model
+from jaxltl.core import validation
 
 
 class RowTable(NamedTuple):
@@ -156,7 +156,7 @@ def refuse_sharded(model: Model) -> None:
     while hasattr(model, "mdp"):
         model = model.mdp
     if isinstance(model, ShardedMDP):
-        raise ValueError(no_model(model))
+        raise ValueError(validation.unsupported_model(model))
 
 
 def over_devices(model: ShardedMDP, function: Any, *arguments: Any) -> Any:

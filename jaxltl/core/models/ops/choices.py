@@ -18,7 +18,7 @@ from jaxltl.core.models.ops import kernels
 from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief
-from jaxltl.core.validation import no_model, shown
+from jaxltl.core import validation
 
 
 def action_mean(policy: jax.Array, quantity: jax.Array) -> jax.Array:
@@ -78,7 +78,7 @@ def is_deterministic(policy: chex.Array) -> bool:
         kind = jnp.result_type(policy)
     except TypeError:
         raise ValueError(
-            f"policy is {shown(policy)}; give the number of an action (of a sparse "
+            f"policy is {validation.shorten(policy)}; give the number of an action (of a sparse "
             "model, of a choice) for each state, or weights of all."
         ) from None
     return jnp.issubdtype(kind, jnp.integer)
@@ -348,7 +348,7 @@ class Rows(NamedTuple):
 def choices(model: Model) -> Actions | Rows:
     """The choices of a model's states; of a representation of one's own, its `available`."""
     if not hasattr(model, "available"):
-        raise ValueError(no_model(model))
+        raise ValueError(validation.unsupported_model(model))
     return Actions(model.available)
 
 
@@ -362,7 +362,7 @@ def row_choices(model: SparseMDP) -> Rows:
 def choice_shape(model: Model) -> tuple[int, ...]:
     """The shape of a quantity on choices: ``(S, A)``, in a product ``(S, Q, A)``, or ``(R,)``."""
     if not hasattr(model, "num_actions"):
-        raise ValueError(no_model(model))
+        raise ValueError(validation.unsupported_model(model))
     return (*model.state_shape, model.num_actions)
 
 

@@ -37,7 +37,7 @@ from jaxltl.core.models.ops.kernels import only_real
 from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.types import describe_row, row_tolerance
-from jaxltl.core.validation import no_model
+from jaxltl.core import validation
 
 
 @singledispatch
@@ -220,7 +220,7 @@ def pushforward(model: Model, mass: jax.Array) -> jax.Array:
 
 def _unknown(model: Model) -> str:
     if hasattr(model, "nominal"):
-        return no_model(model)
+        return validation.unsupported_model(model)
     return (
         f"{type(model).__name__} is not a model: pass an MDP, a DenseMDP, a SparseMDP, a "
         "Product or a Game."

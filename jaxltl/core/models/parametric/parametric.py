@@ -17,8 +17,7 @@ from jaxltl.core.models import facts
 from jaxltl.core.models.ops.array_namespace import is_traced
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
 from jaxltl.core.pretty_print import brief
-from jaxltl.core.validation import listed, shown
-from jaxltl.core.validation import numbers as _numbers
+from jaxltl.core import validation
 
 Ends = Any  # a number for all parameters, a number for each name, or float[D]
 _TRIALS = 64  # points that are tried for one at which the functions are a model
@@ -86,7 +85,7 @@ class ParametricMDP:
         Raises:
           ValueError: they have another shape, or one of them is outside.
         """
-        found, names = _numbers(f"{name}s", points), self.parameters
+        found, names = validation.float_array(f"{name}s", points), self.parameters
         if found.ndim != 2 or found.shape[1] != len(names) or not len(found):
             raise ValueError(
                 f"{name}s has shape {found.shape}; expected (N, {len(names)}), a number "
@@ -169,16 +168,16 @@ def make_parametric(
             "its nominal one)."
         )
     if not callable(numbers):
-        raise ValueError(f"numbers is {shown(numbers)}; give a function of float[D].")
+        raise ValueError(f"numbers is {validation.shorten(numbers)}; give a function of float[D].")
     if parameters is None:
         parameters = (
             tuple(low)
             if isinstance(low, Mapping)
             else tuple(f"p{d}" for d in range(max(np.size(low), np.size(high))))
         )
-    names = tuple(listed("parameters", parameters))
+    names = tuple(validation.sequence("parameters", parameters))
     if not all(isinstance(x, str) for x in names) or len(set(names)) < len(names):
-        raise ValueError(f"parameters are {shown(names)}; name each once.")
+        raise ValueError(f"parameters are {validation.shorten(names)}; name each once.")
     low, high = box_of(low, high, names)
     numbers = numbers if isinstance(numbers, Partial) else Partial(numbers)
     numbers = Partial(_paired, numbers, model.host.state)
@@ -296,7 +295,7 @@ def _point(of: str, values: Any, names: Sequence[str]) -> np.ndarray:
                 f"{word}; the parameters are {', '.join(names)}."
             )
         values = [values[name] for name in names]
-    found = _numbers(of, values)
+    found = validation.float_array(of, values)
     if found.ndim == 0 and of != "values":
         found = np.full(len(names), found)
     if found.shape != (len(names),):

@@ -10,7 +10,7 @@ from jaxltl.core.array_types import Floats, Integers
 from jaxltl.core.sparse.interval.l1_distance import Ball
 from jaxltl.core.sparse.interval.uncertainty_set import HostInterval
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.validation import numbers, wholes
+from jaxltl.core import validation
 
 
 def l1_expectation(
@@ -41,9 +41,10 @@ def l1_expectation(
       ([0.1], [0.9, 0.1, 0.0])
     """
     value, center, radius = (
-        numbers(name, x) for name, x in (("value", value), ("center", center), ("radius", radius))
+        validation.float_array(name, x)
+        for name, x in (("value", value), ("center", center), ("radius", radius))
     )
-    start: Any = wholes("entry_start", entry_start).reshape(-1)
+    start: Any = validation.integer_array("entry_start", entry_start).reshape(-1)
     if value.shape != center.shape or (start.size - 1,) != radius.shape:
         raise ValueError(
             f"value has shape {value.shape}, center {center.shape} and radius {radius.shape}; "

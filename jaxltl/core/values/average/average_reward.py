@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.sparse.solvers.average_reward import average
 from jaxltl.core.types import Solution
@@ -16,6 +17,7 @@ from jaxltl.core.values.undiscounted.step_bounded import (
 )
 
 
+@validated()
 def average_reward(
     model: Any,
     reward: Any,

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.models.construct.padded import padded_rows
 from jaxltl.core.models.compiled.compiled import compiled_form, in_shape_of
 from jaxltl.core.models.game import Game, as_game, as_padded_game, is_deterministic
@@ -27,6 +28,7 @@ from jaxltl.core.types import Solution, status_code
 from jaxltl.core.values.discounted.discounted import expected_reward
 
 
+@validated()
 def mean_payoff(game: Any, reward: chex.Array, *, max_steps: int = 100_000) -> Solution:
     """Average reward for a move that the system can secure in a deterministic game, exactly.
 

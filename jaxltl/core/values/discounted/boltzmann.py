@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.models.compiled.compiled import compiled_form, in_shape_of
 from jaxltl.core.models.ops.choices import choices
 from jaxltl.core.models.ops.successor_tables import table
@@ -66,6 +67,7 @@ def boltzmann_expansion(num_actions: Any) -> Any:
     return found if xp is jnp else float(found)
 
 
+@validated(adjoint=("exact", "approximate"), method=("damped", "newton"))
 def boltzmann_value(
     model: Any,
     reward: jax.Array,
@@ -113,10 +115,6 @@ def boltzmann_value(
       >>> round(boltzmann_value(mdp, jnp.ones((1, 2)), 0.5).value.item(), 4)
       2.0
     """
-    if adjoint not in ("exact", "approximate"):
-        raise ValueError(f"adjoint={adjoint!r}; choose exact or approximate.")
-    if method not in ("damped", "newton"):
-        raise ValueError(f"method={method!r}; choose damped or newton.")
     form, reward = compiled_form(model, reward)
     return in_shape_of(
         model,
@@ -168,7 +166,7 @@ def _boltzmann_value(
             num_steps=n,
             status=status_code(
                 converged,
-                jnp.isfinite(bound) & (discount < 1),
+                jnp.isfinite(bound),
                 bound <= given.enough,
                 certified=given.contracts,
             ),
@@ -232,6 +230,7 @@ def softmax_mean(over: Any, q: Any, given: Any) -> tuple[jax.Array, Any]:
     )
 
 
+@validated()
 def boltzmann_fixed_points(
     model: Any,
     reward: jax.Array,

@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.models.compiled.compiled import compiled_form, flat_policy, in_shape_of
 from jaxltl.core.models.ops.array_namespace import is_traced
 from jaxltl.core.models.ops.choices import choices
@@ -189,6 +190,7 @@ def differentiable(
 # --- a policy --------------------------------------------------------------------------------
 
 
+@validated()
 def policy_value(
     model: Any,
     policy: jax.Array,
@@ -268,6 +270,7 @@ def _policy_value(model, policy, reward, discount, tolerance, max_steps) -> Solu
 # --- optimal values --------------------------------------------------------------------------
 
 
+@validated(method=_METHODS)
 def optimal_value(
     model: Any,
     reward: jax.Array,
@@ -340,8 +343,6 @@ def _optimal_value(
     max_steps: jax.Array | int,
     evaluation_sweeps: jax.Array | int,
 ) -> Solution:
-    if method not in _METHODS:
-        raise ValueError(f"method={method!r}; choose {', '.join(_METHODS[:-1])} or {_METHODS[-1]}.")
     if method == "auto":
         few = math.prod(model.state_shape) <= DENSE_LIMIT
         method = "policy_iteration" if few else "modified_policy_iteration"

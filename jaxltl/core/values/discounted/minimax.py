@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.graphs.attractor import attract
 from jaxltl.core.graphs.graph import Graph, graph_of, take
 from jaxltl.core.models.compiled.compiled import compiled_form, flat_policy, in_shape_of
@@ -40,9 +41,11 @@ from jaxltl.core.values.engine.implicit_diff import implicit
 from jaxltl.core.values.engine.iterate import iterate
 from jaxltl.core.values.engine.linear import DENSE_LIMIT, System, solver
 
+_PER = ("move", "system_move")
 _METHODS = ("policy_iteration", "value_iteration", "strategy_iteration")
 
 
+@validated(per=_PER, method=_METHODS)
 def minimax_value(
     game: Any,
     reward: chex.Array,
@@ -108,7 +111,6 @@ def minimax_value(
       >>> [round(v, 4) for v in best.value.tolist()], best.policy.tolist()
       ([4.0, 4.0], [1, 0])
     """
-    _require("method", method, _METHODS)
     given = as_game(game)
     game, reward = compiled_form(given, reward)
     if allowed is not None:
@@ -141,6 +143,7 @@ def minimax_value(
     )
 
 
+@validated(per=_PER, method=_METHODS, environment=("adversarial",))
 def strategy_value(
     game: Any,
     strategy: chex.Array,
@@ -191,11 +194,9 @@ def strategy_value(
       >>> [round(v, 4) for v in met.value.tolist()]
       [1.6667, 1.3333]
     """
-    _require("method", method, _METHODS)
     asked = as_game(game)
     game, reward = compiled_form(asked, reward)
     if isinstance(environment, str):
-        _require("environment", environment, ("adversarial",))
         environment = None
     strategy, environment = (flat_policy(asked.mdp, x) for x in (strategy, environment))
     given = [("strategy", strategy, game.system)]
@@ -275,14 +276,8 @@ def _joint(game: Game, strategy: chex.Array, environment: chex.Array | None) -> 
     return _Drawn(weight, given, valid, lax.stop_gradient(weight) > 0)
 
 
-def _require(name: str, value: str, choices: tuple[str, ...]) -> None:
-    if value not in choices:
-        raise ValueError(f"{name}={value!r}; choose {' or '.join(choices)}.")
-
-
 def _returns(graph: Graph, per: str, goal: Any, moves: Any, drawn: Any) -> Any:
     """Whether the environment always comes back to a goal, as values per system move need."""
-    _require("per", per, ("move", "system_move"))
     if per == "move":
         return np.True_
     back = attract(graph, goal, moves, rule=drawn).region

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.models.compiled.compiled import compiled_form, flat_policy
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.ops.choices import choices
@@ -22,6 +23,7 @@ from jaxltl.core.values.engine.iterate import in_turn
 from jaxltl.core.values.engine.linear import System, solver
 
 
+@validated()
 def occupancy_measure(
     model: Any,
     policy: jax.Array,

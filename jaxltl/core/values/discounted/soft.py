@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.models.compiled.compiled import compiled_form, in_shape_of
 from jaxltl.core.models.ops.choices import choices
 from jaxltl.core.models.ops.operators import expectation, pushforward
@@ -33,6 +34,7 @@ _LEAST = 0.95  # of the logarithm of the least normal number, to which probabili
 _SWEEPS_BETWEEN = 4  # sweeps between two looks at what is left
 
 
+@validated(method=("newton", "value_iteration"))
 def soft_value(
     model: Any,
     reward: jax.Array,
@@ -73,8 +75,6 @@ def soft_value(
       >>> round(soft_value(mdp, jnp.zeros((1, 2)), 0.5).value.item(), 4)  # 2 log 2
       1.3863
     """
-    if method not in ("newton", "value_iteration"):
-        raise ValueError(f"method={method!r}; choose newton or value_iteration.")
     form, reward = compiled_form(model, reward)
     return in_shape_of(
         model, _soft_value(form, reward, discount, initial, tolerance, max_steps, method=method)
@@ -158,6 +158,7 @@ def softmax_policy(
     return over.softmax(q)
 
 
+@validated()
 def soft_policy_adjoint(
     model: Any,
     policy: jax.Array,

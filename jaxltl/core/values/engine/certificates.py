@@ -154,5 +154,5 @@ def refuse(solution: Solution, policy: jax.Array, valid: jax.Array) -> Solution:
         lower=where(solution.lower, -jnp.inf),
         upper=where(solution.upper, jnp.inf),
         residual=where(solution.residual, jnp.nan),
-        status=jnp.where(valid, solution.status, Status.INVALID).astype(jnp.int32),
+        status=jnp.where(valid, solution.status, Status.INVALID_POLICY).astype(jnp.int32),
     )

@@ -19,7 +19,6 @@ from jaxltl.core.sparse.solvers import reachability as optimal
 from jaxltl.core.sparse.solvers.discounted import discounted_value
 from jaxltl.core.sparse.solvers.policy_iteration import Enclosure
 from jaxltl.core.types import (
-    Method,
     Solution,
     Status,
     require_shape,
@@ -67,7 +66,7 @@ def solution_from_enclosure(
         "num_steps": np.int32(found.rounds),
         "status": np.int32(status),
     }
-    method = Method(found.method)
+    method = found.method
     if is_sparse(model):
         return Solution(**parts, method=method)
     dtype = np.dtype(model.dtype)
@@ -204,8 +203,6 @@ def discounted(
     Rewards are named, or arrays on states, choices or transitions, see
     :func:`~jaxltl.core.models.sparse.row_reward`; they are finite.
     """
-    if not 0 <= float(discount) < 1:
-        raise ValueError(f"discount={float(discount):.6g}; it must be at least 0 and below 1.")
     sparse = to_sparse(model)
     earned, magnitude = finite_reward(sparse, reward)
     host, depth = sparse.host, 0
@@ -230,7 +227,7 @@ def discounted(
         "status": np.int32(status),
     }
     parts = {name: x.reshape(model.state_shape) if np.ndim(x) else x for name, x in parts.items()}
-    return with_given_policy(Solution(**parts, method=Method(found.method)), policy)
+    return with_given_policy(Solution(**parts, method=found.method), policy)
 
 
 def default_tolerance(model: Any) -> float:

@@ -15,7 +15,7 @@ from jaxltl.core.models.interval import IntervalMDP, make_interval
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.statistics.confidence_sets import ConfidenceSets, Method, intervals_from_counts
-from jaxltl.core.validation import whole
+from jaxltl.core import validation
 from jaxltl.core.values import facts
 from jaxltl.core.values.interval.robust import require_direction
 from jaxltl.core.values.interval.satisfaction import RobustSatisfaction, robust_satisfaction
@@ -246,7 +246,7 @@ def guarantee_curve(
         raise ValueError(
             f"sizes[{int(np.argmax(wrong))}] is {wanted[wrong][0]}; there are {total} transitions."
         )
-    rng = np.random.default_rng(whole("seed", seed))
+    rng = np.random.default_rng(validation.integer("seed", seed))
     bound = np.empty(wanted.size)
     for i in np.argsort(-wanted, kind="stable"):
         every = rng.multivariate_hypergeometric(every, int(wanted[i]), method="marginals")

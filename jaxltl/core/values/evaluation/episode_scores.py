@@ -92,11 +92,11 @@ def episode_evaluator(
       >>> [float(x) for x in evaluate(jnp.array([0.5]), jax.random.key(0))]
       [-1.3125, 0.328125]
     """
-    num_episodes = validation.whole("num_episodes", num_episodes, least=1, most=2**31 - 1)
+    num_episodes = validation.integer("num_episodes", num_episodes, least=1, most=2**31 - 1)
     several = (
         (costs,)
         if isinstance(costs, str) or callable(costs)
-        else tuple(validation.listed("costs", costs))
+        else tuple(validation.sequence("costs", costs))
     )
     task = task_world(jax.eval_shape(require_environment(environment).reset, jax.random.key(0)))
     names = SUMS if task is None else SUMS + OF_TASKS
@@ -105,12 +105,12 @@ def episode_evaluator(
             of_task = isinstance(score, str) and score in OF_TASKS
             why = "needs a task, which task_environment gives" if of_task else "is none"
             raise ValueError(
-                f"the score {validation.shown(score)} {why}; choose one of {', '.join(names)}, or "
+                f"the score {validation.shorten(score)} {why}; choose one of {', '.join(names)}, or "
                 "give a function of the totals."
             )
     settings = _Scores(objective, several, num_episodes, checked_steps(environment, num_steps))
     if not isinstance(discount, jax.core.Tracer):
-        validation.share("discount", discount)
+        validation.fraction("discount", discount)
     return Partial(_evaluate, settings, environment, as_partial(agent, "agent"), discount)
 
 

@@ -344,13 +344,13 @@ def evaluate(
     """
     num_steps = checked_steps(require_environment(environment), num_steps)
     most = 2**31 - 1
-    num_episodes = validation.whole("num_episodes", num_episodes, least=1, most=most)
-    batch = validation.whole("batch", batch, least=1, most=most)
-    confidence = validation.share("confidence", confidence, ends=(False, False))
+    num_episodes = validation.integer("num_episodes", num_episodes, least=1, most=most)
+    batch = validation.integer("batch", batch, least=1, most=most)
+    confidence = validation.fraction("confidence", confidence, ends=(False, False))
     if threshold is not None:
-        threshold = validation.share("threshold", threshold, ends=(False, False))
+        threshold = validation.fraction("threshold", threshold, ends=(False, False))
     if discount is not None:
-        discount = validation.share("discount", discount, ends=(False, False))
+        discount = validation.fraction("discount", discount, ends=(False, False))
     require_key(key)
     require_split("sharding", sharding)
     agent, world = _checked_agent(agent, environment)
@@ -478,9 +478,9 @@ def share_estimate(count: int, total: int, failure: float, fixed: bool = True) -
       >>> round(found.lower, 3), round(found.upper, 3), found.method
       (0.444, 0.975, 'Clopper-Pearson')
     """
-    total = validation.whole("total", total, least=1, most=2**53)
-    count = validation.whole("count", count, most=total)
-    failure = validation.share("failure", failure, ends=(False, False))
+    total = validation.integer("total", total, least=1, most=2**53)
+    count = validation.integer("count", count, most=total)
+    failure = validation.fraction("failure", failure, ends=(False, False))
     ends = clopper_pearson if fixed else anytime
     (lower,), (upper,) = ends(np.array([count]), np.array([total]), failure)
     share = count / total
@@ -533,7 +533,7 @@ def checked_steps(environment: Environment, num_steps: int | None) -> int:
             "episodes that never end: neither the environment nor num_steps says after how many "
             "steps; give num_steps, or with_time_limit(environment, num_steps)."
         )
-    return validation.whole("num_steps", steps, least=1, most=2**31 - 1)
+    return validation.integer("num_steps", steps, least=1, most=2**31 - 1)
 
 
 def _checked_agent(agent: Any, environment: Environment) -> tuple[Agent, Any]:

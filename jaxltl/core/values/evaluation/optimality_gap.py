@@ -116,7 +116,7 @@ def tabulate_policy(
     """
     inner, _ = without_time_limit(environment)
     validation.instance("table", table, Table, "one of tabulate")
-    num_memory = validation.whole("num_memory", num_memory, least=1, most=2**24)
+    num_memory = validation.integer("num_memory", num_memory, least=1, most=2**24)
     count = table.model.num_states
     size = max(1, min(count, _BATCH // num_memory))
     policy = as_partial(policy, "policy")
@@ -191,7 +191,7 @@ def optimality_gap(
     validation.instance("table", table, Table, "one of tabulate")
     if not isinstance(task, Automaton):
         task = to_automaton(task)
-    steps = table.num_steps if num_steps is None else validation.whole("num_steps", num_steps)
+    steps = table.num_steps if num_steps is None else validation.integer("num_steps", num_steps)
     model = product(table.model, task)
     shown = _rows_of(policy)
     shape, num_actions = model.state_shape, int(np.max(np.asarray(table.model.action))) + 1
@@ -237,7 +237,7 @@ def _rows_of(policy: Any) -> np.ndarray:
         found = np.asarray(None)
     if found.dtype.kind not in "iuf":
         raise ValueError(
-            f"policy is {validation.shown(policy)}; give actions, or their probabilities."
+            f"policy is {validation.shorten(policy)}; give actions, or their probabilities."
         )
     return found
 

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP, make_interval
 from jaxltl.core.models.ops.operators import is_deterministic, row_weights
@@ -15,8 +16,8 @@ from jaxltl.core.sparse.interval.discounted import discounted
 from jaxltl.core.sparse.interval.game_encoding import Spread, spread
 from jaxltl.core.sparse.interval.reachability import Robust
 from jaxltl.core.sparse.interval.uncertainty_set import HostInterval
-from jaxltl.core.types import Method, Solution, require_shape
-from jaxltl.core.validation import numbers, shown
+from jaxltl.core.types import Solution, require_shape
+from jaxltl.core import validation
 from jaxltl.core.values.engine.host_solution import status_between
 from jaxltl.core.values.undiscounted.step_bounded import state_mask
 
@@ -30,32 +31,20 @@ def require_direction(nature: str | None, objective: str) -> str:
       ValueError: it, or the objective, is none of ``"min"`` and ``"max"``.
     """
     if not isinstance(objective, str) or objective not in ("max", "min"):
-        raise ValueError(f'objective={shown(objective)}; it must be "max" or "min".')
+        raise ValueError(f'objective={validation.shorten(objective)}; it must be "max" or "min".')
     if nature is None:
         return "min" if objective == "max" else "max"
     if not isinstance(nature, str) or nature not in ("max", "min"):
         raise ValueError(
-            f'nature={shown(nature)}; it must be "min" (nature makes the value '
+            f'nature={validation.shorten(nature)}; it must be "min" (nature makes the value '
             'small) or "max" (large).'
         )
     return nature
 
 
 def width_asked(tolerance: Any) -> float:
-    """The width of an enclosure that is asked for, 1e-6 where nothing is said.
-
-    Raises:
-      ValueError: it is negative, infinite or no number.
-    """
-    if tolerance is None:
-        return TOLERANCE
-    try:
-        width = float(tolerance)
-    except (TypeError, ValueError):
-        width = float("nan")
-    if not 0 <= width < np.inf:
-        raise ValueError(f"tolerance={shown(tolerance)}; it must be a finite number of at least 0.")
-    return width
+    """The width of the enclosure: `tolerance`, or the default."""
+    return TOLERANCE if tolerance is None else float(tolerance)
 
 
 def refuse_nature(nature: str | None) -> None:
@@ -67,6 +56,7 @@ def refuse_nature(nature: str | None) -> None:
         )
 
 
+@validated()
 def robust_reachability(
     model: Any,
     target: Any,
@@ -128,6 +118,7 @@ def robust_reachability(
     return robust_solution(sides, found, asked, relative=False)
 
 
+@validated()
 def robust_total_reward(
     model: Any,
     reward: Any,
@@ -180,6 +171,7 @@ def robust_total_reward(
     return robust_solution(sides, found, asked, relative=True)
 
 
+@validated()
 def robust_discounted_value(
     model: Any,
     reward: Any,
@@ -218,12 +210,6 @@ def robust_discounted_value(
       >>> found.value.round(6).tolist(), found.nature.tolist()
       ([1.142857, 0.0], [0.25, 0.75, 1.0])
     """
-    try:
-        rate = float(discount)
-    except (TypeError, ValueError):
-        rate = float("nan")
-    if not 0 <= rate < 1:
-        raise ValueError(f"discount={shown(discount)}; it must be at least 0 and below 1.")
     sides = sides_of(model, policy, objective, nature)
     earned = sides.entries(entry_reward(sides.model, reward))
     largest = float(np.abs(earned).max(initial=0)) / (1 - float(discount))
@@ -270,7 +256,7 @@ def robust_expectation(
     require_direction(nature, "max")
     model, _ = world_of(model)
     require_shape("value", value, model.state_shape)
-    ahead = numbers("value", value)[model.host.mdp.successor]
+    ahead = validation.float_array("value", value)[model.host.mdp.successor]
     if not np.isfinite(ahead).all():
         raise ValueError("value is not finite in some successor; give numbers.")
     p = model.host.nature(ahead, maximize=nature == "max")
@@ -349,7 +335,7 @@ def robust_solution(sides: Sides, found: Robust, tolerance: float, *, relative: 
         "num_steps": np.int32(found.rounds),
         "status": np.int32(status),
     }
-    return Solution(**parts, method=Method(found.method))
+    return Solution(**parts, method=found.method)
 
 
 class Sides(NamedTuple):
@@ -382,7 +368,7 @@ class Sides(NamedTuple):
         """``bool[S']``, the states that were not there."""
         return np.arange(self.host.mdp.num_states) >= self.model.num_states
 
-    def state_mask(self, quantity: np.ndarray) -> np.ndarray:
+    def states(self, quantity: np.ndarray) -> np.ndarray:
         """``bool[S']``, nothing of what is new."""
         return np.append(quantity, np.zeros(np.count_nonzero(self.added), bool))
 

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.runs import live_states, universal_states
@@ -22,7 +23,7 @@ from jaxltl.core.sparse.interval.reachability import Robust, reachability
 from jaxltl.core.sparse.interval.uncertainty_set import HostInterval
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.product import SparseProduct, sparse_product
-from jaxltl.core.types import Method, Solution, Status, require_shape, row_tolerance
+from jaxltl.core.types import Solution, Status, require_shape, row_tolerance
 from jaxltl.core.values import facts
 from jaxltl.core.values.interval.robust import Sides, host_sides, width_asked, world_of
 from jaxltl.core.values.undiscounted.sparse_satisfaction import (
@@ -60,6 +61,7 @@ class RobustSatisfaction(NamedTuple):
     value: np.ndarray
 
 
+@validated()
 def robust_satisfaction(
     model: Any,
     task: Task,
@@ -148,9 +150,10 @@ def _solution(
         "num_steps": np.int32(found.rounds),
         "status": np.int32(status),
     }
-    return Solution(**parts, method=Method(found.method))
+    return Solution(**parts, method=found.method)
 
 
+@validated()
 def robust_product_satisfaction(
     model: Product,
     *,

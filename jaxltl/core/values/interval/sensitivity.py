@@ -13,7 +13,7 @@ from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.graph.qualitative import backward_reachable
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.types import Solution
-from jaxltl.core.validation import numbers, shown
+from jaxltl.core import validation
 from jaxltl.core.values.interval.robust import require_direction
 from jaxltl.core.values.undiscounted.step_bounded import state_mask
 
@@ -86,12 +86,12 @@ def robust_sensitivity(
     refuse_ball(require_interval(model), "robust_sensitivity is about ends")
     if not isinstance(solution, Solution) or solution.nature is None:
         raise ValueError(
-            f"solution is {shown(solution)}; give what a solver of interval models "
+            f"solution is {validation.shorten(solution)}; give what a solver of interval models "
             "returned, reachability_probability, say."
         )
     goal = state_mask(model.nominal, target, "target")
     passed = np.ones(goal.size, bool) if stay is None else state_mask(model.nominal, stay, "stay")
-    weight = numbers("initial", model.initial if initial is None else initial)
+    weight = validation.float_array("initial", model.initial if initial is None else initial)
     value, policy = np.asarray(solution.value, np.float64), np.asarray(solution.policy)
     if weight.shape != goal.shape or value.shape != goal.shape:
         raise ValueError(

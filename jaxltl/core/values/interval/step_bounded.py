@@ -11,8 +11,8 @@ import numpy as np
 from jaxltl.core.models.interval import IntervalMDP, require_interval
 from jaxltl.core.sparse.interval import step_bounded as interval_bounded
 from jaxltl.core.sparse.interval.step_bounded import RobustSteps
-from jaxltl.core.types import Method, Solution
-from jaxltl.core.validation import whole
+from jaxltl.core.types import Solution
+from jaxltl.core import validation
 from jaxltl.core.values.interval.robust import entry_reward, require_direction
 from jaxltl.core.values.undiscounted.step_bounded import (
     solution_from_error,
@@ -93,7 +93,7 @@ def robust_bounded_reachability(
       >>> robust_bounded_reachability(coin, [False, True], 2, nature="max").value.tolist()
       [0.9375, 1.0]
     """
-    nature, steps = require_direction(nature, objective), whole("num_steps", num_steps)
+    nature, steps = require_direction(nature, objective), validation.integer("num_steps", num_steps)
     goal = state_mask(require_interval(model).nominal, target, "target")
     free = np.ones_like(goal) if stay is None else state_mask(model.nominal, stay, "stay")
     return _solution(
@@ -185,7 +185,7 @@ def _earned(
     objective: str,
     nature: str | None,
 ) -> Solution:
-    nature, steps = require_direction(nature, objective), whole("num_steps", num_steps)
+    nature, steps = require_direction(nature, objective), validation.integer("num_steps", num_steps)
     return _solution(
         interval_bounded.total(
             model.host, earned, start, steps, maximize=objective == "max", helpful=nature == "max"
@@ -200,4 +200,4 @@ def _solution(found: RobustSteps, highest: float = 1) -> Solution:
     solution = solution_from_error(
         found.value, found.error, found.row.astype(np.int32), found.num_steps, highest=highest
     )
-    return replace(solution, nature=nature, method=Method("step by step"))
+    return replace(solution, nature=nature, method="step by step")

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief
@@ -25,7 +26,7 @@ from jaxltl.core.sparse.multi_objective.weighted_sum import (
 from jaxltl.core.sparse.product import SparseProduct
 from jaxltl.core.sparse.solvers import reachability as optimal
 from jaxltl.core.types import Status
-from jaxltl.core.validation import listed, shown
+from jaxltl.core import validation
 from jaxltl.core.values.engine.host_solution import induced_chain
 from jaxltl.core.values.multi_objective.objectives import Objective, Part, weighted_problem
 from jaxltl.core.values.undiscounted.sparse_satisfaction import sparse_mdp_of_product
@@ -197,6 +198,7 @@ class Pareto(NamedTuple):
     status: Status
 
 
+@validated()
 def achievable(
     model: Any,
     objectives: Sequence[Objective],
@@ -254,6 +256,7 @@ def achievable(
     return Achievable(holds, share, normal, search.front(), Status.CONVERGED)
 
 
+@validated()
 def pareto(
     model: Any, objectives: Sequence[Objective], *, tolerance: float = 1e-4, max_points: int = 200
 ) -> Pareto:
@@ -306,11 +309,12 @@ def _require(model: Any, objectives: Sequence[Objective]) -> None:
             "total_reward, or give model.nominal, which is one choice of "
             "nature."
         )
-    for i, each in enumerate(listed("objectives", objectives)):
+    for i, each in enumerate(validation.sequence("objectives", objectives)):
         if not isinstance(each, Objective):
-            raise ValueError(f"objectives[{i}] is {shown(each)}; give an Objective.")
+            raise ValueError(f"objectives[{i}] is {validation.shorten(each)}; give an Objective.")
 
 
+@validated()
 def multi_objective(
     model: Any,
     objectives: Sequence[Objective],

@@ -13,6 +13,7 @@ import numpy as np
 from flax import struct
 from jax import lax
 
+from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.mesh.sharded import refuse_sharded
 from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
@@ -216,6 +217,7 @@ def _prepared(host: Any, plan: Plan, cost: Any, objective: str) -> Prepared:
     return to_jax(found)
 
 
+@validated()
 def solve_prepared(
     prepared: Prepared,
     *,

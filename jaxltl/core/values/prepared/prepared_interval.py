@@ -12,6 +12,7 @@ import numpy as np
 from flax import struct
 from jax import lax
 
+from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.models.interval import IntervalMDP, refuse_ball, require_interval
 from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
 from jaxltl.core.models.ops.operators import is_deterministic, row_weights
@@ -23,8 +24,8 @@ from jaxltl.core.sparse.prepared.interval_plan import (
     plan_total_reward,
 )
 from jaxltl.core.sparse.rows import concatenated_ranges
-from jaxltl.core.types import Method, Solution, Status, require_shape, status_code
-from jaxltl.core.validation import numbers, shown, whole
+from jaxltl.core.types import Solution, Status, require_shape, status_code
+from jaxltl.core import validation
 from jaxltl.core.values import facts
 from jaxltl.core.values.engine.implicit_diff import implicit
 from jaxltl.core.values.engine.iterate import in_turn
@@ -257,6 +258,7 @@ def _prepared(
     return to_jax(found)
 
 
+@validated()
 def solve_prepared_interval(
     prepared: PreparedInterval,
     *,
@@ -304,16 +306,20 @@ def solve_prepared_interval(
       0.5
     """
     if not isinstance(prepared, PreparedInterval):
-        raise ValueError(f"prepared is {shown(prepared)}; give what prepare_interval returns.")
+        raise ValueError(
+            f"prepared is {validation.shorten(prepared)}; give what prepare_interval returns."
+        )
     shape = prepared.lower.shape
     lower, upper, reward = (
         None
         if x is None
-        else jnp.asarray(x if is_traced(x) else numbers(name, x), prepared.lower.dtype)
+        else jnp.asarray(
+            x if is_traced(x) else validation.float_array(name, x), prepared.lower.dtype
+        )
         for name, x in (("lower", lower), ("upper", upper), ("reward", reward))
     )
     if not is_traced(max_steps):
-        max_steps = whole("max_steps", max_steps, most=2**31 - 1)
+        max_steps = validation.integer("max_steps", max_steps, most=2**31 - 1)
     if tolerance is not None and not is_traced(tolerance):
         tolerance = width_asked(tolerance)
     for name, ends in (("lower", lower), ("upper", upper)):
@@ -476,7 +482,7 @@ def _answer(
         residual=jnp.where(good, residual, jnp.nan),
         num_steps=found.rounds,
         status=status,
-        method=Method("policy iteration with nature"),
+        method="policy iteration with nature",
     )
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.logic.bounded import Bounded, unfolded
 from jaxltl.core.logic.labels import is_boolean
 from jaxltl.core.logic.ltl import TRUE, Formula
@@ -27,6 +28,7 @@ from jaxltl.core.values.multi_objective.multi_objective import (
 from jaxltl.core.values.properties.solve_property import TOLERANCE
 
 
+@validated()
 def answer_several(
     model: SparseMDP, prop: Property | str, *, tolerance: float = TOLERANCE
 ) -> Achievable | ConstrainedOptimum | Pareto:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.logic.bounded import Bounded, Earned, unfolded
 from jaxltl.core.logic.labels import is_boolean
 from jaxltl.core.logic.ltl import TRUE, Formula
@@ -18,7 +19,7 @@ from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.types import Solution, Status
-from jaxltl.core.validation import shown
+from jaxltl.core import validation
 from jaxltl.core.values import facts
 from jaxltl.core.values.average.average_reward import average_reward
 from jaxltl.core.values.interval.robust import width_asked
@@ -129,6 +130,7 @@ class _Aim(NamedTuple):
         return {"objective": self.policy, "nature": self.nature}
 
 
+@validated()
 def solve_property(
     model: SparseMDP | IntervalMDP,
     prop: Property | str,
@@ -166,7 +168,7 @@ def solve_property(
     """
     prop = parse_property(prop) if isinstance(prop, str) else prop
     if not isinstance(prop, Property):
-        raise ValueError(f"prop is {shown(prop)}; give a property or its text.")
+        raise ValueError(f"prop is {validation.shorten(prop)}; give a property or its text.")
     if not isinstance(model, SparseMDP | IntervalMDP):
         raise ValueError(
             f"{type(model).__name__} is no model that answers properties; give a "
@@ -384,7 +386,7 @@ def _without_intervals(
 
 
 def _plain(states: np.ndarray, solution: Solution, by: str = "") -> _Found:
-    method = str(solution.method) or {
+    method = solution.method or {
         "steps": "step by step",
         "reward": "level by level of the reward",
     }.get(by, "")
@@ -495,7 +497,7 @@ class _Probability(NamedTuple):
                     self.model, path, objective=aim.policy, states=self.states, tolerance=tolerance
                 )
                 row = result.row
-            method = str(result.solution.method)
+            method = result.solution.method
             size = f"product of {result.product.host.num_states} states"
             return _Found(
                 result.solution,

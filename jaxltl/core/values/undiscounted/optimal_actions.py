@@ -36,6 +36,7 @@ from jaxltl.core.values.undiscounted.satisfaction import (
     optimal_satisfaction,
     satisfaction_probability,
 )
+from jaxltl.core.values.engine.validated import validated
 
 Booleans = NDArray[np.bool_]
 
@@ -71,6 +72,7 @@ class OptimalActions:
     status: jax.Array
 
 
+@validated()
 def optimal_actions(
     model: Product,
     solution: Solution | None = None,

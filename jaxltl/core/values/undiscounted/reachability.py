@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.graphs.attractor import attract, surely
 from jaxltl.core.graphs.end_components import EndComponents, components_within
 from jaxltl.core.graphs.graph import Graph, TracedGraph, graph_of, is_table, take
@@ -56,6 +57,7 @@ QUICK_LIMIT = 100_000  # states of a concrete model up to which its quickest pol
 _FILLED = 2048  # of these undecided, as elimination may fill a matrix of so many rows
 
 
+@validated()
 def reachability_probability(
     model: Any,
     target: jax.Array,

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 from jax import lax
 
+from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.graphs.acceptance import (
     Accepting,
@@ -35,6 +36,7 @@ from jaxltl.core.values.undiscounted.reachability import (
 from jaxltl.core.values.undiscounted.sparse_satisfaction import product_satisfaction
 
 
+@validated()
 def satisfaction_probability(
     model: Product,
     policy: jax.Array,
@@ -100,6 +102,7 @@ def satisfaction_probability(
     return opposite_event(reach) if kind == "safety" else reach
 
 
+@validated()
 def optimal_satisfaction(
     model: Product,
     *,

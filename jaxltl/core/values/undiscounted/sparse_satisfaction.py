@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.automata.automaton import Automaton, letter_index
 from jaxltl.core.automata.runs import live_states, universal_states
 from jaxltl.core.automata.translate import Task, to_automaton
@@ -57,6 +58,7 @@ class Satisfaction(NamedTuple):
     row: np.ndarray
 
 
+@validated()
 def sparse_satisfaction(
     model: SparseMDP,
     task: Task,

@@ -15,7 +15,7 @@ from jaxltl.core.models.sparse import Rewards, SparseMDP, reward_parts, row_rewa
 from jaxltl.core.sparse.solvers import step_bounded as host
 from jaxltl.core.sparse.solvers.reward_bounded import bounded_cost, in_units
 from jaxltl.core.types import Solution, Status
-from jaxltl.core.validation import shown, whole
+from jaxltl.core import validation
 
 TOLERANCE = 1e-6  # half the width of an enclosure up to which it counts as narrow, relative
 
@@ -239,7 +239,7 @@ def reward_bounded_reachability(
 
 
 def _problem(model: Any, objective: str, num_steps: int = 0) -> tuple[SparseMDP, Any]:
-    whole("num_steps", num_steps)
+    validation.integer("num_steps", num_steps)
     return to_sparse(model), reduction_for(objective)
 
 
@@ -250,7 +250,7 @@ def reduction_for(objective: str) -> Any:
       ValueError: it is neither "max" nor "min".
     """
     if not isinstance(objective, str) or objective not in ("max", "min"):
-        raise ValueError(f'objective={shown(objective)}; it must be "max" or "min".')
+        raise ValueError(f'objective={validation.shorten(objective)}; it must be "max" or "min".')
     return np.maximum if objective == "max" else np.minimum
 
 

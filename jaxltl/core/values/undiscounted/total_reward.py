@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.mdp import MDP, DenseMDP
@@ -29,6 +30,7 @@ from jaxltl.core.values.interval.robust import refuse_nature, robust_total_rewar
 from jaxltl.core.values.undiscounted.traced_total_reward import total_reward_by_sweeps
 
 
+@validated()
 def total_reward(
     model: Any,
     reward: str | Rewards | chex.Array | None,

@@ -242,7 +242,7 @@ def test_parts_equal_the_whole():
         *(
             (
                 lambda ask=ask: ask(shard(world(0), mesh_of(2))),
-                r"lies on a mesh of devices, where this",
+                r"lies on a mesh of devices, which",
             )
             for ask in (
                 to_dense,

@@ -203,7 +203,7 @@ def test_bad_arguments_are_named():
         jl.policy_value(mdp, policy, jnp.zeros(5), 0.9)
     with pytest.raises(ValueError, match=r"policy has shape \(4,\)"):
         jl.policy_value(mdp, policy[:4], reward, 0.9)
-    with pytest.raises(ValueError, match="method='fast'; choose auto, policy_iteration"):
+    with pytest.raises(ValueError, match="method='fast'; choose one of auto, policy_iteration"):
         jl.optimal_value(mdp, reward, 0.9, method="fast")
     with pytest.raises(ValueError, match="method='fast'; choose newton or value_iteration"):
         jl.soft_value(mdp, reward, 0.9, method="fast")

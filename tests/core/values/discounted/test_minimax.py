@@ -570,14 +570,10 @@ def test_how_it_ends_when_it_cannot_converge(cases, method):
     vain = minimax_value(game, reward, 0.9, method=method, tolerance=1e-20, max_steps=10_000)
     assert vain.status == Status.PRECISION
     assert vain.num_steps < 1000
-    for bad in (
-        minimax_value(game, reward, 1.0, **options),
-        minimax_value(game, reward, -0.5, **options),
-        minimax_value(game, np.full_like(reward, np.nan), 0.5, **options),
-    ):
-        assert bad.status == Status.NONFINITE
-        assert (bad.lower == -np.inf).all()
-        assert (bad.upper == np.inf).all()
+    bad = minimax_value(game, np.full_like(reward, np.nan), 0.5, **options)
+    assert bad.status == Status.NONFINITE
+    assert (bad.lower == -np.inf).all()
+    assert (bad.upper == np.inf).all()
 
 
 # --- mean payoff ---------------------------------------------------------------------------

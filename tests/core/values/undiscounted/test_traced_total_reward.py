@@ -368,4 +368,4 @@ def test_what_is_refused():
     bad = inside(model, np.where(np.arange(S)[:, None] == 3, -1.0, reward), target)
     assert bad.status == Status.NONFINITE and np.isnan(bad.value).all()
     none = inside(model, reward, target, policy * 2)
-    assert none.status == Status.INVALID and np.isnan(none.value).all()
+    assert none.status == Status.INVALID_POLICY and np.isnan(none.value).all()

@@ -1,0 +1,100 @@
+"""Validation of the arguments of solvers, by their names."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar
+
+import jax
+import jax.numpy as jnp
+
+from jaxltl.core.types import Solution, Status
+from jaxltl.core.validation import RANGES, choice, is_concrete, require_in_range, require_real
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def validated(**words: tuple[str, ...]) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Decorator of solvers that checks the arguments named in :data:`validation.RANGES`.
+
+    Concrete arguments out of range, complex arrays and unknown words raise ValueError. A traced
+    argument out of range is replaced by the least valid number, so that the solver ends, and the
+    solution has the status :func:`argument_status`, NaN for its value, and infinite bounds.
+    (An array instead of a solution becomes NaN.)
+
+    Args:
+      words: the valid strings of arguments such as `method`.
+
+    Example:
+      >>> from jaxltl.core.values.discounted.discounted import policy_value
+      >>> policy_value(None, None, None, discount=-0.5)
+      Traceback (most recent call last):
+      ValueError: discount=-0.5; it must be at least 0 and below 1.
+    """
+
+    def decorate(solve: Callable[P, R]) -> Callable[P, R]:
+        signature = inspect.signature(solve)
+
+        @wraps(solve)
+        def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
+            bound = signature.bind(*args, **kwargs)
+            for name, known in words.items():
+                if isinstance(bound.arguments.get(name), str):
+                    choice(name, bound.arguments[name], known)
+            traced = traced_arguments(bound.arguments)
+            if not traced:
+                return solve(*bound.args, **bound.kwargs)
+            for name, value in traced.items():
+                valid = RANGES[name]
+                bound.arguments[name] = jnp.where(valid.contains(value), value, valid.low)
+            return invalidated(solve(*bound.args, **bound.kwargs), argument_status(traced))
+
+        return wrapper
+
+    return decorate
+
+
+def traced_arguments(arguments: Mapping[str, Any]) -> dict[str, jax.Array]:
+    """Checks concrete arguments by their names; returns the scalar ones that are traced."""
+    traced = {}
+    for name, value in arguments.items():
+        if name in RANGES and value is not None:
+            require_in_range(name, value)
+            if not is_concrete(value):
+                traced[name] = value
+        else:
+            require_real(name, value)
+    return traced
+
+
+def argument_status(arguments: Mapping[str, Any]) -> jax.Array:
+    """Status code of scalar arguments: CONVERGED, or the reason why one is out of range."""
+    status = jnp.int32(Status.CONVERGED)
+    for name, value in arguments.items():
+        reason = Status.INVALID_DISCOUNT if name == "discount" else Status.INVALID_OPTION
+        invalid = jnp.where(RANGES[name].contains(value), Status.CONVERGED, reason)
+        status = jnp.maximum(status, invalid.astype(jnp.int32))
+    return status
+
+
+def invalidated(solution: Any, reason: jax.Array) -> Any:
+    """A solution, without value and bounds, or an array of NaN, if `reason` is not CONVERGED."""
+    valid = reason == Status.CONVERGED
+
+    def where(x: jax.Array, bad: float) -> jax.Array:
+        return jnp.where(valid, x, jnp.asarray(bad, x.dtype))
+
+    if not isinstance(solution, Solution):
+        return where(solution, jnp.nan)
+    return replace(
+        solution,
+        value=where(solution.value, jnp.nan),
+        lower=where(solution.lower, -jnp.inf),
+        upper=where(solution.upper, jnp.inf),
+        residual=where(solution.residual, jnp.nan),
+        status=jnp.maximum(solution.status, reason).astype(jnp.int32),
+    )
