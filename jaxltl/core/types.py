@@ -29,8 +29,11 @@ class Status(enum.IntEnum):
     - ``PRECISION``: rounding errors alone keep the bounds wider than the tolerance.
     - ``MAX_STEPS``: stopped by `max_steps`, or without further progress.
     - ``NONFINITE``: NaN or infinity where a number should be.
-    - ``INVALID`` and above: an argument is invalid; the member names it. Concrete invalid arguments
-      raise ValueError, so these occur inside ``jit`` only.
+    - ``INVALID``: an argument is invalid. Concrete invalid arguments raise ValueError, so this and
+      the next occur inside ``jit`` only.
+    - ``INVALID_POLICY``: a policy is not a distribution over available actions.
+    - ``INVALID_DISCOUNT``: a discount is out of range.
+    - ``INVALID_OPTION``: a tolerance or a number of steps is out of range.
 
     Example:
       >>> [status.name for status in Status if Status.MAX_STEPS < status <= Status.INVALID]
@@ -147,6 +150,9 @@ def check(solution: SolutionT, *, certified: bool = True) -> SolutionT:
     Args:
       solution: one solution or a batch; or what a learner's run returns.
       certified: whether to insist on bounds; if False, ``UNCERTIFIED`` is accepted too.
+
+    Returns:
+      The solution itself; it is differentiable where the solver's own call is traced, not here.
 
     Raises:
       NotConverged: some lane did not converge. The message names the status, the first such lane,

@@ -38,6 +38,7 @@ def validated(**words: tuple[str, ...]) -> Callable[[Callable[P, R]], Callable[P
 
     def decorate(solve: Callable[P, R]) -> Callable[P, R]:
         signature = inspect.signature(solve)
+        optional = {x.name for x in signature.parameters.values() if x.default is None}
 
         @wraps(solve)
         def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -45,7 +46,10 @@ def validated(**words: tuple[str, ...]) -> Callable[[Callable[P, R]], Callable[P
             for name, known in words.items():
                 if isinstance(bound.arguments.get(name), str):
                     choice(name, bound.arguments[name], known)
-            traced = traced_arguments(bound.arguments)
+            given = bound.arguments.items()
+            traced = traced_arguments(
+                {name: x for name, x in given if x is not None or name not in optional}
+            )
             if not traced:
                 return solve(*bound.args, **bound.kwargs)
             for name, value in traced.items():
@@ -62,7 +66,7 @@ def traced_arguments(arguments: Mapping[str, Any]) -> dict[str, jax.Array]:
     """Checks concrete arguments by their names; returns the scalar ones that are traced."""
     traced = {}
     for name, value in arguments.items():
-        if name in RANGES and value is not None:
+        if name in RANGES:
             require_in_range(name, value)
             if not is_concrete(value):
                 traced[name] = value

@@ -205,11 +205,11 @@ def test_bad_arguments_are_named():
         jl.policy_value(mdp, policy[:4], reward, 0.9)
     with pytest.raises(ValueError, match="method='fast'; choose one of auto, policy_iteration"):
         jl.optimal_value(mdp, reward, 0.9, method="fast")
-    with pytest.raises(ValueError, match="method='fast'; choose newton or value_iteration"):
+    with pytest.raises(ValueError, match="method='fast'; choose one of newton, value_iteration"):
         jl.soft_value(mdp, reward, 0.9, method="fast")
-    with pytest.raises(ValueError, match="method='fast'; choose damped or newton"):
+    with pytest.raises(ValueError, match="method='fast'; choose one of damped, newton"):
         jl.values.boltzmann_value(mdp, reward, 0.9, method="fast")
-    with pytest.raises(ValueError, match="adjoint='none'; choose exact or approximate"):
+    with pytest.raises(ValueError, match="adjoint='none'; choose one of exact, approximate"):
         jl.values.boltzmann_value(mdp, reward, 0.9, adjoint="none")
 
 
