@@ -81,7 +81,7 @@ def cases() -> Iterator[Case]:
         legend={"s": ["s"], "t": ["trap"], "g": ["goal"], ".": []},
     )
     task = ppo.make_problem(
-        jl.task_environment(jl.environments.environment_of(world), "!trap U goal")
+        jl.task_environment(jl.environments.model_environment(world), "!trap U goal")
     )
     hparams = ppo.Hparams(discount=1.0, num_envs=16, num_steps=64)
     yield Case(

@@ -179,7 +179,7 @@ def measure(name: str, size: int, folder: Path, objectives: tuple[str, ...] = ("
     write_model(path, FAMILIES[name](size, np.random.default_rng(size)))
     model = read_model(path)
     peer = stormpy.build_model_from_drn[stormpy.Interval](str(path))
-    target = model.states_where("goal")
+    target = model.states_with_label("goal")
     for objective in objectives:
         for nature in ("min", "max"):
             ours, theirs = [], []
@@ -224,7 +224,7 @@ def prepared() -> None:
         np.stack(x)
         for x in zip(*(_intervals(rng, chance, start, 0.3) for _ in range(LANES)), strict=True)
     )
-    target = model.states_where("goal")
+    target = model.states_with_label("goal")
     for nature in ("min", "max"):
         question = prepare_interval(model, target, nature=nature)
         one = jax.jit(lambda q, a, b: solve_prepared_interval(q, lower=a, upper=b))

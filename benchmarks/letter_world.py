@@ -20,7 +20,11 @@ from jax.tree_util import Partial
 
 from jaxltl.algos import many_tasks, ppo
 from jaxltl.core.automata.translate import to_automaton
-from jaxltl.core.environments.sequence_task import events_of, sequence_environment, sequence_sampler
+from jaxltl.core.environments.sequence_task import (
+    make_events,
+    sequence_environment,
+    sequence_sampler,
+)
 from jaxltl.core.environments.tabulate import tabulate
 from jaxltl.core.environments.task_environment import task_environment
 from jaxltl.core.values.evaluation.evaluation import evaluate
@@ -49,7 +53,7 @@ CHUNK = 10  # steps of the learner
 def problems(depth: int = DEPTH) -> list[ppo.Problem]:
     """Sequences of one step, then up to two, three, four, and of up to six."""
     world = letter_world()
-    events = events_of(world.propositions)
+    events = make_events(world.propositions)
     network = many_tasks.SequenceNetwork(num_actions=4, events_seen=events_seen)
     found = []
     for longest in (1, 2, 3, 4, depth):
@@ -102,7 +106,7 @@ def gaps(network: Any, automaton: Any, table: Any) -> dict[str, float]:
     """The certified optimum and the agent's gap to it, over maps and all their beginnings."""
     world = letter_world()
     plan = many_tasks.make_plan(
-        automaton, events_of(world.propositions), world.propositions, depth=DEPTH
+        automaton, make_events(world.propositions), world.propositions, depth=DEPTH
     )
     policy = Partial(many_tasks.sequence_policy, network, plan)
     acts = tabulate_policy(policy, world, table, len(automaton.delta))
@@ -120,7 +124,7 @@ def visited(network: Any, formula: str, number: int, episodes: int) -> dict[str,
     """How often an infinite task is accepted within 1,000 steps."""
     world, automaton = letter_world(horizon=1000), to_automaton(formula)
     plan = many_tasks.make_plan(
-        automaton, events_of(world.propositions), world.propositions, depth=DEPTH
+        automaton, make_events(world.propositions), world.propositions, depth=DEPTH
     )
     found = evaluate(
         jax.random.key(2000 + number),
@@ -147,7 +151,7 @@ def main() -> None:
     parser.add_argument("--layouts", type=int, default=200)
     given = parser.parse_args()
     world = letter_world()
-    events = events_of(world.propositions)
+    events = make_events(world.propositions)
     rows: list[dict[str, Any]] = []
     table = maps(given.layouts) if given.layouts else None
     seeds = range(given.first, given.first + given.seeds)

@@ -19,7 +19,7 @@ import numpy as np
 from benchmarks.models import random_mdp, risky_mdp
 from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.models.mdp import MDP
-from jaxltl.core.models.product import Product, letters_of, product
+from jaxltl.core.models.product import Product, occurring_letters, product
 from jaxltl.core.values.discounted.discounted import optimal_value
 from jaxltl.core.values.undiscounted.reachability import reachability_probability
 from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction
@@ -60,7 +60,7 @@ def large_product(num_states: int) -> Product:
         names,
     )
     formula = "F (g0 & F (g1 & F (g2 & F (g3 & F (g4 & F (g5 & F (g6 & F g7)))))))"
-    task = to_automaton(f"X {formula}", letters=letters_of(world))
+    task = to_automaton(f"X {formula}", letters=occurring_letters(world))
     return product(world, task)
 
 

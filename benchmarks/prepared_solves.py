@@ -19,7 +19,7 @@ import jax
 import numpy as np
 
 from benchmarks.real_models import storm
-from jaxltl.core.models.sparse import SparseMDP, make_sparse, row_reward
+from jaxltl.core.models.sparse import SparseMDP, choice_reward, make_sparse
 from jaxltl.core.values.prepared.prepared import Prepared, prepare, solve_prepared
 from jaxltl.io.model_files import read_model, write_model
 
@@ -158,13 +158,13 @@ def main() -> None:
         for name, p in expected[path.stem]["properties"].items():
             objective = "min" if p["objective"] == "min" else "max"
             sign = "" if model.is_chain else objective
-            target, stay = model.states_where(f"goal_{name}"), None
-            reward = row_reward(model, name) if p["kind"] == "reward" else None
+            target, stay = model.states_with_label(f"goal_{name}"), None
+            reward = choice_reward(model, name) if p["kind"] == "reward" else None
             text = f'P{sign}=? [ F "goal_{name}" ]'
             if reward is not None:
                 text = f'R{{"{name}"}}{sign}=? [ F "goal_{name}" ]'
             elif f"stay_{name}" in model.propositions:
-                stay = model.states_where(f"stay_{name}")
+                stay = model.states_with_label(f"stay_{name}")
                 text = f'P{sign}=? [ "stay_{name}" U "goal_{name}" ]'
             used = model
             if chosen.deadline:

@@ -68,7 +68,7 @@ def worlds(size: int) -> dict[str, Any]:
     game = robots(size)
     strategy = jl.permissive_strategy(game, _SAFE)
     seconds = time.perf_counter() - begin
-    world = jl.environments.environment_of(
+    world = jl.environments.model_environment(
         game, observe=Partial(partial(_seen, size**2)), opponent=chaser(game, size)
     )
     task = jl.task_environment(world, f"{_SAFE} & {_PATROL}", reward="eventual", discount=_DISCOUNT)

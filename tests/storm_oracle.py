@@ -30,7 +30,7 @@ def storm_model(model: SparseMDP) -> Any:
     labels = models.StateLabeling(host.num_states)
     shown = {
         "init": np.asarray(model.initial) > 0,
-        **{name: model.states_where(name) for name in model.propositions},
+        **{name: model.states_with_label(name) for name in model.propositions},
     }
     for name, region in shown.items():
         labels.add_label(name)

@@ -181,9 +181,9 @@ def things(folder):
                 "actions": None,
             },
         ),
-        (jl.models.counts_on, {"model": sparse, "counts": counts}),
+        (jl.models.align_counts, {"model": sparse, "counts": counts}),
         (
-            jl.models.counted_model,
+            jl.models.model_from_counts,
             {
                 "counts": counts,
                 "initial": "0",
@@ -309,8 +309,8 @@ def simulated():
     }
     world = en.make_environment(**corridor)
     task = te.task_environment(world, "F goal")
-    agent = ep.agent_of(lambda seen, key: jnp.int32(0))
-    events, key = st.events_of(["home", "goal"]), jax.random.key(0)
+    agent = ep.make_agent(lambda seen, key: jnp.int32(0))
+    events, key = st.make_events(["home", "goal"]), jax.random.key(0)
     sets = st.proposition_sets(events)
     asked = {
         "propositions": ["home", "goal"],
@@ -326,17 +326,17 @@ def simulated():
     return [
         (en.make_box, {"low": 0.0, "high": 1.0, "shape": (2,), "dtype": None}),
         (en.make_environment, corridor),
-        (ep.agent_of, {"function": step}),
+        (ep.make_agent, {"function": step}),
         (ep.run_episode, {"key": key, "environment": world, "agent": agent, "num_steps": 2}),
         (with_time_limit, {"environment": world, "num_steps": 2}),
         (te.make_task_tables, {"formula": "F goal", **asked}),
         (te.task_environment, {"environment": world, "formula": "F goal", "labels": None, **asked}),
-        (te.with_tables, {"environment": task, "tables": te.task_tables(task)}),
+        (te.with_task_tables, {"environment": task, "tables": te.task_tables(task)}),
         (te.task_tables, {"environment": task}),
         (te.stack_tasks, {"environments": [task]}),
         (te.stack_tables, {"tables": [te.task_tables(task)]}),
-        (te.what_is_left, {"task": task, "memory": 0}),
-        (st.events_of, {"propositions": ["a"], "at_most": 1}),
+        (te.residual_formula, {"task": task, "memory": 0}),
+        (st.make_events, {"propositions": ["a"], "at_most": 1}),
         (st.sequence_sampler, {"length": [1], "reach": [1], "avoid": [1], "sets": sets}),
         (
             st.sequence_environment,
@@ -453,7 +453,7 @@ def taught(world, key):
     state = jax.eval_shape(lambda: ppo.init(key, problem, hparams))
     coin = jl.from_dense([[[0.5, 0.5]], [[0, 1]]], label=[[0], [1]], propositions=["a"])
     told = {"reward": None, "observe": None, "opponent": None}
-    safe = {"environment": jl.environments.environment_of(coin), "state_of": None}
+    safe = {"environment": jl.environments.model_environment(coin), "state_of": None}
     plane = navigation.navigation()
     network = navigation.policy_network(plane)
     score = navigation.evaluator(plane, 1, num_trajectories=1)
@@ -552,8 +552,8 @@ def taught(world, key):
                 "report": None,
             },
         ),
-        (jl.environments.environment_of, {"model": coin, **told}),
-        (jl.environments.environment_of, {"model": robots(2), **told}),
+        (jl.environments.model_environment, {"model": coin, **told}),
+        (jl.environments.model_environment, {"model": robots(2), **told}),
         (
             jl.games.shield_environment,
             {"strategy": jl.permissive_strategy(coin, "F a"), **safe},
@@ -643,7 +643,7 @@ def test_what_is_of_another_run_is_named():
         return cce.make_problem(scored, diagonal_gaussian(jnp.zeros(size), 1.0))
 
     found = cce.init(key, search(2, 1), cce.Hparams())
-    events = st.events_of(world.propositions)
+    events = st.make_events(world.propositions)
     plan = many_tasks.make_plan("F a", events, world.propositions, depth=1)
     network = many_tasks.trained(
         many_tasks.SequenceNetwork(num_actions=4, hidden=(2,)), state.parameters
@@ -755,7 +755,7 @@ def test_good_input_is_taken(tmp_path):
             "ask what does .*robust_bounded_reachability",
         ),
         (lambda m: jl.models.to_dense(m), "or give its nominal model, model.nominal"),
-        (lambda m: jl.graphs.attractor(m, m.states_where("a")), "IntervalMDP has intervals"),
+        (lambda m: jl.graphs.attractor(m, m.states_with_label("a")), "IntervalMDP has intervals"),
         (lambda m: jl.make_interval(m, m.lower, m.upper), "of an interval model, its nominal one"),
     ],
 )
@@ -797,7 +797,7 @@ def test_a_log_of_a_world_whose_slips_repeat_a_successor(tmp_path):
     assert counts.count.tolist() == [2, 1]
     assert jl.learn_guarantee(world, counts, "true", 0.9).bound == 1
     with pytest.raises(ValueError, match="convert a model whose rows repeat a successor by to_sp"):
-        jl.models.counts_on(world, counts)
+        jl.models.align_counts(world, counts)
     path.write_text("state,action,next\n1,0,0\n")
     with pytest.raises(ValueError, match="line 2"):
         jl.read_log(path, world)

@@ -59,7 +59,7 @@ from jaxltl.algos.common.schedules import Schedule, at
 from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.models.parametric.parametric import Ends, ParametricMDP
 from jaxltl.core.models.protocols import Array
-from jaxltl.core.models.sparse import SparseMDP, row_reward
+from jaxltl.core.models.sparse import SparseMDP, choice_reward
 from jaxltl.core.pretty_print import brief, history
 from jaxltl.core.sparse.solvers import reachability as optimal
 from jaxltl.core.types import Status, require_shape
@@ -252,13 +252,13 @@ def make_problem(
             "make_parametric makes, or read_parametric(path).over(low, high)."
         )
     here = model.model
-    target = here.states_where(target) if isinstance(target, str) else np.asarray(target)
+    target = here.states_with_label(target) if isinstance(target, str) else np.asarray(target)
     require_shape("target", target, (here.num_states,))
     target = target.astype(bool)
     if here.is_chain:
         objective = "max"  # which allows rewards that become zero
     if reward is not None:
-        row_reward(here, reward)  # raises for an unknown name
+        choice_reward(here, reward)  # raises for an unknown name
     problem = Problem(
         model=model,
         prepared=prepare(here, target, stay=stay, reward=reward, objective=objective),
@@ -649,6 +649,6 @@ def _bounds(problem: Problem, model: SparseMDP, tolerance: float) -> tuple[float
     if problem.reward is None:
         found = optimal.reachability(model.host, problem.target, stay=problem.stay, **options)
     else:
-        earned = row_reward(model, problem.reward)
+        earned = choice_reward(model, problem.reward)
         found = optimal.total_reward(model.host, earned, problem.target, **options)
     return safe_ends(model, found, highest=problem.highest)

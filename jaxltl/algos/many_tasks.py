@@ -16,7 +16,7 @@ Example: what a network of the letter world would be trained on, and two formula
   >>> from jaxltl.algos import many_tasks, ppo
   >>> from jaxltl.envs.letter_world import events_seen
   >>> world = jl.envs.letter_world(size=4, letters=3, copies=1, horizon=30)
-  >>> events = jl.environments.events_of(world.propositions)  # nothing, a, b, c
+  >>> events = jl.environments.make_events(world.propositions)  # nothing, a, b, c
   >>> network = many_tasks.SequenceNetwork(num_actions=4, events_seen=events_seen, hidden=(8,))
   >>> def problem(longest):  # sequences of up to so many steps
   ...     sampler = jl.environments.sequence_sampler(

@@ -25,7 +25,7 @@ from jaxltl.app.explorer import (
 )
 from jaxltl.app.job import automaton_picture, over_seeds, short_name
 from jaxltl.core.environments.monitor import Verdict, verdicts
-from jaxltl.core.models.construct.batch import lift_memory
+from jaxltl.core.models.construct.batch import lift_memory_policy
 from jaxltl.core.models.trajectories import Trajectories, make_trajectories
 from jaxltl.envs.gridworld import ACTIONS
 
@@ -251,7 +251,7 @@ def _runs(outcome: Outcome, one: _Drawn) -> list[Run]:
     if setup.memory is not setup.judge:
         # The task's state varies fastest.
         policy, count = (
-            np.asarray(lift_memory(jnp.asarray(policy), setup.judge)),
+            np.asarray(lift_memory_policy(jnp.asarray(policy), setup.judge)),
             len(setup.judge.delta),
         )
     found = learned_runs(part_of(one.worlds.judged, one.w), policy, outcome.seed)

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxltl.core.models.construct.counts import TransitionCounts, counted_model, counts_on
+from jaxltl.core.models.construct.counts import TransitionCounts, model_from_counts, align_counts
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.statistics.confidence_sets import check_confidence
 from jaxltl.core.types import Status
@@ -76,7 +76,7 @@ def read_evidence(
     Args:
       log, labels, model: files.
       initial, terminal: names of states.
-      graph: what is known of successors; see :func:`~jaxltl.core.models.construct.counts.counted_model`.
+      graph: what is known of successors; see :func:`~jaxltl.core.models.construct.counts.model_from_counts`.
       option: how an option stands where it was given, for messages.
 
     Returns:
@@ -98,7 +98,7 @@ def read_evidence(
                 "a model has its labels and initial states; leave --labels, --initial "
                 "and --terminal out."
             )
-        return _named(given, counts_on(given, read_log(log, given)))
+        return _named(given, align_counts(given, read_log(log, given)))
     if not initial:
         raise ValueError(f"name the state in which runs start: {option.format('initial')}STATE.")
     counts = read_log(log)
@@ -110,7 +110,7 @@ def read_evidence(
                 f"has {_some(counts)}."
             )
     known = None if labels is None else read_labels(labels, counts.states)
-    sparse, count = counted_model(
+    sparse, count = model_from_counts(
         counts,
         initial=list(initial),
         labels=known,

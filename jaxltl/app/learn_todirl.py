@@ -64,7 +64,7 @@ from jaxltl.app.job import fingerprint as fingerprint
 from jaxltl.app.job import postfix as postfix
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.synchronize import synchronize
-from jaxltl.core.models.construct.batch import lift_memory, narrow, stack_products
+from jaxltl.core.models.construct.batch import lift_memory_policy, narrow, stack_products
 from jaxltl.core.models.construct.lifting import allowed_steps
 from jaxltl.core.models.construct.restrict import with_allowed
 from jaxltl.core.models.ops.operators import action_mean, expectation
@@ -355,7 +355,7 @@ def _judge(
             policy = jnp.asarray(held.policy)
         else:
             policy, status = _plan(network, parameters, worlds.model, worlds.observation, hparams)
-        lifted = policy if setup.memory is setup.judge else lift_memory(policy, setup.judge)
+        lifted = policy if setup.memory is setup.judge else lift_memory_policy(policy, setup.judge)
         performances.append(_probability(worlds.judged, lifted, hparams.horizon))
         policies.append(policy if i == chosen else None)
         codes.append(status)

@@ -76,7 +76,7 @@ class NotConverged(RuntimeError):
       >>> import jaxltl as jl
       >>> coin = jl.make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1],
       ...                       label={"heads": [1]})
-      >>> stopped = jl.reachability_probability(coin, coin.states_where("heads")).replace(
+      >>> stopped = jl.reachability_probability(coin, coin.states_with_label("heads")).replace(
       ...     status=np.int32(Status.MAX_STEPS))
       >>> try:
       ...     check(stopped)
@@ -126,7 +126,7 @@ class Solution:
       >>> import jaxltl as jl
       >>> coin = jl.make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1],
       ...                       label={"heads": [1]})
-      >>> found = jl.reachability_probability(coin, coin.states_where("heads"))
+      >>> found = jl.reachability_probability(coin, coin.states_with_label("heads"))
       >>> found.value.tolist(), Status(int(found.status)).name
       ([0.5, 1.0, 0.0], 'CONVERGED')
       >>> bool((found.lower <= found.value).all() and (found.value <= found.upper).all())
@@ -163,7 +163,7 @@ def check(solution: SolutionT, *, certified: bool = True) -> SolutionT:
       >>> import jaxltl as jl
       >>> coin = jl.make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1],
       ...                       label={"heads": [1]})
-      >>> check(jl.reachability_probability(coin, coin.states_where("heads"))).value.tolist()
+      >>> check(jl.reachability_probability(coin, coin.states_with_label("heads"))).value.tolist()
       [0.5, 1.0, 0.0]
     """
     if isinstance(solution.status, jax.core.Tracer):

@@ -343,7 +343,7 @@ def _labels(numbers: chex.Array, world: LetterState) -> jax.Array:
 
 def events_seen(observation: jax.Array) -> jax.Array:
     """``float[size, size, letters + 1]``: which event each cell of an observation is, that without
-    a letter first, as :func:`~jaxltl.core.environments.sequence_task.events_of` numbers them.
+    a letter first, as :func:`~jaxltl.core.environments.sequence_task.make_events` numbers them.
 
     Example:
       >>> world = letter_world(size=2, letters=["x"], copies=1, connected=False)

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxltl.core import validation
-from jaxltl.core.games.objective import States, states_where
+from jaxltl.core.games.objective import States, states_with_label
 from jaxltl.core.logic.labels import satisfying
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.mdp import MDP, make_mdp
@@ -210,7 +210,7 @@ def arrival_reward(game: Any, condition: States) -> jax.Array:
       >>> arrival_reward(game, "system_lower_left")[state].tolist()
       [0.0, 0.0, 1.0, 0.0, 0.0]
     """
-    arrives = states_where(game, condition).astype(game.dtype)
+    arrives = states_with_label(game, condition).astype(game.dtype)
     counts = game.system[..., None] & game.available
     return jnp.where(counts, operators.expectation(game, arrives), 0)
 

@@ -182,7 +182,7 @@ def _written(given: SparseMDP | IntervalMDP) -> Iterator[bytes]:
         if reward.transition is not None:
             raise ValueError(
                 f"the reward {name!r} has rewards of transitions, which the format does not hold; "
-                "give their expectation on choices, Rewards(choice=row_reward(model, name))."
+                "give their expectation on choices, Rewards(choice=choice_reward(model, name))."
             )
         rewards.append((reward.state, reward.choice))
     if "" in list(model.rewards)[1:]:

@@ -66,8 +66,8 @@ def read_log(
 
     Returns:
       :class:`~jaxltl.core.models.construct.counts.TransitionCounts`.
-      :func:`~jaxltl.core.models.construct.counts.counts_on` puts it beside the probabilities of a model, and
-      :func:`~jaxltl.core.models.construct.counts.counted_model` makes a model of it.
+      :func:`~jaxltl.core.models.construct.counts.align_counts` puts it beside the probabilities of a model, and
+      :func:`~jaxltl.core.models.construct.counts.model_from_counts` makes a model of it.
 
     Raises:
       ValueError: naming the file and the line: the file cannot be read, is no such table, has an
@@ -131,7 +131,7 @@ def read_labels(
 
     Returns:
       The states of each label, in the order of the file, as
-      :func:`~jaxltl.core.models.construct.counts.counted_model` takes them.
+      :func:`~jaxltl.core.models.construct.counts.model_from_counts` takes them.
 
     Raises:
       ValueError: naming the file and the line, as :func:`read_log`.

@@ -22,7 +22,7 @@ from jaxltl.core.logic.labels import satisfying
 from jaxltl.core.logic.ltl import Formula, Letter, parse_ltl, proposition_text
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.game import Game
-from jaxltl.core.models.product import Product, expected_reads
+from jaxltl.core.models.product import Product, read_probability
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief
 from jaxltl.io._files import read_text
@@ -58,7 +58,7 @@ def read_reward_machine(
     Args:
       source: a file, or the text itself.
       letters: the letters that occur, each a collection of proposition names, such as
-        ``jaxltl.models.letters_of(world)``; None stands for all 2^P subsets.
+        ``jaxltl.models.occurring_letters(world)``; None stands for all 2^P subsets.
 
     Returns:
       :class:`RewardMachine`; :func:`machine_reward` is its reward in a product with a world.
@@ -259,7 +259,7 @@ def machine_reward(product: Any, reward: ArrayLike | jax.Array) -> Any:
         raise ValueError(f"reward has shape {np.shape(reward)}; expected {shape}, a number for "
                          "each state and letter of the automaton.")  # fmt: skip
     if not isinstance(model.mdp, SparseMDP):
-        return expected_reads(model, jnp.asarray(reward))
+        return read_probability(model, jnp.asarray(reward))
     host = to_sparse(model).host
     pays, letter = np.asarray(reward, np.float64), np.asarray(model.letter)
     state, memory = np.divmod(host.state, model.num_memory)

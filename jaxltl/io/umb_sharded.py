@@ -16,11 +16,11 @@ import numpy as np
 from jax.sharding import Mesh
 from numpy.typing import NDArray
 
-from jaxltl.core.models.construct.padded import action_of
+from jaxltl.core.models.construct.padded import row_actions
 from jaxltl.core.models.mdp import refuse_negative
 from jaxltl.core.models.mesh.shard import ModelPart, model_from_parts, ranges_of
 from jaxltl.core.models.mesh.sharded import ShardedMDP
-from jaxltl.core.models.sparse import row_reward, sparse_part
+from jaxltl.core.models.sparse import choice_reward, sparse_part
 from jaxltl.io._files import FileBytes, compression_of, opened, pieces
 from jaxltl.io._umb_index import ACTIONS, INITIAL, Index, Items
 from jaxltl.io._umb_members import (
@@ -361,10 +361,10 @@ def _part(
         entry_start=model.entry_start,
         successor=model.successor,
         probability=model.probability,
-        action=action_of(model),
+        action=row_actions(model),
         initial=initial,
         label=label,
-        rewards={name: row_reward(model, name) for name in model.rewards},
+        rewards={name: choice_reward(model, name) for name in model.rewards},
         row=np.arange(index.choices) + index.begins[1],
     )
     return part, names

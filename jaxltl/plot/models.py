@@ -88,7 +88,7 @@ def solution(solution: Solution, model: Any = None, *, memories: Any = None) -> 
       >>> import jaxltl as jl
       >>> coin = jl.make_sparse(
       ...     None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1], label={"heads": [1]})
-      >>> found = jl.reachability_probability(coin, coin.states_where("heads"))
+      >>> found = jl.reachability_probability(coin, coin.states_with_label("heads"))
       >>> len(solution(found).axes), len(solution(found, coin).axes)
       (1, 1)
     """

@@ -18,7 +18,7 @@ from jaxltl.app.job import plain
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.synchronize import synchronize
 from jaxltl.core.automata.translate import to_automaton
-from jaxltl.core.models.construct.batch import lift_memory, stack_products
+from jaxltl.core.models.construct.batch import lift_memory_policy, stack_products
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.trajectories import Trajectories, make_trajectories
 from jaxltl.core.values.undiscounted.performance import task_performances
@@ -258,7 +258,9 @@ def _performance(
     if memory is setting.task:
         return _bounds(task_performances(_stacked(worlds, setting.task), policies))
     both = synchronize(memory, setting.task)
-    return _bounds(task_performances(_stacked(worlds, both), lift_memory(policies, setting.task)))
+    return _bounds(
+        task_performances(_stacked(worlds, both), lift_memory_policy(policies, setting.task))
+    )
 
 
 class Bounds(NamedTuple):

@@ -13,7 +13,7 @@ from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.environments.environment import Timestep, make_box, make_environment
 from jaxltl.core.environments.episodes import run_episode
 from jaxltl.core.environments.monitor import Verdict
-from jaxltl.core.environments.sequence_task import Sequence, SequenceObservation, events_of
+from jaxltl.core.environments.sequence_task import Sequence, SequenceObservation, make_events
 from jaxltl.core.environments.tabulate import tabulate
 from jaxltl.core.environments.task_environment import stack_tasks, task_environment
 from jaxltl.core.values.evaluation.optimality_gap import optimality_gap, tabulate_policy
@@ -21,7 +21,7 @@ from jaxltl.envs.flat_world import flat_world
 from jaxltl.envs.letter_world import events_seen, letter_world
 
 NAMES = ("a", "b", "c")
-EVENTS = events_of(NAMES)
+EVENTS = make_events(NAMES)
 WORLD = letter_world(size=4, letters=NAMES, copies=1, horizon=30)
 DEPTH = 3
 TASKS = ("F(a & F b)", "!a U b", "F(a & F c) & F b", "(!c U (b & F c)) & F a")

@@ -277,7 +277,7 @@ def main(names: str, coordinator: str, process: int, processes: int) -> None:
             assert_near(jl.models.on_host(found), run(hparams), 1e-10)
         elif name == "episodes":
             problem, _ = plain()
-            agent = jl.environments.agent_of(lambda seen, key: jax.random.randint(key, (), 0, 2))
+            agent = jl.environments.make_agent(lambda seen, key: jax.random.randint(key, (), 0, 2))
             run = partial(
                 jl.evaluate,
                 jax.random.key(0),

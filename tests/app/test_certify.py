@@ -8,7 +8,7 @@ import pytest
 from click.testing import CliRunner
 
 from jaxltl.cli import main
-from jaxltl.core.models.construct.counts import counted_model
+from jaxltl.core.models.construct.counts import model_from_counts
 from jaxltl.core.values.evaluation.data_guarantee import learn_guarantee
 from jaxltl.io.log import read_labels, read_log
 
@@ -60,7 +60,7 @@ def test_what_is_guaranteed_is_printed_and_written(log):
     out = log.parent / "policy.json"
     found = certified(log, "--json", "--policy", out)
     assert found.exit_code == 0, found.output
-    model, counts = counted_model(
+    model, counts = model_from_counts(
         read_log(log), initial="hall", labels=read_labels(log.parent / "labels.csv")
     )
     expected = learn_guarantee(model, counts, "F safe", 0.95)

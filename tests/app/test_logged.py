@@ -8,7 +8,7 @@ import pytest
 from jaxltl.app.files.task import load_demonstrations, load_world, read_task
 from jaxltl.app.logged import guaranteed
 from jaxltl.app.reports.learn import remarks
-from jaxltl.core.models.construct.counts import counted_model
+from jaxltl.core.models.construct.counts import model_from_counts
 from jaxltl.core.models.product import product
 from jaxltl.core.values.evaluation.data_guarantee import learn_guarantee
 from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction
@@ -108,7 +108,7 @@ def test_what_is_guaranteed_of_a_policy(write, label_on, method):
     policy = np.eye(len(world.actions))[np.asarray(best.policy)]
     found = guaranteed(world.logged, prod, task.formula, policy)
     counts = read_log(task.path.parent / "log.csv")
-    model, count = counted_model(
+    model, count = model_from_counts(
         counts,
         initial="dock",
         terminal=["pit"],

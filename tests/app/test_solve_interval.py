@@ -120,7 +120,7 @@ def test_choices_and_what_nature_picks_attain_the_value(policy, nature, chain, t
     found, strategy = written(tmp_path, model, f'P{policy}{nature}=? [ !"half" U "goal" ]')
     assert strategy["kind"] == "memoryless"
     assert_within(model, strategy["nature"])
-    goal, stay = (np.asarray(model.states_where(x)) for x in ("goal", "half"))
+    goal, stay = (np.asarray(model.states_with_label(x)) for x in ("goal", "half"))
     value = goal.astype(float)
     for _ in range(2000):
         value = np.array(

@@ -163,7 +163,7 @@ def test_the_learner_is_given_what_the_task_is_not(write):
     setup = prepared(path)
     policy = np.full((3, 9, len(setup.memory.delta), 4), 0.25)
     policy[:] = np.random.default_rng(0).dirichlet(np.ones(4), policy.shape[:-1])
-    lifted = job.lift_memory(jnp.asarray(policy), setup.judge)
+    lifted = job.lift_memory_policy(jnp.asarray(policy), setup.judge)
     found = job._probability(setup.worlds.judged, lifted, None)
     same = job._probability(setup.worlds.judged, setup.expert, None)
     np.testing.assert_array_equal(same.mean, [1, 1, 0])

@@ -61,7 +61,7 @@ def made():
         rewards={"steps": jl.models.Rewards(state=np.array([1.0, 0, 0]))},
     )
     rough = jl.make_interval(coin, [0.4, 0.4, 0.8, 0.0, 1, 1], [0.6, 0.6, 1.0, 0.2, 1, 1])
-    solution = jl.reachability_probability(coin, coin.states_where("lost"))
+    solution = jl.reachability_probability(coin, coin.states_with_label("lost"))
     counts = jl.make_counts([0, 1, 0], [0, 0, 0], [1, 1, 0], [880, 5, 120], states=["dock", "bay"])
     game = jl.envs.grid_game("a.\n.b")
     region = np.arange(32) < 20

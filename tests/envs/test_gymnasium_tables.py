@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxltl.core.models.construct.convert import to_padded
-from jaxltl.core.models.sparse import row_reward
+from jaxltl.core.models.sparse import choice_reward
 from jaxltl.core.values.discounted.discounted import optimal_value
 from jaxltl.core.values.undiscounted.reachability import reachability_probability
 from jaxltl.envs.gymnasium_tables import from_gymnasium
@@ -39,7 +39,7 @@ def test_a_table_by_hand():
     assert model.probability.tolist() == [0.75, 0.25, 1, 0.5, 0.5, 1, 1, 1]
     assert model.rewards["reward"].transition.tolist() == [2, 8, -1, 3, 2, 7, 0, 0]
     assert model.initial.tolist() == [0.25, 0.75, 0, 0, 0]
-    assert row_reward(model).tolist() == [3.5, -1, 2.5, 7, 0, 0]
+    assert choice_reward(model).tolist() == [3.5, -1, 2.5, 7, 0, 0]
     padded = to_padded(model)
     assert np.asarray(padded.available).sum(1).tolist() == [2, 1, 1, 1, 1]
 
@@ -98,11 +98,11 @@ def test_the_environments_own_tables(name):
     env = gymnasium.make(latest(gymnasium, name))
     model = from_gymnasium(env)
     table = env.unwrapped.P
-    count, terminated = len(table), model.states_where("terminated")
+    count, terminated = len(table), model.states_with_label("terminated")
     assert terminated.tolist() == [False] * count + [True] * (model.num_states - count)
     assert model.initial[:count].tolist() == env.unwrapped.initial_state_distrib.tolist()
     matrix = model.host.matrix.toarray()
-    mean = row_reward(model)
+    mean = choice_reward(model)
     for row, (s, a) in enumerate((x, y) for x in table for y in table[x]):
         assert (model.host.state[row], model.action[row]) == (s, a)
         expected, earned = np.zeros(model.num_states), 0.0
@@ -122,7 +122,7 @@ def test_the_values_of_frozen_lake():
     pytest.importorskip("gymnasium")
     model = from_gymnasium("FrozenLake-v1", labels={"goal": [15]})
     # Value iteration with nothing of the library's but the numbers.
-    matrix, reward, value = model.host.matrix.toarray(), row_reward(model), np.zeros(18)
+    matrix, reward, value = model.host.matrix.toarray(), choice_reward(model), np.zeros(18)
     assert model.num_states == 16 + 5  # four holes and the goal
     value = np.zeros(21)
     for _ in range(20_000):
@@ -130,7 +130,7 @@ def test_the_values_of_frozen_lake():
         value = np.maximum.reduceat(q, model.row_start[:-1])
     np.testing.assert_allclose(value[0], 14 / 17, atol=1e-9)
     padded = to_padded(model)
-    goal = np.asarray(model.states_where("goal"))
+    goal = np.asarray(model.states_with_label("goal"))
     found = reachability_probability(padded, goal)
     assert found.lower[0] - 1e-6 <= 14 / 17 <= found.upper[0] + 1e-6
     # And discounted, against the environment's own table.

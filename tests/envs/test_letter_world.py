@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxltl.core.environments.episodes import step_or_reset
+from jaxltl.core.environments.episodes import auto_reset_step
 from jaxltl.envs.letter_world import ACTIONS, connected_cells, is_connected, letter_world
 
 MOVES = {"up": (-1, 0), "down": (1, 0), "left": (0, -1), "right": (0, 1)}
@@ -99,7 +99,7 @@ def test_steps_and_what_is_seen_are_the_slow_worlds():
 
 def test_an_episode_is_truncated_after_75_steps():
     def move(state, key):
-        _, found = step_or_reset(world(), state, 0, key)
+        _, found = auto_reset_step(world(), state, 0, key)
         return found.world, found
 
     _, found = jax.lax.scan(

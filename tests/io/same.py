@@ -78,7 +78,7 @@ def assert_same(found: SparseMDP, model: SparseMDP, *, valuation=True):
         assert a.dtype == b.dtype and a.tobytes() == b.tobytes(), name
     assert set(found.propositions) == set(model.propositions)
     for name in model.propositions:
-        np.testing.assert_array_equal(found.states_where(name), model.states_where(name))
+        np.testing.assert_array_equal(found.states_with_label(name), model.states_with_label(name))
     assert actions(found) == actions(model)
     assert list(found.rewards) == list(model.rewards)
     for name, reward in model.rewards.items():

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jaxltl.core.models.sparse import Rewards, make_sparse, row_reward
+from jaxltl.core.models.sparse import Rewards, choice_reward, make_sparse
 from jaxltl.io.drn import read_drn, write_drn
 from tests.io.same import actions, assert_same, full_model, refuses
 from tests.sparse_models import storm_values
@@ -62,7 +62,7 @@ def test_a_model_of_storm(tmp_path):
     assert model.probability.tolist() == [0.5, 0.5, 0.1, 0.9, 1, 0.25, 0.75, 1]
     assert model.initial.tolist() == [0.5, 0, 0, 0.5]
     assert set(model.propositions) == {"two words", "plain", "quoted", "twice"}
-    assert model.states_where("plain").tolist() == [False, True, False, True]
+    assert model.states_with_label("plain").tolist() == [False, True, False, True]
     assert actions(model) == ["go", "stay", "", "", "go"]
     assert list(model.rewards) == ["time", "", "steps"]
     assert model.rewards["time"].state.tolist() == [1, 0, 0, 0]
@@ -202,10 +202,10 @@ def test_storm_reads_what_is_written_and_writes_what_is_read(tmp_path, chain):
     storm = stormpy.build_model_from_drn(tmp_path / "m.drn", options=named)
     direction = "" if chain else "max"
     values = storm_values(storm, f'P{direction}=? [ F<=4 "goal" ]')
-    reached = model.states_where("goal").astype(float)
+    reached = model.states_with_label("goal").astype(float)
     for _ in range(4):
         best = model.host.over_choices(np.maximum, model.host.expectation(reached))
-        reached = np.where(model.states_where("goal"), 1, best)
+        reached = np.where(model.states_with_label("goal"), 1, best)
     np.testing.assert_allclose(values, reached, rtol=1e-12)
     exact = io.DirectEncodingExporterOptions()
     exact.output_precision = 17
@@ -219,8 +219,10 @@ def test_storm_reads_what_is_written_and_writes_what_is_read(tmp_path, chain):
     assert found.successor.tolist() == model.successor.tolist()
     assert actions(found) == actions(model)
     for name in model.propositions:
-        assert found.states_where(name).tolist() == model.states_where(name).tolist()
+        assert found.states_with_label(name).tolist() == model.states_with_label(name).tolist()
     assert set(found.rewards) == set(model.rewards)
     assert found.rewards["cost"].state.tolist() == storm.get_reward_model("cost").state_rewards
     for name, reward in model.rewards.items():
-        np.testing.assert_allclose(row_reward(found, name), row_reward(model, reward), rtol=1e-15)
+        np.testing.assert_allclose(
+            choice_reward(found, name), choice_reward(model, reward), rtol=1e-15
+        )

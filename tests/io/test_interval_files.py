@@ -332,7 +332,7 @@ def test_storm_reads_what_is_written(tmp_path):
             states = [
                 s for s in range(model.num_states) if "goal" in one.labeling.get_labels_of_state(s)
             ]
-            assert states == np.flatnonzero(model.states_where("goal")).tolist()
+            assert states == np.flatnonzero(model.states_with_label("goal")).tolist()
         back = from_stormpy(to_stormpy(model))
         assert back.lower.tobytes() == model.lower.tobytes()
         assert back.upper.tobytes() == model.upper.tobytes()

@@ -12,7 +12,7 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from jaxltl.core.models.construct.counts import counts_on
+from jaxltl.core.models.construct.counts import align_counts
 from jaxltl.core.models.mdp import make_mdp
 from jaxltl.core.models.sparse import make_sparse
 from jaxltl.io import _columns, log
@@ -209,7 +209,7 @@ def test_logs_that_fit_a_model(tmp_path):
     path.write_text("state,action,next\nhall,left,bath\nhall,right,den\nhall,left,bath\n")
     found = read_log(path, room)
     assert found.states == ("hall", "bath", "den") and found.actions == ("left", "right")
-    assert counts_on(room, found).tolist() == [0, 2, 1, 0, 0]
+    assert align_counts(room, found).tolist() == [0, 2, 1, 0, 0]
     for line, message in (
         ("hall,left,attic", "there is no state 'attic'; there are 3: 'hall', 'bath', 'den'"),
         ("attic,left,hall", "there is no state 'attic'"),
@@ -225,7 +225,7 @@ def test_logs_that_fit_a_model(tmp_path):
     # Without names, numbers are names.
     mdp = make_mdp([[[0, 1], [1, 0]], [[1, 0], [0, 0]]], [[[0.5, 0.5], [1, 0]], [[1, 0], [0, 0]]])
     path.write_text("state,action,next,count\n0,0,1,5\n1,0,1,2\n0,1,1,3\n")
-    assert counts_on(mdp, read_log(path, mdp)).tolist() == [[[0, 5], [3, 0]], [[2, 0], [0, 0]]]
+    assert align_counts(mdp, read_log(path, mdp)).tolist() == [[[0, 5], [3, 0]], [[2, 0], [0, 0]]]
     path.write_text("state,action,next\n1,1,0\n")
     with pytest.raises(ValueError, match="line 2: the model does not have it: state '1' has no"):
         read_log(path, mdp)

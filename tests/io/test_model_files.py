@@ -154,7 +154,10 @@ def test_padded_arrays_are_read_in_full_precision(tmp_path):
         )
         found = read_model(path)
         assert found.probability.tolist() == [0.1, 0.9, 1] and found.initial.tolist() == [0.3, 0.7]
-        assert found.action_names == ("x",) and found.states_where("p").tolist() == [True, False]
+        assert found.action_names == ("x",) and found.states_with_label("p").tolist() == [
+            True,
+            False,
+        ]
         np.savez(path, transition=[[[0.1, 0.9]], [[0, 1]]], system=[0, 1])
         found = read_model(path)
         assert found.mdp.probability.tolist() == [0.1, 0.9, 1]

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxltl.core.models.sparse import row_reward
+from jaxltl.core.models.sparse import choice_reward
 from jaxltl.io.drn import read_drn, write_drn
 from jaxltl.io.parametric import read_parametric
 from tests.io.same import assert_same, full_model
@@ -166,7 +166,7 @@ def test_functions_of_arrays_are_those_of_the_file(tmp_path, text):
         exact = found.at(dict(zip("pq", x, strict=True)))
         probability, rewards = evaluate(over.numbers, jnp.array(x))
         np.testing.assert_allclose(probability, exact.probability, rtol=1e-14)
-        np.testing.assert_allclose(rewards["cost"], row_reward(exact), rtol=1e-13, atol=1e-15)
+        np.testing.assert_allclose(rewards["cost"], choice_reward(exact), rtol=1e-13, atol=1e-15)
         assert_same(over.at(x), exact)
     assert_same(over.model, over.at(over.inside))
     assert over.parameters == ("p", "q") and over.low.tolist() == [0.2, 0.1]

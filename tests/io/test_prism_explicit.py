@@ -55,7 +55,7 @@ def test_a_model_of_prism(tmp_path):
     assert model.probability.tolist() == [0.5, 0.5, 1, 1, 0.25, 0.75, 1]
     assert model.initial.tolist() == [1, 0, 0, 0]
     assert model.propositions == ("deadlock", "my goal")
-    assert model.states_where("my goal").tolist() == [False, False, False, True]
+    assert model.states_with_label("my goal").tolist() == [False, False, False, True]
     assert actions(model) == ["go", "", "", "go", ""]
     assert model.valuation["x"].tolist() == [0, -3, 5, 0]
     assert model.valuation["b"].tolist() == [True, True, False, False]
@@ -310,7 +310,7 @@ def test_storm_reads_what_is_written_for_it(tmp_path, chain):
     entries = [(e.column, e.value) for r in range(model.num_rows) for e in matrix.get_row(r)]
     assert entries == list(zip(model.successor.tolist(), model.probability.tolist(), strict=True))
     for label in ("goal", "b", "init"):
-        where = model.initial > 0 if label == "init" else model.states_where(label)
+        where = model.initial > 0 if label == "init" else model.states_with_label(label)
         assert [label in storm.labeling.get_labels_of_state(s) for s in range(12)] == where.tolist()
     direction = "" if chain else "max"
     mine = read_prism(path)
@@ -321,11 +321,11 @@ def test_storm_reads_what_is_written_for_it(tmp_path, chain):
 
 def bounded_reward(model, steps):
     """The most that is earned in some steps, by backward induction."""
-    from jaxltl.core.models.sparse import row_reward
+    from jaxltl.core.models.sparse import choice_reward
 
     host, value = model.host, np.zeros(model.num_states)
     for _ in range(steps):
-        value = host.over_choices(np.maximum, row_reward(model) + host.expectation(value))
+        value = host.over_choices(np.maximum, choice_reward(model) + host.expectation(value))
     return value
 
 

@@ -11,7 +11,7 @@ from jaxltl.core.automata.automaton import letter_index
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.mdp import make_mdp
 from jaxltl.core.models.product import product
-from jaxltl.core.models.sparse import Rewards, row_reward
+from jaxltl.core.models.sparse import Rewards, choice_reward
 from jaxltl.core.values.discounted.discounted import optimal_value
 from jaxltl.io.reward_machine import machine_reward, read_reward_machine
 
@@ -200,7 +200,7 @@ def test_the_reward_of_a_product(label_on):
         rows = machine_reward(sparse, machine.reward)
         np.testing.assert_allclose(rows, expected[available[:, None].repeat(4, 1)], atol=1e-6)
         out = to_sparse(sparse)
-        assert row_reward(out, Rewards(choice=rows)).tolist() == rows.tolist()
+        assert choice_reward(out, Rewards(choice=rows)).tolist() == rows.tolist()
         if i == 0:
             value = np.zeros((5, 4))
             for _ in range(300):

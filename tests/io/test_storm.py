@@ -7,7 +7,7 @@ import pytest
 
 from jaxltl.core.models.construct.convert import to_padded
 from jaxltl.core.models.game import Game, make_game
-from jaxltl.core.models.sparse import Rewards, make_sparse, row_reward
+from jaxltl.core.models.sparse import Rewards, choice_reward, make_sparse
 from jaxltl.core.values.undiscounted.reachability import reachability_probability
 from jaxltl.io.storm import from_stormpy, to_stormpy
 from tests.storm_oracle import storm_values
@@ -55,7 +55,7 @@ def assert_same(one, other):
         assert getattr(one, name).tolist() == getattr(other, name).tolist(), name
     assert sorted(one.propositions) == sorted(other.propositions)
     for name in one.propositions:
-        assert one.states_where(name).tolist() == other.states_where(name).tolist()
+        assert one.states_with_label(name).tolist() == other.states_with_label(name).tolist()
     if one.action is not None:
         names = [[x.action_names[a] for a in x.action] for x in (one, other)]
         assert names[0] == names[1]
@@ -84,7 +84,7 @@ def test_values_agree():
     for _ in range(5):
         model = random_model(rng)
         there = to_stormpy(model)
-        goal = model.states_where("a")
+        goal = model.states_with_label("a")
         for name, objective in (("max", "max"), ("min", "min")):
             (expected,) = storm_values(there, f'P{name}=? [ F "a" ]')
             found = reachability_probability(to_padded(model), goal, objective=objective)
@@ -96,7 +96,7 @@ def test_rewards_mean_the_same():
     rng = np.random.default_rng(2)
     for _ in range(5):
         model = random_model(rng, chain=True)
-        matrix, reward = model.host.matrix.toarray(), row_reward(model, "all")
+        matrix, reward = model.host.matrix.toarray(), choice_reward(model, "all")
         expected, at = 0.0, np.eye(6)[0]
         for _ in range(7):
             expected, at = expected + at @ reward, at @ matrix
@@ -116,7 +116,7 @@ def test_a_model_that_storm_built():
     assert {"left", "right"} <= set(found.action_names)
     assert sorted(found.rewards) == ["plain", "steps"]
     assert set(found.valuation) == {"x", "done"}
-    assert found.states_where("top").tolist() == (found.valuation["x"] == 4).tolist()
+    assert found.states_with_label("top").tolist() == (found.valuation["x"] == 4).tolist()
     start = int(np.argmax(found.initial))
     assert (found.valuation["x"][start], found.valuation["done"][start]) == (1, False)
 

@@ -726,7 +726,7 @@ def assert_storm_has(storm, model):
     labels = storm.labeling
     assert labels.get_labels() - {"init"} == set(model.propositions) - {"init"}
     for name in labels.get_labels():
-        expected = model.initial > 0 if name == "init" else model.states_where(name)
+        expected = model.initial > 0 if name == "init" else model.states_with_label(name)
         assert list(labels.get_states(name)) == np.flatnonzero(expected).tolist()
     assert set(storm.reward_models) == set(model.rewards)
 
@@ -797,8 +797,10 @@ def test_what_storm_writes_is_read(tmp_path):
         for row in range(found.num_rows):
             name = found.action_names[found.action[row]]
             assert storm.choice_labeling.get_labels_of_choice(row) == ({name} if name else set())
-        x, goal = found.valuation["x"], found.states_where("goal")
-        assert np.array_equal(goal, x == 7) and np.array_equal(found.states_where("Low"), x < 0)
+        x, goal = found.valuation["x"], found.states_with_label("goal")
+        assert np.array_equal(goal, x == 7) and np.array_equal(
+            found.states_with_label("Low"), x < 0
+        )
         assert found.valuation["b"].dtype == bool
 
 

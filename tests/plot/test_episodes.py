@@ -11,7 +11,7 @@ import pytest
 
 from jaxltl.core.environments.environment import Timestep as Step
 from jaxltl.core.environments.environment import make_environment
-from jaxltl.core.environments.episodes import Agent, agent_of, run_episode
+from jaxltl.core.environments.episodes import Agent, make_agent, run_episode
 from jaxltl.core.environments.task_environment import task_environment
 from jaxltl.envs.flat_world import flat_world
 from jaxltl.envs.letter_world import letter_world
@@ -29,7 +29,7 @@ KEY = jax.random.key(0)
 
 
 def episode(world, action, num_steps=6):
-    return run_episode(KEY, world, agent_of(lambda seen, key: action), num_steps=num_steps)
+    return run_episode(KEY, world, make_agent(lambda seen, key: action), num_steps=num_steps)
 
 
 def letters():
@@ -137,7 +137,7 @@ def test_what_has_no_picture_is_named():
         draw_episode(other, episode(other, jnp.int32(0)))
     world = letters()
     many = jax.vmap(
-        lambda key: run_episode(key, world, agent_of(lambda seen, key: jnp.int32(0)), num_steps=2)
+        lambda key: run_episode(key, world, make_agent(lambda seen, key: jnp.int32(0)), num_steps=2)
     )(jax.random.split(KEY, 2))
     with pytest.raises(ValueError, match="take one trajectory of many"):
         play_episode(world, many)

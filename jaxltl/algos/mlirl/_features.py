@@ -17,7 +17,7 @@ from jaxltl.core.models.construct.lifting import lift_trajectories
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.ops.array_namespace import namespace, to_jax
 from jaxltl.core.models.ops.operators import expectation
-from jaxltl.core.models.product import Product, expected_reads
+from jaxltl.core.models.product import Product, read_probability
 from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.solvers.dense_reachability import policy_row, steps_until
@@ -187,7 +187,7 @@ def _task_values(
     elif kind != "safety":
         priority = jnp.asarray(model.automaton.priority)
         even = jnp.where(priority % 2 == 0, priority, jnp.iinfo(priority.dtype).max)
-        columns.append(expected_reads(model, priority == jnp.min(even)))
+        columns.append(read_probability(model, priority == jnp.min(even)))
     if avoid:
         columns.append(-entered[0])
     if kind == "cosafe":

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxltl.app.files import tables
 from jaxltl.core.games.objective import Parity
-from jaxltl.core.models.construct.padded import action_of, to_padded
+from jaxltl.core.models.construct.padded import row_actions, to_padded
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.mdp import MDP
@@ -107,7 +107,7 @@ def padded(model: SparseMDP) -> tuple[MDP, tuple[str, ...], np.ndarray]:
         model = replace(model, action=None)
     mdp = to_padded(model)
     kind = "choice" if model.action is None else "action"
-    return mdp, _numbered(kind, mdp.num_actions), action_of(model)
+    return mdp, _numbered(kind, mdp.num_actions), row_actions(model)
 
 
 def _numbered(what: str, count: int) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ def synchronize(memory: Task, task: Task, *, alphabet: Iterable[Letter] | None =
     """An automaton that runs two others side by side and accepts as the second does.
 
     So a policy with the memory of one automaton is judged by the task of another: make
-    the product with this automaton, and lift the policy by :func:`lift_memory`. The pair
+    the product with this automaton, and lift the policy by :func:`lift_memory_policy`. The pair
     of memory state q1 and task state q2 is the state ``q1 * Q2 + q2``.
 
     Args:

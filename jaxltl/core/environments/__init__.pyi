@@ -9,14 +9,14 @@ from .environment import (
 from .episodes import (
     Agent as Agent,
     Episode as Episode,
-    agent_of as agent_of,
+    make_agent as make_agent,
     run_episode as run_episode,
-    step_or_reset as step_or_reset,
+    auto_reset_step as auto_reset_step,
 )
 from .finite_task import (
     FiniteTask as FiniteTask,
     Shares as Shares,
-    finite_shares as finite_shares,
+    finite_verdict_frequencies as finite_verdict_frequencies,
     make_finite_task as make_finite_task,
 )
 from .monitor import (
@@ -30,12 +30,12 @@ from .monitor import (
 )
 from .sequence_task import (
     SequenceSampler as SequenceSampler,
-    events_of as events_of,
+    make_events as make_events,
     proposition_sets as proposition_sets,
     sequence_environment as sequence_environment,
     sequence_sampler as sequence_sampler,
 )
-from .simulated_model import environment_of as environment_of
+from .model_environment import model_environment as model_environment
 from .tabulate import Table as Table, tabulate as tabulate
 from .task_environment import (
     TaskObservation as TaskObservation,
@@ -43,6 +43,6 @@ from .task_environment import (
     TaskWorld as TaskWorld,
     stack_tasks as stack_tasks,
     task_environment as task_environment,
-    what_is_left as what_is_left,
+    residual_formula as residual_formula,
 )
 from .time_limit import with_time_limit as with_time_limit

@@ -15,7 +15,7 @@ state of their own::
 are told apart: it is *terminated* if nothing comes after it, and *truncated* if something would,
 but is not simulated; a value is bootstrapped at the second alone. ``step`` never starts anew by
 itself, so that the world in which an episode ended is seen;
-:func:`~jaxltl.core.environments.episodes.step_or_reset` does, for those who draw episodes one after the
+:func:`~jaxltl.core.environments.episodes.auto_reset_step` does, for those who draw episodes one after the
 other.
 """
 

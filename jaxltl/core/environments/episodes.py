@@ -32,7 +32,7 @@ def require_agent(agent: Any) -> Agent:
         agent,
         Agent,
         "an Agent, such as ppo.policy(state, problem, hparams), or "
-        "agent_of(function) of (observation, key)",
+        "make_agent(function) of (observation, key)",
     )
     return found
 
@@ -57,7 +57,7 @@ class Agent:
     memory: Any = ()
 
 
-def agent_of(function: Callable[..., Any]) -> Agent:
+def make_agent(function: Callable[..., Any]) -> Agent:
     """An :class:`Agent` without memory that ignores masks, of a function.
 
     Args:
@@ -67,7 +67,7 @@ def agent_of(function: Callable[..., Any]) -> Agent:
       :class:`Agent`.
 
     Example:
-      >>> still = agent_of(lambda observation, key: 0)
+      >>> still = make_agent(lambda observation, key: 0)
       >>> still.act((), None, None, None)
       (0, ())
     """
@@ -104,7 +104,7 @@ class Episode(NamedTuple):
       ...     lambda world, action, key: Timestep(action, 1.0, action == 1),
       ...     lambda world: world[None], actions=2)
       >>> seen = jax.eval_shape(
-      ...     lambda key: run_episode(key, coin, agent_of(lambda seen, key: 1), num_steps=5),
+      ...     lambda key: run_episode(key, coin, make_agent(lambda seen, key: 1), num_steps=5),
       ...     jax.random.key(0))
       >>> seen.world.shape, seen.reward.shape, seen.terminated.shape
       ((6,), (5,), ())
@@ -147,7 +147,7 @@ def run_episode(
       ...     lambda world, action, key: Timestep(action, 1.0, action == 1),
       ...     lambda world: world[None], actions=2)
       >>> run = jax.jit(
-      ...     lambda key: run_episode(key, coin, agent_of(lambda seen, key: 1), num_steps=5))
+      ...     lambda key: run_episode(key, coin, make_agent(lambda seen, key: 1), num_steps=5))
       >>> found = run(jax.random.key(0))
       >>> found.reward.tolist(), bool(found.terminated)
       ([1.0, 0.0, 0.0, 0.0, 0.0], True)
@@ -233,7 +233,7 @@ def continue_episode(
     )
 
 
-def step_or_reset(
+def auto_reset_step(
     environment: Environment, world: Any, action: Any, key: chex.PRNGKey
 ) -> tuple[Any, Timestep]:
     """A step, and a fresh start where an episode ends with it; for episodes one after the other.
@@ -254,7 +254,7 @@ def step_or_reset(
       ...     lambda key: jnp.int32(0),
       ...     lambda world, action, key: Timestep(action, 1.0, action == 1),
       ...     lambda world: world[None], actions=2)
-      >>> onward, made = step_or_reset(coin, jnp.int32(0), jnp.int32(1), jax.random.key(0))
+      >>> onward, made = auto_reset_step(coin, jnp.int32(0), jnp.int32(1), jax.random.key(0))
       >>> int(onward), int(made.world)
       (0, 1)
     """

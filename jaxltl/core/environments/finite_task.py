@@ -144,7 +144,7 @@ def finite_verdicts(
     return trace_verdicts(task.monitor, task.letter[code], length)[..., -1]
 
 
-def verdict_shares(verdict: chex.Array, axis: int | tuple[int, ...] | None = -1) -> Shares:
+def verdict_frequencies(verdict: chex.Array, axis: int | tuple[int, ...] | None = -1) -> Shares:
     """The shares of the three verdicts among trajectories.
 
     Args:
@@ -155,7 +155,7 @@ def verdict_shares(verdict: chex.Array, axis: int | tuple[int, ...] | None = -1)
       Arrays ``float[...]``.
 
     Example:
-      >>> [float(x) for x in verdict_shares(jnp.array([1, 1, 0, 2]))]
+      >>> [float(x) for x in verdict_frequencies(jnp.array([1, 1, 0, 2]))]
       [0.5, 0.25, 0.25]
     """
     verdict = jnp.asarray(verdict)
@@ -163,8 +163,10 @@ def verdict_shares(verdict: chex.Array, axis: int | tuple[int, ...] | None = -1)
     return Shares(*(jnp.mean(verdict == v, axis=axis, dtype=float) for v in order))
 
 
-def finite_shares(task: FiniteTask, label: chex.Array, length: chex.Array | None = None) -> Shares:
-    """:func:`verdict_shares` of the M trajectories of a batch.
+def finite_verdict_frequencies(
+    task: FiniteTask, label: chex.Array, length: chex.Array | None = None
+) -> Shares:
+    """:func:`verdict_frequencies` of the M trajectories of a batch.
 
     Args:
       task, label, length: as for :func:`finite_verdicts`, with ``bool[..., M, T, P]``.
@@ -177,7 +179,7 @@ def finite_shares(task: FiniteTask, label: chex.Array, length: chex.Array | None
 
     Example:
       >>> task = make_finite_task("F dry", ["wet", "dry"])
-      >>> float(finite_shares(task, jnp.array([[[0, 1]], [[1, 0]]], bool)).satisfied)
+      >>> float(finite_verdict_frequencies(task, jnp.array([[[0, 1]], [[1, 0]]], bool)).satisfied)
       0.5
     """
     if jnp.ndim(label) < 3:
@@ -185,4 +187,4 @@ def finite_shares(task: FiniteTask, label: chex.Array, length: chex.Array | None
             f"labels have shape {list(jnp.shape(label))}; give [..., M, T, P], with an axis of "
             "trajectories."
         )
-    return verdict_shares(finite_verdicts(task, label, length))
+    return verdict_frequencies(finite_verdicts(task, label, length))

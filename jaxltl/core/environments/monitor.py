@@ -98,7 +98,7 @@ def verdicts(automaton: Automaton) -> np.ndarray:
     return table
 
 
-def lasting_verdicts(automaton: Automaton) -> np.ndarray:
+def lasso_verdicts(automaton: Automaton) -> np.ndarray:
     """``int32[Q, L]``: the verdict on a word that led to a state, if one letter repeats for ever.
 
     Of a world that terminates: the state after its last label, and the letter of that label. It is
@@ -106,7 +106,7 @@ def lasting_verdicts(automaton: Automaton) -> np.ndarray:
 
     Example:
       >>> from jaxltl import to_automaton
-      >>> lasting_verdicts(to_automaton("G F a"))[0].tolist()
+      >>> lasso_verdicts(to_automaton("G F a"))[0].tolist()
       [2, 1]
     """
     delta, least = np.asarray(automaton.delta), np.asarray(automaton.priority)

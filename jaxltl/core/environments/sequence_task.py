@@ -59,7 +59,7 @@ class SequenceSampler:
 
     Example:
       >>> import jaxltl as jl
-      >>> events = jl.environments.events_of(["a", "b"])
+      >>> events = jl.environments.make_events(["a", "b"])
       >>> sampler = jl.environments.sequence_sampler([1, 1], [1], [1, 1], jl.environments.proposition_sets(events))
       >>> sampler.sets.shape, sampler.length.tolist()
       ((2, 3), [1.0, 1.0])
@@ -96,7 +96,7 @@ class SequenceObservation(NamedTuple):
     sequence: Sequence
 
 
-def events_of(propositions: Ordered[str], at_most: int = 1) -> np.ndarray:
+def make_events(propositions: Ordered[str], at_most: int = 1) -> np.ndarray:
     """The labels in which at most so many propositions hold, first that of none.
 
     Args:
@@ -110,7 +110,7 @@ def events_of(propositions: Ordered[str], at_most: int = 1) -> np.ndarray:
       ValueError: a name twice, or a number below 0.
 
     Example:
-      >>> events_of(["a", "b"]).astype(int).tolist()
+      >>> make_events(["a", "b"]).astype(int).tolist()
       [[0, 0], [1, 0], [0, 1]]
     """
     width = len(validation.distinct_names("propositions", propositions))
@@ -122,7 +122,7 @@ def events_of(propositions: Ordered[str], at_most: int = 1) -> np.ndarray:
     return events
 
 
-def event_index(events: chex.Array, label: chex.Array) -> jax.Array:
+def nearest_event(events: chex.Array, label: chex.Array) -> jax.Array:
     """``int32[]``: which event a label is; of labels that are none, the one most like it.
 
     Args:
@@ -136,13 +136,13 @@ def proposition_sets(events: ArrayLike) -> np.ndarray:
     """For each proposition the events in which it holds, to be drawn as sets.
 
     Args:
-      events: ``bool[E, P]``, as of :func:`events_of`.
+      events: ``bool[E, P]``, as of :func:`make_events`.
 
     Returns:
       ``bool[P, E]``, NumPy's.
 
     Example:
-      >>> proposition_sets(events_of(["a", "b"], at_most=2)).astype(int).tolist()
+      >>> proposition_sets(make_events(["a", "b"], at_most=2)).astype(int).tolist()
       [[0, 1, 0, 1], [0, 0, 1, 1]]
     """
     return np.asarray(events, bool).T
@@ -247,7 +247,7 @@ def sequence_environment(
 
     Args:
       environment: the inner world, whose rewards do not count.
-      events: ``bool[E, P]``, the labels that occur, as of :func:`events_of`.
+      events: ``bool[E, P]``, the labels that occur, as of :func:`make_events`.
       sampler: of sequences over these events.
       violation, progress: rewards.
 
@@ -264,7 +264,7 @@ def sequence_environment(
       ...     lambda key: jnp.int32(0), lambda world, action, key: jl.environments.Timestep(action, 0.0, False),
       ...     lambda world: world[None], actions=2,
       ...     labels=lambda world: world == jnp.array([1]), propositions=["a"])
-      >>> events = events_of(["a"])
+      >>> events = make_events(["a"])
       >>> drawn = sequence_environment(
       ...     coin, events, sequence_sampler([1], [1], [1], proposition_sets(events)))
       >>> jax.eval_shape(drawn.reset, jax.random.key(0)).sequence.reach.shape  # steps, events
@@ -319,7 +319,7 @@ def _read(
     inner: Environment, events: jax.Array, world: Any, sequence: Sequence, index: jax.Array
 ) -> SequenceWorld:
     """A world, once its event is read."""
-    event = event_index(events, inner.labels(world))
+    event = nearest_event(events, inner.labels(world))
     wanted, shunned = sequence.reach[index, event], sequence.avoid[index, event]
     after = index + wanted
     verdict = jnp.where(

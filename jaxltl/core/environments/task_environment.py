@@ -34,8 +34,8 @@ from jaxltl.core.environments.environment import (
     require_environment,
 )
 from jaxltl.core.environments.finite_task import make_finite_task
-from jaxltl.core.environments.monitor import Verdict, lasting_verdicts, verdicts
-from jaxltl.core.environments.task_reward import Pay, pay_of
+from jaxltl.core.environments.monitor import Verdict, lasso_verdicts, verdicts
+from jaxltl.core.environments.task_reward import Pay, make_task_reward
 from jaxltl.core.logic.labels import require_known
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.models.ops.annotated_pytree import register_annotated_pytree
@@ -168,7 +168,7 @@ def make_task_tables(
       formula: a formula, its text, or an automaton that reads every subset of its propositions.
       propositions: the names of the world's P labels.
       reward, discount, ratio, shaping, learner_discount: see
-        :func:`~jaxltl.core.environments.task_reward.pay_of`.
+        :func:`~jaxltl.core.environments.task_reward.make_task_reward`.
       ending: see :func:`task_environment`.
       embedding: ``float[Q, ...]``, or None.
 
@@ -187,7 +187,7 @@ def make_task_tables(
     with jax.ensure_compile_time_eval():  # tables are made on the host wherever it is called
         reading = make_finite_task(automaton, propositions)
     decisions = verdicts(automaton)
-    pay: Pay = pay_of(
+    pay: Pay = make_task_reward(
         automaton,
         decisions,
         reward=reward,
@@ -256,7 +256,7 @@ def task_environment(
 
     The rewards of the task are chosen by name. ``"auto"`` takes ``"reach"`` for co-safe tasks,
     ``"keep"`` for safety, ``"eventual"`` for Buchi and ``"parity"`` for the others;
-    ``"two-discount"`` is the fifth. :func:`~jaxltl.core.environments.task_reward.pay_of` tells their
+    ``"two-discount"`` is the fifth. :func:`~jaxltl.core.environments.task_reward.make_task_reward` tells their
     equations, their theorems and what these ask for. All their discounts come with the steps, as
     ``Timestep.discount``: let the learner's own discount be 1.
 
@@ -296,7 +296,7 @@ def task_environment(
       >>> task = task_environment(corridor, "F (goal & F home)")
       >>> world = task.reset(jax.random.key(0))
       >>> for action in (1, 1, 0, 0):
-      ...     print(what_is_left(task, world.memory))
+      ...     print(residual_formula(task, world.memory))
       ...     found = task.step(world, action, jax.random.key(0))
       ...     world = found.world
       F (goal & F home)
@@ -345,7 +345,7 @@ def task_environment(
     return _beside(inner, tables)
 
 
-def with_tables(environment: Environment, tables: TaskTables) -> Environment:
+def with_task_tables(environment: Environment, tables: TaskTables) -> Environment:
     """The environment of a task with another task in its place, also under ``jit`` and ``vmap``.
 
     Args:
@@ -378,7 +378,7 @@ def stack_tables(tables: Sequence[TaskTables]) -> TaskTables:
     """Tasks of different formulas, padded to one shape, with a first axis of N.
 
     States of padding are violated, and no run enters them. For ``vmap`` of a function that calls
-    :func:`with_tables`.
+    :func:`with_task_tables`.
 
     Args:
       tables: N of them, over the same P propositions.
@@ -411,8 +411,8 @@ def stack_tasks(environments: Sequence[Environment]) -> Environment:
 
     Example:
       >>> from jaxltl import from_dense
-      >>> from jaxltl.core.environments import environment_of
-      >>> walk = environment_of(from_dense(
+      >>> from jaxltl.core.environments import model_environment
+      >>> walk = model_environment(from_dense(
       ...     [[[.5, .5]], [[.5, .5]]], label=[[0], [1]], propositions=["a"]))
       >>> both = stack_tasks([task_environment(walk, "F a"), task_environment(walk, "G F a")])
       >>> jax.vmap(lambda e, key: e.reset(key).memory, (0, None))(both, jax.random.key(0)).shape
@@ -422,7 +422,7 @@ def stack_tasks(environments: Sequence[Environment]) -> Environment:
     if not environments:
         raise ValueError("there is no environment; give at least one.")
     padded = _padded([task_tables(e) for e in environments])
-    made = [with_tables(e, t) for e, t in zip(environments, padded, strict=True)]
+    made = [with_task_tables(e, t) for e, t in zip(environments, padded, strict=True)]
     shapes = [_structure(e) for e in made]
     for number, shape in enumerate(shapes):
         if shape != shapes[0]:
@@ -433,7 +433,7 @@ def stack_tasks(environments: Sequence[Environment]) -> Environment:
     return _stacked(made)
 
 
-def what_is_left(task: Environment | TaskTables | Automaton, memory: Any) -> str:
+def residual_formula(task: Environment | TaskTables | Automaton, memory: Any) -> str:
     """What is left of a formula in a state of its automaton, as text, on the host.
 
     The formula that the rest of the word must satisfy. Of a state without a name (automata from
@@ -451,7 +451,7 @@ def what_is_left(task: Environment | TaskTables | Automaton, memory: Any) -> str
       ValueError: there is no such state.
 
     Example:
-      >>> what_is_left(to_automaton("F (a & X b)"), 0)
+      >>> residual_formula(to_automaton("F (a & X b)"), 0)
       'F (a & X b)'
     """
     if isinstance(task, Automaton):
@@ -588,7 +588,7 @@ def _of_world(function: Callable[..., Any], joint: TaskWorld) -> Any:
 def _at_the_end(automaton: Automaton, ending: str) -> np.ndarray:
     """``int32[Q, L]``: the verdict of a world that ends in a state after a letter."""
     if ending == "repeat":
-        return lasting_verdicts(automaton)
+        return lasso_verdicts(automaton)
     verdict = Verdict.VIOLATED if ending == "violated" else Verdict.UNDECIDED
     return np.full(np.shape(automaton.delta), verdict, np.int32)
 

@@ -43,7 +43,7 @@ class Pay(NamedTuple):
     potential: np.ndarray
 
 
-def pay_of(
+def make_task_reward(
     automaton: Automaton,
     decisions: np.ndarray,
     *,

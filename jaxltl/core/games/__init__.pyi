@@ -8,7 +8,7 @@ from .objective import (
     parity as parity,
     reach as reach,
     safety as safety,
-    states_where as states_where,
+    states_with_label as states_with_label,
 )
 from .permissive import (
     Permissive as Permissive,

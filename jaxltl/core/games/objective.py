@@ -19,7 +19,7 @@ from jaxltl.core.games import facts
 from jaxltl.core.logic.labels import satisfying
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.models.ops.array_namespace import is_traced, namespace, to_jax
-from jaxltl.core.models.product import label_rows, shown_by
+from jaxltl.core.models.product import distinct_labels, letters_by_state
 from jaxltl.core.pretty_print import brief
 
 States: TypeAlias = chex.Array | Formula | str  # a set of states
@@ -78,7 +78,7 @@ class GR1:
     lost: jax.Array | np.ndarray
 
 
-def states_where(model: Any, condition: States, place: str = "condition") -> jax.Array:
+def states_with_label(model: Any, condition: States, place: str = "condition") -> jax.Array:
     """A set of states as ``bool[S]``: of an array, or of a Boolean formula over propositions.
 
     Args:
@@ -96,7 +96,7 @@ def states_where(model: Any, condition: States, place: str = "condition") -> jax
     Example:
       >>> from jaxltl import from_dense
       >>> world = from_dense([[[1.0, 0]], [[0, 1.0]]], label=[[0], [1]], propositions=["a"])
-      >>> states_where(world, "!a").tolist()
+      >>> states_with_label(world, "!a").tolist()
       [True, False]
     """
     if isinstance(condition, str) and condition in ("true", "false"):
@@ -106,8 +106,8 @@ def states_where(model: Any, condition: States, place: str = "condition") -> jax
         world = model
         while hasattr(world, "mdp"):
             world = world.mdp
-        holds = satisfying(label_rows(world), world.propositions, condition, place)
-        xp, holds = namespace(shown_by(world, np.asarray(holds)))
+        holds = satisfying(distinct_labels(world), world.propositions, condition, place)
+        xp, holds = namespace(letters_by_state(world, np.asarray(holds)))
         extra = len(model.state_shape) - 1
         return to_jax(xp.broadcast_to(holds.reshape(-1, *(1,) * extra), model.state_shape))
     _, condition = namespace(condition if is_traced(condition) else np.asarray(condition))
@@ -170,7 +170,7 @@ def reach(game: Any, goal: States, *, safe: States = "true") -> Parity:
       >>> jl.winning_region(path, reach(path, middle, safe="b")).region.tolist()
       [False, True, False]
     """
-    return _parity(game, 1, 2, safe, won=states_where(game, goal, "goal"))
+    return _parity(game, 1, 2, safe, won=states_with_label(game, goal, "goal"))
 
 
 def buchi(game: Any, accepting: States, *, safe: States = "true") -> Parity:
@@ -197,7 +197,7 @@ def buchi(game: Any, accepting: States, *, safe: States = "true") -> Parity:
       >>> jl.winning_region(path, buchi(path, "a")).region.tolist()
       [True, True, True]
     """
-    xp, accepting = namespace(states_where(game, accepting, "accepting"))
+    xp, accepting = namespace(states_with_label(game, accepting, "accepting"))
     return _parity(game, xp.where(accepting, 0, 1), 2, safe)
 
 
@@ -225,7 +225,7 @@ def cobuchi(game: Any, persistent: States, *, safe: States = "true") -> Parity:
       >>> jl.winning_region(path, cobuchi(path, "b")).region.tolist()
       [False, False, False]
     """
-    xp, persistent = namespace(states_where(game, persistent, "persistent"))
+    xp, persistent = namespace(states_with_label(game, persistent, "persistent"))
     return _parity(game, xp.where(persistent, 2, 1), 3, safe)
 
 
@@ -274,7 +274,7 @@ def _parity(game: Any, priority: Any, num_priorities: int, safe: States, won: An
     """Priorities, and what is won; unsafe states that are not won are lost."""
     priority = priority if is_traced(priority) else np.asarray(priority)
     won = np.zeros(game.state_shape, bool) if won is None else won
-    xp, priority, won, safe = namespace(priority, won, states_where(game, safe, "safe"))
+    xp, priority, won, safe = namespace(priority, won, states_with_label(game, safe, "safe"))
     return Parity(
         priority=to_jax(xp.broadcast_to(priority.astype(np.int32), game.state_shape)),
         won=to_jax(won),
@@ -340,11 +340,11 @@ def gr1(
     def rows(sets: Sequence[States], name: str) -> jax.Array:
         if isinstance(sets, str | Formula):
             raise ValueError(f"{name} is {str(sets)!r}; give a list of sets of states.")
-        found: list[Any] = [states_where(game, x, f"{name}[{i}]") for i, x in enumerate(sets)]
+        found: list[Any] = [states_with_label(game, x, f"{name}[{i}]") for i, x in enumerate(sets)]
         xp, *found = namespace(*found or [np.ones(game.state_shape, bool)])
         return to_jax(xp.stack(found))
 
-    _, inside = namespace(states_where(game, safe, "safe"))
+    _, inside = namespace(states_with_label(game, safe, "safe"))
     return GR1(
         assumptions=rows(assumptions, "assumptions"),
         guarantees=rows(guarantees, "guarantees"),

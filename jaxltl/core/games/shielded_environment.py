@@ -94,7 +94,7 @@ def shield_environment(
         ``bool[S, A]``, or ``bool[S, Q, A]``.
       state_of: ``world -> int``, the model's state of a world; of a mask with more axes a tuple of
         them. Default: the world itself, as for
-        :func:`~jaxltl.core.environments.simulated_model.environment_of`.
+        :func:`~jaxltl.core.environments.model_environment.model_environment`.
 
     Returns:
       The environment.
@@ -105,10 +105,10 @@ def shield_environment(
 
     Example:
       >>> from jaxltl import from_dense, permissive_strategy
-      >>> from jaxltl.core.environments import environment_of
+      >>> from jaxltl.core.environments import model_environment
       >>> model = from_dense([[[1.0, 0], [0, 1.0]], [[0, 1.0], [0, 0]]],
       ...                    label=[[0], [1]], propositions=["crash"], initial=[1, 0])
-      >>> safe = shield_environment(environment_of(model), permissive_strategy(model, "G !crash"))
+      >>> safe = shield_environment(model_environment(model), permissive_strategy(model, "G !crash"))
       >>> safe.allowed(safe.reset(jax.random.key(0))).tolist()
       [True, False]
     """

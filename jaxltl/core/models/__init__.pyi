@@ -1,9 +1,12 @@
-from .construct.batch import lift_memory as lift_memory, stack_products as stack_products
+from .construct.batch import (
+    lift_memory_policy as lift_memory_policy,
+    stack_products as stack_products,
+)
 from .construct.convert import to_padded as to_padded, to_sparse as to_sparse
 from .construct.counts import (
     TransitionCounts as TransitionCounts,
-    counted_model as counted_model,
-    counts_on as counts_on,
+    model_from_counts as model_from_counts,
+    align_counts as align_counts,
     make_counts as make_counts,
 )
 from .construct.lifting import (
@@ -51,12 +54,12 @@ from .parametric.parametric import (
     ParametricMDP as ParametricMDP,
     make_parametric as make_parametric,
 )
-from .product import Product as Product, letters_of as letters_of, product as product
+from .product import Product as Product, occurring_letters as occurring_letters, product as product
 from .sparse import (
     Rewards as Rewards,
     SparseMDP as SparseMDP,
     make_sparse as make_sparse,
-    row_reward as row_reward,
+    choice_reward as choice_reward,
 )
 from .trajectories import (
     Trajectories as Trajectories,

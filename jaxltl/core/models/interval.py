@@ -61,7 +61,7 @@ class IntervalMDP:
       >>> rough = jl.make_interval(coin, [0.4, 0.3, 1, 1], [0.7, 0.6, 1, 1])
       >>> rough.num_transitions, rough.lower.tolist(), rough.is_chain
       (4, [0.4, 0.3, 1.0, 1.0], True)
-      >>> round(float(jl.reachability_probability(rough, rough.states_where("heads"), nature="min")
+      >>> round(float(jl.reachability_probability(rough, rough.states_with_label("heads"), nature="min")
       ...             .value[0]), 6)
       0.4
     """
@@ -138,13 +138,13 @@ class IntervalMDP:
         """The ends alone, the smallest that hold the ball: no less is possible within them."""
         return replace(self, center=None, radius=None)
 
-    def states_where(self, proposition: str) -> Array:
+    def states_with_label(self, proposition: str) -> Array:
         """``bool[S]``, where a proposition holds.
 
         Raises:
           ValueError: there is no such proposition.
         """
-        return self.nominal.states_where(proposition)
+        return self.nominal.states_with_label(proposition)
 
     def changed(self, change: Callable[[SparseMDP], SparseMDP]) -> IntervalMDP:
         """The model after a change that drops, repeats or moves entries, but adds up none."""

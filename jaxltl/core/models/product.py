@@ -145,7 +145,7 @@ class Product:
         return to_jax(xp.broadcast_to(final, self.state_shape))
 
 
-def letters_of(
+def occurring_letters(
     world: LabelledModel, propositions: Collection[str] | None = None
 ) -> list[frozenset]:
     """The sets of propositions that occur at some state of a world, for ``to_automaton``.
@@ -160,14 +160,14 @@ def letters_of(
     Example:
       >>> from jaxltl import from_dense
       >>> world = from_dense([[[1.0, 0]], [[0, 1.0]]], label=[[0], [1]], propositions=["a"])
-      >>> [sorted(letter) for letter in letters_of(world)]
+      >>> [sorted(letter) for letter in occurring_letters(world)]
       [[], ['a']]
     """
     keep = [
         i for i, p in enumerate(world.propositions) if propositions is None or p in propositions
     ]
     names = [world.propositions[i] for i in keep]
-    rows, _ = distinct_rows(label_rows(world)[:, keep])
+    rows, _ = distinct_rows(distinct_labels(world)[:, keep])
     return [frozenset(n for n, holds in zip(names, row, strict=True) if holds) for row in rows]
 
 
@@ -216,30 +216,30 @@ def product(
     if isinstance(task, str | Formula):
         formula = parse_ltl(task) if isinstance(task, str) else task
         require_known(formula.propositions, world.propositions, "the task")
-        task = to_automaton(formula, letters=letters_of(world, formula.propositions))
+        task = to_automaton(formula, letters=occurring_letters(world, formula.propositions))
     if not isinstance(task, Automaton):
         raise ValueError(
             f"task is {validation.shorten(task)}; give a formula, its text, or an automaton."
         )
     require_known(task.propositions, world.propositions, "the task")
     column = [world.propositions.index(p) for p in task.propositions]
-    labels = label_rows(world)
+    labels = distinct_labels(world)
     rows, letter = distinct_rows(labels[:, column])
     index = np.array(
         [_letter(task, row, int(np.argmax(letter == i))) for i, row in enumerate(rows)], np.int32
     )
-    return Product(world, to_jax(task), shown_by(world, index[letter.ravel()]), label_on)
+    return Product(world, to_jax(task), letters_by_state(world, index[letter.ravel()]), label_on)
 
 
 @singledispatch
-def label_rows(world: LabelledModel) -> np.ndarray:
+def distinct_labels(world: LabelledModel) -> np.ndarray:
     """The labels of a world on the host, ``bool[S, P]``; of one on a mesh those that occur."""
     return np.asarray(world.label)
 
 
 @singledispatch
-def shown_by(world: LabelledModel, letter: np.ndarray) -> jax.Array:
-    """``int32[S]``, what each state shows, from a number for each of the :func:`label_rows`."""
+def letters_by_state(world: LabelledModel, letter: np.ndarray) -> jax.Array:
+    """``int32[S]``, what each state shows, from a number for each of the :func:`distinct_labels`."""
     return to_jax(letter)
 
 
@@ -250,7 +250,7 @@ def _letter(automaton: Automaton, row: np.ndarray, state: int) -> int:
     except ValueError as error:
         raise ValueError(
             f"world state {state} shows the letter {{{', '.join(sorted(shown))}}}, which the "
-            "automaton was not built for; translate with letters=letters_of(world)."
+            "automaton was not built for; translate with letters=occurring_letters(world)."
         ) from error
 
 
@@ -301,7 +301,7 @@ def reads(model: Product, marked: jax.Array) -> jax.Array:
     return found & model.available
 
 
-def expected_reads(model: Product, marked: jax.Array) -> jax.Array:
+def read_probability(model: Product, marked: jax.Array) -> jax.Array:
     """The probability that an action makes the automaton read a marked transition.
 
     Args:
@@ -361,7 +361,7 @@ def _(model: Product, value: jax.Array) -> jax.Array:
         model,
         operators.least_successor,
         value,
-        kernels.only_real,
+        kernels.where_positive,
         jnp.minimum,
         kernels.largest(value.dtype),
     )
@@ -422,9 +422,9 @@ def _(model: Product, policy: jax.Array) -> Any:
     return onward
 
 
-@operators.given_states.register
+@operators.unpadded_states.register
 def _(model: Product) -> Any:
-    found: Any = operators.given_states(model.mdp)
+    found: Any = operators.unpadded_states(model.mdp)
     return found if found is True else found[:, None]
 
 

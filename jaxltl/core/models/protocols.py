@@ -99,7 +99,7 @@ class RowModel(LabelledModel, Protocol):
     def rewards(self) -> Any:
         """Reward structures by name."""
 
-    def states_where(self, proposition: str) -> Array:
+    def states_with_label(self, proposition: str) -> Array:
         """``bool[S]``, the states in which a proposition holds."""
 
 

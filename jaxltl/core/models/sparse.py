@@ -83,7 +83,7 @@ class SparseMDP:
       ...                     label={"goal": [1]}, rewards={"steps": Rewards(state=[1, 0, 0])})
       >>> model.num_states, model.num_rows, model.num_transitions, model.is_chain
       (3, 4, 5, False)
-      >>> model.states_where("goal").tolist()
+      >>> model.states_with_label("goal").tolist()
       [False, True, False]
     """
 
@@ -152,7 +152,7 @@ class SparseMDP:
         probability = np.asarray(self.probability, np.float64)
         return HostMDP(row_start, entry_start, successor, probability)
 
-    def states_where(self, proposition: str) -> Array:
+    def states_with_label(self, proposition: str) -> Array:
         """``bool[S]``, where a proposition holds.
 
         Raises:
@@ -166,7 +166,7 @@ class SparseMDP:
         return self.label[:, self.propositions.index(proposition)]
 
 
-def row_reward(model: SparseMDP, reward: str | Rewards | chex.Array | None = None) -> np.ndarray:
+def choice_reward(model: SparseMDP, reward: str | Rewards | chex.Array | None = None) -> np.ndarray:
     """The expected reward of each choice, ``r(s) + r(s, a) + sum_t P(t | s, a) r(s, a, t)``.
 
     Args:
@@ -184,10 +184,10 @@ def row_reward(model: SparseMDP, reward: str | Rewards | chex.Array | None = Non
 
     Example:
       >>> model = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
-      >>> row_reward(model, Rewards(state=[1, 0, 0], transition=[4, 0, 0, 0])).tolist()
+      >>> choice_reward(model, Rewards(state=[1, 0, 0], transition=[4, 0, 0, 0])).tolist()
       [3.0, 0.0, 0.0]
     """
-    reward = reward_parts(model, reward)
+    reward = reward_structure(model, reward)
     if is_traced((model, reward)):
         return _traced_reward(model, reward)
     host = model.host
@@ -202,8 +202,8 @@ def row_reward(model: SparseMDP, reward: str | Rewards | chex.Array | None = Non
     return total
 
 
-def reward_parts(model: SparseMDP, reward: str | Rewards | chex.Array | None = None) -> Rewards:
-    """A reward as a structure, by name or however else it is given to :func:`row_reward`.
+def reward_structure(model: SparseMDP, reward: str | Rewards | chex.Array | None = None) -> Rewards:
+    """A reward as a structure, by name or however else it is given to :func:`choice_reward`.
 
     Raises:
       ValueError: as there.

@@ -19,7 +19,7 @@ from jaxltl.core.environments.environment import (
     random_action,
     some_action,
 )
-from jaxltl.core.environments.episodes import Agent, agent_of, run_episode, step_or_reset
+from jaxltl.core.environments.episodes import Agent, auto_reset_step, make_agent, run_episode
 from jaxltl.core.environments.time_limit import with_time_limit
 
 
@@ -172,7 +172,7 @@ def test_a_step_may_leave_out_what_has_a_default():
         return place, 1.0, place == 3
 
     episode = run_episode(
-        jax.random.key(0), made(step=short), agent_of(lambda seen, key: 0), num_steps=2
+        jax.random.key(0), made(step=short), make_agent(lambda seen, key: 0), num_steps=2
     )
     assert episode.discount.tolist() == [1, 1] and episode.cost.tolist() == [0, 0]
 
@@ -285,7 +285,7 @@ def test_an_episode_is_its_steps_one_by_one():
 
 def test_episodes_need_a_step():
     for run in (
-        partial(run_episode, jax.random.key(0), corridor(), agent_of(lambda o, k: 0)),
+        partial(run_episode, jax.random.key(0), corridor(), make_agent(lambda o, k: 0)),
         partial(with_time_limit, corridor()),
     ):
         with pytest.raises(ValueError, match="num_steps=0"):
@@ -311,7 +311,7 @@ def test_a_step_or_a_fresh_start():
 
     @jax.vmap
     def both(place, action, key):
-        world, found = step_or_reset(environment, place, action, key)
+        world, found = auto_reset_step(environment, place, action, key)
         step_key, reset_key = jax.random.split(key)
         return world, found, environment.step(place, action, step_key), environment.reset(reset_key)
 

@@ -10,10 +10,10 @@ import pytest
 from jaxltl.core.automata.automaton import make_automaton
 from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.environments.finite_task import (
-    finite_shares,
+    finite_verdict_frequencies,
     finite_verdicts,
     make_finite_task,
-    verdict_shares,
+    verdict_frequencies,
 )
 from jaxltl.core.environments.monitor import Verdict, verdict
 from tests.reference_logic import holds_by_definition, random_formula, subsets, words
@@ -75,7 +75,7 @@ def test_random_formulas_against_the_automatons_reading():
         ]
         found = finite_verdicts(task, jnp.asarray(label))
         assert found.tolist() == expected
-        shares = finite_shares(task, jnp.asarray(label))
+        shares = finite_verdict_frequencies(task, jnp.asarray(label))
         parts = [expected.count(v) / 6 for v in (YES, NO, OPEN)]
         np.testing.assert_allclose(shares, parts, rtol=1e-12)
         seen |= set(expected)
@@ -103,17 +103,17 @@ def test_lengths_cut_trajectories_off():
     label = jnp.asarray(np.stack([rows("..g"), rows(".g.")]))
     assert finite_verdicts(task, label, jnp.array([2, 2])).tolist() == [OPEN, YES]
     assert finite_verdicts(task, label, 1).tolist() == [OPEN, OPEN]
-    assert finite_shares(task, label, jnp.array([2, 2])).satisfied == 0.5
+    assert finite_verdict_frequencies(task, label, jnp.array([2, 2])).satisfied == 0.5
 
 
 def test_shares_under_jit_and_vmap_of_a_population():
     task = make_finite_task("!obstacle U goal", COLUMNS)
     label = jnp.asarray(np.random.default_rng(0).random((5, 7, 4, 3)) < 0.3)
-    shares = jax.jit(finite_shares)
+    shares = jax.jit(finite_verdict_frequencies)
     mapped = jax.vmap(shares, (None, 0))(task, label)
     whole = shares(task, label)
     for i in range(5):
-        alone = finite_shares(task, label[i])
+        alone = finite_verdict_frequencies(task, label[i])
         assert [x[i] for x in mapped] == [x[i] for x in whole] == list(alone)
     np.testing.assert_allclose(sum(whole), 1, rtol=1e-12)
     assert all(len(np.unique(x)) > 1 for x in whole)
@@ -127,8 +127,8 @@ def test_shares_under_jit_and_vmap_of_a_population():
 
 def test_axes_of_shares():
     told = jnp.array([[1, 1, 2], [0, 1, 2]])
-    assert verdict_shares(told, axis=0).satisfied.tolist() == [0.5, 1, 0]
-    assert [float(x) for x in verdict_shares(told, axis=None)] == [0.5, 2 / 6, 1 / 6]
+    assert verdict_frequencies(told, axis=0).satisfied.tolist() == [0.5, 1, 0]
+    assert [float(x) for x in verdict_frequencies(told, axis=None)] == [0.5, 2 / 6, 1 / 6]
 
 
 def test_unknown_propositions_are_refused():
@@ -158,4 +158,4 @@ def test_labels_that_do_not_fit_are_refused():
         with pytest.raises(ValueError, match=r"give booleans \[\.\.\., T, 3\]"):
             finite_verdicts(task, label)
     with pytest.raises(ValueError, match="an axis of trajectories"):
-        finite_shares(task, np.zeros((4, 3), bool))
+        finite_verdict_frequencies(task, np.zeros((4, 3), bool))

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from jaxltl.core.environments.environment import Timestep, make_environment
-from jaxltl.core.environments.episodes import agent_of, run_episode
+from jaxltl.core.environments.episodes import make_agent, run_episode
 from jaxltl.core.environments.monitor import Verdict
 from jaxltl.core.environments.sequence_task import (
     draw_sequence,
-    event_index,
-    events_of,
+    make_events,
+    nearest_event,
     proposition_sets,
     remaining,
     sequence_environment,
@@ -19,7 +19,7 @@ from jaxltl.core.environments.sequence_task import (
 )
 
 NAMES = ("a", "b", "c")
-EVENTS = events_of(NAMES)
+EVENTS = make_events(NAMES)
 SAMPLER = sequence_sampler([1, 1, 1], [2, 1], [1, 1], [False, True, True, True])
 STEPS = 12
 
@@ -47,7 +47,7 @@ def episodes():
     )
 
     def one(key):
-        return run_episode(key, world, agent_of(lambda seen, key: 0), num_steps=STEPS)
+        return run_episode(key, world, make_agent(lambda seen, key: 0), num_steps=STEPS)
 
     keys = jax.random.split(jax.random.key(3), 200)
     return jax.tree.map(np.asarray, jax.jit(jax.vmap(one))(keys))
@@ -104,7 +104,7 @@ def test_what_is_drawn_has_the_weights_asked_for():
 
 @pytest.mark.slow
 def test_sets_of_events_are_drawn_whole():
-    events = events_of(NAMES, 2)
+    events = make_events(NAMES, 2)
     sampler = sequence_sampler([1, 1], [1, 1], [0, 1], proposition_sets(events))
     drawn = jax.vmap(draw_sequence, (0, None))(jax.random.split(jax.random.key(2), 500), sampler)
     sets = proposition_sets(events)
@@ -121,8 +121,8 @@ def test_sets_of_events_are_drawn_whole():
 
 
 def test_events_are_told_by_their_labels():
-    assert [int(event_index(EVENTS, row)) for row in EVENTS] == [0, 1, 2, 3]
-    assert events_of(NAMES, 3).shape == (8, 3)
+    assert [int(nearest_event(EVENTS, row)) for row in EVENTS] == [0, 1, 2, 3]
+    assert make_events(NAMES, 3).shape == (8, 3)
 
 
 @pytest.mark.parametrize(
@@ -159,7 +159,7 @@ def test_starts_of_the_inner_world_are_not_those_of_sequences_and_discounts_are_
         propositions=["a"],
         starts=lambda: (jnp.zeros(1, jnp.int32), jnp.ones(1)),
     )
-    events = events_of(["a"])
+    events = make_events(["a"])
     sampler = sequence_sampler([1], [1], [1], [False, True])
     made = sequence_environment(inner, events, sampler)
     assert made.starts is None and made.outcomes is None

@@ -11,19 +11,19 @@ from jax.tree_util import Partial
 from jaxltl.core.automata.automaton import accepts_lasso, make_automaton, run
 from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.environments.environment import Timestep, make_box, make_environment, random_action
-from jaxltl.core.environments.episodes import agent_of, run_episode
+from jaxltl.core.environments.episodes import make_agent, run_episode
+from jaxltl.core.environments.model_environment import model_environment
 from jaxltl.core.environments.monitor import Verdict, verdicts
-from jaxltl.core.environments.simulated_model import environment_of
 from jaxltl.core.environments.task_environment import (
     TaskObservation,
     TaskWorld,
     make_task_tables,
+    residual_formula,
     stack_tables,
     stack_tasks,
     task_environment,
     task_tables,
-    what_is_left,
-    with_tables,
+    with_task_tables,
 )
 from jaxltl.core.environments.time_limit import with_time_limit
 from tests import reference
@@ -74,7 +74,7 @@ def walk(share=0.05):
 
 
 def random_agent():
-    return agent_of(lambda seen, key: random_action(key, walk().actions))
+    return make_agent(lambda seen, key: random_action(key, walk().actions))
 
 
 @partial(jax.jit, static_argnames="num_steps")
@@ -247,7 +247,7 @@ def test_tables_are_exchanged_within_one_program():
     def memory(tables, key):
         nonlocal count
         count += 1
-        return with_tables(task_environment(walk(), "F a"), tables).reset(key).memory
+        return with_task_tables(task_environment(walk(), "F a"), tables).reset(key).memory
 
     for i, formula in enumerate(FORMULAS):
         key = jax.random.key(i)
@@ -270,23 +270,23 @@ def test_what_is_left_of_a_formula():
     automaton = to_automaton("F (a & X b)")
     task = task_environment(walk(), "F (a & X b)")
     for place in (task, task_tables(task), automaton):
-        assert what_is_left(place, jnp.int32(0)) == "F (a & X b)"
-        assert what_is_left(place, 2) == "true"
+        assert residual_formula(place, jnp.int32(0)) == "F (a & X b)"
+        assert residual_formula(place, 2) == "true"
         with pytest.raises(ValueError, match=r"memory=3; the automaton has the states 0\.\.2"):
-            what_is_left(place, 3)
+            residual_formula(place, 3)
     nameless = make_automaton([[1], [0]], 0, np.zeros((1, 0), bool), [], accepting=[True, False])
-    assert what_is_left(nameless, 1) == "state 1 of 2"
+    assert residual_formula(nameless, 1) == "state 1 of 2"
     with pytest.raises(ValueError, match="has no task"):
-        what_is_left(walk(), 0)
+        residual_formula(walk(), 0)
 
 
 def test_programs_and_stacks_show_no_text_of_another_formula():
     tasks = [task_environment(walk(), f"F {name}") for name in "ab"]
     returned = jax.jit(lambda task: task)
     for task in tasks:
-        assert what_is_left(returned(task), 0) == "state 0 of 2"
+        assert residual_formula(returned(task), 0) == "state 0 of 2"
     assert returned._cache_size() == 1
-    assert what_is_left(jax.tree.map(np.asarray, tasks[1]), 0) == "F b"
+    assert residual_formula(jax.tree.map(np.asarray, tasks[1]), 0) == "F b"
     assert task_tables(stack_tasks(tasks)).state_names == ()
 
 
@@ -297,7 +297,7 @@ def test_outcomes_are_those_of_the_steps():
     rng = np.random.default_rng(3)
     model = reference.random_model(rng, 5, 2, 3, certainty=0)
     label = rng.random((5, 3)) < 0.5
-    inner = environment_of(as_mdp(model, label=label, propositions=NAMES))
+    inner = model_environment(as_mdp(model, label=label, propositions=NAMES))
     task = task_environment(inner, "G F a & F (b & X c)", reward="two-discount")
     worlds, probability = task.starts()
     np.testing.assert_allclose(probability, model.initial)

@@ -18,9 +18,9 @@ from jaxltl.core.environments.task_environment import (
     make_task_tables,
     stack_tables,
     task_environment,
-    with_tables,
+    with_task_tables,
 )
-from jaxltl.core.environments.task_reward import pay_of
+from jaxltl.core.environments.task_reward import make_task_reward
 from jaxltl.core.models.product import product
 from jaxltl.core.values.undiscounted.satisfaction import (
     optimal_satisfaction,
@@ -112,7 +112,7 @@ def all_tables(options):
 
 @jax.jit
 def every_step(tables, successor, ends, label):
-    environment = with_tables(some_environment(), tables)
+    environment = with_task_tables(some_environment(), tables)
     _, labels, step = environment.step.args
     inner_labels = Partial(labels.func, label)
     inner_step = Partial(step.func, successor, ends, label)
@@ -297,7 +297,9 @@ def test_shaping_changes_no_best_policy_in_300_products(name):
 def test_distances_in_the_automaton():
     def potential(formula, **options):
         automaton = automaton_of(formula)
-        return pay_of(automaton, verdicts(automaton), shaping="distance", **options).potential
+        return make_task_reward(
+            automaton, verdicts(automaton), shaping="distance", **options
+        ).potential
 
     assert potential("F (a & F b)").tolist() == [0, 0, 1]  # a and b may come at once
     assert potential("F (a & X b)").tolist() == [0, 0.5, 1]
@@ -309,7 +311,7 @@ def test_distances_in_the_automaton():
 def test_parity_with_two_priorities_is_two_discount():
     automaton = automaton_of("G F a & G F b")
     first, second = (
-        pay_of(automaton, verdicts(automaton), reward=name, discount=0.9, ratio=0.5)
+        make_task_reward(automaton, verdicts(automaton), reward=name, discount=0.9, ratio=0.5)
         for name in ("parity", "two-discount")
     )
     np.testing.assert_array_equal(first.reward, second.reward)
@@ -319,12 +321,12 @@ def test_parity_with_two_priorities_is_two_discount():
 def test_priorities_of_one_parity_are_one():
     automaton = automaton_of("(G F a & F G !b) | G F c")
     decisions = verdicts(automaton)
-    pay = pay_of(automaton, decisions, discount=0.5, ratio=0.5)
+    pay = make_task_reward(automaton, decisions, discount=0.5, ratio=0.5)
     assert set(pay.discount.ravel()) == {0.5, 0.75, 0.875, 0.9375}
     # Two more are one rank more, and those of the negation are as many but odd.
-    other = pay_of(complement(complement(automaton)), decisions, discount=0.5, ratio=0.5)
+    other = make_task_reward(complement(complement(automaton)), decisions, discount=0.5, ratio=0.5)
     np.testing.assert_array_equal(pay.reward, other.reward)
-    assert pay_of(complement(automaton), decisions).reward.max() < 1e-3
+    assert make_task_reward(complement(automaton), decisions).reward.max() < 1e-3
 
 
 @pytest.mark.parametrize(
@@ -352,10 +354,10 @@ def test_priorities_of_one_parity_are_one():
 def test_bad_rewards_are_named(formula, options, text):
     automaton = automaton_of(formula)
     with pytest.raises(ValueError, match=text):
-        pay_of(automaton, verdicts(automaton), **options)
+        make_task_reward(automaton, verdicts(automaton), **options)
 
 
 def test_in_single_precision_a_reward_that_would_never_stop_is_refused():
     automaton = automaton_of("(G F a & F G !b) | G F c")
     with jax.enable_x64(False), pytest.raises(ValueError, match="float32 does not tell"):
-        pay_of(automaton, verdicts(automaton), discount=0.999)
+        make_task_reward(automaton, verdicts(automaton), discount=0.999)

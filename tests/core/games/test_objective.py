@@ -14,7 +14,7 @@ from jaxltl.core.games.objective import (
     parity,
     reach,
     safety,
-    states_where,
+    states_with_label,
 )
 from jaxltl.core.models.game import make_game
 from jaxltl.core.models.product import product
@@ -46,16 +46,16 @@ def game():
 )
 def test_sets_of_states(condition, expected):
     for model in (world(), jl.models.to_dense(world()), game()):
-        assert states_where(model, condition).tolist() == expected
+        assert states_with_label(model, condition).tolist() == expected
 
 
 def test_parsed_formulas_are_formulas():
-    assert states_where(world(), jl.parse_ltl("a xor b")).tolist() == [False, True, False]
+    assert states_with_label(world(), jl.parse_ltl("a xor b")).tolist() == [False, True, False]
 
 
 def test_in_a_product_a_formula_speaks_of_the_world():
     for model in (product(world(), "G F b"), product(game(), "G (a -> F b)")):
-        found = states_where(model, "b")
+        found = states_with_label(model, "b")
         assert found.shape == model.state_shape
         for q in range(model.state_shape[1]):
             assert found[:, q].tolist() == [False, False, True]

@@ -10,8 +10,8 @@ from jax.tree_util import Partial
 
 from jaxltl.core.environments.environment import Timestep, make_box, make_environment, random_action
 from jaxltl.core.environments.episodes import Agent, run_episode
+from jaxltl.core.environments.model_environment import model_environment
 from jaxltl.core.environments.monitor import Verdict
-from jaxltl.core.environments.simulated_model import environment_of
 from jaxltl.core.environments.tabulate import tabulate
 from jaxltl.core.environments.task_environment import task_environment
 from jaxltl.core.games.permissive import permissive_strategy
@@ -36,7 +36,7 @@ def game():
 
 def careful(memory, seen, allowed, key):
     """Draws among what is allowed."""
-    return random_action(key, environment_of(game()).actions, allowed), memory
+    return random_action(key, model_environment(game()).actions, allowed), memory
 
 
 @partial(jax.jit, static_argnames="num_steps")
@@ -56,7 +56,7 @@ def episodes(keys, environment, num_steps):
 )
 def test_whatever_is_allowed_satisfies_the_formula(formula, options):
     strategy = permissive_strategy(game(), formula, **options)
-    table = tabulate(shield_environment(environment_of(game()), strategy))
+    table = tabulate(shield_environment(model_environment(game()), strategy))
     assert (np.asarray(table.world.state) >= 0).all()
     for model, least in ((table.model, 1), (to_sparse(game().mdp), 0)):
         joint = product(model, formula)
@@ -66,7 +66,7 @@ def test_whatever_is_allowed_satisfies_the_formula(formula, options):
 
 @pytest.mark.slow
 def test_a_random_walk_inside_a_shield_never_collides():
-    inner = task_environment(environment_of(game()), SAFE)
+    inner = task_environment(model_environment(game()), SAFE)
     strategy = permissive_strategy(game(), SAFE)
     keys = jax.random.split(jax.random.key(0), 100)
     violated = []
@@ -81,7 +81,7 @@ def test_a_mask_follows_what_the_strategy_remembers():
     """With a bound on the system's moves between two visits, which takes a counter."""
     bound = 9
     strategy = permissive_strategy(game(), OFTEN, method="counter", bound=bound)
-    environment = shield_environment(environment_of(game()), strategy)
+    environment = shield_environment(model_environment(game()), strategy)
     found = episodes(jax.random.split(jax.random.key(1), 40), environment, 100)
     names = list(game().propositions)
     label = np.asarray(found.label)
@@ -100,8 +100,8 @@ def test_a_mask_follows_what_the_strategy_remembers():
 
 def test_a_winning_region_is_not_left():
     strategy = permissive_strategy(game(), SAFE)
-    won = shield_environment(environment_of(game()), winning_region(game(), SAFE))
-    stay = shield_environment(environment_of(game()), strategy)
+    won = shield_environment(model_environment(game()), winning_region(game(), SAFE))
+    stay = shield_environment(model_environment(game()), strategy)
     keys = jax.random.split(jax.random.key(2), 10)
     one, other = episodes(keys, won, 30), episodes(keys, stay, 30)
     np.testing.assert_array_equal(one.world.world, other.world.world)
@@ -119,7 +119,7 @@ def cliff():
 
 def test_where_nothing_is_sure_the_world_decides():
     environment = shield_environment(
-        environment_of(cliff()), permissive_strategy(cliff(), "G !fall")
+        model_environment(cliff()), permissive_strategy(cliff(), "G !fall")
     )
     masks = {}
     for seed in range(8):
@@ -140,7 +140,7 @@ def test_where_nothing_is_sure_the_world_decides():
 def test_a_mask_is_looked_up():
     rng = np.random.default_rng(0)
     model = reference.random_model(rng, 5, 2, 2, certainty=0)
-    inner = environment_of(as_mdp(model, label=rng.random((5, 1)) < 0.5, propositions=["a"]))
+    inner = model_environment(as_mdp(model, label=rng.random((5, 1)) < 0.5, propositions=["a"]))
     task = task_environment(inner, "F (a & X a)")
     table = rng.random((5, 3, 2)) < 0.6
     environment = shield_environment(task, table, lambda world: (world.world, world.memory))
@@ -164,7 +164,7 @@ def test_a_mask_is_looked_up():
 
 def test_outcomes_are_those_of_the_steps():
     environment = shield_environment(
-        environment_of(cliff()), permissive_strategy(cliff(), "G !fall")
+        model_environment(cliff()), permissive_strategy(cliff(), "G !fall")
     )
     worlds, chance = environment.starts()
     assert worlds.world.tolist() == [0, 1, 2] and chance.tolist() == [0.5, 0.5, 0]
@@ -196,7 +196,7 @@ def test_outcomes_are_those_of_the_steps():
 )
 def test_bad_shields_are_named(make, options, text):
     with pytest.raises(ValueError, match=text):
-        shield_environment(environment_of(cliff()), make(), **options)
+        shield_environment(model_environment(cliff()), make(), **options)
 
 
 def test_a_box_of_actions_has_no_mask():

@@ -218,7 +218,7 @@ def labelled_world():
 
 def test_formulas_texts_and_automata_are_the_same_task():
     world, text = labelled_world(), "!danger U goal"
-    automaton = jl.to_automaton(text, letters=jl.models.letters_of(world))
+    automaton = jl.to_automaton(text, letters=jl.models.occurring_letters(world))
     for task in (text, jl.parse_ltl(text), automaton):
         lazy = jl.product(world, task)
         np.testing.assert_array_equal(lazy.automaton.delta, automaton.delta)
@@ -228,12 +228,12 @@ def test_formulas_texts_and_automata_are_the_same_task():
 
 def test_letters_of_a_world():
     world = labelled_world()
-    assert set(jl.models.letters_of(world)) == {
+    assert set(jl.models.occurring_letters(world)) == {
         frozenset(),
         frozenset({"goal"}),
         frozenset({"danger"}),
     }
-    assert set(jl.models.letters_of(world, ["goal"])) == {frozenset(), frozenset({"goal"})}
+    assert set(jl.models.occurring_letters(world, ["goal"])) == {frozenset(), frozenset({"goal"})}
 
 
 def test_unknown_propositions_name_themselves_and_the_closest():

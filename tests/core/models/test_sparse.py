@@ -8,7 +8,7 @@ from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.models.construct.convert import to_padded, to_sparse
 from jaxltl.core.models.mdp import MDP, make_mdp, support, to_dense
 from jaxltl.core.models.product import product
-from jaxltl.core.models.sparse import Rewards, make_sparse, row_reward
+from jaxltl.core.models.sparse import Rewards, choice_reward, make_sparse
 
 
 def random_padded(rng, num_states, num_actions=3, width=3) -> MDP:
@@ -81,8 +81,8 @@ def test_repeated_successors_become_one():
     assert model.successor.tolist() == [0, 1, 1]
     assert model.probability.tolist() == [0.5, 0.5, 1.0]
     assert model.rewards["r"].transition.tolist() == [0, 6, 0]
-    assert row_reward(model).tolist() == row_reward(model, "r").tolist() == [6, 0]
-    assert row_reward(model, np.array([1.0, 2.0])).tolist() == [1, 2]
+    assert choice_reward(model).tolist() == choice_reward(model, "r").tolist() == [6, 0]
+    assert choice_reward(model, np.array([1.0, 2.0])).tolist() == [1, 2]
 
 
 def test_unsigned_numbers_are_taken():

@@ -333,7 +333,7 @@ def test_rows_and_weights_are_one_policy():
 
 def test_rewards_are_named_inside_jit():
     model = example().model
-    row = jl.models.row_reward(model, "gain")
+    row = jl.models.choice_reward(model, "gain")
     solve = jax.jit(lambda m, r: jl.optimal_value(m, r, 0.9))
 
     @jax.jit
@@ -415,7 +415,7 @@ def test_products_are_solved_without_padding(label_on):
     assert_solutions_agree(soft, jl.soft_value(flat, reward, 0.9), 1e-10)
     np.testing.assert_allclose(against.value, jl.optimal_value(lazy, reward, 0.9).value, atol=1e-6)
     np.testing.assert_allclose(
-        visits.value @ jl.models.row_reward(flat, "gain"),
+        visits.value @ jl.models.choice_reward(flat, "gain"),
         np.sum(flat.initial * host.value.ravel()),
         atol=1e-6,
     )

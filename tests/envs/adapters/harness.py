@@ -8,7 +8,7 @@ import pytest
 from jax import lax
 
 from jaxltl.core.environments.environment import allowed_in, random_action
-from jaxltl.core.environments.episodes import step_or_reset
+from jaxltl.core.environments.episodes import auto_reset_step
 
 
 def load(name):
@@ -36,7 +36,7 @@ def walk(env, key, num_steps):
     def go(world, key):
         choose, step = jax.random.split(key)
         action = random_action(choose, env.actions, allowed_in(env, world))
-        after, found = step_or_reset(env, world, action, step)
+        after, found = auto_reset_step(env, world, action, step)
         return after, (
             env.observe(world),
             action,

@@ -14,7 +14,7 @@ import numpy as np
 
 import jaxltl as jl
 from jaxltl.core.environments.environment import random_action
-from jaxltl.core.environments.episodes import step_or_reset
+from jaxltl.core.environments.episodes import auto_reset_step
 from tests.envs.adapters.harness import keys_of, own_walk, walk
 
 LIMIT, STEPS, WALKS = 20, 50, 3  # an episode's steps, a walk's, and how many walks are one vmap
@@ -258,7 +258,7 @@ def of_contacts(env, reset, step, steps=STEPS, walks=WALKS):
     def go(world, key):
         choose, at = jax.random.split(key)
         action = random_action(choose, env.actions)
-        after, found = step_or_reset(env, world, action, at)
+        after, found = auto_reset_step(env, world, action, at)
         return after, (world, action, found._replace(world=env.observe(found.world)))
 
     def walked(key):

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxltl.core.environments.episodes import agent_of, run_episode
+from jaxltl.core.environments.episodes import make_agent, run_episode
 from jaxltl.core.environments.time_limit import with_time_limit
 from jaxltl.envs import from_brax
 from tests.envs.adapters.harness import (  # noqa: F401
@@ -59,7 +59,7 @@ def test_a_limit_of_ours_and_labels(envs):
         from_brax(envs.get_environment("fast"), labels=fast, propositions=["fast"]), 10
     )
     episode = run_episode(
-        jax.random.key(0), env, agent_of(lambda seen, key: jnp.ones(1)), num_steps=12
+        jax.random.key(0), env, make_agent(lambda seen, key: jnp.ones(1)), num_steps=12
     )
     assert episode.valid.sum() == 10 and episode.truncated and not episode.terminated
     speed = 0.02 * np.arange(13).clip(max=10)

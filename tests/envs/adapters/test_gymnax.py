@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxltl.core.environments.environment import Box, Finite
-from jaxltl.core.environments.episodes import agent_of, run_episode
+from jaxltl.core.environments.episodes import make_agent, run_episode
 from jaxltl.envs import from_gymnax
 from tests.envs.adapters.harness import (  # noqa: F401
     both_ends,
@@ -61,7 +61,7 @@ def test_boxes_labels_and_params(gymnax):
     assert isinstance(env.actions, Box) and env.actions.shape == (1,) and env.horizon == 200
     cartpole, params = gymnax.make("CartPole-v1")
     gravity = params.replace(gravity=jnp.array([1.0, 20.0]))
-    always = agent_of(lambda seen, key: jnp.int32(1))
+    always = make_agent(lambda seen, key: jnp.int32(1))
 
     def fall(gravity):
         env = from_gymnax(

@@ -17,7 +17,7 @@ from jaxltl.core.models.ops.kernels import gather, owners
 from jaxltl.core.models.ops.operators import is_deterministic
 from jaxltl.core.models.product import Product, flat_successor
 from jaxltl.core.models.protocols import Model
-from jaxltl.core.models.sparse import Rewards, SparseMDP, reward_parts
+from jaxltl.core.models.sparse import Rewards, SparseMDP, reward_structure
 from jaxltl.core.types import Solution
 
 
@@ -34,7 +34,7 @@ def compiled_form(model: Model, reward: Any = None) -> tuple[Any, Any]:
 
     Args:
       model: a model or a game.
-      reward: as of :func:`~jaxltl.core.models.sparse.row_reward`, or None.
+      reward: as of :func:`~jaxltl.core.models.sparse.choice_reward`, or None.
 
     Returns:
       A sparse model without names, rewards and variables, which programs would only be compiled
@@ -51,7 +51,7 @@ def compiled_form(model: Model, reward: Any = None) -> tuple[Any, Any]:
     if not isinstance(model, SparseMDP):
         return model, reward
     if reward is not None:
-        reward = reward_parts(model, reward)
+        reward = reward_structure(model, reward)
     none = np.zeros((model.num_states, 0), bool)
     return replace(
         model, label=none, propositions=(), rewards={}, valuation={}, action=None, action_names=()
@@ -70,7 +70,7 @@ def _named_reward(model: Model, reward: Any) -> tuple[Any, Any]:
     return model, reward
 
 
-def in_shape_of(model: Model, solution: Solution) -> Solution:
+def reshape_solution(model: Model, solution: Solution) -> Solution:
     """A solution of a model's compiled form, with the model's states."""
     lazy = model.mdp if isinstance(model, Game) else model
     if not (is_sparse(lazy) and isinstance(lazy, Product)):
@@ -89,7 +89,7 @@ def in_shape_of(model: Model, solution: Solution) -> Solution:
     )
 
 
-def flat_policy(model: Model, policy: Any) -> Any:
+def flatten_policy(model: Model, policy: Any) -> Any:
     """A policy for the compiled form: of a product of a sparse model rows ``int32[S * Q]``."""
     if is_sparse(model) and isinstance(model, Product) and np.ndim(policy) == 2:
         return policy.reshape(-1)

@@ -22,7 +22,7 @@ from jaxltl.core.logic.ltl import Formula, parse_ltl
 from jaxltl.core.models.ops.array_namespace import is_traced, namespace, to_jax
 from jaxltl.core.models.construct.lifting import allowed_steps, memory_along
 from jaxltl.core.models.mdp import MDP
-from jaxltl.core.models.product import Product, letters_of, product
+from jaxltl.core.models.product import Product, occurring_letters, product
 from jaxltl.core.models.construct.restrict import with_allowed
 from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.trajectories import Trajectories, make_trajectories, require_states
@@ -60,7 +60,9 @@ def stack_products(worlds: Sequence[MDP], task: Task, *, label_on: str = "exit")
     if isinstance(task, str | Formula):
         formula = parse_ltl(task) if isinstance(task, str) else task
         known = set(formula.propositions)
-        shown = {x for world in worlds for x in letters_of(world, known & set(world.propositions))}
+        shown = {
+            x for world in worlds for x in occurring_letters(world, known & set(world.propositions))
+        }
         task = to_automaton(formula, letters=sorted(shown, key=sorted))
     num_states = max(world.num_states for world in worlds)
     width = max(world.num_successors for world in worlds)
@@ -217,7 +219,7 @@ def narrow(models: Product, allowed: Any) -> Product:
     return replace(models, allowed=to_jax(np.stack([np.asarray(x) for x in masks])))
 
 
-def lift_memory(policy: jax.Array, task: Automaton | int) -> jax.Array:
+def lift_memory_policy(policy: jax.Array, task: Automaton | int) -> jax.Array:
     """A policy with the memory of one automaton, in the product with a synchronized one.
 
     Args:
@@ -229,7 +231,7 @@ def lift_memory(policy: jax.Array, task: Automaton | int) -> jax.Array:
       the policy.
 
     Example:
-      >>> lift_memory(jnp.array([[[0.0, 1.0], [1.0, 0.0]]]), 2)[0, :, 1].tolist()
+      >>> lift_memory_policy(jnp.array([[[0.0, 1.0], [1.0, 0.0]]]), 2)[0, :, 1].tolist()
       [1.0, 1.0, 0.0, 0.0]
     """
     num2 = task if isinstance(task, int) else len(task.delta)
@@ -318,7 +320,7 @@ def split_trajectories(
     return first, second
 
 
-def demonstrated_counts(
+def demonstration_counts(
     models: Product,
     trajectories: Demonstrations,
     *,
@@ -410,7 +412,7 @@ def training_counts(
     *,
     horizon: int | None = None,
 ) -> tuple[jax.Array, jax.Array]:
-    """:func:`demonstrated_counts` of what is learned from and of what is held out.
+    """:func:`demonstration_counts` of what is learned from and of what is held out.
 
     Args:
       models: stacked products.
@@ -425,9 +427,9 @@ def training_counts(
     test: Any = held_out
     if held_out is None or isinstance(held_out, int | float):
         demonstrations, test = split_trajectories(demonstrations, held_out or 0.0)
-    counts = demonstrated_counts(models, demonstrations, horizon=horizon)
+    counts = demonstration_counts(models, demonstrations, horizon=horizon)
     if not (np.asarray(counts) > 0).any():
         raise ValueError(
             "demonstrations: no pair is left to learn from; give more, or a smaller held_out."
         )
-    return counts, demonstrated_counts(models, test, horizon=horizon)
+    return counts, demonstration_counts(models, test, horizon=horizon)

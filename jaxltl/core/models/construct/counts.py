@@ -293,7 +293,7 @@ def _found(keys: tuple[Integers, Integers], wanted: Integers) -> Integers:
     return np.where(key[at] == wanted, order[at], -1)
 
 
-def counts_on(model: MDP | DenseMDP | SparseMDP, counts: TransitionCounts) -> NDArray[np.int64]:
+def align_counts(model: MDP | DenseMDP | SparseMDP, counts: TransitionCounts) -> NDArray[np.int64]:
     """Counts in the place of a model's probabilities; states and actions are matched by name.
 
     Args:
@@ -309,7 +309,7 @@ def counts_on(model: MDP | DenseMDP | SparseMDP, counts: TransitionCounts) -> ND
     Example:
       >>> from jaxltl import make_sparse
       >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
-      >>> counts_on(coin, make_counts([0, 0, 0], [0, 0, 0], [2, 1, 2])).tolist()
+      >>> align_counts(coin, make_counts([0, 0, 0], [0, 0, 0], [2, 1, 2])).tolist()
       [1, 2, 0, 0]
     """
     _require_counts(counts)
@@ -380,7 +380,7 @@ def place_of(
 # --- a model of their own ---------------------------------------------------------------------
 
 
-def counted_model(
+def model_from_counts(
     counts: TransitionCounts,
     *,
     initial: str | int | Mapping[Any, float] | Sequence[Any],
@@ -415,8 +415,8 @@ def counted_model(
 
     Example:
       >>> counts = make_counts([0, 0, 1], [0, 0, 0], [0, 1, 1], [7, 3, 9], states=["a", "b"])
-      >>> model, count = counted_model(counts, initial="a", labels={"done": ["b"]})
-      >>> model.probability.tolist(), count.tolist(), model.states_where("done").tolist()
+      >>> model, count = model_from_counts(counts, initial="a", labels={"done": ["b"]})
+      >>> model.probability.tolist(), count.tolist(), model.states_with_label("done").tolist()
       ([0.7, 0.3, 1.0], [7, 3, 9], [False, True])
     """
     _require_counts(counts)

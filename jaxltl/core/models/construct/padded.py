@@ -11,7 +11,7 @@ from jaxltl.core.models.sparse import SparseMDP
 _LARGEST = 8 * 2**30  # bytes of the largest model that is padded
 
 
-def action_of(model: SparseMDP) -> np.ndarray:
+def row_actions(model: SparseMDP) -> np.ndarray:
     """The action that each row of a sparse model becomes when it is padded, ``int[R]``."""
     if not isinstance(model, SparseMDP):
         raise ValueError(validation.unsupported_model(model))
@@ -43,7 +43,7 @@ def to_padded(model: SparseMDP) -> MDP:
       >>> to_padded(model).successor.tolist()
       [[[1, 2]], [[1, 0]], [[2, 0]]]
     """
-    column, host = action_of(model), model.host
+    column, host = row_actions(model), model.host
     width = int(np.diff(host.entry_start).max())
     num_actions = int(column.max()) + 1
     shape = (host.num_states, num_actions, width)
@@ -70,9 +70,9 @@ def to_padded(model: SparseMDP) -> MDP:
     )
 
 
-def padded_rows(model: SparseMDP, quantity: np.ndarray) -> np.ndarray:
+def pad_rows(model: SparseMDP, quantity: np.ndarray) -> np.ndarray:
     """A quantity on rows ``[R]`` as one of the padded model, ``[S, A]``; zero where unavailable."""
-    action = action_of(model)
+    action = row_actions(model)
     found = np.zeros((model.num_states, int(action.max()) + 1), quantity.dtype)
     found[model.host.state, action] = quantity
     return found

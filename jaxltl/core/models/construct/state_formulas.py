@@ -68,7 +68,7 @@ def states_satisfying(
     return satisfying(label_columns(model, names, place), names, condition, place)
 
 
-def letters_of(
+def state_letters(
     model: SparseMDP, names: Collection[str], place: str = "the formula"
 ) -> tuple[list[frozenset[str]], np.ndarray]:
     """The sets of labels that occur, of those named, and the number of each state's: ``int[S]``.

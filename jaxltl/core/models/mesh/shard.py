@@ -17,11 +17,17 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxltl.core import validation
 from jaxltl.core.models import facts
 from jaxltl.core.models.construct.convert import to_sparse
-from jaxltl.core.models.construct.padded import action_of
+from jaxltl.core.models.construct.padded import row_actions
 from jaxltl.core.models.mesh.lanes import automatic, axes_of, on_host
 from jaxltl.core.models.mesh.sharded import RowTable, ShardedMDP
 from jaxltl.core.models.protocols import Model
-from jaxltl.core.models.sparse import SparseMDP, check_entries, checked_starts, row_reward, scaled
+from jaxltl.core.models.sparse import (
+    SparseMDP,
+    check_entries,
+    checked_starts,
+    choice_reward,
+    scaled,
+)
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
 
@@ -96,11 +102,11 @@ def shard(
       [1.0, 2.0]
     """
     sparse = to_sparse(model)
-    host, column = sparse.host, action_of(sparse)
+    host, column = sparse.host, row_actions(sparse)
     ordered = _order(sparse, order)
     place = np.empty(ordered.size, np.int64)
     place[ordered] = np.arange(ordered.size)
-    rewards = {name: row_reward(sparse, name) for name in sparse.rewards}
+    rewards = {name: choice_reward(sparse, name) for name in sparse.rewards}
     initial, label = np.asarray(sparse.initial, np.float64), np.asarray(sparse.label)
 
     def part(start: int, stop: int) -> ModelPart:

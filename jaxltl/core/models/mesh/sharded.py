@@ -20,7 +20,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxltl.core.models import facts
 from jaxltl.core.models.ops import kernels, operators
-from jaxltl.core.models.product import label_rows, shown_by
+from jaxltl.core.models.product import distinct_labels, letters_by_state
 from jaxltl.core.models.protocols import Model
 from jaxltl.core.pretty_print import brief
 from jaxltl.core import validation
@@ -254,12 +254,12 @@ def _across(available: jax.Array, quantity: jax.Array) -> jax.Array:
     return available.reshape(available.shape[0], *(1,) * missing, available.shape[1])
 
 
-@label_rows.register
+@distinct_labels.register
 def _(world: ShardedMDP) -> np.ndarray:
     return np.asarray(world.shown)
 
 
-@shown_by.register
+@letters_by_state.register
 def _(world: ShardedMDP, letter: np.ndarray) -> jax.Array:
     return _looked_up(world.kind, letter)
 
@@ -267,7 +267,7 @@ def _(world: ShardedMDP, letter: np.ndarray) -> jax.Array:
 _looked_up = jax.jit(lambda kind, letter: kernels.gather(letter, kind))
 
 
-@operators.given_states.register
+@operators.unpadded_states.register
 def _(model: ShardedMDP) -> jax.Array:
     return model.number >= 0
 
@@ -289,7 +289,7 @@ def _(model: ShardedMDP, region: jax.Array) -> jax.Array:
 
 @operators.least_successor.register
 def _(model: ShardedMDP, value: jax.Array) -> jax.Array:
-    return operators.combined(model, value, kernels.only_real, jnp.minimum)
+    return operators.combined(model, value, kernels.where_positive, jnp.minimum)
 
 
 @operators.following.register

@@ -119,7 +119,7 @@ def hits(weight: jax.Array, inside: jax.Array) -> jax.Array:
     return (weight > 0) & inside
 
 
-def only_real(weight: jax.Array, value: jax.Array) -> jax.Array:
+def where_positive(weight: jax.Array, value: jax.Array) -> jax.Array:
     """The value where a successor has positive weight, else the largest of its dtype."""
     return jnp.where(weight > 0, value, largest(value.dtype))
 

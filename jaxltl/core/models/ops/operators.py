@@ -33,7 +33,7 @@ from jaxltl.core.models.ops.choices import choice_shape, choices
 from jaxltl.core.models.ops.choices import first_action as first_action
 from jaxltl.core.models.ops.choices import is_deterministic as is_deterministic
 from jaxltl.core.models.ops.entries import entries
-from jaxltl.core.models.ops.kernels import only_real
+from jaxltl.core.models.ops.kernels import where_positive
 from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.types import describe_row, row_tolerance
@@ -248,7 +248,7 @@ def combined(
 
 
 @singledispatch
-def given_states(model: Model) -> jax.Array | bool:
+def unpadded_states(model: Model) -> jax.Array | bool:
     """The states that are the model's own: all, but of one on a mesh ``bool[N]``."""
     return True
 
@@ -283,7 +283,7 @@ def _(model: MDP, region: jax.Array) -> jax.Array:
 
 @least_successor.register
 def _(model: MDP, value: jax.Array) -> jax.Array:
-    return combined(model, value, only_real, jnp.minimum)
+    return combined(model, value, where_positive, jnp.minimum)
 
 
 @combined.register
@@ -374,7 +374,7 @@ def _(model: DenseMDP, region: jax.Array) -> jax.Array:
 
 @least_successor.register
 def _(model: DenseMDP, value: jax.Array) -> jax.Array:
-    return only_real(model.successor_probability, value).min(-1)
+    return where_positive(model.successor_probability, value).min(-1)
 
 
 @sample_successor.register
@@ -406,7 +406,7 @@ def _(model: SparseMDP, region: jax.Array) -> jax.Array:
 @least_successor.register
 def _(model: SparseMDP, value: jax.Array) -> jax.Array:
     of = entries(model)
-    reached = only_real(of.probability, kernels.gather(value, of.successor))
+    reached = where_positive(of.probability, kernels.gather(value, of.successor))
     return of.over_entries(jax.ops.segment_min, reached)
 
 
@@ -495,7 +495,7 @@ def valid_policy(model: Model, policy: jax.Array, where: jax.Array | bool = True
     given = jnp.where(available | (policy == 0), policy, jnp.nan)
     total = over.sum(given)
     row = (jnp.abs(total - 1) <= row_tolerance(policy.dtype)) & over.all(given >= 0)
-    row |= ~jnp.asarray(where & given_states(model))
+    row |= ~jnp.asarray(where & unpadded_states(model))
     uniform = available / over.spread(jnp.maximum(over.sum(available), 1))
     used = jnp.where(
         over.spread(row), jnp.where(available, policy, 0), uniform.astype(policy.dtype)
@@ -509,7 +509,7 @@ def require_policy(model: Model, policy: Any, where: Any = True) -> None:
     Raises:
       ValueError: a row is no distribution over available actions, with its state; or a shape.
     """
-    if is_traced((model, policy, where)) or given_states(model) is not True:
+    if is_traced((model, policy, where)) or unpadded_states(model) is not True:
         return
     world = getattr(model, "mdp", model)
     if isinstance(world, SparseMDP):

@@ -93,7 +93,7 @@ class Primitives:
 
 @brief
 @struct.dataclass
-class SpreadSuccessors:
+class ShardedSuccessorTable:
     """As :class:`Successors` of a model over a mesh, one table of all choices.
 
     Attributes:
@@ -140,7 +140,7 @@ class Predecessors(NamedTuple):
         return kernels.fold(list(self.pair), list(self.probability), mass)
 
 
-def table(model: Model) -> Successors | SpreadSuccessors | Primitives | Entries:
+def table(model: Model) -> Successors | ShardedSuccessorTable | Primitives | Entries:
     """What sweeps a model: its successors where they can be written down, else its primitives.
 
     Of a sparse model, or a game on one, its entries.
@@ -153,7 +153,7 @@ def table(model: Model) -> Successors | SpreadSuccessors | Primitives | Entries:
     return successors(model) or Primitives(model)
 
 
-def _spread_out(model: ShardedMDP) -> SpreadSuccessors | None:
+def _spread_out(model: ShardedMDP) -> ShardedSuccessorTable | None:
     num_actions, width = model.num_actions, model.num_successors
     if model.place is not None or num_actions * width > kernels.WRITTEN_OUT:
         return None
@@ -164,7 +164,7 @@ def _spread_out(model: ShardedMDP) -> SpreadSuccessors | None:
         ]
         for x in model.tables[0]
     )
-    return SpreadSuccessors(model, successor, probability)
+    return ShardedSuccessorTable(model, successor, probability)
 
 
 def successors(model: Model) -> Successors | None:

@@ -37,7 +37,7 @@ def average_reward(
 
     Args:
       model: a SparseMDP, or any concrete model that :func:`to_sparse` takes.
-      reward: as for :func:`~jaxltl.core.models.sparse.row_reward`; finite.
+      reward: as for :func:`~jaxltl.core.models.sparse.choice_reward`; finite.
       objective: ``"max"`` or ``"min"``; of chains either.
       tolerance: the width of the enclosure asked for, as a share of the value; where that is
         small, of a millionth of the largest reward (a thousandth, if some are negative).

@@ -17,13 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core.values.engine.validated import validated
-from jaxltl.core.models.construct.padded import padded_rows
-from jaxltl.core.models.compiled.compiled import compiled_form, in_shape_of
+from jaxltl.core.models.construct.padded import pad_rows
+from jaxltl.core.models.compiled.compiled import compiled_form, reshape_solution
 from jaxltl.core.models.game import Game, as_game, as_padded_game, is_deterministic
 from jaxltl.core.models.mesh.sharded import refuse_sharded
 from jaxltl.core.models.ops.array_namespace import is_traced
 from jaxltl.core.models.ops.operators import induced_chain
-from jaxltl.core.models.sparse import SparseMDP, row_reward
+from jaxltl.core.models.sparse import SparseMDP, choice_reward
 from jaxltl.core.types import Solution, status_code
 from jaxltl.core.values.discounted.discounted import expected_reward
 
@@ -43,7 +43,7 @@ def mean_payoff(game: Any, reward: chex.Array, *, max_steps: int = 100_000) -> S
       game: a deterministic Game; any other model is the game in which the system always moves.
       reward: ``float[S, A]`` or ``float[S, A, K]``, finite; moves of both players count. In a game
         on a sparse model, which is padded for it, as of
-        :func:`~jaxltl.core.models.sparse.row_reward`.
+        :func:`~jaxltl.core.models.sparse.choice_reward`.
       max_steps: pairs of strategies to look at at most.
 
     Returns:
@@ -72,11 +72,11 @@ def mean_payoff(game: Any, reward: chex.Array, *, max_steps: int = 100_000) -> S
     form, reward = compiled_form(asked, reward)
     if isinstance(form.mdp, SparseMDP):
         host = form.mdp.host
-        earned = padded_rows(form.mdp, row_reward(form.mdp, reward))
+        earned = pad_rows(form.mdp, choice_reward(form.mdp, reward))
         found = mean_payoff(as_padded_game(form), earned, max_steps=max_steps)
-        row = padded_rows(form.mdp, np.arange(host.num_rows))
+        row = pad_rows(form.mdp, np.arange(host.num_rows))
         policy = row[np.arange(host.num_states), np.asarray(found.policy)]
-        return in_shape_of(asked, replace(found, policy=jnp.asarray(policy, jnp.int32)))
+        return reshape_solution(asked, replace(found, policy=jnp.asarray(policy, jnp.int32)))
     game, reward = form, expected_reward(form, reward)
     if not is_deterministic(game):
         raise ValueError(

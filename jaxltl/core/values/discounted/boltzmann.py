@@ -12,7 +12,7 @@ import numpy as np
 from jax import lax
 
 from jaxltl.core.values.engine.validated import validated
-from jaxltl.core.models.compiled.compiled import compiled_form, in_shape_of
+from jaxltl.core.models.compiled.compiled import compiled_form, reshape_solution
 from jaxltl.core.models.ops.choices import choices
 from jaxltl.core.models.ops.successor_tables import table
 from jaxltl.core.types import Solution, Status, status_code
@@ -90,7 +90,7 @@ def boltzmann_value(
     Args:
       model: the model.
       reward: ``float[S, A]`` or ``float[S, A, K]``; of a sparse model a name or as of
-        :func:`~jaxltl.core.models.sparse.row_reward`.
+        :func:`~jaxltl.core.models.sparse.choice_reward`.
       discount: scalar in [0, 1).
       initial: ``float[S]``, where to start; default zero.
       adjoint: ``"exact"``, or ``"approximate"`` for the sensitivity (2.7) that holds the
@@ -116,7 +116,7 @@ def boltzmann_value(
       2.0
     """
     form, reward = compiled_form(model, reward)
-    return in_shape_of(
+    return reshape_solution(
         model,
         _boltzmann_value(
             form, reward, discount, initial, tolerance, max_steps, adjoint=adjoint, method=method

@@ -20,12 +20,12 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxltl.core.values.engine.validated import validated
-from jaxltl.core.models.compiled.compiled import compiled_form, flat_policy, in_shape_of
+from jaxltl.core.models.compiled.compiled import compiled_form, flatten_policy, reshape_solution
 from jaxltl.core.models.ops.array_namespace import is_traced
 from jaxltl.core.models.ops.choices import choices
 from jaxltl.core.models.ops.operators import expectation, following, require_policy, valid_policy
 from jaxltl.core.models.ops.successor_tables import table
-from jaxltl.core.models.sparse import SparseMDP, row_reward
+from jaxltl.core.models.sparse import SparseMDP, choice_reward
 from jaxltl.core.types import Solution, status_code
 from jaxltl.core.values.engine import newton
 from jaxltl.core.values.engine.certificates import Enclosure, enclose, refuse, rounding_unit
@@ -59,13 +59,13 @@ def expected_reward(model: Any, reward: jax.Array) -> jax.Array:
     """A reward on pairs ``[S, A]`` or transitions ``[S, A, K]`` as its expectation ``[S, A]``.
 
     Zero at unavailable actions; what stands there and in padding is not read. Of a sparse model it
-    is that of :func:`~jaxltl.core.models.sparse.row_reward`.
+    is that of :func:`~jaxltl.core.models.sparse.choice_reward`.
 
     Raises:
       ValueError: the reward has another shape.
     """
     if isinstance(getattr(model, "mdp", model), SparseMDP):
-        return jnp.asarray(row_reward(getattr(model, "mdp", model), reward), model.dtype)
+        return jnp.asarray(choice_reward(getattr(model, "mdp", model), reward), model.dtype)
     actions = (*model.state_shape, model.num_actions)
     transitions = (*actions, model.num_successors)
     reward = jnp.asarray(reward, model.dtype)
@@ -210,7 +210,7 @@ def policy_value(
       model: the model.
       policy: ``float[S, A]`` or ``int32[S]``.
       reward: ``float[S, A]`` or ``float[S, A, K]``; of a sparse model a name or as of
-        :func:`~jaxltl.core.models.sparse.row_reward`.
+        :func:`~jaxltl.core.models.sparse.choice_reward`.
       discount: scalar in [0, 1).
       tolerance: certified absolute error asked for; default: what the dtype allows.
       max_steps: sweeps at most.
@@ -233,9 +233,11 @@ def policy_value(
     if is_sparse(model) and not is_traced((model, policy, reward, discount, tolerance)):
         return discounted(model, reward, discount, policy=policy, tolerance=tolerance)
     form, reward = compiled_form(model, reward)
-    policy = flat_policy(model, policy)
+    policy = flatten_policy(model, policy)
     require_policy(form, policy)
-    return in_shape_of(model, _policy_value(form, policy, reward, discount, tolerance, max_steps))
+    return reshape_solution(
+        model, _policy_value(form, policy, reward, discount, tolerance, max_steps)
+    )
 
 
 @jax.jit
@@ -288,7 +290,7 @@ def optimal_value(
     Args:
       model: the model.
       reward: ``float[S, A]`` or ``float[S, A, K]``; of a sparse model a name or as of
-        :func:`~jaxltl.core.models.sparse.row_reward`.
+        :func:`~jaxltl.core.models.sparse.choice_reward`.
       discount: scalar in [0, 1).
       method: ``"policy_iteration"`` (Howard 1960, its systems solved to a hundredth),
         ``"modified_policy_iteration"`` (Puterman and Shin 1978: after each sweep of the
@@ -318,7 +320,7 @@ def optimal_value(
     if is_sparse(model) and not is_traced((model, reward, discount, tolerance)):
         return discounted(model, reward, discount, tolerance=tolerance)
     form, reward = compiled_form(model, reward)
-    return in_shape_of(
+    return reshape_solution(
         model,
         _optimal_value(
             form,

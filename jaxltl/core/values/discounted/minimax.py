@@ -21,7 +21,7 @@ from jax import lax
 from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.graphs.attractor import attract
 from jaxltl.core.graphs.graph import Graph, graph_of, take
-from jaxltl.core.models.compiled.compiled import compiled_form, flat_policy, in_shape_of
+from jaxltl.core.models.compiled.compiled import compiled_form, flatten_policy, reshape_solution
 from jaxltl.core.models.game import Game, as_game
 from jaxltl.core.models.ops.array_namespace import namespace, to_jax
 from jaxltl.core.models.ops.choices import choice_shape, choices
@@ -72,7 +72,7 @@ def minimax_value(
     Args:
       game: a Game; any other model is the game in which the system always moves.
       reward: ``float[S, A]`` or ``float[S, A, K]``; what is paid at environment states counts. In
-        a game on a sparse model as of :func:`~jaxltl.core.models.sparse.row_reward`.
+        a game on a sparse model as of :func:`~jaxltl.core.models.sparse.choice_reward`.
       discount: scalar in [0, 1).
       per: ``"move"`` or ``"system_move"``, which moves are discounted.
       method: ``"policy_iteration"``: linear solves for both players' greedy choices (Pollatschek
@@ -125,7 +125,7 @@ def minimax_value(
     moves = moves & ~graph.on_choices(lost) & ~graph.exists(lost)
     defined = _returns(graph, per, system | lost, moves, xp.zeros_like(lost))
     moves, live = to_jax((moves, ~lost))
-    return in_shape_of(
+    return reshape_solution(
         given,
         _solve(
             game,
@@ -198,7 +198,7 @@ def strategy_value(
     game, reward = compiled_form(asked, reward)
     if isinstance(environment, str):
         environment = None
-    strategy, environment = (flat_policy(asked.mdp, x) for x in (strategy, environment))
+    strategy, environment = (flatten_policy(asked.mdp, x) for x in (strategy, environment))
     given = [("strategy", strategy, game.system)]
     if environment is not None:
         given.append(("environment", environment, ~game.system))
@@ -219,7 +219,7 @@ def strategy_value(
     moves = moves & ~graph.on_choices(lost)
     defined = _returns(graph, per, system | lost, moves, drawn)
     moves, drawn, live = to_jax((moves, drawn, ~lost))
-    return in_shape_of(
+    return reshape_solution(
         asked,
         _solve(
             game,

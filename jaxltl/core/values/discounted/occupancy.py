@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxltl.core.values.engine.validated import validated
-from jaxltl.core.models.compiled.compiled import compiled_form, flat_policy
+from jaxltl.core.models.compiled.compiled import compiled_form, flatten_policy
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.ops.choices import choices
 from jaxltl.core.models.ops.operators import pushforward, require_policy, valid_policy
@@ -60,7 +60,7 @@ def occupancy_measure(
       >>> [round(v, 4) for v in x[:, 0].tolist()]
       [1.0, 1.0]
     """
-    (form, _), policy = compiled_form(model), flat_policy(model, policy)
+    (form, _), policy = compiled_form(model), flatten_policy(model, policy)
     require_policy(form, policy)
     start = model.initial if initial is None else initial
     return _occupancy(form, policy, discount, start, tolerance)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxltl.core.values.engine.validated import validated
-from jaxltl.core.models.compiled.compiled import compiled_form, in_shape_of
+from jaxltl.core.models.compiled.compiled import compiled_form, reshape_solution
 from jaxltl.core.models.ops.choices import choices
 from jaxltl.core.models.ops.operators import expectation, pushforward
 from jaxltl.core.models.ops.successor_tables import Predecessors, table
@@ -50,7 +50,7 @@ def soft_value(
     Args:
       model: the model.
       reward: ``float[S, A]`` or ``float[S, A, K]``; of a sparse model a name or as of
-        :func:`~jaxltl.core.models.sparse.row_reward`.
+        :func:`~jaxltl.core.models.sparse.choice_reward`.
       discount: scalar in [0, 1).
       initial: ``float[S]``, where to start; default zero. It changes the number of steps only.
       method: ``"newton"`` (soft policy iteration, few linear solves, for any discount)
@@ -76,7 +76,7 @@ def soft_value(
       1.3863
     """
     form, reward = compiled_form(model, reward)
-    return in_shape_of(
+    return reshape_solution(
         model, _soft_value(form, reward, discount, initial, tolerance, max_steps, method=method)
     )
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxltl.core.models.construct.convert import to_sparse
-from jaxltl.core.models.compiled.compiled import flat_policy
+from jaxltl.core.models.compiled.compiled import flatten_policy
 from jaxltl.core.models.compiled.compiled import is_sparse as is_sparse
 from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
 from jaxltl.core.models.ops.operators import is_deterministic, require_weights, row_weights
@@ -122,7 +122,7 @@ def induced_chain(model: Any, sparse: SparseMDP, policy: Any) -> Chain:
     """
     host = sparse.host
     if is_sparse(model):
-        weight = row_weights(sparse, flat_policy(model, policy))
+        weight = row_weights(sparse, flatten_policy(model, policy))
     else:
         weight = _weights(model, sparse, np.asarray(policy))
         require_weights(host, weight, row_tolerance(np.float64))
@@ -201,7 +201,7 @@ def discounted(
     """Discounted values of a sparse model; arguments as of the functions for padded ones.
 
     Rewards are named, or arrays on states, choices or transitions, see
-    :func:`~jaxltl.core.models.sparse.row_reward`; they are finite.
+    :func:`~jaxltl.core.models.sparse.choice_reward`; they are finite.
     """
     sparse = to_sparse(model)
     earned, magnitude = finite_reward(sparse, reward)

@@ -18,7 +18,7 @@ from jax import lax
 from jaxltl.core.models.mesh.sharded import is_sharded
 from jaxltl.core.models.ops.entries import Entries
 from jaxltl.core.models.ops.operators import transition_matrix
-from jaxltl.core.models.ops.successor_tables import Primitives, SpreadSuccessors, Successors
+from jaxltl.core.models.ops.successor_tables import Primitives, ShardedSuccessorTable, Successors
 from jaxltl.core.values.engine.iterate import in_turn, iterate
 
 Operator = Callable[[jax.Array], jax.Array]
@@ -183,7 +183,7 @@ def solver(
 
 def is_small(table: Any, num_states: int) -> bool:
     """Whether systems of so many states are inverted; those on several devices never are."""
-    spread = isinstance(table, Primitives | SpreadSuccessors) and is_sharded(table.model)
+    spread = isinstance(table, Primitives | ShardedSuccessorTable) and is_sharded(table.model)
     return num_states <= DENSE_LIMIT and not spread
 
 

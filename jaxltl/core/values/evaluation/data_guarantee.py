@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxltl.core.automata.translate import Task
 from jaxltl.core.models.construct.convert import to_sparse
-from jaxltl.core.models.construct.counts import TransitionCounts, counts_on
+from jaxltl.core.models.construct.counts import TransitionCounts, align_counts
 from jaxltl.core.models.interval import IntervalMDP, make_interval
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief
@@ -81,7 +81,7 @@ def learn_guarantee(
 
     Args:
       model: its graph, labels and initial distribution count; its probabilities do not. See
-        :func:`~jaxltl.core.models.construct.counts.counted_model` for one that is made of a log.
+        :func:`~jaxltl.core.models.construct.counts.model_from_counts` for one that is made of a log.
       counts: of its transitions, matched by name; or ``int[T]``, beside its entries.
       task: a formula, its text or an automaton.
       confidence: in (0, 1), of everything that is returned at once.
@@ -111,7 +111,7 @@ def learn_guarantee(
     """
     require_direction(None, objective)
     sparse = to_sparse(model)
-    count = counts_on(sparse, counts) if isinstance(counts, TransitionCounts) else counts
+    count = align_counts(sparse, counts) if isinstance(counts, TransitionCounts) else counts
     sets = intervals_from_counts(
         count,
         confidence,
@@ -232,7 +232,7 @@ def guarantee_curve(
       ((3,), True)
     """
     sparse = to_sparse(model)
-    every = counts_on(sparse, counts) if isinstance(counts, TransitionCounts) else counts
+    every = align_counts(sparse, counts) if isinstance(counts, TransitionCounts) else counts
     every, wanted = np.asarray(every), np.asarray(sizes)
     for name, x in (("counts", every), ("sizes", wanted)):
         if x.ndim != 1 or x.dtype.kind not in "iuf" or (x != np.floor(x)).any():

@@ -80,14 +80,14 @@ def episode_evaluator(
 
     Example:
       >>> from jaxltl import make_environment
-      >>> from jaxltl.core.environments import Timestep, agent_of, make_box
+      >>> from jaxltl.core.environments import Timestep, make_agent, make_box
       >>> def step(place, action, key):
       ...     return Timestep(place + action, -jnp.sum(place**2), False, cost=jnp.sum(action**2))
       >>> cart = make_environment(
       ...     lambda key: jnp.ones(1), step, lambda place: place,
       ...     actions=make_box(-1, 1, (1,)), horizon=3)
       >>> def proportional(gain):
-      ...     return agent_of(jax.tree_util.Partial(lambda gain, place, key: -gain * place, gain))
+      ...     return make_agent(jax.tree_util.Partial(lambda gain, place, key: -gain * place, gain))
       >>> evaluate = episode_evaluator(cart, proportional, costs="cost")
       >>> [float(x) for x in evaluate(jnp.array([0.5]), jax.random.key(0))]
       [-1.3125, 0.328125]

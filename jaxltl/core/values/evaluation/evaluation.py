@@ -55,9 +55,9 @@ class EpisodeTotals(NamedTuple):
 
     Example:
       >>> from jaxltl import from_dense
-      >>> from jaxltl.core.environments import agent_of, environment_of
-      >>> clock = environment_of(from_dense([[[0.0, 1.0]], [[1.0, 0.0]]]))
-      >>> agent = agent_of(lambda observation, key: jnp.int32(0))
+      >>> from jaxltl.core.environments import make_agent, model_environment
+      >>> clock = model_environment(from_dense([[[0.0, 1.0]], [[1.0, 0.0]]]))
+      >>> agent = make_agent(lambda observation, key: jnp.int32(0))
       >>> keys = jax.random.split(jax.random.key(0), 4)
       >>> shapes = jax.eval_shape(jax.vmap(
       ...     lambda key: episode_totals(key, clock, agent, num_steps=3)), keys)
@@ -201,13 +201,13 @@ class Evaluation:
 
     Example:
       >>> from jaxltl import from_dense
-      >>> from jaxltl.core.environments import agent_of, environment_of
+      >>> from jaxltl.core.environments import make_agent, model_environment
       >>> from jaxltl.core.environments.task_environment import task_environment
       >>> coin = from_dense(
       ...     [[[.0, .6, .4]], [[.0, 1., .0]], [[.0, .0, 1.]]], initial=[1, 0, 0],
       ...     label=[[0, 0], [1, 0], [0, 1]], propositions=["heads", "tails"])
-      >>> task = task_environment(environment_of(coin), "!tails U heads")
-      >>> agent = agent_of(lambda observation, key: jnp.int32(0))
+      >>> task = task_environment(model_environment(coin), "!tails U heads")
+      >>> agent = make_agent(lambda observation, key: jnp.int32(0))
       >>> found = evaluate(jax.random.key(0), agent, task, num_steps=5, threshold=0.8)
       >>> found.success.lower < 0.6 < found.success.upper, found.decision
       (True, False)
@@ -310,7 +310,7 @@ def evaluate(
 
     Args:
       key: of everything that is drawn.
-      agent: what acts, such as ``ppo.policy(state, problem, hparams)``, or ``agent_of(function)``.
+      agent: what acts, such as ``ppo.policy(state, problem, hparams)``, or ``make_agent(function)``.
       environment: plain, or with a task. Visits and shares are those of a task.
       num_episodes: how many; with a threshold at most.
       num_steps: after which an episode is cut off; default the environment's horizon.
@@ -332,12 +332,12 @@ def evaluate(
 
     Example:
       >>> from jaxltl import from_dense, task_environment
-      >>> from jaxltl.core.environments import agent_of, environment_of
+      >>> from jaxltl.core.environments import make_agent, model_environment
       >>> coin = from_dense(
       ...     [[[.0, .6, .4]], [[.0, 1., .0]], [[.0, .0, 1.]]], initial=[1, 0, 0],
       ...     label=[[0, 0], [1, 0], [0, 1]], propositions=["heads", "tails"])
-      >>> task = task_environment(environment_of(coin), "!tails U heads")
-      >>> agent = agent_of(lambda observation, key: jnp.int32(0))
+      >>> task = task_environment(model_environment(coin), "!tails U heads")
+      >>> agent = make_agent(lambda observation, key: jnp.int32(0))
       >>> found = evaluate(jax.random.key(0), agent, task, num_steps=5, threshold=0.8)
       >>> print(str(found).rpartition("\\n")[2].strip())
       success is not at least 0.8

@@ -14,7 +14,7 @@ from jaxltl.core import validation
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.environments.environment import Environment, as_partial
-from jaxltl.core.environments.monitor import Verdict, lasting_verdicts, verdicts
+from jaxltl.core.environments.monitor import Verdict, lasso_verdicts, verdicts
 from jaxltl.core.environments.tabulate import Table
 from jaxltl.core.environments.time_limit import without_time_limit
 from jaxltl.core.logic.ltl import Formula
@@ -256,7 +256,7 @@ def _bounded(
         still=decisions != Verdict.UNDECIDED,
     )
     ended = np.asarray(table.terminated)[found.base_state]
-    at_end = lasting_verdicts(task)[found.memory, letter[found.base_state]]
+    at_end = lasso_verdicts(task)[found.memory, letter[found.base_state]]
     target = np.where(ended, at_end, decisions[found.memory]) == Verdict.SATISFIED
     going = ~np.asarray(table.truncated)[found.base_state]
     best = host.until(found.host, target, going, steps, np.maximum)

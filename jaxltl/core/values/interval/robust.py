@@ -10,7 +10,7 @@ from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP, make_interval
 from jaxltl.core.models.ops.operators import is_deterministic, row_weights
-from jaxltl.core.models.sparse import Rewards, SparseMDP, reward_parts, row_reward
+from jaxltl.core.models.sparse import Rewards, SparseMDP, reward_structure, choice_reward
 from jaxltl.core.sparse.interval import reachability as interval_values
 from jaxltl.core.sparse.interval.discounted import discounted
 from jaxltl.core.sparse.interval.game_encoding import Spread, spread
@@ -136,7 +136,7 @@ def robust_total_reward(
 
     Args:
       model: the model.
-      reward: as of :func:`~jaxltl.core.models.sparse.row_reward`; at least 0. On transitions it is
+      reward: as of :func:`~jaxltl.core.models.sparse.choice_reward`; at least 0. On transitions it is
         taken of the successors with nature's distribution, so these must not differ within a row
         unless the interval is a point.
       target: ``bool[S]``, or the name of a label.
@@ -189,7 +189,7 @@ def robust_discounted_value(
 
     Args:
       model: the model, or a game on one.
-      reward: of any sign, as of :func:`~jaxltl.core.models.sparse.row_reward`; on transitions,
+      reward: of any sign, as of :func:`~jaxltl.core.models.sparse.choice_reward`; on transitions,
         what nature picks earns it.
       discount: in ``[0, 1)``.
       policy, objective, nature: as of :func:`robust_reachability`.
@@ -269,9 +269,9 @@ def entry_reward(model: IntervalMDP, reward: Any) -> np.ndarray:
     Raises:
       ValueError: some of it is not finite.
     """
-    given = reward_parts(model.nominal, reward)
+    given = reward_structure(model.nominal, reward)
     host = model.nominal.host
-    apart = row_reward(model.nominal, Rewards(state=given.state, choice=given.choice))
+    apart = choice_reward(model.nominal, Rewards(state=given.state, choice=given.choice))
     earned = apart[host.row]
     if given.transition is not None:
         earned = earned + np.asarray(given.transition, np.float64)
@@ -290,7 +290,7 @@ def interval_reward(model: IntervalMDP, reward: Any) -> np.ndarray:
     Raises:
       ValueError: it is negative or not finite, or depends on the successor that nature picks.
     """
-    earned = row_reward(model.nominal, reward)
+    earned = choice_reward(model.nominal, reward)
     bad = ~((earned >= 0) & np.isfinite(earned))
     if bad.any():
         row = int(np.flatnonzero(bad)[0])
@@ -300,7 +300,7 @@ def interval_reward(model: IntervalMDP, reward: Any) -> np.ndarray:
             f"{row - int(model.nominal.row_start[state])} is {earned[row]}; it must "
             "be finite and at least 0."
         )
-    of = reward_parts(model.nominal, reward).transition
+    of = reward_structure(model.nominal, reward).transition
     if of is not None:
         each = np.asarray(of)
         start = model.nominal.host.entry_start[:-1]

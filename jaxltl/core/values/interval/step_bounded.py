@@ -118,7 +118,7 @@ def robust_cumulative_reward(
 
     Args:
       model: the model.
-      reward: as for :func:`~jaxltl.core.models.sparse.row_reward`; finite, of any sign.
+      reward: as for :func:`~jaxltl.core.models.sparse.choice_reward`; finite, of any sign.
       num_steps: how many steps.
       objective, nature: as of :func:`robust_next_probability`.
 

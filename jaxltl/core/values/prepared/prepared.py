@@ -18,7 +18,7 @@ from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.mesh.sharded import refuse_sharded
 from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
 from jaxltl.core.models.ops.operators import is_deterministic
-from jaxltl.core.models.sparse import Rewards, row_reward
+from jaxltl.core.models.sparse import Rewards, choice_reward
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.prepared.reachability_plan import Plan, plan_optimum, plan_policy
 from jaxltl.core.sparse.solvers.reachability import reduce_reachability, reduce_total_reward
@@ -116,7 +116,7 @@ def prepare(
       target: ``bool[S]``.
       stay: ``bool[S]``, the states that may be passed before; default all. Not with a reward.
       reward: asks for the expected total reward until the target and not for the probability of
-        reaching it; as of :func:`~jaxltl.core.models.sparse.row_reward`, finite and at least 0.
+        reaching it; as of :func:`~jaxltl.core.models.sparse.choice_reward`, finite and at least 0.
       objective: ``"max"``, ``"min"``, or ``"policy"`` for values of policies that are given later.
 
     Returns:
@@ -153,7 +153,7 @@ def prepare(
     if stay is not None:
         stay = np.asarray(stay, bool).ravel()
         require_shape("stay", stay, (host.num_states,))
-    cost = None if reward is None else row_reward(sparse, reward)
+    cost = None if reward is None else choice_reward(sparse, reward)
     if cost is not None and not (np.isfinite(cost) & (cost >= 0)).all():
         r = int(np.flatnonzero(~(np.isfinite(cost) & (cost >= 0)))[0])
         raise ValueError(

@@ -14,7 +14,7 @@ from jaxltl.core.logic.labels import is_boolean
 from jaxltl.core.logic.ltl import TRUE, Formula
 from jaxltl.core.logic.properties import MAX_UNFOLDED_STEPS, Property, parse_property
 from jaxltl.core.models.construct.state_formulas import states_satisfying
-from jaxltl.core.models.sparse import SparseMDP, row_reward
+from jaxltl.core.models.sparse import SparseMDP, choice_reward
 from jaxltl.core.types import Status
 from jaxltl.core.values.multi_objective.multi_objective import (
     Achievable,
@@ -184,7 +184,7 @@ def _sum(model: SparseMDP, prop: Property) -> dict[str, Any]:
             f"{prop.text}: inside of multi(...) probabilities, R [ F ... ], R [ C ] "
             "and T are solved for."
         )
-    reward = np.ones(model.num_rows) if prop.operator == "T" else row_reward(model, prop.reward)
+    reward = np.ones(model.num_rows) if prop.operator == "T" else choice_reward(model, prop.reward)
     if isinstance(path, Formula):
         target = states_satisfying(model, path.operands[0], prop.text)
         return {"reward": reward, "target": target}

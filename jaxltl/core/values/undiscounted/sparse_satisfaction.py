@@ -12,7 +12,7 @@ from jaxltl.core.automata.automaton import Automaton, letter_index
 from jaxltl.core.automata.runs import live_states, universal_states
 from jaxltl.core.automata.translate import Task, to_automaton
 from jaxltl.core.logic.ltl import as_formula
-from jaxltl.core.models.construct.state_formulas import letters_of
+from jaxltl.core.models.construct.state_formulas import state_letters
 from jaxltl.core.models.ops.operators import is_deterministic
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.sparse import SparseMDP
@@ -286,10 +286,10 @@ def automaton_and_letters(model: SparseMDP, task: Task) -> tuple[Automaton, np.n
     """The automaton of a task over the letters of a model, and the letter of each state."""
     if not isinstance(task, Automaton):
         task = as_formula(task)
-        shown, number = letters_of(model, task.propositions)
+        shown, number = state_letters(model, task.propositions)
         task = to_automaton(task, letters=shown)
     else:
-        shown, number = letters_of(model, task.propositions)
+        shown, number = state_letters(model, task.propositions)
     index = np.array([letter_index(task, letter) for letter in shown], np.int64)
     automaton = replace(
         task,

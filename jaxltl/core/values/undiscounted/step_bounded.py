@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from jaxltl.core.models.construct.convert import to_sparse
-from jaxltl.core.models.sparse import Rewards, SparseMDP, reward_parts, row_reward
+from jaxltl.core.models.sparse import Rewards, SparseMDP, reward_structure, choice_reward
 from jaxltl.core.sparse.solvers import step_bounded as host
 from jaxltl.core.sparse.solvers.reward_bounded import bounded_cost, in_units
 from jaxltl.core.types import Solution, Status
@@ -116,7 +116,7 @@ def cumulative_reward(
 
     Args:
       model: a SparseMDP, or any concrete model that :func:`to_sparse` takes.
-      reward: as for :func:`~jaxltl.core.models.sparse.row_reward`; finite.
+      reward: as for :func:`~jaxltl.core.models.sparse.choice_reward`; finite.
       num_steps, objective, by_step: as for :func:`bounded_reachability`.
 
     Returns:
@@ -194,7 +194,7 @@ def reward_bounded_reachability(
     Args:
       model: a SparseMDP, or any concrete model that :func:`to_sparse` takes.
       target: ``bool[S]``, or the name of a label.
-      reward: as for :func:`~jaxltl.core.models.sparse.row_reward`, not negative, multiples of one
+      reward: as for :func:`~jaxltl.core.models.sparse.choice_reward`, not negative, multiples of one
         unit; numbers are read as the simplest fractions that round to them.
       bound: what may be earned at most.
       stay, objective: as for :func:`bounded_reachability`.
@@ -222,7 +222,7 @@ def reward_bounded_reachability(
     stay = np.ones_like(target) if stay is None else state_mask(model, stay, "stay")
     if not 0 <= bound < math.inf:
         raise ValueError(f"bound={bound}; it must be finite and not negative.")
-    cost = _entry_reward(model, reward_parts(model, reward))
+    cost = _entry_reward(model, reward_structure(model, reward))
     if (cost < 0).any():
         e = int(np.flatnonzero(cost < 0)[0])
         raise ValueError(
@@ -257,7 +257,7 @@ def reduction_for(objective: str) -> Any:
 def state_mask(model: SparseMDP, given: Any, name: str) -> np.ndarray:
     """A set of states as ``bool[S]``, given so (in the model's shape) or by a label."""
     if isinstance(given, str):
-        return np.asarray(model.states_where(given), bool)
+        return np.asarray(model.states_with_label(given), bool)
     given = np.asarray(given).reshape(-1)
     if given.shape != (model.num_states,) or given.dtype != bool:
         raise ValueError(
@@ -273,7 +273,7 @@ def state_reward(model: SparseMDP, reward: Any) -> np.ndarray:
     Raises:
       ValueError: nothing of the reward is on states, or some is not finite.
     """
-    given = reward_parts(model, reward)
+    given = reward_structure(model, reward)
     if given.state is None:
         raise ValueError(
             "the reward of a state after so many steps needs a reward on states, and "
@@ -288,8 +288,8 @@ def finite_reward(model: SparseMDP, reward: Any) -> tuple[np.ndarray, np.ndarray
     Raises:
       ValueError: some reward is not finite.
     """
-    given = reward_parts(model, reward)
-    earned = row_reward(model, given)
+    given = reward_structure(model, reward)
+    earned = choice_reward(model, given)
     if not np.isfinite(earned).all():
         row = int(np.flatnonzero(~np.isfinite(earned))[0])
         state = int(model.host.state[row])
@@ -310,7 +310,7 @@ def finite_reward(model: SparseMDP, reward: Any) -> tuple[np.ndarray, np.ndarray
             ("transition", given.transition),
         )
     }
-    return earned, row_reward(model, Rewards(**sizes))
+    return earned, choice_reward(model, Rewards(**sizes))
 
 
 def _entry_reward(model: SparseMDP, given: Rewards) -> np.ndarray:

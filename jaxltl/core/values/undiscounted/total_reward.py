@@ -16,7 +16,7 @@ from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.mesh.sharded import ShardedMDP, is_sharded
 from jaxltl.core.models.ops.array_namespace import is_traced
 from jaxltl.core.models.product import Product
-from jaxltl.core.models.sparse import Rewards, SparseMDP, row_reward
+from jaxltl.core.models.sparse import Rewards, SparseMDP, choice_reward
 from jaxltl.core.sparse.solvers import reachability as optimal
 from jaxltl.core.types import Solution, require_shape
 from jaxltl.core.values.engine.host_solution import (
@@ -57,7 +57,7 @@ def total_reward(
       model: an MDP, DenseMDP, SparseMDP or product of one, or an IntervalMDP; inside ``jit`` an
         MDP, DenseMDP, ShardedMDP or product of one.
       reward: at least 0. For a sparse model as of
-        :func:`~jaxltl.core.models.sparse.row_reward`: a name, a structure, or an array on states,
+        :func:`~jaxltl.core.models.sparse.choice_reward`: a name, a structure, or an array on states,
         choices or transitions; else ``float[S]`` or ``float[S, A]``, what a step earns, or of a
         ShardedMDP the name of one.
       target: ``bool[S]``; inside ``jit`` and over a mesh there has to be one.
@@ -136,7 +136,7 @@ def total_reward(
 
 def _earned(model: Any, sparse: SparseMDP, reward: Any) -> np.ndarray:
     if is_sparse(model):
-        return row_reward(sparse, reward)
+        return choice_reward(sparse, reward)
     if reward is None or isinstance(reward, str | Rewards):
         raise ValueError(f"reward={reward!r}; only a SparseMDP has named rewards: give an array.")
     reward = np.asarray(reward, np.float64)

@@ -12,9 +12,9 @@ from jaxltl.core.automata.automaton import accepts_lasso, run
 from jaxltl.core.automata.synchronize import synchronize
 from jaxltl.core.models.construct.batch import (
     as_stacked,
-    demonstrated_counts,
+    demonstration_counts,
     is_stacked,
-    lift_memory,
+    lift_memory_policy,
     num_worlds,
     pad_states,
     split_trajectories,
@@ -185,19 +185,19 @@ def test_a_lifted_policy_is_judged_by_the_other_task(label_on):
     rng = np.random.default_rng(1)
     policy = jnp.asarray(rng.dirichlet(np.ones(4), size=direct.state_shape))
     both = jl.product(world, synchronize(direct.automaton, direct.automaton), label_on=label_on)
-    lifted = lift_memory(policy, direct.automaton)
+    lifted = lift_memory_policy(policy, direct.automaton)
     one, other = probability(direct, policy), probability(both, lifted)
     start, pair = (m.initial_memory for m in (direct, both))
     s = jnp.arange(world.num_states)
     np.testing.assert_allclose(other[s, pair], one[s, start], atol=1e-12)
     actions = jnp.asarray(rng.integers(4, size=direct.state_shape))
     np.testing.assert_array_equal(
-        lift_memory(actions, 3)[:, 3 * 2 : 3 * 3], np.repeat(actions[:, 2:3], 3, axis=1)
+        lift_memory_policy(actions, 3)[:, 3 * 2 : 3 * 3], np.repeat(actions[:, 2:3], 3, axis=1)
     )
     memoryless = jl.product(world, synchronize("true", direct.automaton), label_on=label_on)
     flat = jnp.asarray(rng.dirichlet(np.ones(4), size=(world.num_states, 1)))
     np.testing.assert_allclose(
-        probability(memoryless, lift_memory(flat, direct.automaton)),
+        probability(memoryless, lift_memory_policy(flat, direct.automaton)),
         probability(direct, jl.lift_policy(direct, flat[:, 0])),
         atol=1e-12,
     )
@@ -214,7 +214,7 @@ def test_pairs_are_counted_in_each_world():
     models = stack_products([small_world(), small_world()], TASK)
     first = demonstrations([(0, 1), (3, 3), (4, 3), (5, 0)], [(0, 1)])
     empty = first.replace(length=first.length.at[1].set(0))
-    counts = demonstrated_counts(models, [first, empty])
+    counts = demonstration_counts(models, [first, empty])
     assert counts.sum((1, 2, 3)).tolist() == [5, 4]
     memory = np.asarray(models.automaton.delta[0])
     letter = np.asarray(models.letter[0])
@@ -223,10 +223,10 @@ def test_pairs_are_counted_in_each_world():
     assert counts[0, 0, start, 1] == 2 and counts[1, 0, start, 1] == 1
     assert counts[0, 3, after, 3] == counts[0, 4, after, 3] == counts[0, 5, after, 0] == 1
     with pytest.raises(ValueError, match="demonstrations in 1 worlds; expected 2"):
-        demonstrated_counts(models, first)
+        demonstration_counts(models, first)
     wrong = first.replace(state=first.state.at[0, 1].set(5))
     with pytest.raises(ValueError, match="demonstrations in world 1: trajectory 0, step 0"):
-        demonstrated_counts(models, [first, wrong])
+        demonstration_counts(models, [first, wrong])
 
 
 @pytest.mark.parametrize("label_on", ["exit", "entry"])
@@ -238,9 +238,9 @@ def test_pairs_are_those_of_lifted_trajectories(label_on):
     lifted = jl.models.lift_trajectories(model, runs)
     expected = np.zeros((15, model.num_states, 4))
     np.add.at(expected, (np.arange(15), np.asarray(lifted.state), np.asarray(lifted.action)), 1)
-    found = demonstrated_counts(as_stacked(model), runs, horizon=15)
+    found = demonstration_counts(as_stacked(model), runs, horizon=15)
     np.testing.assert_array_equal(found[0].reshape(expected.shape), expected)
-    found = demonstrated_counts(as_stacked(model), runs)
+    found = demonstration_counts(as_stacked(model), runs)
     np.testing.assert_array_equal(found[0].reshape(expected.shape[1:]), expected.sum(0))
 
 

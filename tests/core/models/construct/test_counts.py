@@ -8,10 +8,10 @@ import pytest
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.construct.counts import (
     action_names,
-    counted_model,
-    counts_on,
+    align_counts,
     in_order,
     make_counts,
+    model_from_counts,
     state_names,
 )
 from jaxltl.core.models.game import make_game
@@ -70,8 +70,8 @@ def test_beside_the_entries_of_a_model():
     rng = np.random.default_rng(1)
     for _ in range(20):
         model, count, counts = model_and_counts(rng)
-        assert (counts_on(model, counts) == count).all()
-        assert (counts_on(model.replace(action=None), counts) == count).all(), "ranks of choices"
+        assert (align_counts(model, counts) == count).all()
+        assert (align_counts(model.replace(action=None), counts) == count).all(), "ranks of choices"
         renamed = model.replace(
             valuation={"state": 10 * np.arange(model.num_states)}, action_names=tuple("abcdefgh")
         )
@@ -83,7 +83,7 @@ def test_beside_the_entries_of_a_model():
             states=[f"{i}0" if i else "0" for i in range(model.num_states)],
             actions="abcdefgh",
         )
-        assert (counts_on(renamed, named) == count).all()
+        assert (align_counts(renamed, named) == count).all()
         assert state_names(renamed)[1] == "10" and action_names(renamed)[1] == "b"
 
 
@@ -97,8 +97,8 @@ def test_beside_padded_entries():
     count = rng.integers(1, 9, sparse.num_transitions)
     row = np.repeat(np.arange(sparse.num_rows), np.diff(sparse.entry_start))
     counts = make_counts(sparse.host.state[row], sparse.action[row], sparse.successor, count)
-    assert (counts_on(sparse, counts) == count).all()
-    padded, dense = counts_on(mdp, counts), counts_on(to_dense(mdp), counts)
+    assert (align_counts(sparse, counts) == count).all()
+    padded, dense = align_counts(mdp, counts), align_counts(to_dense(mdp), counts)
     used = np.asarray(mdp.probability) > 0
     assert padded.shape == used.shape and (padded[used] == count).all() and not padded[~used].any()
     for s, a, t, n in zip(counts.state, counts.action, counts.successor, counts.count, strict=True):
@@ -115,16 +115,16 @@ def test_what_no_model_has():
         (([0], [2], [0]), None, "the model has no action '2'"),
     ):
         with pytest.raises(ValueError, match=message):
-            counts_on(model, make_counts(*numbers, states=names))
+            align_counts(model, make_counts(*numbers, states=names))
     counts = make_counts([0], [0], [1])
     twice = model.replace(action=np.array([0, 0, 0]))
     with pytest.raises(ValueError, match="choices 0 and 1 of the model have the same names"):
-        counts_on(twice, counts)
+        align_counts(twice, counts)
     mdp = make_mdp([[[0, 0]]], [[[0.5, 0.5]]])
     with pytest.raises(ValueError, match="successors 0 and 1 of the model have the same"):
-        counts_on(mdp, counts)
+        align_counts(mdp, counts)
     with pytest.raises(ValueError, match=r"Game has no transitions to count; .*of a game, its mdp"):
-        counts_on(make_game(model, [True, False]), counts)
+        align_counts(make_game(model, [True, False]), counts)
 
 
 @pytest.mark.parametrize("graph", ["seen", "complete"])
@@ -144,7 +144,7 @@ def test_a_model_of_counts(graph):
             actions=["x", "y", "z"],
         )
         stays = [x for i, x in enumerate(states) if not (s == i).any()][::2]
-        model, count = counted_model(
+        model, count = model_from_counts(
             counts,
             initial=[states[0], states[-1]],
             terminal=stays,
@@ -176,21 +176,21 @@ def test_a_model_of_counts(graph):
             part = slice(host.entry_start[r], host.entry_start[r + 1])
             more = count[part] + (count[part].min() == 0)
             assert np.allclose(host.probability[part], more / more.sum())
-        assert model.states_where("last").tolist() == [x == states[-1] for x in states]
-        assert not model.states_where("none").any()
+        assert model.states_with_label("last").tolist() == [x == states[-1] for x in states]
+        assert not model.states_with_label("none").any()
         assert model.initial.sum() == 1 and set(np.flatnonzero(model.initial)) <= {
             0,
             num_states - 1,
         }
         assert state_names(model) == tuple(states)
-        assert counts_on(model, counts).tolist() == count.tolist()
+        assert align_counts(model, counts).tolist() == count.tolist()
 
 
 def test_from_counts_to_an_interval_model():
     counts = make_counts(
         [0, 0, 0, 1], [0, 0, 1, 0], [0, 1, 2, 1], [70, 30, 4, 9], states=["start", "goal", "lost"]
     )
-    model, count = counted_model(
+    model, count = model_from_counts(
         counts,
         initial="start",
         labels={"goal": ["goal"]},
@@ -207,7 +207,7 @@ def test_from_counts_to_an_interval_model():
 
 def test_integers_as_names():
     counts = make_counts([0, 1], [0, 0], [1, 1], states=["3", "-12"])
-    model, _ = counted_model(counts, initial={3: 0.25, "-12": 0.75}, terminal=[-12])
+    model, _ = model_from_counts(counts, initial={3: 0.25, "-12": 0.75}, terminal=[-12])
     assert model.valuation["state"].tolist() == [3, -12] and model.initial.tolist() == [0.25, 0.75]
     assert in_order({"b", "a"}) == ("a", "b") and in_order(["2", "10", "-3"]) == ("-3", "2", "10")
 
@@ -227,7 +227,7 @@ def test_integers_as_names():
 def test_models_that_are_refused(arguments, message):
     counts = make_counts([0, 1], [0, 0], [1, 1])
     with pytest.raises(ValueError, match=message):
-        counted_model(counts, **{"initial": "0"} | arguments)
+        model_from_counts(counts, **{"initial": "0"} | arguments)
 
 
 @pytest.mark.parametrize(
@@ -255,4 +255,4 @@ def test_graphs_that_are_too_large():
     size = 20_000
     counts = make_counts(np.arange(size), 0 * np.arange(size), np.arange(size))
     with pytest.raises(ValueError, match="20000 choices that may lead to each of 20000 states"):
-        counted_model(counts, initial=0, graph="complete")
+        model_from_counts(counts, initial=0, graph="complete")

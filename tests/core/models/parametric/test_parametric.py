@@ -38,7 +38,7 @@ def test_a_model_at_a_point():
         assert model.probability.tolist() == [0.125, 0.25, 0.625, 1, 1, 1]
         assert model.rewards["steps"].choice.tolist() == [0.25, 0, 0, 0]
         assert model.rewards["toll"].state.tolist() == [1, 0, 0, 0]
-        assert model.states_where("goal").tolist() == [False, True, False, False]
+        assert model.states_with_label("goal").tolist() == [False, True, False, False]
     probability, rewards = jax.jit(lambda f, x: f.numbers(x))(found, jnp.array([0.125, 0.25]))
     assert probability.tolist() == [0.125, 0.25, 0.625, 1, 1, 1] and set(rewards) == {"steps"}
 

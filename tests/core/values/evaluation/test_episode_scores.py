@@ -9,7 +9,7 @@ from jax.tree_util import Partial
 from jaxltl.algos import cce
 from jaxltl.algos.cce.exponential_family import diagonal_gaussian
 from jaxltl.core.environments.environment import Timestep, make_box, make_environment
-from jaxltl.core.environments.episodes import agent_of, run_episode
+from jaxltl.core.environments.episodes import make_agent, run_episode
 from jaxltl.core.environments.monitor import Verdict
 from jaxltl.core.environments.task_environment import task_environment
 from jaxltl.core.values.evaluation.episode_scores import episode_evaluator
@@ -48,7 +48,7 @@ def towards(goal, observation, key):
 
 
 def agent(goal):
-    return agent_of(Partial(towards, goal))
+    return make_agent(Partial(towards, goal))
 
 
 def above(totals):

@@ -13,7 +13,7 @@ from jax.sharding import NamedSharding, PartitionSpec
 from jax.tree_util import Partial
 
 from jaxltl.core.environments.environment import Timestep, make_environment
-from jaxltl.core.environments.episodes import agent_of, run_episode
+from jaxltl.core.environments.episodes import make_agent, run_episode
 from jaxltl.core.environments.monitor import Verdict
 from jaxltl.core.environments.task_environment import task_environment
 from jaxltl.core.environments.time_limit import with_time_limit
@@ -67,7 +67,7 @@ def choose(observation, key):
     return jax.random.randint(key, (), 0, 3)
 
 
-WANDERER = agent_of(choose)
+WANDERER = make_agent(choose)
 ENVIRONMENTS = {
     "plain": LINE,
     "finite": task_environment(LINE, "!home U goal", ending="violated"),
@@ -217,7 +217,7 @@ def stay(observation, key):
     return jnp.int32(0)
 
 
-IDLE = agent_of(stay)
+IDLE = make_agent(stay)
 COIN = make_environment(
     coin_reset, Partial(coin_step, jnp.asarray(0.5)), nothing, actions=1, horizon=1
 )
@@ -392,7 +392,7 @@ def test_sums_that_are_not_finite_are_told():
         ({"threshold": 0.9}, "threshold=0.9, but the environment has no task"),
         ({"discount": 1.5}, "discount=1.5"),
         ({"agent": choose}, "agent is function; give an Agent"),
-        ({"agent": agent_of(lambda seen, key: seen)}, r"the agent's action is .*1"),
+        ({"agent": make_agent(lambda seen, key: seen)}, r"the agent's action is .*1"),
     ],
 )
 def test_what_does_not_fit_is_refused(change, message):

@@ -160,7 +160,7 @@ def test_parts_of_interval_models():
     np.testing.assert_array_equal(less.upper, chain.upper)
     np.testing.assert_array_equal(less.lower, model.lower[entry])
     part = restrict(model, np.eye(6)[0], allowed=first)
-    target = model.states_where("a")
+    target = model.states_with_label("a")
     for nature in ("min", "max"):
         whole = robust_reachability(model, target, policy=host.row_start[:-1], nature=nature)
         found = robust_reachability(part.model, target[np.asarray(part.base_state)], nature=nature)
@@ -171,7 +171,7 @@ def test_policies_are_evaluated():
     rng = np.random.default_rng(2)
     for _ in range(10):
         model = labelled(rng)
-        target = model.states_where("a")
+        target = model.states_with_label("a")
         for nature in ("min", "max"):
             best = robust_reachability(model, target, nature=nature)
             own = robust_reachability(model, target, policy=best.policy, nature=nature)
@@ -185,7 +185,7 @@ def test_policies_are_evaluated():
 
 def test_one_function_takes_both_kinds():
     model = labelled(np.random.default_rng(3))
-    target = model.states_where("a")
+    target = model.states_with_label("a")
     for objective, nature in DIRECTIONS:
         np.testing.assert_array_equal(
             reachability_probability(model, target, objective=objective, nature=nature).value,
@@ -209,7 +209,7 @@ def test_mixed_policies():
         host = model.nominal.host
         weight = rng.random(host.num_rows)
         weight /= np.add.reduceat(weight, host.row_start[:-1])[host.state]
-        target = model.states_where("a")
+        target = model.states_with_label("a")
         points = make_interval(model.nominal, *[model.nominal.probability] * 2)
         alone = reachability_probability(model.nominal, target, policy=weight)
         np.testing.assert_allclose(

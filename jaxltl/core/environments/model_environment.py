@@ -20,7 +20,7 @@ from jaxltl.core.models.ops.operators import sample_successor
 from jaxltl.core.models.sparse import SparseMDP
 
 
-def environment_of(
+def model_environment(
     model: MDP | DenseMDP | SparseMDP | Game,
     *,
     reward: ArrayLike | None = None,
@@ -50,7 +50,7 @@ def environment_of(
 
     Example:
       >>> from jaxltl import from_dense
-      >>> coin = environment_of(from_dense(
+      >>> coin = model_environment(from_dense(
       ...     [[[.5, .5]], [[0, 1]]], label=[[0], [1]], propositions=["heads"]))
       >>> coin.actions.num, coin.observations.shape, coin.labels(1).tolist()
       (1, (2,), [True])
@@ -61,7 +61,7 @@ def environment_of(
         model = to_padded(model)
     if not isinstance(model, MDP | DenseMDP):
         raise ValueError(
-            f"environment_of: {type(model).__name__} is no world; simulate the MDP under it, and "
+            f"model_environment: {type(model).__name__} is no world; simulate the MDP under it, and "
             "give the task to task_environment."
         )
     size, num_actions = model.num_states, model.num_actions

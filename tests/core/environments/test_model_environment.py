@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from jaxltl.core.environments.environment import random_action
-from jaxltl.core.environments.episodes import agent_of, run_episode
-from jaxltl.core.environments.simulated_model import environment_of
+from jaxltl.core.environments.episodes import make_agent, run_episode
+from jaxltl.core.environments.model_environment import model_environment
 from jaxltl.core.environments.tabulate import tabulate
 from jaxltl.core.environments.task_environment import task_environment
 from jaxltl.core.models.construct.convert import to_sparse
@@ -49,7 +49,7 @@ def test_what_is_told_is_the_model(kind):
         "dense": lambda: to_dense(world()),
         "sparse": lambda: to_sparse(world()),
     }[kind]()
-    environment = environment_of(model)
+    environment = model_environment(model)
     np.testing.assert_allclose(transitions(environment), MODEL.transition)
     states, chance = environment.starts()
     np.testing.assert_allclose(chance, MODEL.initial)
@@ -75,7 +75,7 @@ def drawn_and_told(environment, told):
 
 
 def test_what_is_drawn_is_as_likely_as_told():
-    environment = environment_of(world())
+    environment = model_environment(world())
     assert drawn_and_told(environment, MODEL.transition) < 4 * 0.5 / np.sqrt(COUNT)
     first = np.asarray(jax.vmap(environment.reset)(jax.random.split(jax.random.key(0), COUNT)))
     assert np.abs(np.bincount(first, minlength=S) / COUNT - MODEL.initial).max() < 0.04
@@ -85,23 +85,23 @@ def test_rewards_are_of_states_or_actions():
     of_states, of_actions = np.arange(S), np.arange(S * A).reshape(S, A) / 2
     key = jax.random.key(0)
     state, action = np.argwhere(MODEL.available)[-1]
-    found = environment_of(world(), reward=of_states).step(state, action, key)
+    found = model_environment(world(), reward=of_states).step(state, action, key)
     assert float(found.reward) == int(found.world)
-    found = environment_of(world(), reward=of_actions).step(state, action, key)
+    found = model_environment(world(), reward=of_actions).step(state, action, key)
     assert float(found.reward) == of_actions[state, action]
     for reward in (np.zeros(S + 1), np.zeros((A, S)), np.array(["x"] * S)):
         with pytest.raises(ValueError, match=r"give numbers \[6\]"):
-            environment_of(world(), reward=reward)
+            model_environment(world(), reward=reward)
 
 
 def test_an_observation_of_ones_own():
-    environment = environment_of(world(), observe=lambda state: {"number": state})
+    environment = model_environment(world(), observe=lambda state: {"number": state})
     assert environment.observe(jnp.int32(3)) == {"number": 3}
     assert environment.observations["number"].shape == ()
 
 
 def test_tabulated_it_is_the_model_again():
-    table = tabulate(environment_of(world()))
+    table = tabulate(model_environment(world()))
     for formula in ("F (a & X b)", "G F a"):
         joint = product(world(), formula)
         expected = (np.asarray(joint.initial) * optimal_satisfaction(joint).value).sum()
@@ -118,8 +118,8 @@ def test_success_by_simulation_is_the_probability_by_the_solver():
     policy = jnp.asarray(joint.available / joint.available.sum(-1, keepdims=True))
     value = satisfaction_probability(joint, policy).value
     expected = float((np.asarray(joint.initial) * value).sum())
-    task = task_environment(environment_of(world()), formula)
-    agent = agent_of(lambda seen, key: 0)
+    task = task_environment(model_environment(world()), formula)
+    agent = make_agent(lambda seen, key: 0)
     agent = agent.replace(
         act=lambda memory, seen, allowed, key: (random_action(key, task.actions, allowed), memory)
     )
@@ -138,7 +138,7 @@ def test_a_game_is_played_against_its_opponent():
     rng = np.random.default_rng(5)
     weight = rng.random((S, A)) * MODEL.available
     for opponent in (None, weight):
-        environment = environment_of(make_game(world(), system), opponent=opponent)
+        environment = model_environment(make_game(world(), system), opponent=opponent)
         share = MODEL.available if opponent is None else weight
         share = share / share.sum(1, keepdims=True)
         told = transitions(environment)
@@ -163,4 +163,4 @@ def test_a_game_is_played_against_its_opponent():
 )
 def test_bad_models_are_named(model, options, text):
     with pytest.raises(ValueError, match=text):
-        environment_of(model(), **options)
+        model_environment(model(), **options)
