@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import connected_components
 import jaxltl as jl
 from jaxltl.algos import interval_learning as learning
 from jaxltl.algos.common import learner
-from jaxltl.algos.interval_learning import _interval_data
+from jaxltl.algos.interval_learning import _intervals
 from jaxltl.core.models.game import make_game
 from jaxltl.core.models.interval import make_interval
 from jaxltl.core.statistics.confidence_sets import intervals_from_counts
@@ -43,7 +43,7 @@ def worlds(number):
         world = random_world(rng)
         if len(np.unique(np.asarray(world.label), axis=0)) < 4:
             continue
-        open_ = [~(p.won | p.lost) for p in (learning.make_problem(world, t) for t in TASKS)]
+        open_ = [~(p.winning | p.losing) for p in (learning.make_problem(world, t) for t in TASKS)]
         if sum(bool(x.any()) for x in open_) >= 2:
             found.append(world)
     return found
@@ -85,7 +85,7 @@ def wins(problem, play):
         ):
             if p > 0:
                 edge[s * width + q, t * width + step[s, q]] = True
-    won = np.asarray(problem.won).ravel()
+    won = np.asarray(problem.winning).ravel()
     if not used.reshape(size, -1).any(-1)[won].all() or edge[won][:, ~won].any():
         return False
     priority = np.asarray(model.automaton.priority)[:, np.asarray(model.letter)].T.ravel()
@@ -105,7 +105,7 @@ def test_every_policy_on_the_way_wins_almost_surely(task):
     for i in range(3):
         problem, hparams, (states, _) = on_the_way(task, "linear", i)
         sure = np.asarray(optimal_satisfaction(problem.model).lower) == 1
-        np.testing.assert_array_equal(problem.won, sure)
+        np.testing.assert_array_equal(problem.winning, sure)
         allowed = np.asarray(problem.allowed)
         for number in (0, 1, 2, 5, 39):
             state = lane(states, number)
@@ -154,7 +154,7 @@ def test_where_a_task_is_won_only_what_may_be_done_for_ever_is_done():
         propositions=["a", "b"],
     )
     problem = learning.make_problem(world, "F G a | G F b")
-    assert np.asarray(problem.won).all()
+    assert np.asarray(problem.winning).all()
     state = learning.init(jax.random.key(0), problem, settings())
     for play in (
         learning.behavior(state, problem, settings()),
@@ -266,7 +266,7 @@ def test_intervals_with_a_confidence_hold_those_of_any_time_and_only_shrink():
 
 def test_frequencies_that_are_rounded_beyond_one_make_no_nan():
     shares = np.array([-3e-16, 0.0, 0.5, 1.0, 1 + 3e-16])
-    ends = np.asarray(jax.jit(_interval_data._least)(shares, 0.01))
+    ends = np.asarray(jax.jit(_intervals.kl_lower_end)(shares, 0.01))
     assert (ends[:2] == 0).all() and (ends[3:] > 0.9).all() and 0.4 < ends[2] < 0.45
 
 
@@ -342,11 +342,11 @@ def test_guarantees_hold_and_come_near():
 def test_a_run_ends_when_values_are_known_well_enough():
     problem, hparams, _ = on_the_way(TASKS[0], "linear", 0)
     run = partial(learning.train_until, jax.random.key(0), problem, hparams, num_steps=4000)
-    found = jl.check(run(until=learning.known_within(0.2)))
+    found = jl.check(run(until=learning.bounds_within(0.2)))
     assert found.metrics.upper - found.metrics.lower <= 0.2
     assert found.num_steps < 4000
     with counted_traces() as traced:
-        later = run(until=learning.known_within(0.1))
+        later = run(until=learning.bounds_within(0.1))
     assert not traced
     assert later.num_steps >= found.num_steps
 

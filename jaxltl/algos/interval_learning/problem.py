@@ -1,0 +1,111 @@
+"""Problems of robust anytime learning: a product, and its qualitative preprocessing."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from jaxltl.algos.common.play import cumulative
+from jaxltl.core.automata.translate import Task
+from jaxltl.core.graphs.acceptance import Accepting, accepting_end_components
+from jaxltl.core.graphs.attractor import almost_surely_reaching, attractor
+from jaxltl.core.graphs.end_components import end_components
+from jaxltl.core.models.construct.convert import to_padded, to_sparse
+from jaxltl.core.models.game import as_game
+from jaxltl.core.models.mdp import support
+from jaxltl.core.models.ops.array_namespace import to_jax
+from jaxltl.core.models.ops.operators import forall_successor
+from jaxltl.core.models.product import Product, product
+from jaxltl.core.models.protocols import Model
+from jaxltl.core.pretty_print import brief
+
+
+@brief
+@struct.dataclass
+class Problem:
+    """A task in an MDP with unknown probabilities; made by :func:`make_problem`.
+
+    Attributes:
+      model: the product with the task's automaton; the learner reads the support of its
+        probabilities, and samples.
+      winning: ``bool[S, Q]``, the almost-sure winning region.
+      losing: ``bool[S, Q]``, the states from which the task cannot be satisfied.
+      allowed: ``bool[S, Q, A]``, the actions to be tried; in the winning region, actions all of
+        which may be repeated for ever and satisfy the task almost surely.
+      component: ``int32[S * Q]``, the maximal end component of each undecided state, or its own
+        number.
+      staying: ``bool[S, Q, A]``, the actions of undecided states that stay in it.
+      start_table: ``uint32[S]``, the initial distribution as cumulative weights.
+      num_claims: ``int[]``, number of unknown probabilities.
+    """
+
+    model: Product
+    winning: jax.Array
+    losing: jax.Array
+    allowed: jax.Array
+    component: jax.Array
+    staying: jax.Array
+    start_table: jax.Array
+    num_claims: jax.Array
+
+
+def make_problem(world: Model, task: Task) -> Problem:
+    """A checked :class:`Problem`: the product with the task, and its qualitative preprocessing.
+
+    Args:
+      world: an MDP or a sparse model; its labels, start and graph are known to the learner.
+      task: a formula, its text, or an automaton over the letters that occur. To make a probability
+        small, negate the formula.
+
+    Returns:
+      :class:`Problem`.
+
+    Raises:
+      ValueError: the world is a game or no model, or the formula has unknown labels.
+
+    Example:
+      >>> from jaxltl import make_mdp
+      >>> world = make_mdp([[[1, 2], [0, 1]], [[1, 0], [1, 0]], [[2, 0], [2, 0]]],
+      ...                  [[[.7, .3], [.5, .5]], [[1, 0], [1, 0]], [[1, 0], [1, 0]]],
+      ...                  initial=[1, 0, 0], label=[[0], [1], [0]], propositions=["home"])
+      >>> problem = make_problem(world, "F home")
+      >>> problem.winning[0].tolist()  # by repeating the second action
+      [True, True]
+      >>> problem.allowed[0, 0].tolist()
+      [False, True]
+    """
+    system = np.asarray(as_game(world).system)
+    if hasattr(world, "system") and not system.all():
+        raise ValueError(
+            "interval_learning plays alone; of a game with an environment learn by "
+            "jaxltl.algos.rmax, whose evidence(confidence=) bounds what counts say."
+        )
+    # The sparse form lists each successor of an action once, as it is observed.
+    padded = to_padded(to_sparse(getattr(world, "mdp", world) if system.all() else world))
+    model = product(padded, task, label_on="exit")
+    accepting = accepting_end_components(model)
+    sure = almost_surely_reaching(model, accepting.region).region
+    winning, losing = np.asarray(sure), ~np.asarray(attractor(model, sure).region)
+    between = end_components(model, ~winning & ~losing)
+    outcomes = support(padded).sum(-1)
+    claims = np.where(outcomes > 2, outcomes, outcomes > 1).sum()
+    return Problem(
+        model=model,
+        winning=to_jax(winning),
+        losing=to_jax(losing),
+        allowed=_allowed(model, winning, accepting),
+        component=to_jax(np.asarray(between.component, np.int32).reshape(-1)),
+        staying=to_jax(between.inside),
+        start_table=to_jax(np.asarray(cumulative(np.asarray(padded.initial, float)))),
+        num_claims=to_jax(np.int32(max(int(claims), 1))),
+    )
+
+
+@jax.jit
+def _allowed(model: Product, winning: jax.Array, accepting: Accepting) -> jax.Array:
+    """In the winning region, actions inside accepting end components, or else those that stay."""
+    safe = forall_successor(model, winning) & model.available & winning[..., None]
+    safe = jnp.where(accepting.region[..., None], accepting.inside, safe)
+    return jnp.where(winning[..., None], safe, model.available)

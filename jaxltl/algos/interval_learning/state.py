@@ -1,0 +1,100 @@
+"""Settings, state and metrics of robust anytime learning."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+from flax import struct
+
+from jaxltl.core.pretty_print import brief, history
+from jaxltl.core.types import Status
+
+INTERVALS = ("linear", "confidence")
+
+
+@brief
+@struct.dataclass
+class Hparams:
+    """Settings; numbers are traced.
+
+    Attributes:
+      intervals: ``"linear"``: linearly updating intervals, which narrow fast and forget a wrong
+        prior; ``"confidence"``: intervals that contain all true probabilities at all times with
+        probability `confidence`; static; default ``"linear"``.
+      confidence: in (0, 1); of ``"confidence"`` only; default 0.9.
+      least: positive; assumed lower bound of each transition probability; default 1e-4.
+      strength, most_strength: prior strengths in samples of linear intervals where data contradict
+        them and where they agree, 0 < strength <= most_strength; default 5.0 and 10.0.
+      exploration: in (0, 1], probability of any allowed action; default 0.1.
+      restart: probability of restarting before a move in the almost-sure winning region; in the
+        losing region 1; default 0.05.
+      discount: in (0, 1); among actions of the same optimistic value those that win soonest are
+        preferred; default 0.99.
+      sweeps: of value iteration in a step; at least the moves to the winning region; default 40.
+      tolerance: change of the last sweep at which values count as converged; default 1e-4.
+      num_runs: episodes sampled in a step; static; default 4.
+      length: moves of an episode; static; default 64.
+    """
+
+    intervals: str = struct.field(pytree_node=False, default="linear")
+    confidence: jax.Array | float = 0.9
+    least: jax.Array | float = 1e-4
+    strength: jax.Array | float = 5.0
+    most_strength: jax.Array | float = 10.0
+    exploration: jax.Array | float = 0.1
+    restart: jax.Array | float = 0.05
+    discount: jax.Array | float = 0.99
+    sweeps: jax.Array | int = 40
+    tolerance: jax.Array | float = 1e-4
+    num_runs: int = struct.field(pytree_node=False, default=4)
+    length: int = struct.field(pytree_node=False, default=64)
+
+
+@brief
+@struct.dataclass
+class State:
+    """Counts, intervals and values.
+
+    Attributes:
+      key: root key of the run.
+      step: ``int32[]``, steps made.
+      samples: ``int32[]``, observed transitions; near 2^31 further steps sample none.
+      counts: ``int32[S, A, K]``, observations of each transition.
+      lower, upper: ``float[S, A, K]``, intervals; 0 in padding.
+      pessimistic, optimistic: ``float[S, Q]``, optimal satisfaction probability with adversarial
+        and with cooperative nature, as far as value iteration has converged.
+      best: ``bool[S, Q, A]``, preferred actions.
+      residual: ``float[]``, largest change of the last sweep.
+    """
+
+    key: jax.Array
+    step: jax.Array
+    samples: jax.Array
+    counts: jax.Array
+    lower: jax.Array
+    upper: jax.Array
+    pessimistic: jax.Array
+    optimistic: jax.Array
+    best: jax.Array
+    residual: jax.Array
+
+
+@brief(facts=partial(history, codes={"status": Status}))
+@struct.dataclass
+class Metrics:
+    """Figures after a step; scalars, of a run ``[T]``.
+
+    Attributes:
+      samples: observed transitions.
+      lower, upper: pessimistic and optimistic value, mean over the initial distribution.
+      residual: of :class:`State`.
+      status: CONVERGED if the residual is at most the tolerance; MAX_STEPS if not, or if all
+        samples that can be counted were observed.
+    """
+
+    samples: jax.Array
+    lower: jax.Array
+    upper: jax.Array
+    residual: jax.Array
+    status: jax.Array
