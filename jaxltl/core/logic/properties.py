@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from jaxltl.core.logic.bounded import Bounded, Earned, unfolded
 from jaxltl.core.logic.labels import is_boolean
@@ -264,17 +264,9 @@ class _Parser:
         path = _CONTENT[operator](self)
         self.expect("]", " or an operator")
         text = self.text[start.start : self.tokens[self.place - 1].end]
-        return Property(
-            text,
-            operator,
-            objective,
-            relation,
-            threshold,
-            reward,
-            path,  # type: ignore[arg-type]
-            name=name,
-            nature=nature,
-        )  # type: ignore[arg-type]
+        fields: dict[str, Any] = {"operator": operator, "objective": objective}
+        fields |= {"relation": relation, "threshold": threshold, "reward": reward, "path": path}
+        return Property(text, **fields, name=name, nature=nature)
 
     def multi(self, start: _Token, name: str | None) -> Property:
         self.expect("(")
