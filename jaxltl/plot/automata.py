@@ -42,7 +42,7 @@ def automaton(
     Args:
       automaton: the automaton.
       names: list the formula that each state has left to satisfy under the graph.
-      layout: who places the states: ``"graphviz"``, ``"matplotlib"`` for our own way, which needs
+      layout: the layout engine: ``"graphviz"``, or ``"matplotlib"`` for the built-in one, which needs
         nothing else and puts rejecting states below, or ``"auto"``, which is graphviz if its
         program ``dot`` is there.
 
@@ -50,7 +50,7 @@ def automaton(
       The figure, in inches that suit the graph.
 
     Raises:
-      ValueError: graphviz is asked for and cannot be run.
+      ValueError: ``layout="graphviz"`` and graphviz cannot be run.
 
     Example:
       >>> from jaxltl import to_automaton
@@ -77,7 +77,7 @@ def automaton(
 
 
 def canvas(graph: drawing.Graph, lines: Sequence[str]) -> tuple[Figure, Axes]:
-    """Room for a graph, above lines of notes."""
+    """A figure for a graph with lines of notes below."""
     width, height = graph.size
     # As wide as the notes, at 8 points a character of a monospaced font.
     full = max([width, *(0.5 + 0.602 * 8 / 72 * len(line) for line in lines)])
@@ -101,7 +101,7 @@ def canvas(graph: drawing.Graph, lines: Sequence[str]) -> tuple[Figure, Axes]:
 
 
 def on_the_host(automaton: Automaton) -> Automaton:
-    """The same with NumPy arrays."""
+    """The automaton with NumPy arrays."""
     return replace(
         automaton,
         delta=np.asarray(automaton.delta),
@@ -144,7 +144,7 @@ def edge_texts(table: Automaton, doomed: NDArray[np.bool_]) -> dict[drawing.Key,
     accepting transitions of a Buchi automaton have their own. The longest guard of each state
     says "else", which is shorter and exact.
     """
-    # Nothing is accepted after an arrow to a doomed state, whatever its priority.
+    # No word is accepted after a transition to a rejecting state, for any priority.
     priority = np.where(doomed[table.delta], 1, table.priority)
     texts = {k: pretty_guard(t) for k, t in edge_guards(replace(table, priority=priority)).items()}
     for q in range(len(table.delta)):
@@ -165,7 +165,7 @@ def edge_texts(table: Automaton, doomed: NDArray[np.bool_]) -> dict[drawing.Key,
 
 
 def _notes(table: Automaton, texts: Mapping[drawing.Key, drawing.Rows], width: float) -> list[str]:
-    """What stands under the graph."""
+    """Lines of text below the graph."""
     lines = _state_lines(table, width)
     if table.acceptance in _NOTES:
         lines += textwrap.wrap(_NOTES[table.acceptance], max(44, int(width * 13.5)))
@@ -193,7 +193,7 @@ def _edge_color(table: Automaton, key: drawing.Key, doomed: NDArray[np.bool_]) -
 
 
 def draw_label(axes: Axes, label: drawing.Label, color: str) -> None:
-    """The lines of a label in the middle; if some have marks, to the left, after the marks."""
+    """Draws the lines of a label: centred, or left-aligned after acceptance marks."""
     rows, (x, y) = label.rows, label.center
     style: dict[str, Any] = {
         "fontsize": drawing.FONT_SIZE,
@@ -215,7 +215,7 @@ def draw_label(axes: Axes, label: drawing.Label, color: str) -> None:
 
 
 def _mark(axes: Axes, center: tuple[float, float], mark: str) -> None:
-    """A dot, or a priority in a circle that is filled if it is even."""
+    """Draws an acceptance mark: a dot, or a priority in a circle, filled if even."""
     filled = mark == "●" or int(mark) % 2 == 0
     axes.add_patch(
         Circle(
@@ -240,7 +240,7 @@ def _mark(axes: Axes, center: tuple[float, float], mark: str) -> None:
 
 
 def draw_edge(axes: Axes, curve: NDArray[np.float64], color: str) -> None:
-    """An arrow along a Bezier curve."""
+    """Draws an arrow along a Bezier curve."""
     codes = [Path.MOVETO] + [Path.CURVE3 if len(curve) == 3 else Path.CURVE4] * (len(curve) - 1)
     axes.add_patch(
         FancyArrowPatch(
@@ -256,7 +256,7 @@ def draw_edge(axes: Axes, curve: NDArray[np.float64], color: str) -> None:
 
 
 def draw_start(axes: Axes, center: NDArray[np.float64]) -> None:
-    """The arrow from nowhere to the initial state."""
+    """Draws the arrow of the initial state."""
     tail = center - [drawing.RADIUS + 0.42, 0]
     draw_edge(axes, np.array([tail, (tail + center) / 2, center - [drawing.RADIUS, 0]]), INK)
 
@@ -264,7 +264,7 @@ def draw_start(axes: Axes, center: NDArray[np.float64]) -> None:
 def draw_state(
     axes: Axes, center: NDArray[np.float64], text: str, final: bool, doomed: bool
 ) -> None:
-    """A circle with a text, double where it is final, grey where it is doomed."""
+    """Draws a state: a circle with a text, double if final, grey if rejecting."""
     line, fill = (MUTED, "#f2f3f5") if doomed else (INK, GOOD if final else PAPER)
     axes.add_patch(
         Circle(tuple(center), drawing.RADIUS, facecolor=fill, edgecolor=line, lw=1.3, zorder=5)

@@ -1,4 +1,4 @@
-"""The cells of a map: places that are filled, framed and numbered, and arrows between them."""
+"""Drawing of grid cells: fill, frames, numbers, arrows and robots."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ROBOT, LOSES, WALL = "#c2571a", "#ead0cb", "#55606c"
 
 
 class Board(NamedTuple):
-    """The cells of a game's map, and where its C places lie."""
+    """The cells of a game's map, and the positions of its C places."""
 
     cells: NDArray[np.str_]
     places: NDArray[np.int_]  # [C, 2], row and column from 0 at the top left
@@ -31,7 +31,7 @@ class Board(NamedTuple):
 
 
 def board_of(board: int | str | Board, wall: str) -> Board:
-    """The board of a map, or of a number of cells a side; or the board that it is."""
+    """A board from a text map, a number of cells per side, or a board."""
     if isinstance(board, Board):
         return board
     if isinstance(board, str):
@@ -43,7 +43,7 @@ def board_of(board: int | str | Board, wall: str) -> Board:
 
 
 def fill_cells(axes: Axes, world: Board, colors: Sequence[str], lines: str = PAPER) -> None:
-    """A colour for each place, and the names of cells in their corners."""
+    """Fills each place with its colour and writes names of cells into corners."""
     for (row, column), color in zip(world.places, colors, strict=True):
         axes.add_patch(Rectangle((column, row), 1, 1, facecolor=color, lw=0))
         kind = world.cells[row, column]
@@ -64,7 +64,7 @@ def fill_cells(axes: Axes, world: Board, colors: Sequence[str], lines: str = PAP
 
 
 def short_name(kind: str) -> str:
-    """The name of a cell, as much of it as there is room for.
+    """The name of a cell, cut to five characters.
 
     >>> short_name("goal"), short_name("upper_left")
     ('goal', 'uppe…')
@@ -73,7 +73,7 @@ def short_name(kind: str) -> str:
 
 
 def frame_cells(axes: Axes, world: Board, color: str = PAPER) -> None:
-    """Draws the lines between the cells, and limits the axes to them."""
+    """Draws walls and cell borders, and sets the limits of the axes."""
     rows, columns = world.cells.shape
     for row, column in np.argwhere(world.cells == world.wall):
         axes.add_patch(Rectangle((column, row), 1, 1, facecolor=WALL, lw=0))
@@ -86,7 +86,7 @@ def frame_cells(axes: Axes, world: Board, color: str = PAPER) -> None:
 def rule_cells(
     axes: Axes, rows: int, columns: int, color: str, width: float = 0.6, **options: Any
 ) -> None:
-    """The lines between the cells."""
+    """Draws the borders of cells."""
     lines = [((0, r), (columns, r)) for r in range(rows + 1)]
     lines += [((c, 0), (c, rows)) for c in range(columns + 1)]
     axes.add_collection(LineCollection(lines, colors=color, linewidths=width, **options))
@@ -108,9 +108,9 @@ def draw_moves(
     hollow: bool = False,
     scale: float = 1.0,
 ) -> None:
-    """A triangle towards each neighbour that a mask allows, and a dot for staying."""
+    """Draws an action mask: a triangle per allowed move, a dot for staying."""
     for place, a in np.argwhere(mask):
-        # Above the environment's robot, whose cell may be shared.
+        # Drawn over the environment's robot, which may be in the same cell.
         color = PAPER if dark is not None and dark[place] else INK
         face, edge = ("none", MUTED) if hollow else (color, "none")
         row, column = world.places[place]
@@ -127,7 +127,7 @@ def draw_moves(
 
 
 def number_cells(axes: Axes, rows: int, columns: int) -> None:
-    """Numbers rows and columns, from 1."""
+    """Numbers rows and columns from 1."""
     for axis, count in ((axes.xaxis, columns), (axes.yaxis, rows)):
         stride = max(1, count // 10)
         axis.set_ticks(
@@ -148,7 +148,7 @@ def draw_arrows(
     high: float,
     actions: Sequence[str],
 ) -> None:
-    """Triangles from the centre of each cell, as long as the action is likely."""
+    """Draws a policy: triangles whose length is the probability of the action."""
     shapes: list[Any] = []
     colors: list[str] = []
     for state, chances in enumerate(policy):
@@ -167,18 +167,18 @@ def draw_arrows(
 def _triangle(
     center: NDArray[np.float64], step: NDArray[np.float64], base: float, tip: float, width: float
 ) -> list[NDArray[np.float64]]:
-    """The corners of an arrow's head, whose base and tip are so far from the centre."""
+    """Corners of an arrow head; `base` and `tip` are distances from the centre."""
     side = step[::-1] * width
     return [center + step * base + side, center + step * tip, center + step * base - side]
 
 
 def cell_size(shape: tuple[int, ...]) -> float:
-    """The inches of a cell that holds arrows."""
+    """The size of a cell with arrows, in inches."""
     return float(np.clip(5.2 / max(shape), 0.3, 0.6))
 
 
 def rows_of_maps(shape: tuple[int, ...], count: int, across: int) -> tuple[Figure, NDArray[Any]]:
-    """A figure with so many axes of maps, in rows."""
+    """A figure with `count` axes for maps, `across` per row."""
     (rows, columns), size = shape, cell_size(shape)
     down = -(-count // across)
     figure = Figure(
@@ -193,7 +193,7 @@ def rows_of_maps(shape: tuple[int, ...], count: int, across: int) -> tuple[Figur
 
 
 def keep_out_of_layout(axes: Axes) -> None:
-    """What lies in the cells sticks out nowhere, so that no layout has to measure it."""
+    """Excludes artists inside cells from the layout, which saves measuring them."""
     for artist in (*axes.texts, *axes.patches, *axes.collections, *axes.images, *axes.lines):
         artist.set_in_layout(False)
 

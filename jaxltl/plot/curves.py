@@ -1,4 +1,4 @@
-"""Curves over steps, bands over seeds, and paths."""
+"""Learning curves, bands over seeds, bounds over samples, and trajectories in the plane."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def curves(
     steps: ArrayLike | None = None,
     show: Sequence[str] | None = None,
 ) -> Figure:
-    """Learning curves, one panel per figure: the median over seeds, and their spread.
+    """Learning curves, one panel per figure: the median and range over seeds.
 
     Args:
       metrics: figures ``[T]`` or ``[N, T]`` by name, or a learner's ``Metrics``.
@@ -42,7 +42,7 @@ def curves(
       show: names in order; default all that are not wholly NaN.
 
     Returns:
-      The figure. The band holds all the seeds; it is left out for a single one.
+      The figure. The band is the range over seeds.
 
     Raises:
       ValueError: there is nothing to show.
@@ -65,7 +65,7 @@ def curves(
 def _shown(
     what: str, metrics: Mapping[str, ArrayLike] | Any, show: Sequence[str] | None
 ) -> dict[str, NDArray[np.float64]]:
-    """The figures that are asked for and not wholly NaN, by name."""
+    """The chosen metrics by name, without those that are NaN everywhere."""
     if not isinstance(metrics, Mapping):
         metrics = {name: getattr(metrics, name) for name in metrics.__dataclass_fields__}
     every = {k: np.asarray(v, float) for k, v in metrics.items()}
@@ -104,7 +104,7 @@ def bands(
 
     Args:
       rows: by the titles of row and column and the name of the series, the horizontal places
-        ``[T]``, a mean ``[T]``, and how far the band goes to either side ``[T]``.
+        ``[T]``, a mean ``[T]``, and the half-width of the band ``[T]``.
       limits: by the titles of row and column, a number at which a dashed line is drawn.
       label: of the horizontal axis.
 
@@ -115,7 +115,7 @@ def bands(
       ValueError: there is nothing to show.
 
     Example:
-      >>> band = ([1, 2], [0.5, 0.75], [0.1, 0.1])  # steps, means, and how far to either side
+      >>> band = ([1, 2], [0.5, 0.75], [0.1, 0.1])  # steps, means, half-widths
       >>> figure = bands({"small": {"reward": {"PPO": band, "CPO": band}, "cost": {"CPO": band}}},
       ...                limits={"small": {"cost": 0.8}})
       >>> len(figure.axes)
@@ -152,18 +152,18 @@ def sweep(
     steps: ArrayLike | None = None,
     show: Sequence[str] | None = None,
 ) -> Figure:
-    """Learning curves of several settings, one panel per figure: means over seeds, and spreads.
+    """Learning curves of several settings, one panel per figure: mean and standard deviation over seeds.
 
     Args:
       metrics: figures ``[H, N, T]`` of H settings and N seeds by name, or a learner's ``Metrics``
         of a ``vmap`` over seeds within one over settings.
-      settings: the names of the H settings; at most six, which is as many as colours tell apart.
+      settings: the names of the H settings; at most six, the number of distinct colours.
       steps: ``[T]``, the step of each figure; default 1, 2, ...
       show: names of figures in order; default all that are not wholly NaN.
 
     Returns:
       The figure. The line is the mean over seeds, and the band a standard deviation to either side
-      of it (of a single seed, none); seeds whose figure is not finite in a step are left out of it.
+      of it (none for one seed); seeds that are not finite at a step are excluded there.
 
     Raises:
       ValueError: there is nothing to show, or figures of another number of axes or settings.
@@ -200,7 +200,7 @@ def lines(
     labels: Sequence[str] = (),
     names: tuple[str, str] = ("found", "reference"),
 ) -> Figure:
-    """Many runs over time, and one to compare them with: a row of panels for each setting.
+    """Many runs over time beside a reference run: a row of panels for each setting.
 
     Args:
       rows: by the titles of row and column, runs ``[K, T]`` and a reference ``[T]`` or None.
@@ -254,8 +254,8 @@ def guarantees(
 
     Args:
       samples: ``[T]``, positive.
-      bounds: by name ``[T]``, or ``[N, T]`` of several runs, whose median and range are drawn.
-      reference: what they come near to.
+      bounds: by name ``[T]``, or ``[N, T]`` for N runs, drawn as median and range.
+      reference: the exact value, drawn as a line.
       names: of the axes.
 
     Returns:
@@ -283,7 +283,7 @@ def guarantees(
     if reference is not None:
         axes.axhline(reference, color=MUTED, lw=1, ls="--", label="no policy has more")
     axes.set_xscale("log")
-    if count.max() > 10 * count.min():  # else no power of ten may be among them
+    if count.max() > 10 * count.min():  # otherwise the axis may have no major tick
         axes.xaxis.set_minor_formatter(NullFormatter())
     axes.set_ylim(0, 1.02)
     axes.set_xlabel(names[0], color=INK, fontsize=8.5)

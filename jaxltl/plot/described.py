@@ -1,4 +1,4 @@
-"""A figure with its text alternative, as notebooks and the pages made of them show it."""
+"""Figures with a text alternative for notebooks and pages."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from matplotlib.figure import Figure
 
 from jaxltl.plot.style import to_bytes
 
-_DPI, _SCREEN = 144, 96  # of what is saved, and of what a width in a page is told in
+_DPI, _SCREEN = 144, 96  # of saved images, and of widths in pages
 
 
 class Described(NamedTuple):
-    """A picture that a notebook shows with a text for who does not see it.
+    """A figure with a text alternative, as a notebook displays it.
 
     Attributes:
       figure: the figure.
-      text: what it shows, in a sentence or two.
+      text: a description in one or two sentences.
       page: HTML that shows the same and moves, or None. Notebooks show it in a frame where they
         run; where it was not saved, or is not trusted, the picture stands in its place.
     """
@@ -53,12 +53,12 @@ def described(figure: Figure, text: str, *, page: str | None = None) -> Describe
 
     Args:
       figure: the figure.
-      text: what it shows, for who does not see it: what there is, and what is to be seen in it.
+      text: the text alternative: the objects in the figure and its main result.
       page: HTML that shows the same and moves, such as that of
         :func:`~jaxltl.plot.episodes.play_episode`.
 
     Returns:
-      Figure, text and page.
+      The figure with its text and page.
 
     Raises:
       ValueError: the text is empty or has brackets or line breaks, which such places do not take.

@@ -48,13 +48,13 @@ _PIXELS = 440.0
 
 
 class Scene(NamedTuple):
-    """An episode as a picture: y goes down, and the corner at the upper left is the origin.
+    """The geometry of an episode in image coordinates: y points down, origin at the upper left.
 
     Attributes:
       size: of the square.
-      cells: how many a side, or 0: there are none.
+      cells: the number per side; 0 for continuous worlds.
       letters: (column, row, name) of cells.
-      discs: (x, y, radius, name) of what is round.
+      discs: (x, y, radius, name) of round objects.
       track: ``float[T + 1, 2]``, where the agent was.
       heading: ``float[T + 1]``, where it looked, radians, or None.
       shown: the propositions that held, for each of the T + 1 worlds.
@@ -136,7 +136,7 @@ def _draw_scene(axes: Axes, scene: Scene, title: str | None) -> None:
 
 
 def scene_of(environment: Any, episode: Any) -> Scene:
-    """What :func:`draw_episode` and :func:`play_episode` show."""
+    """The scene that :func:`draw_episode` and :func:`play_episode` draw."""
     valid = np.asarray(episode.valid)
     if valid.ndim != 1:
         raise ValueError(
@@ -179,7 +179,7 @@ def scene_of(environment: Any, episode: Any) -> Scene:
 
 
 def _place_of(world: Any) -> Any:
-    """The world with places inside what limits and tasks have added; of others, the places."""
+    """The innermost world that has places, below wrappers such as time limits and tasks."""
     while not isinstance(world, LetterState | FlatState | ZoneState):
         place = world.get("place") if isinstance(world, dict) else getattr(world, "place", None)
         if place is not None and np.ndim(place) == 2 and np.shape(place)[1] == 2:
@@ -198,7 +198,7 @@ def _place_of(world: Any) -> Any:
 
 
 def _free(track: NDArray[np.float64], shown: list[str]) -> Scene:
-    """Of a world of which only the places are known: a mark where something begins to hold."""
+    """Scene of a world without known regions: marks where propositions become true."""
     least, most = track.min(axis=0), track.max(axis=0)
     side = 1.16 * max(float((most - least).max()), 1e-6)
     corner = (least + most) / 2 - side / 2
@@ -220,14 +220,14 @@ def _named(discs: Discs, names: tuple[str, ...]) -> list[tuple[float, float, flo
 def _upright(
     extent: float, discs: list[Any], track: NDArray[np.float64], heading: Any, shown: list[str]
 ) -> Scene:
-    """From a square around zero, whose y goes up."""
+    """Converts from a centred square with y up to image coordinates."""
     turned = [(x + extent, extent - y, r, name) for x, y, r, name in discs]
     places = np.stack([track[:, 0] + extent, extent - track[:, 1]], axis=1)
     return Scene(2 * extent, 0, [], turned, places, heading, shown, False)
 
 
 def tint(name: str, number: int) -> str:
-    """The pale colour of what is named for a colour, or of the number-th other thing."""
+    """A pale colour: by the name if it is one of a colour, else by number."""
     if not is_color_like(name):
         return KINDS[number % len(KINDS)]
     red, green, blue = (0.55 + 0.45 * x for x in to_rgb(name))
@@ -235,7 +235,7 @@ def tint(name: str, number: int) -> str:
 
 
 def _met(scene: Scene) -> str:
-    """What held on the way, each time anew; of a long list the end."""
+    """Propositions in the order in which they became true; the last ones if there are many."""
     before, found = "", []
     for now in scene.shown:
         if now and now != before:
@@ -246,14 +246,14 @@ def _met(scene: Scene) -> str:
 
 
 def _spread(scene: Scene) -> NDArray[np.float64]:
-    """Places that drift a little in cells, so that what is done twice shows."""
+    """Places with a small drift, so that repeated visits stay visible."""
     count = len(scene.track)
     drift = np.linspace(-0.18, 0.18, count) if scene.cells and count > 1 else np.zeros(count)
     return scene.track + drift[:, None]
 
 
 def _segments(scene: Scene) -> list[NDArray[np.float64]]:
-    """Lines from place to place; across a side that is joined, two halves."""
+    """Line segments between places; two halves across a joined border."""
     places, parts = _spread(scene), []
     begin = 0
     for i, step in enumerate(np.diff(scene.track, axis=0)):
@@ -356,7 +356,7 @@ show(0);
 
 
 def play_episode(environment: Any, episode: Any, *, title: str | None = None) -> str:
-    """A page, complete in itself, that plays an episode: play, pause, and any step by a slider.
+    """A self-contained HTML page that plays an episode, with a pause button and a slider.
 
     Args:
       environment, episode, title: as for :func:`draw_episode`.
@@ -392,7 +392,7 @@ def play_episode(environment: Any, episode: Any, *, title: str | None = None) ->
 
 
 def _ground_svg(scene: Scene, zoom: float) -> str:
-    """The map, the pieces of the track with the steps that they come after, and the agent."""
+    """SVG of the map, the track by steps, and the agent."""
     side, parts = scene.size * zoom, []
     for column, row, name in scene.letters:
         x, y = column * zoom, row * zoom

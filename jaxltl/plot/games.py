@@ -58,7 +58,7 @@ def game_values(
     limits: tuple[float, float] | None = None,
     wall: str = "#",
 ) -> Figure:
-    """A value where the system moves: for each cell of the environment a map of the system's.
+    """Values on the system's turns: one map of the system's cell per cell of the environment.
 
     Args:
       values: ``float[2 * C * C]``, of the states of :func:`jaxltl.envs.robots.robots` or
@@ -114,7 +114,7 @@ def game_region(
     environment: Sequence[int] | None = None,
     wall: str = "#",
 ) -> Figure:
-    """From where the system wins on its turn: for each cell of the environment a map.
+    """Winning region on the system's turns: one map per cell of the environment.
 
     Args:
       region: ``bool[2 * C * C]``, see :func:`game_values`.
@@ -162,7 +162,7 @@ def game_moves(
     titles: Sequence[str] | str = "",
     wall: str = "#",
 ) -> Figure:
-    """What the system may do in each cell while the environment's robot is in a certain one.
+    """Allowed moves of the system in each cell, for one cell of the environment.
 
     Args:
       allowed: ``bool[2 * C * C, A]``, or with M panels first, such as one for each memory
@@ -247,7 +247,7 @@ def _of_turns(array: NDArray[Any], world: Board, name: str) -> NDArray[Any]:
 def _small_multiples(
     world: Board, environment: Sequence[int] | None, bar: float = 0.0
 ) -> tuple[Figure, dict[int, Axes], float]:
-    """A figure, its axes by the environment's place, and the inches of a cell."""
+    """A figure with axes by the environment's place, and the size of a cell in inches."""
     rows, columns = world.cells.shape
     if environment is None:
         down, across = rows, columns
@@ -326,7 +326,7 @@ def compare(
     groups: Sequence[str] | None = None,
     label: str = "value",
 ) -> Figure:
-    """Values of the same states under several strategies, a column of marks for each state.
+    """Values of the same states under several strategies, one column per state.
 
     Args:
       values: ``float[S]`` by the name of the strategy. States are sorted by the first, then by

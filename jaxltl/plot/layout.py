@@ -1,4 +1,4 @@
-"""Where the parts of a drawn automaton go: states in layers, curves, and labels that stand free.
+"""Layered graph layout of automata: positions of states, curves and labels.
 
 Lengths are inches. Positions are found by trying a few candidates and scoring each against
 what is already there.
@@ -42,7 +42,7 @@ class Edge(NamedTuple):
 
 
 class Label(NamedTuple):
-    """Guards, each with its mark before the first of its lines, and where they stand."""
+    """The label of an edge: guards with their marks, and its position."""
 
     key: Key
     rows: Rows
@@ -59,7 +59,7 @@ class Graph(NamedTuple):
 
 
 class Box(NamedTuple):
-    """A rectangle along the axes, by its middle and half its sides."""
+    """An axis-parallel rectangle, by its centre and half its sides."""
 
     center: Points
     half: Points
@@ -92,7 +92,7 @@ def arrange(
     texts: Mapping[Key, Rows],
     position: Points | None = None,
 ) -> Graph:
-    """A drawing of a transition graph.
+    """The layout of a transition graph.
 
     Args:
       delta: ``int[Q, L]``.
@@ -138,7 +138,7 @@ def arrange(
 
 
 def graphviz_positions(count: int, initial: int, texts: Mapping[Key, Rows]) -> Points | None:
-    """``float[count, 2]``: where graphviz puts the states, or None where it does not run."""
+    """``float[count, 2]``: positions by graphviz, or None if it cannot be run."""
     program = shutil.which("dot")
     if program is None:
         return None
@@ -151,7 +151,7 @@ def graphviz_positions(count: int, initial: int, texts: Mapping[Key, Rows]) -> P
         *map(str, range(count)),  # the first that is named stands on the left
     ]
     for (source, target, _), rows in texts.items():
-        # The room that the label takes is all that counts, not what it says.
+        # Only the size of the label counts.
         text = "\\n".join("m" * (len(line) + 2) for _, line in _wrapped(rows))
         lines.append(f'{source} -> {target} [label="{text}"];')
     try:
@@ -382,7 +382,7 @@ def _best_label(
         for shift in (0.0, clear, -clear, clear + 0.1, -clear - 0.1):
             box = Box(own[i] + shift * normal, half)
             cost = _label_cost(box, position, drawn, near) + abs(i - 30) * 0.05
-            # On its own line a label hides it, so beside the line is better, if it fits.
+            # A label hides the line under it, so a position next to the line is better.
             cost += 6.0 if shift == 0 else 2.0 * box.holds(own) + 2.0 * (abs(shift) > clear)
             if cost < least:
                 best, least = box, cost
@@ -417,7 +417,7 @@ def _distances(points: Points, others: Points) -> NDArray[np.float64]:
 
 
 def _wrapped(rows: Rows) -> Rows:
-    """Rows of one line each; the mark of a guard stands before its first line."""
+    """Rows of one line each; the mark of a guard precedes its first line."""
     return tuple(
         (mark if i == 0 else "", line) for mark, text in rows for i, line in enumerate(_wrap(text))
     )
@@ -446,7 +446,7 @@ def text_width(rows: Rows) -> float:
 
 
 def is_marked(rows: Rows) -> bool:
-    """Whether some line has a mark before it."""
+    """True if a line has a mark."""
     return any(mark for mark, _ in rows)
 
 

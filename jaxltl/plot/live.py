@@ -1,4 +1,4 @@
-"""Pictures for pages that move: the text of an SVG whose parts a script can find again.
+"""SVG drawings for interactive pages: parts have classes and data attributes for scripts.
 
 Each part has a class and data attributes for what it stands for (``data-memory``, ``data-from`` and
 ``data-to``, ``data-state``, ``data-run``), and takes its colours from the page's style. Lengths are
@@ -56,7 +56,7 @@ def live_automaton(automaton: Automaton, name: str) -> str:
     height = graph.size[1]
 
     def at(points: ArrayLike) -> NDArray[np.float64]:
-        """From inches, upwards, to pixels, downwards."""
+        """Converts inches with y up to pixels with y down."""
         return (np.asarray(points, float) * [1, -1] + [0, height]) * _INCH
 
     labels = {label.key: label for label in graph.labels}
@@ -103,7 +103,7 @@ def live_automaton(automaton: Automaton, name: str) -> str:
 
 
 def _lines(rows: layout.Rows, center: NDArray[np.float64]) -> str:
-    """The guards of an arrow, a line each, with their marks."""
+    """The guards of an edge, one per line, with their marks."""
     step, found = 16.0, []
     for i, (mark, line) in enumerate(rows):
         y = center[1] + (i - (len(rows) - 1) / 2) * step
@@ -113,7 +113,7 @@ def _lines(rows: layout.Rows, center: NDArray[np.float64]) -> str:
 
 
 def _arrow(curve: NDArray[np.float64]) -> str:
-    """A Bezier curve with its head, which ends where the curve does."""
+    """SVG of a Bezier curve with an arrow head."""
     along = curve[-1] - curve[-2]
     along = along / max(float(np.hypot(*along)), 1e-9)
     side, end = np.array([-along[1], along[0]]) * 4, curve[-1]
@@ -125,7 +125,7 @@ def _arrow(curve: NDArray[np.float64]) -> str:
 
 
 class _Ground(NamedTuple):
-    """What is under the layers of a map: S colours, empty for a plain cell, and S names."""
+    """The background of a map: S colours, empty for plain cells, and S names."""
 
     shape: tuple[int, int]
     colors: list[str]
@@ -169,7 +169,7 @@ def live_map(
     wall: str = "#",
     pieces: int = 1,
 ) -> str:
-    """A map with a layer for each memory, of which a page shows one at a time; the first is shown.
+    """A map with one layer per memory state, the first of which is visible.
 
     Args:
       place: the cells of a text map, ``str[rows, columns]``, or a coloured world.
@@ -256,7 +256,7 @@ def _cell(row: int, column: int, kind: str, color: str, more: str = "") -> str:
 def _layer(
     ground: _Ground, values: ArrayLike | None, policy: ArrayLike | None, actions: Sequence[str]
 ) -> list[str]:
-    """A colour for each value, and the arrows of a policy: light where it is dark beneath."""
+    """SVG of one layer: values as colours, and the arrows of a policy."""
     parts, columns, beneath = [], ground.shape[1], list(ground.colors)
     if values is not None:
         shown = np.asarray(values, float)
@@ -276,7 +276,7 @@ def _layer(
 
 
 def _triangle(row: int, column: int, action: str, chance: float) -> str:
-    """An arrow's head from the middle of a cell, as long as its action is likely."""
+    """SVG of an arrow head whose length is the probability of its action."""
     step = np.array(STEPS[action], float)
     side = step[::-1] * (0.055 + 0.085 * chance)
     middle = np.array([column + 0.5, row + 0.5])
@@ -289,7 +289,7 @@ def _triangle(row: int, column: int, action: str, chance: float) -> str:
 
 
 def _track(number: int, cells: Sequence[int], columns: int) -> str:
-    """The line of a run, from a dot."""
+    """SVG of a trajectory, from a dot."""
     points = [
         (state % columns * CELL + CELL / 2, state // columns * CELL + CELL / 2) for state in cells
     ]
@@ -302,7 +302,7 @@ def _track(number: int, cells: Sequence[int], columns: int) -> str:
 
 
 def live_curve(name: str, values: ArrayLike, steps: ArrayLike) -> str:
-    """A learning curve: the median over seeds as a line, and all of them as a band.
+    """A learning curve: the median over seeds as a line, their range as a band.
 
     Args:
       name: what the id begins with.

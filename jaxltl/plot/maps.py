@@ -40,7 +40,7 @@ from jaxltl.plot.style import (
     value_limits,
 )
 
-# Cells are often named for a colour, and then have it.
+# Colours of cells that are named after one.
 _NAMED = {"r": "#f0b9b1", "y": "#f7e08e", "g": "#bfe3c4", "b": "#bcd3f2"}
 
 
@@ -60,10 +60,10 @@ def grid(
     Args:
       cells: a text map (see :func:`jaxltl.envs.text_map.parse_map`) or its cells.
       values: ``float[S]``, or ``float[M, S]`` for M panels; NaN leaves a cell blank.
-      policy: ``float[S, A]`` or ``int[S]``, or with M panels first; arrows are as long as
-        their action is likely, and a row of NaN has none.
+      policy: ``float[S, A]`` or ``int[S]``, or with M panels first; the length of an arrow is the
+        probability of its action, and a row of NaN has none.
       titles: one per panel.
-      label: what the colours mean.
+      label: of the colour scale.
       limits: values at the ends of the scale; None takes the data's.
       actions: the name of each action, of up, down, left and right.
       wall: the kind of cell that is not a place.
@@ -229,7 +229,7 @@ def kind_colors(kinds: NDArray[np.str_], wall: str) -> dict[str, str]:
 
 
 def _short_number(value: float) -> str:
-    """Three places; a probability goes without its leading zero."""
+    """A number to three digits, without a leading zero."""
     return f"{value:.3f}".removeprefix("0") if 0 <= value < 1 else f"{value:.3g}"
 
 
@@ -245,16 +245,16 @@ def strategies(
     actions: Sequence[str] = ("up", "down", "left", "right"),
     wall: str = "#",
 ) -> Figure:
-    """Mixed strategies on a map: big arrows for what is played often, small ones for the rest.
+    """Mixed strategies on a map: large arrows for likely moves, small ones for rare moves.
 
-    For strategies with moves so rare that :func:`grid` would not show them.
+    For strategies with moves too rare for :func:`grid`.
 
     Args:
       cells: a text map (see :func:`jaxltl.envs.text_map.parse_map`) or its cells.
       play: ``float[S, A]``, or ``float[M, S, A]`` for M panels: the probability of each move;
-        zero draws nothing, and a cell whose row is NaN is grey, since it is never reached.
+        zero draws nothing, and a cell whose row is NaN is grey (never reached).
       marked: ``bool[S]``, or with M panels first: cells with a coloured background.
-      mark: what that colour means.
+      mark: the legend of that colour.
       titles: one per panel.
       across: panels in a row, at most.
       seldom: moves of a smaller probability get a small arrow.

@@ -1,6 +1,6 @@
-"""Models and solutions as pictures: maps where moves lie on a grid, else graphs of few states.
+"""Pictures of models and solutions: grid maps, or graphs of small models.
 
-Kinds of models are told by their fields: to import their types would load JAX, for which who draws
+Kinds of models are recognised by their fields: importing their types would load JAX, and a caller that draws
 in a process apart need not wait.
 """
 
@@ -32,11 +32,11 @@ _WALL = "#"
 
 
 def model(model: Any) -> Figure:
-    """A model: the map on which its moves lie, or the graph of its few states.
+    """A model as a grid map if its moves lie on one, else as a graph.
 
     That moves lie on a map is read off them: there are four actions, most of what each does goes
     one cell up, down, left or right, or stays, and states are numbered in rows from the top left,
-    as :func:`~jaxltl.gridworld` has it. What nobody enters or leaves is a wall. In a game of two
+    as :func:`~jaxltl.gridworld` has it. Cells without moves in or out are walls. In a game of two
     robots, see :func:`~jaxltl.envs.grid_game`, the map is that of both.
 
     Args:
@@ -68,21 +68,21 @@ def model(model: Any) -> Figure:
 
 
 def solution(solution: Solution, model: Any = None, *, memories: Any = None) -> Figure:
-    """What a solver found: values and policy on the map or graph of a model, or values alone.
+    """A solution: values and policy on the map or graph of a model, or values alone.
 
     Args:
       solution: of one lane; without a model also of several.
-      model: what was solved. Without it the values are drawn from the least to the greatest, with
+      model: the solved model. Without it the values are drawn in ascending order, with
         their certified bounds.
-      memories: of a product, which memory states to show; default those in which the values are
-        not all the same, at most nine of them.
+      memories: of a product, the memory states to show; default those whose values differ, at
+        most nine.
 
     Returns:
       The figure, with a panel for each memory state of a product.
 
     Raises:
-      ValueError: the model has no map and is too large for a graph, or the solution is another
-        one's.
+      ValueError: the model has no map and is too large for a graph, or the solution
+        belongs to another model.
 
     Example:
       >>> import jaxltl as jl
@@ -138,7 +138,7 @@ def solution(solution: Solution, model: Any = None, *, memories: Any = None) -> 
 
 
 def _limits(values: NDArray[Any]) -> tuple[float, float] | None:
-    """The scale of probabilities, or that of the data."""
+    """The limits [0, 1] for probabilities, else None."""
     return (0.0, 1.0) if values.size and values.min() >= 0 and values.max() <= 1 else None
 
 
@@ -155,7 +155,7 @@ def _open_memories(values: NDArray[Any], inside: NDArray[np.bool_]) -> list[int]
 
 
 def _strip(found: Solution) -> Figure:
-    """Values of all states from the least to the greatest; a line for each lane."""
+    """Values of all states in ascending order, one line per lane."""
     value, low, high = (np.asarray(x, float) for x in (found.value, found.lower, found.upper))
     lanes = int(np.prod(np.shape(found.status)))
     figure = Figure(figsize=(4.6, 1.7), layout="constrained", facecolor=PAPER)
@@ -296,7 +296,7 @@ class _Arrow(NamedTuple):
 
 
 def _arrows_of(world: Any) -> Iterator[_Arrow]:
-    """What is possible in a model, choice by choice."""
+    """All transitions of a model, choice by choice."""
     if hasattr(world, "row_start"):
         rows, entries = np.asarray(world.row_start), np.asarray(world.entry_start)
         for s in range(world.num_states):
@@ -389,7 +389,7 @@ def _square(axes: Axes, center: NDArray[np.float64], text: str, good: bool) -> N
 
 
 def _notes(world: Any, values: NDArray[Any] | None) -> list[str]:
-    """What holds, and what is worth what, state by state."""
+    """Labels and values by state, as text."""
     label = np.asarray(world.label)
     lines = []
     for s in range(world.num_states):

@@ -1,4 +1,4 @@
-"""What notebooks show of objects: small pictures, each with its text; none where it would crowd."""
+"""Notebook representations of objects: small pictures with a text alternative."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _PLACES, _SOME_PLACES = 9, 64  # of a board, up to which there is a map for each
 
 
 def svg(draw: Callable[..., Figure], *arguments: Any, text: str, **options: Any) -> str:
-    """A figure as an SVG that stands in a page, with a text for who does not see it."""
+    """A figure as an inline SVG with a text alternative."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of signs that the font lacks, which stay boxes
         found = to_bytes(draw(*arguments, **options), "svg").decode()
@@ -42,7 +42,7 @@ def svg(draw: Callable[..., Figure], *arguments: Any, text: str, **options: Any)
 
 
 def _stacked(pictures: list[str], text: str) -> str | None:
-    """Pictures one below the other, as one."""
+    """Pictures stacked vertically in one SVG."""
     if not pictures:
         return None
     sizes = [
@@ -100,7 +100,7 @@ def _(value: Solution) -> str | None:
 @picture.register(Winning)
 @picture.register(Permissive)
 def _region(value: Any) -> str | None:
-    """Where the system wins on its turn, before anything has happened, in games of two robots."""
+    """Winning region on the system's turns in the initial memory state, for games of two robots."""
     game, region = value.game, np.asarray(value.region)
     if isinstance(game.mdp, Product):
         memory = np.asarray(game.mdp.initial_memory)

@@ -1,4 +1,4 @@
-"""Runs that play by themselves: a moving picture in one SVG, without a script."""
+"""Animated trajectories: one SVG without scripts."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ def playback(
     times: int = 3,
     wall: str = "#",
 ) -> str:
-    """One run on a map, and beside it the state that the task's automaton is in at each step.
+    """A trajectory on a map, next to the state of the task's automaton at each step.
 
     It plays `times` times and then rests with the whole way drawn; so it does from the start for
-    readers who have asked their system for less motion. Any page shows it as an image.
+    readers whose system is set to reduced motion. Any page shows it as an image.
 
     Args:
       cells: a text map (see :func:`jaxltl.envs.text_map.parse_map`) or its cells.
       states: ``int[T]``, the cells of the run, in order.
       automaton, memory: an automaton and ``int[T]``, its state at each of the steps; or neither.
-      label: what readers are told who do not see it; default how many steps it has.
+      label: the text alternative; default the number of steps.
       wait: seconds for each step.
       times: how often it plays.
       wall: the kind of cell that is not a place.
@@ -92,12 +92,12 @@ def _whole(name: str, given: ArrayLike | None, count: int, what: str) -> list[in
 
 
 def _plain(text: str) -> str:
-    """Without what makes parts of a live picture buttons."""
+    """A live picture without its interactive attributes."""
     return re.sub(r' (?:role|tabindex|aria-pressed|aria-label)="[^"]*"', "", text)
 
 
 def _timed(name: str, frames: Sequence[str], wait: float) -> str:
-    """Keyframes, one for each step that changes something, and a rest at the end."""
+    """Keyframes of an attribute: one per change, and a pause at the end."""
     total = (len(frames) - 1) * wait + _REST
     kept = [
         t
@@ -113,7 +113,7 @@ def _plays(name: str, steps: int, wait: float, times: int, how: str = "linear") 
 
 
 def _moves(run: list[int], columns: int, wait: float, times: int) -> str:
-    """The token goes from cell to cell, and draws its line."""
+    """Animation of the token and its line."""
     place = [divmod(s, columns) for s in run]
     at = [
         f"transform:translate({c * CELL + CELL // 2}px,{r * CELL + CELL // 2}px)" for r, c in place
@@ -132,7 +132,7 @@ def _moves(run: list[int], columns: int, wait: float, times: int) -> str:
 
 
 def _memories(memory: list[int], wait: float, times: int) -> str:
-    """Of the automaton the state that a step is in, and nothing else, is filled."""
+    """Animation of the automaton: the current state is filled."""
     parts = []
     for q in sorted(set(memory)):
         for tag, on, off in (
@@ -172,7 +172,7 @@ _LOOK = (
 
 
 def _beside(panes: Sequence[str], style: str, told: str) -> str:
-    """Pictures side by side on a card of their own, so that any page can be behind them."""
+    """Pictures side by side on a card with a background."""
     sizes = [
         [float(x) for x in re.findall(r'viewBox="\S+ \S+ (\S+) (\S+)"', pane)[0]] for pane in panes
     ]

@@ -20,7 +20,7 @@ ACCENT, GOOD, PAPER = "#1f6f8b", "#e4f1ea", "#ffffff"
 KINDS = ("#dfd0ea", "#f5d6b3", "#d3e6e8", "#e3ddd0", "#f0d3df", "#dbe3b8")
 SERIES = ("#1f6f8b", "#c2571a", "#5b7f2b", "#7a4f9a", "#a23b5b", "#4a5a6a")
 
-# What is well is light, so that the cells that are not stand out.
+# High values are light, so that low ones stand out.
 SCALE = LinearSegmentedColormap.from_list(
     "probability", ["#2f2b57", "#4a5a92", "#7f9cc0", "#bfd3df", "#f6f8f4"]
 )
@@ -58,7 +58,7 @@ def to_bytes(figure: Figure, kind: str = "svg", dpi: int = 150) -> bytes:
         figure.set_facecolor(PAPER)
         engine.execute(figure)
         figure.set_layout_engine("none")
-        figure.dpi = dpi  # of what is drawn as an image
+        figure.dpi = dpi  # of images inside the figure
         canvas.print_svg(buffer, metadata={"Date": None})
     finally:
         figure.set_layout_engine(engine)
@@ -68,14 +68,14 @@ def to_bytes(figure: Figure, kind: str = "svg", dpi: int = 150) -> bytes:
 
 
 def settle(figure: Figure) -> None:
-    """Lays a figure out once more than drawing does: titles find their height after the maps."""
+    """Runs the layout once more, since titles get their height after the maps."""
     engine = figure.get_layout_engine()
     if engine is not None:
         engine.execute(figure)
 
 
 def note(figure: Figure, marks: Sequence[tuple[Any, ...]], title: str = "") -> None:
-    """What colours and marks mean, under the maps: colour, text, marker and, if not 7, its size."""
+    """Draws a legend below the maps: (colour, text, marker[, size])."""
     handles = [
         Line2D(
             [],
@@ -110,7 +110,7 @@ def note(figure: Figure, marks: Sequence[tuple[Any, ...]], title: str = "") -> N
 def value_limits(
     values: NDArray[np.float64], limits: tuple[float, float] | None
 ) -> tuple[float, float]:
-    """The ends of a scale of values; if none are given, those of the finite values."""
+    """The limits of a colour scale; default the range of the finite values."""
     if limits is not None:
         return limits
     finite = values[np.isfinite(values)]
@@ -126,7 +126,7 @@ def scale_bar(
     shrink: float = 0.6,
     aspect: float = 24,
 ) -> None:
-    """What the colours of values mean, beside the maps."""
+    """Draws the colour scale of values."""
     # As many ticks at any height, so that the layout, which comes first, finds labels as they are.
     bar = figure.colorbar(
         image, ax=list(axes), shrink=shrink, pad=0.015, aspect=aspect, ticks=MaxNLocator(5)
@@ -142,7 +142,7 @@ def head(axes: Axes, text: str) -> None:
 
 
 def plain_axes(axes: Axes) -> None:
-    """Axes without what distracts."""
+    """Removes spines and ticks from axes."""
     axes.tick_params(labelsize=8, color=FAINT, labelcolor=INK, length=3)
     axes.grid(color=FAINT, lw=0.5)
     axes.set_axisbelow(True)

@@ -1,4 +1,4 @@
-"""Coloured worlds, what is done in them, and what it is worth."""
+"""Pictures of coloured gridworlds with policies, trajectories and values."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from jaxltl.plot.style import ACCENT, INK, PAPER, SCALE, SERIES, head, note, sca
 if TYPE_CHECKING:
     from jaxltl.envs.temporal_gridworld import World
 
-# Of cell_kinds.COLORS: paler than their names, so that what is drawn on them shows.
+# Pale versions of cell_kinds.COLORS, for contrast with drawings on top.
 TINTS = ("#e79a8c", "#f5db80", "#fdfcf8", "#c3add8", "#4a4f58")
 _IS_LIGHT = np.array([1.0, 1.0, 1.0, 1.0, 0.0])
 
@@ -46,7 +46,7 @@ def temporal_gridworld(
 ) -> Figure:
     """A coloured world and its objects, with a policy as arrows and trajectories as lines.
 
-    Objects and obstacles have a frame and their name; the ring that only patches show is pale.
+    Objects and obstacles have a frame and their name; the margin, seen in patches only, is pale.
 
     Args:
       world: a :class:`jaxltl.envs.temporal_gridworld.World`.
@@ -55,7 +55,7 @@ def temporal_gridworld(
       trajectories: of the world, drawn from a dot to a square, side by side where they overlap.
       value: ``float[S]`` or ``float[S, Q]``, as colours in a second row of panels.
       title: one per panel.
-      label: what the value is.
+      label: the name of the value.
       limits: values at the ends of the scale; default the data's.
       actions: the name of each action, of up, down, left and right.
 
@@ -133,7 +133,7 @@ def _of_memory(
 
 
 def _color_cells(axes: Axes, world: World) -> NDArray[np.float64]:
-    """The colours of a world and its ring; returns which cells are light, ``[S]``."""
+    """Colours a world and its margin; returns the mask of light cells, ``[S]``."""
     (rows, columns), margin = world.shape, world.margin
     colors = np.asarray(world.colors)
     axes.imshow(
@@ -158,7 +158,7 @@ def _color_cells(axes: Axes, world: World) -> NDArray[np.float64]:
 
 
 def _name_kinds(axes: Axes, world: World) -> None:
-    """A frame around each object and obstacle, and its name where there is room."""
+    """Frames objects and obstacles, and writes their names if they fit."""
     kinds = np.asarray(world.mdp.label)
     tiny = max(world.shape) > 16
     for state, number in np.argwhere(kinds):
@@ -176,7 +176,7 @@ def _name_kinds(axes: Axes, world: World) -> None:
                 zorder=5,
             )
         )
-        # Where cells are tiny, the name of what is rare stands beside it.
+        # In small cells, names of rare kinds are written next to them.
         if not tiny or kinds[:, number].sum() <= 3:
             x, y = (column + 1.2, row + 0.04) if tiny else (column + 0.04, row + 0.04)
             axes.text(
@@ -206,7 +206,7 @@ def _walks(trajectories: Any, world: World) -> list[NDArray[np.float64]]:
             f"to {size - 1}. Pass trajectories of the world, not of a product."
         )
     count = len(states)
-    # Beside one another, so that what many do looks broad.
+    # Parallel lines, so that frequent paths look broad.
     offset = np.linspace(-0.22, 0.22, count) if count > 1 else np.zeros(1)
     points = []
     for row, length, shift in zip(states, lengths, offset, strict=True):
