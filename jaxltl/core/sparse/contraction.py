@@ -1,8 +1,9 @@
-"""Smaller models with the same answers: chains of single successors, and end components, as one."""
+"""Contraction of chains of single successors, and quotients by end components."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -10,19 +11,20 @@ from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
 
-_WORTH = 8  # a model is contracted if more than one in so many of its states goes
+_WORTH = 8  # a model is contracted if more than one in that many of its states vanishes
 
 
-class Contraction(NamedTuple):
+@dataclass(frozen=True)
+class Contraction:
     """A model in which some states stand for several.
 
     Attributes:
-      mdp: the smaller model; its rows need be neither sorted nor without repetition.
-      node: ``int[S]``, the state of the smaller model that stands for a state.
-      row: ``int[R']``, the row of the model that each row of the smaller one is.
-      earned: ``float64[S]``, what a state earns on the way to its node.
-      cost: ``float64[R']``, what a row earns until the next node.
-      depth: how many sums may stand behind one number of these.
+      mdp: the smaller model of N nodes; its rows may be unsorted and repeat successors.
+      node: ``int[S]``, the node that stands for a state.
+      row: ``int[R']``, the model's row of each row of the smaller model.
+      earned: ``float64[S]``, the reward between a state and its node.
+      cost: ``float64[R']``, the expected reward of a row up to the next node.
+      depth: the number of sums behind one of these numbers.
     """
 
     mdp: HostMDP
@@ -30,19 +32,32 @@ class Contraction(NamedTuple):
     row: Integers
     earned: Floats
     cost: Floats
-    depth: int
+    depth: int = 0
+
+    def region(self, states: Booleans) -> Booleans:
+        """The nodes of some states, ``bool[N]``."""
+        found = np.zeros(self.mdp.num_states, bool)
+        found[self.node[states]] = True
+        return found
+
+
+def identity(mdp: HostMDP, cost: Floats | None = None) -> Contraction:
+    """The model as its own contraction."""
+    states, rows = np.arange(mdp.num_states), np.arange(mdp.num_rows)
+    cost = np.zeros(mdp.num_rows) if cost is None else cost
+    return Contraction(mdp, states, rows, np.zeros(mdp.num_states), cost)
 
 
 def contract_chains(mdp: HostMDP, fixed: Booleans, cost: Floats | None) -> Contraction | None:
-    """States that have one row with one successor become what they lead to.
+    """Identifies states that have one row with one successor with that successor.
 
     Args:
       mdp: the model.
       fixed: ``bool[S]``, states to keep.
-      cost: ``float64[R]``, what rows earn, or None for nothing.
+      cost: ``float64[R]``, rewards, or None for zero.
 
     Returns:
-      The contraction, whose nodes are in the order of their states; None where it would not pay.
+      The contraction, with nodes in the order of their states; None where it does not pay.
     """
     size = mdp.num_states
     width = mdp.entry_start[mdp.row_start[1:]] - mdp.entry_start[mdp.row_start[:-1]]
@@ -52,11 +67,11 @@ def contract_chains(mdp: HostMDP, fixed: Booleans, cost: Floats | None) -> Contr
     after = np.arange(size)
     from_ = np.flatnonzero(alias)
     to = mdp.successor[mdp.entry_start[mdp.row_start[from_]]]
-    alias[from_[to == from_]] = False  # where it stands still
+    alias[from_[to == from_]] = False  # self-loops
     after[from_] = to
     end, rounds = _ends(after)
     if (trapped := alias[end]).any():
-        # A circle of single successors: what lies on it is kept, as nobody leaves it.
+        # A cycle of single successors is kept.
         alias[end[trapped]] = False
         after = np.where(alias, after, np.arange(size))
         end, rounds = _ends(after)
@@ -73,17 +88,16 @@ def contract_chains(mdp: HostMDP, fixed: Booleans, cost: Floats | None) -> Contr
     node = number[end]
     count = np.diff(mdp.row_start)[kept]
     row = concatenated_ranges(mdp.row_start[kept], count)
-    smaller, entry = _taken(mdp, row, count, node)
+    smaller, entry = _renamed(mdp, row, count, node)
     spent = np.zeros(row.size)
     if cost is not None:
-        spent = cost[row] + np.add.reduceat(
-            mdp.probability[entry] * earned[mdp.successor[entry]], smaller.entry_start[:-1]
-        )
+        terms = mdp.probability[entry] * earned[mdp.successor[entry]]
+        spent = cost[row] + np.add.reduceat(terms, smaller.entry_start[:-1])
     return Contraction(smaller, node, row, earned, spent, rounds + 1)
 
 
 def _ends(after: Integers) -> tuple[Integers, int]:
-    """Where pointers end, by doubling, and how many doublings that took."""
+    """The ends of pointers by doubling, and the number of doublings."""
     end, rounds = after, 0
     while True:
         further = end[end]
@@ -92,10 +106,10 @@ def _ends(after: Integers) -> tuple[Integers, int]:
         end, rounds = further, rounds + 1
 
 
-def _taken(
+def _renamed(
     mdp: HostMDP, row: Integers, count: Integers, node: Integers
 ) -> tuple[HostMDP, Integers]:
-    """The model of some rows whose successors are renamed, and the entries that it has."""
+    """The model of some rows with renamed successors, and its entries."""
     width = np.diff(mdp.entry_start)[row]
     entry = concatenated_ranges(mdp.entry_start[row], width)
     smaller = HostMDP(
@@ -108,13 +122,13 @@ def _taken(
 
 
 def quotient(mdp: HostMDP, component: Integers, inside: Booleans, cost: Floats) -> Contraction:
-    """Each end component becomes one state, with the rows that leave it.
+    """The quotient by end components: one state each, with the rows that leave it.
 
     Args:
       mdp: the model.
       component: ``int[S]``, the least state of each state's component.
-      inside: ``bool[R]``, the rows to leave out. A state all of whose rows are left out must not
-        be asked for: it keeps one of them.
+      inside: ``bool[R]``, the rows to leave out. A node all of whose rows are left out keeps one of
+        them, and its value is meaningless.
       cost: ``float64[R]``.
     """
     size = mdp.num_states
@@ -122,14 +136,14 @@ def quotient(mdp: HostMDP, component: Integers, inside: Booleans, cost: Floats) 
     kept = ~inside
     some = np.zeros(size, bool)
     some[leader[kept]] = True
-    stuck = (component == np.arange(size)) & ~some
-    kept[mdp.row_start[:-1][stuck]] = True
+    is_leader = component == np.arange(size)
+    kept[mdp.row_start[:-1][is_leader & ~some]] = True
     row = np.flatnonzero(kept)
     row = row[np.argsort(leader[row], kind="stable")]
-    leaders = np.flatnonzero(component == np.arange(size))
+    leaders = np.flatnonzero(is_leader)
     number: Any = np.zeros(size, np.int32)
     number[leaders] = np.arange(leaders.size)
     node = number[component]
     count = np.bincount(node[mdp.state[row]], minlength=leaders.size)
-    smaller, _ = _taken(mdp, row, count, node)
-    return Contraction(smaller, node, row, np.zeros(size), cost[row], 0)
+    smaller, _ = _renamed(mdp, row, count, node)
+    return Contraction(smaller, node, row, np.zeros(size), cost[row])

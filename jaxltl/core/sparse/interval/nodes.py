@@ -19,7 +19,7 @@ from jaxltl.core.sparse.interval.uncertainty_set import HostInterval
 from jaxltl.core.sparse.linear.topological_order import Edges, ordered_components
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
-from jaxltl.core.sparse.solvers.mixing import expands_fast
+from jaxltl.core.sparse.solvers.reachability import expands_fast
 
 _EPS = float(np.finfo(np.float64).eps)
 _TINY = 1e-290

@@ -20,7 +20,7 @@ from jaxltl.core.sparse.interval.nodes import Choice, Nodes
 from jaxltl.core.sparse.interval.systems import Systems
 from jaxltl.core.sparse.interval.uncertainty_set import HostInterval
 from jaxltl.core.sparse.rows import offsets_from_counts
-from jaxltl.core.sparse.solvers.policy_iteration import Enclosure
+from jaxltl.core.sparse.solvers.total_cost import Enclosure
 
 _EPS = float(np.finfo(np.float64).eps)
 _LEAST = 1e-270

@@ -27,7 +27,7 @@ from jaxltl.core.sparse.interval.qualitative import (
 from jaxltl.core.sparse.interval.uncertainty_set import HostInterval
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.solvers import reachability as optimal
-from jaxltl.core.sparse.solvers.policy_iteration import Enclosure
+from jaxltl.core.sparse.solvers.total_cost import Enclosure
 
 _EPS = float(np.finfo(np.float64).eps)
 _ROUNDS = 100

@@ -24,7 +24,8 @@ from jaxltl.core.sparse.graph.qualitative import (
 )
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
-from jaxltl.core.sparse.solvers.policy_iteration import ShortestPathProblem, optimum
+from jaxltl.core.sparse.solvers.policy_iteration import policy_iteration
+from jaxltl.core.sparse.solvers.total_cost import ShortestPathProblem
 
 _EPS = float(np.finfo(np.float64).eps)
 _ROUNDS = 100
@@ -218,15 +219,15 @@ def _solved(
     none = np.zeros(mdp.num_states)
     first = shortest_path_rows(mdp, end, np.ones(mdp.num_rows, bool)).astype(np.int64)
     if not loss.any():
-        problem = ShortestPathProblem(mdp, ~end, none, gain, first=first)
-        found = optimum(problem, maximize=True, tolerance=tolerance, relative=False)
+        problem = ShortestPathProblem(mdp, ~end, none, gain, proper_policy=first)
+        found = policy_iteration(problem, maximize=True, tolerance=tolerance, relative=False)
         return found.upper, found.row
     if not (gain[moves] > 0).any():
         most = quotient.known.max()
         lost = np.where(moves, loss, most - quotient.known)
         lost[-1] = 0
-        problem = ShortestPathProblem(mdp, ~end, none, lost, first=first)
-        found = optimum(problem, maximize=False, tolerance=tolerance, relative=False)
+        problem = ShortestPathProblem(mdp, ~end, none, lost, proper_policy=first)
+        found = policy_iteration(problem, maximize=False, tolerance=tolerance, relative=False)
         return most - found.lower, found.row
     return _signed(mdp, end, gain - loss, np.abs(gain) + loss, first, tolerance)
 

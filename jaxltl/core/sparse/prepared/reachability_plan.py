@@ -94,21 +94,21 @@ def plan_optimum(reduced: ReducedProblem, cost: Floats | None) -> Plan:
       reduced: what the graph leaves.
       cost: ``float[R]``, the rewards of the rows of the model; None for probabilities.
     """
-    mdp, whole, part = reduced.mdp, reduced.whole, reduced.part
+    mdp, whole, part = reduced.mdp, reduced.contraction, reduced.quotient
     small = whole.mdp if part is None else part.mdp
     origin = whole.row if part is None else whole.row[part.row]
     node = whole.node if part is None else part.node[whole.node]
-    finite = np.isfinite(reduced.known)
-    codes = np.where(finite & ((reduced.known == 0) | (cost is not None)), GOAL, ONE)
+    finite = np.isfinite(reduced.known_value)
+    codes = np.where(finite & ((reduced.known_value == 0) | (cost is not None)), GOAL, ONE)
     codes = np.where(finite, codes, LOST)
     if cost is None:
-        codes[reduced.known == 0] = LOST
+        codes[reduced.known_value == 0] = LOST
     open_, rows = np.zeros(small.num_states, bool), np.zeros(0, np.int64)
     if reduced.problem is not None:
-        open_ = reduced.problem.open
+        open_ = reduced.problem.interior
         kept = open_[small.state]
-        if reduced.problem.rows is not None:
-            kept &= reduced.problem.rows
+        if reduced.problem.allowed is not None:
+            kept &= reduced.problem.allowed
         rows = np.flatnonzero(kept)
     nodes, loops = _optimum_nodes(mdp, small, origin, open_, rows, codes, cost)
     order = schedule(
@@ -192,30 +192,32 @@ def _with_costs(
 
 def _own(reduced: ReducedProblem, codes: Integers) -> tuple[Integers, Integers]:
     """The nodes whose rows states take, and the rows of the others."""
-    mdp, whole, part = reduced.mdp, reduced.whole, reduced.part
+    mdp, whole, part = reduced.mdp, reduced.contraction, reduced.quotient
     mine = mdp.state[whole.row[whole.mdp.row_start[:-1]]]  # the state that each node is
-    chosen: Any = reduced.row
+    chosen: Any = reduced.known_row
     node: Any = np.arange(mine.size)
     if part is not None and reduced.components is not None:
-        chosen = quotient_policy(whole.mdp, reduced.components, part.row[reduced.row][part.node])
+        chosen = quotient_policy(
+            whole.mdp, reduced.components, part.row[reduced.known_row][part.node]
+        )
         node = part.node
-    if reduced.sure is not None and reduced.sure_row is not None:
-        chosen = np.where(reduced.sure, reduced.sure_row, chosen)
+    if reduced.fixed is not None and reduced.fixed_row is not None:
+        chosen = np.where(reduced.fixed, reduced.fixed_row, chosen)
     row: Any = mdp.row_start[:-1].astype(np.int32)
     row[mine] = whole.row[chosen]
     own: Any = np.full(mdp.num_states, -1, np.int32)
     if reduced.problem is not None:
-        own[mine] = np.where(reduced.problem.open, codes, -1)[node]
+        own[mine] = np.where(reduced.problem.interior, codes, -1)[node]
     return own, row
 
 
 def _circles(reduced: ReducedProblem) -> Circles | None:
     """The states of end components that are open; elsewhere rows are known."""
-    components, whole, part = reduced.components, reduced.whole, reduced.part
+    components, whole, part = reduced.components, reduced.contraction, reduced.quotient
     if components is None or part is None or reduced.problem is None:
         return None
     mdp = whole.mdp
-    open_ = reduced.problem.open[part.node]
+    open_ = reduced.problem.interior[part.node]
     inside = components.inside & open_[mdp.state]
     region: Any = np.zeros(mdp.num_states, bool)
     region[mdp.state[inside]] = True

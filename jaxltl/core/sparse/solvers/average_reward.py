@@ -23,12 +23,16 @@ from jaxltl.core.sparse.graph.qualitative import (
     shortest_path_rows,
 )
 from jaxltl.core.sparse.linear.elimination import factorize
-from jaxltl.core.sparse.linear.matrix_tree import share_of_values
-from jaxltl.core.sparse.linear.refinement import difference, two_sum
+from jaxltl.core.sparse.linear.extended_precision import (
+    perturbation_bound,
+    two_float_difference,
+    two_sum,
+)
 from jaxltl.core.sparse.linear.topological_order import Edges, ordered_components
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
-from jaxltl.core.sparse.solvers.policy_iteration import ShortestPathProblem, optimum
+from jaxltl.core.sparse.solvers.policy_iteration import policy_iteration
+from jaxltl.core.sparse.solvers.total_cost import ShortestPathProblem
 from jaxltl.core.sparse.solvers.step_bounded import backup_unit
 
 _EPS = float(np.finfo(np.float64).eps)
@@ -137,7 +141,7 @@ def _stopped(
     known = np.concatenate([np.zeros(size), worth - shift])
     open_ = np.arange(mdp.num_states) < size
     problem = ShortestPathProblem(mdp, open_, known, np.zeros(mdp.num_rows))
-    found = optimum(
+    found = policy_iteration(
         problem,
         maximize=sign > 0,
         relative=relative,
@@ -248,7 +252,7 @@ class _Part(NamedTuple):
         ahead = (
             v[target] - v[source]
             if low is None
-            else difference(v[target], low[target], v[source], low[source])
+            else two_float_difference(v[target], low[target], v[source], low[source])
         )
         step = mdp.probability * ahead
         slack = np.add.reduceat(np.abs(step), mdp.entry_start[:-1])
@@ -342,14 +346,16 @@ class _Gains:
         ``c - g + sum_t P_t (v_t - v_s)``. If that of each chosen row is at most a share e of the
         sum of its absolute terms, the policy has the gain g for weights and costs that differ by e;
         if no row has more, no policy has a greater one. As quotients of sums of their products
-        (:func:`~jaxltl.core.sparse.linear.matrix_tree.share_of_values`), gains of the true ones
+        (:func:`~jaxltl.core.sparse.linear.extended_precision.perturbation_bound`), gains of the true ones
         differ by a small multiple of e, however far apart biases are.
         """
         part, which = left.part, left.which[0]
         mdp, base = part.mdp, float(part.reward.min())
         start, cost, earned = mdp.entry_start[:-1], part.reward - base, max(gain - base, 0.0)
         source, target = mdp.state[mdp.row], mdp.successor
-        flow = mdp.probability * difference(high[target], low[target], high[source], low[source])
+        flow = mdp.probability * two_float_difference(
+            high[target], low[target], high[source], low[source]
+        )
         gap = (part.reward - gain) + np.add.reduceat(flow, start)
         scale = cost + earned + np.add.reduceat(np.abs(flow), start)
         share = np.abs(gap) / np.maximum(scale, 1e-300)
@@ -358,7 +364,7 @@ class _Gains:
         slack = part.unit * float(part.magnitude.max())
         bounds = []
         for side, error in ((-1, own), (1, every)):
-            error = share_of_values(error + 2 * part.unit, mdp.num_states)
+            error = perturbation_bound(error + 2 * part.unit, mdp.num_states)
             far = gain + side * (error * earned + slack) if error < _LOOSEST else side * np.inf
             bounds.append(far)
         if bounds[0] > self.lower[which]:
@@ -567,7 +573,9 @@ def _cycle(
     target = matrix.indices
     with np.errstate(all="ignore"):
         for _ in range(_REFINED):
-            step = matrix.data * difference(high[target], low[target], high[source], low[source])
+            step = matrix.data * two_float_difference(
+                high[target], low[target], high[source], low[source]
+            )
             earned = system.solve((reward - gain + np.bincount(source, step, states.size)) / leaves)
             share = earned[visited] / time[visited]
             if not np.isfinite(earned).all() or not np.isfinite(share):

@@ -1,15 +1,16 @@
-"""Discounted values on sparse rows: a run ends with what the discount leaves out of each step."""
+"""Discounted values on sparse rows, as a shortest path problem that ends with probability 1 - d."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from jaxltl.core.array_types import Floats
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.solvers.mixing import optimum
-from jaxltl.core.sparse.solvers.policy_iteration import Enclosure, ShortestPathProblem
+from jaxltl.core.sparse.solvers.reachability import solve_shortest_path
+from jaxltl.core.sparse.solvers.total_cost import Enclosure, ShortestPathProblem
 
 _EPS = float(np.finfo(np.float64).eps)
 
@@ -20,48 +21,38 @@ def discounted_value(
     magnitude: Floats,
     discount: float,
     *,
-    maximize: bool,
     tolerance: float,
     depth: int = 0,
 ) -> Enclosure:
-    """``V = opt_r (reward_r + discount * P_r V)``, enclosed.
+    """Certified largest solution of ``V = max_r (reward_r + discount * P_r V)``.
 
     Args:
       mdp: the model.
       reward: ``float64[R]``, of any sign.
-      magnitude: ``float64[R]``, the sum of the absolute values of what a reward is made of.
+      magnitude: ``float64[R]``, the sum of absolute values behind each reward.
       discount: in ``[0, 1)``.
-      maximize: which optimum.
-      tolerance: the width of the enclosure asked for.
-      depth: how many roundings stand behind each number of the model.
+      tolerance: the width of the enclosure.
+      depth: the number of roundings behind each number of the model.
     """
     least = float(reward.min())
-    ending = _ending(mdp, discount)
-    open_ = np.ones(ending.num_states, bool)
-    open_[-1] = False
-    # What every step earns at least is earned for ever, and the rest is at least 0.
+    ending = _with_final_state(mdp, discount)
+    interior = np.ones(ending.num_states, bool)
+    interior[-1] = False
+    # The least reward is earned forever, and the rest is at least 0.
     cost = np.append(reward - least, 0)
-    problem = ShortestPathProblem(ending, open_, np.zeros(open_.size), cost, depth=depth)
-    found = optimum(problem, maximize=maximize, tolerance=tolerance, relative=False)
+    problem = ShortestPathProblem(ending, interior, np.zeros(interior.size), cost, depth=depth)
+    found = solve_shortest_path(problem, maximize=True, tolerance=tolerance, relative=False)
     always = least / (1 - discount)
     value, lower, upper = (x[:-1] + always for x in (found.value, found.lower, found.upper))
-    # Terms of a reward may cancel, and their rounding stays.
+    # Terms of a reward may cancel; their rounding stays.
     terms = int(np.diff(mdp.entry_start).max()) + depth + 4
     lost = terms * float(magnitude.max()) / (1 - discount)
     slack = 4 * _EPS * (np.abs(found.value[:-1]) + abs(always) + lost)
-    return Enclosure(
-        value,
-        lower - slack,
-        upper + slack,
-        found.row[:-1],
-        found.rounds,
-        found.residual,
-        found.method,
-    )
+    return replace(found, value=value, lower=lower - slack, upper=upper + slack, row=found.row[:-1])
 
 
-def _ending(mdp: HostMDP, discount: float) -> HostMDP:
-    """The model that ends, in one more state, with the rest of the discount."""
+def _with_final_state(mdp: HostMDP, discount: float) -> HostMDP:
+    """The model with a final state, which every row enters with probability 1 - discount."""
     end, rows = mdp.num_states, mdp.num_rows
     entry_start = np.append(mdp.entry_start + np.arange(rows + 1), 0)
     entry_start[-1] = entry_start[-2] + 1

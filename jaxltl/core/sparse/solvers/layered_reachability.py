@@ -9,6 +9,7 @@ memories at once (:mod:`jaxltl.core.sparse.graph.bitsets`), and what it leaves o
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -20,6 +21,7 @@ from jaxltl.core.sparse.graph.bitsets import LARGEST, BitSets, bit_graph, decide
 from jaxltl.core.sparse.graph.qualitative import end_components
 from jaxltl.core.sparse.linear.gauss_seidel import (
     BlockProblem,
+    SweepSettings,
     RowBlocks,
     SweptBounds,
     row_blocks,
@@ -28,8 +30,7 @@ from jaxltl.core.sparse.linear.gauss_seidel import (
 from jaxltl.core.sparse.linear.topological_order import Edges, ordered_components
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.rows import offsets_from_counts
-from jaxltl.core.sparse.solvers.mixing import expands_fast
-from jaxltl.core.sparse.solvers.reachability import quotient_policy
+from jaxltl.core.sparse.solvers.reachability import expands_fast, quotient_policy
 
 _EPS = float(np.finfo(np.float64).eps)
 _TINY = 1e-290
@@ -323,8 +324,8 @@ def _solved(
     problem: _Problem, sign: int, budget: float, unit: float, guess: tuple[Floats, float] | None
 ) -> SweptBounds | None:
     """Bounds of the nodes, and their rows."""
-    host = problem.host
-    circles = None
+    host, circles = problem.host, None
+    settings = SweepSettings(sign=sign, tolerance=budget, relative=False, unit=unit)
     if problem.stays.any():
         # Rows that stay in the component of the automaton, and where they can be taken for ever.
         here = problem.stays & problem.inner
@@ -340,9 +341,7 @@ def _solved(
             blocks, problem.open, problem.live, problem.near, problem.far, None, problem.rows
         )
         start, time = (None, None) if guess is None else guess
-        return solve_by_sweeps(
-            sums, sign=sign, tolerance=budget, relative=False, unit=unit, start=start, time=time
-        )
+        return solve_by_sweeps(sums, settings, start, time)
     part = quotient(host, circles.component, circles.inside, np.zeros(host.num_rows))
     leader = np.flatnonzero(circles.component == np.arange(host.num_states))
     mask = None if problem.rows is None else problem.rows[part.row]
@@ -355,11 +354,11 @@ def _solved(
         None,
         mask,
     )
-    found = solve_by_sweeps(sums, sign=sign, tolerance=budget, relative=False, unit=unit)
+    found = solve_by_sweeps(sums, settings)
     if found is None:
         return None
     row = quotient_policy(host, circles, part.row[found.row][part.node])
-    return found._replace(near=found.near[part.node], far=found.far[part.node], row=row)
+    return replace(found, near=found.near[part.node], far=found.far[part.node], row=row)
 
 
 def _cut(host: HostMDP) -> RowBlocks:

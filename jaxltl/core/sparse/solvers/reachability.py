@@ -1,72 +1,73 @@
-"""Certified probabilities of reaching states, and rewards until they are reached, on sparse rows.
+"""Certified reachability probabilities and total expected rewards of sparse MDPs.
 
-The graph decides first: chains are contracted, then who reaches the target with probability 0 or 1
-or may earn for ever; end components become one state. What is left has one solution, and
-:mod:`jaxltl.core.sparse.solvers.policy_iteration` encloses it.
+Qualitative preprocessing comes first: chains of single successors are contracted, states with
+probability 0 or 1, or with infinite reward, are found in the graph, and end components become
+single states of a quotient. The remaining stochastic shortest path problem has one solution, which
+Gauss-Seidel sweeps enclose if the model mixes well, and policy iteration otherwise.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
-from jaxltl.core.sparse.contraction import Contraction, quotient, contract_chains
+from jaxltl.core.sparse.contraction import Contraction, contract_chains, identity, quotient
 from jaxltl.core.sparse.graph.qualitative import (
     EndComponents,
+    almost_sure_reachability,
+    backward_reachable,
     end_components,
     positive_under_all_policies,
-    backward_reachable,
-    almost_sure_reachability,
     shortest_path_rows,
 )
+from jaxltl.core.sparse.linear.gauss_seidel import (
+    BlockProblem,
+    SweepSettings,
+    row_blocks,
+    solve_by_sweeps,
+)
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.solvers.mixing import optimum
-from jaxltl.core.sparse.solvers.policy_iteration import Enclosure, ShortestPathProblem
+from jaxltl.core.sparse.rows import concatenated_ranges, group_starts
+from jaxltl.core.sparse.solvers.policy_iteration import policy_iteration
+from jaxltl.core.sparse.solvers.total_cost import TINY, Enclosure, ShortestPathProblem
 
 _EPS = float(np.finfo(np.float64).eps)
+# A model mixes well, so that sweeps beat elimination, if a search meets many states in few steps.
+_LARGE, _MET, _STEPS = 20_000, 4096, 10  # of as many interior states: that many, in that many steps
+_SOME, _FEW = 400, 5  # of fewer states: half of them
 
 
-class ReducedProblem(NamedTuple):
-    """What the graph leaves of a question.
+@dataclass(frozen=True)
+class ReducedProblem:
+    """Residual problem after qualitative preprocessing.
 
     Attributes:
-      mdp: the model.
-      whole: the model without chains.
-      part: of that, the model whose end components are states; None where there are none.
+      known_value: ``float64[N]``, of the nodes outside the problem's interior.
+      known_row: ``int[N]``, their policy.
+      problem: on the nodes of `quotient`, or else of `contraction`; None if nothing is left.
+      quotient: of `contraction.mdp`, the model whose end components are states; None without any.
       components: these end components.
-      problem: what is left, on the nodes of `part` or else of `whole`; None where nothing is.
-      known: ``float64[N]``, what is known of the nodes that are not open.
-      row: ``int[N]``, the rows of nodes that are not open.
-      sure: ``bool``, the nodes of `whole` that take the rows of `sure_row` whatever is found.
-      most: what no value exceeds.
+      fixed, fixed_row: nodes of `contraction` whose rows are known whatever the solution is.
+      mdp: the model; contraction: the model without chains.
+      highest: a bound on all values.
       maximize: whether the largest value is asked for.
     """
 
-    mdp: HostMDP
-    whole: Contraction
-    part: Contraction | None
-    components: EndComponents | None
-    problem: ShortestPathProblem | None
-    known: Floats
-    row: Integers
-    sure: Booleans | None
-    sure_row: Integers | None
-    most: float
-    maximize: bool
-
-
-class _Left(NamedTuple):
-    """The same without what came before: a problem or None, and what is known."""
-
-    problem: ShortestPathProblem | None
-    known: Floats
-    row: Integers
-    part: Contraction | None = None
+    known_value: Floats
+    known_row: Integers
+    problem: ShortestPathProblem | None = None
+    quotient: Contraction | None = None
     components: EndComponents | None = None
-    sure: Booleans | None = None
-    sure_row: Integers | None = None
+    fixed: Booleans | None = None
+    fixed_row: Integers | None = None
+    mdp: Any = None
+    contraction: Any = None
+    highest: float = 1.0
+    maximize: bool = False
 
 
 def reachability(
@@ -78,194 +79,18 @@ def reachability(
     tolerance: float = 1e-6,
     depth: int = 0,
 ) -> Enclosure:
-    """The largest or smallest probability of reaching a target through states where one may stay.
+    """Optimal probability of reaching a target through states where one may stay.
 
     Args:
       mdp: the model.
       target: ``bool[S]``.
-      maximize: which of the two; the same for a Markov chain.
+      maximize: the largest or the smallest probability; irrelevant for a Markov chain.
       stay: ``bool[S]``, the states that may be passed; default all.
-      tolerance: the width of the enclosure asked for.
-      depth: how many roundings stand behind each number of the model.
+      tolerance: the width of the enclosure.
+      depth: the number of roundings behind each probability of the model.
     """
-    return _solved(
-        reduce_reachability(mdp, target, maximize=maximize, stay=stay, depth=depth), tolerance
-    )
-
-
-def reduce_reachability(
-    mdp: HostMDP,
-    target: Booleans,
-    *,
-    maximize: bool,
-    stay: Booleans | None = None,
-    depth: int = 0,
-) -> ReducedProblem:
-    """What the graph leaves of :func:`reachability`, with the same arguments."""
-    blocked = np.zeros(mdp.num_states, bool) if stay is None else ~stay & ~target
-    whole = contract_chains(mdp, target | blocked, None) or _identity(mdp)
-    small = whole.mdp
-    goal, dead = (np.zeros(small.num_states, bool) for _ in range(2))
-    goal[whole.node[target]], dead[whole.node[blocked]] = True, True
-    reduce = _largest if maximize and not small.is_chain else _smallest
-    left = reduce(small, goal, dead, whole.depth + depth)
-    return _reduced(mdp, whole, left, 1.0, maximize and not small.is_chain)
-
-
-def _identity(mdp: HostMDP) -> Contraction:
-    return Contraction(
-        mdp,
-        np.arange(mdp.num_states),
-        np.arange(mdp.num_rows),
-        np.zeros(mdp.num_states),
-        np.zeros(mdp.num_rows),
-        0,
-    )
-
-
-def _reduced(
-    mdp: HostMDP, whole: Contraction, left: _Left, most: float, maximize: bool
-) -> ReducedProblem:
-    return ReducedProblem(
-        mdp,
-        whole,
-        left.part,
-        left.components,
-        left.problem,
-        left.known,
-        left.row,
-        left.sure,
-        left.sure_row,
-        most,
-        maximize,
-    )
-
-
-def _solved(reduced: ReducedProblem, tolerance: float) -> Enclosure:
-    """What was asked, of the states of the model."""
-    found = _enclosed(reduced, tolerance)
-    part = reduced.part
-    if part is not None and reduced.components is not None:
-        row = quotient_policy(reduced.whole.mdp, reduced.components, part.row[found.row][part.node])
-        if reduced.sure is not None and reduced.sure_row is not None:
-            row = np.where(reduced.sure, reduced.sure_row, row)
-        found = found._replace(
-            value=found.value[part.node],
-            lower=found.lower[part.node],
-            upper=found.upper[part.node],
-            row=row,
-        )
-    return _expanded(reduced.mdp, reduced.whole, found)
-
-
-def _enclosed(reduced: ReducedProblem, tolerance: float) -> Enclosure:
-    """What was asked, of the nodes."""
-    known, most, problem = reduced.known, reduced.most, reduced.problem
-    if problem is None:
-        return Enclosure(known, known, known, reduced.row, 0, 0.0, "the graph")
-    found = optimum(
-        problem, maximize=reduced.maximize, tolerance=tolerance, relative=not np.isfinite(most)
-    )
-    row = np.where(problem.open, found.row, reduced.row)
-    value, lower, upper = (
-        np.where(np.isinf(known), np.inf, x)
-        for x in (
-            np.minimum(found.value, most),
-            np.clip(found.lower, 0, most),
-            np.minimum(found.upper, most),
-        )
-    )
-    return Enclosure(value, lower, upper, row, found.rounds, found.residual, found.method)
-
-
-def _expanded(mdp: HostMDP, whole: Contraction, found: Enclosure) -> Enclosure:
-    """What was found for nodes, for states, with what these earn on the way."""
-    if whole.node.size == whole.mdp.num_states:
-        return found
-    row = mdp.row_start[:-1].astype(np.int64)
-    places = np.zeros(whole.mdp.num_states, np.int64)
-    places[whole.node[::-1]] = np.arange(whole.node.size)[::-1]
-    # A node is the only state with its rows; all others have one row.
-    own = mdp.state[whole.row[whole.mdp.row_start[:-1]]]
-    row[own] = whole.row[found.row]
-    share = whole.depth * _EPS
-    earned = whole.earned
-    value, lower, upper = (x[whole.node] for x in (found.value, found.lower, found.upper))
-    if earned.any():
-        lower = (lower + earned * (1 - share)) * (1 - _EPS)
-        upper = (upper + earned * (1 + share)) * (1 + _EPS)
-        value = value + earned
-    return Enclosure(value, lower, upper, row, found.rounds, found.residual, found.method)
-
-
-def _smallest(mdp: HostMDP, goal: Booleans, dead: Booleans, depth: int) -> _Left:
-    """The least probability of reaching a goal before anything dead."""
-    outside = goal | dead
-    zero = dead | ~positive_under_all_policies(mdp, goal, among=~dead)
-    one = goal | ~backward_reachable(mdp, zero, _rows_of(mdp, ~outside))
-    stays = ~mdp.support.some_successor_in(~zero) & zero[mdp.state]
-    return _between(mdp, zero, one, mdp.first_choice(stays)[1].astype(np.int64), depth)
-
-
-def _between(mdp: HostMDP, zero: Booleans, one: Booleans, row: Integers, depth: int) -> _Left:
-    """The probabilities that are neither zero nor one."""
-    open_, known = ~(zero | one), one.astype(np.float64)
-    if not open_.any():
-        return _Left(None, known, row)
-    problem = ShortestPathProblem(mdp, open_, known, np.zeros(mdp.num_rows), depth=depth)
-    return _Left(problem, known, row)
-
-
-def _rows_of(mdp: HostMDP, states: Booleans) -> Booleans:
-    return states[mdp.state]
-
-
-def _largest(mdp: HostMDP, goal: Booleans, dead: Booleans, depth: int) -> _Left:
-    """The largest probability of reaching a goal before anything dead."""
-    outside = goal | dead
-    open_ = ~outside
-    zero = ~backward_reachable(mdp, goal, _rows_of(mdp, open_))
-    open_ &= ~zero
-    components = end_components(mdp, open_)
-    if components.inside.any():
-        return _merged(mdp, goal, zero, components, depth)
-    return _largest_apart(mdp, goal, zero, depth)
-
-
-def _merged(
-    mdp: HostMDP, goal: Booleans, zero: Booleans, components: EndComponents, depth: int
-) -> _Left:
-    """The same with end components as one state each, from which the best row leaves."""
-    part = quotient(mdp, components.component, components.inside, np.zeros(mdp.num_rows))
-    small = part.mdp
-    goal_, zero_ = (np.zeros(small.num_states, bool) for _ in range(2))
-    goal_[part.node[goal]], zero_[part.node[zero]] = True, True
-    left = _largest_apart(small, goal_, zero_, depth)
-    return left._replace(part=part, components=components)
-
-
-def quotient_policy(mdp: HostMDP, components: EndComponents, row: Integers) -> Integers:
-    """A policy that goes round in an end component until it is where the given row leaves."""
-    states = np.flatnonzero(components.region(mdp))
-    exits = np.zeros(mdp.num_states, bool)
-    exits[mdp.state[row[states]]] = True
-    found: Any = mdp.row_start[:-1].astype(np.int64)
-    own = mdp.state[row] == np.arange(mdp.num_states)
-    found[own] = row[own]
-    ranked = shortest_path_rows(mdp, exits, components.inside)
-    inner = np.zeros(mdp.num_states, bool)
-    inner[states] = True
-    inner &= ~exits
-    found[inner] = ranked[inner]
-    return found
-
-
-def _largest_apart(mdp: HostMDP, goal: Booleans, zero: Booleans, depth: int) -> _Left:
-    """The same where every policy leaves the open states almost surely."""
-    one = ~positive_under_all_policies(mdp, zero, among=~goal)
-    # From where the probability is one, rows that keep it so.
-    stays = ~mdp.support.some_successor_in(~one) & one[mdp.state]
-    return _between(mdp, zero, one, mdp.first_choice(stays)[1].astype(np.int64), depth)
+    reduced = reduce_reachability(mdp, target, maximize=maximize, stay=stay, depth=depth)
+    return _solve(reduced, tolerance)
 
 
 def total_reward(
@@ -277,22 +102,123 @@ def total_reward(
     tolerance: float = 1e-6,
     depth: int = 0,
 ) -> Enclosure:
-    """The largest or smallest expected reward until a target is reached.
+    """Optimal expected reward until a target is reached.
 
-    Infinite where the target is not reached almost surely: for the largest, under some policy;
-    for the smallest, under every one.
+    Infinite where the target is not reached almost surely: for a maximum under some policy, for a
+    minimum under every policy.
 
     Args:
       mdp: the model.
-      reward: ``float64[R]``, at least 0; infinity where a row must not be taken.
+      reward: ``float64[R]``, at least 0; infinite for rows that must not be taken.
       target: ``bool[S]``.
-      maximize: which of the two.
-      tolerance: the width of the enclosure asked for, as a share of the value.
-      depth: how many roundings stand behind each number of the model.
+      maximize: the largest or the smallest reward.
+      tolerance: the width of the enclosure, relative to the value.
+      depth: the number of roundings behind each number of the model.
     """
-    return _solved(
-        reduce_total_reward(mdp, reward, target, maximize=maximize, depth=depth), tolerance
-    )
+    reduced = reduce_total_reward(mdp, reward, target, maximize=maximize, depth=depth)
+    return _solve(reduced, tolerance)
+
+
+def reward_forever(
+    mdp: HostMDP, reward: Floats, *, maximize: bool, tolerance: float = 1e-6, depth: int = 0
+) -> Enclosure:
+    """Optimal expected reward over the infinite horizon.
+
+    The maximum is infinite where an end component with positive reward is reachable; all other end
+    components earn nothing and are left at most once. The minimum is the reward until a state from
+    which some policy earns nothing more, and infinite where that is not reached almost surely.
+
+    Arguments as of :func:`total_reward`, with finite rewards.
+    """
+    if not maximize or mdp.is_chain:
+        earning = reward > 0
+        nothing = np.zeros(mdp.num_states, bool)
+        never = ~positive_under_all_policies(mdp, nothing, ~earning)
+        found = total_reward(mdp, reward, never, maximize=False, tolerance=tolerance, depth=depth)
+        quiet = never[mdp.state] & ~earning & ~mdp.support.some_successor_in(~never)
+        return replace(found, row=np.where(never, mdp.first_choice(quiet)[1], found.row))
+    components = end_components(mdp)
+    earns = np.zeros(mdp.num_states, bool)
+    paid = components.inside & (reward > 0)
+    earns[components.component[mdp.state[paid]]] = True
+    rich = earns[components.component]
+    infinite = backward_reachable(mdp, rich)
+    part = quotient(mdp, components.component, components.inside, reward)
+    small = part.mdp
+    finished = np.ones(small.num_states, bool)  # nodes that no row leaves
+    finished[small.state[~components.inside[part.row]]] = False
+    row = small.row_start[:-1].astype(np.int64)
+    reduced = _finite_part(small, part.cost, finished, part.region(infinite), depth)
+    reduced = replace(reduced, known_row=row, highest=np.inf, maximize=True)
+    found = _solve_nodes(reduced, tolerance)
+    leaving = quotient_policy(mdp, components, part.row[found.row][part.node])
+    # Where it is infinite: to components with positive reward, and earning there forever.
+    some, first = mdp.first_choice(paid)
+    inner = shortest_path_rows(mdp, some, components.inside)
+    outer = shortest_path_rows(mdp, rich, np.ones(mdp.num_rows, bool))
+    endless = np.where(some, first, np.where(rich, inner, outer))
+    return _at(found, part.node, np.where(infinite, endless, leaving))
+
+
+# --- qualitative preprocessing --------------------------------------------------------------------
+
+
+def reduce_reachability(
+    mdp: HostMDP,
+    target: Booleans,
+    *,
+    maximize: bool,
+    stay: Booleans | None = None,
+    depth: int = 0,
+) -> ReducedProblem:
+    """Residual problem of :func:`reachability`, with the same arguments."""
+    blocked = np.zeros(mdp.num_states, bool) if stay is None else ~stay & ~target
+    contraction = contract_chains(mdp, target | blocked, None) or identity(mdp)
+    small, depth = contraction.mdp, contraction.depth + depth
+    goal, dead = contraction.region(target), contraction.region(blocked)
+    maximize = maximize and not small.is_chain
+    reduced = (_largest if maximize else _smallest)(small, goal, dead, depth)
+    return replace(reduced, mdp=mdp, contraction=contraction, maximize=maximize)
+
+
+def _smallest(mdp: HostMDP, goal: Booleans, dead: Booleans, depth: int) -> ReducedProblem:
+    """The minimum: zero where some policy avoids the goal, one where none reaches such states."""
+    zero = dead | ~positive_under_all_policies(mdp, goal, among=~dead)
+    one = goal | ~backward_reachable(mdp, zero, ~(goal | dead)[mdp.state])
+    stays = ~mdp.support.some_successor_in(~zero) & zero[mdp.state]
+    return _between(mdp, zero, one, mdp.first_choice(stays)[1], depth)
+
+
+def _largest(mdp: HostMDP, goal: Booleans, dead: Booleans, depth: int) -> ReducedProblem:
+    """The maximum, on the quotient by end components, which every policy leaves."""
+    inner = ~(goal | dead)
+    zero = ~backward_reachable(mdp, goal, inner[mdp.state])
+    components = end_components(mdp, inner & ~zero)
+    if not components.inside.any():
+        return _largest_without_components(mdp, goal, zero, depth)
+    part = quotient(mdp, components.component, components.inside, np.zeros(mdp.num_rows))
+    reduced = _largest_without_components(part.mdp, part.region(goal), part.region(zero), depth)
+    return replace(reduced, quotient=part, components=components)
+
+
+def _largest_without_components(
+    mdp: HostMDP, goal: Booleans, zero: Booleans, depth: int
+) -> ReducedProblem:
+    one = ~positive_under_all_policies(mdp, zero, among=~goal)
+    stays = ~mdp.support.some_successor_in(~one) & one[mdp.state]
+    return _between(mdp, zero, one, mdp.first_choice(stays)[1], depth)
+
+
+def _between(
+    mdp: HostMDP, zero: Booleans, one: Booleans, row: Integers, depth: int
+) -> ReducedProblem:
+    """The problem of the probabilities that are neither zero nor one."""
+    interior, known = ~(zero | one), one.astype(np.float64)
+    problem = None
+    if interior.any():
+        cost = np.zeros(mdp.num_rows)
+        problem = ShortestPathProblem(mdp, interior, known, cost, depth=depth)
+    return ReducedProblem(known, row.astype(np.int64), problem)
 
 
 def reduce_total_reward(
@@ -304,36 +230,32 @@ def reduce_total_reward(
     kept: Booleans | None = None,
     depth: int = 0,
 ) -> ReducedProblem:
-    """What the graph leaves of :func:`total_reward`, with the same arguments.
-
-    Args:
-      mdp, reward, target, maximize, depth: the question.
-      kept: ``bool[S]``, states that are no part of a chain.
-    """
+    """Residual problem of :func:`total_reward`; states in `kept` are not contracted."""
     fixed = target if kept is None else target | kept
-    whole = contract_chains(mdp, fixed, reward) or _identity(mdp)._replace(cost=reward)
-    whole = whole._replace(depth=whole.depth + depth)
-    small = whole.mdp
-    goal = np.zeros(small.num_states, bool)
-    goal[whole.node[target]] = True
-    reduce = _most if maximize and not small.is_chain else _least
-    left = reduce(small, whole.cost, goal, whole.depth)
-    return _reduced(mdp, whole, left, np.inf, maximize and not small.is_chain)
+    contraction = contract_chains(mdp, fixed, reward) or identity(mdp, reward)
+    contraction = replace(contraction, depth=contraction.depth + depth)
+    small, cost = contraction.mdp, contraction.cost
+    maximize = maximize and not small.is_chain
+    reduce = _largest_reward if maximize else _smallest_reward
+    reduced = reduce(small, cost, contraction.region(target), contraction.depth)
+    return replace(reduced, mdp=mdp, contraction=contraction, highest=np.inf, maximize=maximize)
 
 
-def _most(mdp: HostMDP, cost: Floats, goal: Booleans, depth: int) -> _Left:
+def _largest_reward(mdp: HostMDP, cost: Floats, goal: Booleans, depth: int) -> ReducedProblem:
+    """The maximum: infinite where states are reachable from which the goal can be avoided."""
     never = ~positive_under_all_policies(mdp, goal)
-    before = _rows_of(mdp, ~goal)
+    before = ~goal[mdp.state]
     infinite = backward_reachable(mdp, never, before)
-    goal = _nothing(mdp, cost, goal, infinite)
-    # Where it is infinite: rows to where the target can be avoided, and there rows that avoid it.
     avoids = ~mdp.support.some_successor_in(~never) & never[mdp.state]
-    row = np.where(never, mdp.first_choice(avoids)[1], shortest_path_rows(mdp, never, before))
-    return _finite(mdp, cost, goal, infinite, row, depth)
+    reduced = _finite_part(mdp, cost, _without_reward(mdp, cost, goal, infinite), infinite, depth)
+    if not infinite.any():
+        return reduced
+    onward = shortest_path_rows(mdp, never, before)
+    return replace(reduced, known_row=np.where(never, mdp.first_choice(avoids)[1], onward))
 
 
-def _nothing(mdp: HostMDP, cost: Floats, goal: Booleans, infinite: Booleans) -> Booleans:
-    """The goal, and the states from which nothing can be earned before it."""
+def _without_reward(mdp: HostMDP, cost: Floats, goal: Booleans, infinite: Booleans) -> Booleans:
+    """The goal, and the states from which no reward is reachable before it."""
     earning = (cost > 0) & ~goal[mdp.state]
     if earning.all():
         return goal
@@ -342,116 +264,236 @@ def _nothing(mdp: HostMDP, cost: Floats, goal: Booleans, infinite: Booleans) -> 
     return ~(backward_reachable(mdp, some, ~goal[mdp.state]) | infinite)
 
 
-def _finite(
-    mdp: HostMDP,
-    cost: Floats,
-    goal: Booleans,
-    infinite: Booleans,
-    row: Integers,
-    depth: int,
-    rows: Booleans | None = None,
-    first: Integers | None = None,
-) -> _Left:
-    """The finite ones, which never meet the others."""
-    open_ = ~(goal | infinite)
-    known = np.where(infinite, np.inf, 0.0)
-    if not open_.any():
-        return _Left(None, known, row)
-    problem = ShortestPathProblem(mdp, open_, np.zeros(mdp.num_states), cost, rows, first, depth)
-    return _Left(problem, known, row)
+def _finite_part(
+    mdp: HostMDP, cost: Floats, zero: Booleans, infinite: Booleans, depth: int
+) -> ReducedProblem:
+    """The problem of the rewards that are neither zero nor infinite."""
+    interior, known = ~(zero | infinite), np.where(infinite, np.inf, 0.0)
+    problem = None
+    if interior.any():
+        end = np.zeros(mdp.num_states)
+        problem = ShortestPathProblem(mdp, interior, end, cost, depth=depth)
+    return ReducedProblem(known, mdp.row_start[:-1].astype(np.int64), problem)
 
 
-def _least(mdp: HostMDP, cost: Floats, goal: Booleans, depth: int) -> _Left:
+def _restricted(
+    reduced: ReducedProblem, allowed: Booleans, proper_policy: Integers | None
+) -> ReducedProblem:
+    if reduced.problem is None:
+        return reduced
+    problem = replace(reduced.problem, allowed=allowed, proper_policy=proper_policy)
+    return replace(reduced, problem=problem)
+
+
+def _smallest_reward(mdp: HostMDP, cost: Floats, goal: Booleans, depth: int) -> ReducedProblem:
+    """The minimum over policies that reach the goal almost surely."""
     finite, rows = almost_sure_reachability(mdp, goal, np.isfinite(cost) | goal[mdp.state])
     rows &= ~goal[mdp.state]
     if mdp.is_chain:
-        row: Any = mdp.row_start[:-1].astype(np.int64)
-        goal = _nothing(mdp, cost, goal, ~finite)
-        return _finite(mdp, cost, goal, ~finite, row, depth, rows)
-    # What can surely be done for nothing is worth nothing.
+        zero = _without_reward(mdp, cost, goal, ~finite)
+        return _restricted(_finite_part(mdp, cost, zero, ~finite, depth), rows, None)
     free = rows & (cost == 0)
-    nothing, stays = almost_sure_reachability(mdp, goal, free | goal[mdp.state])
+    zero, stays = almost_sure_reachability(mdp, goal, free | goal[mdp.state])
     row = shortest_path_rows(mdp, goal, stays)
-    circles = end_components(mdp, finite & ~nothing, free)
-    if not circles.inside.any():
-        first = shortest_path_rows(mdp, nothing, rows)
-        return _finite(mdp, cost, nothing, ~finite, row, depth, rows, first)
-    # Where going round costs nothing, states are one.
-    part = quotient(mdp, circles.component, circles.inside, cost)
-    small = part.mdp
-    goal_, finite_ = (np.zeros(small.num_states, bool) for _ in range(2))
-    goal_[part.node[nothing]], finite_[part.node[finite]] = True, True
-    kept = rows[part.row] & ~circles.inside[part.row]
-    first = shortest_path_rows(small, goal_, kept)
-    left = _finite(
-        small, part.cost, goal_, ~finite_, small.row_start[:-1].astype(np.int64), depth, kept, first
+    components = end_components(mdp, finite & ~zero, free)
+    if not components.inside.any():
+        proper = shortest_path_rows(mdp, zero, rows)
+        reduced = _finite_part(mdp, cost, zero, ~finite, depth)
+        return replace(_restricted(reduced, rows, proper), known_row=row)
+    # End components without cost become single states.
+    part = quotient(mdp, components.component, components.inside, cost)
+    goal, kept = part.region(zero), rows[part.row] & ~components.inside[part.row]
+    reduced = _finite_part(part.mdp, part.cost, goal, ~part.region(finite), depth)
+    reduced = _restricted(reduced, kept, shortest_path_rows(part.mdp, goal, kept))
+    return replace(reduced, quotient=part, components=components, fixed=zero, fixed_row=row)
+
+
+# --- solution -------------------------------------------------------------------------------------
+
+
+def _solve(reduced: ReducedProblem, tolerance: float) -> Enclosure:
+    """The solution, mapped back to the states of the model."""
+    found = _solve_nodes(reduced, tolerance)
+    mdp, contraction = reduced.mdp, reduced.contraction
+    if reduced.quotient is not None and reduced.components is not None:
+        node = reduced.quotient.node
+        taken = reduced.quotient.row[found.row][node]
+        row = quotient_policy(contraction.mdp, reduced.components, taken)
+        if reduced.fixed is not None and reduced.fixed_row is not None:
+            row = np.where(reduced.fixed, reduced.fixed_row, row)
+        found = _at(found, node, row)
+    if contraction.node.size == contraction.mdp.num_states:
+        return found
+    row = mdp.row_start[:-1].astype(np.int64)
+    # A node is the only state with its rows; all others have one row.
+    own = mdp.state[contraction.row[contraction.mdp.row_start[:-1]]]
+    row[own] = contraction.row[found.row]
+    found, earned, share = _at(found, contraction.node, row), contraction.earned, contraction.depth
+    if not earned.any():
+        return found
+    share *= _EPS
+    return replace(
+        found,
+        value=found.value + earned,
+        lower=(found.lower + earned * (1 - share)) * (1 - _EPS),
+        upper=(found.upper + earned * (1 + share)) * (1 + _EPS),
     )
-    return left._replace(part=part, components=circles, sure=nothing, sure_row=row)
 
 
-def reward_forever(
-    mdp: HostMDP, reward: Floats, *, maximize: bool, tolerance: float = 1e-6, depth: int = 0
+def _at(found: Enclosure, node: Integers, row: Integers) -> Enclosure:
+    """The bounds of the nodes of some states, with their rows."""
+    value, lower, upper = found.value[node], found.lower[node], found.upper[node]
+    return replace(found, value=value, lower=lower, upper=upper, row=row)
+
+
+def _solve_nodes(reduced: ReducedProblem, tolerance: float) -> Enclosure:
+    known, highest, problem = reduced.known_value, reduced.highest, reduced.problem
+    if problem is None:
+        return Enclosure(known, known, known, reduced.known_row, 0, 0.0, "the graph")
+    found = solve_shortest_path(
+        problem,
+        maximize=reduced.maximize,
+        tolerance=tolerance,
+        relative=not np.isfinite(highest),
+    )
+    infinite = np.isinf(known)
+    value, lower, upper = (
+        np.where(infinite, np.inf, np.clip(x, 0, highest))
+        for x in (found.value, found.lower, found.upper)
+    )
+    row = np.where(problem.interior, found.row, reduced.known_row)
+    return replace(found, value=value, lower=lower, upper=upper, row=row)
+
+
+def quotient_policy(mdp: HostMDP, components: EndComponents, row: Integers) -> Integers:
+    """The policy that stays in an end component up to the state of the row by which it is left."""
+    states = np.flatnonzero(components.region(mdp))
+    exits = np.zeros(mdp.num_states, bool)
+    exits[mdp.state[row[states]]] = True
+    found: Any = mdp.row_start[:-1].astype(np.int64)
+    own = mdp.state[row] == np.arange(mdp.num_states)
+    found[own] = row[own]
+    inner = states[~exits[states]]
+    found[inner] = shortest_path_rows(mdp, exits, components.inside)[inner]
+    return found
+
+
+def solve_shortest_path(
+    problem: ShortestPathProblem, *, maximize: bool, tolerance: float, relative: bool
 ) -> Enclosure:
-    """The largest or smallest expected reward in all.
+    """Certified optimum by sweeps where the model mixes well, by policy iteration otherwise.
 
-    The largest is infinite where an end component that earns can be reached; other end components
-    earn nothing and are left at most once. The smallest is what is earned until nothing more need
-    be, and infinite where that is not so almost surely.
+    Arguments as of :func:`~jaxltl.core.sparse.solvers.policy_iteration.policy_iteration`.
+    """
+    size = int(np.count_nonzero(problem.interior))
+    if size >= _SOME and mixes(problem, size):
+        found = sweep_shortest_path(
+            problem, maximize=maximize, tolerance=tolerance, relative=relative
+        )
+        if found is not None:
+            return found
+    return policy_iteration(problem, maximize=maximize, tolerance=tolerance, relative=relative)
+
+
+def mixes(problem: ShortestPathProblem, size: int) -> bool:
+    """Whether few steps from a state lead to many others."""
+    mdp, interior = problem.mdp, problem.interior
+    first = mdp.entry_start[mdp.row_start]
+
+    def follow(states: Any) -> Any:
+        after = mdp.successor[concatenated_ranges(first[states], first[states + 1] - first[states])]
+        return after[interior[after]]
+
+    middle = np.flatnonzero(interior)[size // 2 : size // 2 + 1]
+    if size >= _LARGE:
+        return expands_fast(follow, middle, mdp.num_states)
+    return expands_fast(follow, middle, mdp.num_states, min(_MET, size // 2), _FEW)
+
+
+def expands_fast(
+    follow: Callable[[Any], Any],
+    start: Any,
+    num_states: int,
+    met: int | None = None,
+    steps: int = _STEPS,
+) -> bool:
+    """Whether few steps from a state lead to many others.
 
     Args:
-      mdp: the model.
-      reward: ``float[R]``, at least 0.
-      maximize: which of the two.
-      tolerance: the width of the enclosure asked for, as a share of the value.
-      depth: how many roundings stand behind each number of the model.
+      follow: the successors of some states ``int[M]``, maybe repeated.
+      start: ``int[1]``.
+      num_states: S.
+      met: the number of states to be met; default 4096.
+      steps: in that many steps.
     """
-    if not maximize or mdp.is_chain:
-        earning = reward > 0
-        never = ~_kept_away(mdp, earning)
-        found = total_reward(mdp, reward, never, maximize=False, tolerance=tolerance, depth=depth)
-        quiet = never[mdp.state] & ~earning & ~mdp.support.some_successor_in(~never)
-        return found._replace(row=np.where(never, mdp.first_choice(quiet)[1], found.row))
-    components = end_components(mdp)
-    earns = np.zeros(mdp.num_states, bool)
-    earns[components.component[mdp.state[components.inside & (reward > 0)]]] = True
-    rich = earns[components.component]
-    infinite = backward_reachable(mdp, rich)
-    part = quotient(mdp, components.component, components.inside, reward)
-    small = part.mdp
-    left = np.zeros(small.num_states, bool)  # nodes that some row leaves
-    left[small.state[~components.inside[part.row]]] = True
-    infinite_ = np.zeros(small.num_states, bool)
-    infinite_[part.node[infinite]] = True
-    row = small.row_start[:-1].astype(np.int64)
-    rest = _finite(small, part.cost, ~left, infinite_, row, depth)
-    found = _enclosed(_reduced(mdp, part, rest, np.inf, True), tolerance)
-    leaving = quotient_policy(mdp, components, part.row[found.row][part.node])
-    endless = _earning(mdp, components, rich, reward)
-    return found._replace(
-        value=found.value[part.node],
-        lower=found.lower[part.node],
-        upper=found.upper[part.node],
-        row=np.where(infinite, endless, leaving),
+    left = (_MET if met is None else met) - 1
+    seen: Any = np.zeros(num_states, bool)
+    seen[start] = True
+    for _ in range(steps):
+        if left <= 0:
+            return True
+        after = follow(start)
+        start = np.unique(after[~seen[after]])
+        seen[start] = True
+        left -= start.size
+    return left <= 0
+
+
+def sweep_shortest_path(
+    problem: ShortestPathProblem, *, maximize: bool, tolerance: float, relative: bool
+) -> Enclosure | None:
+    """The optimum by certified Gauss-Seidel sweeps; None where these take too long."""
+    mdp, sign, known = problem.mdp, 1 if maximize else -1, problem.terminal_value
+    weight, allowed = _stochastic_loops(problem)
+    widest = int(np.diff(mdp.entry_start).max())
+    unit = (4 * widest + problem.depth + 16) * _EPS
+    cost = problem.cost if allowed is None else np.where(allowed, problem.cost, 0)
+    blocks = row_blocks(mdp.row_start, mdp.entry_start, mdp.successor, weight, mdp.num_states)
+    found = solve_by_sweeps(
+        BlockProblem(
+            blocks=blocks,
+            interior=problem.interior,
+            live=problem.interior,
+            near=known,
+            far=known,
+            cost=cost if cost.any() else None,
+            allowed=allowed,
+        ),
+        SweepSettings(sign=sign, tolerance=tolerance, relative=relative, unit=unit),
     )
+    if found is None:
+        return None
+    low, high = (found.near, found.far) if sign > 0 else (found.far, found.near)
+    low = np.where(problem.interior, np.maximum(low - TINY, 0), known)
+    high = np.where(problem.interior, high + TINY, known)
+    value = low + (high - low) / 2
+    # The operator carries the bounds towards each other, so the value by at most half the width.
+    residual = float(((high - value) / np.maximum(value, 1))[problem.interior].max(initial=0))
+    row = np.where(problem.interior, found.row, mdp.row_start[:-1])
+    return Enclosure(value, low, high, row, found.sweeps, residual, "sweeps in place")
 
 
-def _kept_away(mdp: HostMDP, rows: Booleans) -> Booleans:
-    """The states from which no policy surely avoids some rows for ever: ``bool[S]``."""
-    nothing = np.zeros(mdp.num_states, bool)
-    return positive_under_all_policies(mdp, nothing, ~rows)
-
-
-def _earning(mdp: HostMDP, components: EndComponents, rich: Booleans, reward: Floats) -> Integers:
-    """A policy that gets to components that earn, and earns there for ever."""
-    paid = components.inside & (reward > 0)
-    some, first = mdp.first_choice(paid)
-    inner = shortest_path_rows(mdp, some, components.inside)
-    outer = shortest_path_rows(mdp, rich, np.ones(mdp.num_rows, bool))
-    return np.where(some, first, np.where(rich, inner, outer))
+def _stochastic_loops(problem: ShortestPathProblem) -> tuple[Floats, Booleans | None]:
+    """Weights with self-loops such that rows sum to one, and the rows that are not only a loop."""
+    mdp = problem.mdp
+    loop = np.flatnonzero(mdp.successor == mdp.state[mdp.row])
+    if not loop.size:
+        return mdp.probability, problem.allowed
+    weight = mdp.probability.copy()
+    weight[loop] = 0
+    first = loop[group_starts(mdp.row[loop])]  # a row may repeat its successors
+    row = mdp.row[first]
+    width = np.diff(mdp.entry_start)[row]
+    entry = concatenated_ranges(mdp.entry_start[row], width)
+    rest = np.add.reduceat(weight[entry], width.cumsum() - width)
+    weight[first] = np.maximum(1 - rest, 0)
+    allowed = np.ones(mdp.num_rows, bool) if problem.allowed is None else problem.allowed.copy()
+    allowed[row[rest == 0]] = False
+    return weight, allowed
 
 
 def worst_width(found: Enclosure, *, relative: bool) -> float:
-    """The widest enclosure, as a share of the value where that is asked for."""
+    """The width of the widest enclosure, relative to the value if asked for."""
     low, high = found.lower, found.upper
     finite = np.isfinite(high)
     width: Any = np.where(finite, high - np.where(finite, low, 0), np.where(low == high, 0, np.inf))

@@ -19,7 +19,7 @@ from jaxltl.core.sparse.choice_order import Choices, choices_of
 from jaxltl.core.sparse.graph.qualitative import positive_under_all_policies, backward_reachable
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.rows import sorted_unique, concatenated_ranges, offsets_from_counts
-from jaxltl.core.sparse.solvers.policy_iteration import Enclosure
+from jaxltl.core.sparse.solvers.total_cost import Enclosure
 from jaxltl.core.sparse.solvers.reachability import reachability, reward_forever, total_reward
 
 UNDERFLOW = 1e-300  # more than all that is lost where numbers are too small

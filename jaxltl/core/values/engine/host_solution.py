@@ -17,7 +17,7 @@ from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.solvers import reachability as optimal
 from jaxltl.core.sparse.solvers.discounted import discounted_value
-from jaxltl.core.sparse.solvers.policy_iteration import Enclosure
+from jaxltl.core.sparse.solvers.total_cost import Enclosure
 from jaxltl.core.types import (
     Solution,
     Status,
@@ -212,9 +212,7 @@ def discounted(
         chain = induced_chain(model, sparse, policy)
         earned, magnitude = (chain.mean(x, host.row_start) for x in (earned, magnitude))
         host, depth = chain.mdp, chain.depth
-    found = discounted_value(
-        host, earned, magnitude, float(discount), maximize=True, tolerance=asked, depth=depth
-    )
+    found = discounted_value(host, earned, magnitude, float(discount), tolerance=asked, depth=depth)
     width = found.upper - found.lower
     status = Status.CONVERGED if (width <= asked).all() else Status.PRECISION
     parts: dict[str, Any] = {

@@ -6,7 +6,7 @@ from scipy import sparse
 
 from jaxltl.core.models.sparse import make_sparse
 from jaxltl.core.sparse.linear import elimination
-from jaxltl.core.sparse.linear import fractions as exact
+from jaxltl.core.sparse.linear import extended_precision as exact
 from jaxltl.core.sparse.linear import topological_order as levels
 from jaxltl.core.sparse.linear.elimination import factorize
 from jaxltl.core.sparse.linear.topological_order import Edges, ordered_components

@@ -5,9 +5,10 @@ import pytest
 
 from jaxltl.core.models.sparse import make_sparse
 from jaxltl.core.sparse.linear import gauss_seidel as relaxation
-from jaxltl.core.sparse.solvers import discounted, mixing
-from jaxltl.core.sparse.solvers import policy_iteration as transient
+from jaxltl.core.sparse.solvers import discounted
 from jaxltl.core.sparse.solvers import reachability as optimal
+from jaxltl.core.sparse.solvers.policy_iteration import policy_iteration
+from jaxltl.core.sparse.solvers.total_cost import ShortestPathProblem
 from tests.sparse_models import random_sparse
 
 
@@ -17,12 +18,12 @@ def always(monkeypatch):
     found = []
 
     def tried(problem, **options):
-        enclosed = mixing.by_sweeps(problem, **options)
+        enclosed = optimal.sweep_shortest_path(problem, **options)
         found.append(enclosed)
-        return transient.optimum(problem, **options) if enclosed is None else enclosed
+        return policy_iteration(problem, **options) if enclosed is None else enclosed
 
-    monkeypatch.setattr(optimal, "optimum", tried)
-    monkeypatch.setattr(discounted, "optimum", tried)
+    monkeypatch.setattr(optimal, "solve_shortest_path", tried)
+    monkeypatch.setattr(discounted, "solve_shortest_path", tried)
     return found
 
 
@@ -62,7 +63,7 @@ def test_probabilities(always, maximize, count, monkeypatch):
         asked = {"maximize": maximize, "stay": stay, "tolerance": 1e-7}
         ours = optimal.reachability(host, goal, **asked)
         with monkeypatch.context() as patch:
-            patch.setattr(optimal, "optimum", transient.optimum)
+            patch.setattr(optimal, "solve_shortest_path", policy_iteration)
             other = optimal.reachability(host, goal, **asked)
         agree(ours, other)
         assert (ours.upper - ours.lower).max() <= 1e-7
@@ -82,13 +83,13 @@ def test_rewards(always, maximize, monkeypatch):
         reward = np.where(rng.random(host.num_rows) < 0.3, 0, rng.random(host.num_rows) * 1e3)
         ours = optimal.total_reward(host, reward, goal, maximize=maximize, tolerance=1e-7)
         with monkeypatch.context() as patch:
-            patch.setattr(optimal, "optimum", transient.optimum)
+            patch.setattr(optimal, "solve_shortest_path", policy_iteration)
             other = optimal.total_reward(host, reward, goal, maximize=maximize, tolerance=1e-7)
         agree(ours, other, relative=True)
     assert np.mean([x is not None for x in always]) > 0.5
 
 
-def test_only_what_spreads_is_swept():
+def test_only_what_spreads_is_swept(monkeypatch):
     """A few steps from a state lead to many, on a random graph, or to few, on a line."""
     rng = np.random.default_rng(3)
     size = 6000
@@ -101,7 +102,9 @@ def test_only_what_spreads_is_swept():
         host = make_sparse(
             None, np.concatenate([[0], kept.sum(-1).cumsum()]), target[kept], weight[kept]
         ).host
-        assert mixing._spreads(host, np.ones(size, bool)) == spreads
+        problem = ShortestPathProblem(host, np.ones(size, bool), np.zeros(size), np.zeros(size))
+        monkeypatch.setattr(optimal, "_LARGE", size)
+        assert optimal.mixes(problem, size) == spreads
 
 
 def test_small_models_of_wide_rows_are_swept_too():
@@ -136,9 +139,11 @@ def test_what_mixes_slowly_is_left_to_others():
     ).host
     open_ = (np.arange(size) > 0) & (np.arange(size) < size - 1)
     goal = (np.arange(size) == 0).astype(float)
-    problem = transient.ShortestPathProblem(host, open_, goal, np.zeros(size))
-    assert mixing.by_sweeps(problem, maximize=True, tolerance=1e-8, relative=False) is None
-    found = mixing.optimum(problem, maximize=True, tolerance=1e-8, relative=False)
+    problem = ShortestPathProblem(host, open_, goal, np.zeros(size))
+    assert (
+        optimal.sweep_shortest_path(problem, maximize=True, tolerance=1e-8, relative=False) is None
+    )
+    found = optimal.solve_shortest_path(problem, maximize=True, tolerance=1e-8, relative=False)
     np.testing.assert_allclose(found.value, 1 - np.arange(size) / (size - 1), atol=1e-8)
 
 
@@ -156,6 +161,6 @@ def test_what_sweeps_leave_unsolved_is_not_proven(always, maximize, monkeypatch)
         asked = {"maximize": maximize, "stay": stay, "tolerance": 1e-7}
         ours = optimal.reachability(host, goal, **asked)
         with monkeypatch.context() as patch:
-            patch.setattr(optimal, "optimum", transient.optimum)
+            patch.setattr(optimal, "solve_shortest_path", policy_iteration)
             agree(ours, optimal.reachability(host, goal, **asked))
     assert any(x is None for x in always)

@@ -134,7 +134,7 @@ def way(request, monkeypatch):
     if request.param == "eliminated at last":
         monkeypatch.setattr(elimination, "_swept", lambda _, b: np.full(b.size, np.nan))
     if request.param == "refined":
-        monkeypatch.setattr(transient, "_prove", lambda *_: None)
+        monkeypatch.setattr(transient._CoreSolver, "_certified", lambda *_: None)
 
 
 def cases(count, seed=0):

@@ -1,10 +1,23 @@
-"""Improvements go all the way, and never make a policy worse."""
+"""Propagated improvements go all the way, and never make a policy worse."""
 
 import numpy as np
 import pytest
 from scipy import sparse
 
-from jaxltl.core.sparse.solvers.onward import propagate_improvements
+from jaxltl.core.sparse.choice_order import choices_of
+from jaxltl.core.sparse.linear.optimality_equation import (
+    OptimalityEquation,
+    propagate_improvements,
+)
+
+
+def improvement(matrix, cost, count, value, policy, sign, threshold):
+    """The improved policy, as rows in the order of the states."""
+    choices = choices_of(np.asarray(count))
+    assert (choices.states == np.arange(len(count))).all()
+    order, place = choices.order, np.argsort(choices.order)
+    equation = OptimalityEquation(matrix[order], cost[order], 0 * cost, choices, sign)
+    return order[propagate_improvements(equation, value, place[policy], threshold)]
 
 
 def value_of(matrix, known, chosen):
@@ -20,9 +33,8 @@ def test_along_a_chain_one_call_is_enough():
         (np.ones(size - 1), (2 * np.arange(1, size) + 1, target[1:])), shape=(2 * size, size)
     )
     known = np.where(np.arange(2 * size) % 2 == 0, wait, 1.0)
-    owner = np.repeat(np.arange(size), 2)
-    chosen = propagate_improvements(
-        matrix, known, owner, np.full(size, wait), 2 * np.arange(size), -1, 1e-9
+    chosen = improvement(
+        matrix, known, [2] * size, np.full(size, wait), 2 * np.arange(size), -1, 1e-9
     )
     np.testing.assert_array_equal(chosen, 2 * np.arange(size) + 1)
 
@@ -37,9 +49,7 @@ def test_no_state_is_worse_off(sign):
         matrix, known = sparse.csr_array(0.95 * rows), rng.random(size * most)
         chosen = most * np.arange(size)
         before = value_of(matrix, known, chosen)
-        after = propagate_improvements(
-            matrix, known, np.repeat(np.arange(size), most), before, chosen, sign, 1e-12
-        )
+        after = improvement(matrix, known, [most] * size, before, chosen, sign, 1e-12)
         np.testing.assert_array_equal(after // most, np.arange(size))
         gain = sign * (value_of(matrix, known, after) - before)
         assert (gain >= -1e-12).all()

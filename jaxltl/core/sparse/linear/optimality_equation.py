@@ -1,0 +1,115 @@
+"""Optimality equation of a total-cost problem without self-loops, on sparse rows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from jaxltl.core.array_types import Floats, Integers
+from jaxltl.core.sparse.choice_order import Choices
+from jaxltl.core.sparse.rows import concatenated_ranges, group_starts
+
+# Rounds of improvements: their overhead in entries, the work allowed relative to the entries of the
+# equation, and the gain, relative to the largest, that is still propagated. Measured on chains and
+# grids of 10^3 to 10^5 states, where one linear system costs as much as some 40 backups.
+_ROUND_OVERHEAD, _RELATIVE_WORK, _MIN_ROUNDS = 3000, 40, 100
+_RELATIVE_GAIN = 0.01
+
+
+@dataclass(frozen=True)
+class OptimalityEquation:
+    """``x_i = opt_r (c_r + sum_j P_rj x_j)`` over the rows r of unknown i.
+
+    Attributes:
+      matrix: SciPy's ``float64[R, M]``, without self-loops.
+      cost: ``float64[R]``, at least 0, with what terminal states add.
+      leaving: ``float64[R]``, the probability of leaving the unknowns.
+      choices: the order of the unknowns and of their rows.
+      sign: 1 to maximise, -1 to minimise.
+    """
+
+    matrix: Any
+    cost: Floats
+    leaving: Floats
+    choices: Choices
+    sign: int
+
+    @property
+    def size(self) -> int:
+        return self.choices.states.size
+
+    @property
+    def owner(self) -> Integers:
+        """The unknown of each row, ``int[R]``."""
+        return self.choices.owner
+
+    @property
+    def is_chain(self) -> bool:
+        return self.choices.is_chain
+
+    def backup(self, value: Floats) -> Floats:
+        """``c + P x`` of each row."""
+        return self.cost + self.matrix @ value
+
+    def best(self, image: Floats) -> Floats:
+        """The optimum over the rows of each unknown."""
+        return self.choices.best(image, np.maximum if self.sign > 0 else np.minimum)
+
+    def greedy_policy(self, value: Floats, num_sweeps: int) -> Integers:
+        """The greedy policy after some sweeps of value iteration."""
+        if self.is_chain:
+            return np.arange(self.size)
+        for _ in range(num_sweeps):
+            image = self.backup(value)
+            value = self.best(image)
+        return self.choices.first(image, value)
+
+
+def propagate_improvements(
+    equation: OptimalityEquation, value: Floats, policy: Integers, threshold: float
+) -> Integers:
+    """Improves a policy and propagates the improvements to predecessors, as ``int[M]``.
+
+    Along a chain of n states plain policy iteration may need n linear systems, one for each state
+    that learns of an improvement. Asynchronous value iteration, of predecessors of improved states
+    alone, takes the news all the way (Bertsekas and Tsitsiklis 1989, section 2.6). Values improve
+    monotonically, so no row that was chosen gets worse, and the new policy is better than the old
+    one wherever it differs.
+
+    Args:
+      equation: the optimality equation.
+      value: ``float64[M]``, of the policy.
+      policy: ``int[M]``, rows.
+      threshold: the smallest gain that counts.
+    """
+    matrix, owner, sign = equation.matrix, equation.owner, equation.sign
+    back = matrix.tocsc()
+    in_degree = np.diff(back.indptr)
+    value, policy = value.copy(), policy.copy()
+    rows: Any = np.arange(owner.size)
+    image = equation.backup(value)
+    budget = _RELATIVE_WORK * matrix.nnz + _ROUND_OVERHEAD * _MIN_ROUNDS
+    while True:
+        state = owner[rows]
+        gain = sign * (image - value[state])
+        better = np.flatnonzero(gain > threshold)
+        if not better.size:
+            return policy
+        better = better[np.lexsort((-gain[better], state[better]))]
+        better = better[group_starts(state[better])]
+        improved = state[better]
+        value[improved], policy[improved] = image[better], rows[better]
+        threshold = max(threshold, _RELATIVE_GAIN * float(gain[better].max()))
+        rows = np.unique(
+            back.indices[concatenated_ranges(back.indptr[improved], in_degree[improved])]
+        )
+        count = matrix.indptr[rows + 1] - matrix.indptr[rows]
+        budget -= int(count.sum()) + _ROUND_OVERHEAD
+        if budget < 0 or not rows.size:
+            return policy
+        entry = concatenated_ranges(matrix.indptr[rows], count)
+        terms = matrix.data[entry] * value[matrix.indices[entry]]
+        sums = np.bincount(np.repeat(np.arange(rows.size), count), terms, rows.size)
+        image = equation.cost[rows] + sums
