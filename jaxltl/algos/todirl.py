@@ -67,14 +67,14 @@ from jax import lax
 from jaxltl.algos.common import learner
 from jaxltl.algos.common.early_stopping import Best, stop_early
 from jaxltl.core.models.construct.batch import (
-    narrow,
+    restrict_stacked_actions,
     stack_models,
     stack_observations,
     training_counts,
 )
-from jaxltl.core.models.construct.batch import world as lane
+from jaxltl.core.models.construct.batch import unstack_product as lane
 from jaxltl.core.models.construct.restrict import with_allowed
-from jaxltl.core.models.ops.successor_tables import Predecessors, predecessors
+from jaxltl.core.models.ops.successor_tables import PredecessorTable, predecessor_table
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.pretty_print import brief, history
@@ -169,7 +169,7 @@ class Problem:
     counts: jax.Array
     held_out: jax.Array
     weight: jax.Array
-    predecessors: Predecessors | None = None
+    predecessors: PredecessorTable | None = None
     network: nn.Module = struct.field(pytree_node=False, default=RewardNetwork())
 
     @property
@@ -300,7 +300,7 @@ def make_problem(
     """
     model = stack_models(worlds)
     if allowed is not None:
-        model = narrow(model, allowed)
+        model = restrict_stacked_actions(model, allowed)
     num_worlds, dtype = model.letter.shape[0], model.dtype
     observation = stack_observations(model, observation)
     counts, other = training_counts(model, demonstrations, held_out, horizon=horizon)
@@ -315,7 +315,7 @@ def make_problem(
         counts=counts,
         held_out=other,
         weight=weight,
-        predecessors=predecessors([lane(model, w) for w in range(num_worlds)]),
+        predecessors=predecessor_table([lane(model, w) for w in range(num_worlds)]),
         network=network,
     )
 

@@ -64,7 +64,11 @@ from jaxltl.app.job import fingerprint as fingerprint
 from jaxltl.app.job import postfix as postfix
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.synchronize import synchronize
-from jaxltl.core.models.construct.batch import lift_memory_policy, narrow, stack_products
+from jaxltl.core.models.construct.batch import (
+    lift_memory_policy,
+    restrict_stacked_actions,
+    stack_products,
+)
 from jaxltl.core.models.construct.lifting import allowed_steps
 from jaxltl.core.models.construct.restrict import with_allowed
 from jaxltl.core.models.ops.operators import action_mean, expectation
@@ -166,7 +170,7 @@ def _narrowed(setup: Setup) -> Setup:
             model = product(worlds.scenes[w].mdp, setup.judge, label_on=task.label_on)
             kept = allowed_steps(with_allowed(model, allowed[w][:size]), trajectories)
         count += int(np.asarray(trajectories.mask).sum() - kept.sum())
-    worlds = worlds._replace(model=narrow(worlds.model, allowed))
+    worlds = worlds._replace(model=restrict_stacked_actions(worlds.model, allowed))
     return replace(setup, worlds=worlds, left_out=count)
 
 

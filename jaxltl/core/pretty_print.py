@@ -106,7 +106,7 @@ def laid_out(name: str, facts: Sequence[str]) -> str:
         return line
     lines = [f"{name}("]
     for i, fact in enumerate(facts):
-        text = cut(fact, WIDTH - 5) + ("," if i + 1 < len(facts) else ")")
+        text = truncate(fact, WIDTH - 5) + ("," if i + 1 < len(facts) else ")")
         if len(lines) > 1 and len(lines[-1]) + 1 + len(text) <= WIDTH:
             lines[-1] += " " + text
         else:
@@ -116,11 +116,11 @@ def laid_out(name: str, facts: Sequence[str]) -> str:
     return "\n".join(lines)
 
 
-def head(value: Any, width: int = _HEAD) -> str:
+def nested_repr(value: Any, width: int = _HEAD) -> str:
     """An object inside of another: its name and as many facts as there is room for."""
     facts = getattr(type(value), "_brief_facts", None)
     if facts is None:
-        return cut(repr(value), width)
+        return truncate(repr(value), width)
     texts, name = facts(value), type(value).__name__
     kept = list(texts)
     while kept and len(f"{name}({', '.join(kept)}, ...)") > width:
@@ -130,7 +130,7 @@ def head(value: Any, width: int = _HEAD) -> str:
     return f"{name}({', '.join(kept)})"
 
 
-def cut(text: str, width: int = _HEAD) -> str:
+def truncate(text: str, width: int = _HEAD) -> str:
     """A text in one line, of at most so many characters."""
     text = " ".join(text.split())
     return text if len(text) <= width else f"{text[: width - 3]}..."
@@ -145,28 +145,28 @@ def count(number: Any, noun: str, nouns: str = "") -> str:
     return f"{int(number):,} {noun if number == 1 else nouns or noun + 's'}"
 
 
-def names(words: Iterable[Any], width: int = _HEAD) -> str:
+def names_text(words: Iterable[Any], width: int = _HEAD) -> str:
     """Names one after the other; of many, the first and how many there are in all.
 
-    >>> names(f"a{i}" for i in range(1000))
+    >>> names_text(f"a{i}" for i in range(1000))
     'a0, a1, a2, a3, a4, a5, a6, a7, a8, a9, a10, a11, a12, a13, ... (1000 in all)'
     """
     if is_array(words):
-        return array(words)
+        return array_text(words)
     listed = list(words)
     kept = [str(word) for word in listed[:width]]
     while len(kept) > 1 and len(", ".join(kept)) > width:
         kept.pop()
-    text = cut(", ".join(kept), width)
+    text = truncate(", ".join(kept), width)
     return text if len(kept) == len(listed) else f"{text}, ... ({len(listed)} in all)"
 
 
-def over(propositions: Sequence[str]) -> str:
+def propositions_text(propositions: Sequence[str]) -> str:
     """What labels speak of."""
-    return f"over {names(propositions) or 'no propositions'}"
+    return f"over {names_text(propositions) or 'no propositions'}"
 
 
-def lanes(shape: Sequence[int]) -> str:
+def batch_text(shape: Sequence[int]) -> str:
     """How many there are side by side; nothing where there is one."""
     return (
         count(shape[0], "lane")
@@ -202,10 +202,10 @@ def readable(value: Any, most: int = READ) -> NDArray[Any] | None:
     return None if found.dtype.kind in "OSU" else found
 
 
-def array(value: Any) -> str:
+def array_text(value: Any) -> str:
     """The type and the shape of an array, and where it is if that is not here.
 
-    >>> array(np.zeros((2, 3), np.float32))
+    >>> array_text(np.zeros((2, 3), np.float32))
     'float32[2, 3]'
     """
     text = f"{value.dtype}[{', '.join(f'{n}' for n in value.shape)}]"
@@ -226,15 +226,15 @@ def number(value: Any) -> str:
     return str(value) if whole else f"{value:.6g}"
 
 
-def span(value: Any) -> str:
+def value_range(value: Any) -> str:
     """What an array holds: a few numbers one by one, of more the least and the greatest.
 
-    >>> span(np.array([0.25, np.nan])), span(np.arange(9)), span(np.zeros(9, bool))
+    >>> value_range(np.array([0.25, np.nan])), span(np.arange(9)), span(np.zeros(9, bool))
     ('[0.25, nan]', '0 to 8', '0 of 9 true')
     """
     read = readable(value)
     if read is None or read.size == 0 or read.dtype.kind == "c":
-        return array(value) if is_array(value) else cut(repr(value))
+        return array_text(value) if is_array(value) else truncate(repr(value))
     if read.dtype.kind not in "biuf":  # narrow floats
         read = read.astype(np.float32)
     if read.ndim == 0:
@@ -254,10 +254,10 @@ def span(value: Any) -> str:
     return f"{text}, {missing:,} nan" if missing else text
 
 
-def apart(lower: Any, upper: Any) -> str:
+def bounds_text(lower: Any, upper: Any) -> str:
     """How far certified bounds are apart at most, and where there are none.
 
-    >>> apart(np.zeros(3), np.array([0, 1e-6, np.inf])), apart(-np.inf, np.inf)
+    >>> bounds_text(np.zeros(3), np.array([0, 1e-6, np.inf])), apart(-np.inf, np.inf)
     ('bounds at most 1e-06 apart, none for 1 of 3', 'no bounds')
     """
     low, high = readable(lower), readable(upper)
@@ -275,11 +275,11 @@ def apart(lower: Any, upper: Any) -> str:
     return f"{text}, none for {none:,} of {known.size:,}" if none else text
 
 
-def coded(value: Any, codes: Iterable[enum.IntEnum]) -> str:
+def enum_counts(value: Any, codes: Iterable[enum.IntEnum]) -> str:
     """The names of codes; of several, how many of each there are, the first code first."""
     read = readable(value)
     if read is None or read.dtype.kind not in "iu":
-        return array(value) if is_array(value) else cut(str(value))
+        return array_text(value) if is_array(value) else truncate(str(value))
     found, times = np.unique(read, return_counts=True)
     known = {int(code): code.name for code in codes}
     words = [known.get(int(n), str(n)) for n in found]
@@ -295,7 +295,7 @@ def fields(value: Any, codes: Mapping[str, Any] | None = None) -> Iterator[str]:
     """All fields of an object, each with what is in it; of lanes of a learner how many they are."""
     step = getattr(value, "step", None)
     if step is not None and is_array(step):
-        yield lanes(step.shape)
+        yield batch_text(step.shape)
     keys = getattr(value, "_fields", None)
     if keys is None:
         keys = [x.name for x in dataclasses.fields(value) if x.repr]
@@ -308,26 +308,26 @@ def fields(value: Any, codes: Mapping[str, Any] | None = None) -> Iterator[str]:
 def field(name: str, value: Any, codes: Iterable[enum.IntEnum] | None = None) -> str:
     """A name and what it stands for."""
     if codes is not None and is_array(value):
-        return f"{name}={coded(value, codes)}"
-    return f"{name}={told(value)}"
+        return f"{name}={enum_counts(value, codes)}"
+    return f"{name}={describe(value)}"
 
 
-def told(value: Any) -> str:
+def describe(value: Any) -> str:
     """Any value in a few words."""
     if is_array(value):
-        text = span(value)
-        if text.startswith("[") or np.ndim(value) == 0 or text == array(value):
+        text = value_range(value)
+        if text.startswith("[") or np.ndim(value) == 0 or text == array_text(value):
             return text
         joined = "with " if value.dtype == bool else "from " if " to " in text else ""
-        return f"{array(value)} {joined}{text}"
+        return f"{array_text(value)} {joined}{text}"
     if hasattr(type(value), "_brief_facts"):
-        return head(value)
+        return nested_repr(value)
     if isinstance(value, enum.Enum):
         return value.name
     if value is None or isinstance(value, str | bytes | bool | int | float | complex):
-        return cut(repr(value))
+        return truncate(repr(value))
     if isinstance(value, tuple | list) and all(isinstance(x, str | int | float) for x in value):
-        return f"({names(value)}{',' if len(value) == 1 else ''})"
+        return f"({names_text(value)}{',' if len(value) == 1 else ''})"
     return _tree(value)
 
 
@@ -339,13 +339,13 @@ def _tree(value: Any) -> str:
         inner = inner.func
     name = getattr(inner, "__name__", type(value).__name__)
     if not leaves and (callable(value) or not isinstance(value, dict | list | tuple)):
-        return cut(name)
+        return truncate(name)
     size = sum(int(np.prod(x.shape)) for x in leaves)
     what = f"{count(len(leaves), 'array')} of {count(size, 'number')}"
     if isinstance(value, dict) and not leaves:
-        return f"{{{names(value)}}}"
+        return f"{{{names_text(value)}}}"
     plain = isinstance(value, dict | list | tuple) and not hasattr(value, "_fields")
-    return what if plain else f"{cut(name)}({what})"
+    return what if plain else f"{truncate(name)}({what})"
 
 
 def _leaves(value: Any) -> list[Any]:
@@ -374,7 +374,7 @@ def history(value: Any, codes: Mapping[str, Any] | None = None) -> Iterator[str]
         if one.name in (codes or {}) or not is_array(given) or given.ndim < len(shape):
             yield field(one.name, given, (codes or {}).get(one.name))
         elif (read := readable(given)) is not None:
-            yield f"{one.name}={span(np.take(read, -1, axis=len(shape) - 1))}"
+            yield f"{one.name}={value_range(np.take(read, -1, axis=len(shape) - 1))}"
         else:
             yield field(one.name, given)
 

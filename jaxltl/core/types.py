@@ -13,7 +13,16 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from jaxltl.core.pretty_print import apart, array, brief, coded, is_array, lanes, span, told
+from jaxltl.core.pretty_print import (
+    bounds_text,
+    array_text,
+    brief,
+    enum_counts,
+    is_array,
+    batch_text,
+    value_range,
+    describe,
+)
 from jaxltl.core.validation import RANGES
 
 SolutionT = TypeVar("SolutionT", bound="Solution")
@@ -89,18 +98,18 @@ class NotConverged(RuntimeError):
 def _facts(solution: Any) -> Iterator[str]:
     more = solution.status.shape
     yield (
-        f"{lanes(more)}: {coded(solution.status, Status)}"
+        f"{batch_text(more)}: {enum_counts(solution.status, Status)}"
         if more
-        else (coded(solution.status, Status))
+        else (enum_counts(solution.status, Status))
     )
-    yield f"value {told(solution.value)}"
-    yield apart(solution.lower, solution.upper)
-    steps = span(solution.num_steps)
+    yield f"value {describe(solution.value)}"
+    yield bounds_text(solution.lower, solution.upper)
+    steps = value_range(solution.num_steps)
     yield "1 step" if steps == "1" else f"{steps} steps"
-    yield f"residual {span(solution.residual)}"
+    yield f"residual {value_range(solution.residual)}"
     yield f"by {solution.method}" if solution.method else ""
-    yield f"policy {array(solution.policy)}" if is_array(solution.policy) else ""
-    yield f"nature {array(solution.nature)}" if is_array(solution.nature) else ""
+    yield f"policy {array_text(solution.policy)}" if is_array(solution.policy) else ""
+    yield f"nature {array_text(solution.nature)}" if is_array(solution.nature) else ""
 
 
 @brief(facts=_facts, drawn=True)

@@ -12,7 +12,7 @@ import pytest
 
 import jaxltl as jl
 from jaxltl.algos import behavioral_cloning as bc
-from jaxltl.core.models.construct.batch import stack_products, world
+from jaxltl.core.models.construct.batch import stack_products, unstack_product
 
 SMALL = bc.DensePolicy(hidden=(16,))
 
@@ -78,7 +78,7 @@ def test_what_was_demonstrated_is_learned():
     assert float(metrics.loss[-1]) < 0.02 < float(metrics.loss[0])
     assert not state.stopped and state.best.step == 150
     for w in range(2):
-        model = world(two_worlds(), w)
+        model = unstack_product(two_worlds(), w)
         policy = bc.policy_in_world(SMALL, state.best.parameters, model, found.observation[w])
         np.testing.assert_allclose(policy.sum(-1), 1, rtol=1e-9)
         seen = np.asarray(found.counts[w]) > 0
@@ -164,7 +164,7 @@ def test_unavailable_actions_have_no_probability():
     network = bc.DensePolicy(num_actions=2, hidden=())
     found = bc.make_problem(model, jnp.eye(2), runs((0, 1), (1, 0)), held_out=None, network=network)
     state = bc.init(jax.random.key(0), found, bc.Hparams())
-    policy = bc.policy_in_world(network, state.parameters, world(model, 0), jnp.eye(2))
+    policy = bc.policy_in_world(network, state.parameters, unstack_product(model, 0), jnp.eye(2))
     assert policy[1].tolist() == [[1, 0]] * 2
     gradient = jax.grad(bc.neg_log_likelihood)(state.parameters, found, found.counts)
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(gradient))

@@ -13,7 +13,7 @@ from jax.flatten_util import ravel_pytree
 import jaxltl as jl
 from jaxltl.algos import todirl
 from jaxltl.core.models.ops.operators import expectation, pushforward
-from jaxltl.core.models.ops.successor_tables import predecessors, successors
+from jaxltl.core.models.ops.successor_tables import predecessor_table, successor_table
 from tests import reference
 from tests.algos.test_guaranteed import evaluate as probability
 from tests.support import random_representation, stack
@@ -193,9 +193,9 @@ def test_numbered_states_lead_where_the_model_does(kind):
         value = jnp.asarray(rng.normal(size=model.state_shape))
         mass = rng.normal(size=(*model.state_shape, model.num_actions))
         mass = np.where(model.available, mass, 0)
-        after = jnp.stack(successors(model).expectation(jnp.ravel(value)), -1)
+        after = jnp.stack(successor_table(model).expectation(jnp.ravel(value)), -1)
         np.testing.assert_allclose(after.reshape(mass.shape), expectation(model, value), atol=1e-14)
-        lists = predecessors([model])
+        lists = predecessor_table([model])
         flow = jax.tree.map(lambda x: x[0], lists).pushforward(
             jnp.asarray(mass.reshape(-1, model.num_actions).T.ravel())
         )

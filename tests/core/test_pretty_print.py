@@ -366,15 +366,15 @@ def test_lanes_are_counted_with_their_statuses():
 def test_arrays_on_several_devices_are_read_from_here():
     mesh = jax.make_mesh((4,), ("x",))
     spread = jax.device_put(np.arange(8.0), NamedSharding(mesh, PartitionSpec("x")))
-    assert show.told(spread) == "float64[8] on 4 devices from 0 to 7"
+    assert show.describe(spread) == "float64[8] on 4 devices from 0 to 7"
     spread.delete()
-    assert show.told(spread) == "deleted float64[8]"
+    assert show.describe(spread) == "deleted float64[8]"
 
 
 def test_nothing_is_moved_where_that_is_forbidden():
     value = jnp.arange(9.0)
     with jax.transfer_guard_device_to_host("disallow"):
-        assert show.told(value).startswith("float64[9]")
+        assert show.describe(value).startswith("float64[9]")
 
 
 def test_they_are_the_same_in_another_process_and_after_a_walk_over_the_tree():

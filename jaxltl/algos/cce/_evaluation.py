@@ -52,10 +52,10 @@ def evaluate_all(
 ) -> tuple[jax.Array, jax.Array]:
     """Objectives ``[n]`` and costs ``[n, C]`` of a population."""
     keys = jax.random.split(key, len(samples))
-    samples, keys = lanes.split((samples, keys), hparams.sharding)
+    samples, keys = lanes.split_axis((samples, keys), hparams.sharding)
     found = jax.vmap(partial(scores, problem))(samples, keys)
     # Every device ranks them all, in one order of operations.
-    return lanes.whole(found, hparams.sharding)
+    return lanes.replicate(found, hparams.sharding)
 
 
 def scores(problem: Any, parameters: jax.Array, key: chex.PRNGKey) -> tuple[jax.Array, jax.Array]:

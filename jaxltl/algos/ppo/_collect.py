@@ -117,7 +117,7 @@ def collected(
     value, last = every.value.astype(dtype), final.value.astype(dtype)
     following = jnp.concatenate([value[1:], last[None]])
     cut = path.truncated & ~path.terminated
-    at_ends = lanes.apart(_at_ends, hparams.sharding, (1, 1, 1, None), 1)
+    at_ends = lanes.shard_function(_at_ends, hparams.sharding, (1, 1, 1, None), 1)
     following = at_ends(
         cut, following, (every.memory, path.last), (problem, state.parameters, state.moments)
     )
@@ -176,10 +176,12 @@ def _walked(key: chex.PRNGKey, state: Any, problem: Any, hparams: Any) -> tuple[
     keys = jax.random.split(move_key, size)
     begin, pool = _starts(reset_key, environment, hparams)
     step = (state.parameters, state.moments, problem, hparams, pool)
-    walk = lanes.apart(
+    walk = lanes.shard_function(
         partial(_walk, sharding=hparams.sharding), hparams.sharding, (0, 0, 1, 1, 1, None), (0, 1)
     )
-    walkers, path = walk(lanes.ranks(hparams.sharding), state.walkers, begin, noise, keys, step)
+    walkers, path = walk(
+        lanes.device_ranks(hparams.sharding), state.walkers, begin, noise, keys, step
+    )
     return learner.strong(walkers), path
 
 

@@ -124,7 +124,7 @@ def improved(
     limits = Limits(at(hparams.clip, state.step), _at(hparams.value_clip, state.step))
     rate = at(hparams.learning_rate, state.step)
     recurrent, over = has_memory(problem), hparams.sharding
-    rows, begun = lanes.whole((rows, begun), over)  # any device may be asked for any of them
+    rows, begun = lanes.replicate((rows, begun), over)  # any device may be asked for any of them
     if not recurrent:
         rows = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rows)
     size = hparams.num_envs if recurrent else len(rows.value)
@@ -133,11 +133,11 @@ def improved(
     def update(going: _Going, chosen: jax.Array) -> tuple[_Going, Any]:
         some = jax.tree.map(lambda x: jnp.take(x, chosen, axis=int(recurrent)), rows)
         memory = jax.tree.map(lambda x: x[chosen], begun) if recurrent else ()
-        some, memory = lanes.split(some, over, int(recurrent)), lanes.split(memory, over)
+        some, memory = lanes.split_axis(some, over, int(recurrent)), lanes.split_axis(memory, over)
         (_, told), slope = jax.value_and_grad(loss, has_aux=True)(
             going.parameters, some, memory, problem, hparams, limits
         )
-        slope, told = lanes.whole((slope, told), over)
+        slope, told = lanes.replicate((slope, told), over)
         norm = jnp.sqrt(sum(jnp.sum(x**2) for x in jax.tree.leaves(slope)))
         told = told._replace(gradient_norm=norm)
         stopped = going.stopped

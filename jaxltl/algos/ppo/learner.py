@@ -489,7 +489,7 @@ def _begun(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
             step=jnp.int32(0),
             parameters=parameters,
             optimizer=descent(hparams).init(parameters),
-            walkers=lanes.split(walkers, hparams.sharding),
+            walkers=lanes.split_axis(walkers, hparams.sharding),
             moments=moments,
             return_moments=no_moments(()) if hparams.normalize_reward else None,
             transitions=jnp.int32(0),

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxltl.core.logic.ltl import Letter, as_letters
-from jaxltl.core.pretty_print import brief, cut, lanes, over, readable
+from jaxltl.core.pretty_print import brief, truncate, batch_text, propositions_text, readable
 
 ACCEPTANCES = ("cosafe", "safety", "buchi", "parity")
 
@@ -21,15 +21,15 @@ ACCEPTANCES = ("cosafe", "safety", "buchi", "parity")
 def _facts(automaton: Any) -> Iterator[str]:
     *more, count, width = automaton.delta.shape
     yield automaton.acceptance
-    yield lanes(more)
+    yield batch_text(more)
     yield (
         extent_text(automaton)
         if not more
-        else (f"{count} states, {width} letters {over(automaton.propositions)}")
+        else (f"{count} states, {width} letters {propositions_text(automaton.propositions)}")
     )
     start = readable(automaton.initial)
     if automaton.state_names and start is not None and not start.ndim:
-        yield f"for {cut(automaton.state_names[int(start)])}"
+        yield f"for {truncate(automaton.state_names[int(start)])}"
 
 
 @brief(facts=_facts, drawn=True)

@@ -15,7 +15,7 @@ from .episodes import (
 )
 from .finite_task import (
     FiniteTask as FiniteTask,
-    Shares as Shares,
+    VerdictFrequencies as VerdictFrequencies,
     finite_verdict_frequencies as finite_verdict_frequencies,
     make_finite_task as make_finite_task,
 )

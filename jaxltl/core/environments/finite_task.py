@@ -51,14 +51,14 @@ class FiniteTask:
 
 
 @brief
-class Shares(NamedTuple):
+class VerdictFrequencies(NamedTuple):
     """What part of some trajectories satisfies, violates or leaves undecided; the sum is 1.
 
     Attributes:
       satisfied, violated, undecided: ``float[...]``.
 
     Example:
-      >>> shares = Shares(satisfied=0.5, violated=0.25, undecided=0.25)
+      >>> shares = VerdictFrequencies(satisfied=0.5, violated=0.25, undecided=0.25)
       >>> shares.satisfied + shares.undecided  # at most that many satisfy it in the end
       0.75
     """
@@ -144,7 +144,9 @@ def finite_verdicts(
     return trace_verdicts(task.monitor, task.letter[code], length)[..., -1]
 
 
-def verdict_frequencies(verdict: chex.Array, axis: int | tuple[int, ...] | None = -1) -> Shares:
+def verdict_frequencies(
+    verdict: chex.Array, axis: int | tuple[int, ...] | None = -1
+) -> VerdictFrequencies:
     """The shares of the three verdicts among trajectories.
 
     Args:
@@ -160,12 +162,12 @@ def verdict_frequencies(verdict: chex.Array, axis: int | tuple[int, ...] | None 
     """
     verdict = jnp.asarray(verdict)
     order = (Verdict.SATISFIED, Verdict.VIOLATED, Verdict.UNDECIDED)
-    return Shares(*(jnp.mean(verdict == v, axis=axis, dtype=float) for v in order))
+    return VerdictFrequencies(*(jnp.mean(verdict == v, axis=axis, dtype=float) for v in order))
 
 
 def finite_verdict_frequencies(
     task: FiniteTask, label: chex.Array, length: chex.Array | None = None
-) -> Shares:
+) -> VerdictFrequencies:
     """:func:`verdict_frequencies` of the M trajectories of a batch.
 
     Args:

@@ -35,7 +35,7 @@ from jaxltl.core.environments.environment import (
 )
 from jaxltl.core.environments.finite_task import make_finite_task
 from jaxltl.core.environments.monitor import Verdict, lasso_verdicts, verdicts
-from jaxltl.core.environments.task_reward import Pay, make_task_reward
+from jaxltl.core.environments.task_reward import TaskReward, make_task_reward
 from jaxltl.core.logic.labels import require_known
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.models.ops.annotated_pytree import register_annotated_pytree
@@ -187,7 +187,7 @@ def make_task_tables(
     with jax.ensure_compile_time_eval():  # tables are made on the host wherever it is called
         reading = make_finite_task(automaton, propositions)
     decisions = verdicts(automaton)
-    pay: Pay = make_task_reward(
+    pay: TaskReward = make_task_reward(
         automaton,
         decisions,
         reward=reward,

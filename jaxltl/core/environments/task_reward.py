@@ -23,7 +23,7 @@ _DEFAULT = 0.99
 
 
 @brief
-class Pay(NamedTuple):
+class TaskReward(NamedTuple):
     """What the readings of an automaton earn.
 
     Attributes:
@@ -52,7 +52,7 @@ def make_task_reward(
     ratio: float | None = None,
     shaping: str | ArrayLike | None = None,
     learner_discount: float = 1.0,
-) -> Pay:
+) -> TaskReward:
     """The reward of a task by its name, on the host.
 
     The learner maximises ``E[sum_t (d_0 ... d_{t-1}) r_t]`` of the rewards r and discounts d below;
@@ -134,7 +134,7 @@ def make_task_reward(
     if shaping is not None:
         potential = _potential(automaton, decisions, accepting, name, shaping)
         _require_discounted(factor, decisions, learner_discount, name)
-    return Pay(name, accepting, payment, factor, decided, potential)
+    return TaskReward(name, accepting, payment, factor, decided, potential)
 
 
 def _require_fit(automaton: Automaton, name: str) -> None:

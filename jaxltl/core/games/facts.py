@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxltl.core.pretty_print import array, count, head, readable, span, told
+from jaxltl.core.pretty_print import array_text, count, nested_repr, readable, value_range, describe
 
 _INNER = 92
 
@@ -17,7 +17,7 @@ def parity(value: Any) -> Iterator[str]:
     yield f"priorities below {value.num_priorities}"
     yield count(value.priority.size, "state")
     for name in ("won", "lost"):
-        yield f"{name} {span(getattr(value, name))}"
+        yield f"{name} {value_range(getattr(value, name))}"
 
 
 def gr1(value: Any) -> Iterator[str]:
@@ -25,14 +25,14 @@ def gr1(value: Any) -> Iterator[str]:
     yield count(value.assumptions.shape[-2], "assumption")
     yield count(value.guarantees.shape[-2], "guarantee")
     yield count(value.lost.shape[-1], "state")
-    yield f"lost {span(value.lost)}"
+    yield f"lost {value_range(value.lost)}"
 
 
 def winning(value: Any) -> Iterator[str]:
     """Of both players' regions."""
     region = readable(value.region)
     if region is None:
-        yield f"region {array(value.region)}"
+        yield f"region {array_text(value.region)}"
     else:
         wins = int(np.count_nonzero(region))
         yield f"the system wins from {wins:,} of {count(region.size, 'state')}"
@@ -43,17 +43,17 @@ def winning(value: Any) -> Iterator[str]:
     memories = value.action.shape[len(value.region.shape) :]
     if memories:
         yield f"strategies with {memories[0]} and {value.counter_action.shape[-1]} memories"
-    yield head(value.objective, _INNER)
-    yield head(value.game, _INNER)
+    yield nested_repr(value.objective, _INNER)
+    yield nested_repr(value.game, _INNER)
 
 
 def permissive(value: Any) -> Iterator[str]:
     """Of a permissive strategy."""
     region = readable(value.region)
     if region is None:
-        yield f"region {array(value.region)}"
+        yield f"region {array_text(value.region)}"
     else:
         yield f"wins from {np.count_nonzero(region):,} of {count(region.size, 'state')}"
-    yield f"allowed {told(value.allowed)}"
+    yield f"allowed {describe(value.allowed)}"
     yield value.reason
-    yield head(value.game, _INNER)
+    yield nested_repr(value.game, _INNER)

@@ -71,7 +71,7 @@ class TracedGraph:
     def least(self, value: jax.Array) -> jax.Array:
         """The smallest value among the successors: ``[S, A]``; the dtype's largest without any."""
         found = operators.least_successor(self.model, value)
-        return jnp.where(self.available, found, kernels.largest(value.dtype))
+        return jnp.where(self.available, found, kernels.dtype_max(value.dtype))
 
     def reads(self, marked: jax.Array) -> jax.Array:
         """Whether an action can make the automaton read a marked transition: ``bool[S, Q, A]``."""

@@ -8,18 +8,18 @@ from typing import Any
 import numpy as np
 
 from jaxltl.core.pretty_print import (
-    array,
-    coded,
+    array_text,
+    enum_counts,
     count,
-    cut,
-    head,
-    lanes,
-    names,
+    truncate,
+    nested_repr,
+    batch_text,
+    names_text,
     number,
-    over,
+    propositions_text,
     readable,
-    span,
-    told,
+    value_range,
+    describe,
 )
 
 _INNER = 92  # characters of a model inside of another
@@ -27,17 +27,17 @@ _INNER = 92  # characters of a model inside of another
 
 def padded(model: Any) -> Iterator[str]:
     """Of an MDP or a DenseMDP."""
-    yield lanes(model.available.shape[:-2])
+    yield batch_text(model.available.shape[:-2])
     yield count(model.num_states, "state")
     yield count(model.num_actions, "action")
     dense = hasattr(model, "transition")
     weights = model.transition if dense else model.probability
     weight, available = readable(weights), readable(model.available)
     if weight is None or available is None:
-        yield array(weights)
+        yield array_text(weights)
     else:
         yield count(np.count_nonzero((weight > 0) & available[..., None]), "transition")
-    yield over(model.propositions)
+    yield propositions_text(model.propositions)
     yield _begins(model.initial)
     if weight is not None:
         yield str(weights.dtype)
@@ -45,11 +45,11 @@ def padded(model: Any) -> Iterator[str]:
 
 def sparse(model: Any) -> Iterator[str]:
     """Of a SparseMDP."""
-    yield lanes(model.row_start.shape[:-1])
+    yield batch_text(model.row_start.shape[:-1])
     yield count(model.num_states, "state")
     yield "a chain" if model.is_chain else count(model.num_rows, "choice")
     yield count(model.num_transitions, "transition")
-    yield over(model.propositions)
+    yield propositions_text(model.propositions)
     yield from _more(model)
     yield _begins(model.initial)
     yield str(model.probability.dtype)
@@ -58,11 +58,11 @@ def sparse(model: Any) -> Iterator[str]:
 def _more(model: Any) -> Iterator[str]:
     """What only some models have."""
     if model.rewards:
-        yield f"rewards {names(model.rewards)}"
+        yield f"rewards {names_text(model.rewards)}"
     if getattr(model, "action_names", ()):
-        yield f"actions {names(model.action_names)}"
+        yield f"actions {names_text(model.action_names)}"
     if getattr(model, "valuation", {}):
-        yield f"variables {names(model.valuation)}"
+        yield f"variables {names_text(model.valuation)}"
 
 
 def _begins(initial: Any) -> str:
@@ -83,14 +83,14 @@ def interval(model: Any) -> Iterator[str]:
     if low is not None and high is not None and low.size:
         yield f"intervals at most {number(float((high - low).max()))} wide"
     if model.radius is not None:
-        yield f"radius {span(model.radius)}"
+        yield f"radius {value_range(model.radius)}"
 
 
 def parametric(model: Any) -> Iterator[str]:
     """Of a ParametricMDP."""
     ends = zip(model.parameters, np.asarray(model.low), np.asarray(model.high), strict=True)
-    yield f"{names((f'{name} in [{low:.6g}, {high:.6g}]' for name, low, high in ends), 90)}"
-    yield head(model.model, _INNER)
+    yield f"{names_text((f'{name} in [{low:.6g}, {high:.6g}]' for name, low, high in ends), 90)}"
+    yield nested_repr(model.model, _INNER)
 
 
 def sharded(model: Any) -> Iterator[str]:
@@ -98,8 +98,8 @@ def sharded(model: Any) -> Iterator[str]:
     yield count(model.num_given, "state")
     yield count(model.num_actions, "action")
     rows = " and ".join(f"{t.successor.shape[0]:,} of {t.successor.shape[1]}" for t in model.tables)
-    yield f"rows {cut(rows)}"
-    yield over(model.propositions)
+    yield f"rows {truncate(rows)}"
+    yield propositions_text(model.propositions)
     yield from _more(model)
     yield f"on {count(model.mesh.shape[model.axis], 'device')} along {model.axis!r}"
     yield str(model.dtype)
@@ -116,35 +116,35 @@ def part(value: Any) -> Iterator[str]:
 
 def product(model: Any) -> Iterator[str]:
     """Of a Product: its world and its automaton."""
-    yield lanes(model.automaton.delta.shape[:-2])
+    yield batch_text(model.automaton.delta.shape[:-2])
     memories = count(model.num_memory, "memory", "memories")
     yield f"{count(model.num_states, 'state')} with {memories}"
-    yield head(model.mdp, _INNER)
-    yield f"beside {head(model.automaton, _INNER)}"
+    yield nested_repr(model.mdp, _INNER)
+    yield f"beside {nested_repr(model.automaton, _INNER)}"
     yield f"labels read on {model.label_on}"
     if model.allowed is not None:
-        yield f"allowed: {told(model.allowed)}"
+        yield f"allowed: {describe(model.allowed)}"
 
 
 def game(value: Any) -> Iterator[str]:
     """Of a Game."""
     read = readable(value.system)
     if read is None:
-        yield f"system: {array(value.system)}"
+        yield f"system: {array_text(value.system)}"
     else:
         yield f"the system moves in {np.count_nonzero(read):,} of {count(read.size, 'state')}"
-    yield head(value.mdp, _INNER)
+    yield nested_repr(value.mdp, _INNER)
 
 
 def memory_policy(value: Any) -> Iterator[str]:
     """Of a FiniteMemoryPolicy."""
     *more, states, memories = value.next_memory.shape
-    yield lanes(more)
+    yield batch_text(more)
     yield count(states, "state")
     yield count(memories, "memory", "memories")
     stochastic = value.action.ndim > value.next_memory.ndim
     yield (f"mixes {count(value.action.shape[-1], 'action')}" if stochastic else "deterministic")
-    yield f"action {array(value.action)}"
+    yield f"action {array_text(value.action)}"
     yield f"labels read on {value.label_on}"
 
 
@@ -153,26 +153,26 @@ def counts(value: Any) -> Iterator[str]:
     samples = readable(value.count)
     yield count(samples.sum(), "sample") if samples is not None else ""
     yield f"of {count(len(value.count), 'transition')}"
-    yield f"{count(len(value.states), 'state')}: {names(value.states)}"
-    yield f"{count(len(value.actions), 'action')}: {names(value.actions)}"
+    yield f"{count(len(value.states), 'state')}: {names_text(value.states)}"
+    yield f"{count(len(value.actions), 'action')}: {names_text(value.actions)}"
 
 
 def trajectories(value: Any) -> Iterator[str]:
     """Of Trajectories."""
     *more, number_of, longest = value.state.shape
-    yield lanes(more)
+    yield batch_text(more)
     yield f"{number_of:,} of at most {count(longest, 'step')}"
-    yield f"lengths {span(value.length)}"
+    yield f"lengths {value_range(value.length)}"
     if value.state_shape is not None:
         yield f"states {value.state_shape}"
 
 
 def table(value: Any) -> Iterator[str]:
     """Of a Table of worlds."""
-    yield head(value.model, _INNER)
+    yield nested_repr(value.model, _INNER)
     yield count(value.start.shape[-1], "beginning")
     for name in ("terminated", "truncated"):
-        yield f"{name} {span(getattr(value, name))}"
+        yield f"{name} {value_range(getattr(value, name))}"
     if value.num_steps is not None:
         yield f"at most {count(value.num_steps, 'step')}"
     yield f"evidence {value.evidence!r}"
@@ -181,25 +181,25 @@ def table(value: Any) -> Iterator[str]:
 def monitor(value: Any, codes: Any) -> Iterator[str]:
     """Of a Monitor."""
     *more, states, letters = value.delta.shape
-    yield lanes(more)
+    yield batch_text(more)
     yield count(states, "state")
     yield count(letters, "letter")
-    yield coded(value.verdict, codes)
+    yield enum_counts(value.verdict, codes)
 
 
 def space(value: Any) -> Iterator[str]:
     """Of a Box."""
     yield f"{value.dtype}[{', '.join(str(n) for n in value.shape)}]"
-    low, high = (span(x) for x in (value.low, value.high))
+    low, high = (value_range(x) for x in (value.low, value.high))
     yield f"from {low} to {high}" if max(len(low), len(high)) < 40 else ""
 
 
 def environment(value: Any) -> Iterator[str]:
     """Of an Environment."""
     finite = hasattr(value.actions, "num")
-    yield count(value.actions.num, "action") if finite else f"actions {head(value.actions)}"
+    yield count(value.actions.num, "action") if finite else f"actions {nested_repr(value.actions)}"
     yield f"observations {_spaces(value.observations)}"
-    yield over(value.propositions)
+    yield propositions_text(value.propositions)
     if value.horizon is not None:
         yield f"at most {count(value.horizon, 'step')}"
     if value.allowed is not None:
@@ -210,7 +210,7 @@ def environment(value: Any) -> Iterator[str]:
 
 def _spaces(tree: Any) -> str:
     if hasattr(tree, "low"):
-        return head(tree)
+        return nested_repr(tree)
     inner = (
         tree.items()
         if isinstance(tree, dict)
@@ -222,16 +222,16 @@ def _spaces(tree: Any) -> str:
 def episode(value: Any) -> Iterator[str]:
     """Of an Episode, or of many."""
     *more, steps = value.valid.shape
-    yield lanes(more)
+    yield batch_text(more)
     yield f"at most {count(steps, 'step')}"
     read = readable(value.valid)
     if read is None:
-        yield f"reward {array(value.reward)}"
+        yield f"reward {array_text(value.reward)}"
         return
-    yield f"made {span(read.sum(-1))}"
+    yield f"made {value_range(read.sum(-1))}"
     for name in ("reward", "cost"):
         numbers = readable(getattr(value, name))
         if numbers is not None and (name == "reward" or numbers.any()):
-            yield f"{name} {span(numbers.sum(-1))}"
+            yield f"{name} {value_range(numbers.sum(-1))}"
     for name in ("terminated", "truncated"):
-        yield f"{name} {span(getattr(value, name))}"
+        yield f"{name} {value_range(getattr(value, name))}"

@@ -297,7 +297,9 @@ def reads(model: Product, marked: jax.Array) -> jax.Array:
     here = jnp.asarray(marked)[:, model.letter].T
     if model.label_on == "exit":
         return here[:, :, None] & model.available
-    found = _each_memory(model.mdp, operators.exists_successor, here, kernels.hits, jnp.logical_or)
+    found = _each_memory(
+        model.mdp, operators.exists_successor, here, kernels.positive_hits, jnp.logical_or
+    )
     return found & model.available
 
 
@@ -347,7 +349,9 @@ def _(model: Product, value: jax.Array) -> jax.Array:
 
 @operators.exists_successor.register
 def _(model: Product, region: jax.Array) -> jax.Array:
-    return _through(model, operators.exists_successor, region, kernels.hits, jnp.logical_or)
+    return _through(
+        model, operators.exists_successor, region, kernels.positive_hits, jnp.logical_or
+    )
 
 
 @operators.forall_successor.register
@@ -363,7 +367,7 @@ def _(model: Product, value: jax.Array) -> jax.Array:
         value,
         kernels.where_positive,
         jnp.minimum,
-        kernels.largest(value.dtype),
+        kernels.dtype_max(value.dtype),
     )
 
 
@@ -410,10 +414,10 @@ def _(model: Product, policy: jax.Array) -> jax.Array:
     return operators.scatter_matrix(flat.reshape(shape), weight.reshape(shape))
 
 
-@operators.following.register
+@operators.policy_operator.register
 def _(model: Product, policy: jax.Array) -> Any:
     if isinstance(model.mdp, MDP | DenseMDP):
-        return operators.along(operators.induced_chain(model, policy))
+        return operators.chain_operator(operators.induced_chain(model, policy))
 
     def onward(value: jax.Array) -> jax.Array:
         ahead = operators.expectation(model, value.reshape(model.state_shape))

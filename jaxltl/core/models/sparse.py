@@ -16,7 +16,7 @@ from flax import struct
 from jaxltl.core.models import facts
 from jaxltl.core.models.mdp import checked_initial, checked_label
 from jaxltl.core.models.ops.array_namespace import is_traced
-from jaxltl.core.models.ops.kernels import gather, owners, segment
+from jaxltl.core.models.ops.kernels import gather, segment_ids, segment_reduce
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.rows import SCIPY_SIZE
@@ -240,13 +240,13 @@ def _sizes(model: SparseMDP) -> tuple[tuple[int, str], ...]:
 def _traced_reward(model: SparseMDP, reward: Rewards) -> Any:
     total = jnp.zeros(model.num_rows, jax.dtypes.canonicalize_dtype(model.dtype))
     if reward.state is not None:
-        total += gather(reward.state, owners(model.row_start, model.num_rows))
+        total += gather(reward.state, segment_ids(model.row_start, model.num_rows))
     if reward.choice is not None:
         total += reward.choice
     if reward.transition is not None:
-        row = owners(model.entry_start, model.num_transitions)
+        row = segment_ids(model.entry_start, model.num_transitions)
         earned = model.probability * jnp.asarray(reward.transition)
-        total += segment(jax.ops.segment_sum, earned, row, model.num_rows)
+        total += segment_reduce(jax.ops.segment_sum, earned, row, model.num_rows)
     return total
 
 

@@ -14,7 +14,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
-from jaxltl.core.pretty_print import brief, count, readable, span
+from jaxltl.core.pretty_print import brief, count, readable, value_range
 from jaxltl.core.statistics.binomial import (
     Ends,
     anytime,
@@ -41,8 +41,10 @@ def _facts(sets: Any) -> Iterator[str]:
     samples, low, high = (readable(x) for x in (sets.num_samples, sets.lower, sets.upper))
     yield count(samples.sum(), "sample") if samples is not None else ""
     yield f"{sets.method}, confidence {sets.confidence:g} shared by {sets.num_claims:,}"
-    yield f"intervals {span(high - low)} wide" if low is not None and high is not None else ""
-    yield f"radius {span(sets.radius)}" if sets.radius is not None else ""
+    yield (
+        f"intervals {value_range(high - low)} wide" if low is not None and high is not None else ""
+    )
+    yield f"radius {value_range(sets.radius)}" if sets.radius is not None else ""
 
 
 @brief(facts=_facts)

@@ -6,16 +6,16 @@ from collections.abc import Iterator
 from typing import Any
 
 from jaxltl.core.pretty_print import (
-    apart,
-    array,
-    coded,
+    bounds_text,
+    array_text,
+    enum_counts,
     count,
-    cut,
-    head,
+    truncate,
+    nested_repr,
     number,
     readable,
-    span,
-    told,
+    value_range,
+    describe,
 )
 from jaxltl.core.types import Status
 
@@ -53,8 +53,8 @@ def guarantee(value: Any) -> Iterator[str]:
     yield f"confidence {value.confidence:g}"
     samples = readable(value.sets.num_samples)
     yield count(samples.sum(), "sample") if samples is not None else ""
-    yield head(value.model, _INNER)
-    yield head(value.satisfaction.automaton, _INNER)
+    yield nested_repr(value.model, _INNER)
+    yield nested_repr(value.satisfaction.automaton, _INNER)
 
 
 def gap(value: Any) -> Iterator[str]:
@@ -73,27 +73,27 @@ def gap(value: Any) -> Iterator[str]:
 
 def optimal_actions(value: Any) -> Iterator[str]:
     """Of OptimalActions."""
-    yield coded(value.status, Status)
-    yield f"allowed {told(value.allowed)}"
-    yield f"loses at most {span(value.loss)}"
-    yield f"best {told(value.best.value)}"
+    yield enum_counts(value.status, Status)
+    yield f"allowed {describe(value.allowed)}"
+    yield f"loses at most {value_range(value.loss)}"
+    yield f"best {describe(value.best.value)}"
 
 
 def answer(value: Any) -> Iterator[str]:
     """Of an Answer."""
     yield value.status.name
     yield count(len(value.states), "state")
-    yield f"value {span(value.value)}"
-    yield apart(value.lower, value.upper)
+    yield f"value {value_range(value.value)}"
+    yield bounds_text(value.lower, value.upper)
     if value.holds is not None:
-        yield f"holds {cut(str(value.holds))}"
+        yield f"holds {truncate(str(value.holds))}"
     yield f"by {value.method}"
 
 
 def satisfaction(value: Any) -> Iterator[str]:
     """Of the best policy with a memory for a task, beside what is reached of the product."""
-    yield head(value.solution, _INNER)
-    yield head(value.automaton, _INNER)
+    yield nested_repr(value.solution, _INNER)
+    yield nested_repr(value.automaton, _INNER)
     yield f"{count(len(value.product.base_state), 'state')} of the product"
 
 
@@ -102,7 +102,7 @@ def objective(value: Any) -> Iterator[str]:
     for name in ("formula", "target", "stay", "avoid", "reward", "threshold"):
         given = getattr(value, name)
         if given is not None:
-            yield f"{name}={told(given)}"
+            yield f"{name}={describe(given)}"
     yield f"direction={value.direction!r}"
 
 
@@ -118,4 +118,4 @@ def prepared(value: Any) -> Iterator[str]:
         yield "circles" if value.cyclic else "no circles"
         yield count(value.levels, "level")
     numbers = value.probability if hasattr(value, "probability") else value.lower
-    yield array(numbers)
+    yield array_text(numbers)

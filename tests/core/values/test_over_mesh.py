@@ -16,7 +16,7 @@ from jaxltl.core.graphs.graph import TracedGraph, graph_of
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import make_mdp
 from jaxltl.core.models.mesh.shard import from_mesh, shard, to_mesh
-from jaxltl.core.models.ops.successor_tables import ShardedSuccessorTable, table
+from jaxltl.core.models.ops.successor_tables import ShardedSuccessorTable, sweep_operator
 from jaxltl.core.models.product import product
 from jaxltl.core.types import Status
 from jaxltl.core.values.discounted.boltzmann import boltzmann_value
@@ -102,7 +102,7 @@ def test_solvers(count, reach, solver):
 )
 def test_solvers_where_one_table_holds_all(solver):
     case = Case(4, 1, ragged=False)
-    assert isinstance(table(case.sharded), ShardedSuccessorTable)
+    assert isinstance(sweep_operator(case.sharded), ShardedSuccessorTable)
     given = case.reward, case.target, case.policy
     one = SOLVERS[solver](case.mdp, *(jnp.asarray(x) for x in given))
     other = jax.jit(SOLVERS[solver])(case.sharded, *(case.there(x) for x in given))

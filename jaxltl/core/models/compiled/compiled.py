@@ -13,7 +13,7 @@ from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mesh.sharded import ShardedMDP, is_sharded
 from jaxltl.core.models.ops.array_namespace import is_traced
-from jaxltl.core.models.ops.kernels import gather, owners
+from jaxltl.core.models.ops.kernels import gather, segment_ids
 from jaxltl.core.models.ops.operators import is_deterministic
 from jaxltl.core.models.product import Product, flat_successor
 from jaxltl.core.models.protocols import Model
@@ -104,12 +104,12 @@ def _written_out(model: Product) -> SparseMDP:
     number = np.arange(model.num_states, dtype=np.int32)
     state, memory = number // num_memory, number % num_memory
     starts = _repeated(row_start, num_memory)
-    of = owners(starts, world.num_rows * num_memory)
+    of = segment_ids(starts, world.num_rows * num_memory)
     row = gather(row_start[state], of) + jnp.arange(of.size, dtype=jnp.int32) - starts[of]
     first = entry_start[row_start]  # of each state's entries
     begins = gather(_repeated(first, num_memory), of) + entry_start[row] - gather(first[state], of)
     begins = jnp.append(begins, world.num_transitions * num_memory).astype(entry_start.dtype)
-    of_entry = owners(begins, world.num_transitions * num_memory)
+    of_entry = segment_ids(begins, world.num_transitions * num_memory)
     entry = gather(entry_start[row], of_entry) + (
         jnp.arange(of_entry.size, dtype=jnp.int32) - begins[of_entry]
     )

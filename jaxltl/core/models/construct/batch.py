@@ -184,13 +184,13 @@ def num_worlds(model: Product) -> int:
     return model.letter.shape[0] if is_stacked(model) else 1
 
 
-def world(model: Product, number: int) -> Product:
+def unstack_product(model: Product, number: int) -> Product:
     """The product of one of the stacked worlds, padding included.
 
     Example:
       >>> from jaxltl import from_dense
       >>> one = from_dense([[[0, 1.0]], [[0, 1.0]]], label=[[0], [1]], propositions=["goal"])
-      >>> world(stack_products([one, one], "F goal"), 1).state_shape
+      >>> unstack_product(stack_products([one, one], "F goal"), 1).state_shape
       (2, 2)
     """
     if is_traced((model, number)):
@@ -198,7 +198,7 @@ def world(model: Product, number: int) -> Product:
     return to_jax(jax.tree.map(lambda x: np.asarray(x)[number], model))
 
 
-def narrow(models: Product, allowed: Any) -> Product:
+def restrict_stacked_actions(models: Product, allowed: Any) -> Product:
     """Stacked products in each of which only some of the actions are left.
 
     Args:
@@ -213,7 +213,7 @@ def narrow(models: Product, allowed: Any) -> Product:
         raise ValueError(f"there are {len(masks)} masks for {num_worlds(models)} worlds.")
     for w, mask in enumerate(masks):
         try:
-            with_allowed(world(models, w), np.asarray(mask))
+            with_allowed(unstack_product(models, w), np.asarray(mask))
         except ValueError as error:
             raise ValueError(f"world {w}: {error}") from error
     return replace(models, allowed=to_jax(np.stack([np.asarray(x) for x in masks])))
@@ -347,7 +347,7 @@ def demonstration_counts(
         raise ValueError(f"there are demonstrations in {len(given)} worlds; expected {count}.")
     found = []
     for w, one in enumerate(given):
-        model = world(models, w)
+        model = unstack_product(models, w)
         shape: tuple[int, ...] = (*model.state_shape, model.num_actions)
         state, action, length = (np.asarray(x) for x in (one.state, one.action, one.length))
         if horizon is not None:

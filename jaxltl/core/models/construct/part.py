@@ -12,7 +12,7 @@ from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
 from jaxltl.core.models.sparse import Rewards, SparseMDP
 
 
-def part_of(model: SparseMDP, states: np.ndarray, rows: np.ndarray) -> SparseMDP:
+def submodel(model: SparseMDP, states: np.ndarray, rows: np.ndarray) -> SparseMDP:
     """The model of some states and rows, with what belongs to them.
 
     Args:
@@ -56,7 +56,7 @@ def part_of(model: SparseMDP, states: np.ndarray, rows: np.ndarray) -> SparseMDP
     )
 
 
-def reachable(model: SparseMDP, start: np.ndarray, rows: np.ndarray) -> np.ndarray:
+def reachable_states(model: SparseMDP, start: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """The states to which some rows lead from some states, these among them: ``bool[S]``."""
     host = model.host
     used = rows[host.row]

@@ -15,7 +15,7 @@ from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.mdp import MDP, DenseMDP, make_mdp, support
-from jaxltl.core.models.construct.part import part_of, reachable
+from jaxltl.core.models.construct.part import submodel, reachable_states
 from jaxltl.core.models.product import Product, flat_successor
 from jaxltl.core import validation
 from jaxltl.core.models.protocols import ActionModel, Model, ModelT
@@ -82,7 +82,7 @@ def _with_rows(model: SparseMDP, allowed: chex.Array) -> SparseMDP:
             f"allowed is {mask.dtype}{list(mask.shape)}; expected "
             f"bool[{model.num_rows}], one for each choice of the sparse model."
         )
-    return part_of(model, np.ones(model.num_states, bool), mask)
+    return submodel(model, np.ones(model.num_states, bool), mask)
 
 
 def _named(state: list[int]) -> str:
@@ -228,8 +228,8 @@ def _restrict_sparse(
                 f"allowed has shape {rows.shape}; expected ({sparse.num_rows},), the "
                 "choices of to_sparse(model)."
             )
-    states = reachable(sparse, start > 0, rows)
-    found = part_of(replace(sparse, initial=start / start.sum()), states, rows)
+    states = reachable_states(sparse, start > 0, rows)
+    found = submodel(replace(sparse, initial=start / start.sum()), states, rows)
     num_memory = lazy.num_memory if isinstance(lazy, Product) else 1
     return _restriction(model, found, np.flatnonzero(states), num_memory)
 

@@ -177,7 +177,7 @@ def require_split(name: str, sharding: Any, **sizes: int) -> None:
             )
 
 
-def split(tree: Any, sharding: NamedSharding | None, axis: int = 0) -> Any:
+def split_axis(tree: Any, sharding: NamedSharding | None, axis: int = 0) -> Any:
     """A tree whose arrays have one axis split over the devices that a sharding's spec names.
 
     Within a lane, under ``jit``; None: as it is.
@@ -188,7 +188,7 @@ def split(tree: Any, sharding: NamedSharding | None, axis: int = 0) -> Any:
     return jax.tree.map(lambda x: _constrained(x, _here(sharding.mesh), spec), tree)
 
 
-def whole(tree: Any, sharding: NamedSharding | None) -> Any:
+def replicate(tree: Any, sharding: NamedSharding | None) -> Any:
     """A tree whose arrays are on all devices of a sharding; None: as it is."""
     if sharding is None:
         return tree
@@ -196,7 +196,7 @@ def whole(tree: Any, sharding: NamedSharding | None) -> Any:
     return jax.tree.map(lambda x: _constrained(x, mesh, PartitionSpec()), tree)
 
 
-def apart(
+def shard_function(
     function: Callable[..., Any],
     sharding: NamedSharding | None,
     axes: Sequence[int | None],
@@ -235,8 +235,8 @@ def vmap_split(function: Callable[..., Any], sharding: NamedSharding | None, in_
     return vmap_over_mesh(function, mesh, _first_axes(sharding), in_axes=in_axes)
 
 
-def ranks(sharding: NamedSharding | None) -> jax.Array:
-    """``int32[D]``, the numbers of a sharding's devices, each of which :func:`apart` gives one."""
+def device_ranks(sharding: NamedSharding | None) -> jax.Array:
+    """``int32[D]``, the numbers of a sharding's devices, each of which :func:`shard_function` gives one."""
     devices = 1 if sharding is None else _count(sharding.mesh, _first_axes(sharding))
     return jnp.arange(devices, dtype=jnp.int32)
 
@@ -246,7 +246,7 @@ def running_sum(
 ) -> tuple[jax.Array, jax.Array]:
     """How many of all devices' ``bool[N]`` are True up to each of one's own, ``int32``; and in all.
 
-    In a function that :func:`apart` calls, with its part of :func:`ranks`.
+    In a function that :func:`shard_function` calls, with its part of :func:`device_ranks`.
     """
     number = jnp.cumsum(counted, dtype=jnp.int32)
     if sharding is None:

@@ -279,7 +279,7 @@ def _(model: ShardedMDP, value: jax.Array) -> jax.Array:
 
 @operators.exists_successor.register
 def _(model: ShardedMDP, region: jax.Array) -> jax.Array:
-    return operators.combined(model, region, kernels.hits, jnp.logical_or)
+    return operators.combined(model, region, kernels.positive_hits, jnp.logical_or)
 
 
 @operators.forall_successor.register
@@ -292,7 +292,7 @@ def _(model: ShardedMDP, value: jax.Array) -> jax.Array:
     return operators.combined(model, value, kernels.where_positive, jnp.minimum)
 
 
-@operators.following.register
+@operators.policy_operator.register
 def _(model: ShardedMDP, policy: jax.Array) -> Any:
     def one(tables: Any, place: Any, sent: Any, available: Any, policy: Any, value: Any) -> Any:
         seen = seen_by(model, sent, value)

@@ -261,7 +261,7 @@ class Rows(NamedTuple):
         """As of :class:`Actions`."""
         if quantity.dtype == bool:
             quantity = quantity.astype(jnp.int32)
-        return kernels.segment(jax.ops.segment_sum, quantity, self.state, self.num_states)
+        return kernels.segment_reduce(jax.ops.segment_sum, quantity, self.state, self.num_states)
 
     def max(self, quantity: jax.Array, where: jax.Array | None = None) -> jax.Array:
         """As of :class:`Actions`, with the derivative of the choice that attains it."""
@@ -273,7 +273,7 @@ class Rows(NamedTuple):
     def argmax(self, quantity: jax.Array) -> tuple[jax.Array, jax.Array]:
         """As of :class:`Actions`."""
         fixed = lax.stop_gradient(quantity)
-        best = kernels.segment(jax.ops.segment_max, fixed, self.state, self.num_states)
+        best = kernels.segment_reduce(jax.ops.segment_max, fixed, self.state, self.num_states)
         some, row = self.first(fixed >= kernels.gather(best, self.state))
         return jnp.where(some, best, jnp.nan), row
 
@@ -281,7 +281,7 @@ class Rows(NamedTuple):
         """As of :class:`Actions`."""
         last = self.shape[0]
         number = jnp.arange(last, dtype=jnp.int32)
-        found = kernels.segment(
+        found = kernels.segment_reduce(
             jax.ops.segment_min, jnp.where(condition, number, last), self.state, self.num_states
         )
         some = found < last
@@ -298,7 +298,7 @@ class Rows(NamedTuple):
     def top(self, logits: jax.Array) -> jax.Array:
         """As of :class:`Actions`; without derivative."""
         fixed = lax.stop_gradient(logits)
-        return kernels.segment(jax.ops.segment_max, fixed, self.state, self.num_states)
+        return kernels.segment_reduce(jax.ops.segment_max, fixed, self.state, self.num_states)
 
     def logsumexp(self, logits: jax.Array) -> jax.Array:
         """As of :class:`Actions`."""
@@ -355,7 +355,7 @@ def choices(model: Model) -> Actions | Rows:
 @choices.register(SparseMDP)
 def row_choices(model: SparseMDP) -> Rows:
     """Of a sparse model."""
-    return Rows(kernels.owners(model.row_start, model.num_rows), jnp.asarray(model.row_start))
+    return Rows(kernels.segment_ids(model.row_start, model.num_rows), jnp.asarray(model.row_start))
 
 
 @singledispatch

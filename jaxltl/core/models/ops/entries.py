@@ -12,7 +12,7 @@ from jaxltl.core.models.ops.choices import Rows, row_choices
 from jaxltl.core.models.sparse import SparseMDP
 
 
-class Entries(NamedTuple):
+class RowEntries(NamedTuple):
     """The transitions of a sparse model as sweeps read them.
 
     Attributes:
@@ -29,7 +29,7 @@ class Entries(NamedTuple):
 
     def over_entries(self, operation: Any, quantity: jax.Array) -> jax.Array:
         """A reduction over the entries of each row: ``[R, ...]`` from ``[T, ...]``."""
-        return kernels.segment(operation, quantity, self.row, self.choices.shape[0])
+        return kernels.segment_reduce(operation, quantity, self.row, self.choices.shape[0])
 
     def expectation(self, value: jax.Array) -> jax.Array:
         """Expected value of the next state, ``[R, ...]`` from ``[S, ...]``."""
@@ -45,11 +45,11 @@ class Entries(NamedTuple):
         return jnp.zeros((size, size), entry.dtype).at[state, self.successor].add(entry)
 
 
-def entries(model: SparseMDP) -> Entries:
+def row_entries(model: SparseMDP) -> RowEntries:
     """A sparse model's transitions, with the row of each entry and the state of each row."""
-    return Entries(
+    return RowEntries(
         row_choices(model),
-        kernels.owners(model.entry_start, model.num_transitions),
+        kernels.segment_ids(model.entry_start, model.num_transitions),
         jnp.asarray(model.successor),
         jnp.asarray(model.probability),
     )

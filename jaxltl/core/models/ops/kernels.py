@@ -114,17 +114,17 @@ def stacked(columns: Sequence[jax.Array]) -> jax.Array:
     return jnp.stack(columns, axis=-1)
 
 
-def hits(weight: jax.Array, inside: jax.Array) -> jax.Array:
+def positive_hits(weight: jax.Array, inside: jax.Array) -> jax.Array:
     """Whether a successor of positive weight lies in a region."""
     return (weight > 0) & inside
 
 
 def where_positive(weight: jax.Array, value: jax.Array) -> jax.Array:
     """The value where a successor has positive weight, else the largest of its dtype."""
-    return jnp.where(weight > 0, value, largest(value.dtype))
+    return jnp.where(weight > 0, value, dtype_max(value.dtype))
 
 
-def largest(dtype: Any) -> Any:
+def dtype_max(dtype: Any) -> Any:
     """The largest value of a dtype."""
     is_float = jnp.issubdtype(dtype, jnp.floating)
     return jnp.inf if is_float else jnp.iinfo(dtype).max
@@ -133,7 +133,7 @@ def largest(dtype: Any) -> Any:
 # --- spans that stand one after another ------------------------------------------------------
 
 
-def owners(start: Any, total: int) -> jax.Array:
+def segment_ids(start: Any, total: int) -> jax.Array:
     """Whose span each of a number of things lies in, ``int32[total]``, from the spans' starts."""
     count = start.shape[-1] - 1
     if not is_traced(start):
@@ -147,6 +147,6 @@ def owners(start: Any, total: int) -> jax.Array:
     return jnp.cumsum(begins, dtype=jnp.int32)
 
 
-def segment(operation: Any, quantity: jax.Array, owner: jax.Array, count: int) -> jax.Array:
+def segment_reduce(operation: Any, quantity: jax.Array, owner: jax.Array, count: int) -> jax.Array:
     """A reduction such as ``jax.ops.segment_sum`` of what each of so many owners has."""
     return operation(quantity, owner, count, indices_are_sorted=True, mode="promise_in_bounds")

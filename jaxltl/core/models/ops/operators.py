@@ -32,7 +32,7 @@ from jaxltl.core.models.ops.choices import action_mean as action_mean
 from jaxltl.core.models.ops.choices import choice_shape, choices
 from jaxltl.core.models.ops.choices import first_action as first_action
 from jaxltl.core.models.ops.choices import is_deterministic as is_deterministic
-from jaxltl.core.models.ops.entries import entries
+from jaxltl.core.models.ops.entries import row_entries
 from jaxltl.core.models.ops.kernels import where_positive
 from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import SparseMDP
@@ -181,12 +181,12 @@ def transition_matrix(model: Model, policy: jax.Array) -> jax.Array:
 
 
 @singledispatch
-def following(model: Model, policy: jax.Array) -> Callable[[jax.Array], jax.Array]:
+def policy_operator(model: Model, policy: jax.Array) -> Callable[[jax.Array], jax.Array]:
     """``v -> P_pi v`` of a deterministic policy, ``float[N]`` from ``float[N]``, for sweeps."""
-    return along(induced_chain(model, policy))
+    return chain_operator(induced_chain(model, policy))
 
 
-def along(chain: Model) -> Callable[[jax.Array], jax.Array]:
+def chain_operator(chain: Model) -> Callable[[jax.Array], jax.Array]:
     """``v -> P v`` of a model with one action."""
     return lambda value: expectation(chain, value)[:, 0]
 
@@ -273,7 +273,7 @@ def _(model: MDP, value: jax.Array) -> jax.Array:
 
 @exists_successor.register
 def _(model: MDP, region: jax.Array) -> jax.Array:
-    return combined(model, jnp.asarray(region), kernels.hits, jnp.logical_or)
+    return combined(model, jnp.asarray(region), kernels.positive_hits, jnp.logical_or)
 
 
 @forall_successor.register
@@ -388,13 +388,13 @@ def _sample(key: chex.PRNGKey, probability: jax.Array) -> jax.Array:
 
 @expectation.register
 def _(model: SparseMDP, value: jax.Array) -> jax.Array:
-    return entries(model).expectation(value)
+    return row_entries(model).expectation(value)
 
 
 @exists_successor.register
 def _(model: SparseMDP, region: jax.Array) -> jax.Array:
-    of = entries(model)
-    inside = kernels.hits(of.probability, kernels.gather(region, of.successor))
+    of = row_entries(model)
+    inside = kernels.positive_hits(of.probability, kernels.gather(region, of.successor))
     return of.over_entries(jax.ops.segment_max, inside.astype(jnp.int32)) > 0
 
 
@@ -405,7 +405,7 @@ def _(model: SparseMDP, region: jax.Array) -> jax.Array:
 
 @least_successor.register
 def _(model: SparseMDP, value: jax.Array) -> jax.Array:
-    of = entries(model)
+    of = row_entries(model)
     reached = where_positive(of.probability, kernels.gather(value, of.successor))
     return of.over_entries(jax.ops.segment_min, reached)
 
@@ -432,12 +432,12 @@ def _(model: SparseMDP, key: chex.PRNGKey, state: jax.Array, action: jax.Array) 
 
 @transition_matrix.register
 def _(model: SparseMDP, policy: jax.Array) -> jax.Array:
-    return entries(model).matrix(policy)
+    return row_entries(model).matrix(policy)
 
 
-@following.register
+@policy_operator.register
 def _(model: SparseMDP, policy: jax.Array) -> Callable[[jax.Array], jax.Array]:
-    of = entries(model)
+    of = row_entries(model)
     return lambda value: kernels.gather(of.expectation(value), policy)
 
 

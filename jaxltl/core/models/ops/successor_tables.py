@@ -23,7 +23,7 @@ from jaxltl.core.models.ops import kernels, operators
 from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.models.ops.choices import Columns
 from jaxltl.core.models.ops.choices import action_columns as action_columns
-from jaxltl.core.models.ops.entries import Entries, entries
+from jaxltl.core.models.ops.entries import RowEntries, row_entries
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import SparseMDP
@@ -34,7 +34,7 @@ _WIDEST = 6  # predecessor lists are at most this many times wider than successo
 
 
 @brief
-class Successors(NamedTuple):
+class SuccessorTable(NamedTuple):
     """Where the pairs of a model lead, ``[A, K, N]``: an array ``[N]`` for each transition.
 
     Separate arrays lie side by side in memory whatever layout XLA chooses, without which
@@ -64,7 +64,7 @@ class Successors(NamedTuple):
 
 @brief
 @struct.dataclass
-class Primitives:
+class ModelOperator:
     """The same by a model's own primitive, for models that are too wide or too large to write down.
 
     Attributes:
@@ -75,11 +75,11 @@ class Primitives:
 
     @property
     def choices(self) -> Columns:
-        """As of :class:`Successors`."""
+        """As of :class:`SuccessorTable`."""
         return Columns()
 
     def expectation(self, value: jax.Array) -> list[jax.Array]:
-        """As :meth:`Successors.expectation`."""
+        """As :meth:`SuccessorTable.expectation`."""
         shape = self.model.state_shape
 
         def one(value: jax.Array) -> list[jax.Array]:
@@ -94,7 +94,7 @@ class Primitives:
 @brief
 @struct.dataclass
 class ShardedSuccessorTable:
-    """As :class:`Successors` of a model over a mesh, one table of all choices.
+    """As :class:`SuccessorTable` of a model over a mesh, one table of all choices.
 
     Attributes:
       model: the model.
@@ -107,11 +107,11 @@ class ShardedSuccessorTable:
 
     @property
     def choices(self) -> Columns:
-        """As of :class:`Successors`."""
+        """As of :class:`SuccessorTable`."""
         return Columns()
 
     def expectation(self, value: jax.Array) -> list[jax.Array]:
-        """As :meth:`Successors.expectation`."""
+        """As :meth:`SuccessorTable.expectation`."""
 
         def one(successor: Any, probability: Any, sent: Any, value: jax.Array) -> list[jax.Array]:
             seen = seen_by(self.model, sent, value)
@@ -124,7 +124,7 @@ class ShardedSuccessorTable:
 
 
 @brief
-class Predecessors(NamedTuple):
+class PredecessorTable(NamedTuple):
     """The pairs that lead to each state, ``a * N + i``, padded with probability zero.
 
     Attributes:
@@ -140,17 +140,19 @@ class Predecessors(NamedTuple):
         return kernels.fold(list(self.pair), list(self.probability), mass)
 
 
-def table(model: Model) -> Successors | ShardedSuccessorTable | Primitives | Entries:
+def sweep_operator(
+    model: Model,
+) -> SuccessorTable | ShardedSuccessorTable | ModelOperator | RowEntries:
     """What sweeps a model: its successors where they can be written down, else its primitives.
 
     Of a sparse model, or a game on one, its entries.
     """
     world = model.mdp if isinstance(model, Game) else model
     if isinstance(world, SparseMDP):
-        return entries(world)
+        return row_entries(world)
     if isinstance(world, ShardedMDP) and (spread := _spread_out(world)):
         return spread
-    return successors(model) or Primitives(model)
+    return successor_table(model) or ModelOperator(model)
 
 
 def _spread_out(model: ShardedMDP) -> ShardedSuccessorTable | None:
@@ -167,7 +169,7 @@ def _spread_out(model: ShardedMDP) -> ShardedSuccessorTable | None:
     return ShardedSuccessorTable(model, successor, probability)
 
 
-def successors(model: Model) -> Successors | None:
+def successor_table(model: Model) -> SuccessorTable | None:
     """The successor table of an MDP, of a product of one or of a game; None where it is too large."""
     model = model.mdp if isinstance(model, Game) else model
     world = model.mdp if isinstance(model, Product) else model
@@ -178,7 +180,7 @@ def successors(model: Model) -> Successors | None:
         return None
     weight = world.successor_probability
     if not isinstance(model, Product):
-        return Successors(_columns(world.successor), _columns(weight))
+        return SuccessorTable(_columns(world.successor), _columns(weight))
     if model.num_states * num_pairs > _LARGEST:
         return None
     num_memory, memory = model.num_memory, model.next_memory
@@ -191,7 +193,7 @@ def successors(model: Model) -> Successors | None:
     flat = world.successor[:, None] * num_memory + after
     probability = jnp.broadcast_to(weight[:, None], shape)
     rows = (model.num_states, *shape[2:])
-    return Successors(_columns(flat.reshape(rows)), _columns(probability.reshape(rows)))
+    return SuccessorTable(_columns(flat.reshape(rows)), _columns(probability.reshape(rows)))
 
 
 def _columns(entries: jax.Array) -> list[list[jax.Array]] | jax.Array:
@@ -202,7 +204,7 @@ def _columns(entries: jax.Array) -> list[list[jax.Array]] | jax.Array:
     return [[entries[:, a, k] for k in range(width)] for a in range(num_actions)]
 
 
-def predecessors(models: Sequence[Any]) -> Predecessors | None:
+def predecessor_table(models: Sequence[Any]) -> PredecessorTable | None:
     """The predecessor lists of models of one shape, with a leading axis, on the host.
 
     Args:
@@ -212,7 +214,7 @@ def predecessors(models: Sequence[Any]) -> Predecessors | None:
       Lists padded to the longest, ``[W, P, N]``; None if there is no successor table, or if
       some state has too many predecessors for that to pay.
     """
-    table_of = jax.jit(successors)
+    table_of = jax.jit(successor_table)
     tables = [table_of(model) for model in models]
     lists = []
     for table in tables:
@@ -236,4 +238,4 @@ def predecessors(models: Sequence[Any]) -> Predecessors | None:
     probability = np.zeros(pairs.shape, weight.dtype)
     for w, (target, rank, pair, weight, _) in enumerate(lists):
         pairs[w, rank, target], probability[w, rank, target] = pair, weight
-    return Predecessors(to_jax(pairs), to_jax(probability))
+    return PredecessorTable(to_jax(pairs), to_jax(probability))

@@ -14,7 +14,7 @@ from jax import lax
 from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.models.compiled.compiled import compiled_form, reshape_solution
 from jaxltl.core.models.ops.choices import choices
-from jaxltl.core.models.ops.successor_tables import table
+from jaxltl.core.models.ops.successor_tables import sweep_operator
 from jaxltl.core.types import Solution, Status, status_code
 from jaxltl.core.values.discounted.discounted import (
     action_value,
@@ -142,7 +142,7 @@ def _boltzmann_value(
     start = jnp.zeros(model.num_states, model.dtype) if initial is None else initial.ravel()
     damping = jnp.where(given.contracts | (method == "newton"), 0.0, 0.5).astype(model.dtype)
     value, image, n = newton.solve(
-        table(model),
+        sweep_operator(model),
         softmax_mean,
         _judge,
         newton.Backup(gains(model, reward), discount, damping, given),
@@ -184,7 +184,7 @@ def _boltzmann_value(
         if adjoint == "exact":
             q = action_value(model, reward, discount, solution.value)
             policy *= 1 + q - over.spread(over.mean(policy, q))
-        return System(table(model), over.columns(policy), discount)
+        return System(sweep_operator(model), over.columns(policy), discount)
 
     solution = differentiable(solution, backup, system)
     return with_softmax(model, reward, discount, solution)

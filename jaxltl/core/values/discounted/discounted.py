@@ -23,8 +23,13 @@ from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.models.compiled.compiled import compiled_form, flatten_policy, reshape_solution
 from jaxltl.core.models.ops.array_namespace import is_traced
 from jaxltl.core.models.ops.choices import choices
-from jaxltl.core.models.ops.operators import expectation, following, require_policy, valid_policy
-from jaxltl.core.models.ops.successor_tables import table
+from jaxltl.core.models.ops.operators import (
+    expectation,
+    policy_operator,
+    require_policy,
+    valid_policy,
+)
+from jaxltl.core.models.ops.successor_tables import sweep_operator
 from jaxltl.core.models.sparse import SparseMDP, choice_reward
 from jaxltl.core.types import Solution, status_code
 from jaxltl.core.values.engine import newton
@@ -245,7 +250,7 @@ def _policy_value(model, policy, reward, discount, tolerance, max_steps) -> Solu
     given = parameters(model, reward, discount, tolerance)
     reward = expected_reward(model, reward)
     checked = valid_policy(model, policy)
-    over, rows = choices(model), table(model)
+    over, rows = choices(model), sweep_operator(model)
     weight = over.columns(checked.distribution)
     given = given._replace(policy=weight)
 
@@ -357,7 +362,7 @@ def _optimal_value(
         )
     else:
         value, image, n = newton.solve(
-            table(model),
+            sweep_operator(model),
             best_action,
             judge,
             newton.Backup(
@@ -375,7 +380,7 @@ def _optimal_value(
 
     def system() -> System:
         chosen = over.one_hot(policy, model.dtype)
-        return System(table(model), over.columns(chosen), given.discount)
+        return System(sweep_operator(model), over.columns(chosen), given.discount)
 
     return differentiable(solution_of(model, given, value, image, policy, n), backup, system)
 
@@ -395,7 +400,7 @@ def _modified_policy_iteration(model, reward, given: Parameters, max_steps, swee
 
     def step(_, carry, __):
         _, image, policy = carry
-        onward = following(model, policy)
+        onward = policy_operator(model, policy)
         gain = over.mean(policy, reward).ravel()
         value = lax.fori_loop(0, sweeps, lambda _, v: gain + given.discount * onward(v), image)
         return value, *greedy(value)

@@ -31,7 +31,7 @@ from jaxltl.core.models.ops.operators import (
     require_policy,
     valid_policy,
 )
-from jaxltl.core.models.ops.successor_tables import table
+from jaxltl.core.models.ops.successor_tables import sweep_operator
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.types import Solution, require_shape, status_code
 from jaxltl.core.values.discounted.discounted import best_action, expected_reward
@@ -464,7 +464,7 @@ def _solve(
         jnp.max(size),
         None if tolerance is None else jnp.asarray(tolerance, game.dtype),
     )
-    rows, columns = table(game), over.columns(moves)
+    rows, columns = sweep_operator(game), over.columns(moves)
     horizon = _horizon(rows, play, columns, flat, per, defined, max_steps)
     play = play._replace(horizon=jnp.max(horizon))
     numbers = newton.Backup(

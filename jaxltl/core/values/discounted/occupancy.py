@@ -13,7 +13,7 @@ from jaxltl.core.models.compiled.compiled import compiled_form, flatten_policy
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.ops.choices import choices
 from jaxltl.core.models.ops.operators import pushforward, require_policy, valid_policy
-from jaxltl.core.models.ops.successor_tables import table
+from jaxltl.core.models.ops.successor_tables import sweep_operator
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.types import Solution, status_code
@@ -81,7 +81,7 @@ def _occupancy(model, policy, discount, start, tolerance) -> Solution:
     def flow(d: jax.Array) -> jax.Array:
         return start + discount * pushforward(model, over.spread(d) * policy)
 
-    system = System(table(model), over.columns(policy), discount)
+    system = System(sweep_operator(model), over.columns(policy), discount)
     linear = solver(system)
     visits, n = in_turn(_visits, model, policy, discount, start, linear)
     residual = jnp.sum(jnp.abs(flow(visits) - visits))

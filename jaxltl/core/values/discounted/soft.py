@@ -15,7 +15,7 @@ from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.models.compiled.compiled import compiled_form, reshape_solution
 from jaxltl.core.models.ops.choices import choices
 from jaxltl.core.models.ops.operators import expectation, pushforward
-from jaxltl.core.models.ops.successor_tables import Predecessors, table
+from jaxltl.core.models.ops.successor_tables import PredecessorTable, sweep_operator
 from jaxltl.core.types import Solution
 from jaxltl.core.values.discounted.discounted import (
     Parameters,
@@ -96,7 +96,7 @@ def _soft_value(
     reward, over = expected_reward(model, reward), choices(model)
     start = jnp.zeros(model.num_states, model.dtype) if initial is None else initial.ravel()
     value, image, n = newton.solve(
-        table(model),
+        sweep_operator(model),
         soft_maximum,
         judge,
         newton.Backup(gains(model, reward), given.discount, jnp.zeros_like(given.discount), given),
@@ -111,7 +111,7 @@ def _soft_value(
 
     def system() -> System:
         logits = policy_logits(model, reward, given.discount, solution.value)
-        return System(table(model), over.columns(over.softmax(logits)), given.discount)
+        return System(sweep_operator(model), over.columns(over.softmax(logits)), given.discount)
 
     solution = differentiable(solution, backup, system)
     return with_softmax(model, reward, given.discount, solution)
@@ -165,7 +165,7 @@ def soft_policy_adjoint(
     discount: jax.Array | float,
     cotangent: jax.Array,
     *,
-    predecessors: Predecessors | None = None,
+    predecessors: PredecessorTable | None = None,
     max_steps: jax.Array | int = 100_000,
 ) -> jax.Array:
     """The derivative of ``sum c log pi`` in the reward, for the soft policy pi of that reward.

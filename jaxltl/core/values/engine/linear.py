@@ -16,9 +16,13 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxltl.core.models.mesh.sharded import is_sharded
-from jaxltl.core.models.ops.entries import Entries
+from jaxltl.core.models.ops.entries import RowEntries
 from jaxltl.core.models.ops.operators import transition_matrix
-from jaxltl.core.models.ops.successor_tables import Primitives, ShardedSuccessorTable, Successors
+from jaxltl.core.models.ops.successor_tables import (
+    ModelOperator,
+    ShardedSuccessorTable,
+    SuccessorTable,
+)
 from jaxltl.core.values.engine.iterate import in_turn, iterate
 
 Operator = Callable[[jax.Array], jax.Array]
@@ -34,7 +38,7 @@ class System(NamedTuple):
     """``x - scale * sum_a w(s, a) (P x)(s, a)`` over numbered states.
 
     Attributes:
-      table: the model's successors, see :func:`~jaxltl.core.models.ops.successor_tables.table`.
+      table: the model's successors, see :func:`~jaxltl.core.models.ops.successor_tables.sweep_operator`.
       weight: ``float[N]`` for each action, such as a policy's columns; of a sparse model
         ``float[R]``.
       scale: ``float[N]`` or a scalar, such as the discount; zero where a value is fixed.
@@ -66,12 +70,12 @@ class System(NamedTuple):
         """``float[N, N]``, written out."""
         n = self.num_states
         eye = jnp.eye(n, dtype=jax.tree.leaves(self.weight)[0].dtype)
-        if not isinstance(self.table, Successors):
-            if isinstance(self.table, Primitives):
+        if not isinstance(self.table, SuccessorTable):
+            if isinstance(self.table, ModelOperator):
                 model = self.table.model
                 policy = jnp.stack(self.weight, -1).reshape(*model.state_shape, -1)
                 found = transition_matrix(model, policy)
-            elif isinstance(self.table, Entries):
+            elif isinstance(self.table, RowEntries):
                 found = self.table.matrix(self.weight)
             else:
                 found = self.table.choices.mean(self.weight, self.table.expectation(eye))
@@ -183,7 +187,7 @@ def solver(
 
 def is_small(table: Any, num_states: int) -> bool:
     """Whether systems of so many states are inverted; those on several devices never are."""
-    spread = isinstance(table, Primitives | ShardedSuccessorTable) and is_sharded(table.model)
+    spread = isinstance(table, ModelOperator | ShardedSuccessorTable) and is_sharded(table.model)
     return num_states <= DENSE_LIMIT and not spread
 
 

@@ -95,7 +95,7 @@ def solve(
     and convex also if its system was solved; if not, ever more sweeps come before the next.
 
     Args:
-      table: the model's, see :func:`~jaxltl.core.models.ops.successor_tables.table`.
+      table: the model's, see :func:`~jaxltl.core.models.ops.successor_tables.sweep_operator`.
       combine: from the table's choices, the action values, columns ``[N, ...]`` or
         ``[R, ...]``, and ``backup.extra``, the image and the weights.
       judge: from value, image and ``backup.extra``, whether to end, and the error.

@@ -31,12 +31,12 @@ from jaxltl.core.models.ops.operators import (
     action_argmax,
     action_mean,
     expectation,
-    following,
+    policy_operator,
     is_deterministic,
     require_policy,
     valid_policy,
 )
-from jaxltl.core.models.ops.successor_tables import action_columns, table
+from jaxltl.core.models.ops.successor_tables import action_columns, sweep_operator
 from jaxltl.core.models.product import Product
 from jaxltl.core.sparse.solvers import dense_reachability as host
 from jaxltl.core.sparse.solvers.layered_reachability import PaddedProduct, layered_reachability
@@ -419,7 +419,9 @@ def _evaluate(model, target, policy, tolerance, max_steps, *, method) -> Solutio
     undecided = ~(sets.one | sets.zero)
     one = sets.one.astype(model.dtype)
     weight = action_columns(model.num_actions, policy)
-    system = lax.stop_gradient(System(table(model), weight, undecided.ravel().astype(model.dtype)))
+    system = lax.stop_gradient(
+        System(sweep_operator(model), weight, undecided.ravel().astype(model.dtype))
+    )
     linear = solver(system, method, max_steps=max_steps)
 
     def onward(y: jax.Array) -> jax.Array:
@@ -556,7 +558,7 @@ def _tighter(sign: int, finest: bool, table: None, carry: _Bounds, search: _Sear
 
 
 def _followed(sign: int, search: _Search, near: jax.Array, action: jax.Array) -> jax.Array:
-    onward = following(search.model, action)
+    onward = policy_operator(search.model, action)
 
     def sweep(_, y: jax.Array) -> jax.Array:
         image = onward(y.ravel()).reshape(y.shape)

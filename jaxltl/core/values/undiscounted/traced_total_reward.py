@@ -36,10 +36,10 @@ from jaxltl.core.models.ops.operators import (
     action_argmax,
     action_mean,
     expectation,
-    following,
+    policy_operator,
     valid_policy,
 )
-from jaxltl.core.models.ops.successor_tables import action_columns, table
+from jaxltl.core.models.ops.successor_tables import action_columns, sweep_operator
 from jaxltl.core.models.product import Product
 from jaxltl.core.types import Solution, status_code
 from jaxltl.core.values.engine.certificates import refuse, rounding_unit
@@ -326,7 +326,7 @@ def _onward(problem: _Problem, at: _Point) -> Callable[[jax.Array], jax.Array]:
     """``x -> P_pi x`` of the policy that attains an image, 0 where it is not open."""
     model = problem.model
     if problem.policy is None and not isinstance(model, Product):
-        along = following(model, at.action)
+        along = policy_operator(model, at.action)
     else:
         weight = at.action if problem.policy is None else problem.policy
 
@@ -351,12 +351,14 @@ def _improved(problem: _Problem, factor: jax.Array, at: _Point) -> tuple[jax.Arr
     def matvec(x: jax.Array) -> jax.Array:
         return x - factor * onward(scale * x) / scale
 
-    if is_small(table(model), change.size):
+    if is_small(sweep_operator(model), change.size):
         weight = problem.policy
         if weight is None:
             weight = jax.nn.one_hot(at.action, model.num_actions, dtype=model.dtype)
         system = System(
-            table(model), action_columns(model.num_actions, weight), problem.open.ravel() * factor
+            sweep_operator(model),
+            action_columns(model.num_actions, weight),
+            problem.open.ravel() * factor,
         )
         eye = jnp.eye(change.size, dtype=model.dtype)
         moves = (eye - system.matrix())[at.leaves.ravel()]

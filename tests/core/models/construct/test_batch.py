@@ -20,7 +20,7 @@ from jaxltl.core.models.construct.batch import (
     split_trajectories,
     stack_models,
     stack_products,
-    world,
+    unstack_product,
 )
 from jaxltl.core.models.mdp import make_mdp, to_dense
 from jaxltl.core.models.ops.operators import expectation
@@ -60,7 +60,7 @@ def test_a_stacked_world_is_its_own_product(label_on):
         np.testing.assert_allclose(
             found[i][:size], jax.jit(expectation)(alone, jnp.asarray(value[:size])), rtol=1e-12
         )
-        lane = world(stacked, i)
+        lane = unstack_product(stacked, i)
         np.testing.assert_array_equal(lane.initial[:size], alone.initial)
         assert float(lane.initial[size:].sum()) == 0
         assert lane.mdp.propositions == worlds[0].propositions
@@ -116,7 +116,7 @@ def test_products_of_one_kind_stack():
     one, two = (jl.product(jl.gridworld(m), "!b U g") for m in ("g . b\n. . .", ". b .\n. . g"))
     stacked = stack_models([one, two])
     assert is_stacked(stacked) and not is_stacked(one)
-    np.testing.assert_array_equal(world(stacked, 1).letter, two.letter)
+    np.testing.assert_array_equal(unstack_product(stacked, 1).letter, two.letter)
     assert stack_models(stacked) is stacked
     assert num_worlds(stack_models(one)) == 1
     assert num_worlds(one) == 1

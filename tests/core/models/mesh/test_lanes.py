@@ -204,10 +204,10 @@ def test_running_sums_are_those_of_all_devices(number):
     counted = np.random.default_rng(0).random((3, 8)) < 0.5
 
     def sums(sharding):
-        one = lanes.apart(
+        one = lanes.shard_function(
             partial(lanes.running_sum, sharding=sharding), sharding, (0, 0), (0, None)
         )
-        return jax.jit(jax.vmap(one, (0, None)))(counted, lanes.ranks(sharding))
+        return jax.jit(jax.vmap(one, (0, None)))(counted, lanes.device_ranks(sharding))
 
     sharded, last = sums(over(number))
     np.testing.assert_array_equal(sharded, np.cumsum(counted, 1))
@@ -221,12 +221,12 @@ def test_what_is_split_within_lanes_that_are():
     inner = NamedSharding(mesh, P("more"))
 
     def one(key, sharding=None):
-        x = lanes.split(jax.random.normal(key, (4, 3)), sharding)
-        sums = lanes.apart(
+        x = lanes.split_axis(jax.random.normal(key, (4, 3)), sharding)
+        sums = lanes.shard_function(
             partial(lanes.running_sum, sharding=sharding), sharding, (0, 0), (0, None)
         )
-        number, last = sums(x[:, 0] > 0, lanes.ranks(sharding))
-        return lanes.whole(x.sum(1), sharding), number, last
+        number, last = sums(x[:, 0] > 0, lanes.device_ranks(sharding))
+        return lanes.replicate(x.sum(1), sharding), number, last
 
     keys = jax.random.split(jax.random.key(0), 6)
     found = jl.vmap_over_mesh(one, mesh, "lanes")(keys, sharding=inner)
@@ -252,6 +252,6 @@ def test_what_does_not_split_is_named(sharding, message):
 
 def test_no_sharding_changes_nothing():
     tree = {"x": np.arange(3)}
-    assert lanes.split(tree, None) is tree and lanes.whole(tree, None) is tree
-    assert lanes.apart(wander, None, (), ()) is wander
+    assert lanes.split_axis(tree, None) is tree and lanes.replicate(tree, None) is tree
+    assert lanes.shard_function(wander, None, (), ()) is wander
     lanes.require_split("sharding", None, num_envs=3)

@@ -65,7 +65,7 @@ def _asked(model, given):
         "least": operators.least_successor(model, rank),
         "several": operators.combined(model, several, jnp.multiply, jnp.add),
         "greatest": operators.greatest_predecessor(model, push),
-        "following": operators.following(model, policy)(value),
+        "following": operators.policy_operator(model, policy)(value),
         "pushforward": operators.pushforward(model, mass),
     }
 
@@ -145,7 +145,7 @@ def asked_of_product(model, given):
         "expectation": operators.expectation(model, value),
         "exists": operators.exists_successor(model, region),
         "greatest": operators.greatest_predecessor(model, push),
-        "following": operators.following(model, policy)(value.ravel()),
+        "following": operators.policy_operator(model, policy)(value.ravel()),
     }
 
 

@@ -43,7 +43,7 @@ least_successor, transition_matrix, induced_chain, action_argmax, action_max = m
         operators.action_max,
     ),
 )
-following = whole(lambda model, policy, value: operators.following(model, policy)(value))
+following = whole(lambda model, policy, value: operators.policy_operator(model, policy)(value))
 
 
 @pytest.mark.few(4)

@@ -13,7 +13,7 @@ import pytest
 import jaxltl as jl
 from jaxltl import Status
 from jaxltl.core.automata.automaton import make_automaton
-from jaxltl.core.models.construct.batch import stack_models, stack_products, world
+from jaxltl.core.models.construct.batch import stack_models, stack_products, unstack_product
 from jaxltl.core.types import Solution
 from jaxltl.core.values.undiscounted import performance as tp
 from tests import reference
@@ -169,7 +169,7 @@ def reluctant(leaving, dtype):
 )
 def test_what_is_hardly_ever_left_is_certified_all_the_same(leaving, dtype):
     models, policies = reluctant(leaving, dtype)
-    inside = tp.task_performance(world(models, 0), policies[0])
+    inside = tp.task_performance(unstack_product(models, 0), policies[0])
     assert inside.status == Status.PRECISION
     assert (inside.lower, inside.upper) == (0, 1), "nothing is certain"
     found = tp.task_performances(models, policies)
