@@ -624,8 +624,8 @@ def test_what_is_learned_in_section_6_7(patrolled):
         assert anew["seed"] == straight["seed"]
         assert (anew["restart"], straight["restart"]) == (0.02, 0.0)
         assert anew["always_almost_sure"] is True is straight["always_almost_sure"]
-        assert 50 <= anew["eps_optimal_states"] <= anew["eps_optimal_states_met"] <= 54
-        assert 10 <= straight["eps_optimal_states"] <= straight["eps_optimal_states_met"] < 45
+        assert 50 <= anew["eps_optimal_states"] <= anew["eps_optimal_states_played"] <= 54
+        assert 10 <= straight["eps_optimal_states"] <= straight["eps_optimal_states_played"] < 45
         for row in (anew, straight):
             # Steps are of many moves; the one in which the rest is over is made whole.
             assert 0 <= row["moves"] - row["last_update_step"] - 20_000 < 1000

@@ -1,6 +1,5 @@
-"""The dissertation's tables and figures, published beside measured.
+"""Experiments of the dissertation: measured results compared with the published ones.
 
-A module for each experiment, with ``figures(progress) -> dict``, plain numbers, and
-``table(result) -> str``. Run inside double precision (``with jax.enable_x64(True)``), as
-``jaxltl reproduce`` does.
+One module for each experiment, with the interface :class:`~jaxltl.reproduce.experiment.Experiment`.
+Run in double precision (``with jax.enable_x64(True)``), as ``jaxltl reproduce`` does.
 """

@@ -1,4 +1,4 @@
-"""Section 4.5: search under constraints, for a regulator and a robot, beside TRPO and CPO."""
+"""Section 4.5: the constrained cross-entropy method compared with TRPO and CPO."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from jaxltl.envs import lqr
 from jaxltl.envs import navigation as nav
 from jaxltl.envs.navigation_steps import as_environment
 from jaxltl.envs.networks import apply, make_network
+from jaxltl.reproduce.experiment import Figures, svg_files
 
 NETWORKS = ("2-2-1", "2-10-1", "2-10-10-1", "2-50-1")
 METHODS = ("CCE", "TRPO", "CPO", "penalised TRPO")
@@ -32,17 +33,17 @@ LQR_SEEDS, SEEDS = 50, 5
 
 @dataclass(frozen=True)
 class Plan:
-    """How much is done; the default is what the command does.
+    """Sizes of the experiment; the defaults are those of the command line.
 
     Attributes:
       networks: of the regulator.
       tasks, methods: of the robot.
-      feasible_starts: methods by task that are also begun from feasible policies.
-      lqr_steps: of the search for the regulator.
-      steps: of the search for the robot, of 1,000 trajectories each.
-      trust_steps: of TRPO and CPO, of 200 trajectories each.
-      feasible_steps: of both kinds, in trajectories as the first: 200 and 1,000 to a step.
-      fresh: trajectories on which returned policies are judged.
+      feasible_starts: for some tasks, the methods that also start from feasible policies.
+      lqr_steps: search steps for the regulator.
+      steps: search steps for the robot, 1,000 trajectories each.
+      trust_steps: of TRPO and CPO, 200 trajectories each.
+      feasible_steps: search steps, and TRPO and CPO steps, from feasible policies.
+      fresh: trajectories that evaluate a returned policy.
     """
 
     networks: tuple[str, ...] = NETWORKS
@@ -61,25 +62,25 @@ def figures(
     *,
     seeds: int | None = None,
     plan: Plan | None = None,
-) -> dict[str, Any]:
+) -> Figures:
     """Figures 8, 10 and 11.
 
     Args:
       progress: called with a line before each part.
-      seeds: how often each search is repeated; default 50 for the regulator, 5 for the robot.
-      plan: how much is done.
+      seeds: repetitions of each search; default 50 for the regulator, 5 for the robot.
+      plan: sizes of the experiment.
 
     Returns:
-      ``lqr_optimum``. ``lqr``, for each network: ``network``, ``seeds``, ``feasible`` (how many
-      returned policies are), ``gap_median`` and ``gap_max``, how much they cost beyond the
-      optimum. ``navigation``, for each task and method: ``task``, ``method``, ``seeds``;
-      ``trajectories_to_feasible``, for each seed until the policies that were tried first
-      satisfied the constraint on average, or None; on fresh trajectories of the returned policies
+      ``lqr_optimum``. ``lqr``, for each network: ``network``, ``seeds``, ``feasible`` (number of
+      feasible returned policies), ``gap_median`` and ``gap_max``, their costs above the optimum.
+      ``navigation``, for each task and method: ``task``, ``method``, ``seeds``;
+      ``trajectories_to_feasible``, for each seed until the sampled policies first satisfied the
+      constraint on average, or None; on fresh trajectories of the returned policies
       ``seeds_feasible``, ``seeds_confident`` (the 95% interval of the cost too), the means
       ``objective_mean`` and ``cost_mean``, and for each seed ``objective``, ``cost`` and
-      ``cost_interval``; ``seeds_feasible_at_end`` and ``final_objective``, of the policies tried
-      last. ``navigation_feasible_start``, the same from policies that are feasible.
-      ``seconds``. ``figure8``, ``figure10``, ``figure11`` and ``maps``, what the pictures show.
+      ``cost_interval``; ``seeds_feasible_at_end`` and ``final_objective``, of the last sampled
+      policies. ``navigation_feasible_start``, the same with feasible initial policies.
+      ``seconds``. ``figure8``, ``figure10``, ``figure11`` and ``maps``, data of the pictures.
     """
     begin = time.perf_counter()
     plan = plan or Plan()
@@ -87,12 +88,12 @@ def figures(
     rows, drawn = [], []
     for network in plan.networks:
         progress(f"the regulator, network {network}")
-        row, shown = _regulator(network, seeds or LQR_SEEDS, plan, optimum)
+        row, curves = _regulator(network, seeds or LQR_SEEDS, plan, optimum)
         rows.append(row)
-        drawn.append(shown)
-    # All searches of the robot are dispatched before the first is waited for: JAX runs several
-    # side by side, while the next is compiled.
-    usual, taught = [], []
+        drawn.append(curves)
+    # All searches of the robot are dispatched before the first result is read: JAX runs several in
+    # parallel while it compiles the next.
+    usual, pretrained = [], []
     for task in plan.tasks:
         robot = _robot(task)
         for method in plan.methods:
@@ -102,26 +103,28 @@ def figures(
         progress(f"the robot, task {task}, from feasible policies: {', '.join(methods)}")
         robot = _robot(task)
         feasible = _feasible_policies(robot, seeds or SEEDS, plan)
-        taught += [(robot, _search(robot, m, seeds or SEEDS, plan, feasible)) for m in methods]
-    rows_of = []
-    for runs in (usual, taught):
-        progress("the robot: trajectories of what was found")
-        rows_of.append([_judged(robot, run, plan) for robot, run in runs])
-    found, curves, maps = zip(*rows_of[0], strict=True) if usual else ((), (), ())
-    anew, curves_anew, _ = zip(*rows_of[1], strict=True) if taught else ((), (), ())
+        pretrained += [(robot, _search(robot, m, seeds or SEEDS, plan, feasible)) for m in methods]
+    evaluated = []
+    for runs in (usual, pretrained):
+        progress("the robot: trajectories of the returned policies")
+        evaluated.append([_evaluated(robot, run, plan) for robot, run in runs])
+    navigation, curves, maps = zip(*evaluated[0], strict=True) if usual else ((), (), ())
+    from_feasible, feasible_curves, _ = (
+        zip(*evaluated[1], strict=True) if pretrained else ((), (), ())
+    )
     return plain(
         {
             "lqr_optimum": optimum.total,
             "lqr": rows,
-            "navigation": found,
-            "navigation_feasible_start": anew,
+            "navigation": navigation,
+            "navigation_feasible_start": from_feasible,
             "seconds": round(time.perf_counter() - begin, 2),
             "figure8": {
                 "optimum": {"state": optimum.state, "control": optimum.control[:, 0]},
                 "learned": drawn,
             },
             "figure10": curves,
-            "figure11": curves_anew,
+            "figure11": feasible_curves,
             "maps": maps,
         }
     )
@@ -141,10 +144,8 @@ def _keys(seeds: int, part: int) -> jax.Array:
     return jax.vmap(lambda i: jax.random.fold_in(jax.random.key(i), part))(jnp.arange(seeds))
 
 
-def _regulator(
-    name: str, seeds: int, plan: Plan, optimum: lqr.Optimum
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """A network's row, and its part of figure 8."""
+def _regulator(name: str, seeds: int, plan: Plan, optimum: lqr.Optimum) -> tuple[Figures, Figures]:
+    """A network's row, and its curves of figure 8."""
     world, network = lqr.lqr(), make_network(name)
     size = network.num_parameters
     problem = cce.make_problem(
@@ -153,7 +154,7 @@ def _regulator(
     state, _ = _train(
         _keys(seeds, 0), problem, cce.Hparams(rate=0.1, population=100, rho=0.2), plan.lqr_steps
     )
-    # Nothing is random, so that one evaluation tells all.
+    # The regulator is deterministic: one evaluation is exact.
     sampled = jnp.where(state.best.found[:, None], state.best.parameters, state.least.parameters)
     both = jnp.stack([families.center(state.family), sampled], 1)
     objective, cost = jax.vmap(jax.vmap(lambda p: problem.evaluate(p, None)))(both)
@@ -175,14 +176,14 @@ def _regulator(
         "mean_policy_feasible": (cost[:, 0] <= 0).sum(),
         "gap_within_tenth": (good < 0.1).sum(),
     }
-    shown = {
+    curves = {
         "network": name,
         "state": _rounded(jnp.moveaxis(run.state, -1, 0)),
         "control": _rounded(run.control[:, 0].T),
         "gap": np.sort(gap),
         "violation": np.sort(run.violation),
     }
-    return row, shown
+    return row, curves
 
 
 def _rounded(x: Any, digits: int = 4) -> np.ndarray:
@@ -193,7 +194,7 @@ def _rounded(x: Any, digits: int = 4) -> np.ndarray:
 
 
 class Robot(NamedTuple):
-    """A task of the robot, for both kinds of learners, in single precision."""
+    """A task of the robot for both kinds of learners, in single precision."""
 
     task: int
     world: nav.Navigation
@@ -204,15 +205,7 @@ class Robot(NamedTuple):
 
 
 class Search(NamedTuple):
-    """What a method did with all seeds, perhaps still under way.
-
-    Attributes:
-      method: its name.
-      keys: of the seeds.
-      trajectories, objective, cost: of its steps, ``[seeds, T]``.
-      state: of its learner, a lane for each seed.
-      hparams: of the learner.
-    """
+    """The learning curves ``[seeds, T]`` and final states of a method, perhaps not yet computed."""
 
     method: str
     keys: jax.Array
@@ -223,15 +216,15 @@ class Search(NamedTuple):
     hparams: Any
 
 
-_NUM_TRAJECTORIES = 10  # of each policy that is tried
+_NUM_TRAJECTORIES = 10  # of each sampled policy
 _TRUST = tr.Hparams(
     discount=0.999,
     delta=0.01,
     num_trajectories=200,
     hidden=(30, 30),
     value_hidden=(30, 30),
-    # With little damping the steps follow the noise of the sample: CPO then believes that one step
-    # meets the limit, and rests above it.
+    # With little damping the steps follow the noise of the sample: CPO then expects one step to
+    # meet the limit, and stays above it.
     damping=0.1,
     fisher_stride=4,
     value_epochs=3,
@@ -258,25 +251,25 @@ def _robot(task: int) -> Robot:
 
 
 def _scores(task: jax.Array, world: nav.Navigation, run: nav.Run) -> tuple[jax.Array, jax.Array]:
-    """J and Z of a task that is traced, so that one compiled search does for several."""
+    """J and Z of a traced task, so that one compiled search serves all tasks."""
     every = [nav.scores(world, run.state, number) for number in nav.TASKS]
     return tuple(jnp.stack(part)[task - 1] for part in zip(*every, strict=True))  # type: ignore
 
 
-def _search(robot: Robot, method: str, seeds: int, plan: Plan, taught: Any = None) -> Search:
-    """A method from its usual start, or from the policies that were taught."""
+def _search(robot: Robot, method: str, seeds: int, plan: Plan, pretrained: Any = None) -> Search:
+    """A search by a method, from scratch or from pretrained distributions of policies."""
     keys = _keys(seeds, robot.task)
     if method == "CCE":
-        return _by_samples(robot, keys, plan, taught)
-    return _by_steps(robot, method, keys, plan, taught)
+        return _cross_entropy(robot, keys, plan, pretrained)
+    return _trust_region(robot, method, keys, plan, pretrained)
 
 
-def _by_samples(robot: Robot, keys: jax.Array, plan: Plan, taught: Any) -> Search:
-    if taught is None:
+def _cross_entropy(robot: Robot, keys: jax.Array, plan: Plan, pretrained: Any) -> Search:
+    if pretrained is None:
         state, metrics = _train(keys, robot.problem, robot.hparams, plan.steps)
     else:
         state, metrics = _train_from(
-            keys, taught, robot.problem, robot.hparams, plan.feasible_steps[0]
+            keys, pretrained, robot.problem, robot.hparams, plan.feasible_steps[0]
         )
     return Search(
         "CCE",
@@ -293,7 +286,7 @@ def _by_samples(robot: Robot, keys: jax.Array, plan: Plan, taught: Any) -> Searc
 def _train_from(
     keys: jax.Array, family: Any, problem: cce.Problem, hparams: cce.Hparams, num_steps: int
 ) -> Any:
-    """The search from a distribution for each seed."""
+    """The search from an initial distribution for each seed."""
 
     def one(key: jax.Array, family: Any) -> Any:
         return cce.train(key, replace(problem, family=family), hparams, num_steps=num_steps)
@@ -302,42 +295,44 @@ def _train_from(
 
 
 def _feasible_policies(robot: Robot, seeds: int, plan: Plan) -> Any:
-    """For each seed a distribution of policies that are found for the constraint's sake alone.
+    """For each seed a distribution of feasible policies, found by minimising the cost alone.
 
-    With a margin that nothing can keep, the elites are always those of the least cost.
+    No policy satisfies the constraint with this margin, so the elites are those of the least cost.
     """
     hparams = replace(robot.hparams, margin=1e3)
     state, _ = _train(_keys(seeds, 100 + robot.task), robot.problem, hparams, plan.steps // 2)
     return state.family
 
 
-def _by_steps(robot: Robot, method: str, keys: jax.Array, plan: Plan, taught: Any) -> Search:
+def _trust_region(
+    robot: Robot, method: str, keys: jax.Array, plan: Plan, pretrained: Any
+) -> Search:
     hparams = replace(
         _TRUST,
         method="cpo" if method == "CPO" else "trpo",
-        # A penalty of zero is none, and does not recompile.
+        # A penalty of zero instead of None does not recompile.
         penalty=None if method == "CPO" else PENALTY * (method == "penalised TRPO"),
     )
-    num_steps = plan.trust_steps if taught is None else plan.feasible_steps[1]
+    num_steps = plan.trust_steps if pretrained is None else plan.feasible_steps[1]
     state = jax.vmap(lambda key: tr.init(key, robot.stepwise, hparams))(keys)
-    if taught is not None:
-        state = _taught(state, robot, hparams, taught)
+    if pretrained is not None:
+        state = _imitate(state, robot, hparams, pretrained)
     state, metrics = _run(state, robot.stepwise, hparams, num_steps)
     return Search(method, keys, metrics.trajectories, metrics.reward, metrics.cost, state, hparams)
 
 
 @partial(jax.jit, static_argnums=3)
 def _run(state: tr.State, problem: tr.Problem, hparams: tr.Hparams, num_steps: int) -> Any:
-    """Seeds one after the other: side by side their products of matrices are slower."""
+    """Runs of all seeds in sequence: batched matrix products are slower."""
     return jax.lax.map(lambda s: tr.run(s, problem, hparams, num_steps=num_steps), state)
 
 
-def _taught(state: tr.State, robot: Robot, hparams: tr.Hparams, families_: Any) -> tr.State:
-    """Networks that do what the policies do, by least squares on these policies' trajectories."""
+def _imitate(state: tr.State, robot: Robot, hparams: tr.Hparams, families_: Any) -> tr.State:
+    """Policy networks fitted to the distributions' centers by least squares on their trajectories."""
     network = nav.policy_network(robot.world)
     descent = optax.adam(3e-3)
 
-    def teach(state: tr.State, family: Any) -> tr.State:
+    def imitate(state: tr.State, family: Any) -> tr.State:
         policy = families.center(family)
         seen, _, _ = _drive(
             robot.environment,
@@ -347,11 +342,11 @@ def _taught(state: tr.State, robot: Robot, hparams: tr.Hparams, families_: Any) 
             robot.world.horizon,
         )
         seen = seen.reshape(-1, seen.shape[-1])
-        wanted = apply(network, policy, seen)
+        goal = apply(network, policy, seen)
 
         def loss(parameters: Any, chosen: jax.Array) -> jax.Array:
             mean, _ = tr.act(replace(state, parameters=parameters), hparams, seen[chosen])
-            return jnp.mean((mean - wanted[chosen]) ** 2)
+            return jnp.mean((mean - goal[chosen]) ** 2)
 
         def descend(carry: Any, key: jax.Array) -> Any:
             parameters, memory = carry
@@ -364,10 +359,10 @@ def _taught(state: tr.State, robot: Robot, hparams: tr.Hparams, families_: Any) 
         (parameters, _), _ = jax.lax.scan(descend, (first, descent.init(first)), keys)
         return replace(state, parameters={**parameters, "log_deviation": first["log_deviation"]})
 
-    return jax.jit(lambda s, f: jax.lax.map(lambda x: teach(*x), (s, f)))(state, families_)
+    return jax.jit(lambda s, f: jax.lax.map(lambda x: imitate(*x), (s, f)))(state, families_)
 
 
-# --- trajectories of what was found -------------------------------------------------------------
+# --- trajectories of returned policies -------------------------------------------------------------
 
 
 def _by_network(network: Any, policy: jax.Array, seen: jax.Array, key: jax.Array) -> jax.Array:
@@ -387,7 +382,7 @@ def _drive(
     number: int,
     horizon: int,
 ) -> tuple[jax.Array, Any, tuple[jax.Array, jax.Array]]:
-    """Observations ``[T, M, O]``, places ``[T, M]``, and J and Z ``[M]`` of trajectories."""
+    """Observations ``[T, M, O]``, states ``[T, M]``, and J and Z ``[M]`` of M trajectories."""
     starts, noise = jax.random.split(key)
     places = jax.vmap(environment.reset)(jax.random.split(starts, number))
 
@@ -414,12 +409,12 @@ def _driven(
 
 
 def _policies(robot: Robot, run: Search, plan: Plan) -> list[Any]:
-    """What a search returns, for each seed; without a solution what violates the limit least."""
-    found: list[Any] = []
+    """The returned policy of each seed; if none is feasible, the one of the least violation."""
+    policies: list[Any] = []
     for i, key in enumerate(run.keys):
         state = jax.tree.map(lambda x, i=i: x[i], run.state)
         if run.method != "CCE":
-            found.append((state, run.hparams))
+            policies.append((state, run.hparams))
             continue
         result = cce.result(
             state,
@@ -429,14 +424,12 @@ def _policies(robot: Robot, run: Search, plan: Plan) -> list[Any]:
             num_evaluations=max(plan.fresh // _NUM_TRAJECTORIES, 2),
         )
         least = min((result.mean, result.best), key=lambda a: float(a.excess))
-        found.append(least.parameters if result.solution is None else result.solution)
-    return found
+        policies.append(least.parameters if result.solution is None else result.solution)
+    return policies
 
 
-def _judged(
-    robot: Robot, run: Search, plan: Plan
-) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
-    """A row, the learning curves, and some trajectories of the first seed's policy."""
+def _evaluated(robot: Robot, run: Search, plan: Plan) -> tuple[Figures, Figures, Figures]:
+    """A row, the learning curves, and trajectories of the first seed's policy."""
     limit = nav.LIMITS[robot.task]
     trajectories, objectives, costs = (
         np.asarray(x) for x in (run.trajectories, run.objective, run.cost)
@@ -498,8 +491,8 @@ def _judged(
 # --- the table ----------------------------------------------------------------------------------
 
 
-def table(result: dict[str, Any]) -> str:
-    """Section 4.5: what was published in words and pictures, and what was measured."""
+def table(result: Figures) -> str:
+    """The report of section 4.5."""
     lines = [
         f"Section 4.5.1: a regulator with bounded controls, optimal cost "
         f"{result['lqr_optimum']:.10f}",
@@ -515,14 +508,14 @@ def table(result: dict[str, Any]) -> str:
     ]
     for title, rows in (
         ("", result["navigation"]),
-        ("from policies that are feasible", result["navigation_feasible_start"]),
+        ("from feasible policies", result["navigation_feasible_start"]),
     ):
         lines += [
             "",
             *([title] if title else []),
             f"{'':28}{'feasible':>10}{'':>4}{'returned policies':>20}{'':>4}thousand trajectories",
             f"{'task':6}{'limit':>6}  {'method':16}{'seeds':>8}{'sure':>6}{'J':>8}{'H':>8}"
-            f"    until first feasible, of how many",
+            f"    until first feasible, of the total",
         ]
         for x in rows:
             first = ", ".join(
@@ -546,16 +539,16 @@ _DIFFERENCES = (
     "J and H of the robot are means over the seeds on 1,000 fresh trajectories of each returned",
     "policy: of CCE the mean of the last distribution or the best sample, whichever is feasible",
     "and better; of the others the last policy, with its noise. Sure: the 95% interval of H is",
-    "below the limit too. First feasible: the policies that were tried, on average. The map is",
-    "ours, read off a picture. TRPO and CPO are paid the increments of J and Z, step by step.",
+    "below the limit too. First feasible: the sampled policies, on average. The map is ours, read",
+    "off a picture. The rewards of TRPO and CPO are the increments of J and Z in each step.",
 )
 
 
 # --- pictures -----------------------------------------------------------------------------------
 
 
-def pictures(result: dict[str, Any]) -> list[tuple[str, bytes]]:
-    """Figures 8, 10 and 11, and where the returned policies of the first seed go."""
+def pictures(result: Figures) -> list[tuple[str, bytes]]:
+    """Figures 8, 10 and 11, and trajectories of the returned policies of the first seed."""
     from jaxltl import plot
 
     best = result["figure8"]["optimum"]
@@ -587,7 +580,7 @@ def pictures(result: dict[str, Any]) -> list[tuple[str, bytes]]:
     ):
         if not curves:
             continue
-        rows: dict[str, Any] = {}
+        rows: Figures = {}
         limits = {}
         for x in curves:
             row = rows.setdefault(f"task {x['task']}", {"objective": {}, "cost": {}})
@@ -604,4 +597,4 @@ def pictures(result: dict[str, Any]) -> list[tuple[str, bytes]]:
         bounds=world.bounds,
         columns=len({x["method"] for x in result["maps"]}),
     )
-    return [(f"{name}.svg", plot.to_bytes(figure)) for name, figure in drawn.items()]
+    return svg_files(drawn)

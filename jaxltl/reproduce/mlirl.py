@@ -1,4 +1,4 @@
-"""Section 2.5: inverse reinforcement learning with a temporal-logic task."""
+"""Section 2.5: maximum-likelihood inverse RL with temporal-logic side information."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from types import MappingProxyType
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +24,7 @@ from jaxltl.core.types import NotConverged, Status, check
 from jaxltl.core.values.undiscounted.mixture import from_starts
 from jaxltl.core.values.undiscounted.satisfaction import satisfaction_probability
 from jaxltl.envs.gridworld import ACTIONS, gridworld
+from jaxltl.reproduce.experiment import Figures
 
 MAP = """
 w  w  w  w  w  w  r  w  w  w
@@ -41,7 +41,7 @@ b  w  w  w  r  w  w  w  w  y
 LEGEND = {"w": [], "b": ["b"], "r": ["r"], "y": ["y"], "g1": ["g1"], "g2": ["g2"]}
 TASK = "(!r & !y) -> ((!r U y) & (!y U g1) & (!y U g2) & F y)"
 TASK_WITHOUT_SAFETY = "(!r & !y) -> ((!y U g1) & (!y U g2) & F y)"
-# The moves of the four demonstrations from the blue cell: each letter is up, down, left or right.
+# Actions of the four demonstrations from the blue cell: up, down, left or right.
 DEMONSTRATIONS = (
     "r u r uuuuuu rrrrr ddddd r d r d",
     "rrr u rr u rr u l uuuu llll rrrrr dddddd r d r",
@@ -52,7 +52,7 @@ MUS = (0.0, 1e-4, 1e-3, 1e-2, 0.1, 1.0, 10.0)
 STARTS = ((0, 0, 0, 0, 0), (1, 1, 1, 1, 1), (5, 2, 2, 2, 2))
 DISCOUNT, L2, MU = 0.5, 1e-3, 0.01
 
-PUBLISHED: dict[str, dict[str, Any]] = {
+PUBLISHED: dict[str, Figures] = {
     "case1": {"mean": 0.304, "min": 6.9e-9, "theta": [8.5176, 4.2678, -0.0442, -0.8208, 3.7336]},
     "case2": {"mean": 0.954, "min": 0.430, "theta": [9.6090, 2.3128, 2.7393, -0.0121, 2.3221]},
     "case3": {"mean": 0.999, "min": 0.962, "theta": [10.2010, 1.8908, 3.9550, 8.1854, 1.8855]},
@@ -60,13 +60,13 @@ PUBLISHED: dict[str, dict[str, Any]] = {
 
 
 def two_goals() -> tuple[MDP, Trajectories]:
-    """The world of section 2.5 and its four demonstrations; runs start off red and yellow."""
+    """The world of section 2.5 and its four demonstrations; initial cells are not red or yellow."""
     world = gridworld(MAP, legend=LEGEND, absorbing=["y"], initial="!r & !y")
     start = MAP.split().index("b")
     sequences = []
-    for moves in DEMONSTRATIONS:
+    for actions in DEMONSTRATIONS:
         state, pairs = start, []
-        for letter in moves.replace(" ", ""):
+        for letter in actions.replace(" ", ""):
             action = "udlr".index(letter)
             pairs.append((state, action))
             state = int(world.successor[state, action, 0])
@@ -78,17 +78,13 @@ def two_goals() -> tuple[MDP, Trajectories]:
 def learn_cases(
     problem: irl.Problem, mus: tuple[float | None, ...]
 ) -> list[tuple[np.ndarray, jax.Array, float]]:
-    """Learns for each mu from the three starts in one vmapped call, and keeps the best start.
+    """Weights ``[F]``, policy and negative log-likelihood for each mu, from the best of three starts.
 
-    Args:
-      problem: features and demonstrations.
-      mus: weights of the satisfaction term; ``(None,)`` leaves it out.
-
-    Returns:
-      For each mu: the weights ``[F]``, the policy, and the negative log-likelihood.
+    All starts and weights `mus` of the satisfaction term are one vmapped call; ``(None,)`` leaves
+    the term out.
 
     Raises:
-      NotConverged: a gradient did not vanish, or a value's solver failed.
+      NotConverged: a gradient did not vanish, or a solver failed.
     """
     starts = jnp.tile(jnp.asarray(STARTS, problem.features.dtype), (len(mus), 1))
     mu = None if None in mus else jnp.repeat(jnp.asarray(mus), len(STARTS))
@@ -112,7 +108,7 @@ def learn_cases(
     shape = (len(mus), len(STARTS))
     gradient, loss = (x.reshape(shape) for x in (last.gradient_norm, last.loss))
     best = np.argmin(np.where(gradient <= 1e-6, loss, np.inf), axis=1)
-    found = []
+    cases = []
     for i, j in enumerate(best):
         if not gradient[i, j] <= 1e-6:
             raise NotConverged(
@@ -124,19 +120,16 @@ def learn_cases(
         if int(solution.status) != Status.CONVERGED:
             check(solution)
         log_policy = jnp.log(jnp.where(problem.counts > 0, solution.policy, 1))
-        found.append(
+        cases.append(
             (np.asarray(theta), solution.policy, float(-jnp.sum(problem.counts * log_policy)))
         )
-    return found
+    return cases
 
 
 def _evaluated(
     model: Product, policy: jax.Array, named: Mapping[str, int] = MappingProxyType({})
-) -> dict[str, Any]:
-    """Mean and minimum over initial states of the probability of satisfying the task.
-
-    `named` asks for the probability from single world states too.
-    """
+) -> Figures:
+    """Mean and minimum over initial states of the satisfaction probability, and that of `named` ones."""
     solution = check(satisfaction_probability(model, policy))
     starts = np.asarray(model.initial) > 0
     value = np.asarray(solution.value)[starts]
@@ -151,23 +144,22 @@ def _evaluated(
     }
 
 
-def _case(model: Product, found: tuple[np.ndarray, jax.Array, float]) -> dict[str, Any]:
-    theta, policy, likelihood = found
+def _case(model: Product, learned: tuple[np.ndarray, jax.Array, float]) -> Figures:
+    theta, policy, likelihood = learned
     policy = policy if policy.ndim == 3 else lift_policy(model, policy)
     return {**_evaluated(model, policy), "theta": theta, "neg_log_likelihood": likelihood}
 
 
-def _missing_safety(world: MDP, shown: Trajectories, mu: float | None) -> dict[str, Any]:
-    """A policy that was not told to avoid red, evaluated under the true task.
+def _missing_safety(world: MDP, shown: Trajectories, mu: float | None) -> Figures:
+    """A policy learned with a task that does not forbid red, evaluated under the true task.
 
-    Its memory is the automaton of the task it was told; the model in which it is memoryless
-    is put beside the automaton of the true one.
+    Its memory is the automaton of the incomplete task; the product of both automata evaluates it.
     """
-    told = product(world, TASK_WITHOUT_SAFETY)
-    features = irl.task_features(told, shown, avoid=["r"])
-    problem = irl.make_problem(told, features.values, shown)
+    incomplete = product(world, TASK_WITHOUT_SAFETY)
+    features = irl.task_features(incomplete, shown, avoid=["r"])
+    problem = irl.make_problem(incomplete, features.values, shown)
     [(_, policy, _)] = learn_cases(problem, (mu,))
-    reached = restrict(told)
+    reached = restrict(incomplete)
     true = product(reached.model, TASK)
     lifted = lift_policy(true, policy[reached.base_state, reached.memory])
     base = np.asarray(reached.base_state)
@@ -176,11 +168,8 @@ def _missing_safety(world: MDP, shown: Trajectories, mu: float | None) -> dict[s
     return result
 
 
-def figures(progress: Callable[[str], None] = lambda text: None) -> dict[str, Any]:
+def figures(progress: Callable[[str], None] = lambda text: None) -> Figures:
     """Section 2.5: three cases, the sweep of mu, and the task without its safety part.
-
-    Args:
-      progress: called with a line before each part.
 
     Returns:
       ``case1``, ``case2``, ``case3`` (``mean``, ``min``, ``theta``, ``neg_log_likelihood``, and
@@ -200,8 +189,8 @@ def figures(progress: Callable[[str], None] = lambda text: None) -> dict[str, An
     features = irl.task_features(model, shown, avoid=["r"])
     problem = irl.make_problem(model, features.values, shown)
     [second] = learn_cases(problem, (None,))
-    progress(f"case 3: with the satisfaction term, for {len(MUS)} weights mu side by side")
-    sweep = [_case(model, found) for found in learn_cases(problem, MUS)]
+    progress(f"case 3: with the satisfaction term, for {len(MUS)} weights mu in parallel")
+    sweep = [_case(model, case) for case in learn_cases(problem, MUS)]
     progress("without the safety part of the task")
     missing = _missing_safety(world, shown, None)
     result = {
@@ -215,11 +204,11 @@ def figures(progress: Callable[[str], None] = lambda text: None) -> dict[str, An
     return plain(result)
 
 
-def table(result: dict[str, Any]) -> str:
-    """Section 2.5, published beside measured, with what differs and why."""
+def table(result: Figures) -> str:
+    """The report of section 2.5."""
     lines = [
         "Section 2.5: inverse reinforcement learning with a temporal-logic task",
-        "probability of the task over 88 initial states (discount 0.5, mu 0.01)",
+        "satisfaction probability over 88 initial states (discount 0.5, mu 0.01)",
         "",
         f"{'':34}{'published':>22}{'measured':>24}",
         f"{'':34}{'mean':>11}{'minimum':>11}{'mean':>13}{'minimum':>11}",
@@ -266,7 +255,7 @@ def table(result: dict[str, Any]) -> str:
 
 
 _DIFFERENCES = (
-    "Where they differ: the published map is a picture whose cells the text does not give, so ours",
+    "Differences: the published map is a picture whose cells the text does not give, so ours",
     "is a surrogate with the same landmarks and other demonstrations, and the discount is not",
     "printed. What carries over is the order and what drives it: without the task (case 1) the",
     "policy fails where demonstrations are lacking; in the product (case 2) it mostly succeeds,",

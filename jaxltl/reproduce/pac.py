@@ -1,4 +1,4 @@
-"""Section 6.7: learning a patrol with a guarantee, while winning almost surely."""
+"""Section 6.7: PAC learning of a patrol with R-max, while winning almost surely."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,9 +23,10 @@ from jaxltl.core.types import check
 from jaxltl.core.values.discounted.minimax import minimax_value, strategy_value
 from jaxltl.envs.gridworld import ACTIONS
 from jaxltl.envs.post_offices import Patrol, patrol, surveillance
+from jaxltl.reproduce.experiment import Figures, run_seconds, svg_files
 
 DISCOUNT, EPSILON, REWARD_BOUND, FAILURE = 0.6, 1e-4, 1.0, 0.1
-RESTART = 1 / 50  # before a move, with this probability, a run starts anew
+RESTART = 1 / 50  # probability of a restart before a move
 REST = 20_000  # moves without an update after which learning ends
 SEEDS = 10
 
@@ -48,46 +48,38 @@ _HPARAMS = rmax.Hparams(
 )
 
 
-def figures(
-    progress: Callable[[str], None] = lambda text: None, *, seeds: int = SEEDS
-) -> dict[str, Any]:
-    """Section 6.7: the game, its best and initial values, and what is learned in it.
-
-    Args:
-      progress: called with a line before each part.
-      seeds: how often learning is repeated.
+def figures(progress: Callable[[str], None] = lambda text: None, *, seeds: int = SEEDS) -> Figures:
+    """Section 6.7: the game, its optimal and initial values, and learned strategies.
 
     Returns:
       Of the game, ``states``, ``system_states``, ``system_transitions``, ``transitions``,
-      ``reachable_system_states``, ``almost_sure_states``, and ``values``, how many of the
-      system's states have each best value. ``initial_strategy`` (the uniform one, with which
-      learning begins) and ``winning_strategy`` (of the graph alone): ``min``, ``max`` and
-      ``mean`` of their worst-case value there. ``hat_strategy_gap`` and
-      ``uniform_hat_strategy_gap``: how far the strategies of algorithm 4 are from optimal when
-      the model is known. ``learned`` and ``learned_without_restarts``, for each seed: ``seed``,
-      ``restart``, ``last_update_step``, ``moves``, ``updates``, ``eps_optimal_states`` (of the
-      reachable ones, against every environment), ``eps_optimal_states_met`` (against the one
-      that was played) and ``always_almost_sure``. ``seconds`` and ``last_update_seconds``,
-      medians of runs alone; ``seconds_together``, of all of them side by side. ``figure17``,
-      ``figure18`` and ``figure19``, what the pictures show.
+      ``reachable_system_states``, ``almost_sure_states``, and ``values``, the number of system
+      states by optimal value. ``initial_strategy`` (uniform) and ``winning_strategy`` (by the
+      graph): ``min``, ``max`` and ``mean`` of their worst-case value. ``hat_strategy_gap`` and
+      ``uniform_hat_strategy_gap``: the loss of the strategies of algorithm 4 in the true model.
+      ``learned`` and ``learned_without_restarts``, for each seed: ``seed``, ``restart``,
+      ``last_update_step``, ``moves``, ``updates``, ``eps_optimal_states`` (reachable ones, in the
+      worst case), ``eps_optimal_states_played`` (against the environment that was played) and
+      ``always_almost_sure``. ``seconds`` and ``last_update_seconds``, medians of single runs;
+      ``seconds_together``, of one vmapped call. ``figure17``, ``figure18`` and ``figure19``, data
+      of the pictures.
 
     Raises:
       NotConverged: a value or a learner did not converge.
     """
     begin = time.perf_counter()
-    progress("the game, and what is best in it")
+    progress("the game and its optimal values")
     model = patrol()
     problem = rmax.make_problem(model.game, model.accepting, model.reward)
-    known = _known(model)
-    progress(f"learning with {seeds} seeds side by side, with and without restarts")
+    known = _known_model(model)
+    progress(f"learning with {seeds} seeds in one call, with and without restarts")
     keys = jax.vmap(jax.random.key)(jnp.arange(seeds))
-    anew = replace(_HPARAMS, restart=RESTART)
-    found, together = _timed(lambda: _learn_all(keys, problem, anew))
-    straight = _learn_all(keys, problem, _HPARAMS)
-    learned, evidence = _judged(found, problem, anew)
-    without, _ = _judged(straight, problem, _HPARAMS)
-    progress("learning with one seed at a time, for the time that it takes")
-    alone, until_last = _seconds_alone(keys, problem, anew, found)
+    restarting = replace(_HPARAMS, restart=RESTART)
+    runs, together = run_seconds(lambda: _learn_all(keys, problem, restarting))
+    learned, evidence = _evaluated(runs, problem, restarting)
+    without, _ = _evaluated(_learn_all(keys, problem, _HPARAMS), problem, _HPARAMS)
+    progress("learning with one seed at a time, to measure seconds")
+    alone, until_last = _single_run_seconds(keys, problem, restarting, runs)
     system = np.asarray(model.game.system)
     result = {
         **_sizes(model, problem),
@@ -109,10 +101,10 @@ def figures(
     return plain(result)
 
 
-# --- the model is known -------------------------------------------------------------------------
+# --- the true model -------------------------------------------------------------------------
 
 
-def _sizes(model: Patrol, problem: rmax.Problem) -> dict[str, Any]:
+def _sizes(model: Patrol, problem: rmax.Problem) -> Figures:
     game = model.game
     moves = np.asarray(game.available.sum(axis=1))
     reachable = restrict(game).model
@@ -126,8 +118,8 @@ def _sizes(model: Patrol, problem: rmax.Problem) -> dict[str, Any]:
     }
 
 
-def _known(model: Patrol) -> dict[str, Any]:
-    """What can be said of the game when its rewards are known."""
+def _known_model(model: Patrol) -> Figures:
+    """Optimal values and strategies of algorithm 4 in the true model."""
     game, worst = model.game, partial(_worst, model)
     optimal = check(minimax_value(game, model.reward, DISCOUNT)).value
     quantity = model.reward + DISCOUNT * expectation(game, optimal)
@@ -158,12 +150,12 @@ def _known(model: Patrol) -> dict[str, Any]:
     }
 
 
-def _worst(model: Patrol, play: jax.Array) -> jax.Array:
-    """What a strategy secures against every environment."""
-    return check(strategy_value(model.game, play, model.reward, DISCOUNT)).value
+def _worst(model: Patrol, strategy: jax.Array) -> jax.Array:
+    """The worst-case value of a strategy."""
+    return check(strategy_value(model.game, strategy, model.reward, DISCOUNT)).value
 
 
-def _summary(model: Patrol, value: jax.Array) -> dict[str, Any]:
+def _summary(model: Patrol, value: jax.Array) -> Figures:
     here = jnp.maximum(value[model.game.system], 0)  # rounding may leave a tiny negative zero
     return {"min": here.min(), "max": here.max(), "mean": here.mean()}
 
@@ -180,47 +172,37 @@ def _learn_all(keys: jax.Array, problem: rmax.Problem, hparams: rmax.Hparams) ->
 def _learn(
     key: jax.Array, problem: rmax.Problem, hparams: rmax.Hparams, most: jax.Array
 ) -> learner.Learned:
-    """Until the strategy rests, or for so many moves."""
-    return rmax.train_until(key, problem, hparams, until=Partial(_rests, most), num_steps=10**6)
+    """Learning until the strategy is stable, or a number of moves was made."""
+    return rmax.train_until(key, problem, hparams, until=Partial(_is_stable, most), num_steps=10**6)
 
 
-def _rests(most: Any, before: rmax.State, after: rmax.State, metrics: rmax.Metrics) -> jax.Array:
+def _is_stable(
+    most: jax.Array, before: rmax.State, after: rmax.State, metrics: rmax.Metrics
+) -> jax.Array:
     return (after.moves - after.last_update >= REST) | (after.moves >= most)
 
 
-def _timed(job: Callable[[], Any]) -> tuple[Any, float]:
-    """What a job returns, and the seconds of its second run: the first one compiles."""
-    jax.block_until_ready(job())
-    begin = time.perf_counter()
-    result = jax.block_until_ready(job())
-    return result, round(time.perf_counter() - begin, 4)
-
-
-def _seconds_alone(
+def _single_run_seconds(
     keys: jax.Array, problem: rmax.Problem, hparams: rmax.Hparams, found: learner.Learned
 ) -> tuple[float, float]:
-    """Medians over single runs: the seconds until they end, and until their last update.
-
-    For the latter a run is stopped after so many moves; until then it is the same.
-    """
+    """Median seconds of single runs, until they end and until their last update."""
     most = jnp.full_like(found.state.last_update, learner.MOST)
     medians = []
     for limits in (most, found.state.last_update):
         runs = [
-            _timed(partial(_learn, key, problem, hparams, limit))[1]
+            run_seconds(partial(_learn, key, problem, hparams, limit))[1]
             for key, limit in zip(keys, limits, strict=True)
         ]
         medians.append(float(np.median(runs)))
     return medians[0], medians[1]
 
 
-def _judged(
+def _evaluated(
     found: learner.Learned, problem: rmax.Problem, hparams: rmax.Hparams
-) -> tuple[list[dict[str, Any]], rmax.Evidence]:
+) -> tuple[list[Figures], rmax.Evidence]:
     """A row for each seed, and the evidence of the first one.
 
-    Every strategy on the way plays all moves of the region, so the graph on which the last one
-    is seen to win is that of all of them.
+    All strategies of a run have the same support, so the last one represents them qualitatively.
     """
     rows, every = [], []
     for seed in range(len(found.num_steps)):
@@ -228,7 +210,7 @@ def _judged(
         check(one)
         evidence = rmax.evidence(one.state, problem, hparams)
         every.append(evidence)
-        asked = evidence.reachable & problem.game.system
+        counted = evidence.reachable & problem.game.system
         rows.append(
             {
                 "seed": seed,
@@ -236,8 +218,8 @@ def _judged(
                 "last_update_step": one.state.last_update,
                 "moves": one.state.moves,
                 "updates": one.state.num_updates,
-                "eps_optimal_states": jnp.sum(evidence.epsilon_optimal & asked),
-                "eps_optimal_states_met": jnp.sum(evidence.epsilon_optimal_played & asked),
+                "eps_optimal_states": jnp.sum(evidence.epsilon_optimal & counted),
+                "eps_optimal_states_played": jnp.sum(evidence.epsilon_optimal_played & counted),
                 "always_almost_sure": bool(one.state.always_almost_sure & evidence.almost_sure),
             }
         )
@@ -247,13 +229,13 @@ def _judged(
 # --- the table ----------------------------------------------------------------------------------
 
 
-def table(result: dict[str, Any]) -> str:
-    """Section 6.7, published beside measured."""
+def table(result: Figures) -> str:
+    """The report of section 6.7."""
     first, graph = result["initial_strategy"], result["winning_strategy"]
     rows = [
         ("states", "states"),
         ("of the system", "system_states"),
-        ("moves of the system", "system_transitions"),
+        ("actions of the system", "system_transitions"),
         ("almost surely winning", "almost_sure_states"),
     ]
     seen = {**PUBLISHED, "almost_sure_states": PUBLISHED["states"]}
@@ -266,28 +248,28 @@ def table(result: dict[str, Any]) -> str:
         f"{'seconds to its last update':32}{seen['last_update_seconds']:>12}"
         f"{result['last_update_seconds']:>12.4f}",
         "",
-        "best values at the system's states, and at how many of them: "
+        "optimal values of the system's states, and their number of states: "
         + ", ".join(f"{v}: {n}" for v, n in result["values"].items()),
         "",
         f"{'worst-case value (published as a picture)':48}{'min':>10}{'max':>10}{'mean':>10}",
         *(
             f"  {title:46}{x['min']:>10.6f}{x['max']:>10.6f}{x['mean']:>10.6f}"
             for title, x in (
-                ("initial strategy: any move, all alike", first),
-                ("pure winning strategy, by the graph alone", graph),
+                ("initial strategy: uniform over allowed actions", first),
+                ("pure winning strategy, by the graph only", graph),
             )
         ),
         "",
-        "with the model known, the largest loss of the strategies of algorithm 4, which play any",
-        f"move now and then: {result['hat_strategy_gap']:.3e} for the winning strategy of the hat "
+        "in the true model, the largest loss of the strategies of algorithm 4, which explore with a",
+        f"small probability: {result['hat_strategy_gap']:.3e} for the winning strategy of the hat "
         f"game, {result['uniform_hat_strategy_gap']:.3e} for the",
         "uniform one of Remark 4 (the bound is epsilon / 6)",
         "",
         f"learned: epsilon-optimal of the {result['reachable_system_states']} reachable states of "
-        "the system, in the worst case and against the environment met",
+        "the system, in the worst case and against the environment played",
         "",
         f"{'':6}{f'restarts, one in {round(1 / RESTART)} moves':>38}{'no restarts':>38}",
-        f"{'seed':>6}" + f"{'last update':>14}{'updates':>10}{'worst':>7}{'met':>7}" * 2,
+        f"{'seed':>6}" + f"{'last update':>14}{'updates':>10}{'worst':>7}{'played':>7}" * 2,
     ]
     both = zip(result["learned"], result["learned_without_restarts"], strict=True)
     for pair in both:
@@ -295,7 +277,7 @@ def table(result: dict[str, Any]) -> str:
             f"{pair[0]['seed']:>6}"
             + "".join(
                 f"{x['last_update_step']:>14}{x['updates']:>10}{x['eps_optimal_states']:>7}"
-                f"{x['eps_optimal_states_met']:>7}"
+                f"{x['eps_optimal_states_played']:>7}"
                 for x in pair
             )
         )
@@ -308,7 +290,7 @@ def table(result: dict[str, Any]) -> str:
             *_DIFFERENCES,
             "",
             f"{sure} of {len(runs)} runs won almost surely at every moment, by the graph; "
-            f"{len(result['learned'])} runs side by side take {result['seconds_together']:.3f} s; "
+            f"{len(result['learned'])} runs in one call take {result['seconds_together']:.3f} s; "
             f"{result['total_seconds']:.1f} s in all",
         ]
     )
@@ -316,23 +298,23 @@ def table(result: dict[str, Any]) -> str:
 
 _DIFFERENCES = (
     "A run ends after 20,000 moves without an update (published: 10,000 steps); times are medians",
-    "of runs alone, compiled before. The published 192 counts the moves of the system; with those",
+    "of single runs without compilation. The published 192 counts the system's actions; with those",
     "of the light there are 336. In the published picture the learned values lie above the initial",
-    "ones and, says the text, far from the optimal ones. Epsilon-optimality excludes that: ours",
-    "coincide with the optimal ones wherever a state is counted above. Runs that never start anew",
-    "settle on a round trip, and moves of the light that they do not meet stay unknown; all of the",
-    "reachable states, as published, are learned with restarts only. At states that no run can",
-    "reach the learned values mean nothing.",
+    "ones and, by the text, far from the optimal ones. Epsilon-optimality excludes that: ours",
+    "coincide with the optimal ones in every state counted above. Runs without restarts converge",
+    "to a round trip, and actions of the light that do not occur stay unknown; all reachable",
+    "states, as published, are learned with restarts only. In unreachable states the learned",
+    "values are meaningless.",
 )
 
 
 # --- pictures -----------------------------------------------------------------------------------
 
 
-def _figure_17(model: Patrol, quantity: jax.Array) -> dict[str, Any]:
-    """The best moves by the reward alone, for each light, on first, and cell.
+def _figure_17(model: Patrol, quantity: jax.Array) -> Figures:
+    """Optimal actions without the task for each light, on first, and cell.
 
-    The reward does not depend on the automaton, so neither do they.
+    They do not depend on the automaton state, since the reward does not.
     """
     best = pac.near_optimal(quantity, model.game.available, 1e-9)
     here = np.asarray(model.game.system & (model.memory == 0))
@@ -342,29 +324,29 @@ def _figure_17(model: Patrol, quantity: jax.Array) -> dict[str, Any]:
     return {"best": moves}
 
 
-def _figure_19(model: Patrol, winning: jax.Array, learned: rmax.Evidence) -> dict[str, Any]:
-    """Strategies for each light, on first, and automaton state; None where no run comes."""
+def _figure_19(model: Patrol, winning: jax.Array, learned: rmax.Evidence) -> Figures:
+    """Strategies for each light, on first, and automaton state; NaN in unreachable states."""
     system = np.asarray(model.game.system)
     place = tuple(np.asarray(x)[system] for x in (1 - model.light, model.memory, model.cell))
     reached = np.asarray(learned.reachable)[system]
 
-    def laid_out(play: jax.Array) -> np.ndarray:
+    def on_maps(strategy: jax.Array) -> np.ndarray:
         maps = np.full((2, 4, 9, len(ACTIONS)), np.nan)
-        shown = np.asarray(play)[system][:, : len(ACTIONS)]
-        maps[place] = np.where(reached[:, None], shown, np.nan)
+        rows = np.asarray(strategy)[system][:, : len(ACTIONS)]
+        maps[place] = np.where(reached[:, None], rows, np.nan)
         return maps
 
     near = np.zeros((2, 4, 9), bool)
     near[place] = np.asarray(learned.epsilon_optimal)[system] & reached
     return {
-        "initial": laid_out(winning),
-        "learned": laid_out(learned.strategy),
+        "initial": on_maps(winning),
+        "learned": on_maps(learned.strategy),
         "epsilon_optimal": near,
     }
 
 
 def _without_both(automaton: Automaton) -> Automaton:
-    """The automaton without the letter that holds in no cell, for shorter guards."""
+    """The automaton without the letter that no cell has, for shorter guards."""
     kept = ~automaton.letters.all(axis=1)
     return replace(
         automaton,
@@ -374,7 +356,7 @@ def _without_both(automaton: Automaton) -> Automaton:
     )
 
 
-def pictures(result: dict[str, Any]) -> list[tuple[str, bytes]]:
+def pictures(result: Figures) -> list[tuple[str, bytes]]:
     """Figures 17 to 19: the task, the values, and the strategies of the first seed."""
     from jaxltl import plot
 
@@ -397,9 +379,9 @@ def pictures(result: dict[str, Any]) -> list[tuple[str, bytes]]:
                 "optimal": shown["optimal"],
                 "learned": shown["learned"],
                 "initial (uniform)": shown["initial"],
-                "winning, by the graph alone": shown["winning"],
+                "winning, by the graph only": shown["winning"],
             },
-            groups=["reachable" if x else "never reached" for x in shown["reachable"]],
+            groups=["reachable" if x else "unreachable" for x in shown["reachable"]],
             label="worst-case value",
         ),
         "figure_19_initial": plot.strategies(_MAP, laid_out["initial"], titles=titles),
@@ -411,4 +393,4 @@ def pictures(result: dict[str, Any]) -> list[tuple[str, bytes]]:
             mark="epsilon-optimal",
         ),
     }
-    return [(f"{name}.svg", plot.to_bytes(figure)) for name, figure in drawn.items()]
+    return svg_files(drawn)

@@ -1,4 +1,4 @@
-"""Chapter 5: permissive strategies, and learning inside them."""
+"""Section 5.5: permissive strategies, and Q-learning inside them."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from jaxltl.core.types import NotConverged, check
 from jaxltl.core.values.discounted.discounted import optimal_value
 from jaxltl.core.values.discounted.minimax import minimax_value
 from jaxltl.envs.robots import diagonal_reward, reward_against_task, robots
+from jaxltl.reproduce.experiment import Figures, run_seconds, svg_files
 
 SIZES = (3, 4, 5, 6, 8, 10)
 BOUNDS = (4, 6, 8, 10, 14, 20)
@@ -27,7 +28,7 @@ DISCOUNT = 0.9
 TOLERANCE = 1e-3  # the largest error at which learning stops
 CORNERS = "system_upper_left | system_lower_right"
 
-# For each size: seconds to extract the strategy and to learn, moves, states, system states.
+# By size: seconds of synthesis and of learning, moves, states, system states.
 TABLE5 = {
     3: (0.10, 4.28, 9e4, 120, 72),
     4: (0.21, 16.35, 3.2e5, 432, 240),
@@ -40,19 +41,16 @@ TABLE6 = {4: 8.0922, 6: 8.8658, 8: 9.2442, 10: 9.4647, 14: 9.7034, 20: 9.8616}
 MEMORYLESS = 5.7368
 
 
-def figures(progress: Callable[[str], None] = lambda text: None) -> dict[str, Any]:
+def figures(progress: Callable[[str], None] = lambda text: None) -> Figures:
     """Section 5.5: tables 5 and 6, example 2, and the game of figure 12.
-
-    Args:
-      progress: called with a line before each part.
 
     Returns:
       ``table5`` (for each ``n``: ``states``, ``system_states``, ``synthesis_seconds``,
-      ``learning_seconds``, ``learning_moves``, ``max_error`` and ``values``, how many system
-      states have each value), ``table6`` (for each ``bound``: ``states``, ``max_value``),
-      ``memoryless_permissive_max``, ``example2`` (``max``, ``min``, ``mean`` at ``n`` 4),
-      ``figure12`` (``supremum``, ``attained`` and what delays of the task reach), ``figure13``
-      and ``figure14`` (what the pictures show), and ``seconds``.
+      ``learning_seconds``, ``learning_moves``, ``max_error`` and ``values``, the number of system
+      states by value), ``table6`` (for each ``bound``: ``states``, ``max_value``),
+      ``memoryless_permissive_max``, ``example2`` (``max``, ``min``, ``mean`` for ``n`` 4),
+      ``figure12`` (``supremum``, ``attained``, and values for bounded delays of the task),
+      ``figure13`` and ``figure14`` (data of the pictures), and ``seconds``.
 
     Raises:
       NotConverged: a value or a learner did not converge.
@@ -61,9 +59,9 @@ def figures(progress: Callable[[str], None] = lambda text: None) -> dict[str, An
     table5, curve = [], None
     for size in SIZES:
         progress(f"table 5: two robots on a {size} x {size} grid")
-        row, learnt = _example_1(size)
+        row, size_curve = _example_1(size)
         table5.append(row)
-        curve = learnt if size == 4 else curve
+        curve = size_curve or curve
     progress(f"table 6: counters up to {BOUNDS[-1]}")
     table6 = [_counters(bound) for bound in BOUNDS]
     game = robots(3)
@@ -89,51 +87,47 @@ def _restricted(game: Game, objective: Any, bound: int | None = None) -> Any:
 
 
 def _value(game: Game) -> np.ndarray:
-    """The exact value, the discount paid at the system's moves."""
+    """The minimax value, with the system's moves discounted."""
     solution = minimax_value(
         game, diagonal_reward(game), DISCOUNT, per="system_move", tolerance=1e-9
     )
     return np.asarray(check(solution).value)
 
 
-def _timed(job: Callable[[], Any]) -> tuple[Any, float]:
-    """What a job returns, and the seconds of its second run: the first one compiles."""
-    job()
-    begin = time.perf_counter()
-    result = jax.block_until_ready(job())
-    return result, time.perf_counter() - begin
+def _example_1(size: int) -> tuple[Figures, Figures]:
+    """A row of table 5, and the learning curve of size 4."""
 
-
-def _example_1(size: int) -> tuple[dict[str, Any], dict[str, Any]]:
     def synthesize() -> Any:
         game = robots(size)
         return _restricted(game, safety(game, "!collision"))
 
-    found, synthesis_seconds = _timed(synthesize)
-    game = found.model
+    strategy, synthesis_seconds = run_seconds(synthesize)
+    game = strategy.model
     exact = _value(game)
     problem = maximin_q.make_problem(game, diagonal_reward(game))
     problem = maximin_q.with_exact_value(problem, exact, maximin_q.recurrent_states(problem))
     hparams = maximin_q.Hparams(discount=DISCOUNT, num_chains=1024, moves_per_step=16)
-    (state, metrics), learning_seconds = _timed(lambda: _learn(problem, hparams))
+    (state, metrics), learning_seconds = run_seconds(lambda: _learn(problem, hparams))
     system = np.asarray(game.system)
     values, counts = np.unique(np.round(exact[system], 6), return_counts=True)
     row = {
         "n": size,
         "states": game.num_states,
         "system_states": int(system.sum()),
-        "synthesis_seconds": round(synthesis_seconds, 4),
-        "learning_seconds": round(learning_seconds, 4),
+        "synthesis_seconds": synthesis_seconds,
+        "learning_seconds": learning_seconds,
         "learning_moves": float(metrics.moves),
         "max_error": float(metrics.error),
         "violations": int(metrics.violations),
         "values": {f"{v:g}": int(c) for v, c in zip(values, counts, strict=True)},
     }
-    return row, _learning_curve(size, found, problem, state) if size == 4 else {}
+    return row, _learning_curve(size, strategy, problem, state) if size == 4 else {}
 
 
-def _learn(problem: Any, hparams: Any) -> tuple[Any, Any]:
-    """Steps until the error on the recurrent class is below the tolerance."""
+def _learn(
+    problem: maximin_q.Problem, hparams: maximin_q.Hparams
+) -> tuple[maximin_q.State, maximin_q.Metrics]:
+    """Steps until the error on the recurrent states is below the tolerance."""
     state = maximin_q.init(jax.random.key(0), problem, hparams)
     for _ in range(4000):
         state, metrics = maximin_q.run(state, problem, hparams, num_steps=4, max_rows=1)
@@ -146,20 +140,22 @@ def _learn(problem: Any, hparams: Any) -> tuple[Any, Any]:
     )
 
 
-def _learning_curve(size: int, found: Any, problem: Any, learnt: Any) -> dict[str, Any]:
-    """What figure 13 shows: the learned values, and how far they move in 10,000 moves each."""
+def _learning_curve(
+    size: int, strategy: Any, problem: maximin_q.Problem, learned: maximin_q.State
+) -> Figures:
+    """Data of figure 13: the learned values, and their changes in steps of 10,000 moves."""
     hparams = maximin_q.Hparams(discount=DISCOUNT, num_chains=100, moves_per_step=100)
     _, metrics = maximin_q.train(jax.random.key(1), problem, hparams, num_steps=40, max_rows=40)
     return {
         "n": size,
-        "state": np.asarray(found.base_state),
-        "value": np.asarray(learnt.value),
+        "state": np.asarray(strategy.base_state),
+        "value": np.asarray(learned.value),
         "moves": np.asarray(metrics.moves),
         "residual": np.asarray(metrics.residual),
     }
 
 
-def _counters(bound: int) -> dict[str, Any]:
+def _counters(bound: int) -> Figures:
     game = robots(3)
     found = _restricted(game, buchi(game, CORNERS, safe="!collision"), bound)
     return {
@@ -169,7 +165,7 @@ def _counters(bound: int) -> dict[str, Any]:
     }
 
 
-def _example_2() -> dict[str, Any]:
+def _example_2() -> Figures:
     game = robots(4)
     task = gr1(
         game,
@@ -194,11 +190,11 @@ def _example_2() -> dict[str, Any]:
     }
 
 
-def _figure_12() -> dict[str, Any]:
-    """The reward alone is worth 100; strategies that must do the task within m visits, less.
+def _figure_12() -> Figures:
+    """The value without a task, and with the task satisfied within m visits.
 
-    That no winning strategy attains the supremum is decided on the graph: the moves of
-    every optimal strategy are those of full value, and the task cannot be done by them.
+    No winning strategy attains the supremum if the task cannot be satisfied by actions of optimal
+    value, which is decided on the graph.
     """
     game, reward = reward_against_task()
     best = check(optimal_value(game.mdp, reward, DISCOUNT))
@@ -218,8 +214,8 @@ def _figure_12() -> dict[str, Any]:
     return {"supremum": float(best.value.max()), "attained": bool(won), "delays": delays}
 
 
-def table(result: dict[str, Any]) -> str:
-    """Section 5.5, published beside measured."""
+def table(result: Figures) -> str:
+    """The report of section 5.5."""
     lines = [
         "Section 5.5, example 1: two robots, avoid collision (discount 0.9 for each system move)",
         "",
@@ -265,8 +261,12 @@ def table(result: dict[str, Any]) -> str:
         f"mean {second['mean']:.6f}",
         "",
         f"Figure 12: the supremum is {twelve['supremum']:g}, "
-        + ("attained" if twelve["attained"] else "and no strategy that does the task attains it")
-        + "; doing the task within m visits:",
+        + (
+            "attained"
+            if twelve["attained"]
+            else "and no strategy that satisfies the task attains it"
+        )
+        + "; satisfying the task within m visits:",
         "  " + ", ".join(f"{x['bound']}: {x['value']:.3f}" for x in twelve["delays"]),
         "",
         *_DIFFERENCES,
@@ -280,17 +280,17 @@ def table(result: dict[str, Any]) -> str:
 
 _DIFFERENCES = (
     "Times are of the second call: the first one compiles. Learning stops when the largest error",
-    "on the recurrent states is below 0.001; 1,024 games are played side by side and share one",
-    "table, so moves are made faster and more of them are needed than one after the other. In",
-    "example 2 no strategy is the most permissive one, and values depend on which is taken: ours",
-    "is by the rounds of the triple fixpoint. The memory update that section 5.4.1 prints for the",
+    "on the recurrent states is below 0.001; 1,024 parallel games share one table, so moves are",
+    "faster, and more of them are needed than in a sequence. In example 2 no strategy is the most",
+    "permissive one, and values depend on the choice: ours uses the iterations of the triple",
+    "fixpoint. The memory update that section 5.4.1 prints for the",
     "second strategy of figure 12's game never changes the memory, so that strategy does not win;",
     "the one of section 5.3 does.",
 )
 
 
-def pictures(result: dict[str, Any]) -> list[tuple[str, bytes]]:
-    """Figures 13 and 14: values at the system's turns, and how learning comes to rest."""
+def pictures(result: Figures) -> list[tuple[str, bytes]]:
+    """Figures 13 and 14: values of the system's states, and the convergence of learning."""
     from jaxltl import plot
 
     first, second = result["figure13"], result["figure14"]
@@ -302,10 +302,10 @@ def pictures(result: dict[str, Any]) -> list[tuple[str, bytes]]:
         ),
         "figure_14_values": plot.game_values(_on_all_states(second), 4, label="value"),
     }
-    return [(f"{name}.svg", plot.to_bytes(figure)) for name, figure in drawn.items()]
+    return svg_files(drawn)
 
 
-def _on_all_states(shown: dict[str, Any]) -> np.ndarray:
-    values = np.full(2 * shown["n"] ** 4, np.nan)
-    values[np.asarray(shown["state"])] = shown["value"]
+def _on_all_states(part: Figures) -> np.ndarray:
+    values = np.full(2 * part["n"] ** 4, np.nan)
+    values[np.asarray(part["state"])] = part["value"]
     return values

@@ -1,4 +1,4 @@
-"""Section 3.5: rewards learned in one world and planned with in worlds never seen."""
+"""Section 3.5: task-oriented deep inverse RL, and planning in unseen worlds."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ from jaxltl.core.models.trajectories import Trajectories, make_trajectories
 from jaxltl.core.values.undiscounted.performance import task_performances
 from jaxltl.envs import temporal_gridworld as grid
 from jaxltl.io.colored_world import read_world, write_world
+from jaxltl.reproduce.experiment import Figures, svg_files
 
 METHODS = ("todirl", "incomplete", "patch5", "memoryless", "cloning")
 _MEMORY = {"incomplete": grid.INCOMPLETE, "memoryless": "true"}  # of the others, the task's
@@ -33,15 +34,15 @@ _DISCOUNT = 0.95
 
 @dataclass(frozen=True)
 class Plan:
-    """How much is done; the default is what the command does.
+    """Sizes of the experiment; the defaults are those of the command line.
 
     Attributes:
-      methods: what learns.
-      demonstrations: how many are shown.
-      curves: the number of demonstrations whose learning is drawn (figure 6).
-      steps, cloning_steps: of learning, at most, where early stopping does not end it.
+      methods: the learners.
+      demonstrations: numbers of demonstrations.
+      curves: the number of demonstrations of the learning curves (figure 6).
+      steps, cloning_steps: of learning, at most; early stopping may end it.
       points: of a learning curve.
-      test_worlds: never seen in learning.
+      test_worlds: number of unseen worlds.
     """
 
     methods: tuple[str, ...] = METHODS
@@ -58,24 +59,24 @@ def figures(
     *,
     seeds: int | None = None,
     plan: Plan | None = None,
-) -> dict[str, Any]:
+) -> Figures:
     """Figures 6 and 7.
 
     Args:
       progress: called with a line before each part.
-      seeds: how often learning is repeated, each time with other colours in the training world,
-        other demonstrations and another start; default 10. The test worlds stay the same.
-      plan: how much is done.
+      seeds: repetitions of learning, each with other colours in the training world, other
+        demonstrations and other initial parameters; default 10. The test worlds stay the same.
+      plan: sizes of the experiment.
 
     Returns:
       ``by_demonstrations``: for each number of ``demonstrations`` and each ``method``, L_phi
       (3.9) as ``train_mean`` and ``train_std`` over the seeds, ``test_mean`` (over seeds and test
-      worlds), ``test_std`` (over the seeds, of their means), ``test_worst`` (any seed's in any
-      test world), ``test_worst_of_each_seed``, ``test_of_each_seed``, ``seeds``, ``steps`` (until
-      the parameters that are kept, mean over the seeds) and ``half_width``, the widest of the
-      certified bounds. ``reference``: L_phi of the expert and of a random policy, ``train_mean``,
+      worlds), ``test_std`` (over the seeds, of their means), ``test_worst`` (minimum over seeds and
+      test worlds), ``test_worst_of_each_seed``, ``test_of_each_seed``, ``seeds``, ``steps`` (until
+      the returned parameters, mean over the seeds) and ``half_width``, of the widest certified
+      bounds. ``reference``: L_phi of the expert and of a random policy, ``train_mean``,
       ``test_mean`` and ``test_worst``. ``seeds``, ``seconds``. ``figure6``: learning curves, and
-      runs of the first seed's policy of the method ``todirl``.
+      trajectories of the first seed's policy of the method ``todirl``.
     """
     begin = time.perf_counter()
     plan, num_seeds = plan or Plan(), seeds or 10
@@ -108,7 +109,7 @@ class Setting(NamedTuple):
     Attributes:
       train, test: the worlds.
       task: the automaton of the whole task.
-      shown: demonstrations in each training world, as many as are ever used.
+      shown: demonstrations in each training world, the largest number of the plan.
     """
 
     train: list[grid.World]
@@ -130,7 +131,7 @@ def _setting(num_seeds: int, plan: Plan) -> Setting:
 
 
 def _automaton(formula: str, worlds: list[grid.World]) -> Automaton:
-    """Over the letters of our worlds: no cell is of two kinds."""
+    """The automaton of a formula over the letters of the worlds: at most one proposition a cell."""
     names = worlds[0].mdp.propositions
     return to_automaton(formula, letters=[frozenset(), *(frozenset([p]) for p in names)])
 
@@ -175,8 +176,8 @@ def _run(learner: Any, states: Any, problems: Any, hparams: Any, num_steps: int)
 
 def _learned(
     setting: Setting, method: str, number: int, plan: Plan
-) -> tuple[dict[str, Any], dict[str, Any] | None]:
-    """A row, and what is drawn of it if anything is."""
+) -> tuple[Figures, Figures | None]:
+    """A row, and its learning curve for one number of demonstrations."""
     memory = setting.task
     if method in _MEMORY:
         memory = _automaton(_MEMORY[method], setting.train)
@@ -184,43 +185,52 @@ def _learned(
     learner, hparams = (cloning, _CLONING) if method == "cloning" else (todirl, _HPARAMS)
     models, seen = _stacked(setting.train, memory), _observed(setting.train, radius)
     shown = [jax.tree.map(lambda x: x[:number], t) for t in setting.shown]
-    # Each seed learns in its own world alone.
+    # Each seed learns in its own world only.
     problems = jax.tree.map(lambda x: x[:, None], learner.make_problem(models, seen, shown))
     keys = jax.vmap(jax.random.key)(1000 + jnp.arange(len(setting.train)))
     states = _begin(learner, keys, problems, hparams)
-    judge = partial(_judged, setting, memory, method, radius)
+    evaluate = partial(_evaluated, setting, memory, method, radius)
     chunk = max((plan.cloning_steps if method == "cloning" else plan.steps) // plan.points, 1)
     curve: list[Any] = []
     for _ in range(plan.points):
         if not curve or not np.all(states.stopped):
             states = _run(learner, states, problems, hparams, chunk)
-            latest = judge(states.parameters) if number == plan.curves else None
+            latest = evaluate(states.parameters) if number == plan.curves else None
         curve.append(latest)
-    told = {"demonstrations": number, "method": method}
-    row = {**told, **_row(judge(states.best.parameters), states)}
+    name = {"demonstrations": number, "method": method}
+    row = {**name, **_row(evaluate(states.best.parameters), states)}
     if number != plan.curves:
         return row, None
     steps = chunk * (1 + np.arange(plan.points))
-    worlds = _walks(setting, states) if method == "todirl" else []
-    return row, {**told, "steps": steps, **_curve(curve), "worlds": worlds}
+    worlds = _trajectories(setting, states) if method == "todirl" else []
+    return row, {**name, "steps": steps, **_curve(curve), "worlds": worlds}
 
 
-class Judged(NamedTuple):
-    """L_phi with bounds: in the training worlds ``[N]``, in the test worlds ``[N, M]``."""
+class Bounds(NamedTuple):
+    """L_phi and half the width of its certified bounds, for each world."""
 
-    train: Any
-    test: Any
+    mean: np.ndarray
+    half_width: np.ndarray
 
 
-def _judged(setting: Setting, memory: Automaton, method: str, radius: int, parameters: Any):
-    """Each seed's parameters in its own training world and in all test worlds."""
+class Performance(NamedTuple):
+    """L_phi in the training worlds ``[N]`` and in the test worlds ``[N, M]``."""
+
+    train: Bounds
+    test: Bounds
+
+
+def _evaluated(
+    setting: Setting, memory: Automaton, method: str, radius: int, parameters: Any
+) -> Performance:
+    """The performance of each seed's parameters in its training world and in all test worlds."""
     seeds = len(setting.train)
     own = _policies(
         method, parameters, _stacked(setting.train, memory), _observed(setting.train, radius)
     )
     new_models, new_seen = _stacked(setting.test, memory), _observed(setting.test, radius)
     new = _everywhere(method, parameters, new_models, new_seen)
-    return Judged(
+    return Performance(
         _performance(setting, memory, setting.train, own),
         jax.tree.map(
             lambda x: x.reshape(seeds, -1),
@@ -231,7 +241,7 @@ def _judged(setting: Setting, memory: Automaton, method: str, radius: int, param
 
 @partial(jax.jit, static_argnums=0)
 def _policies(method: str, parameters: Any, models: Product, seen: jax.Array) -> jax.Array:
-    """Of each seed in its world: ``float[N, S, Q, A]``."""
+    """Policies of each seed in its world: ``float[N, S, Q, A]``."""
     if method == "cloning":
         network = cloning.ConvolutionalPolicy(num_actions=models.num_actions)
         return jax.vmap(partial(cloning.policy_in_world, network))(parameters, models, seen)
@@ -242,7 +252,7 @@ def _policies(method: str, parameters: Any, models: Product, seen: jax.Array) ->
 
 @partial(jax.jit, static_argnums=0)
 def _everywhere(method: str, parameters: Any, models: Product, seen: jax.Array) -> jax.Array:
-    """Of each seed in all worlds: ``float[N, M, S, Q, A]``."""
+    """Policies of each seed in all worlds: ``float[N, M, S, Q, A]``."""
 
     def one(parameters: Any) -> jax.Array:
         copies = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(seen), *x.shape)), parameters)
@@ -253,8 +263,8 @@ def _everywhere(method: str, parameters: Any, models: Product, seen: jax.Array) 
 
 def _performance(
     setting: Setting, memory: Automaton, worlds: list[grid.World], policies: jax.Array
-) -> Any:
-    """Judged by the whole task, whatever the policies remember."""
+) -> Bounds:
+    """L_phi of the complete task for policies with any memory."""
     if memory is setting.task:
         return _bounds(task_performances(_stacked(worlds, setting.task), policies))
     both = synchronize(memory, setting.task)
@@ -263,49 +273,42 @@ def _performance(
     )
 
 
-class Bounds(NamedTuple):
-    """L_phi of each world and half the width of its certified bounds."""
-
-    mean: Any
-    half_width: Any
-
-
 def _bounds(found: Any) -> Bounds:
     return Bounds(*(np.asarray(x, float) for x in (found.mean, (found.upper - found.lower) / 2)))
 
 
-def _row(judged: Judged, states: Any) -> dict[str, Any]:
-    each = judged.test.mean.mean(1)
+def _row(found: Performance, states: Any) -> Figures:
+    each = found.test.mean.mean(1)
     return {
-        "train_mean": judged.train.mean.mean(),
-        "train_std": _spread(judged.train.mean),
+        "train_mean": found.train.mean.mean(),
+        "train_std": _deviation(found.train.mean),
         "test_mean": each.mean(),
-        "test_std": _spread(each),
-        "test_worst": judged.test.mean.min(),
+        "test_std": _deviation(each),
+        "test_worst": found.test.mean.min(),
         "test_of_each_seed": np.round(each, 5),
-        "test_worst_of_each_seed": np.round(judged.test.mean.min(1), 5),
+        "test_worst_of_each_seed": np.round(found.test.mean.min(1), 5),
         "seeds": len(each),
         "steps": np.mean(states.best.step),
-        "half_width": max(judged.train.half_width.max(), judged.test.half_width.max()),
+        "half_width": max(found.train.half_width.max(), found.test.half_width.max()),
     }
 
 
-def _spread(x: np.ndarray) -> float:
+def _deviation(x: np.ndarray) -> float:
     return float(x.std(ddof=1)) if len(x) > 1 else 0.0
 
 
-def _curve(judged: list[Judged]) -> dict[str, Any]:
-    found: dict[str, Any] = {}
+def _curve(points: list[Performance]) -> Figures:
+    curve: Figures = {}
     for part in ("train", "test"):
-        each = [getattr(j, part).mean.reshape(len(j.train.mean), -1).mean(1) for j in judged]
-        found[f"{part}_mean"] = [x.mean() for x in each]
-        found[f"{part}_std"] = [_spread(x) for x in each]
-    return found
+        each = [getattr(j, part).mean.reshape(len(j.train.mean), -1).mean(1) for j in points]
+        curve[f"{part}_mean"] = [x.mean() for x in each]
+        curve[f"{part}_std"] = [_deviation(x) for x in each]
+    return curve
 
 
-def _walks(setting: Setting, states: Any) -> list[dict[str, Any]]:
-    """Runs of the first seed's policy in its own world and in two new ones."""
-    parameters, found = jax.tree.map(lambda x: x[:1], states.best.parameters), []
+def _trajectories(setting: Setting, states: Any) -> list[Figures]:
+    """Trajectories of the first seed's policy in its training world and in two test worlds."""
+    parameters, drawn = jax.tree.map(lambda x: x[:1], states.best.parameters), []
     worlds = {
         "training world": setting.train[0],
         "test world": setting.test[0],
@@ -317,12 +320,12 @@ def _walks(setting: Setting, states: Any) -> list[dict[str, Any]]:
         runs = grid.demonstrations(jax.random.key(0), _lane(models, 0), policy, 6, horizon=60)
         pairs = np.stack([runs.state, runs.action], -1).tolist()
         cut = [row[:n] for row, n in zip(pairs, np.asarray(runs.length), strict=True)]
-        found.append({"title": title, "world": write_world(world), "runs": cut})
-    return found
+        drawn.append({"title": title, "world": write_world(world), "runs": cut})
+    return drawn
 
 
-def _references(setting: Setting) -> list[dict[str, Any]]:
-    """What the demonstrator and a policy of chance do."""
+def _references(setting: Setting) -> list[Figures]:
+    """L_phi of the expert and of the uniform policy."""
     rows = []
     for name in ("expert", "random"):
         found = []
@@ -346,18 +349,18 @@ def _references(setting: Setting) -> list[dict[str, Any]]:
 # --- table and pictures -------------------------------------------------------------------------
 
 
-def table(result: dict[str, Any]) -> str:
-    """Section 3.5: what was published in words and pictures, and what was measured."""
+def table(result: Figures) -> str:
+    """The report of section 3.5."""
     count = result["seeds"]
     lines = [
-        "Section 3.5: probability of doing the task (L_phi) with rewards learned in one world,",
+        "Section 3.5: satisfaction probability (L_phi) with rewards learned in one world,",
         f"mean over {count} seeds (standard deviation over seeds)",
         "",
         f"{'demonstrations':>14}  {'method':12}{'training world':>20}{'test worlds':>20}"
         f"{'worst':>8}{'steps':>8}",
         *(
             f"{x['demonstrations']:>14}  {x['method']:12}"
-            f"{_spreaded(x, 'train'):>20}{_spreaded(x, 'test'):>20}"
+            f"{_mean_and_deviation(x, 'train'):>20}{_mean_and_deviation(x, 'test'):>20}"
             f"{x['test_worst']:>8.3f}{x['steps']:>8.0f}"
             for x in result["by_demonstrations"]
         ),
@@ -377,44 +380,44 @@ def table(result: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _spreaded(row: dict[str, Any], part: str) -> str:
+def _mean_and_deviation(row: Figures, part: str) -> str:
     return f"{row[part + '_mean']:.4f} ({row[part + '_std']:.4f})"
 
 
-def _orders(rows: list[dict[str, Any]]) -> list[str]:
-    """Which of the three that know the task is ahead, seed by seed."""
-    found = []
+def _orders(rows: list[Figures]) -> list[str]:
+    """Differences of the methods that know the task, paired by seed."""
+    lines = []
     by = {(x["demonstrations"], x["method"]): x for x in rows}
     for (number, method), x in by.items():
         full = by.get((number, "todirl"))
         if method not in ("incomplete", "patch5") or full is None:
             continue
         ahead = np.asarray(full["test_of_each_seed"]) - np.asarray(x["test_of_each_seed"])
-        mean, error = ahead.mean(), _spread(ahead) / np.sqrt(len(ahead))
+        mean, error = ahead.mean(), _deviation(ahead) / np.sqrt(len(ahead))
         verdict = "ahead" if mean > 2 * error else "behind" if mean < -2 * error else "level"
-        found.append(
+        lines.append(
             f"{number:>4} demonstrations: todirl less {method:10} {mean:+.4f} +- {2 * error:.4f}, "
             f"{verdict}"
         )
-    return found
+    return lines
 
 
 _DIFFERENCES = (
     "Published: pictures without digits. All seeds share 20 test worlds and differ in the colours",
     "of the training world, in their demonstrations and starts. Learning is stopped by the",
-    "likelihood of a fifth of the demonstrations, which are held out; test worlds are not looked",
-    "at. incomplete: obstacles are not in the automaton; patch5: the reward sees 5 x 5 cells;",
-    "memoryless: no automaton; cloning: a convolutional policy. Worst: any seed, any test world.",
-    "Ahead or behind: by more than two standard errors of the difference seed by seed.",
+    "likelihood of a fifth of the demonstrations, which are held out; test worlds are not used.",
+    "incomplete: obstacles are not in the automaton; patch5: the reward sees 5 x 5 cells;",
+    "memoryless: no automaton; cloning: a convolutional policy. Worst: minimum over seeds and test",
+    "worlds. Ahead or behind: by more than two standard errors of the difference paired by seed.",
 )
 
 
-def pictures(result: dict[str, Any]) -> list[tuple[str, bytes]]:
-    """Figures 6 and 7, and runs of what was learned."""
+def pictures(result: Figures) -> list[tuple[str, bytes]]:
+    """Figures 6 and 7, and trajectories of learned policies."""
     from jaxltl import plot
 
     columns = {"train": "training world", "test": "test worlds"}
-    learning: dict[str, Any] = {title: {} for title in columns.values()}
+    learning: Figures = {title: {} for title in columns.values()}
     for x in result["figure6"]:
         for part, title in columns.items():
             learning[title][x["method"]] = tuple(
@@ -425,42 +428,30 @@ def pictures(result: dict[str, Any]) -> list[tuple[str, bytes]]:
                     x[f"{part}_std"],
                 )
             )
-    shown: dict[str, Any] = {title: {} for title in columns.values()}
+    by_number: Figures = {title: {} for title in columns.values()}
     rows = result["by_demonstrations"]
     for method in dict.fromkeys(x["method"] for x in rows):
         mine = [x for x in rows if x["method"] == method]
         for part, title in columns.items():
-            shown[title][method] = (
+            by_number[title][method] = (
                 np.log10([x["demonstrations"] for x in mine]),
                 [x[f"{part}_mean"] for x in mine],
                 [x[f"{part}_std"] for x in mine],
             )
-    drawn = [
-        (
-            "figure_7_demonstrations.svg",
-            plot.to_bytes(
-                plot.bands(
-                    {"probability of the task": shown}, label="demonstrations, decimal logarithm"
-                )
-            ),
+    drawn = {
+        "figure_7_demonstrations": plot.bands(
+            {"satisfaction probability": by_number}, label="demonstrations, decimal logarithm"
         )
-    ]
+    }
     if result["figure6"]:
-        drawn.append(
-            (
-                "figure_6_learning.svg",
-                plot.to_bytes(
-                    plot.bands({"probability of the task": learning}, label="share of all steps")
-                ),
-            )
+        drawn["figure_6_learning"] = plot.bands(
+            {"satisfaction probability": learning}, label="share of all steps"
         )
-    for x in result["figure6"]:
-        for place in x["worlds"]:
-            world = read_world(place["world"])
-            figure = plot.temporal_gridworld(
-                world,
-                trajectories=make_trajectories(world.mdp, place["runs"]),
-                title=f"{place['title']}: runs of the learned policy",
-            )
-            drawn.append((f"{place['title'].replace(' ', '_')}.svg", plot.to_bytes(figure)))
-    return drawn
+    for place in (place for x in result["figure6"] for place in x["worlds"]):
+        world = read_world(place["world"])
+        drawn[place["title"].replace(" ", "_")] = plot.temporal_gridworld(
+            world,
+            trajectories=make_trajectories(world.mdp, place["runs"]),
+            title=f"{place['title']}: trajectories of the learned policy",
+        )
+    return svg_files(drawn)

@@ -1,0 +1,43 @@
+"""The interface of an experiment of the dissertation, and parts that several experiments share."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol, TypeVar
+
+import jax
+
+ResultT = TypeVar("ResultT")
+Figures = dict[str, Any]  # numbers, texts, and lists and dicts of them, as in JSON
+
+
+class Experiment(Protocol):
+    """A module of this package: measurements, a report, and pictures.
+
+    ``figures`` also takes ``seeds``, the repetitions of learning, if the experiment has any.
+    """
+
+    def figures(self, progress: Callable[[str], None]) -> Figures:
+        """Measured results; `progress` is called with a line of text before each part."""
+
+    def table(self, result: Figures) -> str:
+        """The published and the measured results side by side, and why they differ."""
+
+    def pictures(self, result: Figures) -> list[tuple[str, bytes]]:
+        """File names and contents of the pictures; absent if the experiment has none."""
+
+
+def run_seconds(job: Callable[[], ResultT]) -> tuple[ResultT, float]:
+    """The result of a job and the seconds of its second run; the first run compiles."""
+    jax.block_until_ready(job())
+    begin = time.perf_counter()
+    result = jax.block_until_ready(job())
+    return result, round(time.perf_counter() - begin, 4)
+
+
+def svg_files(drawn: Mapping[str, Any]) -> list[tuple[str, bytes]]:
+    """SVG files of drawn figures by name."""
+    from jaxltl import plot
+
+    return [(f"{name}.svg", plot.to_bytes(figure)) for name, figure in drawn.items()]
