@@ -1,4 +1,4 @@
-"""Kinds of cells of coloured worlds: objects and obstacles, told by the colours around them."""
+"""Cell kinds of coloured worlds: objects and obstacles, defined by colours around a cell."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ OBSTACLES: Mapping[str, Mapping[str, int]] = {"ob": {"black": 9}}
 Counts = Mapping[str, Mapping[str, int]]
 Kinds = tuple[tuple[str, tuple[int, ...]], ...]
 
-FREE = -1  # a cell whose colour is still to be drawn
+FREE = -1  # a cell without a colour yet
 
 
 def many_objects(num: int) -> dict[str, dict[str, int]]:
-    """Counts of colours for objects ``o1``, ``o2``, ..., no two alike.
+    """Distinct colour counts for objects ``o1``, ``o2``, ...
 
     The first three are those of the dissertation. Each has an X of one colour on another.
 
@@ -46,7 +46,7 @@ def many_objects(num: int) -> dict[str, dict[str, int]]:
 
 
 def make_kinds(objects: Counts, obstacles: Counts) -> Kinds:
-    """Kinds of cells, each a name and its counts of colours, checked."""
+    """Validated cell kinds: names with colour counts."""
     kinds: dict[str, tuple[int, ...]] = {}
     for name, counts in [*objects.items(), *obstacles.items()]:
         if name in kinds:
@@ -67,7 +67,7 @@ def make_kinds(objects: Counts, obstacles: Counts) -> Kinds:
 
 
 def _code(counts: ArrayLike) -> NDArray[np.int64]:
-    """Counts of colours up to 9 as the digits of one number."""
+    """Colour counts (at most 9 each) as the digits of one number."""
     return np.asarray(counts, np.int64) @ 10 ** np.arange(len(COLORS))
 
 
@@ -75,7 +75,7 @@ _DIGIT = np.append(10 ** np.arange(len(COLORS)), 10 ** len(COLORS))  # the last:
 
 
 def find_kinds(colors: NDArray[Any], codes: NDArray[np.int64]) -> NDArray[np.int32]:
-    """The kind of each cell that has a patch, -1 for none; free cells are of no colour."""
+    """Kind of each cell by its 3 x 3 patch, -1 for none; undrawn cells have no colour."""
     digit = _DIGIT[colors]
     across = digit[:, :-2] + digit[:, 1:-1] + digit[:, 2:]
     total = across[:-2] + across[1:-1] + across[2:]
@@ -92,7 +92,7 @@ def categories(
     obstacles: Counts = OBSTACLES,
     margin: int = 1,
 ) -> NDArray[np.int32]:
-    """What each cell is, by the colours of the 3 x 3 patch around it; on the host.
+    """Category of each cell by the colours of its 3 x 3 patch, in NumPy.
 
     Args:
       colors: ``int[rows + 2 * margin, columns + 2 * margin]``, indices into ``COLORS``.
@@ -117,7 +117,7 @@ def categories(
 
 
 def codes_of(kinds: Kinds) -> NDArray[np.int64]:
-    """One number for each kind, by its counts of colours."""
+    """Code of each kind from its colour counts."""
     return _code(np.array([row for _, row in kinds]).reshape(-1, len(COLORS)))
 
 
@@ -132,7 +132,7 @@ def check_margin(margin: int) -> None:
 
 
 def check_colors(colors: ArrayLike, margin: int) -> NDArray[np.int32]:
-    """Colours as ``int32[rows, columns]``, checked; there is a cell inside the margin."""
+    """Validated colours ``int32[rows, columns]`` with at least one cell inside the margin."""
     array = np.asarray(colors)
     check_margin(margin)
     if array.ndim != 2 or min(array.shape) < 2 * margin + 1 or array.dtype.kind not in "iu":

@@ -1,4 +1,4 @@
-"""Colours of cells that make what is planned of them: patches of kinds, and random cells between.
+"""Colourings with planned cell kinds: patches, and random free cells.
 
 Maps of colours have a ring around them, ``int[rows + 2, columns + 2]``, maps of kinds have none.
 """
@@ -18,7 +18,7 @@ _ROUNDS = 10_000
 def plan_map(
     plan: Mapping[str, Sequence[tuple[int, int]]], kinds: Kinds, shape: tuple[int, int]
 ) -> NDArray[np.int32]:
-    """The kind of each cell by a plan of cells from 1; -1 for none.
+    """Kind of each cell from a plan with cells numbered from 1; -1 for none.
 
     Raises:
       ValueError: an unknown kind, or a cell that is outside or used twice.
@@ -41,7 +41,7 @@ def plan_map(
 
 
 def stamps_of(kinds: Kinds) -> list[NDArray[np.int64]]:
-    """A 3 x 3 patch for each kind."""
+    """One 3 x 3 patch per kind."""
     order = np.array([4, 0, 2, 6, 8, 1, 3, 5, 7])  # centre, corners, and the rest
     stamps = []
     for _, counts in kinds:
@@ -53,7 +53,7 @@ def stamps_of(kinds: Kinds) -> list[NDArray[np.int64]]:
 
 
 def planned(kind: NDArray[np.int32], kinds: Kinds) -> NDArray[np.int64]:
-    """The patches of a map of kinds, -1 for none, and free cells elsewhere.
+    """Colours of a map of kinds: patches, and free cells elsewhere.
 
     Raises:
       ValueError: patches overlap with different colours, or make what the plan does not say.
@@ -92,7 +92,7 @@ def filled(
     codes: NDArray[np.int64],
     margin: int,
 ) -> NDArray[np.int64]:
-    """Random colours for free cells that make nothing that is not planned, and outer rings."""
+    """Random colours for free cells and the margin that create no unplanned kind."""
     free = colors == FREE
     again = free
     for _ in range(_ROUNDS):
@@ -125,7 +125,7 @@ def placed(
     stamps: list[NDArray[np.int64]],
     codes: NDArray[np.int64],
 ) -> tuple[NDArray[np.int64], NDArray[np.int32]] | None:
-    """Patches in random cells and the kinds of cells, or None if there is no room.
+    """Patches in random cells with their kinds, or None if they do not fit.
 
     Args:
       random: draws the cells.
@@ -158,7 +158,7 @@ def placed(
 
 
 def _adds(colors, kind, number, stamp, codes, row: int, column: int) -> bool:
-    """Stamps a kind around a cell, unless that is impossible or makes something else too."""
+    """Stamps a kind around a cell if that creates no other kind."""
     patch = colors[row : row + 3, column : column + 3]
     before = patch.copy()
     if not _stamp(colors, stamp, row, column):

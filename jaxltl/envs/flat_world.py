@@ -2,8 +2,8 @@
 
 As the authors' program and that of Jackermeier and Abate (2025) have it: nine discs of seven
 colours in ``[-2, 2]^2``, some of which overlap, so that several colours may hold at once; a
-velocity in ``[-1, 1]^2`` moves the point by .08 of it, and whoever leaves the square has ended the
-episode, with a reward of -1. Only the position is seen, which by itself tells where the discs are,
+velocity in ``[-1, 1]^2`` moves the point by .08 of it; leaving the square ends the
+episode, with a reward of -1. The observation is the position, which determines the position of the discs,
 since they never move. Episodes begin anywhere outside of all discs, at one of very many places that
 were drawn so beforehand.
 """
@@ -55,7 +55,7 @@ _MOVES = (
 
 @brief
 class FlatState(NamedTuple):
-    """Where one is: `place` is ``float32[2]``.
+    """State of a flat world: `place` is ``float32[2]``.
 
     Example:
       >>> FlatState(np.zeros(2)).place.tolist()
@@ -94,7 +94,7 @@ def flat_world(
     num_starts: int = 2**16,
     seed: int = 0,
 ) -> Environment:
-    """The flat world.
+    """FlatWorld as an environment.
 
     Args:
       discs: ``(colour, x, y, radius)`` of each; the colours, sorted, are the propositions.
@@ -190,7 +190,7 @@ def discs_of(environment: Environment) -> Discs:
 @brief
 @dataclass(frozen=True)
 class EventsAround:
-    """Which event holds where, around the agent; made by :func:`events_around`.
+    """Observation encoder by events around the agent; made by :func:`events_around`.
 
     Attributes:
       events: of each its propositions, as Booleans.
@@ -207,7 +207,7 @@ class EventsAround:
     directions: int
 
     def __call__(self, observation: jax.Array) -> jax.Array:
-        """``float[1 + R K, E]``, of the agent's place and R distances in each of K directions."""
+        """``float[1 + R K, E]``: events at the agent's place and at R distances in K directions."""
         turn = np.arange(self.directions) * (2 * np.pi / self.directions)
         ways = np.stack([np.cos(turn), np.sin(turn)], -1)
         there = np.concatenate([[[0.0, 0.0]], *(ways * r for r in self.radii)]).astype(np.float32)
@@ -229,9 +229,9 @@ def events_around(
     radii: Sequence[float] = (0.08, 0.16, 0.28, 0.45, 0.7, 1.0, 1.4, 1.9, 2.5),
     directions: int = 16,
 ) -> EventsAround:
-    """What an agent that knows the discs would see around itself: ``observation -> float[X, E]``.
+    """Egocentric event encoding from known discs: ``observation -> float[X, E]``.
 
-    It is a function of the place alone, since the discs never move, and tells of the agent's own
+    It is a function of the place alone, since the discs never move, and contains the agent's own
     place and of some around it which event holds there; outside of the square none does. For
     :class:`~jaxltl.algos.many_tasks.SequenceNetwork`'s `events_seen`.
 

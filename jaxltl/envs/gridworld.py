@@ -1,4 +1,4 @@
-"""Grid worlds read off a text map."""
+"""Gridworlds from text maps."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def gridworld(
     wall: str = "#",
     initial: str | chex.Array | None = None,
 ) -> MDP:
-    """A labelled grid world with the actions up, down, left, right.
+    """A labelled gridworld MDP with the actions up, down, left, right.
 
     State ``row * columns + column``, both from 0 at the top left. A move off the map or
     into a wall stays. With probability `slip` a move goes to one of the two sides
@@ -36,7 +36,7 @@ def gridworld(
       slip: probability in [0, 1] of moving sideways.
       absorbing: propositions; cells where one holds are never left.
       legend: the propositions of each kind of cell. Without one, ``.`` has none and
-        any other cell has the proposition of its own name.
+        any other cell has the proposition of its name.
       wall: the kind of cell that is not a place.
       initial: where runs start, uniformly: a propositional formula over the labels
         (``"!r & !y"``), or a distribution ``float[S]``; default every cell.

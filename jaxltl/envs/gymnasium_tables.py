@@ -19,10 +19,10 @@ def from_gymnasium(
     labels: Mapping[str, Sequence[int]] | None = None,
     initial: ArrayLike | None = None,
 ) -> SparseMDP:
-    """The model that an environment's own table of transitions describes.
+    """The MDP of an environment's transition table.
 
     `env.unwrapped.P[s][a]` lists branches ``(probability, next state, reward, terminated)``. A
-    branch that terminates goes to an absorbing state of its own, so that nothing is earned or
+    branch that terminates goes to a separate absorbing state, so that nothing is earned or
     visited after the end: states from S on, one for each state in which an episode can end,
     labelled ``"terminated"`` and with the labels of that state. Branches of a row to one state
     become one, with their probabilities' sum and their rewards' mean. A limit on the number of
@@ -80,7 +80,7 @@ def from_gymnasium(
 
 
 def _made(env: Any) -> Any:
-    """The environment itself, made if its id is given."""
+    """The environment, made if an id is given."""
     if isinstance(env, str):
         try:
             import gymnasium
@@ -161,7 +161,7 @@ def _branch(place: str, branch: Any, table: Sized) -> tuple[float, int, float, b
 def _labels(
     given: Mapping[str, Sequence[int]], ended: np.ndarray, count: int
 ) -> dict[str, list[int]]:
-    """Where each proposition holds; an added state has the labels of the one that it stands for."""
+    """Labels by proposition; an added state has the labels of its original."""
     found: dict[str, list[int]] = {}
     for name, states in given.items():
         wrong = [s for s in states if not 0 <= s < count]

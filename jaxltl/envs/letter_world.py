@@ -2,7 +2,7 @@
 
 As published there and used by Jackermeier and Abate (2025, appendix): 7 x 7 cells whose opposite
 sides are joined, each of 12 letters on two of them, four moves that always succeed, and 75 steps.
-An episode has a map of its own. The agent starts on an empty cell from which every cell is reached
+Each episode has a new map. The agent starts on an empty cell from which every cell is reachable
 across empty ones, so that no task has to step on a letter that it does not name. What is seen is
 the map with the agent in its middle: one plane for each letter, and one for the agent.
 
@@ -42,7 +42,7 @@ _NAMES = "abcdefghijklmnopqrstuvwxyz"
 
 @brief
 class LetterState(NamedTuple):
-    """A map and a place on it.
+    """State of a letter world: a map and a place.
 
     Attributes:
       letter: ``int8[C]``, the number of each cell's letter, or that of the letters for none; cells
@@ -72,7 +72,7 @@ def letter_world(
     num_maps: int = 1024,
     seed: int = 0,
 ) -> Environment:
-    """The letter world, with a map drawn for each episode or with one that is given.
+    """LetterWorld with a random map per episode, or with a given map.
 
     Actions are up, down, left and right; there is no reward. Observations are ``float32[size, size,
     letters + 1]`` of zeros and ones, rolled so that the agent is in the middle, which is what the
@@ -87,7 +87,7 @@ def letter_world(
         ``.`` for empty cells, or ``int[size, size]``, numbers of letters, -1 for none. It decides
         the size, and by the letters in it what `letters` must at least have.
       start: the cell in which a given layout is begun; default any that is empty.
-      connected: draw maps all of whose cells are reached across empty ones.
+      connected: draw maps whose cells are all reachable across empty ones.
       flat: observations as one axis.
       num_maps: how many sets of cells are drawn, for connected maps; each has eight turns and
         reflections, and ``(letters * copies)! / copies!^letters`` ways to be lettered.
@@ -165,7 +165,7 @@ def _names(letters: int | Sequence[str]) -> tuple[str, ...]:
 def _given(
     layout: str | ArrayLike, names: tuple[str, ...], letters: Any
 ) -> tuple[np.ndarray, int, tuple[str, ...]]:
-    """The letters of a given map's cells, its size, and their names."""
+    """Letters of the cells of a given map, its size, and the names."""
     if isinstance(layout, str):
         cells = parse_map(layout)
         found = [str(x) for x in np.unique(cells) if x != "."]
@@ -199,7 +199,7 @@ def _given(
 
 
 def connected_cells(size: int, used: int, count: int, seed: int = 0) -> np.ndarray:
-    """``bool[count, C]``: uniform sets of `used` cells that leave every cell within reach.
+    """``bool[count, C]``: uniform sets of `used` cells whose complement is connected.
 
     From any cell that is not in the set every cell of the torus is reached through such cells;
     those of the set are where ways may end.
@@ -255,7 +255,7 @@ def is_connected(used: np.ndarray) -> np.ndarray:
 
 
 def _orders(maps: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Turned and reflected: which letter stands in a cell (the last number: none), and all empty
+    """Symmetries of the torus: letter of each cell (the last number: none), and all empty
     cells."""
     grids = maps.reshape(-1, size, size)
     turned = [np.rot90(grids, k, (1, 2)) for k in range(4)]
@@ -274,7 +274,7 @@ def _neighbors(size: int) -> np.ndarray:
 
 
 def _views(size: int) -> np.ndarray:
-    """Of each place, which cell is seen where, as ``uint8[C, C]`` or ``int32``."""
+    """Cell seen at each position of the view, by place, as ``uint8[C, C]`` or ``int32``."""
     row, column = np.divmod(np.arange(size * size), size)
     here = row[:, None] + row - size // 2, column[:, None] + column - size // 2
     return (here[0] % size * size + here[1] % size).astype(np.int32)
@@ -342,7 +342,7 @@ def _labels(numbers: chex.Array, world: LetterState) -> jax.Array:
 
 
 def events_seen(observation: jax.Array) -> jax.Array:
-    """``float[size, size, letters + 1]``: which event each cell of an observation is, that without
+    """``float[size, size, letters + 1]``: one-hot events of the cells of an observation, the one without
     a letter first, as :func:`~jaxltl.core.environments.sequence_task.make_events` numbers them.
 
     Example:

@@ -52,7 +52,7 @@ class LQR:
 
 @brief
 class Run(NamedTuple):
-    """One run of a policy, with the lanes of its parameters as last axes.
+    """A trajectory of a policy, with lanes of parameters as last axes.
 
     Attributes:
       state: ``float[N + 1, n]``.
@@ -69,7 +69,7 @@ class Run(NamedTuple):
 
 @brief
 class Optimum(NamedTuple):
-    """The best controls, on the host in float64.
+    """Optimal controls in float64 NumPy arrays.
 
     Attributes:
       total: J.
@@ -96,7 +96,7 @@ def lqr(
     horizon: int = 20,
     scale: float | None = None,
 ) -> LQR:
-    """A regulator problem (4.17); by default the dissertation's.
+    """A regulator problem, equation (4.17); the defaults are the dissertation's.
 
     Args:
       dynamics, control: A ``[n, n]`` and B ``[n, m]``.
@@ -202,7 +202,7 @@ def _evaluate(
 
 
 def simulate(world: LQR, network: Network | str, parameters: jax.Array) -> Run:
-    """The run of a policy, or of many.
+    """Trajectories of one or many policies.
 
     Args:
       world: from :func:`lqr`.
@@ -237,7 +237,7 @@ def _simulate(network: Network, world: LQR, parameters: jax.Array) -> Run:
 
 
 def _plain(network: Network, world: LQR, parameters: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Only J and the violation. The loop is not unrolled: that was up to a hundred times slower,
+    """J and the violation only. The loop is not unrolled: unrolling was up to a hundred times slower,
     since whole chains of steps were then computed again for every number that they lead to."""
     world = _as(world, parameters)
     _, total, violation = lax.fori_loop(
@@ -250,7 +250,7 @@ def _plain(network: Network, world: LQR, parameters: jax.Array) -> tuple[jax.Arr
 
 
 def _as(world: LQR, parameters: jax.Array) -> LQR:
-    """The world in the precision of the parameters."""
+    """The problem in the dtype of the parameters."""
     dtype = jnp.promote_types(parameters.dtype, jnp.float32)
     return jax.tree.map(lambda x: jnp.asarray(x, dtype), world)
 
@@ -273,7 +273,7 @@ def _step(
 def _after(
     world: LQR, state: jax.Array, control: jax.Array, total: jax.Array, violation: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """The next state, J so far, and the largest violation so far."""
+    """The next state, accumulated J and largest violation."""
     beside = (1,) * (control.ndim - 1)
     state = _times(world.dynamics, state) + _times(world.control, control)
     total = total + _square(world.state_cost, state) + _square(world.control_cost, control)
@@ -292,7 +292,7 @@ def _square(matrix: jax.Array, x: jax.Array) -> jax.Array:
 
 
 def _finished(total: jax.Array, violation: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Infinite where an overflow has left no number."""
+    """Replaces NaN after an overflow by infinity."""
     lost = ~jnp.isfinite(total) | ~jnp.isfinite(violation)
     return jnp.where(lost, jnp.inf, total), jnp.where(lost, jnp.inf, violation)
 
@@ -320,7 +320,7 @@ def _lanes_last(
 
 @brief
 class Plant(NamedTuple):
-    """A regulator on its way.
+    """State of the regulator as an environment.
 
     Attributes:
       state: ``float[n]``.
@@ -392,7 +392,7 @@ def _controlled(world: LQR, plant: Plant, control: jax.Array, key: Any) -> Times
 
 
 def optimum(world: LQR) -> Optimum:
-    """The best controls, of any policy with or without memory, and their cost.
+    """Optimal control sequence over all policies, and its cost.
 
     With the states written in terms of the controls, J is a sum of squares ``|M u + c|^2`` under
     bounds: a strictly convex problem, solved by an active-set method (Stark and Parker 1995)

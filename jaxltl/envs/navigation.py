@@ -1,4 +1,4 @@
-"""A robot that steers to a goal with local sensors alone (dissertation, section 4.5.2).
+"""Navigation of a robot with local sensors to a goal (dissertation, section 4.5.2).
 
 The robot has a position and a heading ``(x, y, heading)``; an action is a speed and a turn.
 In a step it goes ``speed * time_step`` along its heading, stopped by the bounds of the map, and
@@ -22,7 +22,7 @@ task  J                                          Z                              
                                                  obstacle is not
 ====  =========================================  ==================================  =====
 
-The dissertation tells no geometry but by its figure 9; the numbers here are read off it.
+The dissertation gives the geometry only in figure 9, from which these numbers are read.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ class Run(NamedTuple):
 
 @struct.dataclass
 class _Static:
-    """What is not traced among arguments that are."""
+    """Static arguments of traced functions."""
 
     value: Any = struct.field(pytree_node=False)
 
@@ -190,7 +190,7 @@ def _box(name: str, corners: ArrayLike) -> np.ndarray:
 
 
 def policy_network(world: Navigation, hidden: Sequence[int] = (30, 30)) -> Network:
-    """The dissertation's: ReLU layers with biases, and tanh to a speed and a turn.
+    """The dissertation's policy network: ReLU layers with biases, tanh to speed and turn.
 
     Args:
       world: from :func:`navigation`.
@@ -212,7 +212,7 @@ def policy_network(world: Navigation, hidden: Sequence[int] = (30, 30)) -> Netwo
 def start_states(
     world: Navigation, key: chex.PRNGKey, shape: tuple[int, ...] = (), dtype: Any = None
 ) -> State:
-    """First states, uniform in the box of starts and in their heading.
+    """Initial states, uniform in the start box and in the heading.
 
     Args:
       world: from :func:`navigation`.
@@ -272,7 +272,7 @@ def _wrapped(angle: jax.Array) -> jax.Array:
 
 
 def observe(world: Navigation, state: State) -> jax.Array:
-    """What the robot reads.
+    """Sensor readings of the robot.
 
 
     The labels of the M points, circle by circle, and then the direction of the goal's centre as
@@ -312,7 +312,7 @@ def _inside(box: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
 
 
 def _as(world: Navigation, like: jax.Array) -> Navigation:
-    """The world in the precision of an array."""
+    """The world in the dtype of an array."""
     dtype = jnp.promote_types(jnp.asarray(like).dtype, jnp.float32)
     return jax.tree.map(lambda x: jnp.asarray(x, dtype), world)
 
@@ -321,7 +321,7 @@ def _as(world: Navigation, like: jax.Array) -> Navigation:
 
 
 def labels(world: Navigation, state: State) -> jax.Array:
-    """Which of :data:`PROPOSITIONS` hold; boxes contain their edges.
+    """Truth of :data:`PROPOSITIONS`; boxes are closed.
 
     Args:
       world: from :func:`navigation`.
@@ -341,7 +341,7 @@ def labels(world: Navigation, state: State) -> jax.Array:
 
 
 def obstacle_distance(world: Navigation, state: State) -> jax.Array:
-    """The signed distance from the obstacle, negative inside of it.
+    """The signed distance from the obstacle, negative inside.
 
     Args:
       world: from :func:`navigation`.
@@ -366,7 +366,7 @@ def obstacle_distance(world: Navigation, state: State) -> jax.Array:
 
 
 def reward(world: Navigation, state: State) -> jax.Array:
-    """What one state adds to the J of tasks 1 and 4.
+    """Contribution of one state to J in tasks 1 and 4.
 
     Args:
       world: from :func:`navigation`.
@@ -386,7 +386,7 @@ def reward(world: Navigation, state: State) -> jax.Array:
 
 
 def scores(world: Navigation, state: State, task: int) -> tuple[jax.Array, jax.Array]:
-    """J and Z of trajectories in one of the four tasks.
+    """Objective J and cost Z of trajectories in one of the four tasks.
 
     Args:
       world: from :func:`navigation`.

@@ -1,4 +1,4 @@
-"""The navigation tasks as environments, for learners that are paid by the step.
+"""The navigation tasks as environments with a reward in every step.
 
 :mod:`~jaxltl.envs.navigation` scores whole trajectories. Here each step pays what its state adds:
 rewards and costs are the increments of J and Z along the trajectory, so that their sums are J and
@@ -23,7 +23,7 @@ from jaxltl.envs.navigation import Navigation, State
 
 
 class Place(NamedTuple):
-    """A robot on its way, in arrays without axes.
+    """State of the environment, in scalars.
 
     Attributes:
       state: where the robot is; it has not been paid for this yet.
@@ -48,7 +48,7 @@ class Place(NamedTuple):
 
 @struct.dataclass
 class _Settings:
-    """The task is traced, so that one compiled learner does for all four."""
+    """Settings; the task is traced, so that one compiled program serves all four."""
 
     task: jax.Array
     absorbing: jax.Array

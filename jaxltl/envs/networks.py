@@ -40,7 +40,7 @@ ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {
 @brief
 @struct.dataclass
 class Network:
-    """The shape of a network; it holds no numbers. Made by :func:`make_network`.
+    """Sizes and activations of a network without its parameters; made by :func:`make_network`.
 
     Attributes:
       sizes: the inputs, the nodes of each hidden layer, and the outputs.
@@ -66,7 +66,7 @@ def make_network(
     output: str = "identity",
     biases: bool = True,
 ) -> Network:
-    """A checked network.
+    """A validated network.
 
     Args:
       sizes: such as ``"2-10-10-1"`` or ``(2, 10, 10, 1)``: inputs, hidden layers, outputs.
@@ -100,7 +100,7 @@ def make_network(
 
 
 def num_parameters(sizes: Sequence[int], biases: bool = True) -> int:
-    """``sum_l (n_l + [biases]) * n_(l+1)``, how many numbers a network of these sizes has.
+    """``sum_l (n_l + [biases]) * n_(l+1)``, the number of parameters.
 
     Args:
       sizes: of the layers, from the inputs on.
@@ -157,7 +157,7 @@ def layers(network: Network, parameters: jax.Array) -> Layers:
 
 
 def apply(network: Network, parameters: jax.Array, inputs: jax.Array) -> jax.Array:
-    """What one network answers, ``a(h(x W_1 + b_1) ... W_n + b_n)``.
+    """Output of one network, ``a(h(x W_1 + b_1) ... W_n + b_n)``.
 
     Args:
       network: from :func:`make_network`.
@@ -180,7 +180,7 @@ def apply(network: Network, parameters: jax.Array, inputs: jax.Array) -> jax.Arr
 
 
 def apply_layers(network: Network, parts: Layers, inputs: jax.Array) -> jax.Array:
-    """:func:`apply` with parameters that :func:`layers` has taken apart.
+    """:func:`apply` with parameters split by :func:`layers`.
 
     For loops: inside of one the parameters of many policies would be copied in every pass.
 
@@ -213,7 +213,7 @@ def apply_layers(network: Network, parts: Layers, inputs: jax.Array) -> jax.Arra
 
 
 def padded(parts: Layers, multiple: int = 16) -> Layers:
-    """The same network with hidden layers as wide as the processor likes; outputs are the same.
+    """An equivalent network with hidden layers padded to multiples of the vector width.
 
     The new nodes are zero, and so is what the next layer makes of them, with any activation that
     is 0 at 0. For loops over small products of matrices.
@@ -283,7 +283,7 @@ def _activations(network: Network) -> list[Callable[[jax.Array], jax.Array]]:
 
 
 def weighted(weight: jax.Array, inputs: jax.Array) -> jax.Array:
-    """``sum_i w(i, o) x(i)`` in each lane, by a written-out sum over i.
+    """``sum_i w(i, o) x(i)`` in each lane, by an unrolled sum over i.
 
     A reduction over a leading axis would be compiled to a loop that jumps through memory; a sum
     of rows is read in the order of memory, several lanes at once.
@@ -317,7 +317,7 @@ def network_agent(network: Network, environment: Environment) -> Partial:
 
     Args:
       network: from :func:`make_network`.
-      environment: what it is to act in.
+      environment: the environment of the agent.
 
     Returns:
       A function of parameters, a pytree, that gives an

@@ -1,4 +1,4 @@
-"""Two post offices and a signal light: a game whose reward does not do its task.
+"""Two post offices and a signal light: a game whose reward conflicts with its task.
 
 The example of the dissertation's section 6.7. State ``(cell * 2 + light) * 2 + turn``: cells
 are numbered in rows from the upper left, 0 to 8; `light` is 1 where the light is on, and
@@ -82,7 +82,7 @@ def post_offices() -> Game:
 
 
 def surveillance() -> Automaton:
-    """Visit both post offices again and again: ``G F p1 & G F p2`` (dissertation, figure 17a).
+    """Visit both post offices infinitely often: ``G F p1 & G F p2`` (dissertation, figure 17a).
 
     A deterministic Buchi automaton that first waits in ``q1``; ``q2`` has seen p1 and waits
     for p2, ``q3`` has seen p2 and waits for p1; ``q4``, in which both have been seen, is
@@ -108,7 +108,7 @@ def surveillance() -> Automaton:
 
 
 def patrol_reward(game: Any) -> jax.Array:
-    """What the system is paid for patrolling the dangerous block.
+    """Reward of the system for patrolling the dangerous block.
 
 
     1 for a move into the block that the light marks as dangerous, and for a move inside it
@@ -151,7 +151,7 @@ def patrol_reward(game: Any) -> jax.Array:
 
 
 def _paid_moves() -> np.ndarray:
-    """Whether a move is paid, by the light, the cell and the next cell: ``bool[2, 9, 9]``."""
+    """Rewarded moves by light, cell and next cell: ``bool[2, 9, 9]``."""
     paid = np.zeros((2, _CELLS, _CELLS), bool)
     for light, block in enumerate(_ROUND):
         inside = np.isin(np.arange(_CELLS), block)
@@ -162,7 +162,7 @@ def _paid_moves() -> np.ndarray:
 
 @brief
 class Patrol(NamedTuple):
-    """The game with its task's memory, as it is learned; states are ``world * 4 + memory``.
+    """The product of the game with its task; states are ``world * 4 + memory``.
 
     Attributes:
       game: an explicit game of all 144 states; runs start in any cell under any light, the
@@ -181,7 +181,7 @@ class Patrol(NamedTuple):
 
 
 def patrol() -> Patrol:
-    """The game of the post offices beside the automaton of its task (dissertation, 6.7).
+    """The product of the post office game with the automaton of its task (dissertation, 6.7).
 
     The automaton reads the label of the state that is left, at both turns. The system can
     visit both post offices for ever from every state; the best patrol visits neither.

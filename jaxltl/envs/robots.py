@@ -1,4 +1,4 @@
-"""Games of two robots that move in turns on a grid, and a game whose reward opposes its task.
+"""Turn-based games of two robots on a grid, and a game whose reward conflicts with its task.
 
 State ``(environment * C + system) * 2 + turn``, where `environment` and `system` are the
 numbers of the robots' places, 0 to C - 1, and `turn` is 1 where the system moves; so
@@ -189,7 +189,7 @@ def places(text: str, *, wall: str = "#") -> np.ndarray:
 
 
 def arrival_reward(game: Any, condition: States) -> jax.Array:
-    """The chance that the system's move arrives where a condition holds: ``float[S, A]``.
+    """Probability that the system's move leads to a state of a set: ``float[S, A]``.
 
     ``R(s, a) = sum_t P(t | s, a) [t satisfies the condition]`` where the system moves, and 0
     where the environment does and for unavailable actions.
@@ -216,7 +216,7 @@ def arrival_reward(game: Any, condition: States) -> jax.Array:
 
 
 def diagonal_reward(game: Any) -> jax.Array:
-    """1 where the system's move arrives diagonally to the environment, else 0.
+    """Reward 1 for moves of the system to a cell diagonal to the environment.
 
 
     The instantaneous reward of the dissertation, section 5.5; see :func:`arrival_reward`.
@@ -237,7 +237,7 @@ def diagonal_reward(game: Any) -> jax.Array:
 
 
 def reward_against_task() -> tuple[Game, jax.Array]:
-    """A game whose reward is best collected by never doing the task (dissertation, figure 12).
+    """A game whose reward is maximal when the task is never satisfied (dissertation, figure 12).
 
     The system alone moves. In state 0 the action 0 stays and the action 1 goes to state 1,
     each for a reward of 10; in state 1, where ``b2`` holds, the action 2 stays for nothing.
@@ -276,7 +276,7 @@ class _Moves(NamedTuple):
 
 
 def _moves(world: MDP, cells: np.ndarray) -> _Moves:
-    """The moves of a robot in a grid world, staying included; places are ``cells[0], ...``."""
+    """Moves of a robot in a gridworld with staying; places are ``cells[0], ...``."""
     count = cells.size
     number = np.zeros(world.num_states, np.int32)
     number[cells] = np.arange(count)
@@ -317,7 +317,7 @@ def _start(
     label: np.ndarray,
     propositions: tuple[str, ...],
 ) -> np.ndarray:
-    """The places in which a robot may start: ``bool[C]``."""
+    """Initial places of a robot: ``bool[C]``."""
     if where is None:
         return np.ones(len(position), bool)
     if isinstance(where, str):
@@ -348,7 +348,7 @@ def _start(
 
 
 def _different(environment: np.ndarray, system: np.ndarray) -> np.ndarray:
-    """The distribution ``float[C, C]`` on pairs of different places."""
+    """Uniform distribution ``float[C, C]`` on pairs of distinct places."""
     pairs = environment[:, None] & system & ~np.eye(system.size, dtype=bool)
     if not pairs.any():
         raise ValueError("the robots can only start in one and the same cell; give them two.")

@@ -1,4 +1,4 @@
-"""Coloured grid worlds whose objects are to be visited in an order.
+"""Coloured gridworlds with objects to visit in a given order.
 
 The temporal grid-world of the dissertation, section 3.5. Each cell has one of five colours, and
 what a cell *is* follows from the colours of the 3 x 3 patch around it: an object, an obstacle, or
@@ -57,7 +57,7 @@ INCOMPLETE = "(!o2 & !o3) U (o1 & ((!o3) U (o2 & F o3)))"
 @brief
 @struct.dataclass
 class World:
-    """A coloured grid world; made by :func:`make_world` and its relatives.
+    """A coloured gridworld; made by :func:`make_world` and similar functions.
 
     Attributes:
       mdp: the world as an MDP, its labels the kinds of cells, and starting uniformly in cells
@@ -83,7 +83,7 @@ def colored_world(
     margin: int = 1,
     slip: float = 0.0,
 ) -> World:
-    """The world of given colours.
+    """A world from an array of colours.
 
     Args:
       colors, objects, obstacles, margin: see :func:`categories`.
@@ -137,7 +137,7 @@ def make_world(
     margin: int = 1,
     slip: float = 0.0,
 ) -> World:
-    """A world with objects and obstacles in given cells, and random colours elsewhere.
+    """A world with objects and obstacles in given cells and random colours elsewhere.
 
     The most frequent colours of a kind come first on the cross of its patch, centre and corners,
     so that 5 and 4 cells make the pattern X. Other cells are drawn uniformly, and again where they
@@ -201,7 +201,7 @@ def _check_shape(shape: Sequence[int]) -> None:
 
 
 class _Family(NamedTuple):
-    """What all random worlds of a family share."""
+    """Parameters shared by a family of random worlds."""
 
     blank: MDP
     successor: NDArray[Any]  # [S, A, K]
@@ -224,7 +224,7 @@ def random_worlds(
     slip: float = 0.0,
     max_tries: int = 1000,
 ) -> list[World]:
-    """Worlds with one of each object and some obstacles in random cells, in each of which the
+    """Random worlds with one of each object and several obstacles, in each of which the
     task can be done from every distractor cell.
 
     Args:
@@ -280,7 +280,7 @@ def random_worlds(
 
 
 def random_world(seed: int, task: Task = COMPLETE, **options: Any) -> World:
-    """One world of :func:`random_worlds`, which takes the same options.
+    """One world of :func:`random_worlds`, with the same options.
 
     Args:
       seed: of the world.
@@ -302,7 +302,7 @@ def random_world(seed: int, task: Task = COMPLETE, **options: Any) -> World:
 
 
 def _on_kinds(task: Task, kinds: Kinds) -> tuple[Automaton, NDArray[np.int32]]:
-    """The task's automaton, and its memory after each kind of cell ``[P + 1, Q]``."""
+    """The task's automaton, and its transition table by cell kind ``[P + 1, Q]``."""
     names = [name for name, _ in kinds]
     if isinstance(task, str | Formula):
         formula = parse_ltl(task) if isinstance(task, str) else task
@@ -325,7 +325,7 @@ def _is_feasible(family: _Family, kind: NDArray[np.int32]) -> bool:
             propositions=tuple(name for name, _ in family.kinds),
         )
         return not np.asarray(infeasible_starts(product(world, task, label_on="exit"))).any()
-    # The last row of the table is of cells of no kind, whose number is -1.
+    # The last row of the table is for cells without a kind, number -1.
     can = _can_finish(family.successor, family.step[flat], np.asarray(task.final))
     return bool(can[flat < 0, int(task.initial)].all())
 
@@ -333,7 +333,7 @@ def _is_feasible(family: _Family, kind: NDArray[np.int32]) -> bool:
 def _can_finish(
     successor: NDArray[Any], step: NDArray[Any], final: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """From which world and memory states some run reaches final memory: ``bool[S, Q]``.
+    """World and memory states from which acceptance is reachable: ``bool[S, Q]``.
 
     In NumPy, for thousands of tries; a step reads the cell that it leaves.
 
@@ -355,7 +355,7 @@ def _can_finish(
 
 
 def patches(world: World, radius: int = 1) -> jax.Array:
-    """The colours around each cell.
+    """Colours of the patch around each cell.
 
     Args:
       world: the world.
@@ -388,7 +388,7 @@ def _patches(colors: jax.Array, rows: int, columns: int, margin: int, radius: in
 
 
 def observations(world: World, radius: int = 1) -> jax.Array:
-    """The colours around each cell, one-hot.
+    """One-hot colours of the patch around each cell.
 
 
     ``O = (2 * radius + 1)**2 * 5``: row by row, for each cell one number for each colour. Reshaped
@@ -414,7 +414,7 @@ def observations(world: World, radius: int = 1) -> jax.Array:
 
 
 def _distance(automaton: Any) -> jax.Array:
-    """Letters to read to a final state, at least: ``float[Q]``, infinite where the task failed."""
+    """Distance to a final state in letters: ``float[Q]``, infinite after a violation."""
     delta, final = jnp.asarray(automaton.delta), jnp.asarray(automaton.final)
 
     def sweep(_: int, distance: jax.Array) -> jax.Array:
@@ -425,7 +425,7 @@ def _distance(automaton: Any) -> jax.Array:
 
 
 def is_over(model: Product) -> jax.Array:
-    """Where the task is done or cannot be done any more, by the automaton alone.
+    """Memory states in which the task is satisfied or violated.
 
     Args:
       model: the product of a world and a co-safe task.
@@ -453,7 +453,7 @@ def expert_reward(
     won: jax.Array | float = 3.0,
     lost: jax.Array | float = -3.0,
 ) -> jax.Array:
-    """The reward of one who knows the task.
+    """Reward of an expert, from the distance to acceptance.
 
 
     Each step has one of five rewards. While the task is open: `progress` if the automaton moves
@@ -526,7 +526,7 @@ def expert_policy(
 def demonstrations(
     key: chex.PRNGKey, model: Product, policy: jax.Array, num: int, horizon: int = 100
 ) -> Trajectories:
-    """Runs of a policy in the world, cut where the task is done or has failed.
+    """Trajectories of a policy, cut where the task is satisfied or violated.
 
     Args:
       key: a PRNG key, consumed.

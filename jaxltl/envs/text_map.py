@@ -1,4 +1,4 @@
-"""Text maps: one word or character for each cell."""
+"""Text maps: one word or character per cell."""
 
 from __future__ import annotations
 
@@ -36,6 +36,6 @@ def parse_map(text: str) -> np.ndarray:
 
 
 def plain_kind(cells: np.ndarray) -> str:
-    """The kind of cell that shows nothing: ``.``, or the most frequent."""
+    """The plain cell kind: ``.``, or the most frequent one."""
     names, counts = np.unique(cells, return_counts=True)
     return "." if "." in names else str(names[np.argmax(counts)])

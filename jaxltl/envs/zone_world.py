@@ -9,7 +9,7 @@ The robot here is that point as a formula. Its thrust is limited to ``.3 * .05``
 damping of .01 and its mass, ``4/3 pi .1^3 + .1^3`` at a density of one: it tends to 1.5 units a
 second with a time constant of .52 seconds. Its turning adapts within 6 milliseconds, which is taken
 for at once: ``3.16 * turn`` radians a second, at most 3. A step is .02 seconds, integrated exactly
-but for the turn, whose middle is taken. Readings: walls stop what runs into them, without
+but for the turn, whose middle is taken. Readings: walls stop the robot, without
 bouncing; their four sensors read how near they are; and sensors that never change are left out.
 """
 
@@ -39,7 +39,7 @@ _BINS = 16
 
 @brief
 class ZoneState(NamedTuple):
-    """A robot among zones.
+    """State of a zone world.
 
     Attributes:
       place, velocity: ``float32[2]``, in the frame of the walls.
@@ -86,7 +86,7 @@ def zone_world(
     num_maps: int = 1024,
     seed: int = 0,
 ) -> Environment:
-    """The zone world.
+    """ZoneEnv as an environment.
 
     Actions are ``float32[2]`` in [-1, 1], thrust and turn. Observations are ``float32[16 P + 11]``:
     for each colour how near the nearest zone is in each direction, ``exp(-d / 2)``, counted from
@@ -169,7 +169,7 @@ def zone_world(
 
 
 def draw_places(count: int, extent: float, num_maps: int, seed: int = 0) -> np.ndarray:
-    """``float64[M, count + 1, 2]``: zones, and the robot last, drawn one after the other.
+    """``float64[M, count + 1, 2]``: random places of zones, and of the robot last.
 
     Each is uniform in the square but for its keepout (.55 of a zone, .4 of the robot), and tried
     again where it is nearer to an earlier one than both keepouts; a map on which something finds no
@@ -255,7 +255,7 @@ def _move(n: _Numbers, world: ZoneState, action: Any, key: chex.PRNGKey) -> Time
 
 
 def _own_frame(heading: jax.Array, vector: jax.Array) -> jax.Array:
-    """``float[..., 2]`` as parts ahead and to the left."""
+    """``float[..., 2]`` in the frame of the robot: ahead, to the left."""
     x, y = _ahead(heading)
     return jnp.stack(
         [vector[..., 0] * x + vector[..., 1] * y, vector[..., 1] * x - vector[..., 0] * y], axis=-1
@@ -263,7 +263,7 @@ def _own_frame(heading: jax.Array, vector: jax.Array) -> jax.Array:
 
 
 def _lidar(n: _Numbers, world: ZoneState) -> jax.Array:
-    """``float32[P, 16]``: bin i is the front's i-th sixteenth of a turn to the left."""
+    """``float32[P, 16]``: lidar with bin i at the i-th sixteenth of a turn to the left."""
     seen = _own_frame(world.heading, world.zone - world.place)
     near = jnp.exp(-n.gain * jnp.linalg.norm(seen, axis=-1))
     turn = jnp.arctan2(seen[..., 1], seen[..., 0]) / (2 * np.pi) * _BINS % _BINS

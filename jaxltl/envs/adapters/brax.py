@@ -30,7 +30,7 @@ def from_brax(
     labels: Callable[..., jax.Array] | None = None,
     propositions: Sequence[str] = (),
 ) -> Environment:
-    """A Brax environment, without the wrappers that start anew or make batches.
+    """A Brax environment without its auto-reset and batch wrappers.
 
     Its ``done`` terminates. Brax limits the length of episodes by its ``EpisodeWrapper`` alone:
     ``with_time_limit(from_brax(env), 1000)`` does, or that wrapper, whose ``info["truncation"]``

@@ -1,4 +1,4 @@
-"""What the adapters of other packages' environments share."""
+"""Shared parts of the adapters of other packages' environments."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from jaxltl.core.pretty_print import brief
 
 @jax.tree_util.register_static
 class Held:
-    """An object of a package within a tree: no arrays, and the same where it is the same object.
+    """A static pytree leaf that holds an object of a package, compared by identity.
 
     Attributes:
       it: the object; many are not hashable, or compare by arrays.
@@ -38,11 +38,11 @@ class Held:
 
 @brief
 class Seen(NamedTuple):
-    """A world of a package that returns its observations beside its state.
+    """The state of an environment together with its last observation.
 
     Attributes:
       state: the package's.
-      observation: what was returned with it.
+      observation: the observation returned with it.
     """
 
     state: Any
@@ -50,7 +50,7 @@ class Seen(NamedTuple):
 
 
 def package(name: str) -> Any:
-    """A module of another package, imported.
+    """Imports a module of another package.
 
     Raises:
       ImportError: it cannot be; with the command that installs it.
@@ -68,7 +68,7 @@ def package(name: str) -> Any:
 
 
 def require_environment(root: str, env: Any, kinds: Any, remedy: str) -> None:
-    """Refuses what is no environment of a package."""
+    """Raises ValueError unless the argument is an environment of the package."""
     if not isinstance(env, kinds):
         kind = type(env)
         raise ValueError(
@@ -78,7 +78,7 @@ def require_environment(root: str, env: Any, kinds: Any, remedy: str) -> None:
 
 
 def params_of(root: str, params: Any, own: Any) -> Any:
-    """The parameters that are given, or the environment's own; refuses those of another type."""
+    """The given parameters or the environment's default ones; ValueError for another type."""
     if params is None:
         return own
     if not isinstance(params, type(own)):
@@ -91,7 +91,7 @@ def params_of(root: str, params: Any, own: Any) -> Any:
 
 @contextlib.contextmanager
 def own_errors(root: str, env: Any) -> Iterator[None]:
-    """What a package's own functions raise when they are traced, told as its own."""
+    """Context manager that attributes errors raised while tracing to the package."""
     try:
         yield
     except ValueError:
@@ -106,7 +106,7 @@ def own_errors(root: str, env: Any) -> Iterator[None]:
 
 
 def refuse_wrappers(root: str, env: Any, attribute: str, kinds: Any, remedy: str) -> None:
-    """Refuses an environment that starts anew by itself, or is a batch, in any of its layers."""
+    """Raises ValueError for auto-reset or batch wrappers in any layer of an environment."""
     for layer in layers(env, attribute):
         if isinstance(layer, kinds):
             raise ValueError(
@@ -116,19 +116,19 @@ def refuse_wrappers(root: str, env: Any, attribute: str, kinds: Any, remedy: str
 
 
 def layers(env: Any, attribute: str) -> Iterator[Any]:
-    """An environment, what it wraps, and so on."""
+    """An environment and the environments that it wraps, outermost first."""
     while env is not None:
         yield env
         env = vars(env).get(attribute) if hasattr(env, "__dict__") else None
 
 
 def copied(tree: Any) -> Any:
-    """The same tree in new containers: some packages write into those that they are given."""
+    """A copy of the containers of a tree, since some packages modify their arguments."""
     return jax.tree.map(lambda x: x, tree)
 
 
 def arrays(tree: Any, like: Any = None) -> Any:
-    """The leaves as arrays whose types are not weak: of another tree, or their own.
+    """Leaves as arrays with strong dtypes, those of a reference tree if given.
 
     A tree of another structure is returned as it is, for the checks to tell.
     """
@@ -147,7 +147,7 @@ def arrays(tree: Any, like: Any = None) -> Any:
 
 
 def timestep(world: Any, before: Any, reward: Any, terminated: Any, truncated: Any) -> Timestep:
-    """A :class:`Timestep` of the types that the protocol asks for; costs are zero."""
+    """A :class:`Timestep` with the dtypes of the protocol and zero costs."""
     return Timestep(
         arrays(world, before),
         jnp.asarray(reward, jnp.result_type(float)),
@@ -158,7 +158,7 @@ def timestep(world: Any, before: Any, reward: Any, terminated: Any, truncated: A
 
 
 def labels_of_state(labels: Callable[..., jax.Array] | None) -> Partial | None:
-    """Labels of a world by those of the package's state in it."""
+    """Labelling function of wrapped states from one of the package's states."""
     return None if labels is None else Partial(_label_state, as_partial(labels))
 
 
@@ -167,10 +167,10 @@ def _label_state(labels: Callable[..., jax.Array], world: Any) -> jax.Array:
 
 
 def observation_of(world: Any) -> Any:
-    """What a world holds as its observation."""
+    """The observation stored in a wrapped state."""
     return world.observation
 
 
 def some_allowed(mask: jax.Array) -> jax.Array:
-    """A mask; where nothing is allowed, which is where an episode has ended, everything is."""
+    """An action mask; all actions where it is empty, which happens after the end of an episode."""
     return mask | ~mask.any()

@@ -30,7 +30,7 @@ def from_craftax(
     labels: Callable[..., jax.Array] | None = None,
     propositions: Sequence[str] = (),
 ) -> Environment:
-    """A Craftax environment, by its ``step_env``, which does not start anew.
+    """A Craftax environment, through its ``step_env``, which does not reset.
 
     Craftax has one ``done`` for both ends of an episode. Here it is truncated at
     ``params.max_timesteps``, and terminated if it would be over without that limit. A world is

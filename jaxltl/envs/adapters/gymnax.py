@@ -38,7 +38,7 @@ def from_gymnax(
     labels: Callable[..., jax.Array] | None = None,
     propositions: Sequence[str] = (),
 ) -> Environment:
-    """A gymnax environment, by its ``step_env``, which does not start anew.
+    """A gymnax environment, through its ``step_env``, which does not reset.
 
     An episode is terminated where ``step_env`` says so, and truncated where ``is_truncated`` does.
     A world is a pair of gymnax's ``state`` and ``observation``.
@@ -86,7 +86,7 @@ def from_gymnax(
 
 
 def space_of_actions(root: str, space: Any) -> Finite | Box:
-    """The actions of a space of gymnax's kind."""
+    """Action space from a gymnax space."""
     if hasattr(space, "n"):
         return Finite(int(space.n))
     if hasattr(space, "low") and hasattr(space, "high"):

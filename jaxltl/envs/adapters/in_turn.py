@@ -1,4 +1,4 @@
-"""Actions of several parts, chosen one after the other.
+"""Factored actions whose components are chosen sequentially.
 
 Where N parts have many values each, their combinations are too many to be numbered. A step of the
 package's world is then N steps here: each chooses one part, and the last one moves the world.
@@ -22,7 +22,7 @@ from jaxltl.envs.adapters.common import Held
 
 @brief
 class PartWorld(NamedTuple):
-    """A world and what has been chosen of the action that comes next.
+    """The inner state and the components of the next action chosen so far.
 
     Attributes:
       world: the inner one.
@@ -37,7 +37,7 @@ class PartWorld(NamedTuple):
 
 @brief
 class PartObservation(NamedTuple):
-    """What is seen of the inner world, what has been chosen, and which part comes now.
+    """The inner observation, the components chosen so far, and the index of the current one.
 
     Attributes:
       world: as it is observed.
@@ -61,7 +61,7 @@ def in_turn(
     mask: Callable[..., jax.Array] | None,
     horizon: int | None,
 ) -> Environment:
-    """The environment of N parts of so many values each, whose parts are chosen in turn.
+    """Environment in which the N components of an action are chosen sequentially.
 
     Args:
       counts: values of each part; the actions are the most of them, M.
@@ -129,7 +129,7 @@ def _labels(labels: Callable[..., jax.Array], now: PartWorld) -> jax.Array:
 
 
 def _allowed(counts: Held, mask: Callable[..., jax.Array] | None, now: PartWorld) -> jax.Array:
-    """Values of the part whose turn it is that go with what has been chosen."""
+    """Mask of values of the current component that extend the components chosen so far."""
     most = max(counts.it)
     inside = (jnp.arange(most) < jnp.array(counts.it)[:, None])[now.turn]
     if mask is None:

@@ -73,7 +73,7 @@ def from_jumanji(
     Raises:
       ValueError: no environment of Jumanji, one that starts anew by itself, or a batch; a reward
         for each of several agents; actions that are neither finite nor in a box, have too many
-        combinations, or no parts to be chosen in turn; labels that are not ``bool[P]``.
+        combinations, or no components to choose sequentially; labels that are not ``bool[P]``.
       ImportError: jumanji is not installed.
 
     Example:
@@ -128,7 +128,7 @@ def from_jumanji(
 
 
 def _without_limit(env: Any) -> Any:
-    """A copy of an environment, and of what it wraps, that never runs out of time."""
+    """A copy of an environment without its time limit, in all layers."""
     endless = copy.copy(env)
     for name, found in vars(env).items():
         if name == "_env":
@@ -139,7 +139,7 @@ def _without_limit(env: Any) -> Any:
 
 
 def _parts(env: Any) -> tuple[int, ...] | None:
-    """How many values each part of an action has: () for an action that is a number itself.
+    """Numbers of values of the components of an action; () for a scalar action.
 
     Whole numbers within bounds are such parts too; what a mask of fewer columns leaves out is not
     to be taken.
@@ -171,13 +171,13 @@ def _actions(spec: Any, parts: tuple[int, ...] | None) -> Finite | Box:
 
 
 def _mask_of(env: Any) -> Any:
-    """The shape of the mask that the environment shows, if it shows one."""
+    """Shape of the action mask in observations, or None."""
     seen = jax.eval_shape(lambda key: env.reset(key)[1].observation, jax.random.key(0))
     return getattr(seen, "action_mask", None)
 
 
 def _mask(env: Any, parts: tuple[int, ...] | None) -> Partial | None:
-    """What is allowed, if the environment shows a mask."""
+    """The action mask of an observation, or None."""
     mask = None if parts is None else _mask_of(env)
     if parts is None or mask is None:
         return None
@@ -220,7 +220,7 @@ def _step(
 
 
 def _moved(held: Held, endless: Held, world: Seen, action: Any, key: chex.PRNGKey) -> Timestep:
-    """A step by the package's action, or by its parts as one vector from 0."""
+    """A step with a scalar action, or with a vector of components."""
     del key  # the state has one
     spec = held.it.action_spec
     if spec.shape and jnp.issubdtype(spec.dtype, jnp.integer):

@@ -31,7 +31,7 @@ def from_navix(
 ) -> Environment:
     """A Navix environment.
 
-    Of its step types, termination and truncation are told apart; where both hold, it is terminated.
+    Its step types distinguish termination and truncation; where both hold, the episode is terminated.
     Its own ``step`` starts anew from the last timestep of an episode; here that is never so. A
     world is Navix's timestep, whose state has the key that it draws from; the key of a step is not
     used.

@@ -1,4 +1,4 @@
-"""Games of the package pgx, for one player against a policy."""
+"""Games of the package pgx, for one player against a fixed policy."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from jaxltl.envs.adapters.common import (
 
 @brief
 class Turn(NamedTuple):
-    """A world of a game: the player is to move, or the game is over.
+    """A game state at which the player moves, or the game is over.
 
     Attributes:
       state: Pgx's.
-      owed: what the player earned by moves of others before the first of their own.
+      owed: the player's reward from moves of others before the player's first move.
     """
 
     state: Any
@@ -47,7 +47,7 @@ def from_pgx(
     labels: Callable[..., jax.Array] | None = None,
     propositions: Sequence[str] = (),
 ) -> Environment:
-    """A Pgx game as one player's world, in which all others act by a policy.
+    """A Pgx game as a single-agent environment; the other players follow a fixed policy.
 
     A step is a move of the player and those of the others until it is the player's turn again, or
     the game is over; its reward is what the player earns by all of them. Legal actions are
@@ -59,13 +59,13 @@ def from_pgx(
       opponent: ``(state, key) -> action``, of Pgx's state, which holds the view (`observation`) and
         the `legal_action_mask` of whose turn it is; a function, or a ``Partial`` that hands over
         arrays, such as weights: new ones do not recompile. None for games of one player.
-      player: whom the steps are of. Who begins may be drawn at the reset.
+      player: the index of the learning player. The first player may be random.
       labels: ``state -> bool[P]``, of Pgx's state when it is the player's turn.
       propositions: the names of the labels.
 
     Returns:
       :class:`~jaxltl.core.environments.environment.Environment`; its worlds are pairs of Pgx's ``state``
-      and what is ``owed`` for moves before the player's first.
+      and the reward ``owed`` for moves before the player's first.
 
     Raises:
       ValueError: no environment of Pgx; no opponent, or no such player; labels that are not
@@ -123,7 +123,7 @@ def _step(
 def _await_turn(
     held: Held, player: Any, opponent: Any, state: Any, earned: jax.Array, key: chex.PRNGKey
 ) -> tuple[Any, jax.Array]:
-    """The state in which the player is to move or the game is over, and all that is earned."""
+    """Plays the others' moves until the player moves or the game ends; state and reward."""
     if opponent is None:
         return state, earned
 
@@ -148,7 +148,7 @@ def _await_turn(
 
 
 def _observe(held: Held, player: Any, world: Turn) -> Any:
-    # Its public name shows whose turn it is next alone, who is another where a game has ended.
+    # The public attribute gives the next player, which differs at the end of a game.
     return lax.stop_gradient(held.it._observe(world.state, player))
 
 
