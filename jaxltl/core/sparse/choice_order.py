@@ -1,4 +1,4 @@
-"""The choices of states in the order in which an optimum over them is found fast."""
+"""Order of the choices of states in which an optimum over them is fast."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ _SLICE, _ENTRY, _REDUCTION, _SPAN, _REDUCED = 1000, 0.25, 2000, 20, 0.15
 
 
 class Choices(NamedTuple):
-    """The choices of N states, those of states with the most first.
+    """The choices of N states, states with the most choices first.
 
-    The first choices of all states stand first, in order, then the second ones of those that have
-    two, and so on: so an optimum goes over slices. Where few states have more choices, what is left
-    of these stands state by state, to be reduced at once.
+    The first choices of all states come first, in order, then the second ones of states that have two,
+    and so on, so that an optimum goes over slices. Where few states have further choices, these are
+    listed state by state, for one reduction.
 
     Attributes:
-      states: ``int[N]``, which state each is, in the order that was given.
-      order: ``int[R]``, which choice each is, in the order that was given, state by state.
-      owner: ``int[R]``, whose it is, among `states`.
+      states: ``int[N]``, the number of each state in the original order.
+      order: ``int[R]``, the number of each choice in the original order, state by state.
+      owner: ``int[R]``, the state of each choice, among `states`.
       starts: where the first, second, ... choices begin, and where the last of these end.
       further: ``int[W]``, where after that the further choices of the first W states begin.
     """
@@ -42,15 +42,7 @@ class Choices(NamedTuple):
         return self.order.size == self.states.size
 
     def best(self, quantity: Floats, operation: Any) -> Floats:
-        """The optimum over the choices of each state.
-
-        Args:
-          quantity: ``float64[R]``.
-          operation: ``np.maximum`` or ``np.minimum``.
-
-        Returns:
-          ``float64[N]``; of a chain the quantity itself.
-        """
+        """The optimum over the choices of each state, by ``np.maximum`` or ``np.minimum``."""
         if self.is_chain:
             return quantity
         found = quantity[: self.starts[1]].copy()
@@ -62,7 +54,7 @@ class Choices(NamedTuple):
         return found
 
     def first(self, quantity: Floats, best: Floats) -> Integers:
-        """Where the first choice stands that attains the best of each state: ``int[N]``."""
+        """The first choice that attains the optimum of each state: ``int[N]``."""
         found = np.arange(self.states.size)
         if self.further.size:
             end = self.starts[-1]
@@ -75,17 +67,13 @@ class Choices(NamedTuple):
 
 
 def choices_of(count: Integers) -> Choices:
-    """The order of choices.
+    """The order of choices, from the number of choices of each state ``int[N]``, at least one.
 
-    Args:
-      count: ``int[N]``, how many each state has, at least one.
-
-    Example:
-      >>> choices = choices_of(np.array([1, 2]))
-      >>> choices.states.tolist(), choices.order.tolist()
-      ([1, 0], [1, 0, 2])
-      >>> choices.best(np.array([5.0, 7.0, 6.0]), np.maximum).tolist()
-      [6.0, 7.0]
+    >>> choices = choices_of(np.array([1, 2]))
+    >>> choices.states.tolist(), choices.order.tolist()
+    ([1, 0], [1, 0, 2])
+    >>> choices.best(np.array([5.0, 7.0, 6.0]), np.maximum).tolist()
+    [6.0, 7.0]
     """
     states = np.argsort(-count, kind="stable")
     base, sizes = (count.cumsum() - count)[states], count[states]
@@ -104,7 +92,7 @@ def choices_of(count: Integers) -> Choices:
 
 
 def _ranks(having: Integers) -> int:
-    """Up to which rank choices stand by rank, at least one."""
+    """The number of ranks listed as slices, at least one, that costs least."""
     entries = having.cumsum()
     by_rank = _SLICE * np.arange(1, having.size + 1) + _ENTRY * entries
     after = np.append(having[1:], 0)

@@ -1,4 +1,4 @@
-"""A decision process as sparse rows on the host, and reductions over its choices."""
+"""Markov decision processes as sparse rows of NumPy arrays, and reductions over choices."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from jaxltl.core.sparse.rows import Rows, concatenated_ranges
 @brief
 @dataclass(frozen=True)
 class HostMDP:
-    """The transitions of a decision process, without padding, as NumPy arrays.
+    """Transitions of a Markov decision process, without padding.
 
-    The choices of state s are the rows ``row_start[s]`` to ``row_start[s + 1] - 1``, and the
-    successors of row r the entries ``entry_start[r]`` to ``entry_start[r + 1] - 1``.
+    The choices of state s are the rows ``row_start[s]`` to ``row_start[s + 1] - 1``, and the successors
+    of row r the entries ``entry_start[r]`` to ``entry_start[r + 1] - 1``.
 
     Attributes:
       row_start: ``int32[S + 1]``, strictly ascending: every state has a choice.
@@ -65,7 +65,7 @@ class HostMDP:
 
     @cached_property
     def is_self_loop(self) -> NDArray[np.bool_]:
-        """Whether a row leads to its own state alone, ``bool[R]``."""
+        """Whether the own state is the only successor of a row, ``bool[R]``."""
         found: NDArray[np.bool_] = self.successor[self.entry_start[:-1]] == self.state
         count = np.diff(self.entry_start)
         several = np.flatnonzero(found & (count > 1))
@@ -76,18 +76,18 @@ class HostMDP:
 
     @cached_property
     def predecessors(self) -> tuple[Integers, Integers]:
-        """The rows that lead to state t, one an entry: ``row[start[t] : start[t + 1]]``."""
+        """The rows with successor t, one per entry: ``row[start[t] : start[t + 1]]``."""
         return self.support.predecessors
 
     @cached_property
     def support(self) -> Rows:
-        """Which states a row leads to."""
+        """The successors of each row."""
         return Rows(self.entry_start, self.successor, self.num_states)
 
     @cached_property
     def matrix(self) -> Any:
         """The transition matrix, SciPy's sparse ``float64[R, S]``."""
-        from scipy import sparse  # a tenth of a second that only those need who multiply
+        from scipy import sparse  # slow to import; only products need it
 
         arrays = self.probability, self.successor, self.entry_start
         return sparse.csr_array(arrays, shape=(self.num_rows, self.num_states))
@@ -97,17 +97,13 @@ class HostMDP:
         return self.matrix @ value
 
     def over_choices(self, operation: Any, quantity: NDArray[Any]) -> NDArray[Any]:
-        """A reduction, such as ``np.maximum``, over the choices of each state: ``[S]``, ``[R]``."""
+        """A reduction, such as ``np.maximum``, over the choices of each state: ``[R]`` to ``[S]``."""
         if self.is_chain:
             return quantity
         return operation.reduceat(quantity, self.row_start[:-1])
 
     def first_choice(self, mask: Booleans) -> tuple[Booleans, Integers]:
-        """Whether some choice of a state is marked, and the row of the first one (or the first).
-
-        Args:
-          mask: ``bool[R]``.
-        """
+        """Whether some row of a state is marked, and its first marked row (or its first row)."""
         row = np.flatnonzero(mask)
         first = self.row_start[:-1].astype(np.int32)
         some = np.zeros(self.num_states, bool)

@@ -1,4 +1,4 @@
-"""A decision process beside an automaton, as far as it is reached, written out without padding."""
+"""Reachable product of a sparse MDP and an automaton, without padding."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ _MAX_EDGES = 2**27  # of the whole product, that are written down for the search
 
 @brief
 class SparseProduct(NamedTuple):
-    """What is reached of a product, numbered by world state first and memory next.
+    """Reachable states of a product, ordered by model state first and automaton state next.
 
     Attributes:
-      host: the process, N states.
-      base_state: ``int32[N]``, the world's state.
+      host: the product MDP, N states.
+      base_state: ``int32[N]``, the model's state.
       memory: ``int32[N]``, the automaton's state.
-      base_row: ``int32[R']``, the world's row of each row; of a state that stands still, its first.
-      start: ``int64[I]``, the state in which the run from each start begins.
-      still: ``bool[N]``, the states whose verdict is known, made to stand still by a loop.
+      base_row: ``int32[R']``, the model's row of each row; of an absorbing state, its first.
+      start: ``int64[I]``, the product state of each start.
+      still: ``bool[N]``, states whose verdict is known, made absorbing.
     """
 
     host: HostMDP
@@ -40,11 +40,9 @@ class SparseProduct(NamedTuple):
     still: Booleans
 
     def entry_letter(self, letter: Integers, on_entry: bool) -> Integers:
-        """The letter that each entry reads, ``int[T']``.
+        """The letter that each entry reads, ``int[T']``, from the letters of the model's states.
 
-        Args:
-          letter: ``int[S]``, of the world's states.
-          on_entry: whether a step reads the state that is entered, not the one that is left.
+        It is the letter of the state that is entered if `on_entry`, else of the state that is left.
         """
         if on_entry:
             return letter[self.base_state[self.host.successor]]
@@ -61,21 +59,21 @@ def sparse_product(
     on_entry: bool = True,
     still: Booleans | None = None,
 ) -> SparseProduct:
-    """The part of the product that is reached from some pairs.
+    """The part of the product that is reachable from some pairs.
 
     A step leads from ``(s, q)`` to ``(t, delta[q, letter[t]])``, or to ``(t, delta[q, letter[s]])``
     where letters are read on exit.
 
     Args:
-      host: the world.
+      host: the model.
       delta: ``int[Q, L]``.
-      letter: ``int[S]``, the letter that each state shows.
-      state, memory: ``int[I]``, where runs start.
+      letter: ``int[S]``, of each state.
+      state, memory: ``int[I]``, the starts.
       on_entry: whether the letter of the state that is entered is read.
-      still: ``bool[Q]``, memories in which nothing matters any more; their states get one loop.
+      still: ``bool[Q]``, automaton states whose verdict is known; their states become absorbing.
 
     Raises:
-      ValueError: there are more than 2^31 pairs, with their number.
+      ValueError: there are more than 2^31 pairs.
 
     Example:
       >>> from jaxltl import make_sparse
@@ -104,7 +102,7 @@ def sparse_product(
 
 
 def product_without_memory(host: HostMDP, state: Integers) -> SparseProduct:
-    """The world itself as its product with an automaton of one state, reached or not."""
+    """The model as its product with an automaton of one state, reachable or not."""
     number = np.arange(host.num_states, dtype=np.int32)
     return SparseProduct(
         host,
@@ -134,7 +132,7 @@ class _World(NamedTuple):
 
 
 def _reached(world: _World, start: Integers) -> Booleans:
-    """``bool[S * Q]``, the pairs to which some run leads."""
+    """The reachable pairs, ``bool[S * Q]``, by breadth-first search."""
     host = world.host
     seen = np.zeros(host.num_states * world.num_memory, bool)
     seen[start] = True
@@ -181,7 +179,7 @@ def _searched(world: _World, start: Integers) -> Booleans:
         if moves:
             target.append(world.step[world.letter[left], q] * num_states + host.successor)
     first = np.unique(start % num_memory * num_states + start // num_memory)
-    target.append(first)  # of a node of its own
+    target.append(first)  # of an additional node
     size = num_states * num_memory + 1
     index = np.concatenate([[0], np.concatenate([*count, [first.size]]).cumsum()])
     edges = np.concatenate(target)
@@ -194,7 +192,7 @@ def _searched(world: _World, start: Integers) -> Booleans:
 
 
 def _written(world: _World, code: Integers, number: Any, start: Integers) -> SparseProduct:
-    """The rows of the pairs that are reached."""
+    """The rows of the reachable pairs."""
     host = world.host
     state, memory = np.divmod(code, world.num_memory)
     still = world.still[memory]

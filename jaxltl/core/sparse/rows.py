@@ -1,7 +1,6 @@
-"""Sparse rows: the successors of every choice, without padding, and sweeps over them.
+"""Sparse rows: the successors of every choice without padding, and reductions over them.
 
-SciPy takes a tenth of a second to import and small models take none of that, so below some
-size NumPy alone does the work.
+SciPy takes a tenth of a second to import, so below some size NumPy alone does the work.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ _FEW = 16  # columns up to which reducing them one by one beats a reduction over
 
 @dataclass(frozen=True)
 class Rows:
-    """The support of a transition function: row r leads to ``successor[entry_start[r] : ...]``.
+    """Support of a transition function: row r has successors ``successor[entry_start[r] : ...]``.
 
     Attributes:
       entry_start: ``int[R + 1]``.
@@ -39,13 +38,13 @@ class Rows:
 
     @cached_property
     def count(self) -> Integers:
-        """``int[R]``: how many entries a row has."""
+        """The number of entries of each row, ``int[R]``."""
         return np.diff(self.entry_start)
 
     @cached_property
     def matrix(self) -> Any:
         """The sparse matrix of ones, ``[R, S]``."""
-        from scipy import sparse  # a tenth of a second that only large models need
+        from scipy import sparse  # slow to import; only large models need it
 
         # Bytes are the fastest, but a row of 256 of them can add up to zero.
         data = np.ones(self.successor.size, np.uint8 if self.count.max() < 256 else bool)
@@ -64,11 +63,11 @@ class Rows:
         return self._reduce(np.logical_or, region, False)
 
     def least(self, value: NDArray[Any], default: Any) -> NDArray[Any]:
-        """The smallest value among the successors, ``[R, ...]``; the default without any."""
+        """The smallest value among the successors, ``[R, ...]``; the default for empty rows."""
         return self._reduce(np.minimum, value, default)
 
     def number_in(self, region: Booleans) -> Integers:
-        """How many entries lie in a region: ``int32[R, ...]``."""
+        """The number of entries in a region, ``int32[R, ...]``."""
         return self._reduce(np.add, region.astype(np.int32), 0)
 
     def _reduce(self, operation: Any, value: NDArray[Any], default: Any) -> NDArray[Any]:
@@ -80,7 +79,7 @@ class Rows:
         return found
 
     def take(self, rows: Integers) -> Rows:
-        """Some of the rows, in the order asked for."""
+        """The given rows, in the given order."""
         if self.successor.size > SCIPY_SIZE:
             part = self.matrix[rows]
             return Rows(part.indptr, part.indices, self.num_states)
@@ -94,7 +93,7 @@ class Rows:
 
     @cached_property
     def predecessors(self) -> tuple[Integers, Integers]:
-        """The rows into state t, one an entry: ``row[start[t] : start[t + 1]]``, in order."""
+        """The rows with successor t, one per entry and in order: ``row[start[t] : start[t + 1]]``."""
         if self.successor.size > SCIPY_SIZE:
             columns = self.matrix.tocsc()
             return columns.indptr, columns.indices
@@ -105,7 +104,7 @@ class Rows:
 
 
 def concatenated_ranges(start: Integers, count: Integers) -> Integers:
-    """The numbers ``start[i], ..., start[i] + count[i] - 1`` of all spans in a row."""
+    """The numbers ``start[i], ..., start[i] + count[i] - 1`` of all ranges, concatenated."""
     end = count.cumsum()
     found = (start - end + count).repeat(count)
     found += np.arange(found.size)
@@ -113,7 +112,7 @@ def concatenated_ranges(start: Integers, count: Integers) -> Integers:
 
 
 def offsets_from_counts(count: Integers) -> Integers:
-    """Where spans of so many begin, and where the last one ends: ``int32[N + 1]``, if that fits.
+    """The start of each group of the given sizes, and the end: ``int32[N + 1]``, if that fits.
 
     >>> offsets_from_counts(np.array([2, 0, 1])).tolist()
     [0, 2, 2, 3]
@@ -124,7 +123,7 @@ def offsets_from_counts(count: Integers) -> Integers:
 
 
 def sorted_unique(number: Integers, size: int) -> Integers:
-    """Numbers below a size in order, each once.
+    """Numbers below a size in ascending order, without repetition.
 
     >>> sorted_unique(np.array([3, 1, 3]), 5).tolist()
     [1, 3]
@@ -138,7 +137,7 @@ def sorted_unique(number: Integers, size: int) -> Integers:
 
 
 def group_starts(number: Integers) -> Booleans:
-    """Whether each number is another one than the number before it: ``bool[N]``.
+    """Whether each number differs from the number before it: ``bool[N]``.
 
     >>> group_starts(np.array([1, 1, 3])).tolist()
     [True, False, True]
@@ -149,7 +148,7 @@ def group_starts(number: Integers) -> Booleans:
 
 
 def decrement(counter: Integers, number: Integers) -> None:
-    """Takes one from a counter for each time that its number stands, in place."""
+    """Decrements a counter once for each occurrence of its number, in place."""
     if number.size < counter.size:
         np.subtract.at(counter, number, counter.dtype.type(1))  # another type is far slower
     else:
@@ -157,17 +156,11 @@ def decrement(counter: Integers, number: Integers) -> None:
 
 
 def rows_from_padded(successor: Integers, used: Booleans, num_states: int) -> Rows:
-    """Rows from padded lists.
+    """Rows from padded lists ``int[..., K]``, of which the entries in `used` ``bool[..., K]`` count.
 
-    Args:
-      successor: ``int[..., K]``; entries that are not used may be anything.
-      used: ``bool[..., K]``.
-      num_states: S.
-
-    Example:
-      >>> rows = rows_from_padded(np.array([[1, 7], [0, 1]]), np.array([[True, False], [True, True]]), 2)
-      >>> rows.entry_start.tolist(), rows.successor.tolist()
-      ([0, 1, 3], [1, 0, 1])
+    >>> rows = rows_from_padded(np.array([[1, 7], [0, 1]]), np.array([[True, False], [True, True]]), 2)
+    >>> rows.entry_start.tolist(), rows.successor.tolist()
+    ([0, 1, 3], [1, 0, 1])
     """
     width = used.shape[-1]
     index: Any = np.int32 if used.size < 2**31 else np.int64
@@ -180,7 +173,7 @@ def rows_from_padded(successor: Integers, used: Booleans, num_states: int) -> Ro
 
 
 def rows_from_dense(used: Booleans) -> Rows:
-    """Rows from a full support, ``bool[..., S]``."""
+    """Rows from a dense support, ``bool[..., S]``."""
     flat = used.reshape(-1, used.shape[-1])
     start: Integers = np.concatenate([[0], flat.sum(-1).cumsum()])
     return Rows(start, np.nonzero(flat)[1].astype(np.int32), used.shape[-1])

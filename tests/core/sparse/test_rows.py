@@ -26,7 +26,7 @@ def random_lists(rng, wide=False):
 @pytest.mark.parametrize("wide", [False, True])
 @pytest.mark.parametrize("large", [-1, 10**9])
 def test_reductions_equal_loops(large, wide, monkeypatch):
-    monkeypatch.setattr(host_rows, "LARGE", large)
+    monkeypatch.setattr(host_rows, "SCIPY_SIZE", large)
     rng = np.random.default_rng(0)
     for _ in range(20):
         successor, used = random_lists(rng, wide)

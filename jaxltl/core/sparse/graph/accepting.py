@@ -1,4 +1,4 @@
-"""Where runs beside an automaton are accepted almost surely: end components of sparse rows."""
+"""Almost-sure acceptance on a product with an automaton: accepting end components."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from jaxltl.core.sparse.mdp import HostMDP
 
 
 class AcceptingRegion(NamedTuple):
-    """The states of end components whose least priority can be even for ever.
+    """States of end components in which the least recurring priority can be even.
 
     Attributes:
       region: ``bool[S]``.
-      row: ``int32[S]``, in the region the row of a policy by which almost every run is accepted;
-        elsewhere a state's first.
+      row: ``int32[S]``, in the region a policy by which almost every run is accepted; elsewhere a
+        state's first row.
     """
 
     region: Booleans
@@ -25,15 +25,15 @@ class AcceptingRegion(NamedTuple):
 
 
 def accepting_region(mdp: HostMDP, priority: Integers) -> AcceptingRegion:
-    """Where the least priority that is read for ever can be even.
+    """Accepting end components under the min-even parity condition.
 
-    For each even p: the maximal end components of the rows that read no priority below p, with a
-    row that reads p (Baier and Katoen 2008, section 10.6.4, for Rabin pairs). A run is accepted
-    with the largest probability of reaching them.
+    For each even p: the maximal end components of the rows that read no priority below p, with a row
+    that reads p (Baier and Katoen 2008, section 10.6.4, for Rabin pairs). The largest probability of
+    acceptance is that of reaching them.
 
     Args:
       mdp: the product.
-      priority: ``int[T]``, what each entry reads.
+      priority: ``int[T]``, read by each entry.
 
     Example:
       >>> from jaxltl import make_sparse

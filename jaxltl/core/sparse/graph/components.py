@@ -1,4 +1,4 @@
-"""Strongly connected components and searches of graphs that are given by their edges."""
+"""Strongly connected components and searches of graphs given by their edges."""
 
 from __future__ import annotations
 
@@ -13,13 +13,8 @@ from jaxltl.core.sparse.rows import SCIPY_SIZE
 def strong_components(source: Integers, target: Integers, num_nodes: int) -> Integers:
     """The smallest node of every node's strongly connected component: ``int[N]``.
 
-    Args:
-      source, target: ``int[E]``, the edges; repeated ones count once.
-      num_nodes: N.
-
-    Example:
-      >>> strong_components(np.array([0, 1, 1]), np.array([1, 0, 2]), 3).tolist()
-      [0, 0, 2]
+    >>> strong_components(np.array([0, 1, 1]), np.array([1, 0, 2]), 3).tolist()
+    [0, 0, 2]
     """
     if max(source.size, num_nodes) <= SCIPY_SIZE // 4:
         label = _tarjan(source, target, num_nodes)
@@ -35,12 +30,12 @@ def strong_components(source: Integers, target: Integers, num_nodes: int) -> Int
 
 
 def forward_reachable(source: Integers, target: Integers, start: Booleans) -> Booleans:
-    """The nodes to which edges lead from some starting ones, these among them: ``bool[N]``."""
+    """Nodes that are reachable from some nodes, these included: ``bool[N]``."""
     seen = start.copy()
     if max(source.size, start.size) > SCIPY_SIZE // 4:
         from scipy.sparse import csgraph
 
-        # One search from a node of its own that leads to every start.
+        # One search from an additional node that leads to every start.
         first, num_nodes = np.flatnonzero(start), start.size
         graph = _matrix(
             np.concatenate([source, np.full(first.size, num_nodes)]),
@@ -76,7 +71,7 @@ def _lists(source: Integers, target: Integers, num_nodes: int) -> list[list[int]
 
 
 def _tarjan(source: Integers, target: Integers, num_nodes: int) -> Integers:
-    """Tarjan (1972), with a stack of iterators in place of recursion."""
+    """Tarjan's algorithm (1972), with a stack of iterators instead of recursion."""
     after = _lists(source, target, num_nodes)
     label, number = [-1] * num_nodes, [-1] * num_nodes
     low = [0] * num_nodes

@@ -1,4 +1,4 @@
-"""What the graph of sparse rows decides: who can get where, who must, and end components."""
+"""Qualitative analysis of sparse MDPs: reachability in the graph, and end components."""
 
 from __future__ import annotations
 
@@ -22,15 +22,12 @@ _MANY = 64  # transitions into one of them from which it does not
 
 
 def backward_reachable(mdp: HostMDP, goal: Booleans, rows: Booleans | None = None) -> Booleans:
-    """The states from which some path leads to a goal: where its largest probability is positive.
+    """States from which some path leads to a goal: the largest probability is positive.
 
     Args:
       mdp: the model.
       goal: ``bool[S]``.
       rows: ``bool[R]``, the rows that may be taken; default all.
-
-    Returns:
-      ``bool[S]``.
     """
     start, row = mdp.predecessors
     source = mdp.state[row]
@@ -42,14 +39,14 @@ def backward_reachable(mdp: HostMDP, goal: Booleans, rows: Booleans | None = Non
 
 
 def forward_search(start: Integers, after: Integers, first: Booleans) -> Booleans:
-    """All nodes that a search from some nodes meets; node i leads to ``after[start[i] : ...]``."""
+    """Nodes that are reachable from some nodes; node i has successors ``after[start[i] : ...]``."""
     seen = first.copy()
     frontier = np.flatnonzero(first)
     if after.size > SCIPY_SIZE // 4:
         from scipy import sparse
         from scipy.sparse import csgraph
 
-        # One search from a node of its own that leads to all where it starts.
+        # One search from an additional node that leads to all starts.
         size = first.size + 1
         starts = np.append(start, start[-1] + frontier.size)
         targets = np.concatenate([after, frontier.astype(after.dtype)])
@@ -70,19 +67,16 @@ def forward_search(start: Integers, after: Integers, first: Booleans) -> Boolean
 def positive_under_all_policies(
     mdp: HostMDP, goal: Booleans, rows: Booleans | None = None, among: Booleans | None = None
 ) -> Booleans:
-    """The states whose every row may lead on to a goal: its least probability is positive.
+    """States from which every policy reaches a goal with positive probability.
 
-    The least set with the goal and with all states each of whose rows has a successor in it. From
-    the other states some rows lead never to the goal, whatever happens.
+    The least set with the goal and all states each of whose rows has a successor in it (the complement
+    of Prob0E). From all other states some policy avoids the goal.
 
     Args:
       mdp: the model.
       goal: ``bool[S]``.
       rows: ``bool[R]``, the rows that count; a state without any joins. Default all.
       among: ``bool[S]``, the states that may join; default all.
-
-    Returns:
-      ``bool[S]``.
     """
     if mdp.is_chain and rows is None and among is None:
         return backward_reachable(mdp, goal)
@@ -95,7 +89,7 @@ def positive_under_all_policies(
     open_ = ~goal if among is None else among & ~goal
     region = goal | (open_ & (left == 0))
     open_ = open_ & ~region
-    search = _Forced(mdp, waiting, left, open_, region)
+    search = _PositiveSearch(mdp, waiting, left, open_, region)
     frontier: Integers = np.flatnonzero(region)
     start = mdp.predecessors[0]
     while frontier.size:
@@ -104,8 +98,8 @@ def positive_under_all_policies(
     return region
 
 
-class _Forced(NamedTuple):
-    """A growing region; `left` counts the rows of a state that do not lead there yet."""
+class _PositiveSearch(NamedTuple):
+    """A growing region; `left` counts the rows of a state without a successor in it yet."""
 
     mdp: HostMDP
     waiting: Booleans
@@ -162,15 +156,9 @@ class _Forced(NamedTuple):
 def almost_sure_reachability(
     mdp: HostMDP, goal: Booleans, rows: Booleans | None = None
 ) -> tuple[Booleans, Booleans]:
-    """The states from which some policy reaches a goal almost surely, and the rows it may take.
+    """States from which some policy reaches a goal almost surely (Prob1E), ``bool[S]``.
 
-    Args:
-      mdp: the model.
-      goal: ``bool[S]``.
-      rows: ``bool[R]``, the rows that may be taken; default all.
-
-    Returns:
-      ``bool[S]``, and ``bool[R]``, the rows of these states that never leave them.
+    Also the rows ``bool[R]`` of these states that never leave them; `rows` are those that may be taken.
     """
     kept = np.ones(mdp.num_rows, bool) if rows is None else rows.copy()
     inside = backward_reachable(mdp, goal, rows)
@@ -185,9 +173,9 @@ def almost_sure_reachability(
 
 
 def shortest_path_rows(mdp: HostMDP, goal: Booleans, rows: Booleans) -> Integers:
-    """A row by which each state may come nearer to a goal, among some rows: ``int32[S]``.
+    """The first row of each state on a shortest path to a goal among some rows: ``int32[S]``.
 
-    The first row of states at the goal, and of those that cannot get there.
+    The first row of all for states in the goal, and for those that cannot reach it.
     """
     first = mdp.row_start[:-1].astype(np.int32)
     if not (rows & ~goal[mdp.state]).any():
@@ -200,13 +188,13 @@ def shortest_path_rows(mdp: HostMDP, goal: Booleans, rows: Booleans) -> Integers
 
 
 def _next_on_the_way(mdp: HostMDP, goal: Booleans, rows: Booleans) -> Integers:
-    """The next state on a shortest path to a goal, ``int[S]``; -1 at it and where there is none."""
+    """The next state on a shortest path to a goal, ``int[S]``; -1 in the goal and without a path."""
     from scipy.sparse import csgraph, csr_array
 
     start, row = mdp.predecessors
     kept = rows[row]
     last = np.flatnonzero(goal)
-    # One search backwards, from a node of its own that leads to every goal.
+    # One search backwards from an additional node that leads to every goal.
     index = np.concatenate([[0], kept.cumsum()])[start]
     edges = np.concatenate([mdp.state[row[kept]], last])
     size = mdp.num_states + 1
@@ -222,15 +210,15 @@ class EndComponents(NamedTuple):
     """Maximal end components.
 
     Attributes:
-      component: ``int64[S]``, the least state of a state's end component; its own elsewhere.
-      inside: ``bool[R]``, the rows of end components that stay in them.
+      component: ``int64[S]``, the least state of a state's end component; its own number elsewhere.
+      inside: ``bool[R]``, the rows of end components that stay inside.
     """
 
     component: Integers
     inside: Booleans
 
     def region(self, mdp: HostMDP) -> Booleans:
-        """``bool[S]``, the states of end components."""
+        """The states of end components, ``bool[S]``."""
         found = np.zeros(mdp.num_states, bool)
         found[mdp.state[self.inside]] = True
         return found
@@ -239,11 +227,11 @@ class EndComponents(NamedTuple):
 def end_components(
     mdp: HostMDP, states: Booleans | None = None, rows: Booleans | None = None
 ) -> EndComponents:
-    """The maximal end components of some states and rows (Baier and Katoen 2008, section 10.6.3).
+    """Maximal end components within some states and rows (Baier and Katoen 2008, section 10.6.3).
 
-    States that cannot stay are taken away first, so that components are looked for among few.
-    Rows that stand still belong to them and hold nothing together: they come last, else each state
-    at the rim of what does not stay would be taken away in a round of its own.
+    States that cannot stay are removed first, so that strongly connected components are computed on few.
+    Self-loops connect nothing and are added at the end; otherwise each state at the rim of a transient
+    region would be removed in a round by itself.
 
     Args:
       mdp: the model.
@@ -259,7 +247,7 @@ def end_components(
 
 
 def _moving_components(mdp: HostMDP, kept: Booleans) -> EndComponents:
-    """Those of some rows."""
+    """End components of rows without self-loops."""
     component = np.arange(mdp.num_states)
     inside = np.zeros(mdp.num_rows, bool)
     while True:
@@ -298,7 +286,7 @@ def _labels(
 
 
 def _untouched(state: Integers, crossing: Booleans, leaves: Booleans, label: Integers) -> Booleans:
-    """The rows of components that no further row was taken from, which are end components."""
+    """The rows of components that lost no row, which are end components."""
     touched = np.zeros(label.size, bool)
     touched[label[state[crossing & ~leaves]]] = True
     return ~crossing & ~touched[label[state]]

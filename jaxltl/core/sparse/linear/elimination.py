@@ -1,9 +1,9 @@
-"""Systems ``(I - P) x = b`` of policies that leave, solved by sparse elimination where it pays.
+"""Sparse elimination of policy evaluation systems ``(I - P) x = b``, and Krylov steps where it fills.
 
-Unknowns are ordered by strongly connected component, and in each by Cuthill and McKee (1969), so
-that elimination fills these, and what leads from one to another. Where that would be much, large
-components are eliminated one after the other, and nothing between them fills. Where a component
-itself would (graphs that mix well), Krylov steps and sweeps converge. What fills is counted before.
+Unknowns are ordered by strongly connected component, and within each by reverse Cuthill-McKee
+(1969), so that only components and the blocks between them fill. Where the blocks between fill too
+much, large components are eliminated one after the other. Where a component itself fills too much
+(graphs that mix well), a Krylov method converges. The fill is bounded or counted in advance.
 """
 
 from __future__ import annotations
@@ -14,37 +14,38 @@ import numpy as np
 
 from jaxltl.core.array_types import Floats, Integers
 
-_SMALL = 3000  # states of a component up to which it may be filled
-_LARGE = 3000  # states of a component from which
-_SEVERAL = 1.5  # mean number of successors, fewer of which are nearly trees and fill little,
-_NARROW = 40  # and mean bandwidth beyond which it fills less to begin with those of least degree
-_SPREAD = 8  # how many times its mean bandwidth a larger one must have states
-_MOST = 2**28  # entries that may be filled, 12 bytes each
+# Limits of elimination; measured on the models of benchmarks.real_models and on random graphs.
+_SMALL = 3000  # states of a component up to which it may fill
+_LARGE = 3000  # states of a component from which minimum degree is tried,
+_SEVERAL = 1.5  # if its rows have more entries in the mean (sparser ones are nearly trees)
+_NARROW = 40  # and its mean bandwidth is larger
+_SPREAD = 8  # times its mean bandwidth that a larger component must have states
+_MOST = 2**28  # entries of factors, 12 bytes each
 _MOST_BETWEEN = 10**7  # of these, between components that are eliminated together
-_APART = 500  # states from which a component is eliminated alone, if they are not
-_LAST = 8000  # states up to which it is eliminated, however it fills, where sweeps fail
-_WORK = 1e11  # multiplications of a band from which Krylov steps come first,
-_MANY = 2  # if there are more successors than these in the mean
-_SAMPLED = 64  # rows in which what fills is counted where its bound is too large
-_PANEL = 2  # columns that are eliminated at once: each wants room for a full one
-_FILL = 4  # growth of the fill after which the order is sought anew
-_AGAIN = 8  # times, at most,
-_KRYLOV = 500  # steps of a Krylov method where elimination would fill
+_APART = 500  # states from which a component is eliminated alone otherwise
+_LAST = 8000  # states up to which a component is eliminated, however it fills, if sweeps fail
+_WORK = 1e11  # multiplications of a band from which a Krylov method comes first,
+_MANY = 2  # if rows have more entries in the mean
+_SAMPLED = 64  # rows in which the fill is counted
+_PANEL = 2  # columns that SuperLU eliminates at once: each needs room for a full one
+_FILL = 4  # growth of the fill after which the order is computed anew
+_AGAIN = 8  # restarts of the Krylov method,
+_KRYLOV = 500  # steps of each
 _SWEEPS = 20_000  # and sweeps after it
-_ROUNDED = 4 * float(np.finfo(np.float64).eps)  # of the solution, which may be left of it
-_LEFT = 1e-14  # largest residual of what they find, as a share of the right side
+_ROUNDED = 4 * float(np.finfo(np.float64).eps)  # smallest residual relative to the solution
+_LEFT = 1e-14  # residual relative to the right side
 
 
 class _Block(NamedTuple):
-    """Some components, which lead to no block behind.
+    """Some components, which no earlier block depends on.
 
     Attributes:
-      order: ``int[B]``, the states in the order of elimination; ascending where they are swept.
+      order: ``int[B]``, the states in the order of elimination; ascending for a Krylov method.
       inner: ``float64[B, B]``, the policy's matrix on these.
-      outer: ``float64[B, M]``, on the blocks before; None where there are none.
-      factor: of SuperLU; None where it is swept.
+      outer: ``float64[B, M]``, on earlier blocks; None without any.
+      factor: of SuperLU; None for a Krylov method.
       fill: entries of the first factors in this order.
-      sparing: whether those of least degree go first, wherever that may help.
+      min_degree: whether states of least degree are eliminated first, wherever that may help.
     """
 
     order: Integers
@@ -52,15 +53,15 @@ class _Block(NamedTuple):
     outer: Any
     factor: Any
     fill: int
-    sparing: bool = False
+    min_degree: bool = False
 
 
 class Factors(NamedTuple):
     """The system of a policy, ready to be solved.
 
     Attributes:
-      rows: ``float64[R, M]``, all rows, SciPy's.
-      label: ``int[M]``, components in order.
+      rows: SciPy's ``float64[R, M]``, all rows.
+      label: ``int[M]``, components in topological order.
       blocks: in the order of solution.
     """
 
@@ -70,18 +71,18 @@ class Factors(NamedTuple):
 
     @property
     def method(self) -> str:
-        """How it is solved, in words."""
+        """The algorithm, in words."""
         swept = {x.factor is None for x in self.blocks}
         how = {True: "sweeps", False: "elimination"}
         return "policy iteration by " + " and ".join(how[x] for x in sorted(swept))
 
     @property
     def fill(self) -> int:
-        """How many entries the factors had at first."""
+        """The number of entries of the first factors."""
         return sum(x.fill for x in self.blocks)
 
     def solve(self, b: Floats) -> Floats:
-        """The solution; NaN where it could not be found."""
+        """The solution; NaN where none was found."""
         x = np.zeros(b.size)
         for block in self.blocks:
             right = b[block.order]
@@ -97,12 +98,12 @@ class Factors(NamedTuple):
         return x
 
     def other(self, chosen: Integers) -> Factors | None:
-        """The same for another policy."""
+        """The factors of another policy, in the same order unless that fills more."""
         found = []
         for block in self.blocks:
             swept = block.factor is None
             new = _block(
-                self.rows, self.label, block.order, chosen, swept=swept, sparing=block.sparing
+                self.rows, self.label, block.order, chosen, swept=swept, min_degree=block.min_degree
             )
             if new is None:
                 return None
@@ -112,7 +113,7 @@ class Factors(NamedTuple):
         return self._replace(blocks=tuple(found))
 
     def eliminated(self, chosen: Integers) -> Factors | None:
-        """The same of a policy with which sweeps do not come to an end; None if too large."""
+        """The factors without Krylov methods, for policies on which these fail; None if too large."""
         if not any(x.factor is None for x in self.blocks):
             return None
         found, matrix = [], self.rows[chosen]
@@ -124,7 +125,7 @@ class Factors(NamedTuple):
                 and elimination_order(matrix[nodes][:, nodes], self.label[nodes]) is None
             ):
                 return None
-            new = _block(self.rows, self.label, nodes, chosen, sparing=swept or block.sparing)
+            new = _block(self.rows, self.label, nodes, chosen, min_degree=swept or block.min_degree)
             if new is None or new.factor is None:
                 return None
             found.append(new)
@@ -132,15 +133,12 @@ class Factors(NamedTuple):
 
 
 def factorize(rows: Any, label: Integers, chosen: Integers) -> Factors | None:
-    """The system of a policy.
+    """Factors of a policy's system; None if it is singular.
 
     Args:
-      rows: ``float64[R, M]``, SciPy's.
+      rows: SciPy's ``float64[R, M]``.
       label: ``int[M]``, numbers of components; no row leads to a greater one.
       chosen: ``int[M]``, the row of each state.
-
-    Returns:
-      Its factors; None where it is singular.
     """
     matrix, size = rows[chosen], np.bincount(label)
     if min(_between(matrix, label, size)) <= _MOST_BETWEEN:
@@ -162,7 +160,7 @@ def factorize(rows: Any, label: Integers, chosen: Integers) -> Factors | None:
 
 
 def _parts(label: Integers, size: Integers) -> list[Integers]:
-    """The states of each large component, and of what stands between two of them."""
+    """The states of each large component, and of what lies between two of them."""
     large = size > _APART
     begins = large.copy()
     begins[1:] |= large[:-1]
@@ -172,7 +170,7 @@ def _parts(label: Integers, size: Integers) -> list[Integers]:
 
 
 def _between(matrix: Any, label: Integers, size: Integers) -> tuple[int, int]:
-    """What may fill between components: if the earlier ones stand first, and if the later ones."""
+    """Bounds of the fill between components: with earlier ones first, and with later ones first."""
     source = np.repeat(label, np.diff(matrix.indptr))
     target = label[matrix.indices]
     between = source != target
@@ -180,12 +178,12 @@ def _between(matrix: Any, label: Integers, size: Integers) -> tuple[int, int]:
 
 
 def elimination_order(matrix: Any, label: Integers, work: float = np.inf) -> Integers | None:
-    """By component, and in each one after its neighbours; None where that would not help.
+    """Order by component, and within each by reverse Cuthill-McKee; None where that would not help.
 
     Args:
-      matrix: ``float64[M, M]``, SciPy's.
+      matrix: SciPy's ``float64[M, M]``.
       label: ``int[M]``, the components.
-      work: multiplications, as bands have them, that a component may cost.
+      work: multiplications, for a band matrix, that a component may cost.
     """
     from scipy.sparse import csgraph
 
@@ -211,7 +209,7 @@ def elimination_order(matrix: Any, label: Integers, work: float = np.inf) -> Int
         fills = (size * mean**2 > work) & (within.nnz > _MANY * label.size)
         if ((size > _SMALL) & ((mean * _SPREAD > size) | fills)).any():
             return None
-    # What leads from one component to another fills, of the two, the one that stands first.
+    # An edge between components fills the one that is eliminated first.
     return order[::-1] if out_of < into else order
 
 
@@ -222,9 +220,9 @@ def _block(
     chosen: Integers,
     *,
     swept: bool = False,
-    sparing: bool = False,
+    min_degree: bool = False,
 ) -> _Block | None:
-    """Some states of a policy, factored unless that would fill too much; None if singular."""
+    """Some states of a policy, factored unless that fills too much; None if singular."""
     from scipy.sparse import linalg
 
     whole = order.size == label.size
@@ -241,7 +239,7 @@ def _block(
         inner = inner[:, order]
     if swept or _too_much(inner, label[order]):
         return _Block(order, inner, outer, None, 0)
-    # In one large component those of least degree may go first (Liu 1985).
+    # In one large component minimum degree fills less (Liu 1985).
     most = np.bincount(label[order]).max(initial=0)
     wide = (
         most > max(order.size / 2, _LARGE)
@@ -251,7 +249,7 @@ def _block(
     try:
         factor = linalg.splu(
             _minus(inner).T,
-            permc_spec="MMD_AT_PLUS_A" if sparing or wide else "NATURAL",
+            permc_spec="MMD_AT_PLUS_A" if min_degree or wide else "NATURAL",
             diag_pivot_thresh=0,
             relax=1,
             panel_size=_PANEL,
@@ -259,11 +257,11 @@ def _block(
         )
     except (RuntimeError, MemoryError):
         return None
-    return _Block(order, inner, outer, factor, int(factor.nnz), sparing)
+    return _Block(order, inner, outer, factor, int(factor.nnz), min_degree)
 
 
 def _bandwidth(matrix: Any) -> float:
-    """How far the first entries of rows and columns stand from the diagonal, in the mean."""
+    """The mean distance of the first entries of rows and columns from the diagonal."""
     size = matrix.shape[0]
     source = np.repeat(np.arange(size), np.diff(matrix.indptr))
     left, top = _first_entries(source, matrix.indices, size)
@@ -271,7 +269,7 @@ def _bandwidth(matrix: Any) -> float:
 
 
 def _first_entries(source: Integers, target: Integers, size: int) -> tuple[Integers, Integers]:
-    """Where the first entry of each row, and of each column, stands; at most at the diagonal."""
+    """The first entry of each row, and of each column; at most the diagonal."""
     left, top = np.arange(size), np.arange(size)
     np.minimum.at(left, source, target.astype(left.dtype))  # of one type, which is far faster
     np.minimum.at(top, target, source.astype(top.dtype))
@@ -279,14 +277,14 @@ def _first_entries(source: Integers, target: Integers, size: int) -> tuple[Integ
 
 
 def _too_much(matrix: Any, label: Integers) -> bool:
-    """Whether elimination in the order of the states would fill more than there may be.
+    """Whether elimination in the order of the states fills more than the limit.
 
     Factors fill nothing before the first entry of a row and of a column (George and Liu 1981). In
-    components where that allows too much, rows are counted along the elimination tree.
+    components where that bound is too large, rows are counted along the elimination tree.
 
     Args:
       matrix: ``float64[B, B]``.
-      label: ``int[B]``, the components, which stand together.
+      label: ``int[B]``, contiguous components.
     """
     size = label.size
     if size * (size + 1) <= _MOST:
@@ -306,7 +304,7 @@ def _too_much(matrix: Any, label: Integers) -> bool:
 
 
 def _counted(source: Integers, target: Integers, size: int) -> float:
-    """About how many entries one factor of a symmetric pattern has, by some of its rows.
+    """Estimated number of entries of one factor of a symmetric pattern, from a sample of its rows.
 
     Row i is filled where the elimination tree leads from its entries towards i (Liu 1990).
     """
@@ -347,7 +345,7 @@ def _minus(matrix: Any) -> Any:
 
 
 def _swept(matrix: Any, b: Floats) -> Floats:
-    """By a Krylov method (van der Vorst 1992), and by sweeps as long as what is left shrinks."""
+    """Solution by BiCGSTAB (van der Vorst 1992), then by sweeps while the residual shrinks."""
     from scipy.sparse import linalg
 
     size = np.abs(b).max(initial=0)
@@ -355,11 +353,11 @@ def _swept(matrix: Any, b: Floats) -> Floats:
     x, left = np.zeros(b.size), np.array(b)
 
     def enough() -> bool:
-        # Where x is far larger than b, its own rounding is left.
+        # Where x is far larger than b, its own rounding remains.
         least = max(_LEFT * size, _ROUNDED * float(np.abs(x).max(initial=0)))
         return bool(np.abs(left).max(initial=0) <= least)
 
-    for _ in range(_AGAIN):  # from what is left, where it stagnates or breaks down
+    for _ in range(_AGAIN):  # restarts where it stagnates or breaks down
         more, _ = linalg.bicgstab(system, left, rtol=0, atol=_LEFT * size, maxiter=_KRYLOV)
         after = left - (more - matrix @ more)
         if not np.isfinite(more).all() or not np.abs(after).max() < np.abs(left).max():

@@ -91,7 +91,7 @@ def refined_optimum(
       unit: the relative error of its numbers and of the sums of a row.
       policy: ``int[M]``, a policy that leaves almost surely.
       solver_of: approximate solver of ``(I - P) x = b`` for a policy's rows P, or None.
-      tolerance: the relative error asked for.
+      tolerance: the relative error that suffices.
     """
     rows = _Rows(equation)
     for round_ in range(1, _POLICIES + 1):

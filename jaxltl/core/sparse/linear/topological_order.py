@@ -1,4 +1,4 @@
-"""The order in which a system of states can be solved: level by level before and after its circles."""
+"""Topological levels and strongly connected components of the graph of a linear system."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import numpy as np
 from jaxltl.core.array_types import Booleans, Integers
 from jaxltl.core.sparse.rows import decrement, sorted_unique, concatenated_ranges
 
-_ROUNDS = 16  # levels, and
-_NODES = 64  # so many nodes for a further one, until elimination is faster
+# Levels at most, and nodes for each further one: narrower levels are eliminated faster.
+_ROUNDS, _NODES = 16, 64
 
 
 class Edges(NamedTuple):
-    """A graph: node i leads to ``target[start[i] : start[i + 1]]``, maybe repeatedly."""
+    """A graph: node i has successors ``target[start[i] : start[i + 1]]``, possibly repeated."""
 
     start: Integers
     target: Integers
@@ -24,7 +24,7 @@ class Edges(NamedTuple):
         return self.start.size - 1
 
     def reverse(self) -> Edges:
-        """The graph with its edges turned round."""
+        """The graph with reversed edges."""
         size = self.num_nodes
         if self.target.size > 20_000:
             from scipy import sparse
@@ -39,11 +39,11 @@ class Edges(NamedTuple):
 
 
 class Levels(NamedTuple):
-    """Nodes in an order in which each leads only to earlier ones.
+    """Nodes in an order in which each has only earlier successors.
 
     Attributes:
       node: ``int[M]``.
-      start: where each level starts in it, and M. Nodes of one level do not lead to each other.
+      start: where each level starts in it, and M. Nodes of one level are not connected.
     """
 
     node: Integers
@@ -51,15 +51,15 @@ class Levels(NamedTuple):
 
 
 def topological_levels(back: Edges, number: Integers, among: Booleans) -> Levels:
-    """The nodes that lead, through others of their kind, to nothing that is left.
+    """Levels of the nodes that reach no cycle, by Kahn's algorithm (1962).
 
     Args:
-      back: for each node those that lead to it.
-      number: ``int[N]``, how many edges of a node lead to nodes that are left; counted down.
-      among: ``bool[N]``, the nodes that are left; those that are found are taken away.
+      back: the reversed graph.
+      number: ``int[N]``, the number of edges to remaining nodes; decremented in place.
+      among: ``bool[N]``, the remaining nodes; nodes that are found are removed in place.
 
     Returns:
-      The nodes by level; not all of them where levels are too narrow to be solved one by one.
+      The levels; not all nodes where levels are too narrow to be solved one by one.
     """
     found: list[Integers] = []
     start = [0]
@@ -78,7 +78,7 @@ def topological_levels(back: Edges, number: Integers, among: Booleans) -> Levels
 
 
 def ordered_components(edges: Edges) -> Integers:
-    """Numbers of strongly connected components, ``int[N]``: no edge leads to a greater one."""
+    """Strongly connected components in topological order, ``int[N]``: no edge leads to a greater number."""
     from scipy import sparse
     from scipy.sparse import csgraph
 
@@ -94,7 +94,7 @@ def ordered_components(edges: Edges) -> Integers:
 
 
 def _sorted(label: Integers, source: Integers, target: Integers) -> Integers:
-    """The same components, renumbered from the last ones on (Kahn 1962)."""
+    """The same components in topological order (Kahn 1962)."""
     between = source != target
     count = int(label.max()) + 1
     pairs = np.unique(np.stack([source[between], target[between]], -1), axis=0)

@@ -49,8 +49,8 @@ def way(request, monkeypatch):
     """The same by each way of searching, which sizes choose."""
     monkeypatch.setattr(sparse_graph, "_FEW", 0 if request.param == "numpy" else 1000)
     if request.param == "scipy":
-        monkeypatch.setattr(rows, "LARGE", 0)
-        monkeypatch.setattr(sparse_graph, "LARGE", 0)
+        monkeypatch.setattr(rows, "SCIPY_SIZE", 0)
+        monkeypatch.setattr(sparse_graph, "SCIPY_SIZE", 0)
 
 
 @pytest.mark.usefixtures("way")
