@@ -1,16 +1,16 @@
-"""Long-run averages: the best of each end component, and then of where to end.
+"""Certified long-run average rewards of multichain MDPs.
 
-In an end component the optimal gain g is one number, and any v bounds it:
-``min (T v - v) <= g <= max (T v - v)`` for ``T v = opt_r (c_r + P_r v)`` (Puterman 1994, section
-8.5). Value iteration of all components at once finds such a v, and policy iteration where that
-mixes too slowly. Components with a choice to stop in them, for their gains, as one state each then
-leave a problem whose every policy ends, which :mod:`jaxltl.core.sparse.solvers.policy_iteration` encloses.
+Within an end component the optimal gain g is one number, and every v bounds it:
+``min (T v - v) <= g <= max (T v - v)`` for ``T v = max_r (c_r + P_r v)`` (Puterman 1994, section
+8.5). Value iteration on all components at once finds such a v, and policy iteration where that
+converges too slowly. End components as single states, with an action to stop for their gain, are
+then a shortest path problem (Puterman 1994, chapter 9).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -18,8 +18,8 @@ from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.sparse.graph.components import strong_components
 from jaxltl.core.sparse.graph.qualitative import (
     EndComponents,
-    end_components,
     backward_reachable,
+    end_components,
     shortest_path_rows,
 )
 from jaxltl.core.sparse.linear.elimination import factorize
@@ -32,37 +32,38 @@ from jaxltl.core.sparse.linear.topological_order import Edges, ordered_component
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
 from jaxltl.core.sparse.solvers.policy_iteration import policy_iteration
-from jaxltl.core.sparse.solvers.total_cost import ShortestPathProblem
 from jaxltl.core.sparse.solvers.step_bounded import backup_unit
+from jaxltl.core.sparse.solvers.total_cost import ShortestPathProblem
 
 _EPS = float(np.finfo(np.float64).eps)
-_LAZY = 0.5  # the share of a step by which value iteration moves, so that no period keeps it apart
-_SWEEPS = 400  # of value iteration before policies are solved for
-_JUDGED = 32  # sweeps after which it is seen whether more would do
+_LAZY = 0.5  # the step of value iteration: with self-loops no chain is periodic
+_SWEEPS = 400  # of value iteration before policy iteration
+_JUDGED = 32  # sweeps between two estimates of the rate of convergence
 _PATIENCE = 64  # sweeps for each state before the last ones are judged: news passes all of them
-_EVERY = 8  # sweeps between two looks at the bounds
-_TURNS = 4  # of policies and of as many sweeps, before sweeps alone go on
+_EVERY = 8  # sweeps between two bounds
+_TURNS = 4  # of policy iteration and as many sweeps, before sweeps alone
 _ROUNDS = 60  # policies at most
-_LOOKS = 30  # steps after which it is asked where a policy is most often
-_REFINED = 6  # solves of one bias, each of what the last ones left
-_ELIMINATED = 2_000_000  # states up to which they are
-_LINGERS = 1e12  # times the largest reward: biases that far apart are of states hardly ever left
-_IDLE = 6  # policies in a row that earn more by no more than
-_IDLE_SHARE = 1e-12  # of what the ones before did
-_NEAR = 1e-3  # of their range: the best ones
-_TINY = 1e-13
-_LOOSEST = 1e-3  # share up to which its powers are left out
-_FLOOR = 1e-6  # of the tolerance, times the largest reward: what counts where a gain is near zero
+_LOOKS = 30  # steps that estimate the most frequent state of a policy
+_REFINED = 6  # refinements of a bias
+_ELIMINATED = 2_000_000  # states up to which policies are evaluated by elimination
+_LINGERS = 1e12  # range of biases, relative to rewards, that shows states that are hardly left
+_IDLE = 6  # policies that improve the gain by no more than
+_IDLE_SHARE = 1e-12  # this share, after which policy iteration ends
+_NEAR = 1e-3  # of the range of biases: the best states
+_TINY = 1e-13  # gains beside which a relative tolerance is not reachable
+_LOOSEST = 1e-3  # share up to which second-order terms are negligible
+_FLOOR = 1e-6  # relative to the largest reward: gains near zero are not resolved further
 
 
-class Average(NamedTuple):
+@dataclass(frozen=True)
+class AverageReward:
     """Enclosed long-run averages.
 
     Attributes:
       value, lower, upper: ``float64[S]``.
       row: ``int64[S]``, a policy that attains the bound on the safe side.
       residual: half the width of the widest gain's enclosure.
-      rounds: sweeps, and systems solved.
+      rounds: sweeps, and linear systems.
     """
 
     value: Floats
@@ -81,90 +82,54 @@ def average(
     tolerance: float,
     max_steps: int,
     sign: int = 1,
-) -> Average:
-    """The largest long-run average reward of a step.
+) -> AverageReward:
+    """Largest long-run average reward per step.
 
     Args:
       mdp: the model.
       reward: ``float64[R]``.
-      magnitude: ``float64[R]``, the sum of the absolute values of what a reward is made of.
-      tolerance: the width asked for, as a share of the value.
+      magnitude: ``float64[R]``, the sum of absolute values behind each reward.
+      tolerance: the width, relative to the value.
       max_steps: sweeps at most.
-      sign: -1 where the rewards are the negatives of what is to be made small.
+      sign: -1 if the rewards are negated ones, of which the smallest average is asked for.
     """
     found = end_components(mdp)
     states = np.flatnonzero(found.region(mdp))
-    leader = found.component[states]
-    states = states[np.argsort(leader, kind="stable")]
+    states = states[np.argsort(found.component[states], kind="stable")]
     leaders, start = np.unique(found.component[states], return_index=True)
-    part = _part(mdp, found.inside, states, start, reward, magnitude)
-    gains = _gains(part, tolerance, max_steps)
+    gains = _gains(
+        _submodel(mdp, found.inside, states, start, (reward, magnitude)), tolerance, max_steps
+    )
     middle, half = (gains.lower + gains.upper) / 2, float((gains.upper - gains.lower).max()) / 2
     row = mdp.row_start[:-1].astype(np.int64)
     row[states] = gains.row
     if middle.min() == middle.max():
         value = np.full(mdp.num_states, middle[0])
-        return Average(
-            value, value - half, value + half, _all_to(mdp, states, row), half, gains.rounds
-        )
-    stopping = _with_stops(mdp, found, leaders)
+        inside = found.region(mdp)
+        if not inside.all():
+            onward = shortest_path_rows(mdp, inside, np.ones(mdp.num_rows, bool))
+            row = np.where(inside, row, onward)
+        return AverageReward(value, value - half, value + half, row, half, gains.rounds)
+    stopping = _stopping_problem(mdp, found, leaders)
     least = max(float(np.abs(middle).min()), _FLOOR * float(magnitude.max()))
     width = tolerance / 4 * least
     if half <= width:
-        (low, high, taken, more), slack = _stopped(stopping, middle, tolerance, width, sign), half
+        (low, high, taken, rounds), slack = stopping.solve(middle, tolerance, width, sign), half
     else:
-        # Where little is earned what is not known of other components would be too much.
-        low, _, taken, more = _stopped(stopping, gains.lower, tolerance, width, sign)
-        high, slack = _stopped(stopping, gains.upper, tolerance, width, sign)[1], 0.0
-    return Average(
-        (low + high) / 2,
-        low - slack,
-        high + slack,
-        _routed(mdp, found, taken, row),
-        half,
-        gains.rounds + more,
+        # Beside small gains the error of large ones would be too much: both sides separately.
+        low, _, taken, rounds = stopping.solve(gains.lower, tolerance, width, sign)
+        high, slack = stopping.solve(gains.upper, tolerance, width, sign)[1], 0.0
+    return AverageReward(
+        value=(low + high) / 2,
+        lower=low - slack,
+        upper=high + slack,
+        row=_row_of_states(mdp, found, taken, row),
+        residual=half,
+        rounds=gains.rounds + rounds,
     )
 
 
-def _stopped(
-    stopping: _Stopping, gain: Floats, tolerance: float, width: float, sign: int
-) -> tuple[Floats, Floats, Integers, int]:
-    """Bounds on the best expected gain, rows that attain the lower one, and systems solved.
-
-    What is to be made small, and was not negative, is made small as it is, and found to a share.
-    """
-    node, mdp, origin = stopping
-    size, worth = mdp.num_states - gain.size, sign * gain
-    shift = min(float(worth.min()), 0.0)
-    # Beside large ones, a share of what is all but nothing cannot be had.
-    relative = shift == 0 and bool((worth[worth > 0] > _TINY * worth.max()).all())
-    known = np.concatenate([np.zeros(size), worth - shift])
-    open_ = np.arange(mdp.num_states) < size
-    problem = ShortestPathProblem(mdp, open_, known, np.zeros(mdp.num_rows))
-    found = policy_iteration(
-        problem,
-        maximize=sign > 0,
-        relative=relative,
-        tolerance=tolerance / 4 if relative else width,
-    )
-    slack = 4 * _EPS * (abs(shift) + known.max()) if shift else 0.0
-    low, high = (x[node] + shift for x in (found.lower, found.upper))
-    low, high = (low, high) if sign > 0 else (-high, -low)
-    # It is a mean of what the components earn.
-    low, high = np.maximum(low - slack, gain.min()), np.minimum(high + slack, gain.max())
-    return low, high, origin[found.row[node]], found.rounds
-
-
-def _all_to(mdp: HostMDP, states: Integers, row: Integers) -> Integers:
-    """Rows that lead to components from everywhere, as all are worth the same."""
-    inside = np.zeros(mdp.num_states, bool)
-    inside[states] = True
-    if inside.all():
-        return row
-    return np.where(inside, row, shortest_path_rows(mdp, inside, np.ones(mdp.num_rows, bool)))
-
-
-def _routed(mdp: HostMDP, found: EndComponents, taken: Integers, row: Integers) -> Integers:
+def _row_of_states(mdp: HostMDP, found: EndComponents, taken: Integers, row: Integers) -> Integers:
     """Rows of states from those of nodes, -1 for components to stop in."""
     region = found.region(mdp)
     moves = taken >= 0
@@ -178,21 +143,49 @@ def _routed(mdp: HostMDP, found: EndComponents, taken: Integers, row: Integers) 
     return row
 
 
-class _Stopping(NamedTuple):
-    """Components as one node each, with a row more by which it stops at a node of its own.
+@dataclass(frozen=True)
+class _Stopping:
+    """End components as one node each, with a row that leads to a terminal node of each.
 
     Attributes:
       node: ``int[S]``, the node of each state.
-      mdp: the model; its last nodes are the stops.
-      origin: ``int[R']``, the row that each of its rows is; -1 for stops.
+      mdp: the model; its last nodes are terminal.
+      origin: ``int[R']``, the model's row of each row; -1 for stopping.
     """
 
     node: Integers
     mdp: HostMDP
     origin: Integers
 
+    def solve(
+        self, gain: Floats, tolerance: float, width: float, sign: int
+    ) -> tuple[Floats, Floats, Integers, int]:
+        """Bounds on the best expected gain, rows that attain the lower one, and linear systems.
 
-def _with_stops(mdp: HostMDP, found: EndComponents, leaders: Integers) -> _Stopping:
+        A smallest average of nonnegative rewards is minimised as it is, to a relative tolerance.
+        """
+        mdp = self.mdp
+        size, worth = mdp.num_states - gain.size, sign * gain
+        shift = min(float(worth.min()), 0.0)
+        # Beside large gains, a share of almost zero cannot be resolved.
+        relative = shift == 0 and bool((worth[worth > 0] > _TINY * worth.max()).all())
+        known = np.concatenate([np.zeros(size), worth - shift])
+        interior = np.arange(mdp.num_states) < size
+        found = policy_iteration(
+            ShortestPathProblem(mdp, interior, known, np.zeros(mdp.num_rows)),
+            maximize=sign > 0,
+            relative=relative,
+            tolerance=tolerance / 4 if relative else width,
+        )
+        slack = 4 * _EPS * (abs(shift) + known.max()) if shift else 0.0
+        low, high = (x[self.node] + shift for x in (found.lower, found.upper))
+        low, high = (low, high) if sign > 0 else (-high, -low)
+        # It is a mean of the gains of the components.
+        low, high = np.maximum(low - slack, gain.min()), np.minimum(high + slack, gain.max())
+        return low, high, self.origin[found.row[self.node]], found.rounds
+
+
+def _stopping_problem(mdp: HostMDP, found: EndComponents, leaders: Integers) -> _Stopping:
     heads = np.flatnonzero(found.component == np.arange(mdp.num_states))
     node = np.searchsorted(heads, found.component)
     stops = np.arange(leaders.size) + heads.size
@@ -204,8 +197,7 @@ def _with_stops(mdp: HostMDP, found: EndComponents, leaders: Integers) -> _Stopp
     probability = np.concatenate([mdp.probability[entry], np.ones(2 * stops.size)])
     origin = np.concatenate([row, np.full(2 * stops.size, -1)])
     order = np.argsort(owner, kind="stable")
-    begin = (width.cumsum() - width)[order]
-    entry = concatenated_ranges(begin, width[order])
+    entry = concatenated_ranges((width.cumsum() - width)[order], width[order])
     count = np.bincount(owner, minlength=heads.size + stops.size)
     small = HostMDP(
         offsets_from_counts(count),
@@ -219,14 +211,14 @@ def _with_stops(mdp: HostMDP, found: EndComponents, leaders: Integers) -> _Stopp
 # --- the gain of each component ------------------------------------------------------------------
 
 
-class _Part(NamedTuple):
-    """Some components as a model of their own, without what leaves them.
+@dataclass(frozen=True)
+class _Submodel:
+    """Some components as a separate model, without the rows that leave them.
 
     Attributes:
       mdp: its states are those of the components, one component after the other.
-      start: ``int[C]``, where the states of each begin.
-      size: ``int[C]``, how many each has.
-      row: ``int[R']``, which rows these are.
+      start, size: ``int[C]``, the first state and the number of states of each.
+      row: ``int[R']``, the rows of the model.
       reward, magnitude: ``float64[R']``.
       unit: the rounding of one backup.
     """
@@ -246,28 +238,26 @@ class _Part(NamedTuple):
         return self.mdp.over_choices(np.maximum, image) - v
 
     def gain(self, v: Floats, low: Floats | None = None) -> tuple[Floats, Floats]:
-        """``c + P v - v`` of each row and its rounding, by differences, which are often small."""
-        mdp = self.mdp
-        source, target = mdp.state[mdp.row], mdp.successor
-        ahead = (
-            v[target] - v[source]
-            if low is None
-            else two_float_difference(v[target], low[target], v[source], low[source])
-        )
-        step = mdp.probability * ahead
-        slack = np.add.reduceat(np.abs(step), mdp.entry_start[:-1])
-        return (
-            self.reward + np.add.reduceat(step, mdp.entry_start[:-1]),
-            self.unit * (self.magnitude + slack),
-        )
+        """``c + P v - v`` of each row, and its rounding; `low` is a second float of v."""
+        start, step = self.mdp.entry_start[:-1], self.flow(v, low)
+        slack = self.unit * (self.magnitude + np.add.reduceat(np.abs(step), start))
+        return self.reward + np.add.reduceat(step, start), slack
 
-    def asked(self, low: Floats, high: Floats, tolerance: float) -> Floats:
-        """How wide bounds may be."""
+    def flow(self, v: Floats, low: Floats | None = None) -> Floats:
+        """``P_t (v_t - v_s)`` of each entry."""
+        source, target = self.mdp.state[self.mdp.row], self.mdp.successor
+        if low is None:
+            return self.mdp.probability * (v[target] - v[source])
+        ahead = two_float_difference(v[target], low[target], v[source], low[source])
+        return self.mdp.probability * ahead
+
+    def allowed_width(self, low: Floats, high: Floats, tolerance: float) -> Floats:
+        """The width of bounds that the tolerance allows."""
         weight = np.maximum.reduceat(self.mdp.over_choices(np.maximum, self.magnitude), self.start)
         return tolerance * np.maximum(np.minimum(np.abs(low), np.abs(high)), _FLOOR * weight)
 
     def first_best(self, quantity: Floats) -> Integers:
-        """The first row of each state with the most."""
+        """The first row of each state with the largest quantity."""
         best = self.mdp.over_choices(np.maximum, quantity)
         return self.mdp.first_choice(quantity == best[self.mdp.state])[1].astype(np.int64)
 
@@ -276,14 +266,13 @@ class _Part(NamedTuple):
         return v - np.repeat(v[self.start], self.size)
 
 
-def _part(
+def _submodel(
     mdp: HostMDP,
     inside: Booleans,
     states: Integers,
     start: Integers,
-    reward: Floats,
-    magnitude: Floats,
-) -> _Part:
+    rewards: tuple[Floats, Floats],
+) -> _Submodel:
     """Some components of a model, with the rows that stay inside."""
     number: Any = np.full(mdp.num_states, -1, np.int32)
     number[states] = np.arange(states.size)
@@ -298,25 +287,28 @@ def _part(
         number[mdp.successor[entry]],
         mdp.probability[entry],
     )
-    return _Part(
-        small,
-        start,
-        np.diff(start, append=states.size),
-        row,
-        reward[row],
-        magnitude[row],
-        backup_unit(small),
-    )
+    reward, magnitude = (x[row] for x in rewards)
+    size = np.diff(start, append=states.size)
+    return _Submodel(small, start, size, row, reward, magnitude, backup_unit(small))
+
+
+@dataclass(frozen=True)
+class _Bias:
+    """A policy's gain, and its bias in two floats."""
+
+    gain: float
+    high: Floats
+    low: Floats
 
 
 @dataclass
 class _Gains:
-    """What is known of C components.
+    """Bounds of the gains of C components.
 
     Attributes:
       lower, upper: ``float64[C]``.
       row: ``int64[S']``, rows of their states that attain the lower bound.
-      rounds: what was spent.
+      rounds: sweeps, and linear systems.
     """
 
     lower: Floats
@@ -324,194 +316,179 @@ class _Gains:
     row: Integers
     rounds: int = 0
 
-    def note(self, left: _Left) -> None:
-        """Takes what a value shows of some components."""
-        part, which = left.part, left.which
-        gain, slack = part.gain(left.v)
+    def update(self, rest: _Unsettled) -> None:
+        """Applies the span bound of a value."""
+        part, which = rest.part, rest.which
+        gain, slack = part.gain(rest.v)
         low = np.minimum.reduceat(part.mdp.over_choices(np.maximum, gain - slack), part.start)
         high = np.maximum.reduceat(part.mdp.over_choices(np.maximum, gain + slack), part.start)
         better = low > self.lower[which]
         if better.any():
             inner = np.repeat(better, part.size)
-            self.row[left.states[inner]] = part.row[part.first_best(gain - slack)[inner]]
+            self.row[rest.states[inner]] = part.row[part.first_best(gain - slack)[inner]]
         self.lower[which] = np.maximum(self.lower[which], low)
         self.upper[which] = np.minimum(self.upper[which], high)
 
-    def note_by_weights(
-        self, left: _Left, chosen: Integers, high: Floats, low: Floats, gain: float
-    ) -> None:
-        """Takes what a policy's bias, in two floats, shows of one component.
+    def update_by_weights(self, rest: _Unsettled, chosen: Integers, bias: _Bias) -> None:
+        """Applies the bound by perturbed weights to a policy of one component.
 
         With costs ``c = r - min r`` and ``g = gain - min r``, a row has the balance
         ``c - g + sum_t P_t (v_t - v_s)``. If that of each chosen row is at most a share e of the
-        sum of its absolute terms, the policy has the gain g for weights and costs that differ by e;
-        if no row has more, no policy has a greater one. As quotients of sums of their products
-        (:func:`~jaxltl.core.sparse.linear.extended_precision.perturbation_bound`), gains of the true ones
-        differ by a small multiple of e, however far apart biases are.
+        sum of its absolute terms, the policy has gain g for weights and costs that differ by e; if
+        no row has more, no policy has a larger one. As quotients of sums of products of the
+        weights, the gains of the true ones differ by a small multiple of e, however far apart
+        biases are (:func:`~jaxltl.core.sparse.linear.extended_precision.perturbation_bound`).
         """
-        part, which = left.part, left.which[0]
-        mdp, base = part.mdp, float(part.reward.min())
-        start, cost, earned = mdp.entry_start[:-1], part.reward - base, max(gain - base, 0.0)
-        source, target = mdp.state[mdp.row], mdp.successor
-        flow = mdp.probability * two_float_difference(
-            high[target], low[target], high[source], low[source]
-        )
-        gap = (part.reward - gain) + np.add.reduceat(flow, start)
-        scale = cost + earned + np.add.reduceat(np.abs(flow), start)
+        part, which = rest.part, rest.which[0]
+        base, start = float(part.reward.min()), part.mdp.entry_start[:-1]
+        flow, earned = part.flow(bias.high, bias.low), max(bias.gain - base, 0.0)
+        gap = (part.reward - bias.gain) + np.add.reduceat(flow, start)
+        scale = (part.reward - base) + earned + np.add.reduceat(np.abs(flow), start)
         share = np.abs(gap) / np.maximum(scale, 1e-300)
         own = float(share[chosen].max())
         every = max(own, float(share[gap > 0].max(initial=0)))
         slack = part.unit * float(part.magnitude.max())
         bounds = []
         for side, error in ((-1, own), (1, every)):
-            error = perturbation_bound(error + 2 * part.unit, mdp.num_states)
-            far = gain + side * (error * earned + slack) if error < _LOOSEST else side * np.inf
-            bounds.append(far)
+            error = perturbation_bound(error + 2 * part.unit, part.mdp.num_states)
+            width = error * earned + slack if error < _LOOSEST else np.inf
+            bounds.append(bias.gain + side * width)
         if bounds[0] > self.lower[which]:
             self.lower[which] = bounds[0]
-            self.row[left.states] = part.row[chosen]
+            self.row[rest.states] = part.row[chosen]
         self.upper[which] = min(self.upper[which], bounds[1])
 
-    def wide(self, left: _Left, tolerance: float) -> Booleans:
-        """Whose bounds are wider than asked."""
-        low, high = self.lower[left.which], self.upper[left.which]
-        return high - low > left.part.asked(low, high, tolerance)
+    def too_wide(self, rest: _Unsettled, tolerance: float) -> Booleans:
+        """The components whose bounds are wider than the tolerance."""
+        low, high = self.lower[rest.which], self.upper[rest.which]
+        return high - low > rest.part.allowed_width(low, high, tolerance)
 
 
-def _gains(whole: _Part, tolerance: float, max_steps: int) -> _Gains:
-    """Bounds on the largest gain of each component."""
-    count, size = whole.start.size, whole.mdp.num_states
-    known = _Gains(np.full(count, -np.inf), np.full(count, np.inf), np.zeros(size, np.int64))
-    left = _Left(np.arange(count), np.arange(size), whole, np.zeros(size))
-    left = _swept(known, left, tolerance, min(_SWEEPS, max_steps), patience=0)
-    for turn in range(_TURNS):
-        settled, v = np.zeros(left.which.size, bool), left.v.copy()
-        for i in np.flatnonzero(left.part.size <= _ELIMINATED):
-            one = np.arange(settled.size) == i
-            found = _by_policies(known, left.only(one), tolerance)
-            settled[i] = found is None
-            if found is not None:
-                v[np.repeat(one, left.part.size)] = found
-        # Value iteration goes on where it was, and later from what policies found.
-        left = (left._replace(v=v) if turn else left).only(~settled)
-        if not left.which.size or max_steps <= _SWEEPS:
-            break
-        left = _swept(known, left, tolerance, _SWEEPS)
-    rest, patience = max_steps - (_TURNS + 1) * _SWEEPS, _PATIENCE * left.v.size
-    _swept(known, left, tolerance, rest, patience)
-    return known
-
-
-class _Left(NamedTuple):
-    """Components that are not narrow yet: which, their states, as a part, and a value."""
+@dataclass(frozen=True)
+class _Unsettled:
+    """Components whose bounds are too wide: their numbers, states, submodel, and a value."""
 
     which: Integers
     states: Integers
-    part: _Part
+    part: _Submodel
     v: Floats
 
-    def only(self, kept: Booleans) -> _Left:
+    def only(self, kept: Booleans) -> _Unsettled:
         """Some of these."""
         if kept.all():
             return self
-        states = np.flatnonzero(np.repeat(kept, self.part.size))
-        size = self.part.size[kept]
-        part = self.part
-        small = _part(
-            part.mdp,
-            np.ones(part.mdp.num_rows, bool),
-            states,
-            size.cumsum() - size,
-            part.reward,
-            part.magnitude,
-        )
-        small = small._replace(row=part.row[small.row])
-        return _Left(self.which[kept], self.states[states], small, self.v[states])
+        part, size = self.part, self.part.size[kept]
+        states = np.flatnonzero(np.repeat(kept, part.size))
+        rows, start = np.ones(part.mdp.num_rows, bool), size.cumsum() - size
+        small = _submodel(part.mdp, rows, states, start, (part.reward, part.magnitude))
+        small = replace(small, row=part.row[small.row])
+        return _Unsettled(self.which[kept], self.states[states], small, self.v[states])
 
 
-def _swept(
-    known: _Gains, left: _Left, tolerance: float, num_steps: int, patience: float = np.inf
-) -> _Left:
+def _gains(whole: _Submodel, tolerance: float, max_steps: int) -> _Gains:
+    """Bounds on the largest gain of each component."""
+    count, size = whole.start.size, whole.mdp.num_states
+    known = _Gains(np.full(count, -np.inf), np.full(count, np.inf), np.zeros(size, np.int64))
+    rest = _Unsettled(np.arange(count), np.arange(size), whole, np.zeros(size))
+    rest = _value_iteration(known, rest, tolerance, min(_SWEEPS, max_steps), patience=0)
+    for turn in range(_TURNS):
+        settled, v = np.zeros(rest.which.size, bool), rest.v.copy()
+        for i in np.flatnonzero(rest.part.size <= _ELIMINATED):
+            one = np.arange(settled.size) == i
+            found = _policy_iteration(known, rest.only(one), tolerance)
+            settled[i] = found is None
+            if found is not None:
+                v[np.repeat(one, rest.part.size)] = found
+        # Value iteration continues its own values first, and later those of policies.
+        rest = (replace(rest, v=v) if turn else rest).only(~settled)
+        if not rest.which.size or max_steps <= _SWEEPS:
+            break
+        rest = _value_iteration(known, rest, tolerance, _SWEEPS)
+    num_steps = max_steps - (_TURNS + 1) * _SWEEPS
+    _value_iteration(known, rest, tolerance, num_steps, _PATIENCE * rest.v.size)
+    return known
+
+
+def _value_iteration(
+    known: _Gains, rest: _Unsettled, tolerance: float, num_steps: int, patience: float = np.inf
+) -> _Unsettled:
     """Value iteration of all components at once, until each is narrow.
 
     After `patience` sweeps it also ends where the steps are too few at the rate of convergence.
     """
     before: Floats | None = None
     done = 0
-    while left.which.size and done <= num_steps:
-        v = left.v
+    while rest.which.size and done <= num_steps:
+        v = rest.v
         for _ in range(_EVERY if done else 0):
-            v = left.part.centred(v + _LAZY * left.part.change(v))
+            v = rest.part.centred(v + _LAZY * rest.part.change(v))
         done += _EVERY
-        left = left._replace(v=v)
-        known.note(left)
-        left = left.only(known.wide(left, tolerance))
-        if done >= patience and done % _JUDGED == 0 and left.which.size:
-            if (
-                before is not None
-                and (_steps_left(known, left, before, tolerance) > num_steps - done).all()
-            ):
-                break
+        rest = replace(rest, v=v)
+        known.update(rest)
+        rest = rest.only(known.too_wide(rest, tolerance))
+        if done >= patience and done % _JUDGED == 0 and rest.which.size:
+            if before is not None:
+                needed = _steps_needed(known, rest, before, tolerance)
+                if (needed > num_steps - done).all():
+                    break
             before = known.upper - known.lower
     known.rounds += done
-    return left
+    return rest
 
 
-def _steps_left(known: _Gains, left: _Left, before: Floats, tolerance: float) -> Floats:
-    """How many more it takes, by how much narrower bounds became since they were judged last."""
-    low, high = known.lower[left.which], known.upper[left.which]
+def _steps_needed(known: _Gains, rest: _Unsettled, before: Floats, tolerance: float) -> Floats:
+    """The number of further steps, by the rate at which bounds became narrower since `before`."""
+    low, high = known.lower[rest.which], known.upper[rest.which]
     now = high - low
-    rate = np.log(np.minimum(now / before[left.which], 1 - _EPS))
-    asked = np.maximum(left.part.asked(low, high, tolerance), _EPS * now)
-    return _JUDGED * np.log(asked / now) / rate
+    rate = np.log(np.minimum(now / before[rest.which], 1 - _EPS))
+    goal = np.maximum(rest.part.allowed_width(low, high, tolerance), _EPS * now)
+    return _JUDGED * np.log(goal / now) / rate
 
 
 # --- policies of one component -------------------------------------------------------------------
 
 
-def _by_policies(known: _Gains, left: _Left, tolerance: float) -> Floats | None:
-    """Policy iteration (Howard 1960) of one component, each policy with one recurrent class.
+def _policy_iteration(known: _Gains, rest: _Unsettled, tolerance: float) -> Floats | None:
+    """Policy iteration (Howard 1960) on one component, over policies with one recurrent class.
 
-    Returns:
-      None where it came to an end, where nothing but rounding can be better; else, as policies of
-      one gain take turns whose states for ever are others, the value of one of the best.
+    Returns None if it ended, so that only rounding can be better; otherwise the bias of one of the
+    best policies, where policies of equal gain and different recurrent classes alternate.
     """
-    part = left.part
-    chosen, best, idle = part.first_best(part.gain(left.v)[0]), left.v, 0
+    part = rest.part
+    chosen, best, idle = part.first_best(part.gain(rest.v)[0]), rest.v, 0
     for _ in range(_ROUNDS):
         known.rounds += 1
-        before, solved = float(known.lower[left.which[0]]), _bias(part, chosen)
+        before, solved = float(known.lower[rest.which[0]]), _evaluated(part, chosen)
         if solved is None:
             return best
-        v, chosen = solved
-        known.note(left._replace(v=v[0]))
-        known.note_by_weights(left, chosen, *v)
-        if not known.wide(left, tolerance).any():
+        bias, chosen = solved
+        known.update(replace(rest, v=bias.high))
+        known.update_by_weights(rest, chosen, bias)
+        if not known.too_wide(rest, tolerance).any():
             return None
-        more = float(known.lower[left.which[0]]) - before
+        more = float(known.lower[rest.which[0]]) - before
         idle = 0 if more > _IDLE_SHARE * abs(before) else idle + 1
         if idle > _IDLE:
             break
-        best, range_ = v[0], float(np.ptp(v[0]))
-        gain, slack = part.gain(v[0], v[1])
+        best, range_ = bias.high, float(np.ptp(bias.high))
+        gain, slack = part.gain(bias.high, bias.low)
         better = part.mdp.over_choices(np.maximum, gain - slack) > (gain + slack)[chosen]
         if better.any():
             chosen = np.where(better, part.first_best(gain - slack), chosen)
         elif range_ > _LINGERS * part.magnitude.max():
-            # Some states are left hardly ever: the rest goes to the best of these.
+            # Some states are hardly ever left: the others go to the best of these.
             goal = best >= best.max() - _NEAR * range_
-            chosen = np.where(
-                goal, chosen, shortest_path_rows(part.mdp, goal, np.ones(part.row.size, bool))
-            )
+            onward = shortest_path_rows(part.mdp, goal, np.ones(part.row.size, bool))
+            chosen = np.where(goal, chosen, onward)
         else:
             return None
     return best
 
 
-def _bias(part: _Part, chosen: Integers) -> tuple[tuple[Floats, Floats, float], Integers] | None:
-    """A policy's bias v in two floats, its gain ``c + P v - v``, and the policy.
+def _evaluated(part: _Submodel, chosen: Integers) -> tuple[_Bias, Integers] | None:
+    """A policy's gain and bias, and the policy.
 
-    Where it has several recurrent classes, it is first led to the one of the largest gain.
+    If it has several recurrent classes, it is first led to the one of the largest gain.
     """
     mdp, size = part.mdp, part.mdp.num_states
     chain = mdp.matrix[chosen]
@@ -522,27 +499,29 @@ def _bias(part: _Part, chosen: Integers) -> tuple[tuple[Floats, Floats, float], 
     bottom[label[source[crossing]]] = False
     heads = np.unique(label[bottom[label]])
     if heads.size > 1:
-        alone = [_cycle(part, chosen, np.flatnonzero(label == head)) for head in heads]
-        if any(found is None for found in alone):
-            return None
-        best = int(np.argmax([found[0] for found in alone if found is not None]))
-        goal = label == heads[best]
+        gains = []
+        for head in heads:
+            found = _gain_and_bias(part, chosen, np.flatnonzero(label == head))
+            if found is None:
+                return None
+            gains.append(found.gain)
+        heads = heads[[int(np.argmax(gains))]]
         taken = np.zeros(mdp.num_rows, bool)
         taken[chosen] = True
-        goal = backward_reachable(mdp, goal, taken)
-        chosen = np.where(goal, chosen, shortest_path_rows(mdp, goal, np.ones(mdp.num_rows, bool)))
-        heads = heads[[best]]
-    recurrent = np.flatnonzero(label == heads[0])
-    found = _cycle(part, chosen, np.arange(size), recurrent)
-    return None if found is None else ((found[1], found[2], found[0]), chosen)
+        goal = backward_reachable(mdp, label == heads[0], taken)
+        onward = shortest_path_rows(mdp, goal, np.ones(mdp.num_rows, bool))
+        chosen = np.where(goal, chosen, onward)
+    found = _gain_and_bias(part, chosen, np.arange(size), np.flatnonzero(label == heads[0]))
+    return None if found is None else (found, chosen)
 
 
-def _cycle(
-    part: _Part, chosen: Integers, states: Integers, recurrent: Integers | None = None
-) -> tuple[float, Floats, Floats] | None:
-    """The gain and bias (in two floats) of a chain with one recurrent class, through visits of one state.
+def _gain_and_bias(
+    part: _Submodel, chosen: Integers, states: Integers, recurrent: Integers | None = None
+) -> _Bias | None:
+    """Gain and bias of a chain with one recurrent class, by renewal at a frequent state.
 
-    What is earned between two visits, by how long that takes.
+    The gain is the expected reward between two visits by the expected time. The bias is refined in
+    two floats (Wilkinson 1963), as it may exceed rewards by more than one float resolves.
     """
     mdp = part.mdp
     matrix = mdp.matrix[chosen[states]]
@@ -553,16 +532,16 @@ def _cycle(
         often = (often + matrix.T @ often) / 2
     among = np.arange(states.size) if recurrent is None else recurrent
     visited = among[often[among].argmax()]
-    # Loops are left out, however likely: what they take is in how rarely a state is left.
-    source = np.repeat(np.arange(states.size), np.diff(matrix.indptr))
-    loops = source == matrix.indices
+    # Self-loops are eliminated, however likely: their time is in how rarely a state is left.
+    source, target = np.repeat(np.arange(states.size), np.diff(matrix.indptr)), matrix.indices
+    loops = source == target
     leaves: Any = np.bincount(source[~loops], matrix.data[~loops], states.size)
     if leaves[visited] == 0:
-        leaves[visited] = 1  # it is never left, and so every step is a visit
+        leaves[visited] = 1  # absorbing: every step is a visit
     if (leaves == 0).any():
         return None
     cut = matrix.copy()
-    cut.data = np.where(loops | (matrix.indices == visited), 0, matrix.data / leaves[source])
+    cut.data = np.where(loops | (target == visited), 0, matrix.data / leaves[source])
     cut.eliminate_zeros()
     label = ordered_components(Edges(cut.indptr, cut.indices))
     system = factorize(cut, label, np.arange(states.size))
@@ -570,17 +549,15 @@ def _cycle(
         return None
     time, reward = system.solve(1 / leaves), part.reward[chosen[states]]
     gain, high, low = 0.0, np.zeros(states.size), np.zeros(states.size)
-    target = matrix.indices
     with np.errstate(all="ignore"):
         for _ in range(_REFINED):
-            step = matrix.data * two_float_difference(
-                high[target], low[target], high[source], low[source]
-            )
-            earned = system.solve((reward - gain + np.bincount(source, step, states.size)) / leaves)
+            ahead = two_float_difference(high[target], low[target], high[source], low[source])
+            step = np.bincount(source, matrix.data * ahead, states.size)
+            earned = system.solve((reward - gain + step) / leaves)
             share = earned[visited] / time[visited]
             if not np.isfinite(earned).all() or not np.isfinite(share):
                 return None
             gain += float(share)
             high, lost = two_sum(high, earned - share * time)
             high, low = two_sum(high, low + lost)
-    return gain, high - high[visited], low - low[visited]
+    return _Bias(gain, high - high[visited], low - low[visited])
