@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from jax.sharding import Mesh
@@ -20,7 +20,7 @@ from jaxltl.core.models.construct.padded import row_actions
 from jaxltl.core.models.mdp import refuse_negative
 from jaxltl.core.models.mesh.shard import ModelPart, model_from_parts, ranges_of
 from jaxltl.core.models.mesh.sharded import ShardedMDP
-from jaxltl.core.models.sparse import choice_reward, sparse_part
+from jaxltl.core.models.sparse import Annotations, choice_reward, sparse_part
 from jaxltl.io._files import FileBytes, compression_of, opened, pieces
 from jaxltl.io._umb_index import ACTIONS, INITIAL, Index, Items
 from jaxltl.io._umb_members import (
@@ -347,11 +347,9 @@ def _part(
             entry_start,
             target,
             probability,
-            label=label,
-            propositions=names,
-            begins=index.begins,
-            num_states=num_states,
-            **options,
+            cast(Annotations, {"label": label, "propositions": names, **options}),
+            index.begins,
+            num_states,
         )
         refuse_negative(initial, first=index.begins[0])
     except ValueError as error:

@@ -1,29 +1,26 @@
-"""Worlds that are simulated: pure functions of one trajectory, the same for every learner.
+"""Simulated environments: pure functions of one trajectory, the same for every learner.
 
-An :class:`Environment` is made of functions of one trajectory, without batch axes and without
-state of their own::
+An :class:`Environment` consists of functions without batch axes and without internal state::
 
     reset(key) -> world
     step(world, action, key) -> Timestep(world, reward, terminated, truncated, cost, discount)
     observe(world) -> observation, an array or a tree of arrays
-    labels(world) -> bool[P], which propositions hold
-    allowed(world) -> bool[A], which of finitely many actions may be taken (optional)
-    starts() -> (worlds, float[N]), all that reset draws, and how likely each is (optional)
+    labels(world) -> bool[P], the propositions that hold
+    allowed(world) -> bool[A], the available actions (optional)
+    starts() -> (worlds, float[N]), the support of reset and its probabilities (optional)
     outcomes(world, action) -> (Timestep, float[K]), the same of a step (optional)
 
-``world`` is any tree of arrays. Many trajectories are a ``vmap``. Two ways in which an episode ends
-are told apart: it is *terminated* if nothing comes after it, and *truncated* if something would,
-but is not simulated; a value is bootstrapped at the second alone. ``step`` never starts anew by
-itself, so that the world in which an episode ended is seen;
-:func:`~jaxltl.core.environments.episodes.auto_reset_step` does, for those who draw episodes one after the
-other.
+The state ``world`` is a tree of arrays, and a batch of trajectories is a ``vmap``. An episode is
+*terminated* in an absorbing state, and *truncated* where only the simulation ends; values are
+bootstrapped at truncation alone. ``step`` never resets, so that the last state of an episode is
+visible; :func:`~jaxltl.core.environments.episodes.auto_reset_step` resets.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypedDict, Unpack
 
 import chex
 import jax
@@ -34,8 +31,8 @@ from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 
 from jaxltl.core import validation
-from jaxltl.core.environments.purity import traced
 from jaxltl.core.models import facts
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.types import require_shape
 
@@ -43,10 +40,10 @@ from jaxltl.core.types import require_shape
 @brief
 @struct.dataclass
 class Finite:
-    """The actions ``0 .. num - 1``.
+    """A finite action space, ``0 .. num - 1``.
 
     Attributes:
-      num: how many there are; static.
+      num: the number of actions; static.
 
     Example:
       >>> Finite(4).num
@@ -59,12 +56,12 @@ class Finite:
 @brief(facts=facts.space)
 @struct.dataclass
 class Box:
-    """Arrays between two bounds; made by :func:`make_box`.
+    """A space of arrays between two bounds; :func:`make_box` builds a checked one.
 
     Attributes:
-      low, high: arrays that broadcast to the shape; infinite where there is no bound.
+      low, high: arrays that broadcast to the shape, infinite where unbounded.
       shape: static.
-      dtype: by name; static.
+      dtype: its name; static.
 
     Example:
       >>> space = make_box([-1.0, 0.0], 1.0)
@@ -81,19 +78,18 @@ class Box:
 def make_box(
     low: ArrayLike, high: ArrayLike, shape: Sequence[int] | None = None, dtype: Any = None
 ) -> Box:
-    """Arrays between two bounds, checked: a :class:`Box`.
-
+    """A checked :class:`Box`.
 
     Args:
-      low, high: bounds, numbers or arrays; infinite for none.
-      shape: of what is in it; default that of the bounds together.
-      dtype: default that of the bounds together, at least a float of the default precision.
+      low, high: bounds, numbers or arrays, infinite for none.
+      shape: default: that of the bounds together.
+      dtype: default: that of the bounds together, at least a float of the default precision.
 
     Returns:
-      :class:`Box`, whose bounds are NumPy's.
+      :class:`Box` with NumPy bounds.
 
     Raises:
-      ValueError: bounds that cross, are no numbers, or do not fit the shape.
+      ValueError: bounds that cross, are not numbers, or do not fit the shape.
 
     Example:
       >>> make_box(-1.0, [1.0, 2.0]).shape
@@ -144,22 +140,22 @@ def _bounds(bound: ArrayLike) -> np.ndarray:
 
 
 def _clipped(x: np.ndarray, least: int, most: int) -> np.ndarray:
-    """In integers, since the greatest of 64 bits is no floating-point number."""
+    """Clips to integer bounds; 2^63 - 1 has no exact floating-point value."""
     inside = (x > least) & (x < most)
     return np.where(inside, np.where(inside, x, 0).astype(int), np.where(x > least, most, least))
 
 
 @brief
 class Timestep(NamedTuple):
-    """What a step leads to; all but the world are scalars.
+    """The result of a step; all fields but `world` are scalars.
 
     Attributes:
-      world: after the step, also where the episode ends with it.
-      reward: earned by the step.
-      terminated: whether the episode is over: nothing comes after `world`.
-      truncated: whether it is merely cut off. Both may hold; then it is over.
-      cost: of the step, for learners that keep to a limit.
-      discount: of all that comes after the step, times the learner's own.
+      world: the state after the step, also at the end of an episode.
+      reward: the reward of the step.
+      terminated: True in an absorbing state.
+      truncated: True where the simulation ends without termination.
+      cost: the cost of the step, for constrained learners.
+      discount: the discount of later rewards, a factor on the learner's own.
 
     Example:
       >>> made = Timestep(world=3, reward=1.0, terminated=True)
@@ -167,7 +163,7 @@ class Timestep(NamedTuple):
       (3, False, 1.0)
     """
 
-    world: Any
+    world: PyTree
     reward: chex.Numeric
     terminated: chex.Numeric
     truncated: chex.Numeric = False
@@ -178,20 +174,20 @@ class Timestep(NamedTuple):
 @brief(facts=facts.environment)
 @struct.dataclass
 class Environment:
-    """A simulated world; made by :func:`make_environment`, whose text tells the functions.
+    """A simulated environment; :func:`make_environment` builds a checked one.
 
-    All of its numbers are arrays of the functions, ``jax.tree_util.Partial(function, *arrays)``:
-    new ones do not recompile, and environments of one shape are stacked and vmapped.
+    Its numbers are arrays of the functions, ``jax.tree_util.Partial(function, *arrays)``: new numbers
+    do not recompile, and environments of one shape are stacked and vmapped.
 
     Attributes:
-      reset, step, observe, labels: see the module's text.
-      allowed: the actions that may be taken, or None: all.
+      reset, step, observe, labels: see the module documentation.
+      allowed: the mask of available actions, or None if all are.
       actions: :class:`Finite` or :class:`Box`.
-      observations: a tree of :class:`Box`, as `observe` returns arrays.
+      observations: a tree of :class:`Box` with the structure of an observation.
       propositions: names of the P labels; static.
-      horizon: after how many steps every episode has ended; None: not known; static.
-      starts, outcomes: what may be drawn, or None: not told; the worlds and the fields of the
-        Timestep have a first axis. Of a step that draws nothing they may be left out.
+      horizon: an upper bound on the length of episodes, or None; static.
+      starts, outcomes: the distributions of `reset` and `step`, or None; the worlds and the fields of
+        the Timestep have a leading axis.
 
     Example:
       >>> coin = make_environment(
@@ -203,52 +199,63 @@ class Environment:
       1
     """
 
-    reset: Callable[..., Any]
+    reset: Callable[..., PyTree]
     step: Callable[..., Timestep]
-    observe: Callable[..., Any]
+    observe: Callable[..., PyTree]
     labels: Callable[..., jax.Array]
     allowed: Callable[..., jax.Array] | None
     actions: Finite | Box
-    observations: Any
+    observations: PyTree
     propositions: tuple[str, ...] = struct.field(pytree_node=False)
     horizon: int | None = struct.field(pytree_node=False, default=None)
     starts: Callable[..., Any] | None = None
     outcomes: Callable[..., Any] | None = None
 
 
+class EnvironmentOptions(TypedDict, total=False):
+    """Optional parts of an environment.
+
+    Attributes:
+      labels: ``world -> bool[P]``.
+      propositions: the P names.
+      allowed: ``world -> bool[A]``, the available actions of a finite action space.
+      observations: a tree of :class:`Box`; default: unbounded.
+      horizon: an upper bound on the length of episodes.
+      starts, outcomes: distributions of `reset` and `step`, for
+        :func:`~jaxltl.core.environments.tabulate.tabulate`.
+    """
+
+    labels: Callable[..., jax.Array] | None
+    propositions: Sequence[str]
+    allowed: Callable[..., jax.Array] | None
+    observations: PyTree
+    horizon: int | None
+    starts: Callable[..., PyTree] | None
+    outcomes: Callable[..., PyTree] | None
+
+
 def make_environment(
-    reset: Callable[..., Any],
+    reset: Callable[..., PyTree],
     step: Callable[..., Timestep],
-    observe: Callable[..., Any],
+    observe: Callable[..., PyTree],
     *,
     actions: Finite | Box | int,
-    labels: Callable[..., jax.Array] | None = None,
-    propositions: Sequence[str] = (),
-    allowed: Callable[..., jax.Array] | None = None,
-    observations: Any = None,
-    horizon: int | None = None,
-    starts: Callable[..., Any] | None = None,
-    outcomes: Callable[..., Any] | None = None,
+    **options: Unpack[EnvironmentOptions],
 ) -> Environment:
     """A checked :class:`Environment`.
 
     Args:
-      reset, step, observe: see the module's text; functions, or ``Partial`` objects that hand over
-        arrays. A step may leave out what the last fields of :class:`Timestep` have by default.
-      actions: what a step takes; a number is that of finitely many actions.
-      labels: ``world -> bool[P]``; a row of all False where it is left out.
-      propositions: their names.
-      allowed: ``world -> bool[A]``, for finitely many actions.
-      observations: a tree of :class:`Box`; default: without bounds.
-      horizon: after how many steps every episode has ended, if that is known.
-      starts, outcomes: see the module's text; for :func:`~jaxltl.core.environments.tabulate.tabulate`.
+      reset, step, observe: see the module documentation; functions, or ``Partial`` objects with
+        arrays. A step may omit the last fields of :class:`Timestep`.
+      actions: the action space; a number stands for :class:`Finite`.
+      options: see :class:`EnvironmentOptions`.
 
     Returns:
       :class:`Environment`.
 
     Raises:
-      ValueError: a function that returns something of another shape, that is not pure (it keeps
-        what it was called with, or is another function each time), or a name given twice.
+      ValueError: a function with a result of another shape, a function that is not pure, or a
+        repeated name.
 
     Example:
       >>> def reset(key):
@@ -262,7 +269,10 @@ def make_environment(
       >>> corridor.actions.num, corridor.observations.shape
       (2, (1,))
     """
-    names = validation.distinct_names("propositions", propositions)
+    if unknown := sorted(set(options) - set(EnvironmentOptions.__annotations__)):
+        raise TypeError(f"make_environment() got an unexpected keyword argument {unknown[0]!r}")
+    names = validation.distinct_names("propositions", options.get("propositions", ()))
+    horizon, observations = options.get("horizon"), options.get("observations")
     if horizon is not None:
         horizon = validation.integer("horizon", horizon, least=1)
     if isinstance(actions, int | np.integer):
@@ -271,22 +281,18 @@ def make_environment(
         raise ValueError(f"actions={actions!r}; give Finite(number), or make_box(low, high).")
     if isinstance(actions, Finite) and actions.num < 1:
         raise ValueError(f"actions: Finite({actions.num}); there must be at least one.")
-    if labels is None:
+    functions: dict[str, Any] = {"reset": reset, "step": step, "observe": observe}
+    functions |= {n: options.get(n) for n in ("labels", "allowed", "starts", "outcomes")}
+    if functions["labels"] is None:
         if names:
             raise ValueError(f"propositions={list(names)}, but no labels; give both or neither.")
-        labels = Partial(no_labels)
+        functions["labels"] = Partial(no_labels)
     made = Environment(
-        reset=as_partial(reset, "reset"),
-        step=as_partial(step, "step"),
-        observe=as_partial(observe, "observe"),
-        labels=as_partial(labels, "labels"),
-        allowed=None if allowed is None else as_partial(allowed, "allowed"),
+        **{n: None if f is None else as_partial(f, n) for n, f in functions.items()},
         actions=actions,
         observations=observations,
         propositions=names,
         horizon=horizon,
-        starts=None if starts is None else as_partial(starts, "starts"),
-        outcomes=None if outcomes is None else as_partial(outcomes, "outcomes"),
     )
     seen = _check_functions(made)
     if observations is None:
@@ -301,14 +307,14 @@ def make_environment(
 
 
 def as_partial(function: Callable[..., Any], name: str = "function") -> Partial:
-    """A function as a tree of arrays, which those that ``jit`` compiles take as an argument."""
+    """A function as a pytree, which compiled functions accept as an argument."""
     return (
         function if isinstance(function, Partial) else Partial(validation.function(name, function))
     )
 
 
 def require_environment(environment: Any) -> Environment:
-    """Refuses what is no :class:`Environment`."""
+    """Raises ValueError for anything but an :class:`Environment`."""
     found: Environment = validation.instance(
         "environment", environment, Environment, "one of make_environment"
     )
@@ -316,7 +322,7 @@ def require_environment(environment: Any) -> Environment:
 
 
 def require_key(key: Any) -> chex.PRNGKey:
-    """Refuses what is no single key."""
+    """Raises ValueError for anything but a single random key."""
     dtype = getattr(key, "dtype", None)
     typed = dtype is not None and jax.dtypes.issubdtype(dtype, jax.dtypes.prng_key)
     if not (typed and key.shape == ()) and not (dtype == np.uint32 and key.ndim == 1):
@@ -324,14 +330,14 @@ def require_key(key: Any) -> chex.PRNGKey:
     return key
 
 
-def no_labels(world: Any) -> jax.Array:
-    """``bool[0]``: the labels of a world without propositions."""
+def no_labels(world: PyTree) -> jax.Array:
+    """``bool[0]``: the labels of an environment without propositions."""
     del world
     return jnp.zeros(0, bool)
 
 
 def some_action(actions: Finite | Box) -> jax.ShapeDtypeStruct:
-    """The shape and type of one action."""
+    """Shape and dtype of an action."""
     if isinstance(actions, Finite):
         return jax.ShapeDtypeStruct((), jnp.int32)
     return jax.ShapeDtypeStruct(actions.shape, jnp.dtype(actions.dtype))
@@ -340,7 +346,7 @@ def some_action(actions: Finite | Box) -> jax.ShapeDtypeStruct:
 def random_action(
     key: chex.PRNGKey, actions: Finite | Box, allowed: chex.Array | None = None
 ) -> jax.Array:
-    """One action, uniform among those that are allowed; where a box has no bound, normal."""
+    """A uniform random available action; normal in unbounded directions of a box."""
     if isinstance(actions, Finite):
         weight = jnp.zeros(actions.num) if allowed is None else jnp.where(allowed, 0, -jnp.inf)
         return jax.random.categorical(key, weight).astype(jnp.int32)
@@ -354,12 +360,12 @@ def random_action(
 
 
 def clipped_action(actions: Box, action: chex.Array) -> jax.Array:
-    """The action of a box that is nearest to an array of its shape."""
+    """The projection of an action onto a box."""
     return jnp.clip(action, actions.low, actions.high)
 
 
-def flat_observation(observation: Any) -> jax.Array:
-    """What is observed as one vector ``float[O]``, the arrays of a tree one after the other.
+def flat_observation(observation: PyTree) -> jax.Array:
+    """An observation as one vector ``float[O]``, the concatenated arrays of its tree.
 
     Example:
       >>> flat_observation({"at": jnp.array([1.5, 2.5]), "open": jnp.bool_(True)}).tolist()
@@ -371,8 +377,8 @@ def flat_observation(observation: Any) -> jax.Array:
     return jnp.concatenate([jnp.ravel(x).astype(kind) for x in leaves])
 
 
-def allowed_in(environment: Environment, world: Any) -> jax.Array | None:
-    """``bool[A]``, the actions that may be taken in a world, or None: all."""
+def allowed_in(environment: Environment, world: PyTree) -> jax.Array | None:
+    """``bool[A]``, the available actions in a state, or None if all are."""
     return None if environment.allowed is None else environment.allowed(world)
 
 
@@ -380,7 +386,7 @@ def allowed_in(environment: Environment, world: Any) -> jax.Array | None:
 
 
 def _check_functions(made: Environment) -> Any:
-    """Shapes of all that the functions return; those of an observation are returned."""
+    """Checks the shapes of all results; returns those of an observation."""
     key = jax.random.key(0)
     world = traced("reset", made.reset, key)
     seen = traced("observe", made.observe, world)
@@ -422,7 +428,7 @@ def _check_functions(made: Environment) -> Any:
 
 
 def require_labels(label: Any, propositions: Sequence[str]) -> None:
-    """Refuses labels of a world that are not ``bool[P]``."""
+    """Raises ValueError unless labels are ``bool[P]``."""
     if getattr(label, "shape", None) != (len(propositions),) or not _is_bool(label):
         raise ValueError(
             f"labels returns {_described(label)}; return bool[{len(propositions)}], one for each "
@@ -434,7 +440,7 @@ def _is_bool(x: Any) -> bool:
     return np.dtype(getattr(x, "dtype", type(x))) == np.bool_
 
 
-def _as_arrays(observations: Any) -> Any:
+def _as_arrays(observations: PyTree) -> Any:
     for leaf in jax.tree.leaves(observations, is_leaf=lambda b: isinstance(b, Box)):
         validation.instance("observations", leaf, Box, "a tree of make_box(low, high)")
     return jax.tree.map(
@@ -445,7 +451,7 @@ def _as_arrays(observations: Any) -> Any:
 
 
 def _alike(described: Any, other: Any) -> bool:
-    """Whether two trees are the same; classes of nodes may have an idea of their own of ``==``."""
+    """True if two trees agree; node classes may define another ``==``."""
     same: Any = jax.tree.structure(described)
     return same == jax.tree.structure(other) and (
         jax.tree.leaves(described) == jax.tree.leaves(other)
@@ -455,4 +461,73 @@ def _alike(described: Any, other: Any) -> bool:
 def _described(tree: Any) -> Any:
     return jax.tree.map(
         lambda x: f"{x.dtype}{list(x.shape)}" if hasattr(x, "dtype") else type(x).__name__, tree
+    )
+
+
+# --- purity ---------------------------------------------------------------------------------------
+
+
+def traced(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    """Shapes of the results of a function that is pure, as far as tracing it twice shows.
+
+    Raises:
+      ValueError: it cannot be traced, leaks its arguments, or differs between two calls.
+    """
+    try:
+        try:
+            with jax.checking_leaks():
+                first, again, shapes = _twice(function, *arguments)
+        except Exception as problem:
+            if not _kept_by_jax(problem):
+                raise
+            first, again, shapes = _twice(function, *arguments)
+    except (jax.errors.JAXTypeError, jax.errors.ConcretizationTypeError) as problem:
+        text = str(problem).split("\n", 1)[0]
+        raise ValueError(
+            f"{name} cannot be traced: {text} Write it with jax.numpy; lax.cond and jnp.where "
+            "take the place of if."
+        ) from problem
+    except Exception as problem:
+        if "Leaked" not in str(problem):
+            raise
+        raise ValueError(
+            f"{name} is not pure: it keeps what it was called with. Keep it in the world that "
+            "is returned."
+        ) from problem
+    if not _same(first, again):
+        raise ValueError(
+            f"{name} is not pure: called twice it is two different functions. Draw from the key "
+            "that is given, and keep what changes in the world that is returned."
+        )
+    return shapes
+
+
+def _twice(function: Callable[..., Any], *arguments: Any) -> tuple[Any, Any, Any]:
+    first, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
+    # Another object, so that the second trace is not the first, remembered.
+    return first, jax.make_jaxpr(lambda *given: function(*given))(*arguments), shapes
+
+
+def _kept_by_jax(problem: Exception) -> bool:
+    """True if JAX's own caches hold all leaked tracers, as for solvers of jaxopt."""
+    head, *leaks = str(problem).strip().split("\n\n")
+    own = "<PyTreeDef ", "<WeakrefLRUCache ", "jax._src."
+    return (
+        "Leaked" in head
+        and bool(leaks)
+        and all(any(f" is referred to by {x}" in leak for x in own) for leak in leaks)
+    )
+
+
+def _same(first: Any, again: Any) -> bool:
+    constants = zip(first.consts, again.consts, strict=False)
+    return (
+        len(first.consts) == len(again.consts)
+        and str(first.jaxpr) == str(again.jaxpr)
+        and all(
+            np.array_equal(np.asarray(x), np.asarray(y), equal_nan=np.asarray(x).dtype.kind == "f")
+            for x, y in constants
+            if not isinstance(x, jax.core.Tracer)
+            and not jax.dtypes.issubdtype(getattr(x, "dtype", np.dtype(float)), jax.dtypes.prng_key)
+        )
     )

@@ -1,4 +1,4 @@
-"""Episodes: an agent in a simulated world, from its start to its end, one step after the other."""
+"""Agents, and episodes of an agent in a simulated environment."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from jaxltl.core.pretty_print import brief
 
 
 def require_agent(agent: Any) -> Agent:
-    """Refuses what is no :class:`Agent`."""
+    """Raises ValueError for anything but an :class:`Agent`."""
     found: Agent = validation.instance(
         "agent",
         agent,
@@ -40,12 +40,12 @@ def require_agent(agent: Any) -> Agent:
 @brief
 @struct.dataclass
 class Agent:
-    """What acts in an environment, for :func:`run_episode` and evaluations.
+    """An agent: a policy on observations, with memory.
 
     Attributes:
       act: ``(memory, observation, allowed, key) -> (action, memory)``; `allowed` is ``bool[A]``, or
-        None where the environment allows everything.
-      memory: before anything is seen; a tree of arrays, ``()`` for none.
+        None where all actions are available.
+      memory: the initial memory, a tree of arrays; ``()`` for none.
 
     Example:
       >>> first = Agent(lambda memory, observation, allowed, key: (allowed.argmax(), memory))
@@ -58,10 +58,10 @@ class Agent:
 
 
 def make_agent(function: Callable[..., Any]) -> Agent:
-    """An :class:`Agent` without memory that ignores masks, of a function.
+    """A memoryless :class:`Agent` from a function; masks of actions are ignored.
 
     Args:
-      function: ``(observation, key) -> action``, of one trajectory.
+      function: ``(observation, key) -> action``.
 
     Returns:
       :class:`Agent`.
@@ -83,23 +83,22 @@ def _without_memory(
 
 @brief(facts=facts.episode)
 class Episode(NamedTuple):
-    """One trajectory of T steps, or with a leading axis many.
+    """A trajectory of T steps; a batch has leading axes.
 
-    What comes after its end repeats the last world and is not `valid`.
+    Steps after the end of the episode repeat its last state and are not `valid`.
 
     Attributes:
-      world: before each step and after the last, a tree with a first axis of T + 1.
-      observation: before each step, a tree with a first axis of T.
-      action: a first axis of T.
+      world: the states, a tree with a leading axis of T + 1.
+      observation, action: trees with a leading axis of T.
       reward, cost: ``float[T]``, zero after the end.
-      label: ``bool[T + 1, P]``, of the worlds.
-      valid: ``bool[T]``, whether the step was made.
-      terminated, truncated: ``bool[]``, how it ended; neither if T steps were not enough.
-      discount: ``float[T]``, that of each step; one after the end.
+      label: ``bool[T + 1, P]``, of the states.
+      valid: ``bool[T]``, True for steps before the end.
+      terminated, truncated: ``bool[]``; both False if T steps did not reach the end.
+      discount: ``float[T]`` of the steps; one after the end.
 
     Example:
       >>> import jaxltl as jl
-      >>> coin = jl.make_environment(
+      >>> coin = jl.environments.make_environment(
       ...     lambda key: jnp.int32(0),
       ...     lambda world, action, key: Timestep(action, 1.0, action == 1),
       ...     lambda world: world[None], actions=2)
@@ -127,22 +126,23 @@ def run_episode(
 ) -> Episode:
     """One episode of an agent, from ``reset`` to its end or for `num_steps` steps.
 
-    For ``jit`` and ``vmap``; what is not used of the result is not computed under ``jit``.
+    Runs under ``jit`` and ``vmap``; the compiler drops fields that the caller does not use.
 
     Args:
-      key: of everything that is drawn; the same one gives the same episode.
-      environment, agent: what is run.
+      key: the random key.
+      environment: the environment.
+      agent: the agent.
       num_steps: T; static.
 
     Returns:
       :class:`Episode`. Differentiable where the environment and the agent are.
 
     Raises:
-      ValueError: a number below 1.
+      ValueError: `num_steps` below 1.
 
     Example:
       >>> import jaxltl as jl
-      >>> coin = jl.make_environment(
+      >>> coin = jl.environments.make_environment(
       ...     lambda key: jnp.int32(0),
       ...     lambda world, action, key: Timestep(action, 1.0, action == 1),
       ...     lambda world: world[None], actions=2)
@@ -180,7 +180,7 @@ def run_episode(
 
 @brief
 class Underway(NamedTuple):
-    """An episode that goes on unless it is terminated or truncated."""
+    """The state of an episode during its simulation."""
 
     world: Any
     memory: Any
@@ -190,7 +190,7 @@ class Underway(NamedTuple):
 
 @brief
 class Move(NamedTuple):
-    """One row of an :class:`Episode`: what was there before a step, and what the step gave."""
+    """One step of an :class:`Episode`, with the state before it."""
 
     world: Any
     observation: Any
@@ -205,7 +205,7 @@ class Move(NamedTuple):
 def begin_episode(
     key: chex.PRNGKey, environment: Environment, agent: Agent
 ) -> tuple[Underway, chex.PRNGKey]:
-    """The first world, and the key into which the number of each step is folded."""
+    """The initial state of an episode, and the key into which step numbers are folded."""
     start, path = jax.random.split(key)
     no = jnp.bool_(False)
     return Underway(environment.reset(start), agent.memory, no, no), path
@@ -214,7 +214,7 @@ def begin_episode(
 def continue_episode(
     now: Underway, environment: Environment, agent: Agent, key: chex.PRNGKey
 ) -> tuple[Underway, Move]:
-    """One step of an episode that goes on; one that is over stays as it is, for nothing."""
+    """One step of an episode; the identity after its end."""
     world, active = now.world, ~(now.terminated | now.truncated)
     act_key, step_key = jax.random.split(key)
     observation, allowed = environment.observe(world), allowed_in(environment, world)
@@ -236,21 +236,21 @@ def continue_episode(
 def auto_reset_step(
     environment: Environment, world: Any, action: Any, key: chex.PRNGKey
 ) -> tuple[Any, Timestep]:
-    """A step, and a fresh start where an episode ends with it; for episodes one after the other.
+    """A step that resets the environment where an episode ends.
 
     Args:
-      environment: the world.
-      world: before the step.
-      action: that is taken.
-      key: of the step and of the fresh start.
+      environment: the environment.
+      world: the state before the step.
+      action: the action.
+      key: the random key of the step and of the reset.
 
     Returns:
-      The world to go on from, and the :class:`Timestep`, whose world is the one that the step led
-      to, also where the episode ended there.
+      The next state, after a reset if the episode ended, and the :class:`Timestep`, whose `world` is
+      the state before the reset.
 
     Example:
       >>> import jaxltl as jl
-      >>> coin = jl.make_environment(
+      >>> coin = jl.environments.make_environment(
       ...     lambda key: jnp.int32(0),
       ...     lambda world, action, key: Timestep(action, 1.0, action == 1),
       ...     lambda world: world[None], actions=2)

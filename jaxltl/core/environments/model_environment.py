@@ -1,4 +1,4 @@
-"""Finite models and games as worlds that are simulated: their states are the worlds."""
+"""Finite models and games as simulated environments."""
 
 from __future__ import annotations
 
@@ -27,26 +27,24 @@ def model_environment(
     observe: Any = None,
     opponent: ArrayLike | None = None,
 ) -> Environment:
-    """The world that a finite Markov decision process is, or a game against a given opponent.
+    """The simulated environment of a finite MDP, or of a game against a given opponent.
 
-    Worlds are states, ``int32[]``; labels are the model's; the actions that may be taken are the
-    available ones. Nothing ends an episode. In a game every move is a step; where it is the
-    opponent's turn, what it draws is done instead of the action.
+    The environment's states are those of the model, ``int32[]``; labels and available actions are the
+    model's. Episodes have no end. In a game each move is a step, and on the opponent's turn its policy
+    replaces the action.
 
     Args:
       model: an MDP, a DenseMDP, a SparseMDP, which is padded, or a Game on one of them.
-      reward: ``float[S]``, of the state that a step enters, or ``float[S, A]``, of an action;
-        default zero.
-      observe: ``state -> observation``; default one-hot, ``float[S]``.
-      opponent: ``float[S, A]``, the policy of a game's environment; default uniform among its
-        moves.
+      reward: ``float[S]``, of the successor state, or ``float[S, A]``, of the action; default: zero.
+      observe: ``state -> observation``; default: one-hot, ``float[S]``.
+      opponent: ``float[S, A]``, the policy of the game's environment; default: uniform.
 
     Returns:
-      An :class:`~jaxltl.core.environments.environment.Environment`.
+      :class:`~jaxltl.core.environments.environment.Environment`.
 
     Raises:
-      ValueError: rewards or an opponent of another shape, a product (simulate its world, and give
-        the task to ``task_environment``), or an opponent without a game.
+      ValueError: rewards or an opponent of another shape, an opponent without a game, or a product;
+        simulate its model and give the task to ``task_environment``.
 
     Example:
       >>> from jaxltl import from_dense
@@ -131,7 +129,7 @@ def _earned(reward: jax.Array, state: jax.Array, action: jax.Array, after: jax.A
 
 
 def _opponent(model: MDP | DenseMDP, system: np.ndarray, policy: ArrayLike | None) -> np.ndarray:
-    """The logarithm of what it plays."""
+    """Logarithms of the opponent's policy."""
     available = np.asarray(model.available)
     plays = (
         available.astype(float) if policy is None else validation.float_array("opponent", policy)

@@ -1,4 +1,4 @@
-"""Worlds whose episodes are cut off after so many steps."""
+"""Time limits: environments whose episodes are truncated after a number of steps."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from jaxltl.core.environments.environment import Environment, Timestep, require_
 
 
 def with_time_limit(environment: Environment, num_steps: int) -> Environment:
-    """The same world, whose episodes are truncated after so many steps.
+    """The environment with episodes truncated after `num_steps` steps.
 
-    Its worlds are pairs ``(world, time)``. What is observed is as before: where the best thing to
-    do depends on the time that is left, tell it in `observe`.
+    Its states are pairs ``(world, time)``. Observations do not include the time: where the optimal
+    action depends on it, add it in `observe`.
 
     Args:
-      environment: the world.
-      num_steps: after how many of them an episode is cut off, if it has not ended.
+      environment: the environment.
+      num_steps: the limit.
 
     Returns:
-      The environment; `num_steps` is its horizon, or what was before if that is less.
+      The environment; its horizon is the smaller of `num_steps` and the horizon before.
 
     Raises:
-      ValueError: a number below 1.
+      ValueError: a limit below 1.
 
     Example:
       >>> import jaxltl as jl
-      >>> coin = jl.make_environment(
-      ...     lambda key: jnp.int32(0), lambda world, action, key: jl.environments.Timestep(action, 0.0, False),
+      >>> coin = jl.environments.make_environment(
+      ...     lambda key: jnp.int32(0), lambda world, action, key: Timestep(action, 0.0, False),
       ...     lambda world: world[None], actions=2)
       >>> with_time_limit(coin, 10).horizon
       10
@@ -58,7 +58,7 @@ def with_time_limit(environment: Environment, num_steps: int) -> Environment:
 
 
 def without_time_limit(environment: Environment) -> tuple[Environment, int | None]:
-    """The world inside :func:`with_time_limit`, and the limit; any other as it is, and None."""
+    """The environment inside :func:`with_time_limit` and the limit; any other environment and None."""
     timed: Any = require_environment(environment)
     if timed.step.func is not _step_clock:
         return environment, None

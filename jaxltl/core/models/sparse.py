@@ -1,11 +1,11 @@
-"""Models as they come: choices and successors without padding, with named rewards."""
+"""Sparse Markov decision processes: rows of choices without padding, with named rewards."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import chex
 import jax
@@ -33,12 +33,12 @@ Array = Any  # NumPy's in double precision as it is read, or JAX's
 @brief
 @struct.dataclass
 class Rewards:
-    """A reward structure; what is absent is zero.
+    """A reward structure, the sum of up to three parts; absent parts are zero.
 
     Attributes:
       state: ``float[S]``, earned by each step from a state.
       choice: ``float[R]``, earned by a choice.
-      transition: ``float[T]``, earned by an entry.
+      transition: ``float[T]``, earned by a transition.
 
     Example:
       >>> import jaxltl as jl
@@ -56,14 +56,13 @@ class Rewards:
 @brief(facts=facts.sparse, drawn=True)
 @struct.dataclass
 class SparseMDP:
-    """A labelled decision process whose states have as many choices as they have.
+    """A labelled Markov decision process in compressed sparse rows.
 
-    The choices of state s are the rows ``row_start[s]`` to ``row_start[s + 1] - 1``, and row r
-    leads to ``successor[e]`` with ``probability[e]`` for the entries e from ``entry_start[r]`` to
-    ``entry_start[r + 1] - 1``. Quantities on actions have a number for each row, ``[R]``, and an
-    action of a policy is a row. A Markov chain has one row in each state. Build one with
-    :func:`make_sparse`, which checks it; its arrays are NumPy's, in double precision, whatever
-    JAX's default.
+    The choices of state s are the rows ``row_start[s]`` to ``row_start[s + 1] - 1``, and row r leads
+    to ``successor[e]`` with ``probability[e]`` for the entries e from ``entry_start[r]`` to
+    ``entry_start[r + 1] - 1``. Quantities on choices have the shape ``[R]``, and an action of a
+    policy is a row. A Markov chain has one row in each state. :func:`make_sparse` builds a checked
+    model; its arrays are NumPy's, in double precision.
 
     Attributes:
       row_start: ``int32[S + 1]``.
@@ -71,12 +70,12 @@ class SparseMDP:
       successor: ``int32[T]``, ascending and without repetition within a row.
       probability: ``float[T]``, positive; rows sum to one.
       initial: ``float[S]``, the initial distribution.
-      label: ``bool[S, P]``, which propositions hold in a state.
+      label: ``bool[S, P]``, the propositions that hold in each state.
       rewards: named :class:`Rewards`.
-      action: ``int32[R]``, the number of each row's action, or None.
-      valuation: the values of named variables in each state, ``[S]`` each.
-      propositions: the P names, static.
-      action_names: the names of actions by their number, static; empty if they have none.
+      action: ``int32[R]``, the action number of each row, or None.
+      valuation: values of named variables in each state, ``[S]`` each.
+      propositions: the P names; static.
+      action_names: names of the actions by number, or empty; static.
 
     Example:
       >>> model = make_sparse([0, 2, 3, 4], [0, 1, 3, 4, 5], [1, 1, 2, 1, 2], [1, 0.5, 0.5, 1, 1],
@@ -106,31 +105,27 @@ class SparseMDP:
 
     @property
     def num_rows(self) -> int:
-        """R, the choices of all states."""
+        """R, the number of choices."""
         return self.entry_start.shape[-1] - 1
 
     @property
     def num_transitions(self) -> int:
-        """T, the entries of all choices."""
+        """T, the number of entries."""
         return self.successor.shape[-1]
 
     @property
     def is_chain(self) -> bool:
-        """Whether every state has one choice."""
+        """True if every state has one choice."""
         return self.num_rows == self.num_states
 
     @property
     def available(self) -> Array:
-        """Of padded models only.
-
-        Raises:
-          ValueError: always, with what to do.
-        """
+        """Raises ValueError: only padded models have actions ``[S, A]``."""
         raise ValueError(_PADDED)
 
     @property
     def num_actions(self) -> int:
-        """As `available`."""
+        """Raises ValueError, as `available`."""
         raise ValueError(_PADDED)
 
     @property
@@ -140,12 +135,12 @@ class SparseMDP:
 
     @property
     def dtype(self) -> Any:
-        """Of the probabilities."""
+        """The dtype of the probabilities."""
         return self.probability.dtype
 
     @cached_property
     def host(self) -> HostMDP:
-        """The transitions as the host engine takes them, with what it finds out about them."""
+        """The transitions for the sparse engine, which caches graph properties with them."""
         row_start, entry_start, successor = (
             np.asarray(x) for x in (self.row_start, self.entry_start, self.successor)
         )
@@ -153,11 +148,7 @@ class SparseMDP:
         return HostMDP(row_start, entry_start, successor, probability)
 
     def states_with_label(self, proposition: str) -> Array:
-        """``bool[S]``, where a proposition holds.
-
-        Raises:
-          ValueError: there is no such proposition.
-        """
+        """``bool[S]``, the states in which a proposition holds; ValueError for an unknown one."""
         if proposition not in self.propositions:
             raise ValueError(
                 f"there is no label {proposition!r}; the model has "
@@ -167,20 +158,20 @@ class SparseMDP:
 
 
 def choice_reward(model: SparseMDP, reward: str | Rewards | chex.Array | None = None) -> np.ndarray:
-    """The expected reward of each choice, ``r(s) + r(s, a) + sum_t P(t | s, a) r(s, a, t)``.
+    """Expected reward of each choice, ``r(s) + r(s, a) + sum_t P(t | s, a) r(s, a, t)``.
 
     Args:
       model: the sparse model.
-      reward: the name of one of its rewards, a structure, or an array on states ``[S]``, on
-        choices ``[R]`` or on entries ``[T]``, taken for the first of these that fits. None is the
-        only reward that the model has.
+      reward: the name of one of its rewards, a structure, or an array on states ``[S]``, choices
+        ``[R]`` or transitions ``[T]``, the first of these shapes that fits; default: the only
+        reward of the model.
 
     Returns:
-      ``float64[R]``; where anything is traced, JAX's, in the model's precision, and
-      differentiable in the rewards and the probabilities.
+      ``float64[R]``; of traced arguments a JAX array in the model's precision, differentiable in the
+      rewards and the probabilities.
 
     Raises:
-      ValueError: there is no such reward, or its shape fits nothing.
+      ValueError: an unknown reward, or a shape that fits nothing.
 
     Example:
       >>> model = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
@@ -203,11 +194,7 @@ def choice_reward(model: SparseMDP, reward: str | Rewards | chex.Array | None = 
 
 
 def reward_structure(model: SparseMDP, reward: str | Rewards | chex.Array | None = None) -> Rewards:
-    """A reward as a structure, by name or however else it is given to :func:`choice_reward`.
-
-    Raises:
-      ValueError: as there.
-    """
+    """A reward as a structure, from any form that :func:`choice_reward` accepts."""
     if reward is None:
         if len(model.rewards) != 1:
             raise ValueError(f"name the reward: the model has {_listed(model.rewards)}.")
@@ -265,6 +252,25 @@ def _shaped(model: SparseMDP, reward: Any) -> Rewards:
     )
 
 
+class Annotations(TypedDict, total=False):
+    """Optional parts of a sparse model.
+
+    Attributes:
+      label, propositions: as for :func:`~jaxltl.core.models.mdp.make_mdp`.
+      rewards: named :class:`Rewards`.
+      action: ``int[R]``, the action number of each choice.
+      action_names: names of the actions.
+      valuation: values of named variables, ``[S]`` each.
+    """
+
+    label: chex.Array | Mapping[str, Sequence[int]] | None
+    propositions: Sequence[str]
+    rewards: Mapping[str, Rewards] | None
+    action: chex.Array | None
+    action_names: Sequence[str]
+    valuation: Mapping[str, chex.Array] | None
+
+
 def make_sparse(
     row_start: chex.Array | None,
     entry_start: chex.Array,
@@ -272,57 +278,36 @@ def make_sparse(
     probability: chex.Array,
     *,
     initial: chex.Array | None = None,
-    label: chex.Array | Mapping[str, Sequence[int]] | None = None,
-    propositions: Sequence[str] = (),
-    rewards: Mapping[str, Rewards] | None = None,
-    action: chex.Array | None = None,
-    action_names: Sequence[str] = (),
-    valuation: Mapping[str, chex.Array] | None = None,
+    **annotations: Unpack[Annotations],
 ) -> SparseMDP:
-    """A checked :class:`SparseMDP` from arrays, on the host.
+    """A checked :class:`SparseMDP` from arrays.
 
-    Successors are put into ascending order, and those that stand twice in a row become one, with
-    the sum of their probabilities and the mean of their rewards. Entries of probability zero are
-    dropped. Rows that sum to one but for rounding stay as they are, bit for bit; others within
-    1e-6 are scaled.
+    Successors of a row are sorted; repeated ones are merged, with the sum of their probabilities and
+    the mean of their rewards; entries of probability zero are dropped. Rows that sum to one up to
+    rounding are kept bit for bit, others within 1e-6 are scaled.
 
     Args:
-      row_start: ``int[S + 1]``; None for a Markov chain, whose rows are its states.
+      row_start: ``int[S + 1]``; None for a Markov chain.
       entry_start: ``int[R + 1]``.
       successor: ``int[T]``, in ``[0, S)``.
       probability: ``float[T]``.
       initial: ``float[S]``, a distribution; default: uniform.
-      label, propositions: as for :func:`~jaxltl.core.models.mdp.make_mdp`.
-      rewards: named structures.
-      action: ``int[R]``.
-      action_names: the names of the actions.
-      valuation: values of named variables, ``[S]`` each.
+      annotations: labels, rewards and names, see :class:`Annotations`.
 
     Returns:
-      :class:`SparseMDP`, as NumPy arrays of ``float64``.
+      :class:`SparseMDP` with NumPy arrays in double precision.
 
     Raises:
-      ValueError: naming the state, the choice and the value: a shape is wrong, starts do not
-        ascend, a state has no choice, a choice no successor, a successor is out of range, a
-        probability is negative or not finite, or a row does not sum to one.
+      ValueError: naming the state, the choice and the value: a wrong shape, starts that do not
+        ascend, a state without a choice, a choice without a successor, a successor out of range, a
+        probability that is negative, not finite or subnormal, or a row that does not sum to one.
 
     Example:
       >>> model = make_sparse([0, 2, 3], [0, 2, 3, 4], [0, 1, 1, 1], [0.5, 0.5, 1, 1])
       >>> model.num_states, model.num_rows, model.num_transitions, model.is_chain
       (2, 3, 4, False)
     """
-    model = sparse_part(
-        row_start,
-        entry_start,
-        successor,
-        probability,
-        label=label,
-        propositions=propositions,
-        rewards=rewards,
-        action=action,
-        action_names=action_names,
-        valuation=valuation,
-    )
+    model = sparse_part(row_start, entry_start, successor, probability, annotations)
     return replace(model, initial=checked_initial(initial, model.num_states))
 
 
@@ -331,27 +316,14 @@ def sparse_part(
     entry_start: chex.Array,
     successor: chex.Array,
     probability: chex.Array,
-    *,
-    label: Any = None,
-    propositions: Sequence[str] = (),
-    rewards: Mapping[str, Rewards] | None = None,
-    action: chex.Array | None = None,
-    action_names: Sequence[str] = (),
-    valuation: Mapping[str, chex.Array] | None = None,
+    annotations: Annotations,
     begins: tuple[int, int, int] = (0, 0, 0),
     num_states: int | None = None,
 ) -> SparseMDP:
-    """What :func:`make_sparse` makes of a range of a model's states, without initial ones.
+    """The checked states of a range of a larger model, without initial probabilities.
 
-    Args:
-      row_start, entry_start: where spans start, from 0.
-      successor: numbers among all states.
-      probability, label, propositions, rewards, action, action_names, valuation: as there.
-      begins: the numbers of the first state, choice and transition.
-      num_states: of the whole model; default: this is all of it.
-
-    Raises:
-      ValueError: as there, with numbers of the whole model.
+    `begins` are the numbers of its first state, choice and transition in the whole model, and
+    `num_states` the states of the whole model; error messages use these numbers.
     """
     successor, probability = np.asarray(successor), np.asarray(probability, np.float64)
     if successor.ndim != 1 or successor.shape != probability.shape:
@@ -372,17 +344,21 @@ def sparse_part(
     check_entries(
         row_start, entry_start, successor, probability, first=first, num_states=num_states
     )
-    for of, each in (("rewards", rewards), ("valuation", valuation)):
-        if each is not None and not isinstance(each, Mapping):
+    if unknown := sorted(set(annotations) - set(Annotations.__annotations__)):
+        raise TypeError(f"make_sparse() got an unexpected keyword argument {unknown[0]!r}")
+    structures, valuation = annotations.get("rewards") or {}, annotations.get("valuation") or {}
+    for of, each in (("rewards", structures), ("valuation", valuation)):
+        if not isinstance(each, Mapping):
             raise ValueError(f"{of} is {validation.shorten(each)}; give a dict, by name.")
-    action_names = tuple(validation.sequence("action_names", action_names))
+    action_names = tuple(validation.sequence("action_names", annotations.get("action_names", ())))
     sizes = here, num_rows, successor.size
-    rewards = {
-        name: _checked_rewards(name, x, sizes, begins) for name, x in (rewards or {}).items()
-    }
-    label, names = checked_label(label, propositions, here)
+    rewards = {name: _checked_rewards(name, x, sizes, begins) for name, x in structures.items()}
+    label, names = checked_label(
+        annotations.get("label"), annotations.get("propositions", ()), here
+    )
+    action = annotations.get("action")
     action = None if action is None else _checked_action(action, num_rows, action_names)
-    for name, x in (valuation or {}).items():
+    for name, x in valuation.items():
         if np.shape(x) != (here,):
             raise ValueError(
                 f"valuation {name!r} has shape {np.shape(x)}; expected "
@@ -399,18 +375,14 @@ def sparse_part(
         label=label,
         rewards=rewards,
         action=action,
-        valuation={n: np.asarray(x) for n, x in (valuation or {}).items()},
+        valuation={n: np.asarray(x) for n, x in valuation.items()},
         propositions=names,
         action_names=action_names,
     )
 
 
 def checked_starts(name: str, start: Any, total: int, of: str) -> np.ndarray:
-    """Where spans start, as ``int64``; they go from 0 to a total and ascend.
-
-    Raises:
-      ValueError: they do not.
-    """
+    """Validated span starts as ``int64``: ascending from 0 to `total`."""
     start = np.asarray(start)
     if start.ndim != 1 or not start.size or not np.issubdtype(start.dtype, np.integer):
         raise ValueError(
@@ -432,7 +404,7 @@ def checked_starts(name: str, start: Any, total: int, of: str) -> np.ndarray:
 
 
 def placed(row_start: np.ndarray, row: int, first: int = 0) -> str:
-    """A choice by its state and rank, for messages; the first state's number is `first`."""
+    """A choice as ``state s, choice i`` for messages; `first` is the number of the first state."""
     state = int(np.searchsorted(row_start, row, "right")) - 1
     return f"state {first + state}, choice {row - int(row_start[state])}"
 
@@ -446,9 +418,9 @@ def check_entries(
     first: int = 0,
     num_states: int | None = None,
 ) -> None:
-    """Raises a ValueError where a state, a row or an entry is not what a model may have.
+    """Raises ValueError if a state, a row or an entry is invalid.
 
-    Of a part of a model, `first` is its first state and `num_states` are those of all of it.
+    For a range of a larger model, `first` is its first state and `num_states` the size of the whole.
     """
     num_states = row_start.size - 1 if num_states is None else num_states
     if (np.diff(row_start) == 0).any():
@@ -521,7 +493,7 @@ def _canonical(
     rewards: dict[str, Rewards],
     state: int,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, Rewards]]:
-    """Entries in ascending order, without repetitions and zeros; `state` is the first's number."""
+    """Sorted entries without repetitions and zeros; `state` is the number of the first state."""
     index: Any = np.int32 if successor.size < 2**31 else np.int64
     first = np.zeros(successor.size + 1, bool)
     first[entry_start] = True
@@ -555,7 +527,7 @@ def _canonical(
 
 
 def _sorted(entry_start: np.ndarray, successor: np.ndarray, row: np.ndarray) -> np.ndarray:
-    """The entries in an order in which successors ascend in each row."""
+    """An order of the entries in which successors ascend in each row."""
     if successor.size <= SCIPY_SIZE:
         return np.lexsort((successor, row))
     from scipy.sparse import csr_array
@@ -570,11 +542,7 @@ def _sorted(entry_start: np.ndarray, successor: np.ndarray, row: np.ndarray) -> 
 def scaled(
     row_start: np.ndarray, entry_start: np.ndarray, probability: np.ndarray, *, first: int = 0
 ) -> np.ndarray:
-    """Probabilities whose rows sum to one, from such as do within 1e-6.
-
-    Raises:
-      ValueError: a row does not, with its state, the number of the first one being `first`.
-    """
+    """Normalised rows; ValueError for a row whose sum is not within 1e-6 of one."""
     total = np.add.reduceat(probability, entry_start[:-1])
     off = np.abs(total - 1)
     if off.max() > 1e-6:

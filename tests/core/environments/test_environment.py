@@ -120,8 +120,8 @@ def branches(place, action, key):
     ("changes", "text"),
     [
         ({"propositions": ["a"]}, "no labels"),
-        ({"propositions": ["a", "a"], "labels": lambda place: jnp.zeros(2, bool)}, "given twice"),
-        ({"propositions": [3]}, "3 is no name"),
+        ({"propositions": ["a", "a"], "labels": lambda place: jnp.zeros(2, bool)}, "occurs twice"),
+        ({"propositions": [3]}, "3 is not a string"),
         ({"labels": lambda place: jnp.zeros(2, bool), "propositions": ["a"]}, r"return bool\[1\]"),
         ({"labels": lambda place: jnp.zeros(1), "propositions": ["a"]}, r"float64\[1\]"),
         (
