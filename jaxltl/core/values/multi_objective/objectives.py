@@ -1,4 +1,4 @@
-"""Objectives, and the model beside what it takes to know how each of them stands."""
+"""Objectives of a multi-objective query, and the product with the memory that they need."""
 
 from __future__ import annotations
 
@@ -26,28 +26,28 @@ class Objective:
     """One of several objectives: a probability or an expected reward.
 
     Give one of ``formula`` (the probability of an LTL formula), ``avoid`` (never to enter a set),
-    ``reward`` (the expected total; with a target until that is reached, which then every policy
-    that counts does almost surely), or ``target`` alone (to reach a set, through `stay`).
+    ``reward`` (the expected total; with a target until that is reached, almost surely under every policy
+    that counts), or ``target`` alone (to reach a set, through `stay`).
 
     Attributes:
       formula: a formula, its text, or an automaton.
       target: ``bool[S]``, or the name of a label.
-      stay: with a target, ``bool[S]`` or a label: what must hold until then.
+      stay: with a target, ``bool[S]`` or a label that must hold until then.
       avoid: ``bool[S]``, or the name of a label.
-      reward: as for :func:`~jaxltl.core.models.sparse.choice_reward`, not negative.
+      reward: as for :func:`~jaxltl.core.models.sparse.row_reward`, not negative.
       direction: ``"max"`` or ``"min"``.
       threshold: at least that, or at most that for ``"min"``; None to optimise.
 
     Raises:
-      ValueError: on use, in :func:`~jaxltl.core.values.multi_objective.multi_objective.achievable` and the like:
-        none or several of the four are given, or a direction, a label or a shape is wrong.
+      ValueError: on use: none or several of the four are given, or a direction, a label or a shape is
+        wrong.
 
     Example:
       >>> from jaxltl import make_sparse, multi_objective
       >>> model = make_sparse([0, 2, 3, 4], [0, 1, 2, 3, 4], [1, 2, 1, 2], [1, 1, 1, 1],
       ...                     initial=[1, 0, 0], label={"a": [1], "b": [2]})
-      >>> wanted = [Objective(formula="F G a"), Objective(target="b", threshold=0.25)]
-      >>> round(multi_objective(model, wanted).value, 6)
+      >>> query = [Objective(formula="F G a"), Objective(target="b", threshold=0.25)]
+      >>> round(multi_objective(model, query).value, 6)
       0.75
     """
 
@@ -62,13 +62,13 @@ class Objective:
 
 @brief
 class Part(NamedTuple):
-    """How an objective is counted.
+    """Place of an objective in a weighted problem.
 
     Attributes:
-      number: its number, from 0.
-      kind: ``"sure"`` for a probability, ``"gain"`` for a reward to be made large, ``"cost"``.
-      place: which of those of its kind it is.
-      sign: 1 to be made large, -1 small.
+      number: of the objective, from 0.
+      kind: ``"sure"`` for a probability, ``"gain"`` for a maximised reward, ``"cost"``.
+      place: its number among those of its kind.
+      sign: 1 to maximise, -1 to minimise.
       open: ``bool[N]``, of a reward with a target, where that is not reached yet.
     """
 
@@ -80,15 +80,15 @@ class Part(NamedTuple):
 
 
 class _Tracker(NamedTuple):
-    """What is remembered for an objective.
+    """Deterministic monitor of an objective.
 
     Attributes:
       delta: ``int[Q, L]``.
       letter: ``int[S]``.
-      first: the memory before anything is read.
-      decided: ``bool[Q]``, where nothing changes the verdict any more.
-      priority: ``int[Q, L]`` of reading a letter, of the event to be made likely; None of a reward.
-      verdict: ``int[Q]``, the priority of decided memories.
+      first: the initial state, before anything is read.
+      decided: ``bool[Q]``, where the verdict is known.
+      priority: ``int[Q, L]`` of reading a letter, of the event to be maximised; None of a reward.
+      verdict: ``int[Q]``, the priority of decided states.
     """
 
     delta: np.ndarray
@@ -102,7 +102,7 @@ class _Tracker(NamedTuple):
 def weighted_problem(
     model: SparseMDP, objectives: Sequence[Objective]
 ) -> tuple[WeightedProblem, list[Part], SparseProduct]:
-    """The objectives as sums on the model beside what they remember, as far as it is reached."""
+    """The objectives on the reachable product of the model and their monitors."""
     rewards = [_checked(model, i, o) for i, o in enumerate(objectives)]
     trackers = [_tracker(model, o, r is not None) for o, r in zip(objectives, rewards, strict=True)]
     used = [i for i, x in enumerate(trackers) if x is not None]
@@ -159,7 +159,7 @@ def weighted_problem(
 
 
 def _checked(model: SparseMDP, index: int, objective: Objective) -> np.ndarray | None:
-    """The expected reward of rows, if it is one of rewards."""
+    """Validates an objective; the expected reward of rows if it is one of rewards."""
     name = f"objective {index + 1}"
     if objective.direction not in ("max", "min"):
         raise ValueError(f'{name}: direction={objective.direction!r}; it must be "max" or "min".')
@@ -225,7 +225,7 @@ def _tracker(model: SparseMDP, objective: Objective, is_reward: bool) -> _Tracke
 def _product(
     model: SparseMDP, trackers: list[_Tracker], all_end: bool
 ) -> tuple[SparseProduct, np.ndarray]:
-    """The model beside all trackers, and the memory of each in each joint one, ``int[J, n]``."""
+    """The product with all monitors, and the state of each in each joint one, ``int[J, n]``."""
     first = np.flatnonzero(np.asarray(model.initial) > 0)
     letters: Any = np.zeros((model.num_states, len(trackers)), np.int64)
     for i, x in enumerate(trackers):

@@ -16,6 +16,7 @@ from jaxltl.core.logic.properties import MAX_UNFOLDED_STEPS, Property, parse_pro
 from jaxltl.core.models.construct.state_formulas import states_satisfying
 from jaxltl.core.models.sparse import SparseMDP, choice_reward
 from jaxltl.core.types import Status
+from jaxltl.core.values.multi_objective.front_search import nearest_mixture
 from jaxltl.core.values.multi_objective.multi_objective import (
     Achievable,
     ConstrainedOptimum,
@@ -23,7 +24,6 @@ from jaxltl.core.values.multi_objective.multi_objective import (
     Objective,
     Pareto,
     multi_objective,
-    nearest_mixture,
 )
 from jaxltl.core.values.properties.solve_property import TOLERANCE
 
