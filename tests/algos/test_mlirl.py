@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 
 import jaxltl as jl
 from jaxltl.algos import mlirl
-from jaxltl.algos.mlirl import _features
+from jaxltl.algos.mlirl import features as irl_features
 from tests.support import assert_gradients
 
 UP, DOWN, LEFT, RIGHT = range(4)
@@ -38,7 +38,7 @@ def test_pair_counts_by_hand():
         (4, UP, 1),
     ):
         expected[s, a] = count
-    np.testing.assert_array_equal(_features.pair_counts(world, demonstrations), expected)
+    np.testing.assert_array_equal(irl_features.pair_counts(world, demonstrations), expected)
 
 
 def test_pair_counts_in_a_product_follow_the_memory():
@@ -48,8 +48,8 @@ def test_pair_counts_in_a_product_follow_the_memory():
     lifted = jl.models.lift_trajectories(lazy, demonstrations)
     traced = jax.jit(jl.models.lift_trajectories)(lazy, demonstrations)
     jax.tree.map(np.testing.assert_array_equal, lifted, traced)  # the host finds the same
-    counts = _features.pair_counts(lazy, lifted)
-    np.testing.assert_array_equal(counts, jax.jit(_features.pair_counts)(lazy, traced))
+    counts = irl_features.pair_counts(lazy, lifted)
+    np.testing.assert_array_equal(counts, jax.jit(irl_features.pair_counts)(lazy, traced))
     start = int(lazy.initial_memory[0])
     middle = int(lazy.initial_memory[1])
     expected = np.zeros((6, 3, 4))
@@ -271,7 +271,7 @@ def test_bad_problems_are_refused(arguments, message):
     [
         ({"policy": "greedy"}, "policy='greedy'; choose boltzmann or soft"),
         ({"policy": "soft", "adjoint": "approximate"}, "belongs to the Boltzmann policy"),
-        ({"adjoint": "none"}, "adjoint='none'; choose exact or approximate"),
+        ({"adjoint": "none"}, "adjoint='none'; choose one of exact, approximate"),
         ({"mu": 1.0}, "make the problem in a product"),
         ({"optimizer": "newton"}, "optimizer='newton'; choose one of lbfgs, adam, rmsprop, sgd"),
     ],
@@ -351,7 +351,7 @@ def test_what_takes_longer_than_can_be_told_is_said_to_be_left_out(task):
     assert float(best.lower[0, int(lazy.initial_memory[0])]) == 1
     found = mlirl.task_features(lazy, runs, best=best)
     assert "nearer" not in found.names and found.values.shape[-1] == len(found.names)
-    assert found.remark.startswith("The feature nearer is left out: the best policy's way takes")
+    assert found.remark.startswith("The feature nearer is left out: the best policy's expected")
     plain = mlirl.task_features(lazy, runs)
     assert (plain.names, plain.remark) == (found.names, None)
 
@@ -405,7 +405,7 @@ def test_inside_a_mask_the_policy_and_the_gradient_are_those_of_a_model_without_
 
 def test_steps_outside_the_mask_are_left_out_by_name():
     lazy, allowed, demonstrations, problem = masked()
-    kept = jl.core.models.lifting.allowed_steps(jl.with_allowed(lazy, allowed), demonstrations)
+    kept = allowed_steps(jl.with_allowed(lazy, allowed), demonstrations)
     assert 0 < (~kept & np.asarray(demonstrations.mask)).sum() < demonstrations.length.sum()
     assert problem.counts.sum() == kept.sum()
     assert (problem.counts[~np.asarray(allowed)] == 0).all()

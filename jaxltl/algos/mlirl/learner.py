@@ -59,11 +59,11 @@ from jax.flatten_util import ravel_pytree
 
 from jaxltl.algos.common import learner
 from jaxltl.algos.mlirl import _line_search as line_search
-from jaxltl.algos.mlirl._features import Features as Features
-from jaxltl.algos.mlirl._features import pair_counts
-from jaxltl.algos.mlirl._features import progress_states as progress_states
-from jaxltl.algos.mlirl._features import task_features as task_features
-from jaxltl.algos.mlirl._features import world_features as world_features
+from jaxltl.algos.mlirl.features import Features as Features
+from jaxltl.algos.mlirl.features import pair_counts
+from jaxltl.algos.mlirl.features import progress_states as progress_states
+from jaxltl.algos.mlirl.features import task_features as task_features
+from jaxltl.algos.mlirl.features import world_features as world_features
 from jaxltl.core.models.construct.lifting import allowed_steps, lift_trajectories
 from jaxltl.core.models.construct.restrict import with_allowed
 from jaxltl.core.models.mdp import MDP, DenseMDP

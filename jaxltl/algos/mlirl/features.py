@@ -1,13 +1,24 @@
-"""Features of moves, for rewards that are learned: those of Table 1, for any task.
+"""Named features of state-action pairs for linear rewards: Table 1, generalised to any task.
 
-A table of numbers ``[S, Q, A, F]`` with a name for each of the F features.
+Example: one step leads to the goal.
+
+  >>> import jaxltl as jl
+  >>> from jaxltl.algos import mlirl
+  >>> world = jl.from_dense([[[0, 1.0]], [[0, 1.0]]], label=[[0], [1]], propositions=["g"])
+  >>> shown = jl.make_trajectories(world, [[(0, 0)]])
+  >>> model = jl.product(world, "F g")
+  >>> mlirl.task_features(model, shown).names, mlirl.progress_states(model)
+  (('demonstrated', 'goal', 'progress', 'time'), ())
+  >>> mlirl.world_features(world, shown, goal=["g"]).values[0].tolist()
+  [[1.0, 1.0, 0.0, -1.0]]
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +29,7 @@ from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.ops.array_namespace import namespace, to_jax
 from jaxltl.core.models.ops.operators import expectation
 from jaxltl.core.models.product import Product, read_probability
+from jaxltl.core.models.protocols import ActionModel, Array
 from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.solvers.dense_reachability import policy_row, steps_until
@@ -27,10 +39,12 @@ from jaxltl.core.values.undiscounted.reachability import action_matrices
 from jaxltl.core.values.undiscounted.satisfaction import as_reachability, visiting
 
 
-def pair_counts(model: Any, trajectories: Trajectories, kept: Any = None) -> jax.Array:
-    """How often each state-action pair occurs in trajectories of a model: ``float[S, A]``.
+def pair_counts(
+    model: ActionModel, trajectories: Trajectories, kept: Array | None = None
+) -> jax.Array:
+    """The state-action counts ``float[S, A]`` of `trajectories` of a `model`.
 
-    In those steps that are `kept`, ``bool[N, T]``; default all.
+    Only steps that are `kept`, ``bool[N, T]``, count; default all.
     """
     xp, steps, kept = namespace(trajectories, trajectories.mask if kept is None else kept)
     actions = (*model.state_shape, model.num_actions)
@@ -44,10 +58,14 @@ def pair_counts(model: Any, trajectories: Trajectories, kept: Any = None) -> jax
 
 
 @brief
-class Features(NamedTuple):
-    """Named features: `values` is ``float[S, A, F]`` (``[S, Q, A, F]``).
+@dataclass(frozen=True)
+class Features:
+    """Features of state-action pairs.
 
-    And what is to be said of one that had to be left out.
+    Attributes:
+      values: ``float[S, A, F]``, in a product ``[S, Q, A, F]``.
+      names: of the F features.
+      remark: the reason why a feature is missing, or None.
     """
 
     values: jax.Array
@@ -63,23 +81,23 @@ def task_features(
     progress: Sequence[int] | None = None,
     best: Solution | None = None,
 ) -> Features:
-    """Features in a product: those of Table 1 for a co-safe task, and their like for any other.
+    """The features of Table 1 in a product, and their analogues for tasks that are not co-safe.
 
-    ``demonstrated``: whether the product pair occurs in the lifted demonstrations;
-    ``goal`` (co-safe): probability that the next automaton state is final; ``progress``
-    (co-safe): probability of entering one of the automaton states `progress` from another;
-    ``accepting`` (Buchi and parity): probability of reading a transition of the least even
-    priority; ``avoid``: minus the probability that the next cell shows a proposition of `avoid`
-    (left out if there is none); ``time`` (co-safe): -1; ``nearer`` (with `best`, unless the task
-    is a safety one): by how many steps an action shortens the best policy's expected way to where
-    the task is done, or to an accepting component and there to the next accepting visit; left out,
-    with a remark, where that takes longer than double precision can tell. All are zero where the
-    task is done.
+    ==============  ==============================================================================
+    demonstrated    1 if the pair occurs in the lifted demonstrations
+    goal            (co-safe) probability that the next automaton state is final
+    progress        (co-safe) probability of entering an automaton state of `progress` from another
+    accepting       (Buchi, parity) probability of reading a transition of the least even priority
+    avoid           minus the probability that the next cell has a proposition of `avoid`
+    time            (co-safe) -1
+    nearer          (with `best`, not safety) decrease of the best policy's expected steps to the
+                    end of the task, or to an accepting component and its next accepting visit;
+                    missing, with a remark, if these exceed double precision
+    ==============  ==============================================================================
 
-    There is none of by how much an action changes the best probability: inside the actions that
-    lose nothing that is zero. Where a probability is asked for, ``Hparams.mu`` weighs that of whole
-    runs (2.6), of which it is the part of a single step; and without a guarantee the dissertation's
-    learners see Table 1's features alone.
+    All are zero where the automaton state is final. The change of the optimal satisfaction
+    probability is no feature: it is zero inside the optimal actions, and ``Hparams.mu`` weighs the
+    probability of whole runs (2.6).
 
     Args:
       model: the product.
@@ -87,6 +105,9 @@ def task_features(
       avoid: propositions.
       progress: automaton states; default :func:`progress_states`.
       best: of :func:`~jaxltl.core.values.undiscounted.satisfaction.optimal_satisfaction`; concrete.
+
+    Returns:
+      :class:`Features`.
 
     Raises:
       ValueError: a state or proposition does not exist, or `progress` is given for a task that is
@@ -113,20 +134,20 @@ def task_features(
     main = {"cosafe": ("goal", "progress"), "safety": ()}.get(kind, ("accepting",))
     names = ("demonstrated", *main, *(("avoid",) if avoid else ()))
     names += (("time",) if kind == "cosafe" else ()) + (("nearer",) if nearer is not None else ())
-    return Features(values, names, remark)
+    return Features(values=values, names=names, remark=remark)
 
 
 _TOO_LONG = (
-    "The feature nearer is left out: the best policy's way takes more steps on average than double "
-    "precision can tell, so that nothing is known of which action shortens it."
+    "The feature nearer is left out: the best policy's expected number of steps exceeds double "
+    "precision, so that the actions that decrease it are unknown."
 )
 
 
 def _nearer(model: Product, best: Solution) -> np.ndarray | None:
-    """By how much an action shortens the way ahead, ``float[S, Q, A]``; what is lost is farthest.
+    """Decrease ``float[S, Q, A]`` of the expected steps to the goal; None if these are too many.
 
-    The way leads to where the task is done, or to an accepting component and there to its next
-    accepting visit. None if it is too long to be told.
+    The goal is a final state, or an accepting component and there its next accepting visit. Losing
+    states count as the farthest ones.
     """
     problem, lost = as_reachability(model, "max"), np.asarray(best.upper).ravel() <= 0
     reached = np.asarray(problem.target).ravel()
@@ -141,25 +162,21 @@ def _nearer(model: Product, best: Solution) -> np.ndarray | None:
     if ahead is None or far is None:
         return None
     inside = np.where(reached, far, 0)
-    # Whoever leaves the component has all of a way before him.
-    ahead = np.where(reached, 0, np.where(lost, ahead.max(initial=0), ahead)) + inside.max(
-        initial=0
-    )
+    most = inside.max(initial=0)  # outside of the component, a longest visit inside is added
+    ahead = np.where(reached, 0, np.where(lost, ahead.max(initial=0), ahead)) + most
     way = np.where(reached, inside, ahead)
-    entered = np.where(reached, inside.max(initial=0), ahead)
-    found = np.stack(
-        [
-            np.where(reached, way - visit @ way, way - row @ entered)
-            for row, visit in zip(rows, visits, strict=True)
-        ],
-        -1,
-    )
+    entered = np.where(reached, most, ahead)
+    decrease = [
+        np.where(reached, way - visit @ way, way - row @ entered)
+        for row, visit in zip(rows, visits, strict=True)
+    ]
     available = np.asarray(model.available)
-    return np.where(available, found.reshape(available.shape), 0).astype(model.dtype)
+    table = np.stack(decrease, -1).reshape(available.shape)
+    return np.where(available, table, 0).astype(model.dtype)
 
 
 def _steps(rows: list[Any], policy: Any, ended: np.ndarray) -> np.ndarray | None:
-    """Expected steps until a set is entered or a transition that is left out is made, if known."""
+    """Expected steps of a policy until it enters a set or leaves the given rows; None if unknown."""
     chosen = np.asarray(policy).reshape(-1, 1) == np.arange(len(rows))
     return steps_until(policy_row(rows, chosen.astype(float)), ~ended)
 
@@ -176,7 +193,7 @@ def _task_values(
     kind, num_memory = model.automaton.acceptance, model.num_memory
     columns = [(counts > 0).astype(model.dtype)]
     done = model.final if kind == "cosafe" else jnp.zeros(model.state_shape, bool)
-    regions = [_shows(model.mdp, avoid)[:, None]] if avoid else []
+    regions = [_labelled(model.mdp, avoid)[:, None]] if avoid else []
     if kind == "cosafe":
         target, every = np.isin(np.arange(num_memory), progress), np.arange(num_memory)
         regions += [model.final, *(target & (every != q) for q in every)]
@@ -198,7 +215,7 @@ def _task_values(
 
 
 def _chances(model: Product, regions: Sequence[Any]) -> list[jax.Array]:
-    """Of being in a region after a step, ``float[S, Q, A]`` for each; traced once for all."""
+    """Probabilities ``float[S, Q, A]`` of each region after a step, traced once for all regions."""
     if not regions:
         return []
     inside = jnp.stack([jnp.broadcast_to(x, model.state_shape) for x in regions])
@@ -213,10 +230,10 @@ def world_features(
     progress: Collection[str] = (),
     avoid: Collection[str] = (),
 ) -> Features:
-    """The features of Table 1 without an automaton (case 1), zero in cells that show `goal`.
+    """The features of Table 1 in a `world` without an automaton (case 1), with `demonstrations`.
 
-    As in :func:`task_features`, with the probability that the next cell shows a
-    proposition of `goal`, `progress` and `avoid`.
+    As :func:`task_features`, by the probabilities that the next cell has a proposition of `goal`,
+    `progress` and `avoid`; zero in cells of `goal`.
 
     Raises:
       ValueError: a proposition does not exist.
@@ -227,8 +244,8 @@ def world_features(
     values = _world_values(
         world, counts, goal=tuple(goal), progress=tuple(progress), avoid=tuple(avoid)
     )
-    shown = ("avoid",) if avoid else ()
-    return Features(values, ("demonstrated", "goal", "progress", *shown, "time"))
+    names = ("demonstrated", "goal", "progress", *(("avoid",) if avoid else ()), "time")
+    return Features(values=values, names=names)
 
 
 @partial(jax.jit, static_argnames=("goal", "progress", "avoid"))
@@ -242,20 +259,20 @@ def _world_values(
 ) -> jax.Array:
     columns = [
         (counts > 0).astype(world.dtype),
-        expectation(world, _shows(world, goal).astype(world.dtype)),
-        expectation(world, _shows(world, progress).astype(world.dtype)),
+        expectation(world, _labelled(world, goal).astype(world.dtype)),
+        expectation(world, _labelled(world, progress).astype(world.dtype)),
     ]
     if avoid:
-        columns.append(-expectation(world, _shows(world, avoid).astype(world.dtype)))
-    return _stacked([*columns, -jnp.ones_like(columns[0])], _shows(world, goal))
+        columns.append(-expectation(world, _labelled(world, avoid).astype(world.dtype)))
+    return _stacked([*columns, -jnp.ones_like(columns[0])], _labelled(world, goal))
 
 
 def _stacked(columns: list[jax.Array], done: jax.Array) -> jax.Array:
     return jnp.where(done[..., None, None], 0, jnp.stack(columns, axis=-1))
 
 
-def _shows(world: MDP | DenseMDP, names: tuple[str, ...]) -> jax.Array:
-    """``bool[S]``: where any of the propositions holds."""
+def _labelled(world: MDP | DenseMDP, names: tuple[str, ...]) -> jax.Array:
+    """The states ``bool[S]`` in which any of the propositions holds."""
     return jnp.any(world.label[:, [world.propositions.index(n) for n in names]], axis=1)
 
 
@@ -269,10 +286,9 @@ def _require_known(world: MDP | DenseMDP, names: Collection[str], argument: str)
 
 
 def progress_states(model: Product) -> tuple[int, ...]:
-    """Automaton states that are not final but nearer to it than the farthest start.
+    """The automaton states of a `model` closer to a final state than its farthest initial one.
 
-    Nearer in letters that occur in the world; the starts are the memories of initial
-    states.
+    Distances count letters that occur in the world; final states are excluded.
     """
     automaton = jax.tree.map(np.asarray, model.automaton)
     delta = automaton.delta[:, np.unique(np.asarray(model.letter))]
