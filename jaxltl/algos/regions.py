@@ -1,11 +1,10 @@
-"""Boxes of parameters in which a model has a property, or does not: proven, not sampled.
+"""Region verification of parametric Markov models by parameter lifting.
 
-Over a box every probability has a range. The interval model of these ranges, in which nature picks
-anew at each step, contains the model at every point of the box (parameter lifting, Quatmann,
-Dehnert, Jansen, Junges and Katoen 2016), so that its certified values enclose all of theirs. Where
-they do not decide, the box is split.
+The interval model of the ranges of all probabilities over a box, with nature free at each step,
+contains the model at every point of the box (Quatmann, Dehnert, Jansen, Junges and Katoen 2016), so
+that its certified bounds enclose the values at all points. Undecided boxes are split.
 
-Example: a coin that shows heads with a probability p, of which at least half is asked for.
+Example: a coin with parameter p, and the threshold 1/2 for heads.
 
   >>> import pathlib, tempfile
   >>> import jaxltl as jl
@@ -29,32 +28,54 @@ Example: a coin that shows heads with a probability p, of which at least half is
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from jaxltl.core.models.interval import IntervalMDP, make_interval
-from jaxltl.core.models.parametric.parametric import box_of
+from jaxltl.core.models.parametric.parametric import ParametricMDP, box_of
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.interval import reachability as interval_values
 from jaxltl.core import validation
 from jaxltl.core.values.undiscounted.mixture import safe_ends
 
 ACCEPTED, REJECTED, OPEN = 1, -1, 0
-Problem = Any  # as jaxltl.algos.feasible.make_problem makes it
+Point = NDArray[np.float64]
+Corner = float | Mapping[str, float] | ArrayLike | None
+
+
+class Problem(Protocol):
+    """A threshold question about a parametric model, as ``feasible.make_problem`` returns it.
+
+    Example:
+      >>> from types import SimpleNamespace
+      >>> question: Problem = SimpleNamespace(model=None, bound=">=", objective="max")
+    """
+
+    model: ParametricMDP
+    target: NDArray[np.bool_]
+    stay: NDArray[np.bool_] | None
+    reward: str | None
+    objective: str
+    bound: str
+
+    @property
+    def highest(self) -> float:
+        """The trivial upper bound of the value."""
 
 
 @brief
 @dataclass(frozen=True)
 class Regions:
-    """Boxes that cover a box.
+    """A partition of a box into accepted, rejected and open boxes.
 
     Attributes:
-      low, high: ``float64[N, D]``.
-      lower, upper: ``float64[N]``, what encloses the value in each of them.
-      verdict: ``int8[N]``: 1 where it is past the threshold at every point, -1 where it is at none,
-        0 where nothing was decided.
+      low, high: ``float64[N, D]``, corners of the boxes.
+      lower, upper: ``float64[N]``, certified bounds of the value over each box.
+      verdict: ``int8[N]``: 1 if every point meets the threshold, -1 if none does, 0 if undecided.
 
     Example:
       >>> halves = Regions(np.array([[0.0], [0.5]]), np.array([[0.5], [1.0]]), np.array([0.0, 0.5]),
@@ -70,28 +91,23 @@ class Regions:
     verdict: np.ndarray
 
     def share(self, verdict: int) -> float:
-        """The share of the whole volume that boxes of a verdict take."""
+        """The share of boxes with a verdict in the total volume."""
         volume = np.prod(self.high - self.low, axis=1)
         return float(volume[self.verdict == verdict].sum() / volume.sum())
 
 
-def enclose(problem: Problem, low: Any = None, high: Any = None) -> tuple[float, float]:
-    """Bounds of the value at every point of a box.
+def enclose(problem: Problem, low: Corner = None, high: Corner = None) -> tuple[float, float]:
+    """The certified lower and upper bound of the values at all points of a box; on the host.
 
     Args:
-      problem: made by :func:`~jaxltl.algos.feasible.make_problem`, of a model that was read by
+      problem: of :func:`~jaxltl.algos.feasible.make_problem`, with a model read by
         :func:`~jaxltl.io.parametric.read_parametric`.
       low, high: a number for all parameters, one for each name, or ``float[D]``; default the
         problem's box.
 
-    Returns:
-      No point of the box has a value below the first or above the second number.
-
     Raises:
-      ValueError: the box is none, or reaches out of the problem's or below 0; the model is of
-        functions whose ranges are not known.
-
-    Concrete arrays only, on the host; not differentiable.
+      ValueError: the box is empty or not contained in the problem's, or the ranges of the model's
+        functions are unknown.
     """
     low, high = _box(problem, low, high)
     model = problem.model
@@ -103,11 +119,11 @@ def enclose(problem: Problem, low: Any = None, high: Any = None) -> tuple[float,
     ends, rewards = model.numbers.ranges(low, high)
     interval = make_interval(model.model, ends.lower, ends.upper)
     reward = None if problem.reward is None else rewards[problem.reward]
-    least, most = (_value(problem, interval, reward, large) for large in (False, True))
+    least, most = (_bounds(problem, interval, reward, large) for large in (False, True))
     return least[0], most[1]
 
 
-def _box(problem: Problem, low: Any, high: Any) -> tuple[np.ndarray, np.ndarray]:
+def _box(problem: Problem, low: Corner, high: Corner) -> tuple[Point, Point]:
     _require_problem(problem)
     model = problem.model
     low, high = (whole if x is None else x for x, whole in ((low, model.low), (high, model.high)))
@@ -122,8 +138,8 @@ def _box(problem: Problem, low: Any, high: Any) -> tuple[np.ndarray, np.ndarray]
     return low, high
 
 
-def _value(problem: Problem, model: IntervalMDP, reward: Any, large: bool) -> tuple[float, float]:
-    """Bounds of the mean over the initial distribution, with nature making it large or small."""
+def _bounds(problem: Problem, model: IntervalMDP, reward: Any, large: bool) -> tuple[float, float]:
+    """Bounds of the mean over the initial distribution with maximising or minimising nature."""
     maximize = problem.objective == "max"
     depth = problem.model.roundings
     if problem.reward is None:
@@ -140,19 +156,14 @@ def _value(problem: Problem, model: IntervalMDP, reward: Any, large: bool) -> tu
         found = interval_values.total_reward(
             model.host, earned, problem.target, maximize=maximize, large=large, depth=depth
         )
-    return safe_ends(model, found, highest=1.0 if problem.reward is None else np.inf)
+    return safe_ends(model, found, highest=problem.highest)
 
 
 def verdict_of(problem: Problem, threshold: float, lower: float, upper: float) -> int:
-    """Whether all values between bounds are past a threshold (1), or none (-1), or neither (0).
+    """The verdict of a `problem` for values between `lower` and `upper` bounds.
 
-    Args:
-      problem: which side of the threshold is asked for.
-      threshold: the number.
-      lower, upper: bounds on all values.
-
-    Returns:
-      1, -1 or 0.
+    ``ACCEPTED`` (1) if all of them meet the `threshold`, ``REJECTED`` (-1) if none does, else
+    ``OPEN`` (0).
 
     Example:
       >>> from types import SimpleNamespace
@@ -169,26 +180,24 @@ def prove_regions(
     problem: Problem,
     threshold: float,
     *,
-    low: Any = None,
-    high: Any = None,
+    low: Corner = None,
+    high: Corner = None,
     max_boxes: int = 1000,
 ) -> Regions:
-    """A box split into boxes that are accepted, rejected, or left open.
+    """A partition of a box by iterated bisection of the largest open box; on the host.
 
-    The largest open box is split next, across its side that is the longest as a share of the whole.
+    The longest side, relative to the whole box, is bisected.
 
     Args:
       problem, low, high: as of :func:`enclose`.
-      threshold: the value shall be past it, on the side that the problem says.
-      max_boxes: how many boxes to look at.
+      threshold: of the value, on the side given by ``problem.bound``.
+      max_boxes: number of boxes to examine.
 
     Returns:
       :class:`Regions`.
 
     Raises:
-      ValueError: as :func:`enclose`; the threshold is NaN, or `max_boxes` below 1.
-
-    Concrete arrays only, on the host; not differentiable.
+      ValueError: as :func:`enclose`, the threshold is NaN, or `max_boxes` below 1.
     """
     threshold, max_boxes = _limit(threshold), validation.integer("max_boxes", max_boxes, least=1)
     low, high = _box(problem, low, high)
@@ -213,7 +222,7 @@ def prove_regions(
     return Regions(lows, highs, lower, upper, verdicts.astype(np.int8))
 
 
-def _require_problem(problem: Any) -> None:
+def _require_problem(problem: object) -> None:
     if not all(hasattr(problem, name) for name in ("model", "objective", "bound")):
         raise ValueError(
             f"problem is {validation.shorten(problem)}; give what feasible.make_problem returns."
@@ -221,7 +230,7 @@ def _require_problem(problem: Any) -> None:
 
 
 def _limit(threshold: Any) -> float:
-    """A number, which may be infinite."""
+    """A threshold, which may be infinite."""
     found = validation.float_array("threshold", threshold)
     if found.ndim or np.isnan(found):
         what = (
@@ -234,11 +243,11 @@ def _limit(threshold: Any) -> float:
 
 
 def prove_around(
-    problem: Problem, threshold: float, point: Any, *, num_halvings: int = 12
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """A box around a point, as large as bisection finds, that is accepted as a whole.
+    problem: Problem, threshold: float, point: ArrayLike, *, num_halvings: int = 12
+) -> tuple[Point, Point] | None:
+    """The largest accepted box around a point, by bisection of its size; on the host.
 
-    Its sides are the same share of the problem's box, as far as that reaches.
+    All sides are the same share of the problem's box, clipped to it.
 
     Args:
       problem, threshold: as of :func:`prove_regions`.
@@ -246,12 +255,10 @@ def prove_around(
       num_halvings: of the share.
 
     Returns:
-      Its ends, ``float64[D]`` both; None if not even the smallest one that was tried is accepted.
+      The corners, ``float64[D]``; None if the smallest examined box is not accepted.
 
     Raises:
-      ValueError: as :func:`prove_regions`; the point is not in the box.
-
-    Concrete arrays only, on the host; not differentiable.
+      ValueError: as :func:`prove_regions`, or the point is not in the box.
     """
     _require_problem(problem)
     threshold, num_halvings = (

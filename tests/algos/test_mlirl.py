@@ -13,6 +13,7 @@ from jax.flatten_util import ravel_pytree
 import jaxltl as jl
 from jaxltl.algos import mlirl
 from jaxltl.algos.mlirl import features as irl_features
+from jaxltl.core.models.construct.lifting import allowed_steps
 from tests.support import assert_gradients
 
 UP, DOWN, LEFT, RIGHT = range(4)
