@@ -350,12 +350,14 @@ def test_what_is_no_policy_is_invalid(name):
 @pytest.mark.parametrize("name", SOLVERS)
 def test_what_is_not_certified_has_not_converged(name):
     solver = SOLVERS[name]
-    _, found = solved(name)
+    cases, found = solved(name)
     for case, one in found.items():
         certain = np.isfinite(one.lower).all() and np.isfinite(one.upper).all()
         assert certain or one.status != Status.CONVERGED, case
         if one.status == Status.CONVERGED:
             assert (one.lower <= one.value).all() and (one.value <= one.upper).all(), case
+            width = (one.upper - one.lower).max()
+            assert width <= cases[case][2]["tolerance"] or name in UNDISCOUNTED, case
     for case in [c for c in found if c.split()[-1] in solver.needs]:
         assert found[case].status == Status.NONFINITE, case
         assert found[case].num_steps <= 8, case
@@ -390,6 +392,42 @@ def test_no_more_steps_are_made_than_allowed(name):
         allowed = max(cases[case][2]["max_steps"], 1)
         assert one.num_steps <= allowed, case
     assert found["one step"].status == Status.MAX_STEPS or name in SOLVED_AT_ONCE
+
+
+# --- how narrow bounds are ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("tolerance", [1e-3, 1e-7])
+@pytest.mark.parametrize(("name", "kind"), [pair for pair in PAIRS if pair[0] in DISCOUNTED])
+def test_the_tolerance_is_the_width_of_the_enclosure(name, kind, tolerance):
+    """For every kind of model, on the host and inside jit."""
+    solver = SOLVERS[name]
+    model, _, inputs = example(kind)
+    one = solver.solve(model, inputs, **limits_of(solver, tolerance=tolerance))
+    assert one.status == Status.CONVERGED or name == "boltzmann_value"
+    if one.status == Status.CONVERGED:
+        assert (one.upper - one.lower <= tolerance).all()
+
+
+HOMOGENEOUS = [n for n, s in DISCOUNTED.items() if "reward" in s.needs and n[:4] not in "soft bolt"]
+
+
+@pytest.mark.parametrize("exponent", [-1000, -1015, -1020, -1023, -1030, -1060])
+@pytest.mark.parametrize("name", HOMOGENEOUS)
+def test_bounds_hold_for_rewards_near_underflow(name, exponent):
+    """Values are linear in the reward; XLA flushes numbers below 2 ** -1022 to zero."""
+    solver = SOLVERS[name]
+    model, _, inputs = example("sparse")
+    small = np.ldexp(inputs["reward"], exponent)
+    exact = np.ldexp(small, -exponent)  # what was not rounded off
+    expected = solver.solve(model, {**inputs, "reward": exact}, **limits_of(solver, tolerance=1e-9))
+    assert expected.status == Status.CONVERGED
+    for limits in ({}, limits_of(solver, tolerance=2.0**exponent * 1e-3)):
+        one = solver.solve(model, {**inputs, "reward": small}, **limits)
+        lower, upper = (np.ldexp(np.asarray(x), -exponent) for x in (one.lower, one.upper))
+        assert (lower <= expected.upper).all() and (expected.lower <= upper).all()
+    if exponent < -1010:
+        assert one.status != Status.CONVERGED
 
 
 # --- jit and traces ------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
-from functools import cache
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -311,6 +311,40 @@ def test_what_is_no_policy_is_named(name):
                 jl.check(lanes(name)[case])
             with pytest.raises(ValueError, match=r"the policy's row .* of state 4"):
                 SOLVERS[name].solve(example().model, inputs)
+
+
+# --- options -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["policy_value", "optimal_value"])
+def test_options_have_one_meaning_on_the_host_and_in_programs(name):
+    model, _, inputs, _ = example()
+    solve = partial(getattr(jl, name), model)
+    if name == "policy_value":
+        solve = partial(solve, inputs["policy"])
+    solve = partial(solve, inputs["reward"])
+    for tolerance in (1e-2, 1e-5, 1e-9):
+        found = [
+            solve(0.9, tolerance=tolerance),
+            solve(0.9, tolerance=tolerance, max_steps=10_000),
+            jax.jit(solve)(0.9, tolerance=tolerance),
+        ]
+        for one in found:
+            assert one.status == Status.CONVERGED
+            assert (one.upper - one.lower <= tolerance).all()
+            for other in found:
+                assert (one.lower <= other.upper).all()
+    assert solve(0.999, max_steps=1).status == Status.MAX_STEPS
+    for wrong in ({"max_steps": -3}, {"tolerance": np.nan}, {"tolerance": -1}):
+        with pytest.raises(ValueError, match=f"{next(iter(wrong))}=.*; it must be"):
+            solve(0.9, **wrong)
+    if name == "optimal_value":
+        with pytest.raises(ValueError, match="method='bogus'; choose one of auto"):
+            solve(0.9, method="bogus")
+        with pytest.raises(ValueError, match="evaluation_sweeps=-1; it must be an integer"):
+            solve(0.9, evaluation_sweeps=-1)
+    with pytest.raises(ValueError, match=r"reward is complex128\[17\]; give real numbers"):
+        jl.optimal_value(model, inputs["reward"] + 1j, 0.9)
 
 
 # --- what is particular to sparse models ---------------------------------------------------------

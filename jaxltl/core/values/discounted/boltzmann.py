@@ -26,7 +26,7 @@ from jaxltl.core.values.discounted.discounted import (
 )
 from jaxltl.core.values.discounted.soft import policy_logits, soft_maximum, with_softmax
 from jaxltl.core.values.engine import newton
-from jaxltl.core.values.engine.certificates import most_choices, rounding_unit
+from jaxltl.core.values.engine.certificates import backup_error, most_choices, rounding_unit
 from jaxltl.core.values.engine.linear import System
 
 
@@ -97,8 +97,8 @@ def boltzmann_value(
         policy constant.
       method: ``"damped"``, or ``"newton"`` for Newton steps from the start on, which may
         also find fixed points that repel.
-      tolerance: on the certified error where the operator contracts, on the
-        residual elsewhere; default: what the dtype allows.
+      tolerance: width of the enclosure where the operator contracts, of the residual elsewhere;
+        default: what the dtype allows.
       max_steps: damped steps at most.
 
     Returns:
@@ -205,8 +205,12 @@ def _given(model: Any, reward: jax.Array, discount: jax.Array, tolerance: Any) -
     contracts = expansion < 1
     gap = jnp.where(contracts, 1 - expansion, 1)
     size = reward_size(model, reward)
-    rounding = rounding_unit(model) * (size + size / (1 - discount)) / gap
-    goal = 4 * rounding if tolerance is None else jnp.asarray(tolerance, model.dtype)
+    rounding = backup_error(rounding_unit(model), size, size / (1 - discount)) / gap
+    goal = 4 * rounding
+    if tolerance is not None:
+        tolerance = jnp.asarray(tolerance, model.dtype)
+        # Of the enclosure's width, less its own rounding; elsewhere of the residual.
+        goal = jnp.where(contracts, tolerance / 2 - rounding / 4, tolerance)
     return _Given(contracts, gap, rounding, goal, jnp.maximum(goal, 2 * rounding))
 
 

@@ -33,12 +33,20 @@ from jaxltl.core.models.ops.successor_tables import sweep_operator
 from jaxltl.core.models.sparse import SparseMDP, choice_reward
 from jaxltl.core.types import Solution, status_code
 from jaxltl.core.values.engine import newton
-from jaxltl.core.values.engine.certificates import Enclosure, enclose, refuse, rounding_unit
+from jaxltl.core.values.engine.certificates import (
+    Enclosure,
+    backup_error,
+    enclose,
+    refuse,
+    rounding_unit,
+)
 from jaxltl.core.values.engine.host_solution import discounted, is_sparse
 from jaxltl.core.values.engine.implicit_diff import implicit
 from jaxltl.core.values.engine.iterate import iterate
 from jaxltl.core.values.engine.linear import DENSE_LIMIT, System, solver
 
+MAX_STEPS = 100_000
+_SWEEPS = 24  # under a fixed policy, in modified policy iteration
 _METHODS = ("auto", "policy_iteration", "modified_policy_iteration", "value_iteration")
 
 
@@ -118,7 +126,7 @@ def judge(value: jax.Array, image: jax.Array, given: Parameters) -> tuple[jax.Ar
 
 
 def _enclosed(value: jax.Array, image: jax.Array, given: Parameters) -> Enclosure:
-    rounding = given.unit * (given.size + jnp.max(jnp.abs(image), axis=0))
+    rounding = backup_error(given.unit, given.size, jnp.max(jnp.abs(image), axis=0))
     return enclose(value, image, given.discount, rounding, given.tolerance)
 
 
@@ -203,7 +211,7 @@ def policy_value(
     discount: jax.Array | float,
     *,
     tolerance: jax.Array | float | None = None,
-    max_steps: jax.Array | int = 100_000,
+    max_steps: jax.Array | int | None = None,
 ) -> Solution:
     """Expected discounted reward of a policy.
 
@@ -217,8 +225,9 @@ def policy_value(
       reward: ``float[S, A]`` or ``float[S, A, K]``; of a sparse model a name or as of
         :func:`~jaxltl.core.models.sparse.choice_reward`.
       discount: scalar in [0, 1).
-      tolerance: certified absolute error asked for; default: what the dtype allows.
-      max_steps: sweeps at most.
+      tolerance: width of the enclosure; default: what the dtype allows.
+      max_steps: sweeps at most; default 100,000. Concrete sparse models are solved on the host,
+        without sweeps, unless it is given.
 
     Returns:
       :class:`Solution`; `value` is ``float[S]``.
@@ -235,8 +244,10 @@ def policy_value(
       >>> round(policy_value(mdp, jnp.array([0]), jnp.ones((1, 1)), 0.5).value.item(), 4)
       2.0
     """
-    if is_sparse(model) and not is_traced((model, policy, reward, discount, tolerance)):
+    concrete = not is_traced((model, policy, reward, discount, tolerance))
+    if is_sparse(model) and concrete and max_steps is None:
         return discounted(model, reward, discount, policy=policy, tolerance=tolerance)
+    max_steps = MAX_STEPS if max_steps is None else max_steps
     form, reward = compiled_form(model, reward)
     policy = flatten_policy(model, policy)
     require_policy(form, policy)
@@ -285,8 +296,8 @@ def optimal_value(
     *,
     method: str = "auto",
     tolerance: jax.Array | float | None = None,
-    max_steps: jax.Array | int = 100_000,
-    evaluation_sweeps: jax.Array | int = 24,
+    max_steps: jax.Array | int | None = None,
+    evaluation_sweeps: jax.Array | int | None = None,
 ) -> Solution:
     """Largest expected discounted reward, ``V = max_a R + discount * P V``.
 
@@ -301,9 +312,12 @@ def optimal_value(
         ``"modified_policy_iteration"`` (Puterman and Shin 1978: after each sweep of the
         optimality operator, `evaluation_sweeps` cheap ones under the greedy policy),
         ``"value_iteration"``, or ``"auto"``, the first up to 512 states, then the second.
-      tolerance: certified absolute error asked for; default: what the dtype allows.
-      max_steps: applications of the optimality operator or of the linear one at most.
-      evaluation_sweeps: sweeps under a fixed policy, in modified policy iteration.
+      tolerance: width of the enclosure; default: what the dtype allows.
+      max_steps: applications of the optimality operator or of the linear one at most; default
+        100,000.
+      evaluation_sweeps: sweeps under a fixed policy, in modified policy iteration; default 24.
+        Concrete sparse models are solved on the host, by policy iteration, unless `method`,
+        `max_steps` or this is given.
 
     Returns:
       :class:`Solution`; `value` is ``float[S]``, `policy` ``int32[S]`` is greedy and its
@@ -322,7 +336,9 @@ def optimal_value(
       >>> [round(v, 4) for v in best.value.tolist()], best.policy.tolist()
       ([1.0, 2.0], [1, 0])
     """
-    if is_sparse(model) and not is_traced((model, reward, discount, tolerance)):
+    concrete = not is_traced((model, reward, discount, tolerance))
+    default = method == "auto" and max_steps is None and evaluation_sweeps is None
+    if is_sparse(model) and concrete and default:
         return discounted(model, reward, discount, tolerance=tolerance)
     form, reward = compiled_form(model, reward)
     return reshape_solution(
@@ -333,8 +349,8 @@ def optimal_value(
             discount,
             method=method,
             tolerance=tolerance,
-            max_steps=max_steps,
-            evaluation_sweeps=evaluation_sweeps,
+            max_steps=MAX_STEPS if max_steps is None else max_steps,
+            evaluation_sweeps=_SWEEPS if evaluation_sweeps is None else evaluation_sweeps,
         ),
     )
 

@@ -36,7 +36,13 @@ from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.types import Solution, require_shape, status_code
 from jaxltl.core.values.discounted.discounted import best_action, expected_reward
 from jaxltl.core.values.engine import newton
-from jaxltl.core.values.engine.certificates import Enclosure, judged, refuse, rounding_unit
+from jaxltl.core.values.engine.certificates import (
+    Enclosure,
+    backup_error,
+    judged,
+    refuse,
+    rounding_unit,
+)
 from jaxltl.core.values.engine.implicit_diff import implicit
 from jaxltl.core.values.engine.iterate import iterate
 from jaxltl.core.values.engine.linear import DENSE_LIMIT, System, solver
@@ -82,7 +88,7 @@ def minimax_value(
       allowed: ``bool[S, A]``, the moves that may be made, such as a permissive strategy's;
         default the available ones. A play that reaches a state without any is worth minus
         infinity, so the system keeps away, and that is the value where it cannot.
-      tolerance: certified absolute error asked for; default: what the dtype allows.
+      tolerance: width of the enclosure; default: what the dtype allows.
       max_steps: applications of the operator, or of the linear one of fixed choices, at most;
         in strategy iteration, choices that are looked at. As many again may go into h where
         not every move is discounted; they are not counted.
@@ -402,7 +408,7 @@ def _certify(play: _Play, value: jax.Array, image: jax.Array) -> Enclosure:
     with h, its maximum in place of h tells whether the enclosure is narrow enough everywhere.
     """
     horizon = play.horizon
-    unit = play.unit * (play.size + jnp.max(jnp.abs(image), axis=0))
+    unit = backup_error(play.unit, play.size, jnp.max(jnp.abs(image), axis=0))
     change = image - value
     top, bottom = jnp.max(change, axis=0), jnp.min(change, axis=0)
     least = play.discount / (1 - play.discount)

@@ -17,7 +17,7 @@ from jaxltl.core.models.ops.successor_tables import sweep_operator
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.types import Solution, status_code
-from jaxltl.core.values.engine.certificates import most_choices, refuse
+from jaxltl.core.values.engine.certificates import backup_error, most_choices, refuse
 from jaxltl.core.values.engine.implicit_diff import implicit
 from jaxltl.core.values.engine.iterate import in_turn
 from jaxltl.core.values.engine.linear import System, solver
@@ -42,7 +42,7 @@ def occupancy_measure(
       policy: ``float[S, A]`` or ``int32[S]``; of a sparse model ``float[R]``, or rows ``int32[S]``.
       discount: scalar in [0, 1).
       initial: ``float[S]``, mass to start from; default the model's distribution.
-      tolerance: certified absolute error asked for; default: what the dtype allows.
+      tolerance: width of the enclosure; default: what the dtype allows.
 
     Returns:
       :class:`Solution` whose `value`, `lower` and `upper` are ``float[S, A]``, of a sparse model
@@ -90,13 +90,13 @@ def _occupancy(model, policy, discount, start, tolerance) -> Solution:
     # lead there contribute.
     epsilon = float(jnp.finfo(model.dtype).eps)
     terms = lax.stop_gradient(_inflow_terms(model)) + most_choices(model) + 4
-    rounding = epsilon * jnp.sum(terms * jnp.abs(visits)) / gap
+    rounding = jnp.sum(backup_error(epsilon * terms, jnp.abs(visits))) / gap
     # So does the sum over the states.
     rounding, residual = (x * (1 + model.num_states * epsilon) for x in (rounding, residual))
     bound = residual / gap + rounding
     finite = jnp.isfinite(bound)
     bound = jnp.where(finite, bound, jnp.inf)
-    goal = 4 * rounding if tolerance is None else tolerance
+    goal = 4 * rounding if tolerance is None else tolerance / 2 - rounding / 4
     visits = implicit(flow, visits, solve=linear.transpose_solve, transpose_solve=linear.solve)
     value = over.spread(visits) * policy
     frozen = lax.stop_gradient(value)

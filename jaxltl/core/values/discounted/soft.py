@@ -55,7 +55,7 @@ def soft_value(
       initial: ``float[S]``, where to start; default zero. It changes the number of steps only.
       method: ``"newton"`` (soft policy iteration, few linear solves, for any discount)
         or ``"value_iteration"`` (cheap sweeps).
-      tolerance: certified absolute error asked for; default: what the dtype allows.
+      tolerance: width of the enclosure; default: what the dtype allows.
       max_steps: steps of the method at most.
 
     Returns:

@@ -39,13 +39,24 @@ def widest_row(model: Any) -> Any:
     return model.num_successors
 
 
+def backup_error(unit: Any, *sizes: Any) -> jax.Array:
+    """Absolute error of one backup: rounding relative to the magnitudes, and underflow.
+
+    XLA flushes results below the least normal number to zero. A backup has ``unit / epsilon``
+    roundings, each of which may flush a product and a sum, hence the least magnitude
+    ``2 tiny / epsilon``.
+    """
+    info = jnp.finfo(jnp.asarray(sizes[0]).dtype)
+    return unit * (sum(sizes) + 2 * float(info.tiny) / float(info.eps))
+
+
 class Enclosure(NamedTuple):
     """An enclosure seen from an image, and what it shows; a field may have lanes.
 
     Attributes:
       shift: from the image to the middle.
       half: half of the width; infinite without a certificate.
-      converged: whether that is as narrow as asked.
+      converged: whether the width is at most the tolerance.
       exhausted: whether it is mostly rounding, so that further sweeps would not help.
       finite: whether there is a certificate.
     """
@@ -77,7 +88,7 @@ def enclose(
       value, image: ``[N, ...]``, v and ``T v``.
       discount: g; there are no bounds from 1 on.
       rounding: what one backup can err by.
-      tolerance: half width asked for; None: what the dtype allows.
+      tolerance: width of the enclosure; None: what the dtype allows.
     """
     change = image - value
     gap = jnp.where(discount < 1, 1 - discount, jnp.nan)
@@ -88,10 +99,14 @@ def enclose(
 
 
 def judged(down: Any, up: Any, rounding: Any, tolerance: Any) -> Enclosure:
-    """What ends of an enclosure show, seen from the image, that rounding may have moved so far."""
+    """The enclosure between two ends, relative to the image; `rounding` is included in both.
+
+    A quarter of `rounding` on each side pays for rounding in ``middle - half`` and
+    ``middle + half``, so that the width is at most the tolerance as computed.
+    """
     half = (up - down) / 2
     finite = jnp.isfinite(half)
-    goal = 4 * rounding if tolerance is None else tolerance
+    goal = 4 * rounding if tolerance is None else tolerance / 2 - rounding / 4
     return Enclosure(
         shift=jnp.where(finite, (up + down) / 2, 0),
         half=jnp.where(finite, half, jnp.inf),

@@ -207,7 +207,7 @@ def discounted(
     earned, magnitude = finite_reward(sparse, reward)
     host, depth = sparse.host, 0
     largest = float(np.abs(earned).max()) / (1 - float(discount))
-    asked = 1e-8 * max(largest, 1e-300) if tolerance is None else 2 * float(tolerance)
+    asked = 1e-8 * max(largest, 1e-300) if tolerance is None else float(tolerance)
     if policy is not None:
         chain = induced_chain(model, sparse, policy)
         earned, magnitude = (chain.mean(x, host.row_start) for x in (earned, magnitude))
