@@ -25,7 +25,7 @@ import jax
 import numpy as np
 
 from jaxltl.algos.feasible import Budget, feasible, make_problem
-from jaxltl.io.parametric import read_parametric
+from jaxltl.io.drn.parametric import read_parametric
 
 # Of the networks, by K, what the literature asks for.
 THRESHOLDS = {"2": 3.0, "4": 4.0}

@@ -459,7 +459,7 @@ def _render(result: Automaton, form: str, formula: str) -> str:
     if form == "json":
         return json.dumps(to_dict(result))
     if form == "hoa":
-        from jaxltl.io.hoa import write_hoa
+        from jaxltl.io.hoa.hoa import write_hoa
 
         return write_hoa(result, name=formula).removesuffix("\n")
     program = shutil.which("dot")

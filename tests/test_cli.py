@@ -21,7 +21,7 @@ from jaxltl.app.programs import SOON, cache_directory, known_flags
 from jaxltl.cli import main
 from jaxltl.core.automata.language import is_equivalent
 from jaxltl.core.automata.translate import to_automaton
-from jaxltl.io.hoa import read_hoa_stream
+from jaxltl.io.hoa.hoa import read_hoa_stream
 from tests.app.test_task import SHOWN, TASK, write  # noqa: F401
 
 QUICK = (

@@ -101,7 +101,7 @@ def enclose(problem: Problem, low: Corner = None, high: Corner = None) -> tuple[
 
     Args:
       problem: of :func:`~jaxltl.algos.feasible.make_problem`, with a model read by
-        :func:`~jaxltl.io.parametric.read_parametric`.
+        :func:`~jaxltl.io.drn.parametric.read_parametric`.
       low, high: a number for all parameters, one for each name, or ``float[D]``; default the
         problem's box.
 

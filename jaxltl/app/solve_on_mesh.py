@@ -34,7 +34,7 @@ from jaxltl.core.values.properties.solve_on_mesh import (
     question_on_mesh,
 )
 from jaxltl.core.values.properties.solve_property import FINER, Answer
-from jaxltl.io.umb_sharded import read_sharded
+from jaxltl.io.umb.sharded import read_sharded
 
 _WORK = 1e9  # transitions that are gone over before bounds are saved
 _ROUND = 24  # sweeps in a step of interval iteration, about

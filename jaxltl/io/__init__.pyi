@@ -4,9 +4,13 @@ from .colored_world import (
     save_world as save_world,
     write_world as write_world,
 )
-from .drn import read_drn as read_drn, write_drn as write_drn
-from .hoa import read_hoa as read_hoa, read_hoa_stream as read_hoa_stream, write_hoa as write_hoa
-from .hoa_game import (
+from .drn.drn import read_drn as read_drn, write_drn as write_drn
+from .hoa.hoa import (
+    read_hoa as read_hoa,
+    read_hoa_stream as read_hoa_stream,
+    write_hoa as write_hoa,
+)
+from .hoa.game import (
     HoaGame as HoaGame,
     read_hoa_game as read_hoa_game,
     write_hoa_game as write_hoa_game,
@@ -20,7 +24,7 @@ from .learned_reward import (
 from .log import read_labels as read_labels, read_log as read_log
 from .model_files import read_model as read_model, write_model as write_model
 from .npz import read_npz as read_npz, write_npz as write_npz
-from .parametric import (
+from .drn.parametric import (
     ParametricModel as ParametricModel,
     RationalFunction as RationalFunction,
     read_parametric as read_parametric,
@@ -31,12 +35,12 @@ from .pgsolver import (
     read_pgsolver as read_pgsolver,
     write_pgsolver as write_pgsolver,
 )
-from .prism_explicit import read_prism as read_prism, write_prism as write_prism
+from .prism.explicit import read_prism as read_prism, write_prism as write_prism
 from .reward_machine import (
     RewardMachine as RewardMachine,
     machine_reward as machine_reward,
     read_reward_machine as read_reward_machine,
 )
 from .storm import from_stormpy as from_stormpy, to_stormpy as to_stormpy
-from .umb import read_umb as read_umb, write_umb as write_umb
-from .umb_sharded import read_sharded as read_sharded
+from .umb.umb import read_umb as read_umb, write_umb as write_umb
+from .umb.sharded import read_sharded as read_sharded

@@ -24,7 +24,7 @@ from jaxltl.core.models.construct.counts import (
     places,
 )
 from jaxltl.core.models.mdp import MDP, DenseMDP
-from jaxltl.io._columns import Lines, read_columns
+from jaxltl.io.csv_columns import Lines, read_columns
 
 _COUNT = re.compile(r"[0-9]{1,16}")
 _MOST = 2**53  # transitions

@@ -11,13 +11,13 @@ from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.sparse import SparseMDP
-from jaxltl.io._files import pieces, raw_bytes, write_bytes
-from jaxltl.io.drn import read_drn, write_drn
-from jaxltl.io.hoa_game import read_hoa_game, write_hoa_game
+from jaxltl.io.files import pieces, raw_bytes, write_bytes
+from jaxltl.io.drn.drn import read_drn, write_drn
+from jaxltl.io.hoa.game import read_hoa_game, write_hoa_game
 from jaxltl.io.npz import read_npz, write_npz
 from jaxltl.io.pgsolver import read_pgsolver, write_pgsolver
-from jaxltl.io.prism_explicit import read_prism, write_prism
-from jaxltl.io.umb import read_umb, write_umb
+from jaxltl.io.prism.explicit import read_prism, write_prism
+from jaxltl.io.umb.umb import read_umb, write_umb
 
 _BEGINNING = 4096  # bytes by which a format is known
 

@@ -21,8 +21,8 @@ from jaxltl.core.models.interval import IntervalMDP, interval_rows
 from jaxltl.core.models.mdp import MDP, DenseMDP, from_dense, make_mdp
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
 from jaxltl.core.sparse.rows import offsets_from_counts
-from jaxltl.io._files import ALWAYS_ALLOWED, MAX_RATIO, raw_bytes
-from jaxltl.io._intervals import exact_part
+from jaxltl.io.files import ALWAYS_ALLOWED, MAX_RATIO, raw_bytes
+from jaxltl.io.intervals import exact_part
 
 Arrays = Mapping[str, NDArray[Any]]
 

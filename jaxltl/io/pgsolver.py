@@ -21,7 +21,7 @@ from jaxltl.core.models.mdp import support
 from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.models.sparse import SparseMDP, make_sparse
 from jaxltl.core.pretty_print import brief
-from jaxltl.io._files import read_text, write_bytes
+from jaxltl.io.files import read_text, write_bytes
 
 MAX_NUMBER = 2**31 - 1  # of vertices and of priorities
 
@@ -326,7 +326,7 @@ def objective_of(game: Game) -> Parity:
     """The objective that came with a game's file.
 
     Args:
-      game: of :func:`read_pgsolver`, :func:`~jaxltl.io.hoa_game.read_hoa_game` or
+      game: of :func:`read_pgsolver`, :func:`~jaxltl.io.hoa.game.read_hoa_game` or
         :func:`~jaxltl.io.model_files.read_model`.
 
     Returns:

@@ -25,8 +25,8 @@ from jaxltl.core.models.game import Game
 from jaxltl.core.models.product import Product, read_probability
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief
-from jaxltl.io._files import read_text
-from jaxltl.io._hoa_table import alphabet_of
+from jaxltl.io.files import read_text
+from jaxltl.io.hoa.table import alphabet_of
 
 
 @brief

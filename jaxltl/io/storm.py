@@ -1,7 +1,7 @@
 """Models of Storm, by its Python package stormpy, which is imported only here and only when asked.
 
 Both ways go through a file of the UMB format, which holds all that either side has of a model:
-see :mod:`jaxltl.io.umb`.
+see :mod:`jaxltl.io.umb.umb`.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.sparse import SparseMDP
-from jaxltl.io._intervals import exact_part
-from jaxltl.io.umb import read_umb, write_umb
+from jaxltl.io.intervals import exact_part
+from jaxltl.io.umb.umb import read_umb, write_umb
 
 
 def from_stormpy(model: Any) -> SparseMDP | IntervalMDP | Game:

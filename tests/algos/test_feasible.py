@@ -18,7 +18,7 @@ from jaxltl.algos.feasible import Budget, Hparams, certify, evaluate, feasible, 
 from jaxltl.core.models.parametric.parametric import make_parametric
 from jaxltl.core.models.sparse import Rewards, make_sparse
 from jaxltl.core.types import Status
-from jaxltl.io.parametric import read_parametric
+from jaxltl.io.drn.parametric import read_parametric
 from tests.sparse_models import exact_solve
 from tests.support import counted_traces
 

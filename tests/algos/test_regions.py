@@ -14,7 +14,7 @@ from jaxltl.core.models.parametric.rational import make_rationals
 from jaxltl.core.models.sparse import make_sparse
 from jaxltl.core.values.undiscounted.reachability import reachability_probability
 from jaxltl.core.values.undiscounted.total_reward import total_reward
-from jaxltl.io.parametric import read_parametric
+from jaxltl.io.drn.parametric import read_parametric
 
 ONE = Fraction(1)
 TWICE = """@type: DTMC

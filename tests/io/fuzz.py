@@ -19,15 +19,15 @@ import numpy as np
 
 from jaxltl.core.models.game import make_game
 from jaxltl.core.models.sparse import make_sparse
-from jaxltl.io.drn import read_drn, write_drn
-from jaxltl.io.hoa_game import read_hoa_game
+from jaxltl.io.drn.drn import read_drn, write_drn
+from jaxltl.io.drn.parametric import read_parametric
+from jaxltl.io.hoa.game import read_hoa_game
 from jaxltl.io.log import read_log
 from jaxltl.io.npz import read_npz, write_npz
-from jaxltl.io.parametric import read_parametric
 from jaxltl.io.pgsolver import read_pgsolver
-from jaxltl.io.prism_explicit import read_prism, write_prism
+from jaxltl.io.prism.explicit import read_prism, write_prism
 from jaxltl.io.reward_machine import read_reward_machine
-from jaxltl.io.umb import read_umb, write_umb
+from jaxltl.io.umb.umb import read_umb, write_umb
 from tests.io.archives import classes_example, example, members_of, tar, umb
 from tests.io.mutate import mutated
 from tests.io.same import full_interval, full_model

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxltl.core.models.sparse import Rewards, choice_reward, make_sparse
-from jaxltl.io.drn import read_drn, write_drn
+from jaxltl.io.drn.drn import read_drn, write_drn
 from tests.io.same import actions, assert_same, full_model, refuses
 from tests.sparse_models import storm_values
 
@@ -93,9 +93,9 @@ def test_blocks_do_not_matter(tmp_path, monkeypatch):
     model = full_model(np.random.default_rng(3), 40, transition_rewards=False)
     write_drn(tmp_path / "m.drn", model)
     for size in (1, 30, 200, 1000):
-        monkeypatch.setattr("jaxltl.io._tokens._SIZE", size)
+        monkeypatch.setattr("jaxltl.io.tokens._SIZE", size)
         assert_same(read_drn(tmp_path / "m.drn"), model, valuation=False)
-    monkeypatch.setattr("jaxltl.io.drn._STEP", 7)
+    monkeypatch.setattr("jaxltl.io.drn.drn._STEP", 7)
     write_drn(tmp_path / "n.drn", model)
     assert (tmp_path / "n.drn").read_bytes() == (tmp_path / "m.drn").read_bytes()
 

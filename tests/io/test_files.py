@@ -6,8 +6,8 @@ import lzma
 import numpy as np
 import pytest
 
-from jaxltl.io import _files
-from jaxltl.io._files import read_bytes, write_bytes
+from jaxltl.io import files as _files
+from jaxltl.io.files import read_bytes, write_bytes
 
 TEXT = b"some text\n" * 1000
 

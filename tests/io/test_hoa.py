@@ -11,7 +11,7 @@ import pytest
 from jaxltl.core.automata.automaton import accepts_lasso, complement, make_automaton
 from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.logic.ltl import holds_on_lasso
-from jaxltl.io.hoa import read_hoa, read_hoa_stream, write_hoa
+from jaxltl.io.hoa.hoa import read_hoa, read_hoa_stream, write_hoa
 from tests.reference_logic import subsets, words
 
 

@@ -12,9 +12,9 @@ from jaxltl.core.games.verify import verify
 from jaxltl.core.games.winning import winning_region
 from jaxltl.core.models.game import make_game
 from jaxltl.core.models.mdp import from_dense, make_mdp
-from jaxltl.io import hoa_game
-from jaxltl.io.hoa import write_hoa
-from jaxltl.io.hoa_game import read_hoa_game, write_hoa_game
+from jaxltl.io.hoa import game as hoa_game
+from jaxltl.io.hoa.game import read_hoa_game, write_hoa_game
+from jaxltl.io.hoa.hoa import write_hoa
 from jaxltl.io.pgsolver import read_pgsolver, write_pgsolver
 from tests.io.test_pgsolver import random_vertices, text_of, winners
 

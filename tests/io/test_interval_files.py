@@ -10,11 +10,11 @@ import pytest
 
 from jaxltl.app.files.models import read_padded
 from jaxltl.core.models.interval import IntervalMDP, interval_rows
-from jaxltl.io.drn import read_drn
+from jaxltl.io.drn.drn import read_drn
 from jaxltl.io.model_files import read_model, write_model
-from jaxltl.io.prism_explicit import read_prism, write_prism
+from jaxltl.io.prism.explicit import read_prism, write_prism
 from jaxltl.io.storm import from_stormpy, to_stormpy
-from jaxltl.io.umb import read_umb
+from jaxltl.io.umb.umb import read_umb
 from tests.io.archives import example, f64, members_of, u64, umb
 from tests.io.same import assert_same_interval, full_interval
 

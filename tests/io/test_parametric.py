@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from jaxltl.core.models.sparse import choice_reward
-from jaxltl.io.drn import read_drn, write_drn
-from jaxltl.io.parametric import read_parametric
+from jaxltl.io.drn.drn import read_drn, write_drn
+from jaxltl.io.drn.parametric import read_parametric
 from tests.io.same import assert_same, full_model
 from tests.support import counted_traces
 
@@ -107,7 +107,7 @@ def test_models_without_parameters_are_read_as_ever(tmp_path):
 
 def test_numbers_alone_are_not_what_such_files_hold(tmp_path):
     (tmp_path / "m.drn").write_text(CHAIN)
-    with pytest.raises(ValueError, match=r"parameters, p, q; jaxltl.io.parametric.read_param"):
+    with pytest.raises(ValueError, match=r"parameters, p, q; jaxltl.io.drn.parametric.read_param"):
         read_drn(tmp_path / "m.drn")
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxltl.core.models.sparse import Rewards, make_sparse
-from jaxltl.io.prism_explicit import read_prism, write_prism
+from jaxltl.io.prism.explicit import read_prism, write_prism
 from tests.io.same import actions, assert_same, full_model, refuses
 from tests.sparse_models import storm_values
 

@@ -15,11 +15,13 @@ import pytest
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.mdp import make_mdp
 from jaxltl.core.models.sparse import Rewards, make_sparse
-from jaxltl.io import _files, _umb_values, umb
-from jaxltl.io._umb_index import Record, Type, Variable
-from jaxltl.io._umb_tar import tar_pieces, write_gzip
-from jaxltl.io._umb_values import read_numbers, read_variables
-from jaxltl.io.umb import read_umb, write_umb
+from jaxltl.io import files as _files
+from jaxltl.io.umb import umb
+from jaxltl.io.umb import values as _umb_values
+from jaxltl.io.umb.index import Record, Type, Variable
+from jaxltl.io.umb.tar import tar_pieces, write_gzip
+from jaxltl.io.umb.umb import read_umb, write_umb
+from jaxltl.io.umb.values import read_numbers, read_variables
 from tests.io.archives import (
     classes_example,
     example,

@@ -12,10 +12,11 @@ import pytest
 from jaxltl.core.models.game import make_game
 from jaxltl.core.models.mesh.lanes import on_host
 from jaxltl.core.models.mesh.shard import shard, to_mesh
-from jaxltl.io import _files, umb_sharded
+from jaxltl.io import files as _files
 from jaxltl.io.model_files import read_model, write_model
-from jaxltl.io.umb import write_umb
-from jaxltl.io.umb_sharded import read_sharded
+from jaxltl.io.umb import sharded as umb_sharded
+from jaxltl.io.umb.sharded import read_sharded
+from jaxltl.io.umb.umb import write_umb
 from tests.core.models.mesh.test_sharded import mesh_of
 from tests.io.archives import classes_example, example, f64, members_of, tar, u32, u64
 from tests.io.archives import umb as archive
@@ -107,7 +108,7 @@ def test_only_the_ranges_are_held(tmp_path, monkeypatch):
     path, taken, step = tmp_path / "m.umb", [], 512
     write_umb(path, model, compression=None)
     fetch = _files.FileBytes.__getitem__
-    monkeypatch.setattr("jaxltl.io._umb_tar._STEP", step)
+    monkeypatch.setattr("jaxltl.io.umb.tar._STEP", step)
     monkeypatch.setattr(
         _files.FileBytes,
         "__getitem__",

@@ -28,7 +28,7 @@ from jaxltl.core.models.trajectories import Trajectories, make_trajectories
 from jaxltl.core.types import Solution
 from jaxltl.envs.gridworld import ACTIONS, gridworld
 from jaxltl.envs.text_map import parse_map
-from jaxltl.io.prism_explicit import files_beside
+from jaxltl.io.prism.explicit import files_beside
 
 if TYPE_CHECKING:
     from jaxltl.app.logged import Logged

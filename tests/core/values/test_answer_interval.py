@@ -10,7 +10,7 @@ from jaxltl.core.models.interval import interval_rows
 from jaxltl.core.models.sparse import Rewards, make_sparse
 from jaxltl.core.types import Status
 from jaxltl.core.values.properties.solve_property import solve_property
-from jaxltl.io.drn import read_drn
+from jaxltl.io.drn.drn import read_drn
 from jaxltl.io.storm import to_stormpy
 from tests.core.sparse.interval.test_step_bounded import random_interval, vertices
 

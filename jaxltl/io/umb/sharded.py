@@ -21,9 +21,9 @@ from jaxltl.core.models.mdp import refuse_negative
 from jaxltl.core.models.mesh.shard import ModelPart, model_from_parts, ranges_of
 from jaxltl.core.models.mesh.sharded import ShardedMDP
 from jaxltl.core.models.sparse import Annotations, choice_reward, sparse_part
-from jaxltl.io._files import FileBytes, compression_of, opened, pieces
-from jaxltl.io._umb_index import ACTIONS, INITIAL, Index, Items
-from jaxltl.io._umb_members import (
+from jaxltl.io.files import FileBytes, compression_of, opened, pieces
+from jaxltl.io.umb.index import ACTIONS, INITIAL, Index, Items
+from jaxltl.io.umb.members import (
     actions_of,
     check_chain,
     check_memory,
@@ -35,8 +35,8 @@ from jaxltl.io._umb_members import (
     rewards_of,
     starts_of,
 )
-from jaxltl.io._umb_tar import Stream
-from jaxltl.io._umb_values import Bytes, count_bits, read_bits, read_starts, write_bits
+from jaxltl.io.umb.tar import Stream
+from jaxltl.io.umb.values import Bytes, count_bits, read_bits, read_starts, write_bits
 
 _UNLIMITED = 2**62  # bytes that an archive may hold: little of it is held at a time
 _ROWS, _ENTRIES, _IS_INITIAL = (
@@ -77,7 +77,7 @@ def read_sharded(
     Example:
       >>> import tempfile, jax
       >>> from jaxltl import make_sparse
-      >>> from jaxltl.io.umb import write_umb
+      >>> from jaxltl.io.umb.umb import write_umb
       >>> path = tempfile.mkdtemp() + "/coin.umb"
       >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
       >>> write_umb(path, coin, compression=None)

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, BinaryIO
 
-from jaxltl.io._files import FileBytes
+from jaxltl.io.files import FileBytes
 
 _BLOCK = 512
 _LONGEST_NAME = 2**16  # bytes of an extended header

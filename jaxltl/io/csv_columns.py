@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from itertools import chain
 from operator import itemgetter
 
-from jaxltl.io._files import streamed
+from jaxltl.io.files import streamed
 
 _STEP = 2**13  # bytes whose fields are held at a time; more of them cost more
 _LONGEST = 2**16  # bytes of a line

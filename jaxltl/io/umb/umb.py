@@ -20,8 +20,8 @@ from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.interval import IntervalMDP, interval_rows, refuse_ball
 from jaxltl.core.models.mdp import checked_initial
 from jaxltl.core.models.sparse import SparseMDP, make_sparse
-from jaxltl.io._files import Compression, compression_by_name, pieces, raw_bytes, write_bytes
-from jaxltl.io._umb_index import (
+from jaxltl.io.files import Compression, compression_by_name, pieces, raw_bytes, write_bytes
+from jaxltl.io.umb.index import (
     ACTIONS,
     INITIAL,
     OTHER_LABELS,
@@ -31,7 +31,7 @@ from jaxltl.io._umb_index import (
     Index,
     ids_for,
 )
-from jaxltl.io._umb_members import (
+from jaxltl.io.umb.members import (
     actions_of,
     check_chain,
     check_memory,
@@ -45,8 +45,8 @@ from jaxltl.io._umb_members import (
     texts_of,
     uniform,
 )
-from jaxltl.io._umb_tar import Stream, tar_pieces, write_gzip
-from jaxltl.io._umb_values import (
+from jaxltl.io.umb.tar import Stream, tar_pieces, write_gzip
+from jaxltl.io.umb.values import (
     Bytes,
     read_bits,
     read_variables,

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxltl.io._intervals import intervals, point_rewards, with_whole_brackets
-from jaxltl.io._tokens import Block, Integers, Text, decoded, numbered, refuse
+from jaxltl.io.intervals import intervals, point_rewards, with_whole_brackets
+from jaxltl.io.tokens import Block, Integers, Text, decoded, numbered, refuse
 
 # Reads tokens of a block as numbers, or as something else that NumPy can hold.
 Values = Callable[[Block, Integers], NDArray[Any]]

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from jaxltl.io._hoa_grammar import (
+from jaxltl.io.hoa.grammar import (
     KNOWN_HEADERS,
     Tree,
     error_at,

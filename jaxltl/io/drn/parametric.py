@@ -23,9 +23,9 @@ from jaxltl.core.models.parametric.rational import Rationals, make_rationals
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
 from jaxltl.core.pretty_print import brief
 from jaxltl.core import validation
-from jaxltl.io._drn_body import names_of, read_body, read_header, rewards_of
-from jaxltl.io._files import read_bytes
-from jaxltl.io._tokens import Block, Integers, Text, as_fraction, numbered, refuse
+from jaxltl.io.drn.body import names_of, read_body, read_header, rewards_of
+from jaxltl.io.files import read_bytes
+from jaxltl.io.tokens import Block, Integers, Text, as_fraction, numbered, refuse
 
 _TOKEN = re.compile(
     r"\s*(?:(\d+(?:\.\d*)?(?:[eE][+-]?\d+)?|\.\d+(?:[eE][+-]?\d+)?)"
@@ -305,7 +305,7 @@ def read_parametric(path: str | os.PathLike[str]) -> ParametricModel:
 
     Raises:
       ValueError: naming file and line, and what was expected; as for
-        :func:`~jaxltl.io.drn.read_drn`.
+        :func:`~jaxltl.io.drn.drn.read_drn`.
 
     Example:
       >>> import tempfile, pathlib

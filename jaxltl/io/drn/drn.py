@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from jaxltl.core.models.interval import IntervalMDP, interval_rows
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
-from jaxltl.io._drn_body import (
+from jaxltl.io.drn.body import (
     INTERVALS,
     NO_LABEL,
     Body,
@@ -22,10 +22,10 @@ from jaxltl.io._drn_body import (
     read_header,
     rewards_of,
 )
-from jaxltl.io._files import read_bytes, write_bytes
-from jaxltl.io._init_label import labels_with_init
-from jaxltl.io._intervals import exact_part, first_without_distribution, value_texts
-from jaxltl.io._tokens import (
+from jaxltl.io.files import read_bytes, write_bytes
+from jaxltl.io.init_label import labels_with_init
+from jaxltl.io.intervals import exact_part, first_without_distribution, value_texts
+from jaxltl.io.tokens import (
     Text,
     as_double,
     refuse,
@@ -83,7 +83,7 @@ def read_drn(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP:
         refuse(
             name,
             f"its probabilities have parameters, {', '.join(header.parameters)}; "
-            "jaxltl.io.parametric.read_parametric reads it.",
+            "jaxltl.io.drn.parametric.read_parametric reads it.",
         )
     known = _placeholders(header)
     try:

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.sparse import Rewards, SparseMDP
-from jaxltl.io._init_label import labels_with_init
-from jaxltl.io._intervals import exact_part, value_texts
-from jaxltl.io._tokens import joined_lines
+from jaxltl.io.init_label import labels_with_init
+from jaxltl.io.intervals import exact_part, value_texts
+from jaxltl.io.tokens import joined_lines
 
 _STEP = 2**17  # lines that are held at a time
 

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from jaxltl.core.automata.automaton import letter_text
 from jaxltl.core.logic.ltl import Letter, as_letters
-from jaxltl.io._hoa_grammar import (
+from jaxltl.io.hoa.grammar import (
     Edge,
     State,
     Tree,
     error_at,
 )
-from jaxltl.io._hoa_header import Header, only_target, set_number
+from jaxltl.io.hoa.header import Header, only_target, set_number
 
 MAX_FREE_PROPOSITIONS = 12  # 2^12 letters
 

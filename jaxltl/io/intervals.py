@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from jaxltl.core.models.interval import NEAR, IntervalMDP, refuse_ball
 from jaxltl.core.models.sparse import SparseMDP
-from jaxltl.io._tokens import Block, Floats, Integers, Text, as_double, bytes_of, edges
+from jaxltl.io.tokens import Block, Floats, Integers, Text, as_double, bytes_of, edges
 
 EXPECTED = "a probability or an interval [l, u] with 0 <= l <= u <= 1"
 _SIGN = bytes_of(b"[,]\n")

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core.models.sparse import Rewards, SparseMDP
-from jaxltl.io._tokens import (
+from jaxltl.io.tokens import (
     Block,
     Floats,
     Integers,

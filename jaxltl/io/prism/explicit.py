@@ -14,16 +14,16 @@ from numpy.typing import NDArray
 
 from jaxltl.core.models.interval import IntervalMDP, interval_rows
 from jaxltl.core.models.sparse import SparseMDP, make_sparse
-from jaxltl.io._files import read_bytes, write_bytes
-from jaxltl.io._intervals import (
+from jaxltl.io.files import read_bytes, write_bytes
+from jaxltl.io.intervals import (
     first_without_distribution,
     has_bracket,
     intervals,
     with_whole_brackets,
 )
-from jaxltl.io._prism_parts import Section, read_labels, read_rewards, read_valuation
-from jaxltl.io._prism_text import written_sections
-from jaxltl.io._tokens import Block, Floats, Integers, Text, decoded, numbered, refuse
+from jaxltl.io.prism.parts import Section, read_labels, read_rewards, read_valuation
+from jaxltl.io.prism.sections import written_sections
+from jaxltl.io.tokens import Block, Floats, Integers, Text, decoded, numbered, refuse
 
 _NAME = re.compile(
     r"(?P<stem>.+)\.(?P<kind>tra|pexp)(?P<packed>\.gz|\.xz)?", re.DOTALL | re.IGNORECASE

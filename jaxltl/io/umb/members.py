@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core.models.sparse import Rewards
-from jaxltl.io._umb_index import ACTIONS, OTHER_LABELS, PARTS, Index, parse_index
-from jaxltl.io._umb_tar import Stream, members
-from jaxltl.io._umb_values import (
+from jaxltl.io.umb.index import ACTIONS, OTHER_LABELS, PARTS, Index, parse_index
+from jaxltl.io.umb.tar import Stream, members
+from jaxltl.io.umb.values import (
     Bytes,
     read_bits,
     read_ends,
@@ -29,7 +29,7 @@ def read_index(stream: Stream) -> Index:
     """The index of an archive, from a stream at its beginning.
 
     Raises:
-      ValueError: there is none, or as of :func:`~jaxltl.io._umb_index.parse_index`.
+      ValueError: there is none, or as of :func:`~jaxltl.io.umb.index.parse_index`.
     """
     for member, size in members(stream):
         if member == "index.json":

@@ -22,18 +22,18 @@ from jaxltl.core.logic.ltl import Formula, parse_ltl, proposition_text, subformu
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.sparse import SparseMDP, make_sparse
 from jaxltl.core.pretty_print import brief
-from jaxltl.io._files import read_text
-from jaxltl.io._hoa_acceptance import condition_given, decisive_sets, edge_priority
-from jaxltl.io._hoa_grammar import Edge, State, error_at, parse_tokens, split_texts
-from jaxltl.io._hoa_header import Header, read_header
-from jaxltl.io._hoa_table import (
+from jaxltl.io.files import read_text
+from jaxltl.io.hoa.acceptance import condition_given, decisive_sets, edge_priority
+from jaxltl.io.hoa.grammar import Edge, State, error_at, parse_tokens, split_texts
+from jaxltl.io.hoa.header import Header, read_header
+from jaxltl.io.hoa.table import (
     by_number,
     guarded_edges,
     label_reader,
     marks_of,
     nondeterminism,
 )
-from jaxltl.io.hoa import parity_text, quoted
+from jaxltl.io.hoa.hoa import parity_text, quoted
 from jaxltl.io.pgsolver import edges_of, max_even, min_even, objective_of
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxltl.io._umb_index import Record, Type, Variable, bit_bytes
+from jaxltl.io.umb.index import Record, Type, Variable, bit_bytes
 
 Bytes = NDArray[np.uint8]
 

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxltl.io._hoa_grammar import (
+from jaxltl.io.hoa.grammar import (
     FALSE,
     TRUE,
     Tree,
     error_at,
 )
-from jaxltl.io._hoa_header import Header
+from jaxltl.io.hoa.header import Header
 
 MAX_COLORS = 62  # acceptance sets as bits of one int64
 

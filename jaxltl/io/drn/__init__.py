@@ -1,0 +1,1 @@
+"""DRN, Storm's text format, and its parametric models."""

@@ -1,0 +1,1 @@
+"""The Hanoi Omega-Automata format and its extension to games."""
