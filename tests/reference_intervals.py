@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 
 from jaxltl.core.models.interval import interval_rows
-from jaxltl.core.sparse.interval.uncertainty_set import HostInterval
+from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
 from jaxltl.core.sparse.mdp import HostMDP
 
 
@@ -79,9 +79,9 @@ def random_model(rng, num_states=4, most_rows=2, width=3, unit=8):
         row_start.append(len(entry_start) - 1)
     shape = (np.array(x, np.int32) for x in (row_start, entry_start, successor))
     mdp = HostMDP(*shape, np.array(lower))
-    model = HostInterval(mdp, np.array(lower), np.array(upper))
-    chance = model.within(np.ones(len(successor), bool))
-    return HostInterval(
+    model = UncertainMDP(mdp, np.array(lower), np.array(upper))
+    chance = model.interior_distributions(np.ones(len(successor), bool))
+    return UncertainMDP(
         HostMDP(mdp.row_start, mdp.entry_start, mdp.successor, chance), model.lower, model.upper
     )
 
@@ -98,7 +98,7 @@ def chains(model, goal):
         for p in (
             vertices(*ends)
             if ball is None
-            else ball_vertices(*ends, ball.center[of], 2 * ball.most[r])
+            else ball_vertices(*ends, ball.center[of], 2 * ball.gain[r])
         ):
             row = np.zeros((1, mdp.num_states))
             row[0, mdp.successor[of]] = p

@@ -30,7 +30,7 @@ from jaxltl.core.environments import episodes as ep
 from jaxltl.core.environments import sequence_task as st
 from jaxltl.core.environments import task_environment as te
 from jaxltl.core.environments.time_limit import with_time_limit
-from jaxltl.core.sparse.interval.l1_ball import l1_expectation
+from jaxltl.core.sparse.interval.uncertainty_set import l1_expectation
 from jaxltl.core.statistics.confidence_sets import samples_needed
 from jaxltl.core.statistics.empirical_bernstein import bounded_mean
 from jaxltl.core.values.evaluation.evaluation import share_estimate

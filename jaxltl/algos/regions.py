@@ -38,7 +38,9 @@ from numpy.typing import ArrayLike, NDArray
 from jaxltl.core.models.interval import IntervalMDP, make_interval
 from jaxltl.core.models.parametric.parametric import ParametricMDP, box_of
 from jaxltl.core.pretty_print import brief
-from jaxltl.core.sparse.interval import reachability as interval_values
+from jaxltl.core.sparse.interval.reachability import reachability
+from jaxltl.core.sparse.interval.robust_values import Query
+from jaxltl.core.sparse.interval.total_reward import total_reward
 from jaxltl.core import validation
 from jaxltl.core.values.undiscounted.mixture import safe_ends
 
@@ -141,21 +143,12 @@ def _box(problem: Problem, low: Corner, high: Corner) -> tuple[Point, Point]:
 def _bounds(problem: Problem, model: IntervalMDP, reward: Any, large: bool) -> tuple[float, float]:
     """Bounds of the mean over the initial distribution with maximising or minimising nature."""
     maximize = problem.objective == "max"
-    depth = problem.model.roundings
+    query = Query(maximize, large, depth=problem.model.roundings)
     if problem.reward is None:
-        found = interval_values.reachability(
-            model.host,
-            problem.target,
-            maximize=maximize,
-            helpful=large,
-            stay=problem.stay,
-            depth=depth,
-        )
+        found = reachability(model.host, problem.target, query, stay=problem.stay)
     else:
         earned = reward.upper if large else np.maximum(reward.lower, 0)
-        found = interval_values.total_reward(
-            model.host, earned, problem.target, maximize=maximize, large=large, depth=depth
-        )
+        found = total_reward(model.host, earned, problem.target, query)
     return safe_ends(model, found, highest=problem.highest)
 
 

@@ -23,10 +23,9 @@ from jaxltl.core.models.sparse import (
     placed,
 )
 from jaxltl.core.pretty_print import brief
-from jaxltl.core.sparse.interval.l1_distance import Ball
+from jaxltl.core.sparse.interval.l1_ball import Ball
 from jaxltl.core.sparse.interval.row_table import row_sums
-from jaxltl.core.sparse.interval.uncertainty_set import HostInterval
-from jaxltl.core.sparse.mdp import HostMDP
+from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP, uncertainty_sets
 from jaxltl.core.sparse.rows import offsets_from_counts
 from jaxltl.core import validation
 
@@ -123,7 +122,7 @@ class IntervalMDP:
         return self.nominal.rewards
 
     @cached_property
-    def host(self) -> HostInterval:
+    def host(self) -> UncertainMDP:
         """The transitions as the host engine takes them."""
         lower, upper = (np.asarray(x, np.float64) for x in (self.lower, self.upper))
         ball = (
@@ -131,7 +130,7 @@ class IntervalMDP:
             if self.radius is None or self.center is None
             else Ball(np.asarray(self.center, np.float64), np.asarray(self.radius, np.float64) / 2)
         )
-        return HostInterval(self.nominal.host, lower, upper, ball)
+        return UncertainMDP(self.nominal.host, lower, upper, ball)
 
     @property
     def box(self) -> IntervalMDP:
@@ -371,16 +370,12 @@ def interval_rows(
         _check_ball(starts, entry_start, row, lower, upper, *ball)
         lower, upper, ball = _around(entry_start, row, lower, upper, *ball)
     lower, upper = _pointed(entry_start, row, lower, upper, ball)
-    states: Any = np.zeros(entry_start.size, np.int64)  # the host's rows need no states here
-    ends = HostInterval(
-        HostMDP(states, entry_start, successor, lower),
-        lower,
-        upper,
-        None if ball is None else Ball(ball[0], ball[1] / 2),
+    ends = uncertainty_sets(
+        entry_start, lower, upper, None if ball is None else Ball(ball[0], ball[1] / 2)
     )
     # Nature has nothing left to give where lower ends add up to one.
-    possible = (upper > 0) & ((lower > 0) | (ends.rest > 0)[row])
-    nominal = np.where(possible, ends.within(possible), 0)
+    possible = (upper > 0) & ((lower > 0) | (ends.free_mass > 0)[row])
+    nominal = np.where(possible, ends.interior_distributions(possible), 0)
     extra = _travelling(lower, upper, *(ball or (None, None)))
     return _taken_apart(
         make_sparse(row_start, entry_start, successor, nominal, rewards=rewards | extra, **rest)

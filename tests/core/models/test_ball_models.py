@@ -26,7 +26,7 @@ from jaxltl.core.values.undiscounted.satisfaction import (
     satisfaction_probability,
 )
 from jaxltl.io.model_files import read_model, write_model
-from tests.core.sparse.interval.test_l1_distance import within_ball
+from tests.core.sparse.interval.test_balls import within_ball
 from tests.core.values.evaluation.test_data_guarantee import drawn, labelled
 
 TASKS = ["F a", "!b U a", "G F a", "F G a | F b", "G !b"]

@@ -1,115 +1,105 @@
-"""Discounted values of interval models, by policy iteration of both who choose."""
+"""Discounted values of uncertain MDPs by policy iteration of both sides."""
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
 from jaxltl.core.array_types import Floats, Integers
-from jaxltl.core.sparse.interval.reachability import Robust
-from jaxltl.core.sparse.interval.uncertainty_set import HostInterval
+from jaxltl.core.sparse.interval.robust_values import Query, RobustValues
+from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
 from jaxltl.core.sparse.linear.elimination import factorize
 from jaxltl.core.sparse.linear.topological_order import Edges, ordered_components
 
-_EPS = float(np.finfo(np.float64).eps)
 _ROUNDS = 300
 
 
-def discounted(
-    model: HostInterval,
-    reward: Floats,
-    discount: Floats,
-    *,
-    maximize: bool,
-    large: bool,
-    tolerance: float,
-) -> Robust:
-    """``V = opt_r opt_p sum_t p_t (reward_t + discount_r V_t)``, enclosed.
+@dataclass(frozen=True)
+class DiscountedModel:
+    """``V = opt_r opt_p sum_t p_t (reward_t + discount_r V_t)``.
 
-    Args:
-      model: the model.
-      reward: ``float64[T]``, what each entry earns, of any sign.
+    Attributes:
+      model: the rows.
+      reward: ``float64[T]``, of any sign.
       discount: ``float64[R]``, below 1 in every second step at least.
-      maximize: whether the policy makes the value large.
-      large: whether nature does.
-      tolerance: the width at which to stop.
     """
-    mdp = model.mdp
+
+    model: UncertainMDP
+    reward: Floats
+    discount: Floats
+
+    def ahead(self, value: Floats) -> Floats:
+        """``reward_t + discount_r V_t``, ``float64[T]``."""
+        mdp = self.model.mdp
+        return self.reward + self.discount[mdp.row] * value[mdp.successor]
+
+    def backup(self, value: Floats, nature_maximizes: bool) -> tuple[Floats, Floats, Floats]:
+        """Nature's distributions, the value of each row, and its rounding error."""
+        model, ahead = self.model, self.ahead(value)
+        q = model.extreme_distributions(ahead, maximize=nature_maximizes)
+        size = np.abs(self.reward).max(initial=0) + np.abs(value).max(initial=0)
+        return q, model.sum_rows(q * ahead), 4 * model.rounding * size
+
+    def evaluate(self, row: Integers, p: Floats, label: Integers) -> Floats | None:
+        """The value of a policy and nature; None where the system is singular."""
+        chain, entry = self.model.under_policy(row)
+        earned = chain.sum_rows(p[entry] * self.reward[entry])
+        mdp = chain.resolve(p[entry])
+        matrix = mdp.matrix.copy()
+        matrix.data = matrix.data * self.discount[row][mdp.row]
+        system = factorize(matrix, label, np.arange(mdp.num_states))
+        found = None if system is None else system.solve(earned)
+        return found if found is not None and np.isfinite(found).all() else None
+
+
+def discounted_value(problem: DiscountedModel, query: Query) -> RobustValues:
+    """The optimal discounted value.
+
+    Enclosure by ``V +- |Phi V - V| / (1 - discount)``, with rounding.
+    """
+    model, mdp, discount = problem.model, problem.model.mdp, problem.discount
     label = ordered_components(Edges(mdp.entry_start[mdp.row_start], mdp.successor))
     rate = float(discount[discount < 1].max(initial=0))
-    # A step that is not discounted comes at most after each one that is.
     steps = (2 if (discount == 1).any() else 1) / (1 - rate)
-    best, sign = (np.maximum, 1) if maximize else (np.minimum, -1)
+    best, sign = (np.maximum, 1) if query.maximize else (np.minimum, -1)
+    nature = 1 if query.nature_maximizes else -1
     value = np.zeros(mdp.num_states)
     row: Integers = mdp.row_start[:-1].astype(np.int64)
-    p = model.nature(reward, maximize=large)
+    p = model.extreme_distributions(problem.reward, maximize=query.nature_maximizes)
     low, high = np.full(value.size, -np.inf), np.full(value.size, np.inf)
     rounds, residual = 0, np.inf
     while rounds < _ROUNDS:
         rounds += 1
-        solved = _solved(model, reward, discount, row, p, label)
-        if solved is None or not np.isfinite(solved).all():
+        solved = problem.evaluate(row, p, label)
+        if solved is None:
             break
         value = solved
-        q, image, noise = _backup(model, reward, discount, value, large)
-        now = model.total(p * _ahead(model, reward, discount, value))
+        q, image, noise = problem.backup(value, query.nature_maximizes)
+        now = model.sum_rows(p * problem.ahead(value))
         # Nature answers first; only then does the policy improve.
-        answers = (image - now) * (1 if large else -1) > noise
-        answers &= np.isin(np.arange(mdp.num_rows), row)
+        taken = np.isin(np.arange(mdp.num_rows), row)
+        answers = ((image - now) * nature > noise) & taken
         found = mdp.over_choices(best, image)
         residual = float(np.abs(found - value).max())
         error = (residual + float(noise.max())) * steps
         if error < (high - low).max() / 2:
             low, high = value - error, value + error
-        if 2 * error <= tolerance:
+        if 2 * error <= query.tolerance:
             break
         better = sign * (found - image[row]) > noise[row]
         if not answers.any() and not better.any():
             break
-        p = np.where((answers | ~np.isin(np.arange(mdp.num_rows), row))[mdp.row], q, p)
+        p = np.where((answers | ~taken)[mdp.row], q, p)
         if not answers.any():
             row = np.where(better, mdp.first_choice(image == found[mdp.state])[1], row)
-    return Robust(
-        np.clip(value, low, high),
-        low,
-        high,
-        row,
-        p,
-        rounds,
-        residual,
-        "policy iteration with nature",
+    return RobustValues(
+        value=np.clip(value, low, high),
+        lower=low,
+        upper=high,
+        row=row,
+        probability=p,
+        rounds=rounds,
+        residual=residual,
+        method="policy iteration with nature",
     )
-
-
-def _backup(
-    model: HostInterval, reward: Floats, discount: Floats, value: Floats, large: bool
-) -> tuple[Floats, Floats, Floats]:
-    """Nature's distributions, the value of each row, and how much rounding may change it."""
-    ahead = _ahead(model, reward, discount, value)
-    q = model.nature(ahead, maximize=large)
-    size = np.abs(reward).max(initial=0) + np.abs(value).max(initial=0)
-    return q, model.total(q * ahead), 4 * model.rounding * size
-
-
-def _ahead(model: HostInterval, reward: Floats, discount: Floats, value: Floats) -> Floats:
-    """What each entry earns and leads to."""
-    return reward + discount[model.mdp.row] * value[model.mdp.successor]
-
-
-def _solved(
-    model: HostInterval,
-    reward: Floats,
-    discount: Floats,
-    row: Integers,
-    p: Floats,
-    label: Integers,
-) -> Any:
-    """The value of a policy and nature; None where the system is singular."""
-    chain, entry = model.chain(row)
-    earned = chain.total(p[entry] * reward[entry])
-    mdp = chain.fixed(p[entry])
-    matrix = mdp.matrix.copy()
-    matrix.data = matrix.data * discount[row][mdp.row]
-    system = factorize(matrix, label, np.arange(mdp.num_states))
-    return None if system is None else system.solve(earned)

@@ -1,65 +1,64 @@
-"""Games and mixed policies as interval models: whose choice it is, is told by intervals.
+"""Encodes the choices of a second player, or of a mixed policy, in uncertainty sets.
 
-A player that wants what nature wants is nature: its choice among rows is a distribution with ends 0
-and 1 over states that have one of the rows each. A policy that mixes rows does so with equal ends.
+A player that wants the same as nature is part of nature: its choice among rows is a distribution
+with ends 0 and 1 over auxiliary states that have one of the rows each. The rows of a mixed policy
+are such a distribution with equal ends.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
-from jaxltl.core.sparse.interval.l1_distance import Ball
-from jaxltl.core.sparse.interval.uncertainty_set import HostInterval
+from jaxltl.core.sparse.interval.l1_ball import Ball
+from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
 
 
-class Spread(NamedTuple):
-    """A model in which some states' rows are chosen by nature.
+@dataclass(frozen=True)
+class EncodedChoices:
+    """A model in which nature chooses the rows of some states.
 
     Attributes:
-      model: the first states are those that there were; the others have one row each.
-      source: ``int[S']``, which state each one stands for.
-      row: ``int[R']``, which row each one was; -1 of the rows by which nature chooses.
-      entry: ``int[T']``, which entry each one was; -1 of the entries of those rows.
-      chosen: ``int[T']``, the row that an entry of those rows leads to; -1 elsewhere.
+      model: original states first; each auxiliary state has one row.
+      source: ``int[S']``, original state of each state.
+      row: ``int[R']``, original row, -1 for rows by which nature chooses.
+      entry: ``int[T']``, original entry, -1 in those rows.
+      chosen: ``int[T']``, original row that an entry of those rows stands for; -1 elsewhere.
     """
 
-    model: HostInterval
+    model: UncertainMDP
     source: Integers
     row: Integers
     entry: Integers
     chosen: Integers
 
     def policy(self, row: Integers, probability: Floats) -> Integers:
-        """The rows of the model that there was: nature's most likely where it chooses."""
+        """Original rows of a policy; nature's most likely one where it chooses."""
         size = int(self.source.size - np.count_nonzero(np.arange(self.source.size) != self.source))
         found = self.row[row[:size]].copy()
         mdp = self.model.mdp
-        waits = np.flatnonzero(found < 0)
-        for s in waits:
+        for s in np.flatnonzero(found < 0):
             first, last = mdp.entry_start[row[s]], mdp.entry_start[row[s] + 1]
             found[s] = self.chosen[first + int(probability[first:last].argmax())]
         return found
 
     def nature(self, probability: Floats, otherwise: Floats) -> Floats:
-        """Nature's distributions in the model that there was."""
-        found, given = otherwise.copy(), self.entry >= 0
-        found[self.entry[given]] = probability[given]
+        """Nature's distributions in the original entries, `otherwise` where there are none."""
+        found, original = otherwise.copy(), self.entry >= 0
+        found[self.entry[original]] = probability[original]
         return found
 
 
-def spread(model: HostInterval, states: Booleans, lower: Floats, upper: Floats) -> Spread:
-    """The model in which nature chooses the rows of some states, within ends.
+def let_nature_choose(
+    model: UncertainMDP, states: Booleans, lower: Floats, upper: Floats
+) -> EncodedChoices:
+    """The model in which nature chooses the rows of some states between ends ``float64[R]``.
 
-    Args:
-      model: the model.
-      states: ``bool[S]``.
-      lower, upper: ``float64[R]``, how likely nature may take a row, in these states; rows with an
-        upper end of 0 are left out there.
+    Rows of these states with an upper end of 0 are left out.
     """
     mdp = model.mdp
     moved = np.flatnonzero(states[mdp.state] & (upper > 0))
@@ -70,33 +69,32 @@ def spread(model: HostInterval, states: Booleans, lower: Floats, upper: Floats) 
     row_start = offsets_from_counts(rows)
     row = np.full(int(row_start[-1]), -1)
     row[~np.repeat(np.append(states, np.zeros(moved.size, bool)), rows)] = np.append(own, moved)
-    choosing = np.flatnonzero(row < 0)
     width = np.where(row < 0, 0, np.diff(mdp.entry_start)[row])
-    width[choosing] = many[states]
+    width[row < 0] = many[states]
     starts = offsets_from_counts(width)
-    given = np.repeat(row >= 0, width)
-    entry = np.full(given.size, -1)
-    entry[given] = concatenated_ranges(mdp.entry_start[row[row >= 0]], width[row >= 0])
-    chosen = np.full(given.size, -1)
-    chosen[~given] = moved
-    successor = np.empty(given.size, np.int32)
-    successor[given] = mdp.successor[entry[given]]
-    successor[~given] = mdp.num_states + np.arange(moved.size)
-    ends: list[Any] = []
-    for of, at in ((model.lower, lower), (model.upper, upper)):
-        x = np.empty(given.size)
-        x[given], x[~given] = of[entry[given]], at[moved]
-        ends.append(x)
-    lower, upper = ends
-    host = HostMDP(row_start, starts, successor, upper)
+    original = np.repeat(row >= 0, width)
+    entry = np.full(original.size, -1)
+    entry[original] = concatenated_ranges(mdp.entry_start[row[row >= 0]], width[row >= 0])
+    chosen = np.full(original.size, -1)
+    chosen[~original] = moved
+    successor = np.empty(original.size, np.int32)
+    successor[original] = mdp.successor[entry[original]]
+    successor[~original] = mdp.num_states + np.arange(moved.size)
+
+    def of_entries(inner: Floats, outer: Floats) -> Floats:
+        x = np.empty(original.size)
+        x[original], x[~original] = inner[entry[original]], outer[moved]
+        return x
+
+    low, high = of_entries(model.lower, lower), of_entries(model.upper, upper)
     ball = None
-    if model.ball is not None:  # where nature chooses it may gain all that the ends leave
-        center, most = lower.copy(), np.ones(row.size)
-        center[given] = model.ball.center[entry[given]]
-        most[row >= 0] = model.ball.most[row[row >= 0]]
-        ball = Ball(center, most)
-    found = HostInterval(host, lower, upper, ball)
-    chance = found.within(np.ones(given.size, bool))
-    host = HostMDP(row_start, starts, successor, chance)
+    if model.ball is not None:  # no limit where nature chooses
+        center, gain = low.copy(), np.ones(row.size)
+        center[original] = model.ball.center[entry[original]]
+        gain[row >= 0] = model.ball.gain[row[row >= 0]]
+        ball = Ball(center, gain)
+    sets = UncertainMDP(HostMDP(row_start, starts, successor, high), low, high, ball)
+    nominal = sets.interior_distributions(np.ones(original.size, bool))
+    sets = UncertainMDP(HostMDP(row_start, starts, successor, nominal), low, high, ball)
     source = np.concatenate([np.arange(mdp.num_states), mdp.state[moved]])
-    return Spread(HostInterval(host, lower, upper, ball), source, row, entry, chosen)
+    return EncodedChoices(sets, source, row, entry, chosen)

@@ -1,72 +1,80 @@
-"""Rows whose distributions lie in a ball around a center, and what nature makes of them."""
+"""L1 balls around the nominal distributions of an interval model.
+
+Of ``sum_t |p_t - c_t| <= radius`` half is gained by some successors and half lost by others, so the
+ball is the constraint ``sum_t max(p_t - c_t, 0) <= gain``, which also holds for rows without the
+successors of mass 0.
+
+For a given order of the successors the best ones gain first and the worst ones lose first, up to
+the limit. Between the resulting ends the greedy distribution is extreme (Strehl and Littman 2008,
+section 3.2, with ends): :func:`narrow_intervals`.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
-from jaxltl.core.array_types import Floats, Integers
-from jaxltl.core.sparse.interval.l1_distance import Ball
-from jaxltl.core.sparse.interval.uncertainty_set import HostInterval
-from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core import validation
+from jaxltl.core.array_types import Booleans, Floats, Integers
 
 
-def l1_expectation(
-    value: Floats, center: Floats, radius: Floats, entry_start: Integers, *, maximize: bool
-) -> tuple[Floats, Floats]:
-    """The extreme of ``sum_t p_t v_t`` over ``sum_t |p_t - center_t| <= radius``, in every row.
+@dataclass(frozen=True)
+class Ball:
+    """L1 balls of all rows.
 
-    Half of the radius is moved, from the worst successors to the best one (Strehl and Littman 2008,
-    section 3.2).
-
-    Args:
-      value: ``float64[T]``, finite, of each entry: ``v[successor]``.
-      center: ``float64[T]``, distributions; entries of zero can gain.
-      radius: ``float64[R]``, from 0.
-      entry_start: ``int[R + 1]``, where rows begin; none is empty.
-      maximize: whether nature makes the expectation large.
-
-    Returns:
-      The expectations ``float64[R]``, and distributions ``float64[T]`` that attain them.
-
-    Raises:
-      ValueError: shapes do not fit, a row is empty, or a radius is negative.
-
-    Example:
-      >>> least, chosen = l1_expectation(np.array([0.0, 1.0, 2.0]), np.array([0.5, 0.25, 0.25]),
-      ...                                np.array([0.8]), np.array([0, 3]), maximize=False)
-      >>> least.round(9).tolist(), chosen.round(9).tolist()
-      ([0.1], [0.9, 0.1, 0.0])
+    Attributes:
+      center: ``float64[T]``, between the ends.
+      gain: ``float64[R]``, mass that may be gained over the center: half of the radius.
     """
-    value, center, radius = (
-        validation.float_array(name, x)
-        for name, x in (("value", value), ("center", center), ("radius", radius))
-    )
-    start: Any = validation.integer_array("entry_start", entry_start).reshape(-1)
-    if value.shape != center.shape or (start.size - 1,) != radius.shape:
-        raise ValueError(
-            f"value has shape {value.shape}, center {center.shape} and radius {radius.shape}; "
-            f"expected [T], [T] and [{start.size - 1}], an entry for each row."
-        )
-    width = np.diff(start)
-    if start[0] != 0 or start[-1] != value.size or (width <= 0).any():
-        raise ValueError(
-            f"entry_start goes from {start[0]} to {start[-1]}; it must ascend from 0 to "
-            f"{value.size}, without an empty row."
-        )
-    if not (np.isfinite(value) & np.isfinite(center)).all():
-        raise ValueError("value or center is not finite in some entry; give numbers.")
-    if not (radius >= 0).all():
-        r = int(np.argmin(radius >= 0))
-        raise ValueError(f"the radius of row {r} is {radius[r]}; it must be at least 0.")
-    states: Any = np.zeros(start.size, np.int64)  # what is done here needs no states
-    ball = HostInterval(
-        HostMDP(states, start, states[:0], center),
-        np.zeros_like(center),
-        np.ones_like(center),
-        Ball(center, np.minimum(radius / 2, 1)),
-    )
-    chosen = ball.nature(value, maximize=bool(maximize))
-    return ball.total(chosen * value), chosen
+
+    center: Floats
+    gain: Floats
+
+    def select(self, entry: Integers, row: Integers) -> Ball:
+        """The balls of some rows."""
+        return Ball(self.center[entry], self.gain[row])
+
+
+@dataclass(frozen=True)
+class BallLimits:
+    """Limits of some rows, ``float64[N, 1]``; what exceeds one by rounding alone meets it.
+
+    Attributes:
+      gain: as of :class:`Ball`.
+      deficit: one minus the sum of the center.
+      rounding: bound on the rounding error of a sum over the row.
+    """
+
+    gain: Floats
+    deficit: Floats
+    rounding: Floats
+
+
+def narrow_intervals(
+    lower: Floats, upper: Floats, center: Floats, used: Booleans | None, limits: BallLimits
+) -> tuple[Floats, Floats]:
+    """Ends ``float64[N, W]`` between which the greedy distribution is extreme in the ball.
+
+    Columns are sorted, best successor first; `used` is False in padding.
+    """
+    rise, fall = upper - center, center - lower
+    if used is not None:
+        rise, fall = np.where(used, rise, 0), np.where(used, fall, 0)
+    left = limits.gain - _sums_before(rise)
+    added = np.clip(np.where(left > limits.rounding, left, 0), 0, rise)
+    high = np.where(added == rise, upper, center + added)
+    left = limits.gain - limits.deficit - _sums_before(fall[:, ::-1])[:, ::-1]
+    removed = np.clip(np.where(left > limits.rounding, left, 0), 0, fall)
+    low = np.where(fall <= left + limits.rounding, lower, center - removed)
+    return low, high
+
+
+def _sums_before(x: Floats) -> Floats:
+    found = np.zeros_like(x)
+    np.cumsum(x[:, :-1], axis=1, out=found[:, 1:])
+    return found
+
+
+def share_of(part: Floats, whole: Floats) -> Floats:
+    """``part / whole``, clipped to [0, 1]; 0 where the whole is 0."""
+    return np.clip(np.divide(part, whole, out=np.zeros_like(whole), where=whole > 0), 0, 1)

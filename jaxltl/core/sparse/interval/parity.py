@@ -1,44 +1,50 @@
-"""The probability of a parity condition that a policy can have whatever nature picks.
+"""Parity objectives against an adversarial nature, by strategy improvement.
 
-The policy improves while nature answers best: by rows that gain something at once, and, where none
+The policy improves while nature answers optimally: by rows that gain at once, and, where none
 does, in a class of states of equal value by choices that keep to the class for ever and win there
-unless nature gives way (strategy improvement, Chatterjee and Henzinger 2006). When nothing is left,
-nature has choices that leave each class or win in it, and both are bounded by what is known of one
-player: nothing rests on how values were told apart.
+unless nature gives way (Chatterjee and Henzinger 2006). At the end nature has choices that leave
+each class or win in it, and the value is bounded from each side by fixing one player: the
+certificate does not depend on how values were grouped into classes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.sparse.graph.accepting import accepting_region
-from jaxltl.core.sparse.interval import reachability as interval_values
-from jaxltl.core.sparse.interval.optimal_face import face_of
-from jaxltl.core.sparse.interval.qualitative import joint_accepting
-from jaxltl.core.sparse.interval.reachability import Robust, gains, terms
-from jaxltl.core.sparse.interval.uncertainty_set import HostInterval
-from jaxltl.core.sparse.solvers import reachability as optimal
+from jaxltl.core.sparse.interval.l1_ball import Ball, share_of
+from jaxltl.core.sparse.interval.qualitative import RobustRegion, joint_accepting_region
+from jaxltl.core.sparse.interval.reachability import reachability
+from jaxltl.core.sparse.interval.robust_values import (
+    Query,
+    RobustValues,
+    distribution_depth,
+    row_gains,
+)
+from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
+from jaxltl.core.sparse.solvers import reachability as mdp_reachability
 
-_CLASS = 1e-9  # values nearer than this are looked at together
+_CLASS = 1e-9  # values nearer than this are in one class
+_GAIN = 1e-12  # gain at which a row is better
 _ROUNDS = 200
 
 
 def parity_against_nature(
-    model: HostInterval, priority: Integers, *, tolerance: float = 1e-6
-) -> Robust:
-    """The largest probability that the least priority met for ever is even, nature against it.
+    model: UncertainMDP, priority: Integers, *, tolerance: float = 1e-6
+) -> RobustValues:
+    """Maximal probability that the least priority seen infinitely often is even, for any nature.
 
     Args:
       model: the product.
-      priority: ``int[S]``, what each state reads as it is left.
-      tolerance: the width of the enclosure asked for.
+      priority: ``int[S]``, read as a state is left.
+      tolerance: requested width of the enclosure.
 
     Returns:
-      Values, the policy, and nature's distributions against which no policy does better.
+      Values, a policy, and nature's distributions against which no policy does better.
     """
     mdp = model.mdp
     row: Integers = mdp.row_start[:-1].astype(np.int64)
@@ -46,70 +52,82 @@ def parity_against_nature(
     rounds = 0
     while True:
         rounds += 1
-        answer = _answered(model, row, priority, tolerance)
-        value = 1 - answer.value
-        gain, p = gains(model, value, zero, up=False)
+        losing = _losing_probability(model, row, priority, tolerance)
+        value = 1 - losing.value
+        gain, p = row_gains(model, value, zero, nature_maximizes=False)
         best = mdp.over_choices(np.maximum, gain)
-        better = best > 1e-12
+        better = best > _GAIN
         if better.any():
-            new = mdp.first_choice(gain == best[mdp.state])[1]
-            row = np.where(better, new, row)
+            row = np.where(better, mdp.first_choice(gain == best[mdp.state])[1], row)
         else:
-            game = _tight(model, value, gain)
-            found = almost_surely(game, priority, leader="policy")
+            game = _class_game(model, value, gain)
+            found = almost_sure_parity(game, priority, leader="policy")
             better = found.region & (value < 1 - _CLASS)
             row = np.where(better, found.row, row)
         if not better.any() or rounds == _ROUNDS:
             break
-    nature = almost_surely(_tight(model, value, gain), priority + 1, leader="nature")
+    nature = almost_sure_parity(_class_game(model, value, gain), priority + 1, leader="nature")
     kept = nature.region[mdp.state] & (gain >= -_CLASS)
     p = np.where(kept[mdp.row], nature.probability, p)
-    p, able = model.settled(p)
-    mdp_ = model.fixed(p)
-    region = accepting_region(mdp_, priority[mdp_.state[mdp_.row]]).region
-    other = optimal.reachability(
-        mdp_, region, maximize=True, tolerance=tolerance / 2, depth=terms(mdp_)
-    )
-    lower = np.clip(1 - answer.upper - 1e-16, 0, 1)
-    lower = np.where(answer.upper == 0, 1, np.where(answer.upper >= 1, 0, lower))
-    upper = np.maximum(other.upper if able else 1, lower)
-    return Robust(
-        np.clip(value, lower, upper),
-        lower,
-        upper,
-        row,
-        p,
-        rounds,
-        float(best.max(initial=0)),
-        "strategy improvement against nature",
+    p, upper = _value_under_nature(model, p, priority, tolerance)
+    lower = np.clip(1 - losing.upper - 1e-16, 0, 1)
+    lower = np.where(losing.upper == 0, 1, np.where(losing.upper >= 1, 0, lower))
+    upper = np.maximum(upper, lower)
+    return RobustValues(
+        value=np.clip(value, lower, upper),
+        lower=lower,
+        upper=upper,
+        row=row,
+        probability=p,
+        rounds=rounds,
+        residual=float(best.max(initial=0)),
+        method="strategy improvement against nature",
     )
 
 
-def _answered(model: HostInterval, row: Integers, priority: Integers, tolerance: float) -> Robust:
-    """What nature makes of a policy: the probability that it does not win."""
-    part, _ = model.chain(row)
-    lost = joint_accepting(part, priority[part.mdp.state[part.mdp.row]] + 1)
-    return interval_values.reachability(
-        part, lost.region, maximize=True, helpful=True, tolerance=tolerance / 2
+def _value_under_nature(
+    model: UncertainMDP, p: Floats, priority: Integers, tolerance: float
+) -> tuple[Floats, Floats]:
+    """Nature's distributions next to p, and an upper bound of the values under them."""
+    p, able = model.nearest_distributions(p)
+    mdp = model.resolve(p)
+    region = accepting_region(mdp, priority[mdp.state[mdp.row]]).region
+    depth = distribution_depth(mdp)
+    found = mdp_reachability.reachability(
+        mdp, region, maximize=True, tolerance=tolerance / 2, depth=depth
     )
+    return p, found.upper if able else np.ones(mdp.num_states)
 
 
-class _Game(NamedTuple):
-    """What is left where nobody gives anything away.
+def _losing_probability(
+    model: UncertainMDP, row: Integers, priority: Integers, tolerance: float
+) -> RobustValues:
+    """Probability that nature violates the condition under a policy."""
+    part, _ = model.under_policy(row)
+    lost = joint_accepting_region(part, priority[part.mdp.state[part.mdp.row]] + 1)
+    query = Query(maximize=True, nature_maximizes=True, tolerance=tolerance / 2)
+    return reachability(part, lost.region, query)
+
+
+# --- the game inside classes of equal values ----------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ClassGame:
+    """Choices of both players that keep the value.
 
     Attributes:
-      model: nature's distributions that cost it nothing.
-      rows: ``bool[R]``, the policy's rows that cost it nothing.
-      inside: ``bool[T]``, the entries that stay in the class.
+      model: nature's optimal distributions.
+      rows: ``bool[R]``, the policy's optimal rows.
+      inside: ``bool[T]``, entries that stay in their class.
     """
 
-    model: HostInterval
+    model: UncertainMDP
     rows: Booleans
     inside: Booleans
 
 
-def _tight(model: HostInterval, value: Floats, gain: Floats) -> _Game:
-    """The choices that keep the value, and the classes of equal values."""
+def _class_game(model: UncertainMDP, value: Floats, gain: Floats) -> ClassGame:
     mdp = model.mdp
     order = np.argsort(value, kind="stable")
     jump = np.diff(value[order], prepend=-1.0) > _CLASS
@@ -117,30 +135,95 @@ def _tight(model: HostInterval, value: Floats, gain: Floats) -> _Game:
     label[order] = jump.cumsum()
     ahead = label[mdp.successor]
     inside = ahead == label[mdp.state[mdp.row]]
-    return _Game(face_of(model, ahead), gain >= -_CLASS, inside)
+    return ClassGame(optimal_face(model, ahead), gain >= -_CLASS, inside)
 
 
-class Winning(NamedTuple):
-    """Where one side wins almost surely.
+def optimal_face(model: UncertainMDP, rank: Integers) -> UncertainMDP:
+    """The face of distributions that minimise ``sum_t p_t rank_t`` in each row; ranks ``int[T]``.
+
+    Between intervals, mass goes to lesser ranks first and is free within the last rank that gets
+    any. In a ball that binds, one rank is the last that gains over the center and a greater one the
+    first that loses; mass is free within each of the two.
+    """
+    start, row = model.mdp.entry_start[:-1], model.mdp.row
+    p = model.extreme_distributions(rank.astype(np.float64), maximize=False)
+    loose = model.lower < model.upper
+    last = np.maximum.reduceat(np.where(loose & (p > model.lower), rank, -1), start)
+    free = loose & (rank == last[row])
+    lower, upper = np.where(free, model.lower, p), np.where(free, model.upper, p)
+    if model.ball is None:
+        return UncertainMDP(model.mdp, lower, upper, tolerant=True)
+    center, limit = model.ball.center, model.ball.gain
+    off = p - center
+    gainer = np.maximum.reduceat(np.where(off > 0, rank, -1), start)
+    loser = np.minimum.reduceat(np.where(off < 0, rank, rank.max(initial=0) + 1), start)
+    gained = model.sum_rows(np.maximum(off, 0))
+    binds = ((gained >= limit - model.rounding) & (gainer < loser))[row]
+    # A ball that does not bind between ranks still binds within the free one.
+    spare = limit - model.sum_rows(np.where(free, 0, np.maximum(off, 0)))
+    upper = np.where(free & (spare <= model.rounding)[row], center, upper)
+    gains, loses = (binds & (rank == x[row]) for x in (gainer, loser))
+    lower = np.where(gains, center, np.where(loses, model.lower, np.where(binds, p, lower)))
+    upper = np.where(gains, model.upper, np.where(loses, center, np.where(binds, p, upper)))
+    left = model.sum_rows(np.where(loses, p - lower, 0))
+    upper = np.where(loses & (left <= model.rounding)[row], lower, upper)
+    inner = np.where(binds, lower, np.where(free, center, p))
+    limit = np.where(np.logical_or.reduceat(binds, start), 1, spare)
+    return SplitMDP(
+        model.mdp,
+        lower,
+        upper,
+        Ball(inner, limit),
+        tolerant=True,
+        gains=gains,
+        mass=model.sum_rows(np.where(gains, p, 0)),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SplitMDP(UncertainMDP):
+    """Uncertainty sets in which some entries have a given total mass.
 
     Attributes:
-      region: ``bool[S]``.
-      row: ``int[S]``, there the policy's rows.
-      probability: ``float64[T]``, there nature's distributions.
+      gains: ``bool[T]``, those entries.
+      mass: ``float64[R]``.
     """
 
-    region: Booleans
-    row: Integers
-    probability: Floats
+    gains: Booleans
+    mass: Floats
+
+    @property
+    def _parts(self) -> tuple[tuple[Booleans, Floats], tuple[Booleans, Floats]]:
+        return (self.gains, self.mass), (~self.gains, 1 - self.mass)
+
+    def can_stay_on(self, entries: Booleans) -> Booleans:
+        found = UncertainMDP.can_stay_on(self, entries)
+        for part, mass in self._parts:
+            room = self.sum_rows(np.where(entries & part, self.upper, 0))
+            found &= room >= mass - self.rounding
+        return found
+
+    def interior_distributions(self, entries: Booleans) -> Floats:
+        row = self.mdp.row
+        entries = entries | ~self.can_stay_on(entries)[row]
+        found = UncertainMDP.interior_distributions(self, entries)
+        split = np.logical_or.reduceat(self.gains, self.mdp.entry_start[:-1])[row]
+        for part, mass in self._parts:
+            free = np.where(entries & part, self.upper - self.lower, 0)
+            rest = mass - self.sum_rows(np.where(part, self.lower, 0))
+            share = share_of(rest, self.sum_rows(free))[row]
+            inner = np.where(entries, self.lower + free * share, 0)
+            found = np.where(part & split, inner, found)
+        return found
 
 
-def almost_surely(game: _Game, priority: Integers, *, leader: str) -> Winning:
-    """Where the leader sees to it that the least priority met for ever is even almost surely.
+def almost_sure_parity(game: ClassGame, priority: Integers, *, leader: str) -> RobustRegion:
+    """Region in which the leader ensures almost surely that the least priority is even.
 
-    The nested fixpoint ``nu Y0 mu X0 nu Y1 mu X1 ...``: of a state of priority 2j or 2j + 1 either
-    all that comes next is in Yi, and some of it in Xi, for some i < j (i <= j where the priority is
-    odd), or, where it is even, all is in Yj (de Alfaro and Henzinger 2000, for one side that moves
-    at a time). The policy loses where a class is left, nature wins.
+    The nested fixed point ``nu Y0 mu X0 nu Y1 mu X1 ...``: at a state of priority 2j or 2j + 1
+    either all successors are in Yi and some in Xi, for some i < j (i <= j where the priority is
+    odd), or, where it is even, all are in Yj (de Alfaro and Henzinger 2000, with sides that move
+    one after the other). Leaving a class is lost for the policy and won for nature.
 
     Args:
       game: the choices of both.
@@ -149,106 +232,105 @@ def almost_surely(game: _Game, priority: Integers, *, leader: str) -> Winning:
     """
     model = game.model
     possible = (model.upper > 0) & (
-        (model.lower > 0) | (model.rest > model.rounding)[model.mdp.row]
+        (model.lower > 0) | (model.free_mass > model.rounding)[model.mdp.row]
     )
     inside, outside = game.inside & possible, ~game.inside & possible
-    by = _by_policy if leader == "policy" else _by_nature
-    return _Fixpoint(game, priority, inside, outside, by).solved([], [])
+    step = _policy_step if leader == "policy" else _nature_step
+    return _Fixpoint(game, priority, inside, outside, step).solve([], [])
 
 
-def _by_policy(
-    of: _Fixpoint, odd: bool, ys: list[Booleans], xs: list[Booleans]
+def _policy_step(
+    fixpoint: _Fixpoint, odd: bool, ys: list[Booleans], xs: list[Booleans]
 ) -> tuple[Booleans, Integers, Floats]:
-    """The states with a row that is good whatever nature picks, and the row."""
-    model, mdp = of.game.model, of.game.model.mdp
-    possible = of.inside | of.outside
-    bad = of.some(possible & ~(of.inside & ys[0][mdp.successor]))
-    # Nature avoids what is near for the first levels, and leaves what must be kept for the next.
+    """States with a row that satisfies the step for any nature, and the rows."""
+    model, mdp = fixpoint.game.model, fixpoint.game.model.mdp
+    possible = fixpoint.inside | fixpoint.outside
+    bad = fixpoint.some(possible & ~(fixpoint.inside & ys[0][mdp.successor]))
+    # Nature avoids the X of the first levels and leaves the Y of the next one.
     apart = possible.copy()
     for y, x in zip(ys[1:], xs, strict=False):
         apart &= ~x[mdp.successor]
-        bad |= model.may_keep(apart) & of.some(apart & ~y[mdp.successor])
+        bad |= model.can_stay_on(apart) & fixpoint.some(apart & ~y[mdp.successor])
     if odd:
-        bad |= model.may_keep(apart & ~xs[-1][mdp.successor])
-    some, row = mdp.first_choice(of.game.rows & ~bad)
+        bad |= model.can_stay_on(apart & ~xs[-1][mdp.successor])
+    some, row = mdp.first_choice(fixpoint.game.rows & ~bad)
     return some, row, mdp.probability
 
 
-def _by_nature(
-    of: _Fixpoint, odd: bool, ys: list[Booleans], xs: list[Booleans]
+def _nature_step(
+    fixpoint: _Fixpoint, odd: bool, ys: list[Booleans], xs: list[Booleans]
 ) -> tuple[Booleans, Integers, Floats]:
-    """The states of whose every row nature makes something good, and what."""
-    model, mdp = of.game.model, of.game.model.mdp
-    good, p = np.zeros(mdp.num_rows, bool), mdp.probability
+    """States in whose every row nature satisfies the step, and its distributions."""
+    model, mdp = fixpoint.game.model, fixpoint.game.model.mdp
+    able_rows, p = np.zeros(mdp.num_rows, bool), mdp.probability
     for i, (y, x) in enumerate(zip(ys, xs, strict=True)):
-        kept = of.outside | (of.inside & y[mdp.successor])
-        able = model.may_keep(kept)
+        kept = fixpoint.outside | (fixpoint.inside & y[mdp.successor])
+        able = model.can_stay_on(kept)
         if odd or i < len(ys) - 1:
-            able &= of.some(kept & (of.outside | x[mdp.successor]))
-        p = np.where((able & ~good)[mdp.row], model.within(kept), p)
-        good |= able
-    every = mdp.over_choices(np.logical_and, good | ~of.game.rows)
+            able &= fixpoint.some(kept & (fixpoint.outside | x[mdp.successor]))
+        p = np.where((able & ~able_rows)[mdp.row], model.interior_distributions(kept), p)
+        able_rows |= able
+    every = mdp.over_choices(np.logical_and, able_rows | ~fixpoint.game.rows)
     return every, mdp.row_start[:-1], p
 
 
-class _Fixpoint(NamedTuple):
-    """The nested fixpoint over states of several priorities.
+@dataclass(frozen=True)
+class _Fixpoint:
+    """The nested fixed point.
 
     Attributes:
       game, priority: the game.
-      inside, outside: ``bool[T]``, the entries that stay in a class and those that leave it, where
-        nature may give them any mass.
-      by: the states that are good at the next step, by the sets of each level; with rows and
-        distributions.
+      inside, outside: ``bool[T]``, possible entries that stay in their class and that leave it.
+      step: one application of the controllable predecessor to the sets of all levels.
     """
 
-    game: _Game
+    game: ClassGame
     priority: Integers
     inside: Booleans
     outside: Booleans
-    by: Callable[..., tuple[Booleans, Integers, Floats]]
+    step: Callable[..., tuple[Booleans, Integers, Floats]]
 
     def some(self, entries: Booleans) -> Booleans:
-        """Whether a row has some of the entries: ``bool[R]`` from ``bool[T]``."""
+        """Rows with one of the entries: ``bool[R]`` from ``bool[T]``."""
         return np.logical_or.reduceat(entries, self.game.model.mdp.entry_start[:-1])
 
-    def solved(self, ys: list[Booleans], xs: list[Booleans]) -> Winning:
-        """The fixpoint of the inner variables, with the choices by which states came in first."""
+    def solve(self, ys: list[Booleans], xs: list[Booleans]) -> RobustRegion:
+        """The fixed point of the inner variables, with the choices by which states entered."""
         level = len(ys)
         if 2 * level > self.priority.max():
             return self.body(ys, xs)
-        # What is deeper down counts on the progress that is made here.
+        # Inner levels rely on progress at this one.
         below = (self.priority >= 2 * level + 1).any()
         y = ys[-1] if ys else np.ones(self.priority.size, bool)
         while True:
-            found = self.solved([*ys, y], [*xs, np.zeros_like(y)])
+            found = self.solve([*ys, y], [*xs, np.zeros_like(y)])
             while below:
-                new = self.solved([*ys, y], [*xs, found.region])
+                new = self.solve([*ys, y], [*xs, found.region])
                 fresh = new.region & ~found.region
                 if not fresh.any():
                     break
-                found = self.joined(found, new, fresh)
+                found = self.join(found, new, fresh)
             if (found.region == y).all():
                 return found
             y = found.region
 
-    def joined(self, found: Winning, new: Winning, fresh: Booleans) -> Winning:
-        """What was found, and what is new of some states."""
+    def join(self, found: RobustRegion, new: RobustRegion, fresh: Booleans) -> RobustRegion:
+        """The region with new states."""
         mdp = self.game.model.mdp
         source = fresh[mdp.state[mdp.row]]
-        return Winning(
+        return RobustRegion(
             found.region | fresh,
             np.where(fresh, new.row, found.row),
             np.where(source, new.probability, found.probability),
         )
 
-    def body(self, ys: list[Booleans], xs: list[Booleans]) -> Winning:
+    def body(self, ys: list[Booleans], xs: list[Booleans]) -> RobustRegion:
         """One step from each state, by its priority."""
         mdp = self.game.model.mdp
         region = np.zeros(mdp.num_states, bool)
-        found = Winning(region, mdp.row_start[:-1].astype(np.int64), mdp.probability)
+        found = RobustRegion(region, mdp.row_start[:-1].astype(np.int64), mdp.probability)
         for p in np.unique(self.priority):
             up = p // 2 + 1
-            some, row, chance = self.by(self, p % 2 == 1, ys[:up], xs[:up])
-            found = self.joined(found, Winning(some, row, chance), some & (self.priority == p))
+            some, row, chance = self.step(self, p % 2 == 1, ys[:up], xs[:up])
+            found = self.join(found, RobustRegion(some, row, chance), some & (self.priority == p))
         return found

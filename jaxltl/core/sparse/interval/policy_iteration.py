@@ -1,385 +1,462 @@
-"""Optimal sums where policy and nature want the same: ``x = opt_r (c_r + opt_p p x)``, bounded.
+"""Certified stochastic shortest paths of policy and nature: ``x = max_r opt_p (c_r + p x)``.
 
 Policy iteration (Howard 1960) over rows and distributions together, each round one sparse system.
-A step that leaves a state earns (or costs) a little more than it does, so that the solution
-satisfies ``x >= c_r + p x`` for all rows and all distributions with room for rounding, and is a
-bound by that alone. Differences of values are what is weighed: states that nature may hold on to
-with almost all mass then lose no precision.
+The bounds rest on one application of the operator. With a small extra reward for every step that
+leaves a node, the solution satisfies ``x >= c_r + p x`` for all rows and distributions with room
+for rounding, so it is an upper bound; with a small extra cost it is attained. Where runs take so
+long that these extras cost more than the tolerance, values are refined beyond double precision
+(:mod:`jaxltl.core.sparse.interval.refinement`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
-from jaxltl.core.sparse.interval.nodes import Choice, Nodes
-from jaxltl.core.sparse.interval.systems import Systems
-from jaxltl.core.sparse.interval.uncertainty_set import HostInterval
+from jaxltl.core.sparse.interval.refinement import Refinement
+from jaxltl.core.sparse.interval.row_operator import PolicyPair, RowOperator
+from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
+from jaxltl.core.sparse.linear.krylov import SystemSequence
 from jaxltl.core.sparse.rows import offsets_from_counts
 from jaxltl.core.sparse.solvers.total_cost import Enclosure
 
 _EPS = float(np.finfo(np.float64).eps)
 _LEAST = 1e-270
-_AIM = 0.25  # of the tolerance: how much of it the extra of all steps may take
-_ABOUT = 0.1  # residual of systems then, as a share of it
-_NEARLY = 1e-4  # change up to which choices are improved without it, as a share of the tolerance
-_ROUGH = 0.1  # residual of systems that are solved for these, as a share of what changed
-_DOUBT = 0.2  # what others must gain, as a share of that residual
-_LARGE = 500  # nodes from which choices of a model that does not mix are improved by sweeps first,
-_STARTS = 40  # so many times,
-_SWEEPS = 40  # after so many sweeps of each,
-_SLOW = 1e-5  # or until one changes so little, as a share of the values,
-_LOOKS = 4  # of which one in so many is looked at,
-_STILL = 1e-2  # and as long as all of them together change more
+_AIM = 0.25  # share of the tolerance that the extras of all steps may take
+_RESIDUAL = 0.1  # of systems with an extra, as a share of it
+_NEARLY = 1e-4  # change of values, as a share of the tolerance, at which extras are added
+_ROUGH = 0.1  # residual of systems before that, as a share of the last change
+_DOUBT = 0.2  # gain to exceed then, as a share of that residual
+_LARGE = 500  # nodes from which value iteration comes first, where elimination fills little:
+_STARTS = 40  # improvements,
+_SWEEPS = 40  # sweeps of each,
+_LOOKS = 4  # sweeps between two tests
+_SLOW = 1e-5  # of the change of a sweep, as a share of the values,
+_STILL = 1e-2  # and of the change since the last improvement
 _ROUNDS = 200
-_NEAR = 20  # rounds for the other bound
+_ATTEMPTS = 20  # improvements for the attained bound
 _PATIENCE = 30  # rounds after which the extra grows
+_KILLED = 1e-6  # probability that a step is the last one, for policies that leave soon
 
 
-class Joint(NamedTuple):
-    """A problem whose every policy that counts, with its nature, leaves all of its states.
+@dataclass(frozen=True)
+class Accuracy:
+    """Requested width of an enclosure, absolute or relative to the value."""
+
+    tolerance: float
+    relative: bool = False
+
+    def accepts(self, low: Floats, high: Floats) -> bool:
+        scale = high if self.relative else 1.0
+        return bool((np.isfinite(high) & (high - low <= self.tolerance * scale)).all())
+
+
+@dataclass(frozen=True)
+class PathProblem:
+    """Sums until a set of states is left, by every pair of policy and nature that counts.
 
     Attributes:
       model: the model.
       open: ``bool[S]``, the states to solve for.
-      known: ``float64[S]``, at least 0 and finite: what is earned at the others.
-      cost: ``float64[R]``, at least 0; rows that may not be taken have NaN.
-      component: ``int[S]``, states of the same number move between each other at will.
-      depth: how many roundings stand behind a number.
-      wandering: whether some policies never leave, at a cost that has no end.
+      known: ``float64[S]``, finite and at least 0, the values of the others.
+      cost: ``float64[R]``, at least 0; NaN in rows that must not be taken.
+      component: ``int[S]``, number of the end component that is one node.
+      maximize: whether the policy maximises.
+      adversarial: whether nature wants the opposite; then no two states are in one component.
+      first: ``int[S]``, rows to begin with, by which all open states are left.
+      depth: roundings behind each number.
+      may_stay: whether some pairs never leave, at infinite cost.
     """
 
-    model: HostInterval
+    model: UncertainMDP
     open: Booleans
     known: Floats
     cost: Floats
     component: Integers
+    maximize: bool
+    adversarial: bool = False
+    first: Integers | None = None
     depth: int = 0
-    wandering: bool = False
+    may_stay: bool = False
+
+    def operator(self) -> RowOperator:
+        """The optimality operator on the open components."""
+        mdp, sign = self.model.mdp, 1 if self.maximize else -1
+        states = np.flatnonzero(self.open)
+        heads, number = np.unique(self.component[states], return_inverse=True)
+        node = np.full(mdp.num_states, -1)
+        node[states] = number
+        row = np.flatnonzero(self.open[mdp.state] & ~np.isnan(self.cost))
+        row = row[np.argsort(node[mdp.state[row]], kind="stable")]
+        count = np.bincount(node[mdp.state[row]], minlength=heads.size)
+        part, entry = self.model.select_rows(offsets_from_counts(count), row)
+        return RowOperator(
+            part=part,
+            row=row,
+            entry=entry,
+            node=node,
+            sign=sign,
+            known=sign * self.known,
+            cost=sign * self.cost[row],
+            depth=self.depth,
+            adversarial=self.adversarial,
+        )
 
 
-class JointBound(NamedTuple):
-    """A bound on the far side, and what attains almost that.
+@dataclass(frozen=True)
+class PathBounds:
+    """Bounds of the optimum, and a pair that nearly attains it.
 
     Attributes:
-      bound: ``float64[S]``: of a maximum no less, of a minimum no more than it.
-      attained: ``float64[S]``, what the choices attain at least, or cost at most; None where that
-        is not proven.
-      value: ``float64[S]``, what they are worth, without bounds.
-      row: ``int[S]``, the row that leaves the component of a state; a state's first elsewhere.
-      probability: ``float64[T]``, nature's distributions of all rows.
+      beyond: ``float64[S]``, the bound that no pair exceeds: above a maximum, below a minimum.
+      attained: ``float64[S]``, proven for `row` (and nature), or None.
+      value: ``float64[S]``, of the pair, not proven.
+      row: ``int[S]``, the row by which a component is left; a state's first one elsewhere.
+      probability: ``float64[T]``, nature's distributions.
       rounds: systems solved.
     """
 
-    bound: Floats
+    beyond: Floats
     attained: Floats | None
     value: Floats
     row: Integers
     probability: Floats
     rounds: int
 
-    def enclosed(self, maximize: bool, tolerance: float, relative: bool) -> Enclosure | None:
-        """The optimum, if both bounds are proven and as near as asked."""
+    def enclosed(self, problem: PathProblem, accuracy: Accuracy) -> Enclosure | None:
+        """The optimum, if it is enclosed as narrowly as requested."""
         if self.attained is None:
             return None
-        low, high = (self.attained, self.bound) if maximize else (self.bound, self.attained)
-        scale = high if relative else 1.0
-        if not (np.isfinite(high) & (high - low <= tolerance * scale)).all():
+        ends = self.attained, self.beyond
+        low, high = ends if problem.maximize else ends[::-1]
+        if not accuracy.accepts(low, high):
             return None
         return Enclosure(np.clip(self.value, low, high), low, high, self.row, 0, 0.0, "")
 
 
-def joint_bound(
-    problem: Joint,
-    *,
-    maximize: bool,
-    tolerance: float,
-    relative: bool,
-    against: bool = False,
-    first: Integers | None = None,
-) -> JointBound:
-    """The optimum of a joint problem, or of one against nature, bounded from both sides.
-
-    Args:
-      problem: what is asked.
-      maximize: whether the policy makes the sum large, else small.
-      tolerance: how far the bound may be.
-      relative: whether as a share of the value.
-      against: whether nature wants the opposite. Then no two states are in one component.
-      first: ``int[S]``, rows by which open states are left, to begin with.
-    """
-    search = _Search(_nodes(problem, 1 if maximize else -1, against), tolerance, relative)
-    nodes = search.nodes
-    if first is not None:
-        chosen, p = nodes.rows_of(first), nodes.anything()
-    elif problem.wandering or not (nodes.known > 0).any():
-        chosen, p = nodes.nearer(worth=False)
+def enclose_paths(problem: PathProblem, accuracy: Accuracy) -> PathBounds:
+    """Bounds of a :class:`PathProblem` from both sides."""
+    search = _Search(problem.operator(), accuracy, problem.may_stay)
+    operator = search.operator
+    if problem.first is not None:
+        chosen = operator.rows_of_nodes(problem.first)
     else:
-        chosen, p = nodes.nearer(worth=True)
-    begin = Choice(chosen, p, np.zeros(nodes.size), np.ones(nodes.size))
-    far = search.beyond(search.risen(begin) or begin)
-    near = None if far is None else search.attained(far)
-    return _found(problem, search, far, near)
+        chosen = operator.exit_rows(
+            positive=not problem.may_stay and bool((operator.known > 0).any())
+        )
+    zero = np.zeros(operator.size)
+    begin = PolicyPair(chosen, operator.interior(), zero, zero + 1)
+    beyond = search.upper_bound(search.approximate(begin) or begin)
+    attained = None if beyond is None else search.attained_bound(beyond)
+    if not search.is_narrow(beyond, attained):
+        beyond, attained = search.long_runs(beyond, attained)
+    return _path_bounds(problem, search, beyond, attained)
 
 
-def _found(problem: Joint, search: _Search, far: Choice | None, near: Choice | None) -> JointBound:
-    """What was found, in the numbers of the model."""
-    nodes = search.nodes
+def _path_bounds(
+    problem: PathProblem, search: _Search, beyond: PolicyPair | None, attained: PolicyPair | None
+) -> PathBounds:
+    operator = search.operator
     states = np.flatnonzero(problem.open)
-    lost = np.full(nodes.size, np.inf if nodes.sign > 0 else 0.0)
 
-    def everywhere(x: Floats) -> Floats:
+    def of_states(x: Floats) -> Floats:
         found = problem.known.copy()
-        found[states] = np.maximum(nodes.sign * x, 0)[nodes.node[states]]
+        found[states] = np.maximum(operator.sign * x, 0)[operator.node[states]]
         return found
 
     row = problem.model.mdp.row_start[:-1].astype(np.int64)
-    chance = problem.model.mdp.probability.copy()
-    last = far or search.last
+    probability = problem.model.mdp.probability.copy()
+    last = beyond or search.last
     if last is not None:
-        chance[nodes.entry] = nodes.by_entry(last.p)
-        row[states] = nodes.row[(near or last).chosen][nodes.node[states]]
-    return JointBound(
-        everywhere(lost if far is None else far.z),
-        None if near is None else everywhere(near.z),
-        everywhere(lost if last is None else last.value),
+        probability[operator.entry] = operator.by_entry(last.p)
+        row[states] = operator.row[(attained or last).chosen][operator.node[states]]
+    unknown = np.full(operator.size, np.inf if operator.sign > 0 else 0.0)
+    return PathBounds(
+        of_states(unknown if beyond is None or beyond.bound is None else beyond.bound),
+        None if attained is None or attained.bound is None else of_states(attained.bound),
+        of_states(unknown if last is None else last.value),
         row,
-        chance,
+        probability,
         search.rounds,
     )
 
 
 @dataclass
 class _Search:
-    """Bounds of the nodes; systems solved are counted.
+    """State of a policy iteration.
 
     Attributes:
-      nodes: what is asked.
-      tolerance, relative: how far bounds may be.
-      extra: what a step earns besides. It never grows for long: else who goes round for it comes
-        and goes with it.
-      rounds: systems; last: what was solved last.
+      extra: reward or cost of each step. It never grows for long: a pair that lingers for it
+        would come and go with it.
+      rounds: systems solved; last: the last pair evaluated.
     """
 
-    nodes: Nodes
-    tolerance: float
-    relative: bool
+    operator: RowOperator
+    accuracy: Accuracy
+    may_stay: bool
     extra: float = np.inf
     rounds: int = 0
-    last: Choice | None = None
+    last: PolicyPair | None = None
 
     @cached_property
-    def systems(self) -> Systems:
-        return Systems(lambda: self.nodes.label, self.nodes.mixes)
-
-    def worth(self, choice: Choice, left: float) -> Choice | None:
-        """What choices are worth; None where some never leave."""
-        chain = self.nodes.chain(choice)
-        self.rounds += 1
-        value = (
-            None
-            if chain is None
-            else self.systems.solve(chain.matrix, chain.earned, choice.value, left)
-        )
-        if value is None:
-            return None
-        self.last = choice._replace(value=value)
-        return self.last
-
-    def timed(
-        self, choice: Choice, extra: float, full: Booleans | None = None
-    ) -> tuple[Choice, float] | None:
-        """The same with their steps, and what each of these earns besides: no more than that.
-
-        Args:
-          choice, extra: the choices, and what a step may earn.
-          full: ``bool[M]``, nodes that are worth the ceiling as they are.
-        """
-        chain = self.nodes.chain(choice)
-        self.rounds += 1
-        if chain is None:
-            return None
-        matrix, earned, each = chain.matrix, chain.earned, np.ones(self.nodes.size)
-        if full is not None and full.any():
-            matrix.data[np.repeat(full, np.diff(matrix.indptr))] = 0
-            matrix.eliminate_zeros()
-            earned, each = np.where(full, self.nodes.ceiling, earned), np.where(full, 0.0, 1.0)
-        steps = self.systems.solve(matrix, each, choice.steps, _ABOUT)
-        if steps is None:
-            return None
-        choice = choice._replace(steps=steps)
-        extra = min(extra, self.more(choice))
-        value = self.systems.solve(matrix, earned, choice.value, _ABOUT * extra)
-        if value is None:
-            return None
-        self.last = choice._replace(value=value)
-        return self.last, min(extra, self.more(self.last))
-
-    def risen(self, choice: Choice) -> Choice | None:
-        """Choices that are good, by policy iteration whose systems are solved as far as needed."""
-        left = 0.0
-        if self.nodes.wandering:
-            return choice
-        choice = self.started(choice)
-        for _ in range(_ROUNDS):
-            found = self.worth(choice, left)
-            if found is None:
-                return None
-            choice, change = self.nodes.improved(found, found.value, 0.0, _DOUBT * left)
-            if change <= _NEARLY * self.tolerance * self.scale(found.value):
-                break
-            left = _ROUGH * change
-        return choice
-
-    def started(self, choice: Choice) -> Choice:
-        """Choices that are improved as values rise from zero by their sweeps."""
-        nodes = self.nodes
-        if nodes.size < _LARGE or nodes.mixes:
-            return choice
-        z = np.zeros(nodes.size)
-        for _ in range(_STARTS):
-            before, chain = z, nodes.chain(choice)
-            if chain is None:
-                break
-            for i in range(_SWEEPS):
-                last, z = z, chain.matrix @ z
-                z += chain.earned
-                if i % _LOOKS == 0 and np.abs(z - last).max() <= _SLOW * np.abs(z).max():
-                    break
-            choice, _ = nodes.improved(choice, z, 0.0)
-            if np.abs(z - before).max() <= _STILL * np.abs(z).max():
-                break
-        return choice._replace(value=z)
-
-    def scale(self, value: Floats) -> float:
-        """What a tolerance is a share of."""
-        size = np.abs(value)
-        return float(size[size > 0].min(initial=np.inf)) if self.relative and size.any() else 1.0
-
-    def beyond(self, choice: Choice) -> Choice | None:
-        """A bound on the far side.
-
-        Nodes that are nearly worth the ceiling are worth that: else choices that are not worse go
-        round among them for what steps earn.
-        """
-        nodes, factor = self.nodes, 1.0
-        full = np.zeros(nodes.size, bool)
-        if not self.relative:
-            full = choice.value >= nodes.ceiling - self.tolerance / 4
-        for rounds in range(1, _ROUNDS):
-            found = self.timed(choice, self.extra, full)
-            if found is None:
-                return None
-            choice, self.extra = found
-            factor *= 8 if rounds % _PATIENCE == 0 else 1
-            z = np.minimum(choice.value + factor * self.extra * choice.steps, nodes.ceiling)
-            z[full] = nodes.ceiling
-            if not np.isfinite(z).all():
-                return None
-            p = nodes.proves(z)
-            if p is not None:
-                self.extra *= factor
-                return choice._replace(z=z, p=p if nodes.against else choice.p)
-            choice, _ = nodes.improved(choice, z, factor * self.extra)
-        return None
-
-    def attained(self, choice: Choice) -> Choice | None:
-        """A bound that choices attain; against nature they may have to be others."""
-        for _ in range(_NEAR if self.nodes.against else 2):
-            z = choice.value - self.extra * choice.steps
-            if self.nodes.attains(z, choice):
-                return choice._replace(z=z)
-            if not choice.steps.all() and (near := self.finely(choice)) is not None:
-                return near
-            if self.nodes.against:
-                choice = self.nodes.improved(choice, z, -self.extra)[0]
-            found = self.timed(choice, self.extra)
-            if found is None:
-                return None
-            choice, self.extra = found
-        return None
-
-    def finely(self, choice: Choice) -> Choice | None:
-        """A bound that choices attain, of steps that cost a share of what is lacked where they are.
-
-        Who goes round for long where hardly anything is lacking, and so need not leave for more,
-        then pays hardly anything. What is lacked of the ceiling is what is computed.
-        """
-        top = self.nodes.ceiling
-        if self.relative or self.nodes.mixes or not np.isfinite(top):
-            return None
-        known = self.nodes.known - top
-        if top and not ((known == 0) | (self.nodes.known == 0)).all():
-            return None  # what is lacked would be rounded
-        nodes, share = replace(self.nodes, known=known), self.rounding
-        for _ in range(_NEAR if nodes.against else 1):
-            chain = nodes.chain(choice)
-            self.rounds += 1
-            value = None if chain is None else self.systems.direct(chain.matrix, chain.earned)
-            if chain is None or value is None:
-                return None
-            cost = self.systems.direct(chain.matrix, share * np.abs(value) + _LEAST)
-            if cost is None or not np.isfinite(cost).all():
-                return None
-            z = value - cost
-            holds = nodes.attains(z, choice)
-            if not holds and nodes.against:
-                # Where next to nothing is lacking a step costs next to nothing, not less: that
-                # hides what nature could still gain there.
-                steps = self.systems.direct(chain.matrix, np.ones(nodes.size))
-                if steps is None:
-                    return None
-                cost += self.tolerance / (8 * steps.max(initial=1)) * steps
-                z = value - cost
-                holds = nodes.attains(z, choice)
-            if holds:
-                if cost.max(initial=0) > self.tolerance / 4:
-                    return None
-                # The sum is rounded, and may be so upwards.
-                lower = np.nextafter(z + top, -np.inf) if top else z
-                self.last = choice._replace(value=value + top, z=lower)
-                return self.last
-            choice = nodes.improved(choice, z, 0.0, everywhere=True)[0]
-        return None
+    def systems(self) -> SystemSequence:
+        return SystemSequence(lambda: self.operator.label, self.operator.mixes)
 
     @property
     def rounding(self) -> float:
-        """What a step must earn for each unit of value, so that rounding cannot hide it."""
-        return 64 * (self.nodes.widest + 8) * _EPS
+        """Reward of a step, per unit of value, that exceeds rounding."""
+        return 64 * (self.operator.widest + 8) * _EPS
 
-    def more(self, found: Choice) -> float:
-        """How much more a step earns: little beside the tolerance, and more than rounding."""
-        nodes = self.nodes
-        most = np.abs(found.steps).max(initial=1)
-        size = max(np.abs(found.value).max(initial=0), np.abs(nodes.known).max(initial=0))
-        aim = _AIM * self.tolerance * self.scale(found.value) / most
+    def scale(self, value: Floats) -> float:
+        """The value that the tolerance is a share of."""
+        size = np.abs(value)
+        relative = self.accuracy.relative and size.any()
+        return float(size[size > 0].min(initial=np.inf)) if relative else 1.0
+
+    def step_extra(self, pair: PolicyPair) -> float:
+        """Extra of a step: small beside the tolerance, and more than rounding."""
+        operator = self.operator
+        most = np.abs(pair.steps).max(initial=1)
+        size = max(np.abs(pair.value).max(initial=0), np.abs(operator.known).max(initial=0))
+        aim = _AIM * self.accuracy.tolerance * self.scale(pair.value) / most
         return float(max(aim, self.rounding * size, _LEAST))
 
+    def is_narrow(self, beyond: PolicyPair | None, attained: PolicyPair | None) -> bool:
+        if beyond is None or attained is None or beyond.bound is None or attained.bound is None:
+            return False
+        width = self.accuracy.tolerance * self.scale(beyond.bound)
+        return bool(((beyond.bound - attained.bound) <= width).all())
 
-def _nodes(problem: Joint, sign: int, against: bool) -> Nodes:
-    mdp = problem.model.mdp
-    states = np.flatnonzero(problem.open)
-    heads, number = np.unique(problem.component[states], return_inverse=True)
-    node = np.full(mdp.num_states, -1)
-    node[states] = number
-    row = np.flatnonzero(problem.open[mdp.state] & ~np.isnan(problem.cost))
-    row = row[np.argsort(node[mdp.state[row]], kind="stable")]
-    count = np.bincount(node[mdp.state[row]], minlength=heads.size)
-    part, entry = problem.model.of_rows(offsets_from_counts(count), row)
-    cost: Any = sign * problem.cost[row]
-    return Nodes(
-        part,
-        row,
-        entry,
-        node,
-        sign,
-        sign * problem.known,
-        cost,
-        problem.depth,
-        problem.wandering,
-        against,
-    )
+    def _is_near(self, pair: PolicyPair | None) -> bool:
+        """Whether a bound is near the value of its pair."""
+        if pair is None or pair.bound is None:
+            return False
+        width = 0.5 * self.accuracy.tolerance * self.scale(pair.value)
+        return bool((np.abs(pair.bound - pair.value) <= width).all())
+
+    # --- evaluation ---------------------------------------------------------------------------
+
+    def evaluate(self, pair: PolicyPair, residual: float) -> PolicyPair | None:
+        """The pair with its values; None if it never leaves some node."""
+        system = self.operator.system(pair)
+        self.rounds += 1
+        if system is None:
+            return None
+        value = self.systems.solve(system.matrix, system.earned, pair.value, residual)
+        if value is None:
+            return None
+        self.last = replace(pair, value=value)
+        return self.last
+
+    def evaluate_with_steps(
+        self, pair: PolicyPair, extra: float, full: Booleans | None = None
+    ) -> tuple[PolicyPair, float] | None:
+        """The pair with its values and steps, and the extra of a step, at most `extra`.
+
+        Nodes of `full` have the value of the ceiling.
+        """
+        system = self.operator.system(pair)
+        self.rounds += 1
+        if system is None:
+            return None
+        (matrix, earned), each = system, np.ones(self.operator.size)
+        if full is not None and full.any():
+            matrix.data[np.repeat(full, np.diff(matrix.indptr))] = 0
+            matrix.eliminate_zeros()
+            earned, each = np.where(full, self.operator.ceiling, earned), np.where(full, 0.0, 1.0)
+        steps = self.systems.solve(matrix, each, pair.steps, _RESIDUAL)
+        if steps is None:
+            return None
+        pair = replace(pair, steps=steps)
+        extra = min(extra, self.step_extra(pair))
+        value = self.systems.solve(matrix, earned, pair.value, _RESIDUAL * extra)
+        if value is None:
+            return None
+        self.last = replace(pair, value=value)
+        return self.last, min(extra, self.step_extra(self.last))
+
+    # --- improvement --------------------------------------------------------------------------
+
+    def approximate(self, pair: PolicyPair) -> PolicyPair | None:
+        """A nearly optimal pair, by policy iteration with systems solved as far as needed."""
+        residual = 0.0
+        if self.may_stay:
+            return pair
+        pair = self._value_iteration(pair)
+        for _ in range(_ROUNDS):
+            found = self.evaluate(pair, residual)
+            if found is None:
+                return None
+            pair, change = self.operator.improve(found, found.value, 0.0, _DOUBT * residual)
+            if change <= _NEARLY * self.accuracy.tolerance * self.scale(found.value):
+                break
+            residual = _ROUGH * change
+        return pair
+
+    def _value_iteration(self, pair: PolicyPair) -> PolicyPair:
+        """The pair improved as values rise from zero by sweeps."""
+        operator = self.operator
+        if operator.size < _LARGE or operator.mixes:
+            return pair
+        z = np.zeros(operator.size)
+        for _ in range(_STARTS):
+            before, system = z, operator.system(pair)
+            if system is None:
+                break
+            for i in range(_SWEEPS):
+                last, z = z, system.matrix @ z
+                z += system.earned
+                if i % _LOOKS == 0 and np.abs(z - last).max() <= _SLOW * np.abs(z).max():
+                    break
+            pair, _ = operator.improve(pair, z, 0.0)
+            if np.abs(z - before).max() <= _STILL * np.abs(z).max():
+                break
+        return replace(pair, value=z)
+
+    # --- bounds -------------------------------------------------------------------------------
+
+    def upper_bound(self, pair: PolicyPair) -> PolicyPair | None:
+        """A pair with a bound that no pair exceeds.
+
+        Nodes that are nearly worth the ceiling count as worth the ceiling: optimal pairs may
+        linger among them for the extra alone.
+        """
+        operator, factor = self.operator, 1.0
+        full = np.zeros(operator.size, bool)
+        if not self.accuracy.relative:
+            full = pair.value >= operator.ceiling - self.accuracy.tolerance / 4
+        for rounds in range(1, _ROUNDS):
+            found = self.evaluate_with_steps(pair, self.extra, full)
+            if found is None:
+                return None
+            pair, self.extra = found
+            factor *= 8 if rounds % _PATIENCE == 0 else 1
+            z = np.minimum(pair.value + factor * self.extra * pair.steps, operator.ceiling)
+            z[full] = operator.ceiling
+            if not np.isfinite(z).all():
+                return None
+            p = operator.proves_upper_bound(z)
+            if p is not None:
+                self.extra *= factor
+                return replace(pair, bound=z, p=p if operator.adversarial else pair.p)
+            pair, _ = operator.improve(pair, z, factor * self.extra)
+        return None
+
+    def attained_bound(self, pair: PolicyPair) -> PolicyPair | None:
+        """A pair with a bound that it attains; with an adversarial nature, its policy alone."""
+        operator = self.operator
+        for _ in range(_ATTEMPTS if operator.adversarial else 2):
+            z = pair.value - self.extra * pair.steps
+            if operator.proves_attained(z, pair):
+                return replace(pair, bound=z)
+            if not pair.steps.all() and (found := self.proportional_bound(pair)) is not None:
+                return found
+            if operator.adversarial:
+                pair = operator.improve(pair, z, -self.extra)[0]
+            found = self.evaluate_with_steps(pair, self.extra)
+            if found is None:
+                return None
+            pair, self.extra = found
+        return None
+
+    def proportional_bound(self, pair: PolicyPair) -> PolicyPair | None:
+        """An attained bound by steps that cost a share of the distance from the ceiling.
+
+        A pair that lingers where values are nearly the ceiling then pays nearly nothing. The
+        distance from the ceiling is what is computed.
+        """
+        operator, top = self.operator, self.operator.ceiling
+        if self.accuracy.relative or operator.mixes or not np.isfinite(top):
+            return None
+        known = operator.known - top
+        if top and not ((known == 0) | (operator.known == 0)).all():
+            return None  # the distance would be rounded
+        shifted = replace(operator, known=known)
+        for _ in range(_ATTEMPTS if operator.adversarial else 1):
+            system = shifted.system(pair)
+            self.rounds += 1
+            solve = self.systems.solve_directly
+            value = None if system is None else solve(system.matrix, system.earned)
+            if system is None or value is None:
+                return None
+            cost = solve(system.matrix, self.rounding * np.abs(value) + _LEAST)
+            if cost is None or not np.isfinite(cost).all():
+                return None
+            z = value - cost
+            holds = shifted.proves_attained(z, pair)
+            if not holds and operator.adversarial:
+                # Steps that cost next to nothing hide what nature still gains there.
+                steps = solve(system.matrix, np.ones(operator.size))
+                if steps is None:
+                    return None
+                cost += self.accuracy.tolerance / (8 * steps.max(initial=1)) * steps
+                z = value - cost
+                holds = shifted.proves_attained(z, pair)
+            if holds:
+                if cost.max(initial=0) > self.accuracy.tolerance / 4:
+                    return None
+                lower = np.nextafter(z + top, -np.inf) if top else z  # the sum is rounded
+                self.last = replace(pair, value=value + top, bound=lower)
+                return self.last
+            pair = shifted.improve(pair, z, 0.0, all_fine=True)[0]
+        return None
+
+    def long_runs(
+        self, beyond: PolicyPair | None, attained: PolicyPair | None
+    ) -> tuple[PolicyPair | None, PolicyPair | None]:
+        """The bounds where optimal pairs take very long to leave, or never do.
+
+        First a refinement beyond double precision; then a pair that is optimal if every step may
+        be the last one, so that it leaves soon, improved from there.
+        """
+        operator, last = self.operator, attained or self.last
+        tolerance = self.accuracy.tolerance * self.scale(
+            np.zeros(0) if last is None else last.value
+        )
+        refinement = Refinement(self.systems.solve_directly, tolerance)
+        if last is not None and not self._is_near(beyond):
+            beyond = refinement.bound(operator, last, 1) or beyond
+        if last is not None and not self._is_near(attained):
+            attained = refinement.bound(operator, last, -1) or attained
+        if self.is_narrow(beyond, attained):
+            return beyond, attained
+        if beyond is None or self.accuracy.relative or self.operator.adversarial:
+            return beyond, attained
+        best, self.extra = self._leaving_soon(beyond), np.inf
+        for _ in range(_ATTEMPTS):
+            if best is None:
+                break
+            found = self.evaluate_with_steps(best, self.extra)
+            if found is None:
+                break
+            best, self.extra = found
+            z = best.value - self.extra * best.steps
+            if self.operator.proves_attained(z, best):
+                attained = replace(best, bound=z)
+                if self.is_narrow(beyond, attained):
+                    break
+            best = self.operator.improve(best, z, -self.extra)[0]
+        return beyond, attained
+
+    def _leaving_soon(self, pair: PolicyPair) -> PolicyPair | None:
+        """A pair that is nearly optimal if each step is the last one with chance `_KILLED`."""
+        operator = self.operator
+        worst = -1.0 if operator.sign < 0 else 0.0
+        for _ in range(_ROUNDS):
+            system = operator.system(pair)
+            self.rounds += 1
+            if system is None:
+                return None
+            matrix = system.matrix
+            matrix.data *= 1 - _KILLED
+            earned = system.earned + _KILLED * worst
+            value = self.systems.solve(matrix, earned, pair.value, 1e-6 * _KILLED)
+            if value is None:
+                return None
+            pair, change = operator.improve(replace(pair, value=value), value, -_KILLED)
+            if change <= 1e-3 * _KILLED:
+                break
+        return pair

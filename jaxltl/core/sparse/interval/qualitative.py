@@ -1,17 +1,17 @@
-"""What is certain of intervals, whatever nature picks or as it pleases: sets decided on supports.
+"""Qualitative analysis of uncertain MDPs: fixed points on supports that nature may change.
 
-Nature may take an edge away where its lower end is 0, if the others can carry all mass. So the
-graph is a game: a row may *keep* to a set of states (some distribution does), or it *must enter*
-one (every distribution does with positive probability).
+Nature may drop an edge whose lower end is 0 if the others can carry all mass, so the graph is a
+game: nature *can stay* in a set of states (some distribution does), or a row *must enter* one
+(every distribution does with positive probability).
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from jaxltl.core.array_types import Booleans, Integers
+from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.sparse.graph.components import strong_components
 from jaxltl.core.sparse.graph.qualitative import (
     EndComponents,
@@ -19,50 +19,38 @@ from jaxltl.core.sparse.graph.qualitative import (
     backward_reachable,
     shortest_path_rows,
 )
-from jaxltl.core.sparse.interval.uncertainty_set import HostInterval
+from jaxltl.core.sparse.interval.robust_values import Query
+from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
 from jaxltl.core.sparse.rows import decrement, sorted_unique, concatenated_ranges
 
 
-def compelled(
-    model: HostInterval, goal: Booleans, *, every: bool, rows: Booleans | None = None
+def attractor_against_nature(
+    model: UncertainMDP, goal: Booleans, *, all_rows: bool, rows: Booleans | None = None
 ) -> Booleans:
-    """The states from which a goal is reached with positive probability against nature.
+    """States that reach a goal with positive probability whatever nature picks.
 
-    The least set with the goal and with each state some row of which (all of whose rows) must
-    enter it.
-
-    Args:
-      model: the model.
-      goal: ``bool[S]``.
-      every: whether all rows must, else some.
-      rows: ``bool[R]``, the rows that may be taken; default all.
+    With `all_rows`, under every policy; else under some policy of `rows` (default all).
     """
-    if model.firm:  # the graph is the same whatever nature picks
-        if every and rows is None:
+    if model.has_fixed_support:
+        if all_rows and rows is None:
             return positive_under_all_policies(model.mdp, goal)
-        if not every:
+        if not all_rows:
             return backward_reachable(model.mdp, goal, rows)
-    return _compelled(model, goal, every, rows)[0]
+    return _attractor(model, goal, all_rows, rows)[0]
 
 
-def attracting(model: HostInterval, goal: Booleans, rows: Booleans | None = None) -> Integers:
-    """Rows by which states must come nearer to a goal against nature: ``int[S]``.
-
-    Any row at the goal, and where it cannot be forced.
-
-    Args:
-      model, goal, rows: as of :func:`compelled`.
-    """
-    if model.firm:
+def attracting_rows(model: UncertainMDP, goal: Booleans, rows: Booleans | None = None) -> Integers:
+    """Rows that lead towards a goal whatever nature picks, ``int[S]``; elsewhere any row."""
+    if model.has_fixed_support:
         rows = np.ones(model.mdp.num_rows, bool) if rows is None else rows
         return shortest_path_rows(model.mdp, goal, rows).astype(np.int64)
-    return _compelled(model, goal, False, rows)[1]
+    return _attractor(model, goal, False, rows)[1]
 
 
-def _compelled(
-    model: HostInterval, goal: Booleans, every: bool, rows: Booleans | None
+def _attractor(
+    model: UncertainMDP, goal: Booleans, all_rows: bool, rows: Booleans | None
 ) -> tuple[Booleans, Integers]:
-    """The states of :func:`compelled`, and rows that make it so."""
+    """The attractor, and rows by which states entered it."""
     mdp = model.mdp
     region = goal.copy()
     found: Integers = mdp.row_start[:-1].astype(np.int64)
@@ -76,7 +64,7 @@ def _compelled(
         row = row[model.must_enter(row, region)]
         waiting[row] = False
         state = mdp.state[row]
-        if every:
+        if all_rows:
             decrement(left, state)
             state = state[left[state] == 0]
         else:
@@ -87,93 +75,73 @@ def _compelled(
     return region, found
 
 
-class Decided(NamedTuple):
-    """Where a probability is 0 and where it is 1.
-
-    Attributes:
-      zero, one: ``bool[S]``.
-    """
+class ZeroOneStates(NamedTuple):
+    """States with reachability probability 0 and 1, ``bool[S]`` each."""
 
     zero: Booleans
     one: Booleans
 
 
-def decided(model: HostInterval, goal: Booleans, *, maximize: bool, helpful: bool) -> Decided:
-    """Where the probability of reaching a goal is 0 and where it is 1.
-
-    Args:
-      model: the model; states of the goal, and those that may not be passed, stand still.
-      goal: ``bool[S]``.
-      maximize: whether the policy makes the probability large.
-      helpful: whether nature does.
-    """
+def zero_one_states(model: UncertainMDP, goal: Booleans, query: Query) -> ZeroOneStates:
+    """The prob0 and prob1 states of a model in which the goal and its complement are absorbing."""
     mdp = model.mdp
-    if maximize and helpful:
-        zero = ~backward_reachable(mdp, goal)
-    elif maximize:
-        zero = ~compelled(model, goal, every=False)
-    elif helpful:
-        zero = ~positive_under_all_policies(mdp, goal)
+    if query.nature_maximizes:
+        zero = ~(backward_reachable if query.maximize else positive_under_all_policies)(mdp, goal)
     else:
-        zero = ~compelled(model, goal, every=True)
-    if not maximize and not helpful:
-        return Decided(zero, ~backward_reachable(mdp, zero))
-    return Decided(zero, surely(model, goal, ~zero, maximize=maximize, helpful=helpful)[0])
+        zero = ~attractor_against_nature(model, goal, all_rows=not query.maximize)
+        if not query.maximize:
+            return ZeroOneStates(zero, ~backward_reachable(mdp, zero))
+    return ZeroOneStates(zero, almost_sure_states(model, goal, ~zero, query)[0])
 
 
-def held(
-    model: HostInterval, target: Booleans, known: Decided, *, maximize: bool
+def certain_choices(
+    model: UncertainMDP, target: Booleans, known: ZeroOneStates, *, maximize: bool
 ) -> tuple[Integers, Booleans]:
-    """What keeps a probability against the other side where it is decided.
+    """Choices of opposed players that keep the probability where it is 0 or 1.
 
-    Args:
-      model, target, maximize: as of :func:`decided`, of a policy and nature that are opposed.
-      known: what is decided.
-
-    Returns:
-      ``int[S]``, rows of the policy: where it has what it wants, these keep it. And ``bool[T]``,
-      the entries to which nature keeps: all, unless it has what it wants.
+    Returns rows ``int[S]`` of the policy, and ``bool[T]``: the entries to which nature keeps, all
+    unless the state is decided in its favour.
     """
     mdp = model.mdp
     mine, other = (known.one, known.zero) if maximize else (known.zero, known.one)
     rows = ~mdp.support.some_successor_in(~mine) & mine[mdp.state]
-    row = attracting(model, target, rows) if maximize else mdp.first_choice(rows)[1]
-    keeps = model.may_stay(other) & other[mdp.state]
+    row = attracting_rows(model, target, rows) if maximize else mdp.first_choice(rows)[1]
+    keeps = model.can_stay_in(other) & other[mdp.state]
     return row.astype(np.int64), other[mdp.successor] | ~keeps[mdp.row]
 
 
-def surely(
-    model: HostInterval, goal: Booleans, inside: Booleans, *, maximize: bool, helpful: bool
+def almost_sure_states(
+    model: UncertainMDP, goal: Booleans, inside: Booleans, query: Query
 ) -> tuple[Booleans, Booleans]:
-    """The states from which a goal is reached almost surely, and the rows that stay among them.
+    """States from which a goal is reached almost surely, and the rows that stay among them.
 
-    The greatest set that can be kept and in which the goal is reached with positive probability:
-    by a policy and nature together, by one against the other (de Alfaro, Henzinger and Kupferman
-    2007), but not by neither.
+    The greatest set that can be kept and in which the goal is reached with positive probability, by
+    the players that maximise against those that minimise (de Alfaro, Henzinger and Kupferman
+    2007); not for two that minimise.
 
     Args:
-      model, goal, maximize, helpful: as of :func:`decided`.
-      inside: ``bool[S]``, a set that holds it.
+      model, goal, query: as for :func:`zero_one_states`.
+      inside: ``bool[S]``, a superset of the result.
 
     Returns:
-      ``bool[S]``, and ``bool[R]``: rows that nature may keep inside if it is helpful, else those
-      that stay inside whatever it does.
+      ``bool[S]``, and ``bool[R]``: rows that nature can keep inside if it maximises, else rows that
+      stay inside whatever it does.
     """
-    mdp = model.mdp
+    mdp, helps = model.mdp, query.nature_maximizes
     while True:
-        # Who cannot keep to the set goes all the way back, not by one step a round.
+        # All states that cannot keep to the set leave it at once, not one step a round.
         inside = inside & ~(
-            compelled(model, ~inside, every=maximize)
-            if helpful
+            attractor_against_nature(model, ~inside, all_rows=query.maximize)
+            if helps
             else positive_under_all_policies(mdp, ~inside)
         )
-        kept = model.may_stay(inside) if helpful else ~mdp.support.some_successor_in(~inside)
-        if maximize:
+        kept = model.can_stay_in(inside) if helps else ~mdp.support.some_successor_in(~inside)
+        if query.maximize:
             kept &= inside[mdp.state]
             found = (
                 backward_reachable(mdp, goal & inside, kept)
-                if helpful
-                else compelled(model, goal & inside, every=False, rows=kept)
+                if helps
+                else attractor_against_nature(model, goal & inside, all_rows=False, rows=kept)
             )
         else:
             bad = np.zeros(mdp.num_states, bool)
@@ -184,32 +152,32 @@ def surely(
         inside = found
 
 
-def joint_components(
-    model: HostInterval, states: Booleans | None = None, entries: Booleans | None = None
+def joint_end_components(
+    model: UncertainMDP, states: Booleans | None = None, entries: Booleans | None = None
 ) -> tuple[EndComponents, Booleans]:
-    """The maximal end components that policy and nature can keep to together.
+    """Maximal end components of policy and nature together.
 
     Args:
       model: the model.
-      states: ``bool[S]``; default all.
-      entries: ``bool[T]``, those that may be used; default all.
+      states: ``bool[S]``, states to search; default all.
+      entries: ``bool[T]``, entries that may be used; default all.
 
     Returns:
-      The components, whose rows nature may keep inside, and the entries that it may use there.
+      The components, and ``bool[T]``, the entries used inside.
     """
     mdp = model.mdp
     used = np.ones(mdp.num_transitions, bool) if entries is None else entries.copy()
-    if states is not None:
-        used &= states[mdp.successor] & states[mdp.state[mdp.row]]
     source = mdp.state[mdp.row]
+    if states is not None:
+        used &= states[mdp.successor] & states[source]
     while True:
-        kept = model.may_keep(used)
+        kept = model.can_stay_on(used)
         used &= kept[mdp.row]
         if not kept.any():
             return EndComponents(np.arange(mdp.num_states), kept), used
         alive = np.zeros(mdp.num_states, bool)
         alive[mdp.state[kept]] = True
-        stays = ~_compelled(model, ~alive, True, kept)[0]
+        stays = ~_attractor(model, ~alive, True, kept)[0]
         now = used & stays[mdp.successor] & stays[source]
         label = strong_components(source[now], mdp.successor[now], mdp.num_states)
         now &= label[source] == label[mdp.successor]
@@ -220,40 +188,36 @@ def joint_components(
     return EndComponents(component, kept), used
 
 
-class JointRegion(NamedTuple):
-    """Where policy and nature together can have the least priority even for ever.
+class RobustRegion(NamedTuple):
+    """States from which policy and nature together accept for ever, with their choices.
 
     Attributes:
       region: ``bool[S]``.
-      row: ``int[S]``, in the region the rows of a policy that has it.
-      probability: ``float64[T]``, and nature's distributions; elsewhere some.
+      row: ``int[S]``, accepting rows inside the region.
+      probability: ``float64[T]``, nature's distributions.
     """
 
     region: Booleans
     row: Integers
-    probability: Any
+    probability: Floats
 
 
-def joint_accepting(model: HostInterval, priority: Integers) -> JointRegion:
-    """The end components of policy and nature together whose least priority can be even.
+def joint_accepting_region(model: UncertainMDP, priority: Integers) -> RobustRegion:
+    """The joint end components whose least priority can be even.
 
-    As :func:`~jaxltl.core.sparse.graph.accepting.accepting_region`, but nature may drop the entries that
-    read a lesser priority.
-
-    Args:
-      model: the product.
-      priority: ``int[T]``, what each entry reads.
+    As :func:`~jaxltl.core.sparse.graph.accepting.accepting_region` with priorities ``int[T]``, but
+    nature may drop entries that read a lesser priority.
     """
     mdp = model.mdp
     region = np.zeros(mdp.num_states, bool)
     row = mdp.row_start[:-1].astype(np.int64)
     chance = mdp.probability.copy()
     for p in np.unique(priority[priority % 2 == 0]):
-        found, used = joint_components(model, ~region, priority >= p)
+        found, used = joint_end_components(model, ~region, priority >= p)
         hit = used & (priority == p)
-        wins = np.zeros(mdp.num_states, bool)
-        wins[found.component[mdp.state[mdp.row[hit]]]] = True
-        new = wins[found.component] & found.region(mdp)
+        accepting = np.zeros(mdp.num_states, bool)
+        accepting[found.component[mdp.state[mdp.row[hit]]]] = True
+        new = accepting[found.component] & found.region(mdp)
         if not new.any():
             continue
         region |= new
@@ -262,7 +226,7 @@ def joint_accepting(model: HostInterval, priority: Integers) -> JointRegion:
         some, first = mdp.first_choice(takes)
         keep = used & new[mdp.state[mdp.row]]
         inside = found.inside & new[mdp.state]
-        way = HostInterval.fixed(model, np.where(keep | ~inside[mdp.row], chance, 0))
+        way = model.resolve(np.where(keep | ~inside[mdp.row], chance, 0))
         row = np.where(new, np.where(some, first, shortest_path_rows(way, some, inside)), row)
-        chance = np.where(inside[mdp.row], model.within(keep), chance)
-    return JointRegion(region, row, chance)
+        chance = np.where(inside[mdp.row], model.interior_distributions(keep), chance)
+    return RobustRegion(region, row, chance)

@@ -1,27 +1,29 @@
-"""What can be had in so many steps when probabilities lie in intervals, with its rounding."""
+"""Step-bounded probabilities and rewards of uncertain MDPs, with a bound of their rounding."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.sparse.graph.qualitative import backward_reachable
-from jaxltl.core.sparse.interval.uncertainty_set import HostInterval
+from jaxltl.core.sparse.interval.robust_values import Query
+from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
 
 _EPS = float(np.finfo(np.float64).eps)
 
 
-class RobustSteps(NamedTuple):
-    """What some sweeps found.
+@dataclass(frozen=True)
+class StepBoundedValues:
+    """Values after a number of steps.
 
     Attributes:
       value: ``float64[S]``.
-      error: ``float64[S]``, how far that may be off.
-      row: ``int64[S]``, the first choices.
+      error: ``float64[S]``, bound of the rounding error.
+      row: ``int64[S]``, the policy of the first step.
       probability: ``float64[T]``, nature's distributions in the first step.
-      num_steps: sweeps that were done until nothing changed.
+      num_steps: backups until a fixed point.
     """
 
     value: Floats
@@ -31,94 +33,68 @@ class RobustSteps(NamedTuple):
     num_steps: int
 
 
-def backup_error(model: HostInterval) -> float:
-    """How far one backup of numbers in [-1, 1] may be off.
+def backup_error(model: UncertainMDP) -> float:
+    """Rounding error of one backup of numbers in [-1, 1].
 
     A greedy distribution of n entries misses an extreme one by at most (3 n + 3) u of mass that is
-    placed wrongly, by n u that is lost in the sum, and by the slack of :attr:`rounding
-    <jaxltl.core.sparse.interval.uncertainty_set.HostInterval.rounding>`, 8 (n + 1) u, which counts as none; the
-    product and its sum lose (n + 1) u. Backups are not expansive, so errors of several add up.
+    placed wrongly, by n u that is lost in the sum, and by the slack of
+    :attr:`UncertainMDP.rounding`, 8 (n + 1) u, which counts as none; the product and its sum lose
+    (n + 1) u. Backups are not expansive, so errors of several add up.
     """
     width = int(np.diff(model.mdp.entry_start).max(initial=1))
     return 16 * (width + 1) * _EPS
 
 
 def until(
-    model: HostInterval,
-    target: Booleans,
-    stay: Booleans,
-    num_steps: int,
-    *,
-    maximize: bool,
-    helpful: bool,
-) -> RobustSteps:
-    """Probability of a target within so many steps, through states where one may stay.
-
-    Args:
-      model: the model.
-      target, stay: ``bool[S]``.
-      num_steps: n.
-      maximize: whether the policy makes it large.
-      helpful: whether nature does.
-    """
+    model: UncertainMDP, target: Booleans, stay: Booleans, num_steps: int, query: Query
+) -> StepBoundedValues:
+    """Probability of reaching a target within `num_steps` through states of `stay`."""
     open_ = stay & ~target
     value, done = target.astype(np.float64), 0
     row: Integers = model.mdp.row_start[:-1].astype(np.int64)
     chance = model.mdp.probability
     while done < num_steps:
         done += 1
-        ahead = value[model.mdp.successor]
-        found, row, chance = _backup(model, ahead, maximize=maximize, helpful=helpful)
+        found, row, chance = _backup(model, value[model.mdp.successor], query)
         new = np.where(open_, np.clip(found, 0, 1), target)
         if np.array_equal(new, value):
             break
         value = new
     total = num_steps * backup_error(model)
     error = np.where(open_ & (num_steps > 0), min(total, 1.0), 0)
-    # What is exactly zero or one, supports tell.
+    # Supports decide which values are exactly 0 or 1.
     if num_steps:
         for surely in (False, True):
-            within = _within(model, target, open_, num_steps, surely, maximize, helpful)
-            known = open_ & (within if surely else ~within)
+            region = _qualitative(model, (target, open_), num_steps, surely, query)
+            known = open_ & (region if surely else ~region)
             value, error = np.where(known, surely, value), np.where(known, 0, error)
-    return RobustSteps(value, error, row, chance, done)
+    return StepBoundedValues(value, error, row, chance, done)
 
 
-def next_step(
-    model: HostInterval, target: Booleans, *, maximize: bool, helpful: bool
-) -> RobustSteps:
-    """Probability that the next state is in a set.
-
-    Args:
-      model, target, maximize, helpful: as of :func:`until`.
-    """
+def next_step(model: UncertainMDP, target: Booleans, query: Query) -> StepBoundedValues:
+    """Probability that the next state is a target."""
     ahead = target.astype(np.float64)[model.mdp.successor]
-    value, row, chance = _backup(model, ahead, maximize=maximize, helpful=helpful)
+    value, row, chance = _backup(model, ahead, query)
     value, error = np.clip(value, 0, 1), np.full(value.size, backup_error(model))
     for surely in (False, True):
-        rows = _entering(model, target, surely, helpful)
-        found = model.mdp.over_choices(_some(maximize), rows)
+        rows = _entering(model, target, surely, query.nature_maximizes)
+        found = model.mdp.over_choices(_any_or_all(query), rows)
         known = found if surely else ~found
         value, error = np.where(known, surely, value), np.where(known, 0, error)
-    return RobustSteps(value, error, row, chance, 1)
+    return StepBoundedValues(value, error, row, chance, 1)
 
 
 def total(
-    model: HostInterval,
-    earned: Floats,
-    start: Floats,
-    num_steps: int,
-    *,
-    maximize: bool,
-    helpful: bool,
-) -> RobustSteps:
-    """Expected reward of so many steps, and then of the state where one is.
+    model: UncertainMDP, earned: Floats, start: Floats, num_steps: int, query: Query
+) -> StepBoundedValues:
+    """Expected reward of `num_steps` steps plus a final reward.
 
     Args:
       model: the model.
-      earned: ``float64[T]``, what each entry earns.
-      start: ``float64[S]``, of the last state.
-      num_steps, maximize, helpful: as of :func:`until`; what the policy or nature make large.
+      earned: ``float64[T]``, reward of each entry.
+      start: ``float64[S]``, final reward.
+      num_steps: the number of steps.
+      query: directions of policy and nature.
     """
     mdp, one = model.mdp, backup_error(model)
     value, error, done = start, 0.0, 0
@@ -127,9 +103,9 @@ def total(
     while done < num_steps:
         done += 1
         ahead = earned + value[mdp.successor]
-        found, row, chance = _backup(model, ahead, maximize=maximize, helpful=helpful)
+        found, row, chance = _backup(model, ahead, query)
         still = np.array_equal(found, value)
-        # The same again and again, if nothing changes any more: e -> (1 + one) e + one * size.
+        # At a fixed point the error of all further steps follows from e -> (1 + one) e + one size.
         size, repeated = float(np.abs(ahead).max(initial=0)), num_steps - done + 1 if still else 1
         growth = float(np.expm1(min(repeated * np.log1p(one), 500)))
         error = (
@@ -143,47 +119,46 @@ def total(
     some = start != 0
     some[mdp.state[mdp.row[earned != 0]]] = True
     off = np.where(backward_reachable(mdp, some), error if num_steps else 0, 0)
-    return RobustSteps(value, off, row, chance, done)
+    return StepBoundedValues(value, off, row, chance, done)
 
 
-def _backup(
-    model: HostInterval, ahead: Floats, *, maximize: bool, helpful: bool
-) -> tuple[Floats, Integers, Floats]:
-    """One step to what each entry has ahead: the value, the best rows, nature's distributions."""
+def _backup(model: UncertainMDP, ahead: Floats, query: Query) -> tuple[Floats, Integers, Floats]:
+    """The optimal mean of ``float64[T]``, the best rows, and nature's distributions."""
     mdp = model.mdp
-    chance = model.nature(ahead, maximize=helpful)
-    image = model.total(chance * ahead)
-    best = mdp.over_choices(np.maximum if maximize else np.minimum, image)
+    chance = model.extreme_distributions(ahead, maximize=query.nature_maximizes)
+    image = model.sum_rows(chance * ahead)
+    best = mdp.over_choices(np.maximum if query.maximize else np.minimum, image)
     row = mdp.first_choice(image == best[mdp.state])[1].astype(np.int64)
     return best, row, chance
 
 
-def _some(maximize: bool) -> Any:
-    """How what is true of rows is true of states: of some for who maximizes, else of all."""
-    return np.logical_or if maximize else np.logical_and
+def _any_or_all(query: Query) -> np.ufunc:
+    return np.logical_or if query.maximize else np.logical_and
 
 
-def _entering(model: HostInterval, region: Booleans, surely: bool, helpful: bool) -> Booleans:
-    """The rows by which a region is entered possibly, or surely, with nature for or against it."""
+def _entering(
+    model: UncertainMDP, region: Booleans, surely: bool, nature_maximizes: bool
+) -> Booleans:
+    """Rows that enter a region with positive probability, or surely, under nature's best choice."""
+    leads = model.mdp.support.some_successor_in
     if surely:
-        return model.may_stay(region) if helpful else ~model.mdp.support.some_successor_in(~region)
-    return model.mdp.support.some_successor_in(region) if helpful else ~model.may_stay(~region)
+        return model.can_stay_in(region) if nature_maximizes else ~leads(~region)
+    return leads(region) if nature_maximizes else ~model.can_stay_in(~region)
 
 
-def _within(
-    model: HostInterval,
-    target: Booleans,
-    open_: Booleans,
+def _qualitative(
+    model: UncertainMDP,
+    sets: tuple[Booleans, Booleans],
     num_steps: int,
     surely: bool,
-    maximize: bool,
-    helpful: bool,
+    query: Query,
 ) -> Booleans:
-    """Whether a target is met in so many steps with positive probability, or surely."""
+    """States that reach a target through open ones in time with positive probability, or surely."""
+    target, open_ = sets
     region = target
     for _ in range(num_steps):
-        rows = _entering(model, region, surely, helpful)
-        new = target | (open_ & model.mdp.over_choices(_some(maximize), rows))
+        rows = _entering(model, region, surely, query.nature_maximizes)
+        new = target | (open_ & model.mdp.over_choices(_any_or_all(query), rows))
         if (new == region).all():
             break
         region = new

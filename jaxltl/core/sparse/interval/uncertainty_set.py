@@ -1,156 +1,158 @@
-"""Decision processes whose probabilities lie in intervals, and what nature makes of a row.
+"""Sparse MDPs whose rows are uncertainty sets: intervals, intersected with L1 balls.
 
-A row is the set of all distributions p with ``lower <= p <= upper``. Each time that it is taken,
-nature picks one of them. A linear function is extreme where mass goes first to the best successors
-(Nilim and El Ghaoui 2005; Givan, Leach and Dean 2000). Where there is a ball too, p lies in both.
+A row is the set of all distributions p with ``lower <= p <= upper``, and with
+``sum_t |p_t - center_t| <= radius`` where there is a ball. Nature picks one each time that the row
+is taken. A linear function is extreme where mass goes greedily to the best successors (Nilim and
+El Ghaoui 2005; Givan, Leach and Dean 2000).
 
-Numbers are what they are to the last bit: nature may do without a successor if the upper ends of
-the others sum to one or more exactly, and has to give it the last 1e-17 otherwise. A row whose ends
-are all equal is in proportion to them, however they add up.
+Ends are exact numbers: nature may drop a successor if the upper ends of the others sum to one or
+more exactly, and must give it the last 1e-17 otherwise. A row with equal lower and upper ends is
+their normalised distribution.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.pretty_print import brief
-from jaxltl.core.sparse.interval.l1_distance import Ball, share_of
-from jaxltl.core.sparse.interval.row_table import Table, row_sums, tables
+from jaxltl.core.sparse.interval.l1_ball import Ball, share_of
+from jaxltl.core.sparse.interval.row_table import RowTable, row_parts, row_sums
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
+from jaxltl.core import validation
 
 _EPS = float(np.finfo(np.float64).eps)
-_READ = 2 * _EPS  # by how much a sum of decimals, or of what was rounded once, may miss one
+_DECIMALS = 2 * _EPS  # by how much a sum of decimals may miss one through rounding
 
 
 @brief
 @dataclass(frozen=True)
-class HostInterval:
-    """A decision process with intervals, as NumPy arrays.
+class UncertainMDP:
+    """An MDP with an uncertainty set in each row, as NumPy arrays.
 
     Attributes:
-      mdp: its rows; probabilities are one distribution of each, positive where upper is.
-      lower, upper: ``float64[T]``; each end is met by some distribution of the row.
-      ball: how far from its center each row may be besides; None: as far as the ends allow.
-      nearly: whether sums that miss one by rounding count as one: of ends that are computed.
+      mdp: its rows; the probabilities are one distribution of each set, positive where upper is.
+      lower, upper: ``float64[T]``; each end is attained by some distribution of the row.
+      ball: L1 balls, or None.
+      tolerant: whether sums that miss one by rounding count as one, for computed ends.
     """
 
     mdp: HostMDP
     lower: Floats
     upper: Floats
     ball: Ball | None = None
-    nearly: bool = False
+    tolerant: bool = False
 
     @cached_property
     def rounding(self) -> Floats:
-        """``float64[R]``, by how much a sum over a row may miss, of numbers that add up to one."""
+        """``float64[R]``, bound on the rounding error of a sum of masses over a row."""
         return 4 * _EPS * (np.diff(self.mdp.entry_start) + 1)
 
     @cached_property
-    def rest(self) -> Floats:
-        """``float64[R]``, the mass that the lower ends leave to nature."""
+    def free_mass(self) -> Floats:
+        """``float64[R]``, one minus the sum of the lower ends."""
         return np.maximum(-row_sums(self.lower, self.mdp.entry_start, -self._ones), 0)
 
     @property
     def _ones(self) -> Floats:
         return np.ones(self.mdp.num_rows)
 
-    def over(self, found: Floats) -> Booleans:
-        """Whether sums less one are at least zero: ``bool[R]``, up to rounding if that counts."""
-        return found >= (-self.rounding if self.nearly else 0)
+    def _is_nonnegative(self, excess: Floats) -> Booleans:
+        return excess >= (-self.rounding if self.tolerant else 0)
 
     @cached_property
-    def firm(self) -> bool:
-        """Whether nature must give something to every successor."""
+    def has_fixed_support(self) -> bool:
+        """Whether nature must give every successor some mass."""
         return bool((self.lower > 0).all())
 
     @cached_property
-    def widened(self) -> HostInterval | None:
-        """The model with upper ends, and balls, that are larger by two roundings of one.
+    def enlarged(self) -> UncertainMDP | None:
+        """The model with upper ends and balls enlarged by `_DECIMALS`.
 
-        Nature may drop in it all that it may drop where sums that miss one by these count as one.
-        None where that is clearly no more than it may drop anyway.
+        In it nature may drop all successors that it may drop if sums within rounding of one count
+        as one. None if these are clearly those that it may drop anyway.
         """
-        if self.firm:
+        if self.has_fixed_support:
             return None
         start = self.mdp.entry_start
-        free = (self.lower == 0) & (self.upper > 0)
-        count = np.add.reduceat(free.astype(np.int64), start[:-1])
-        kept = self.total(np.where(free, 0, self.upper)) - 1 - self.rounding
-        # Where one may be dropped alone, the others' sum is clear; where several may be, none is.
-        near = (count > 0) & (kept <= 0) & ((count > 1) | (np.abs(kept) <= 3 * self.rounding))
-        if self.ball is None and not near.any():
+        droppable = (self.lower == 0) & (self.upper > 0)
+        count = np.add.reduceat(droppable.astype(np.int64), start[:-1])
+        kept = self.sum_rows(np.where(droppable, 0, self.upper)) - 1 - self.rounding
+        # With one droppable successor the sum of the others decides; with several, subsets do.
+        unclear = (count > 0) & (kept <= 0) & ((count > 1) | (np.abs(kept) <= 3 * self.rounding))
+        if self.ball is None and not unclear.any():
             return None
-        upper = np.where(self.upper > 0, np.minimum(self.upper + _READ, 1), 0)
-        ball = self.ball
-        ball = None if ball is None else ball._replace(most=ball.most + _READ)
-        return HostInterval(self.mdp, self.lower, upper, ball)
+        upper = np.where(self.upper > 0, np.minimum(self.upper + _DECIMALS, 1), 0)
+        ball = None if self.ball is None else replace(self.ball, gain=self.ball.gain + _DECIMALS)
+        return UncertainMDP(self.mdp, self.lower, upper, ball)
 
     @cached_property
-    def tables(self) -> list[Table]:
-        """The rows by their number of entries, in parts."""
-        lack = None
+    def tables(self) -> list[RowTable]:
+        """The rows by width."""
+        deficit = None
         if self.ball is not None:
-            lack = 1 - self.total(self.ball.center)
-            lack = np.where(np.abs(lack) > self.rounding, lack, 0)
+            deficit = 1 - self.sum_rows(self.ball.center)
+            deficit = np.where(np.abs(deficit) > self.rounding, deficit, 0)
         found = []
-        for row, entry, used in tables(self.mdp.entry_start):
+        for row, entry, used in row_parts(self.mdp.entry_start):
             lower, upper = (
                 x[entry] if used is None else np.where(used, x[entry], 0)
                 for x in (self.lower, self.upper)
             )
             ball: dict[str, Floats] = {}
-            if self.ball is not None and lack is not None:
+            if self.ball is not None and deficit is not None:
                 center = self.ball.center[entry]
                 center = center if used is None else np.where(used, center, 0)
-                ball = {"center": center, "most": self.ball.most[row], "lack": lack[row]}
+                ball = {"center": center, "gain": self.ball.gain[row], "deficit": deficit[row]}
             found.append(
-                Table.of(row, entry, used, lower, upper, self.rest[row], self.rounding[row], **ball)
+                RowTable(
+                    row,
+                    entry,
+                    used,
+                    lower,
+                    upper,
+                    self.free_mass[row],
+                    self.rounding[row],
+                    **ball,
+                )
             )
         return found
 
-    def total(self, quantity: NDArray[Any]) -> NDArray[Any]:
+    def sum_rows(self, quantity: NDArray) -> NDArray:
         """The sum over each row's entries, ``[R]`` from ``[T]``."""
         return np.add.reduceat(quantity, self.mdp.entry_start[:-1])
 
-    def nature(self, quantity: Floats, *, maximize: bool) -> Floats:
-        """The distributions that make ``sum_t p_t quantity_t`` extreme, ``float64[T]``.
+    # --- choices of nature --------------------------------------------------------------------
 
-        Args:
-          quantity: ``float64[T]``, finite, of each entry.
-          maximize: whether nature makes the sum large.
-        """
+    def extreme_distributions(self, quantity: Floats, *, maximize: bool) -> Floats:
+        """Distributions that make ``sum_t p_t quantity_t`` extreme in each row, ``float64[T]``."""
         key, found = -quantity if maximize else quantity, np.empty(quantity.size)
         for table in self.tables:
-            mass = table.best(key[table.entry])
-            if table.used is None:
-                found[table.entry] = mass
-            else:
-                found[table.entry[table.used]] = mass[table.used]
+            scatter(table, table.extreme(key[table.entry]), found)
         return found
 
-    def may_keep(self, entries: Booleans) -> Booleans:
+    def can_stay_on(self, entries: Booleans) -> Booleans:
         """Whether nature may put all mass on some entries: ``bool[R]`` from ``bool[T]``."""
         start = self.mdp.entry_start
-        if self.firm:
+        if self.has_fixed_support:
             return np.logical_and.reduceat(entries, start[:-1])
         every = np.logical_and.reduceat(entries | (self.upper == 0), start[:-1])
         needed = np.logical_or.reduceat(~entries & (self.lower > 0), start[:-1])
-        room = self.over(row_sums(np.where(entries, self.upper, 0), start, -self._ones))
+        room = row_sums(np.where(entries, self.upper, 0), start, -self._ones)
+        able = self._is_nonnegative(room)
         if self.ball is not None:
-            center, most = self.ball
-            room &= self.over(row_sums(np.where(entries, center, 0), start, most, -self._ones))
-        return every | (room & ~needed)
+            center, gain = np.where(entries, self.ball.center, 0), self.ball.gain
+            able &= self._is_nonnegative(row_sums(center, start, gain, -self._ones))
+        return every | (able & ~needed)
 
-    def may_stay(self, region: Booleans) -> Booleans:
-        """Whether nature may keep to a region: ``bool[R]`` from ``bool[S]``."""
-        return self.may_keep(region[self.mdp.successor])
+    def can_stay_in(self, region: Booleans) -> Booleans:
+        """Whether nature may keep to a set of states: ``bool[R]`` from ``bool[S]``."""
+        return self.can_stay_on(region[self.mdp.successor])
 
     def must_enter(self, row: Integers, region: Booleans) -> Booleans:
         """Whether every distribution of some rows enters a region: ``bool[N]``."""
@@ -162,69 +164,59 @@ class HostInterval:
         start = count.cumsum() - count
         inside = region[mdp.successor[entry]]
         start, one = np.append(start, entry.size), np.ones(row.size)
-        least = -self.rounding[row] if self.nearly else np.zeros(row.size)
+        least = -self.rounding[row] if self.tolerant else np.zeros(row.size)
         room = row_sums(np.where(inside, 0, self.upper[entry]), start, -one) >= least
-        sure = np.logical_or.reduceat(inside & (self.lower[entry] > 0), start[:-1])
-        some = np.logical_or.reduceat(inside & (self.upper[entry] > 0), start[:-1])
+        forced = np.logical_or.reduceat(inside & (self.lower[entry] > 0), start[:-1])
+        possible = np.logical_or.reduceat(inside & (self.upper[entry] > 0), start[:-1])
         if self.ball is not None:
-            center, most = self.ball.center[entry], self.ball.most[row]
-            room &= row_sums(np.where(inside, 0, center), start, most, -one) >= least
-        return some & (sure | ~room)
+            center, gain = self.ball.center[entry], self.ball.gain[row]
+            room &= row_sums(np.where(inside, 0, center), start, gain, -one) >= least
+        return possible & (forced | ~room)
 
-    def within(self, entries: Booleans) -> Floats:
-        """Distributions with all of some entries as their support, where nature may keep to them.
+    def interior_distributions(self, entries: Booleans) -> Floats:
+        """Distributions with support `entries` where nature may keep to these, ``float64[T]``.
 
-        Args:
-          entries: ``bool[T]``.
-
-        Returns:
-          ``float64[T]``; of other rows, what they are anyway.
+        Other rows have a distribution with full support.
         """
-        entries = entries | ~self.may_keep(entries)[self.mdp.row]
+        entries = entries | ~self.can_stay_on(entries)[self.mdp.row]
         free = np.where(entries, self.upper - self.lower, 0)
-        room = self.total(free)
-        found = np.where(entries, self.lower + free * share_of(self.rest, room)[self.mdp.row], 0)
-        return found if self.ball is None else self._drawn_in(found, entries, self.ball)
+        share = share_of(self.free_mass, self.sum_rows(free))
+        found = np.where(entries, self.lower + free * share[self.mdp.row], 0)
+        return found if self.ball is None else self._into_ball(found, entries, self.ball)
 
-    def _drawn_in(self, found: Floats, entries: Booleans, ball: Ball) -> Floats:
-        """The same distributions, nearer to the center where they are too far from it."""
-        center = np.where(entries, ball.center, 0)
-        lack = 1 - self.total(center)
-        room, free = (
+    def _into_ball(self, p: Floats, entries: Booleans, ball: Ball) -> Floats:
+        """Moves distributions towards the center until they lie in the ball."""
+        row, center = self.mdp.row, np.where(entries, ball.center, 0)
+        deficit = 1 - self.sum_rows(center)
+        rise, fall = (
             np.where(entries, x, 0) for x in (self.upper - ball.center, ball.center - self.lower)
         )
-        more, less = share_of(lack, self.total(room)), share_of(-lack, self.total(free))
-        # What gains least keeps to the entries; half of the rest is spent on all of them.
-        near = center + room * more[self.mdp.row] - free * less[self.mdp.row]
-        gained = self.total(np.maximum(found - center, 0))
-        least = np.maximum(lack, 0)
-        share = share_of((ball.most - least) / 2, gained - least)
-        far = (gained > ball.most)[self.mdp.row]
-        return np.where(far, near + (found - near) * share[self.mdp.row], found)
+        up = share_of(deficit, self.sum_rows(rise))
+        down = share_of(-deficit, self.sum_rows(fall))
+        # The nearest distribution on the entries; half of the remaining gain goes to all of them.
+        nearest = center + rise * up[row] - fall * down[row]
+        gained = self.sum_rows(np.maximum(p - center, 0))
+        least = np.maximum(deficit, 0)
+        share = share_of((ball.gain - least) / 2, gained - least)
+        outside = (gained > ball.gain)[row]
+        return np.where(outside, nearest + (p - nearest) * share[row], p)
 
-    def settled(self, probability: Floats) -> tuple[Floats, bool]:
-        """Distributions next to those that were computed, each mass right to its last digits.
+    def nearest_distributions(self, probability: Floats) -> tuple[Floats, bool]:
+        """Distributions next to computed ones, with masses right to their last digits.
 
-        Args:
-          probability: ``float64[T]``, from which rows miss distributions by rounding.
-
-        Returns:
-          ``float64[T]``, and whether that could be done in all rows.
+        Also whether all rows have one.
         """
         found, able = probability.copy(), True
         for table in self.tables:
-            p, fits = table.settled(probability[table.entry])
+            p, fits = table.nearest(probability[table.entry])
             able &= bool(fits.all())
-            kept = np.ones(p.shape, bool) if table.used is None else table.used
-            found[table.entry[kept]] = p[kept]
+            scatter(table, p, found)
         return found, able
 
-    def fixed(self, probability: Floats) -> HostMDP:
-        """The decision process that is left when nature's choices are known.
+    # --- derived models -----------------------------------------------------------------------
 
-        Args:
-          probability: ``float64[T]``; entries of zero are left out.
-        """
+    def resolve(self, probability: Floats) -> HostMDP:
+        """The MDP under nature's distributions ``float64[T]``, without entries of mass 0."""
         mdp, kept = self.mdp, probability > 0
         if kept.all():
             return HostMDP(mdp.row_start, mdp.entry_start, mdp.successor, probability)
@@ -233,28 +225,28 @@ class HostInterval:
             mdp.row_start, offsets_from_counts(count), mdp.successor[kept], probability[kept]
         )
 
-    def chain(self, row: Integers) -> tuple[HostInterval, Integers]:
-        """The intervals under a policy ``int[S]``, and which entries these are."""
-        states: Any = np.arange(self.mdp.num_states + 1, dtype=np.int32)
-        return self.of_rows(states, row)
+    def under_policy(self, row: Integers) -> tuple[UncertainMDP, Integers]:
+        """The model under a policy ``int[S]``, and the original entries."""
+        states = np.arange(self.mdp.num_states + 1, dtype=np.int32)
+        return self.select_rows(states, row)
 
-    def of_rows(self, row_start: Integers, row: Integers) -> tuple[HostInterval, Integers]:
-        """Some rows in a new order, and which entries these are."""
+    def select_rows(self, row_start: Integers, row: Integers) -> tuple[UncertainMDP, Integers]:
+        """The model with some rows in a new order, and the original entries."""
         mdp = self.mdp
         width = np.diff(mdp.entry_start)[row]
         entry = concatenated_ranges(mdp.entry_start[row], width)
         part = HostMDP(
             row_start, offsets_from_counts(width), mdp.successor[entry], mdp.probability[entry]
         )
-        ball = None if self.ball is None else self.ball.of(entry, row)
-        return HostInterval(part, self.lower[entry], self.upper[entry], ball), entry
+        ball = None if self.ball is None else self.ball.select(entry, row)
+        return UncertainMDP(part, self.lower[entry], self.upper[entry], ball), entry
 
-    def halted(self, states: Booleans) -> tuple[HostInterval, Integers]:
-        """The model in which some states stand still, and the row that each row was."""
+    def with_absorbing(self, states: Booleans) -> tuple[UncertainMDP, Integers]:
+        """The model with some states made absorbing, and the original rows."""
         mdp = self.mdp
         start, stop = (mdp.entry_start[x[states]] for x in (mdp.row_start[:-1], mdp.row_start[1:]))
         if (stop - start == 1).all() and (mdp.successor[start] == np.flatnonzero(states)).all():
-            return self, np.arange(mdp.num_rows)  # they do already
+            return self, np.arange(mdp.num_rows)
         count = np.where(states, 1, np.diff(mdp.row_start))
         row = concatenated_ranges(mdp.row_start[:-1], count)
         loop = np.repeat(states, count)
@@ -262,12 +254,83 @@ class HostInterval:
         entry, start = concatenated_ranges(mdp.entry_start[row], width), offsets_from_counts(width)
         first = start[:-1][loop]
         successor = mdp.successor[entry]
-        lower, upper, chance = (x[entry] for x in (self.lower, self.upper, mdp.probability))
+        lower, upper, nominal = (x[entry] for x in (self.lower, self.upper, mdp.probability))
         successor[first] = np.flatnonzero(states)
-        lower[first] = upper[first] = chance[first] = 1
+        lower[first] = upper[first] = nominal[first] = 1
         ball = self.ball
         if ball is not None:
-            ball = ball.of(entry, row)
+            ball = ball.select(entry, row)
             ball.center[first] = 1
-        small = HostMDP(offsets_from_counts(count), start, successor, chance)
-        return HostInterval(small, lower, upper, ball), row
+        small = HostMDP(offsets_from_counts(count), start, successor, nominal)
+        return UncertainMDP(small, lower, upper, ball), row
+
+
+def scatter(table: RowTable, mass: Floats, found: Floats) -> None:
+    """Writes the masses ``float64[W, N]`` of a table into ``float64[T]``."""
+    if table.used is None:
+        found[table.entry] = mass
+    else:
+        found[table.entry[table.used]] = mass[table.used]
+
+
+def l1_expectation(
+    value: Floats, center: Floats, radius: Floats, entry_start: Integers, *, maximize: bool
+) -> tuple[Floats, Floats]:
+    """Extreme expectation over an L1 ball: ``sum_t p_t v_t`` with ``sum_t |p_t - c_t| <= radius``.
+
+    Half of the radius is moved from the worst successors to the best one (Strehl and Littman 2008,
+    section 3.2).
+
+    Args:
+      value: ``float64[T]``, finite, ``v[successor]`` of each entry.
+      center: ``float64[T]``, distributions; entries of zero can gain.
+      radius: ``float64[R]``, at least 0.
+      entry_start: ``int[R + 1]``, the first entry of each row; no row is empty.
+      maximize: whether the expectation is maximised.
+
+    Returns:
+      The expectations ``float64[R]``, and distributions ``float64[T]`` that attain them.
+
+    Raises:
+      ValueError: shapes do not match, a row is empty, or a radius is negative.
+
+    Example:
+      >>> least, chosen = l1_expectation(np.array([0.0, 1.0, 2.0]), np.array([0.5, 0.25, 0.25]),
+      ...                                np.array([0.8]), np.array([0, 3]), maximize=False)
+      >>> least.round(9).tolist(), chosen.round(9).tolist()
+      ([0.1], [0.9, 0.1, 0.0])
+    """
+    value, center, radius = (
+        validation.float_array(name, x)
+        for name, x in (("value", value), ("center", center), ("radius", radius))
+    )
+    start: Integers = validation.integer_array("entry_start", entry_start).reshape(-1)
+    if value.shape != center.shape or (start.size - 1,) != radius.shape:
+        raise ValueError(
+            f"value has shape {value.shape}, center {center.shape} and radius {radius.shape}; "
+            f"expected [T], [T] and [{start.size - 1}], an entry for each row."
+        )
+    width = np.diff(start)
+    if start[0] != 0 or start[-1] != value.size or (width <= 0).any():
+        raise ValueError(
+            f"entry_start goes from {start[0]} to {start[-1]}; it must ascend from 0 to "
+            f"{value.size}, without an empty row."
+        )
+    if not (np.isfinite(value) & np.isfinite(center)).all():
+        raise ValueError("value or center has an entry that is not finite; give finite numbers.")
+    if not (radius >= 0).all():
+        r = int(np.argmin(radius >= 0))
+        raise ValueError(f"the radius of row {r} is {radius[r]}; it must be at least 0.")
+    sets = uncertainty_sets(
+        start, np.zeros_like(center), np.ones_like(center), Ball(center, np.minimum(radius / 2, 1))
+    )
+    p = sets.extreme_distributions(value, maximize=bool(maximize))
+    return sets.sum_rows(p * value), p
+
+
+def uncertainty_sets(
+    entry_start: Integers, lower: Floats, upper: Floats, ball: Ball | None = None
+) -> UncertainMDP:
+    """Uncertainty sets of rows alone, for row operations that read no states."""
+    states = np.zeros(entry_start.size, np.int64)
+    return UncertainMDP(HostMDP(states, entry_start, states[:0], lower), lower, upper, ball)

@@ -11,11 +11,12 @@ from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP, make_interval
 from jaxltl.core.models.ops.operators import is_deterministic, row_weights
 from jaxltl.core.models.sparse import Rewards, SparseMDP, reward_structure, choice_reward
-from jaxltl.core.sparse.interval import reachability as interval_values
-from jaxltl.core.sparse.interval.discounted import discounted
-from jaxltl.core.sparse.interval.game_encoding import Spread, spread
-from jaxltl.core.sparse.interval.reachability import Robust
-from jaxltl.core.sparse.interval.uncertainty_set import HostInterval
+from jaxltl.core.sparse.interval.discounted import DiscountedModel, discounted_value
+from jaxltl.core.sparse.interval.game_encoding import EncodedChoices, let_nature_choose
+from jaxltl.core.sparse.interval.reachability import reachability
+from jaxltl.core.sparse.interval.robust_values import Query, RobustValues
+from jaxltl.core.sparse.interval.total_reward import total_reward
+from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
 from jaxltl.core.types import Solution, require_shape
 from jaxltl.core import validation
 from jaxltl.core.values.engine.host_solution import status_between
@@ -107,14 +108,7 @@ def robust_reachability(
     target = sides.states(state_mask(model.nominal, target, "target"))
     if stay is not None:
         stay = sides.states(state_mask(model.nominal, stay, "stay")) | sides.added
-    found = interval_values.reachability(
-        sides.host,
-        target,
-        maximize=sides.maximize,
-        helpful=sides.helpful,
-        stay=stay,
-        tolerance=asked,
-    )
+    found = reachability(sides.host, target, sides.query(asked), stay=stay)
     return robust_solution(sides, found, asked, relative=False)
 
 
@@ -165,9 +159,7 @@ def robust_total_reward(
     model = sides.model
     target = sides.states(state_mask(model.nominal, target, "target"))
     earned = sides.rows(interval_reward(model, reward))
-    found = interval_values.total_reward(
-        sides.host, earned, target, maximize=sides.maximize, large=sides.helpful, tolerance=asked
-    )
+    found = total_reward(sides.host, earned, target, sides.query(asked))
     return robust_solution(sides, found, asked, relative=True)
 
 
@@ -214,14 +206,8 @@ def robust_discounted_value(
     earned = sides.entries(entry_reward(sides.model, reward))
     largest = float(np.abs(earned).max(initial=0)) / (1 - float(discount))
     asked = 1e-8 * max(largest, 1e-300) if tolerance is None else width_asked(tolerance)
-    found = discounted(
-        sides.host,
-        earned,
-        np.where(sides.choosing, 1.0, float(discount)),
-        maximize=sides.maximize,
-        large=sides.helpful,
-        tolerance=asked,
-    )
+    discounts = np.where(sides.choosing, 1.0, float(discount))
+    found = discounted_value(DiscountedModel(sides.host, earned, discounts), sides.query(asked))
     return robust_solution(sides, found, asked, relative=False)
 
 
@@ -259,8 +245,8 @@ def robust_expectation(
     ahead = validation.float_array("value", value)[model.host.mdp.successor]
     if not np.isfinite(ahead).all():
         raise ValueError("value is not finite in some successor; give numbers.")
-    p = model.host.nature(ahead, maximize=nature == "max")
-    return model.host.total(p * ahead), p
+    p = model.host.extreme_distributions(ahead, maximize=nature == "max")
+    return model.host.sum_rows(p * ahead), p
 
 
 def entry_reward(model: IntervalMDP, reward: Any) -> np.ndarray:
@@ -315,7 +301,9 @@ def interval_reward(model: IntervalMDP, reward: Any) -> np.ndarray:
     return earned
 
 
-def robust_solution(sides: Sides, found: Robust, tolerance: float, *, relative: bool) -> Solution:
+def robust_solution(
+    sides: Sides, found: RobustValues, tolerance: float, *, relative: bool
+) -> Solution:
     """What the host found, with its status."""
     size = sides.model.num_states
     value, lower, upper = (x[:size] for x in (found.value, found.lower, found.upper))
@@ -350,11 +338,14 @@ class Sides(NamedTuple):
     """
 
     model: Any
-    host: HostInterval
+    host: UncertainMDP
     maximize: bool
     helpful: bool
-    spread: Spread | None
+    spread: EncodedChoices | None
     policy: Any
+
+    def query(self, tolerance: float) -> Query:
+        return Query(self.maximize, self.helpful, tolerance)
 
     @property
     def choosing(self) -> np.ndarray:
@@ -421,7 +412,7 @@ def world_of(model: Any) -> tuple[IntervalMDP, np.ndarray | None]:
 
 
 def host_sides(
-    host: HostInterval, system: np.ndarray | None, objective: str, nature: str | None
+    host: UncertainMDP, system: np.ndarray | None, objective: str, nature: str | None
 ) -> Sides:
     """:func:`sides_of` on the host, without a policy."""
     helpful = require_direction(nature, objective) == "max"
@@ -430,17 +421,17 @@ def host_sides(
         return Sides(None, host, maximize, helpful, None, None)
     # Who wants what nature wants becomes nature, and the other one is the policy.
     rows = np.ones(host.mdp.num_rows)
-    parted = spread(host, system if maximize == helpful else ~system, 0 * rows, rows)
+    parted = let_nature_choose(host, system if maximize == helpful else ~system, 0 * rows, rows)
     return Sides(None, parted.model, not helpful, helpful, parted, None)
 
 
-def _under(model: IntervalMDP, policy: np.ndarray, where: Any) -> Spread:
+def _under(model: IntervalMDP, policy: np.ndarray, where: Any) -> EncodedChoices:
     """The model in which a policy's choices are made, in all states or those of one player."""
     host = model.host
     if is_deterministic(policy) and np.all(where):
         row_weights(model.nominal, policy)
-        chain, entry = host.chain(policy)
-        return Spread(
+        chain, entry = host.under_policy(policy)
+        return EncodedChoices(
             chain,
             np.arange(model.num_states),
             policy.astype(np.int64),
@@ -450,4 +441,4 @@ def _under(model: IntervalMDP, policy: np.ndarray, where: Any) -> Spread:
     weight = row_weights(model.nominal, policy, where)
     total = host.mdp.over_choices(np.add, weight)
     weight = weight / np.where(total > 0, total, 1)[host.mdp.state]
-    return spread(host, np.broadcast_to(where, (model.num_states,)), weight, weight)
+    return let_nature_choose(host, np.broadcast_to(where, (model.num_states,)), weight, weight)

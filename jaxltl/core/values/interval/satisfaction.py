@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,12 +16,13 @@ from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.ops.operators import is_deterministic, require_weights
 from jaxltl.core.models.product import Product
 from jaxltl.core.pretty_print import brief
-from jaxltl.core.sparse.interval.game_encoding import spread
-from jaxltl.core.sparse.interval.l1_distance import Ball
+from jaxltl.core.sparse.interval.game_encoding import let_nature_choose
+from jaxltl.core.sparse.interval.l1_ball import Ball
 from jaxltl.core.sparse.interval.parity import parity_against_nature
-from jaxltl.core.sparse.interval.qualitative import joint_accepting
-from jaxltl.core.sparse.interval.reachability import Robust, reachability
-from jaxltl.core.sparse.interval.uncertainty_set import HostInterval
+from jaxltl.core.sparse.interval.qualitative import joint_accepting_region
+from jaxltl.core.sparse.interval.reachability import reachability
+from jaxltl.core.sparse.interval.robust_values import Query, RobustValues
+from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.product import SparseProduct, sparse_product
 from jaxltl.core.types import Solution, Status, require_shape, row_tolerance
@@ -135,7 +137,7 @@ def robust_satisfaction(
 
 
 def _solution(
-    found: Robust, tolerance: float, shape: tuple[int, ...], states: Integers, policy: Any
+    found: RobustValues, tolerance: float, shape: tuple[int, ...], states: Integers, policy: Any
 ) -> Solution:
     """What was found, of some states of the product."""
     low, high = (x[states].reshape(shape) for x in (found.lower, found.upper))
@@ -216,11 +218,11 @@ def robust_product_satisfaction(
         solution = _solution(found, asked, shape, product.start, np.asarray(policy))
         return solution.replace(nature=None)  # type: ignore[attr-defined]
     policy = product.base_row[found.row[product.start]].astype(np.int32).reshape(shape)
-    found = found._replace(probability=found.probability[: product.host.num_transitions])
+    found = replace(found, probability=found.probability[: product.host.num_transitions])
     return _solution(found, asked, shape, product.start, policy)
 
 
-def _reading(host: HostInterval, priority: Integers) -> tuple[HostInterval, Integers, Integers]:
+def _reading(host: UncertainMDP, priority: Integers) -> tuple[UncertainMDP, Integers, Integers]:
     """The model in which what entries read is read by states of their own, where nobody chooses.
 
     Args:
@@ -244,10 +246,10 @@ def _reading(host: HostInterval, priority: Integers) -> tuple[HostInterval, Inte
     )
     ball = host.ball
     if ball is not None:
-        ball = Ball(np.append(ball.center, one), np.append(ball.most, one))
+        ball = Ball(np.append(ball.center, one), np.append(ball.gain, one))
     level = np.append(np.full(mdp.num_states, most - 1), read)
     return (
-        HostInterval(inner, np.append(host.lower, one), np.append(host.upper, one), ball),
+        UncertainMDP(inner, np.append(host.lower, one), np.append(host.upper, one), ball),
         level,
         np.append(np.arange(mdp.num_states), target),
     )
@@ -261,7 +263,7 @@ def _pairs(
     memory: Integers,
     still: Booleans,
     on_entry: bool,
-) -> tuple[SparseProduct, HostInterval]:
+) -> tuple[SparseProduct, UncertainMDP]:
     """What is reached of the product, with its intervals."""
     mdp = model.nominal.host
     # Entries travel by number, from 1; a loop of what stands still has 1 too.
@@ -276,14 +278,14 @@ def _pairs(
     )
     ball = model.host.ball
     if ball is not None:
-        ball = ball.of(entry, found.base_row)
-        ball = ball._replace(center=np.where(loop, 1.0, ball.center))
+        ball = ball.select(entry, found.base_row)
+        ball = replace(ball, center=np.where(loop, 1.0, ball.center))
     host = HostMDP(found.host.row_start, found.host.entry_start, found.host.successor, chance)
-    return found._replace(host=host), HostInterval(host, lower, upper, ball)
+    return found._replace(host=host), UncertainMDP(host, lower, upper, ball)
 
 
 def _fixed(
-    model: Product, product: SparseProduct, host: HostInterval, policy: np.ndarray, helpful: bool
+    model: Product, product: SparseProduct, host: UncertainMDP, policy: np.ndarray, helpful: bool
 ) -> Sides:
     """The product under a policy of the world's rows and the memory, in which nature chooses."""
     world: Any = model.mdp
@@ -300,19 +302,19 @@ def _fixed(
     dtype = policy.dtype if policy.dtype.kind == "f" else np.float64
     require_weights(host.mdp, weight, row_tolerance(dtype))
     weight = weight / host.mdp.over_choices(np.add, weight)[host.mdp.state]
-    parted = spread(host, np.ones(host.mdp.num_states, bool), weight, weight)
+    parted = let_nature_choose(host, np.ones(host.mdp.num_states, bool), weight, weight)
     return Sides(None, parted.model, helpful, helpful, parted, policy)
 
 
 def _solved(
     sides: Sides,
-    host: HostInterval,
+    host: UncertainMDP,
     yes: Booleans,
     no: Booleans,
     priority: Integers | None,
     safety: bool,
     tolerance: float,
-) -> Robust:
+) -> RobustValues:
     """The probability from all states of a product, for those who choose in it."""
     maximize, helpful = sides.maximize, sides.helpful
     if sides.spread is None:
@@ -329,7 +331,8 @@ def _solved(
         tolerance,
     )
     size = host.mdp.num_states
-    return found._replace(
+    return replace(
+        found,
         value=found.value[:size],
         lower=found.lower[:size],
         upper=found.upper[:size],
@@ -339,7 +342,7 @@ def _solved(
 
 
 def _of_sides(
-    host: HostInterval,
+    host: UncertainMDP,
     yes: Booleans,
     no: Booleans,
     priority: Integers | None,
@@ -347,49 +350,41 @@ def _of_sides(
     helpful: bool,
     safety: bool,
     tolerance: float,
-) -> Robust:
+) -> RobustValues:
     """The same where a policy and nature choose."""
     if priority is None:
         goal = no if safety else yes
         if safety:
-            return _opposite(
-                reachability(
-                    host, goal, maximize=not maximize, helpful=not helpful, tolerance=tolerance
-                )
-            )
-        return reachability(host, goal, maximize=maximize, helpful=helpful, tolerance=tolerance)
+            return reachability(
+                host, goal, Query(not maximize, not helpful, tolerance)
+            ).complement()
+        return reachability(host, goal, Query(maximize, helpful, tolerance))
     if not maximize:
         # The least probability is one minus the largest of the opposite.
         priority = np.where(no, 0, np.where(yes, 1, priority + 1))
-        return _opposite(_largest(host, priority, not helpful, tolerance))
+        return _largest(host, priority, not helpful, tolerance).complement()
     priority = np.where(yes, 0, np.where(no, 1, priority))
     return _largest(host, priority, helpful, tolerance)
 
 
-def _largest(host: HostInterval, priority: Integers, helpful: bool, tolerance: float) -> Robust:
+def _largest(
+    host: UncertainMDP, priority: Integers, helpful: bool, tolerance: float
+) -> RobustValues:
     """The largest probability, and in doubt also if sums that miss one by rounding are one."""
     found = _as_read(host, priority, helpful, tolerance)
-    wide = host.widened
+    wide = host.enlarged
     if wide is None:
         return found
-    return found.covering(_as_read(wide, priority, helpful, tolerance))
+    return found.hull(_as_read(wide, priority, helpful, tolerance))
 
 
-def _as_read(host: HostInterval, priority: Integers, helpful: bool, tolerance: float) -> Robust:
+def _as_read(
+    host: UncertainMDP, priority: Integers, helpful: bool, tolerance: float
+) -> RobustValues:
     if not helpful:
         return parity_against_nature(host, priority, tolerance=tolerance)
     mdp = host.mdp
-    good = joint_accepting(host, priority[mdp.state[mdp.row]])
-    found = reachability(host, good.region, maximize=True, helpful=True, tolerance=tolerance)
+    good = joint_accepting_region(host, priority[mdp.state[mdp.row]])
+    found = reachability(host, good.region, Query(True, True, tolerance))
     inside: Floats = np.where(good.region[mdp.state[mdp.row]], good.probability, found.probability)
-    return found._replace(row=np.where(good.region, good.row, found.row), probability=inside)
-
-
-def _opposite(found: Robust) -> Robust:
-    """One minus, rounded outwards; 0 and 1 stay what they are."""
-    lower, upper = (
-        np.where((x == 0) | (x == 1), 1 - x, 1 - x + side * 1e-16)
-        for x, side in ((found.upper, -1), (found.lower, 1))
-    )
-    lower, upper = np.clip(lower, 0, 1), np.clip(upper, 0, 1)
-    return found._replace(value=np.clip(1 - found.value, lower, upper), lower=lower, upper=upper)
+    return replace(found, row=np.where(good.region, good.row, found.row), probability=inside)

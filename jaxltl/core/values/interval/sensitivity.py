@@ -110,9 +110,9 @@ def robust_sensitivity(
     host = model.host
     value = np.where(np.isfinite(value), value, 0)
     ahead = value[host.mdp.successor]
-    chain, entry = host.chain(policy)
+    chain, entry = host.under_policy(policy)
     chance = np.asarray(solution.nature, np.float64)[entry]
-    visits = _visits(chain.fixed(chance), goal, passed, weight)
+    visits = _visits(chain.resolve(chance), goal, passed, weight)
     change, given = _against_the_rest(host, ahead, nature == "max")
     taken = np.zeros(host.mdp.num_rows)
     taken[policy] = visits
@@ -150,7 +150,7 @@ def _against_the_rest(host: Any, ahead: Floats, maximize: bool) -> tuple[Floats,
     mdp = host.mdp
     start, far = mdp.entry_start[:-1], np.inf
     key = -ahead if maximize else ahead
-    p = host.nature(ahead, maximize=maximize)
+    p = host.extreme_distributions(ahead, maximize=maximize)
     free = host.upper > host.lower
     short = free & (p < host.upper)  # those that are not given all that they may take
     rest = np.minimum.reduceat(np.where(short, key, far), start)

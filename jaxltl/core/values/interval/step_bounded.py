@@ -10,7 +10,8 @@ import numpy as np
 
 from jaxltl.core.models.interval import IntervalMDP, require_interval
 from jaxltl.core.sparse.interval import step_bounded as interval_bounded
-from jaxltl.core.sparse.interval.step_bounded import RobustSteps
+from jaxltl.core.sparse.interval.robust_values import Query
+from jaxltl.core.sparse.interval.step_bounded import StepBoundedValues
 from jaxltl.core.types import Solution
 from jaxltl.core import validation
 from jaxltl.core.values.interval.robust import entry_reward, require_direction
@@ -51,9 +52,7 @@ def robust_next_probability(
     nature = require_direction(nature, objective)
     chosen = state_mask(require_interval(model).nominal, target, "target")
     return _solution(
-        interval_bounded.next_step(
-            model.host, chosen, maximize=objective == "max", helpful=nature == "max"
-        )
+        interval_bounded.next_step(model.host, chosen, Query(objective == "max", nature == "max"))
     )
 
 
@@ -98,7 +97,7 @@ def robust_bounded_reachability(
     free = np.ones_like(goal) if stay is None else state_mask(model.nominal, stay, "stay")
     return _solution(
         interval_bounded.until(
-            model.host, goal, free, steps, maximize=objective == "max", helpful=nature == "max"
+            model.host, goal, free, steps, Query(objective == "max", nature == "max")
         )
     )
 
@@ -188,13 +187,13 @@ def _earned(
     nature, steps = require_direction(nature, objective), validation.integer("num_steps", num_steps)
     return _solution(
         interval_bounded.total(
-            model.host, earned, start, steps, maximize=objective == "max", helpful=nature == "max"
+            model.host, earned, start, steps, Query(objective == "max", nature == "max")
         ),
         highest=math.inf,
     )
 
 
-def _solution(found: RobustSteps, highest: float = 1) -> Solution:
+def _solution(found: StepBoundedValues, highest: float = 1) -> Solution:
     """What sweeps found, enclosed."""
     nature: Any = found.probability
     solution = solution_from_error(

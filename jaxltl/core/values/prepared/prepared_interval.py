@@ -17,7 +17,8 @@ from jaxltl.core.models.interval import IntervalMDP, refuse_ball, require_interv
 from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
 from jaxltl.core.models.ops.operators import is_deterministic, row_weights
 from jaxltl.core.pretty_print import brief
-from jaxltl.core.sparse.interval.uncertainty_set import HostInterval
+from jaxltl.core.sparse.interval.robust_values import Query
+from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
 from jaxltl.core.sparse.prepared.interval_plan import (
     IntervalPlan,
     plan_reachability,
@@ -164,7 +165,7 @@ def prepare_interval(
     nature = require_direction(nature, objective)
     target = state_mask(model.nominal, target, "target")
     stay = None if stay is None else state_mask(model.nominal, stay, "stay")
-    host: HostInterval = model.host
+    host: UncertainMDP = model.host
     entry: Any = np.arange(model.num_transitions)
     if policy is not None:
         policy = np.asarray(policy)
@@ -174,22 +175,22 @@ def prepare_interval(
                 "the host's solvers."
             )
         row_weights(model.nominal, policy)  # checks it
-        host, entry = host.chain(policy)
+        host, entry = host.under_policy(policy)
     up, large = objective == "max", nature == "max"
     if policy is not None:
         up = large  # who decides nothing wants what nature wants
     cost = None if reward is None else interval_reward(model, reward)
     if cost is None:
-        plan = plan_reachability(host, target, stay, maximize=up, helpful=large)
+        plan = plan_reachability(host, target, stay, Query(up, large))
     else:
         mine = cost if policy is None else cost[np.asarray(policy)]
-        plan = plan_total_reward(host, mine, target, maximize=up, large=large)
+        plan = plan_total_reward(host, mine, target, Query(up, large))
     return _prepared(model, host, entry, plan, cost, policy, (objective, nature, up))
 
 
 def _prepared(
     model: IntervalMDP,
-    host: HostInterval,
+    host: UncertainMDP,
     entry: np.ndarray,
     plan: IntervalPlan,
     cost: Any,
@@ -228,7 +229,7 @@ def _prepared(
     inside = np.ones(whole.num_transitions, bool)
     inside[entry] = plan.within
     objective, nature, _ = directions
-    answers = plan.answers
+    answers = plan.queries
     found = PreparedInterval(
         table=table,
         target=target,
@@ -253,7 +254,7 @@ def _prepared(
         objective=objective,
         nature=nature,
         num_rows=whole.num_rows,
-        circling=plan.circling,
+        circling=plan.has_free_cycles,
     )
     return to_jax(found)
 

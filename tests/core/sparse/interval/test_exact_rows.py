@@ -8,9 +8,10 @@ import pytest
 
 from jaxltl.core.models.interval import interval_rows
 from jaxltl.core.sparse.interval import reachability as interval_values
-from jaxltl.core.sparse.interval.exact_sums import exact_sum
-from jaxltl.core.sparse.interval.row_table import row_sums
-from jaxltl.core.sparse.interval.uncertainty_set import HostInterval
+from jaxltl.core.sparse.interval.robust_values import Query
+from jaxltl.core.sparse.interval.row_table import exact_sum, row_sums
+from jaxltl.core.sparse.interval.total_reward import total_reward
+from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
 from tests.reference_fractions import values
 
 COUNTS = [4, pytest.param(1000, marks=pytest.mark.exhaustive)]
@@ -63,13 +64,9 @@ def test_bounds_are_those_of_the_numbers_as_they_are(kind, count):
         maximize, large = bool(i & 1), bool(i & 2)
         for earned in (None, cost):
             if earned is None:
-                found = interval_values.reachability(
-                    host, goal, maximize=maximize, helpful=large, stay=~ends
-                )
+                found = interval_values.reachability(host, goal, Query(maximize, large), stay=~ends)
             else:
-                found = interval_values.total_reward(
-                    host, cost, ends, maximize=maximize, large=large
-                )
+                found = total_reward(host, cost, ends, Query(maximize, large))
             exact = values(host, goal, ends, earned, maximize=maximize, large=large)
             for low, high, x in zip(found.lower, found.upper, exact, strict=True):
                 if x is None:
@@ -92,7 +89,7 @@ def test_the_only_way_out_is_one_in_2_to_the_50():
     ).host
     goal = np.arange(3) == 1
     for large, value in ((True, 0.8), (False, 0.2)):
-        found = interval_values.reachability(host, goal, maximize=large, helpful=large)
+        found = interval_values.reachability(host, goal, Query(large, large))
         assert found.lower[0] <= value <= found.upper[0] <= found.lower[0] + 1e-6
 
 
@@ -102,7 +99,7 @@ def test_what_nature_may_drop_is_decided_by_the_last_bit():
         host = interval_rows(
             None, [0, 3, 4, 5], [0, 1, 2, 1, 2], [0, 0, 0, 1, 1], [0.5 - less, 0.5, 1, 1, 1]
         ).host
-        assert host.may_stay(np.array([True, True, False]))[0] == keeps
+        assert host.can_stay_in(np.array([True, True, False]))[0] == keeps
         assert host.must_enter(np.array([0]), np.arange(3) == 2)[0] == (not keeps)
 
 
@@ -117,7 +114,7 @@ def test_where_decimals_are_in_doubt_both_are_enclosed():
     ).host
     goal = np.arange(3) == 2
     assert Fraction(0.7) + Fraction(0.3) < 1
-    found = interval_values.reachability(host, goal, maximize=False, helpful=False)
+    found = interval_values.reachability(host, goal, Query(False, False))
     assert (found.upper == 1).all() and (found.lower[:2] < 1e-6).all()
     enough = interval_rows(
         None,
@@ -126,7 +123,7 @@ def test_where_decimals_are_in_doubt_both_are_enclosed():
         [0.7, 0.2, 0, 0.7, 0.2, 0, 1],
         [0.8, 0.3, 0.5, 0.8, 0.3, 0.5, 1],
     ).host
-    found = interval_values.reachability(enough, goal, maximize=False, helpful=False)
+    found = interval_values.reachability(enough, goal, Query(False, False))
     assert found.upper.tolist() == [0, 0, 1]
 
 
@@ -139,9 +136,9 @@ def test_rows_without_a_distribution_are_in_proportion():
     assert Fraction(third) * 3 < 1 and short.lower.tolist() == short.upper.tolist()
     goal = np.arange(3) == 1
     for large in (True, False):
-        found = interval_values.reachability(short, goal, maximize=large, helpful=large)
+        found = interval_values.reachability(short, goal, Query(large, large))
         assert found.lower[0] <= 0.5 <= found.upper[0] <= found.lower[0] + 1e-6
-        assert not short.may_stay(np.array([True, True, False]))[0]
+        assert not short.can_stay_in(np.array([True, True, False]))[0]
     tenths = interval_rows(
         None,
         [0, 3, 4, 5],
@@ -151,7 +148,7 @@ def test_rows_without_a_distribution_are_in_proportion():
         center=[0.7, 0.2, 0.1, 1, 1],
         radius=[0.0, 0, 0],
     ).host
-    found = interval_values.reachability(tenths, goal, maximize=True, helpful=True)
+    found = interval_values.reachability(tenths, goal, Query(True, True))
     assert found.lower[0] <= 2 / 3 <= found.upper[0] <= found.lower[0] + 1e-6
 
 
@@ -174,9 +171,9 @@ def test_distributions_are_settled_to_the_last_digits():
     rng = np.random.default_rng(13)
     for kind in ("firm", "loose", "ball"):
         for _ in range(20):
-            host: HostInterval = tiny_model(rng, kind)
-            p = host.nature(rng.random(host.lower.size), maximize=True)
-            found, able = host.settled(p)
+            host: UncertainMDP = tiny_model(rng, kind)
+            p = host.extreme_distributions(rng.random(host.lower.size), maximize=True)
+            found, able = host.nearest_distributions(p)
             if not able:
                 continue
             for first, last in itertools.pairwise(host.mdp.entry_start):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from jaxltl.core.sparse.interval.l1_ball import l1_expectation
+from jaxltl.core.sparse.interval.uncertainty_set import l1_expectation
 
 
 def by_program(value, center, radius, maximize):

@@ -6,7 +6,10 @@ import pytest
 from jaxltl.core.models.interval import interval_rows
 from jaxltl.core.sparse.graph.accepting import accepting_region
 from jaxltl.core.sparse.interval import reachability as interval_values
+from jaxltl.core.sparse.interval import strategy_iteration
 from jaxltl.core.sparse.interval.parity import parity_against_nature
+from jaxltl.core.sparse.interval.robust_values import Query
+from jaxltl.core.sparse.interval.total_reward import total_reward
 from jaxltl.core.sparse.solvers.reachability import reachability
 from jaxltl.core.values.interval.satisfaction import _largest
 from tests.reference_intervals import chains, optima, parity, random_model, reach, reward
@@ -35,7 +38,7 @@ def test_probabilities(count):
         for (maximize, helpful), value in optima(
             [reach(p, goal) for _, p in chains(model, goal)]
         ).items():
-            found = interval_values.reachability(model, goal, maximize=maximize, helpful=helpful)
+            found = interval_values.reachability(model, goal, Query(maximize, helpful))
             enclosed(found, value)
             checks_out(model, found, goal, maximize, helpful)
 
@@ -44,12 +47,12 @@ def checks_out(model, found, goal, maximize, helpful):
     """Nature's distributions are possible, and prove one bound by themselves."""
     p = found.probability
     assert ((model.lower - 1e-15 <= p) & (p <= model.upper + 1e-15)).all()
-    np.testing.assert_allclose(model.total(p), 1, rtol=1e-14)
+    np.testing.assert_allclose(model.sum_rows(p), 1, rtol=1e-14)
     if maximize == helpful:
-        part, entry = model.chain(found.row)
-        alone = reachability(part.fixed(p[entry]), goal, maximize=True)
+        part, entry = model.under_policy(found.row)
+        alone = reachability(part.resolve(p[entry]), goal, maximize=True)
     else:
-        alone = reachability(model.fixed(p), goal, maximize=maximize)
+        alone = reachability(model.resolve(p), goal, maximize=maximize)
     np.testing.assert_allclose(alone.value, found.value, atol=1e-6)
 
 
@@ -64,7 +67,7 @@ def test_total_rewards(count):
             [reward(p, goal, cost[list(rows)]) for rows, p in chains(model, goal)]
         ).items():
             enclosed(
-                interval_values.total_reward(model, cost, goal, maximize=maximize, large=large),
+                total_reward(model, cost, goal, Query(maximize, large)),
                 value,
             )
 
@@ -92,7 +95,7 @@ def test_nature_that_is_against_a_parity_condition_is_returned():
         found = parity_against_nature(model, priority)
         p = found.probability
         assert ((model.lower - 1e-15 <= p) & (p <= model.upper + 1e-15)).all()
-        mdp = model.fixed(p)
+        mdp = model.resolve(p)
         region = accepting_region(mdp, priority[mdp.state[mdp.row]]).region
         best = reachability(mdp, region, maximize=True)
         np.testing.assert_allclose(best.value, found.value, atol=1e-6)
@@ -100,7 +103,7 @@ def test_nature_that_is_against_a_parity_condition_is_returned():
 
 def test_slow_chains_keep_their_precision():
     """A walk that nature slows down to one step in 10^9 is still proven."""
-    from tests.reference_intervals import HostInterval, HostMDP
+    from tests.reference_intervals import HostMDP, UncertainMDP
 
     eps = 1e-9
     mdp = HostMDP(
@@ -111,11 +114,11 @@ def test_slow_chains_keep_their_precision():
     )
     lower = np.array([0.5, eps, eps, 1, 1])
     upper = np.array([1 - 2 * eps, 3 * eps, 0.5, 1, 1])
-    model = HostInterval(mdp, lower, upper)
+    model = UncertainMDP(mdp, lower, upper)
     goal = np.array([False, True, False])
-    helped = interval_values.reachability(model, goal, maximize=True, helpful=True)
+    helped = interval_values.reachability(model, goal, Query(True, True))
     enclosed(helped, np.array([0.75, 1, 0]))
-    hindered = interval_values.reachability(model, goal, maximize=True, helpful=False)
+    hindered = interval_values.reachability(model, goal, Query(True, False))
     enclosed(hindered, np.array([eps / (0.5 + eps), 1, 0]))
 
 
@@ -125,9 +128,9 @@ def test_ties_and_scales():
     none = np.zeros(6, bool)
     for maximize in (True, False):
         for helpful in (True, False):
-            found = interval_values.reachability(model, none, maximize=maximize, helpful=helpful)
+            found = interval_values.reachability(model, none, Query(maximize, helpful))
             assert (found.upper == 0).all()
-            found = interval_values.reachability(model, ~none, maximize=maximize, helpful=helpful)
+            found = interval_values.reachability(model, ~none, Query(maximize, helpful))
             assert (found.lower == 1).all()
 
 
@@ -146,20 +149,18 @@ def test_a_reward_whose_first_way_there_would_hardly_end():
         np.resize([0.9, 0.15, 0.15], size),
     ).host
     goal = np.arange(n * n) == n * n - 1
-    found = interval_values.total_reward(
-        model, np.ones(4 * n * n), goal, maximize=False, large=True
-    )
+    found = total_reward(model, np.ones(4 * n * n), goal, Query(False, True))
     value = np.zeros(n * n)
     for _ in range(400):
         ahead = value[model.mdp.successor]
-        step = 1 + model.total(model.nature(ahead, maximize=True) * ahead)
+        step = 1 + model.sum_rows(model.extreme_distributions(ahead, maximize=True) * ahead)
         value = np.where(goal, 0, step.reshape(n * n, 4).min(1))
     enclosed(found, value)
 
 
 def test_who_stops_when_bounds_are_near(monkeypatch):
     """Bounds that are looked at in every round enclose the values too."""
-    monkeypatch.setattr(interval_values, "_is_tried", lambda rounds: True)
+    monkeypatch.setattr(strategy_iteration, "_tests_bounds", lambda rounds: True)
     rng = np.random.default_rng(11)
     for _ in range(15):
         model = random_model(rng)
@@ -167,6 +168,4 @@ def test_who_stops_when_bounds_are_near(monkeypatch):
         for (maximize, helpful), value in optima(
             [reach(p, goal) for _, p in chains(model, goal)]
         ).items():
-            enclosed(
-                interval_values.reachability(model, goal, maximize=maximize, helpful=helpful), value
-            )
+            enclosed(interval_values.reachability(model, goal, Query(maximize, helpful)), value)

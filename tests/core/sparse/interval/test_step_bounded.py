@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from jaxltl.core.models.interval import interval_rows
+from jaxltl.core.sparse.interval.robust_values import Query
 from jaxltl.core.sparse.interval.step_bounded import next_step, total, until
 
 
@@ -76,14 +77,14 @@ def test_bounds_hold_the_exact_value(seed):
         policy, nature = (max if x else min for x in (maximize, helpful))
         value = [Fraction(int(x)) for x in target]
         for steps in range(6):
-            found = until(model.host, target, stay, steps, maximize=maximize, helpful=helpful)
+            found = until(model.host, target, stay, steps, Query(maximize, helpful))
             assert_holds(found, value)
             ahead = exact_backup(model, value, policy, nature)
             value = [
                 Fraction(1) if t else a if ok else Fraction(0)
                 for t, ok, a in zip(target, stay, ahead, strict=True)
             ]
-        found = next_step(model.host, target, maximize=maximize, helpful=helpful)
+        found = next_step(model.host, target, Query(maximize, helpful))
         assert_holds(found, exact_backup(model, [Fraction(int(x)) for x in target], policy, nature))
 
 
@@ -102,8 +103,7 @@ def test_bounds_hold_the_exact_reward(seed):
                 earned.astype(float),
                 start.astype(float),
                 steps,
-                maximize=maximize,
-                helpful=helpful,
+                Query(maximize, helpful),
             )
             for approximate, error, true in zip(found.value, found.error, value, strict=True):
                 assert abs(Fraction(float(approximate)) - true) <= Fraction(float(error)) <= 1e-10
@@ -113,12 +113,12 @@ def test_bounds_hold_the_exact_reward(seed):
 def test_a_reward_that_changes_no_more_keeps_its_rounding():
     model = interval_rows(None, [0, 2, 3], [0, 1, 1], [0.25, 0.5, 1], [0.5, 0.75, 1])
     few, many = (
-        total(model.host, np.zeros(3), np.array([0, 1.0]), n, maximize=True, helpful=False)
+        total(model.host, np.zeros(3), np.array([0, 1.0]), n, Query(True, False))
         for n in (2000, 10**9)
     )
     assert few.value.tolist() == many.value.tolist() and many.num_steps < 200
     assert 0 < few.error[0] < many.error[0] < 1e-3
-    nothing = total(model.host, np.zeros(3), np.zeros(2), 10**9, maximize=True, helpful=False)
+    nothing = total(model.host, np.zeros(3), np.zeros(2), 10**9, Query(True, False))
     assert nothing.error.tolist() == [0, 0]
 
 
@@ -136,10 +136,10 @@ def test_what_nature_picks_lies_in_the_intervals_and_attains_the_value():
     for _ in range(20):
         model = random_interval(rng)
         target = np.arange(5) == 0
-        found = until(model.host, target, np.ones(5, bool), 1, maximize=True, helpful=False)
+        found = until(model.host, target, np.ones(5, bool), 1, Query(True, False))
         p = found.probability
         assert ((model.lower <= p) & (p <= model.upper)).all()
-        image = model.host.total(p * target[model.host.mdp.successor])
+        image = model.host.sum_rows(p * target[model.host.mdp.successor])
         attained = np.where(target, 1, image[found.row])
         np.testing.assert_allclose(attained, found.value, atol=1e-15)
         assert (
@@ -151,6 +151,6 @@ def test_what_nature_picks_lies_in_the_intervals_and_attains_the_value():
 def test_many_steps_are_as_few_that_changed_something():
     model = random_interval(np.random.default_rng(1))
     target, stay = np.arange(5) == 2, np.ones(5, bool)
-    found = until(model.host, target, stay, 10**9, maximize=True, helpful=False)
+    found = until(model.host, target, stay, 10**9, Query(True, False))
     assert found.num_steps < 10**4
     assert ((found.error >= 0) & (found.error <= 1)).all()

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from jaxltl.core.sparse.interval.qualitative import decided
-from jaxltl.core.sparse.interval.uncertainty_set import HostInterval
+from jaxltl.core.sparse.interval.qualitative import zero_one_states
+from jaxltl.core.sparse.interval.robust_values import Query
+from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
 from jaxltl.core.sparse.mdp import HostMDP
 from tests.reference_intervals import chains, optima, random_model, reach
 
@@ -22,7 +23,7 @@ def wide_model(rng, most):
         lower.append(np.maximum(p - off, 0))
         upper.append(np.minimum(p + off * rng.random(k), 1))
     lower, upper = np.concatenate(lower), np.concatenate(upper)
-    return HostInterval(HostMDP(np.arange(13), starts, successor, lower), lower, upper)
+    return UncertainMDP(HostMDP(np.arange(13), starts, successor, lower), lower, upper)
 
 
 @pytest.mark.parametrize("most", [3, 8, 60])
@@ -32,9 +33,9 @@ def test_nature_is_extreme(most):
     model = wide_model(rng, most)
     quantity = rng.normal(size=model.lower.size)
     for maximize, sign in ((True, -1), (False, 1)):
-        p = model.nature(quantity, maximize=maximize)
+        p = model.extreme_distributions(quantity, maximize=maximize)
         assert ((model.lower <= p) & (p <= model.upper)).all()
-        np.testing.assert_allclose(model.total(p), 1, rtol=1e-14)
+        np.testing.assert_allclose(model.sum_rows(p), 1, rtol=1e-14)
         for r in range(12):
             of = slice(model.mdp.entry_start[r], model.mdp.entry_start[r + 1])
             bounds = list(zip(model.lower[of], model.upper[of], strict=True))
@@ -46,16 +47,16 @@ def test_nature_is_extreme(most):
 
 def test_decimals_that_add_up_to_one_are_one_if_ends_are_widened():
     """``.1 + .2 + .7`` is less than one in binary; nature may nearly drop the fourth successor."""
-    model = HostInterval(
+    model = UncertainMDP(
         HostMDP(np.array([0, 1]), np.array([0, 4]), np.arange(4), np.full(4, 0.25)),
         np.zeros(4),
         np.array([0.7, 0.2, 0.1, 0.5]),
     )
-    p = model.nature(np.array([0.0, 1.0, 2.0, 3.0]), maximize=False)
+    p = model.extreme_distributions(np.array([0.0, 1.0, 2.0, 3.0]), maximize=False)
     assert p.tolist() == [0.7, 0.2, 0.1, 0.0]
-    assert not model.may_stay(np.array([True, True, True, False])).any()
-    assert model.widened.may_stay(np.array([True, True, True, False])).all()
-    assert not model.widened.may_stay(np.array([True, True, False, False])).any()
+    assert not model.can_stay_in(np.array([True, True, True, False])).any()
+    assert model.enlarged.can_stay_in(np.array([True, True, True, False])).all()
+    assert not model.enlarged.can_stay_in(np.array([True, True, False, False])).any()
 
 
 def test_distributions_within():
@@ -65,9 +66,9 @@ def test_distributions_within():
         model = random_model(rng)
         region = rng.random(4) < 0.6
         entries = region[model.mdp.successor]
-        able = model.may_stay(region)[model.mdp.row]
-        p = model.within(entries)
-        np.testing.assert_allclose(model.total(p), 1, rtol=1e-14)
+        able = model.can_stay_in(region)[model.mdp.row]
+        p = model.interior_distributions(entries)
+        np.testing.assert_allclose(model.sum_rows(p), 1, rtol=1e-14)
         assert ((p <= model.upper + 1e-15) & (p >= model.lower - 1e-15) | ~entries | ~able).all()
         assert (p[able & ~entries] == 0).all()
 
@@ -78,10 +79,10 @@ def test_what_is_certain_is_decided():
     for _ in range(60):
         model = random_model(rng)
         goal = np.arange(4) == rng.integers(4)
-        halted, _ = model.halted(goal)
+        halted, _ = model.with_absorbing(goal)
         for (maximize, helpful), value in optima(
             [reach(p, goal) for _, p in chains(model, goal)]
         ).items():
-            found = decided(halted, goal, maximize=maximize, helpful=helpful)
+            found = zero_one_states(halted, goal, Query(maximize, helpful))
             assert (found.zero == (value < 1e-12)).all()
             assert (found.one == (value > 1 - 1e-12)).all()

@@ -156,7 +156,7 @@ def test_parts_of_interval_models():
     first = np.zeros(model.num_rows, bool)
     first[host.row_start[:-1]] = True
     less = with_allowed(model, first)
-    chain, entry = model.host.chain(host.row_start[:-1])
+    chain, entry = model.host.under_policy(host.row_start[:-1])
     np.testing.assert_array_equal(less.upper, chain.upper)
     np.testing.assert_array_equal(less.lower, model.lower[entry])
     part = restrict(model, np.eye(6)[0], allowed=first)
@@ -322,8 +322,8 @@ def test_discounted_values():
             value = np.zeros(4)
             for _ in range(600):
                 ahead = earned + 0.9 * value[host.successor]
-                p = model.host.nature(ahead, maximize=nature == "max")
-                image = model.host.total(p * ahead)
+                p = model.host.extreme_distributions(ahead, maximize=nature == "max")
+                image = model.host.sum_rows(p * ahead)
                 value = getattr(np, objective + "imum").reduceat(image, host.row_start[:-1])
             found = robust_discounted_value(model, earned, 0.9, objective=objective, nature=nature)
             assert int(found.status) == Status.CONVERGED

@@ -11,10 +11,11 @@ from jaxltl.core.models.interval import interval_rows
 from jaxltl.core.sparse.graph.accepting import accepting_region
 from jaxltl.core.sparse.interval import reachability as interval_values
 from jaxltl.core.sparse.interval import step_bounded as interval_bounded
-from jaxltl.core.sparse.interval.discounted import discounted
-from jaxltl.core.sparse.interval.optimal_face import face_of
-from jaxltl.core.sparse.interval.parity import parity_against_nature
-from jaxltl.core.sparse.interval.qualitative import decided
+from jaxltl.core.sparse.interval.discounted import DiscountedModel, discounted_value
+from jaxltl.core.sparse.interval.parity import optimal_face, parity_against_nature
+from jaxltl.core.sparse.interval.qualitative import zero_one_states
+from jaxltl.core.sparse.interval.robust_values import Query
+from jaxltl.core.sparse.interval.total_reward import total_reward
 from jaxltl.core.sparse.solvers.reachability import reachability
 from jaxltl.core.values.interval.satisfaction import _largest
 from tests.core.sparse.interval.test_reachability import enclosed
@@ -46,10 +47,10 @@ def some_model(rng, i):
 
 def within_ball(model, p):
     """These are distributions of the model."""
-    center, most = model.ball
-    np.testing.assert_allclose(model.total(p), 1, rtol=1e-13)
+    center, most = model.ball.center, model.ball.gain
+    np.testing.assert_allclose(model.sum_rows(p), 1, rtol=1e-13)
     assert ((model.lower - 1e-13 <= p) & (p <= model.upper + 1e-13)).all()
-    assert (model.total(np.abs(p - center)) <= 2 * most + 1e-13).all()
+    assert (model.sum_rows(np.abs(p - center)) <= 2 * most + 1e-13).all()
 
 
 def wide(rng, most):
@@ -80,7 +81,7 @@ def test_nature_is_extreme(most):
     model = wide(rng, most)
     quantity = np.round(rng.normal(size=model.lower.size), 1)  # with ties
     for maximize, sign in ((True, -1), (False, 1)):
-        p = model.nature(quantity, maximize=maximize)
+        p = model.extreme_distributions(quantity, maximize=maximize)
         within_ball(model, p)
         for r in range(12):
             of = slice(model.mdp.entry_start[r], model.mdp.entry_start[r + 1])
@@ -89,7 +90,7 @@ def test_nature_is_extreme(most):
             best = linprog(
                 sign * np.append(quantity[of], none),
                 A_ub=np.block([[one, -one], [-one, -one], [none[None], none[None] + 1]]),
-                b_ub=np.concatenate([center, -center, [2 * model.ball.most[r]]]),
+                b_ub=np.concatenate([center, -center, [2 * model.ball.gain[r]]]),
                 A_eq=np.append(none + 1, none)[None],
                 b_eq=[1],
                 bounds=[*zip(model.lower[of], model.upper[of], strict=True), *[(0, None)] * k],
@@ -107,14 +108,14 @@ def test_supports(count):
         mdp = model.mdp
         entries = rng.random(mdp.num_transitions) < 0.6
         region = rng.random(4) < 0.5
-        may, p = model.may_keep(entries), model.within(entries)
+        may, p = model.can_stay_on(entries), model.interior_distributions(entries)
         must = model.must_enter(np.arange(mdp.num_rows), region)
         within_ball(model, p)
         for r in range(mdp.num_rows):
             of = slice(mdp.entry_start[r], mdp.entry_start[r + 1])
             corners = np.array(
                 ball_vertices(
-                    model.lower[of], model.upper[of], model.ball.center[of], 2 * model.ball.most[r]
+                    model.lower[of], model.upper[of], model.ball.center[of], 2 * model.ball.gain[r]
                 )
             )
             keeps = (corners[:, ~entries[of]] == 0).all(1)
@@ -133,17 +134,17 @@ def test_faces(count):
         model = with_ball(rng, free_model(rng))
         mdp = model.mdp
         rank, entries = rng.integers(0, 2 + rng.integers(2), (2, mdp.num_transitions))
-        face = face_of(model, rank)
+        face = optimal_face(model, rank)
         entries = entries > 0
-        may, p = face.may_keep(entries), face.within(entries)
+        may, p = face.can_stay_on(entries), face.interior_distributions(entries)
         within_ball(model, p)
-        best = model.total(model.nature(rank * 1.0, maximize=False) * rank)
-        np.testing.assert_allclose(model.total(p * rank), best, atol=1e-12)
+        best = model.sum_rows(model.extreme_distributions(rank * 1.0, maximize=False) * rank)
+        np.testing.assert_allclose(model.sum_rows(p * rank), best, atol=1e-12)
         for r in range(mdp.num_rows):
             of = slice(mdp.entry_start[r], mdp.entry_start[r + 1])
             corners = np.array(
                 ball_vertices(
-                    model.lower[of], model.upper[of], model.ball.center[of], 2 * model.ball.most[r]
+                    model.lower[of], model.upper[of], model.ball.center[of], 2 * model.ball.gain[r]
                 )
             )
             corners = corners[np.abs(corners @ rank[of] - best[r]) < 1e-9]
@@ -164,22 +165,22 @@ def test_probabilities_and_rewards(count):
         every = list(chains(model, goal))
         earned = optima([reward(p, goal, cost[list(rows)]) for rows, p in every])
         for (maximize, large), value in optima([reach(p, goal) for _, p in every]).items():
-            found = interval_values.reachability(model, goal, maximize=maximize, helpful=large)
+            found = interval_values.reachability(model, goal, Query(maximize, large))
             enclosed(found, value)
             p = found.probability
             within_ball(model, p)
-            part, entry = model.chain(found.row)
+            part, entry = model.under_policy(found.row)
             alone = (
-                reachability(part.fixed(p[entry]), goal, maximize=True)
+                reachability(part.resolve(p[entry]), goal, maximize=True)
                 if maximize == large
-                else reachability(model.fixed(p), goal, maximize=maximize)
+                else reachability(model.resolve(p), goal, maximize=maximize)
             )
             np.testing.assert_allclose(alone.value, value, atol=1e-6)
-            halted, _ = model.halted(goal)
-            sure = decided(halted, goal, maximize=maximize, helpful=large)
+            halted, _ = model.with_absorbing(goal)
+            sure = zero_one_states(halted, goal, Query(maximize, large))
             np.testing.assert_array_equal(sure.zero, value < 1e-12)
             np.testing.assert_array_equal(sure.one, value > 1 - 1e-12)
-            found = interval_values.total_reward(model, cost, goal, maximize=maximize, large=large)
+            found = total_reward(model, cost, goal, Query(maximize, large))
             enclosed(found, earned[maximize, large])
             within_ball(model, found.probability)
 
@@ -201,7 +202,7 @@ def test_parity(count):
                 enclosed(found, 1 - value)
             within_ball(model, found.probability)
         found = parity_against_nature(model, priority)
-        mdp = model.fixed(found.probability)
+        mdp = model.resolve(found.probability)
         region = accepting_region(mdp, priority[mdp.state[mdp.row]]).region
         best = reachability(mdp, region, maximize=True)
         np.testing.assert_allclose(best.value, found.value, atol=1e-6)
@@ -218,7 +219,9 @@ def test_discounted_and_steps():
         gain = rng.normal(size=mdp.num_transitions)
         rate = np.full(mdp.num_rows, 0.9)
         for maximize, large in DIRECTIONS:
-            found = discounted(model, gain, rate, maximize=maximize, large=large, tolerance=1e-9)
+            found = discounted_value(
+                DiscountedModel(model, gain, rate), Query(maximize, large, tolerance=1e-9)
+            )
             assert (found.upper - found.lower <= 1e-9).all()
             ahead = gain + 0.9 * found.value[mdp.successor]
             np.testing.assert_allclose(
@@ -227,7 +230,7 @@ def test_discounted_and_steps():
             value = goal * 1.0
             for _ in range(3):
                 value = np.where(goal, 1, backup(model, value[mdp.successor], maximize, large))
-            steps = interval_bounded.until(model, goal, ~goal, 3, maximize=maximize, helpful=large)
+            steps = interval_bounded.until(model, goal, ~goal, 3, Query(maximize, large))
             assert (np.abs(steps.value - value) <= steps.error + 1e-15).all()
             np.testing.assert_array_equal(steps.value > 0, value > 0)
 
@@ -239,7 +242,7 @@ def backup(model, ahead, maximize, large):
         of = slice(mdp.entry_start[r], mdp.entry_start[r + 1])
         each = np.array(
             ball_vertices(
-                model.lower[of], model.upper[of], model.ball.center[of], 2 * model.ball.most[r]
+                model.lower[of], model.upper[of], model.ball.center[of], 2 * model.ball.gain[r]
             )
         )
         worth.append((max if large else min)(each @ ahead[of]))

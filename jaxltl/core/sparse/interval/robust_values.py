@@ -1,0 +1,104 @@
+"""Questions to uncertain MDPs, and certified values of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from jaxltl.core.array_types import Floats, Integers
+from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
+from jaxltl.core.sparse.mdp import HostMDP
+
+_EPS = float(np.finfo(np.float64).eps)
+
+
+@dataclass(frozen=True)
+class Query:
+    """Who makes the value large, and how accurately it is enclosed.
+
+    Attributes:
+      maximize: whether the policy maximises the value, else it minimises it.
+      nature_maximizes: whether nature does.
+      tolerance: requested width of the enclosure, of expected rewards relative to the value.
+      depth: roundings behind each number of the model.
+    """
+
+    maximize: bool
+    nature_maximizes: bool
+    tolerance: float = 1e-6
+    depth: int = 0
+
+    @property
+    def cooperative(self) -> bool:
+        """Whether policy and nature want the same."""
+        return self.maximize == self.nature_maximizes
+
+    @property
+    def opposite(self) -> Query:
+        return replace(self, maximize=not self.maximize, nature_maximizes=not self.nature_maximizes)
+
+
+@dataclass(frozen=True)
+class RobustValues:
+    """Certified values of an uncertain MDP, with choices of both sides.
+
+    Attributes:
+      value, lower, upper: ``float64[S]``.
+      row: ``int64[S]``, a policy.
+      probability: ``float64[T]``, nature's distributions.
+      rounds: linear systems solved.
+      residual: by how much the value violates its optimality equation.
+      method: name of the algorithm.
+    """
+
+    value: Floats
+    lower: Floats
+    upper: Floats
+    row: Integers
+    probability: Floats
+    rounds: int
+    residual: float
+    method: str
+
+    def hull(self, other: RobustValues) -> RobustValues:
+        """The same values with bounds that enclose both enclosures."""
+        return replace(
+            self,
+            lower=np.minimum(self.lower, other.lower),
+            upper=np.maximum(self.upper, other.upper),
+        )
+
+    def complement(self) -> RobustValues:
+        """Probabilities of the complement, rounded outwards; 0 and 1 stay exact."""
+        lower, upper = (
+            np.clip(np.where((x == 0) | (x == 1), 1 - x, 1 - x + side * 1e-16), 0, 1)
+            for x, side in ((self.upper, -1), (self.lower, 1))
+        )
+        value = np.clip(1 - self.value, lower, upper)
+        return replace(self, value=value, lower=lower, upper=upper)
+
+
+def differences(model: UncertainMDP, value: Floats) -> Floats:
+    """``x_t - x_s`` of each entry."""
+    mdp = model.mdp
+    return value[mdp.successor] - value[mdp.state[mdp.row]]
+
+
+def row_gains(
+    model: UncertainMDP, value: Floats, cost: Floats, *, nature_maximizes: bool
+) -> tuple[Floats, Floats]:
+    """Gains ``opt_p sum_t p_t (x_t - x_s) + c_r`` of the rows, and nature's distributions."""
+    ahead = differences(model, value)
+    p = model.extreme_distributions(ahead, maximize=nature_maximizes)
+    return model.sum_rows(p * ahead) + cost, p
+
+
+def gain_noise(value: Floats) -> Floats:
+    """Gains that rounding can make."""
+    return 64 * _EPS * (np.abs(value) + np.abs(value).max(initial=0))
+
+
+def distribution_depth(mdp: HostMDP) -> int:
+    """Roundings that may stand behind nature's distributions."""
+    return int(np.diff(mdp.entry_start).max()) + 4

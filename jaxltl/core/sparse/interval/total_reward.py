@@ -1,0 +1,190 @@
+"""Certified expected total rewards of uncertain MDPs until a target is reached."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from jaxltl.core.array_types import Booleans, Floats, Integers
+from jaxltl.core.sparse.graph.qualitative import backward_reachable
+from jaxltl.core.sparse.interval.policy_iteration import Accuracy, PathProblem, enclose_paths
+from jaxltl.core.sparse.interval.qualitative import (
+    almost_sure_states,
+    attracting_rows,
+    joint_end_components,
+    zero_one_states,
+)
+from jaxltl.core.sparse.interval.reachability import METHOD, move_to_exits, without_absorbing
+from jaxltl.core.sparse.interval.robust_values import Query, RobustValues, distribution_depth
+from jaxltl.core.sparse.interval.strategy_iteration import (
+    MDPSolver,
+    Subproblems,
+    improve_nature,
+    improve_policy,
+    under_nature,
+)
+from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
+from jaxltl.core.sparse.mdp import HostMDP
+from jaxltl.core.sparse.rows import offsets_from_counts
+from jaxltl.core.sparse.solvers import reachability as mdp_reachability
+from jaxltl.core.sparse.solvers.total_cost import Enclosure
+
+
+def total_reward(
+    model: UncertainMDP, reward: Floats, target: Booleans, query: Query
+) -> RobustValues:
+    """Optimal expected reward until a target is reached; rewards ``float64[R]`` are at least 0.
+
+    Infinite where the target is not reached almost surely: under every pair of choices of the sides
+    that minimise, and some choice of those that maximise. Where sums of ends within rounding of one
+    decide that, the bounds enclose the values for both readings.
+    """
+    found = _total_reward(model, reward, target, query)
+    wide = model.enlarged
+    if wide is None:
+        return found
+    mine, other = (finite_states(x.with_absorbing(target)[0], target, query) for x in (model, wide))
+    if (mine[0] == other[0]).all():
+        return found
+    return found.hull(_total_reward(wide, reward, target, query))
+
+
+def finite_states(model: UncertainMDP, target: Booleans, query: Query) -> tuple[Booleans, Booleans]:
+    """States with a finite reward ``bool[S]``, and rows that keep it finite ``bool[R]``."""
+    if query.maximize and query.nature_maximizes:
+        one = zero_one_states(model, target, query.opposite).one
+        return one, one[model.mdp.state]
+    return almost_sure_states(model, target, np.ones(target.size, bool), query.opposite)
+
+
+def _total_reward(
+    model: UncertainMDP, reward: Floats, target: Booleans, query: Query
+) -> RobustValues:
+    absorbing, row = model.with_absorbing(target)
+    finite, kept = finite_states(absorbing, target, query)
+    part, origin, entry = _restrict(absorbing, finite, kept)
+    ends = target | ~finite
+    cost = np.where(ends[part.mdp.state], 0, reward[row][origin])
+
+    def fixed_nature(mdp: HostMDP, earned: Floats, maximize: bool) -> Enclosure:
+        depth = query.depth + distribution_depth(mdp)
+        return mdp_reachability.total_reward(
+            mdp, earned, ends, maximize=maximize, tolerance=query.tolerance / 2, depth=depth
+        )
+
+    def joint(some: UncertainMDP, earned: Floats, maximize: bool) -> RobustValues:
+        both = replace(query, maximize=maximize, nature_maximizes=maximize)
+        return _joint(some, earned, ends, both, fixed_nature)
+
+    solve = Subproblems(fixed_nature, joint, cost, Accuracy(query.tolerance, relative=True))
+    if query.cooperative:
+        found = joint(part, cost, query.maximize)
+    elif query.maximize:
+        p = part.interior_distributions(np.ones(part.mdp.num_transitions, bool))
+        found = improve_nature(part, p, solve, nature_maximizes=False)
+    else:
+        found = improve_policy(part, _first_policy(part, ends, solve), solve, maximize=False)
+    value, lower, upper = (
+        np.where(finite, x, np.inf) for x in (found.value, found.lower, found.upper)
+    )
+    # Nature's distributions are arbitrary at infinite values and in rows that are not taken.
+    taken, open_ = np.zeros(absorbing.mdp.num_rows, bool), finite[part.mdp.state]
+    taken[origin[open_]] = True
+    chance = np.where(taken[absorbing.mdp.row], 0, absorbing.mdp.probability)
+    chance[entry[open_[part.mdp.row]]] = found.probability[open_[part.mdp.row]]
+    found = replace(
+        found, value=value, lower=lower, upper=upper, row=origin[found.row], probability=chance
+    )
+    return without_absorbing(model, absorbing, row, target, found)
+
+
+def _joint(
+    model: UncertainMDP, cost: Floats, target: Booleans, query: Query, fixed_nature: MDPSolver
+) -> RobustValues:
+    """Optimal reward where policy and nature cooperate, in a model that ends almost surely."""
+    mdp, up = model.mdp, query.maximize
+    row: Integers = mdp.row_start[:-1].astype(np.int64)
+    chance = mdp.probability.copy()
+    bound, rounds = np.zeros(mdp.num_states), 0
+    pair: Enclosure | None = Enclosure(bound, bound, bound, row, 0, 0.0, "")
+    earning = np.zeros(mdp.num_states, bool)
+    earning[mdp.state[cost > 0]] = True
+    open_ = ~target & (backward_reachable(mdp, earning) if up else True)
+    if open_.any():
+        free = (cost == 0)[mdp.row]
+        components = None if up else joint_end_components(model, open_, free)
+        problem = PathProblem(
+            model=model,
+            open=open_,
+            known=bound,
+            cost=cost,
+            component=np.arange(mdp.num_states) if components is None else components[0].component,
+            maximize=up,
+            depth=query.depth,
+            may_stay=not up,
+        )
+        accuracy = Accuracy(query.tolerance, relative=True)
+        found = enclose_paths(problem, accuracy)
+        bound, rounds = found.beyond, found.rounds
+        pair = found.enclosed(problem, accuracy)
+        row, chance = np.where(open_, found.row, row), found.probability
+        if components is not None and components[0].inside.any():
+            inside, used = components[0].inside, components[1]
+            row, chance = move_to_exits(model, (row, chance), problem.component, inside, used)
+    if pair is None:
+        chain, entry = model.under_policy(row)
+        pair = under_nature(fixed_nature, chain, chance[entry], cost[row], up)
+    low, high = (
+        (pair.lower, np.maximum(bound, pair.lower))
+        if up
+        else (np.minimum(bound, pair.upper), pair.upper)
+    )
+    return RobustValues(
+        pair.value, low, high, row, chance, rounds + pair.rounds, pair.residual, METHOD
+    )
+
+
+def _first_policy(model: UncertainMDP, goal: Booleans, solve: Subproblems) -> Integers:
+    """A policy that reaches a goal almost surely whatever nature picks, cheap where possible.
+
+    Any such policy is correct, but one that arrives by slips alone may take longer than floats
+    resolve.
+    """
+    row = solve.fixed_nature(model.mdp, solve.cost, False).row
+    chain, against = model.under_policy(row)[0], Query(maximize=True, nature_maximizes=False)
+    sure, _ = almost_sure_states(chain, goal, np.ones(goal.size, bool), against)
+    return np.where(sure, row, attracting_rows(model, goal | sure))
+
+
+def _restrict(
+    model: UncertainMDP, inside: Booleans, rows: Booleans
+) -> tuple[UncertainMDP, Integers, Integers]:
+    """The model with some rows, whose entries stay in a set; other states become absorbing.
+
+    Returns the original rows and entries, too.
+    """
+    mdp = model.mdp
+    if inside.all() and rows.all():
+        return model, np.arange(mdp.num_rows), np.arange(mdp.num_transitions)
+    some, first = mdp.first_choice(rows & inside[mdp.state])
+    taken = rows & inside[mdp.state]
+    taken[first[~some]] = True
+    row = np.flatnonzero(taken)
+    starts = offsets_from_counts(np.bincount(mdp.state[row], minlength=mdp.num_states))
+    part, entry = model.select_rows(starts, row)
+    source = part.mdp.state[part.mdp.row]
+    kept = inside[part.mdp.successor] & inside[source]
+    lone = ~some[source]
+    head = np.zeros(entry.size, bool)
+    head[part.mdp.entry_start[:-1]] = True
+    kept = np.where(lone, head, kept)
+    successor = np.where(lone, source, part.mdp.successor)[kept].astype(np.int32)
+    chance = np.where(lone, 1, part.interior_distributions(kept))[kept]
+    lower, upper = (np.where(lone, 1, x)[kept] for x in (part.lower, part.upper))
+    ball = part.ball
+    if ball is not None:
+        ball = replace(ball, center=np.where(lone, 1, ball.center)[kept])
+    width = np.add.reduceat(kept.astype(np.int64), part.mdp.entry_start[:-1])
+    small = HostMDP(starts, offsets_from_counts(width), successor, chance)
+    return UncertainMDP(small, lower, upper, ball), row, entry[kept]
