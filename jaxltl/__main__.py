@@ -9,16 +9,16 @@ from typing import NoReturn
 
 
 def run() -> NoReturn:
-    """Runs the command and ends the process as soon as all is written."""
+    """Runs the command and exits with its status."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _interrupt)
-    # Here, since processes that draw load this file too.
+    # Imports here, since processes that draw load this file too.
     import click
 
-    from jaxltl.app.programs import few_collections
+    from jaxltl.app.compilation import collect_rarely
     from jaxltl.cli import main
 
-    few_collections()
+    collect_rarely()
     status: object = 0
     try:
         status = main(standalone_mode=False)
@@ -28,30 +28,30 @@ def run() -> NoReturn:
     except SystemExit as stop:
         status = stop.code
     except (KeyboardInterrupt, click.Abort):
-        status = _told()
-    except BrokenPipeError:
-        status = 1
-    with contextlib.suppress(OSError):
+        status = _report_interrupt()
+    try:
         sys.stdout.flush()
         sys.stderr.flush()
-    # Else JAX takes most of a second to free its compiled programs one by one.
-    os._exit(status if isinstance(status, int) else 0 if status is None else 1)
+    except BrokenPipeError:  # the reader of a pipe has ended
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        status = 1
+    sys.exit(status if isinstance(status, int) or status is None else 1)
 
 
-_LOST = ("__del__", "_xla_gc_callback")
+_UNSAFE = ("__del__", "_xla_gc_callback")  # exceptions in these functions are lost
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
-    """As usual, but not before what is under way can be interrupted.
+    """Raises KeyboardInterrupt, but not within an import or a finaliser.
 
-    Some imports catch whatever is raised, and modules that are half there then tell of themselves;
-    what is raised while memory is collected is lost.
+    Some imports catch all exceptions and leave half-initialised modules, and exceptions of
+    finalisers are lost; there the interrupt is delayed.
     """
     while frame is not None:
         code = frame.f_code
-        if code.co_filename.startswith("<frozen importlib") or code.co_name in _LOST:
+        if code.co_filename.startswith("<frozen importlib") or code.co_name in _UNSAFE:
             if not hasattr(signal, "setitimer"):
-                os._exit(_told())
+                os._exit(_report_interrupt())
             signal.signal(signal.SIGALRM, _interrupt)
             signal.setitimer(signal.ITIMER_REAL, 0.01)
             return
@@ -59,8 +59,8 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
     raise KeyboardInterrupt
 
 
-def _told() -> int:
-    """Says that the command was interrupted, and returns the status for it."""
+def _report_interrupt() -> int:
+    """Prints a line, and returns the exit status of an interrupted command."""
     with contextlib.suppress(OSError):
         os.write(2, b"interrupted\n")
     return 130

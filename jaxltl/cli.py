@@ -1,6 +1,6 @@
-"""The command line: learn, synthesize, translate formulas, reproduce published figures.
+"""The command line: learning, synthesis, model checking, automata, published figures.
 
-Heavy modules are imported inside the commands, so that the first line comes at once.
+Heavy modules are imported inside the commands, so that their first line is printed at once.
 """
 
 from __future__ import annotations
@@ -22,15 +22,16 @@ import click
 
 import jaxltl
 from jaxltl.app import processes as several
-from jaxltl.app import programs, run_job
-from jaxltl.app.drawing import artist
+from jaxltl.app import compilation, run_job
+from jaxltl.app.reports.drawing import artist
 
 if TYPE_CHECKING:
+    from jaxltl.app.protocols import Job
     from jaxltl.core.automata.automaton import Automaton
 
 
 class _Failure(click.ClickException):
-    """A mistake in what was asked, told in one line."""
+    """An error of usage, reported in one line."""
 
     exit_code = 2
 
@@ -39,7 +40,7 @@ class _Failure(click.ClickException):
 
 
 def _plain_errors(command: Callable[..., None]) -> Callable[..., None]:
-    """Errors meant for people come without a traceback; others are our mistakes and keep it."""
+    """Reports expected errors without a traceback; others are bugs, and keep it."""
 
     @functools.wraps(command)
     def run(*args: Any, **options: Any) -> None:
@@ -59,7 +60,7 @@ def _plain_errors(command: Callable[..., None]) -> Callable[..., None]:
 
 @contextlib.contextmanager
 def _float64() -> Iterator[None]:
-    """Double precision for this command; the library itself leaves JAX's settings alone."""
+    """Double precision for a command; the library itself leaves JAX's settings alone."""
     import jax
 
     # Before JAX 0.8 the context lived in jax.experimental.
@@ -72,21 +73,21 @@ def _float64() -> Iterator[None]:
         yield
 
 
-def _compiling(*, soon: bool) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """For commands that compile, with little effort if the work is short: the option --no-cache."""
+def _compiling(*, fast: bool) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Adds the option --no-cache to a command that compiles; `fast` is for short programs."""
 
     def wrap(command: Callable[..., None]) -> Callable[..., None]:
         @click.option(
             "--no-cache",
             is_flag=True,
-            help="Compile anew, and keep no compiled programs for the next time.",
+            help="Neither read nor write the cache of compiled programs.",
         )
         @functools.wraps(command)
         def run(*args: Any, no_cache: bool, **options: Any) -> None:
-            programs.keep_programs(not no_cache)
-            if soon:
-                programs.compile_soon()
-                programs.one_thread()
+            compilation.use_cache(not no_cache)
+            if fast:
+                compilation.compile_fast()
+                compilation.use_one_thread()
             command(*args, **options)
 
         return run
@@ -95,7 +96,7 @@ def _compiling(*, soon: bool) -> Callable[[Callable[..., None]], Callable[..., N
 
 
 class _Devices(click.ParamType):
-    """How many devices: a number, or all that there are, which is 0."""
+    """A number of devices; 0 for all of them."""
 
     name = "N"
 
@@ -107,35 +108,34 @@ class _Devices(click.ParamType):
         if value.isascii() and value.isdigit() and 0 < int(value) < 2**31:
             return int(value)
         raise _Failure(
-            f"--mesh {value}: give a number of devices, or all; what is not for --mesh "
-            "comes before it."
+            f"--mesh {value}: give a number of devices, or all; other arguments come before --mesh."
         )
 
 
 def _over_devices(command: Callable[..., None]) -> Callable[..., None]:
-    """For commands that can use several devices and processes: which, as one argument."""
+    """Adds the options of devices and processes to a command, as one argument."""
 
     @click.option(
         "--mesh",
         is_flag=False,
         flag_value="all",
         type=_Devices(),
-        help="Use several devices: so many, or all. With srun or mpirun, those of all processes.",
+        help="Number of devices, or all. With srun or mpirun, those of all processes.",
     )
     @click.option(
         "--coordinator",
         metavar="HOST:PORT",
-        help="Without such a launcher: where process 0 is met.",
+        help="Address of process 0, without such a launcher.",
     )
-    @click.option("--process", type=click.IntRange(0), metavar="I", help="Which process this is.")
-    @click.option("--processes", type=click.IntRange(1), metavar="N", help="Of how many.")
+    @click.option("--process", type=click.IntRange(0), metavar="I", help="Number of this process.")
+    @click.option("--processes", type=click.IntRange(1), metavar="N", help="Number of processes.")
     @click.option(
         "--wait",
         default=several.WAIT,
         show_default=True,
         metavar="SECONDS",
         type=click.FloatRange(1, 86400),
-        help="How long another process may be silent, at the start and later.",
+        help="Time after which a silent process is reported, at the start and later.",
     )
     @functools.wraps(command)
     def run(
@@ -154,12 +154,12 @@ def _over_devices(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def _say(text: str) -> None:
-    """A line on how far the work is, which is no part of the result."""
+    """Prints a line of progress to standard error."""
     click.echo(text, err=True)
 
 
 def _begin(text: str) -> None:
-    """The first line, before anything is imported that takes long."""
+    """Prints the first line, before slow imports."""
     _say(_first_line(text))
 
 
@@ -167,8 +167,8 @@ def _first_line(text: str) -> str:
     return f"jaxltl {jaxltl.__version__}: {text}"
 
 
-def _first_says(launch: several.Launch) -> Callable[[str], None]:
-    """:func:`_say` in the first of several processes, in which alone it is of use."""
+def _say_once(launch: several.Launch) -> Callable[[str], None]:
+    """:func:`_say` in the first of several processes, and nothing in others."""
     return _say if launch.process == 0 else lambda text: None
 
 
@@ -179,7 +179,7 @@ def _print_json(result: Any) -> None:
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(jaxltl.__version__, prog_name="jaxltl")
 def main() -> None:
-    """Learn policies that are known to do their task."""
+    """Policies with certified guarantees for temporal-logic tasks."""
 
 
 @main.command()
@@ -193,12 +193,12 @@ def main() -> None:
     default=1,
     show_default=True,
     type=click.IntRange(1),
-    help="Learn with this many seeds side by side and keep the best.",
+    help="Number of seeds, which learn in parallel; the best is kept.",
 )
-@click.option("--again", is_flag=True, help="Do it again where it is done already.")
+@click.option("--again", is_flag=True, help="Repeat a finished run.")
 @click.option("--json", "as_json", is_flag=True, help="End with the result as one JSON line.")
 @_over_devices
-@_compiling(soon=True)
+@_compiling(fast=True)
 @_plain_errors
 def learn(
     task_file: Path,
@@ -209,66 +209,69 @@ def learn(
     as_json: bool,
     asked: several.Asked,
 ) -> None:
-    """Learn a policy for a task, and say how well it does it.
+    """Learn a policy for a formula, and certify its satisfaction probability.
 
-    Writes policy.npz, result.json, report.html and pictures; by method = "todirl", the learned
-    network.npz and the policies of the training worlds. With an environment in [world], a network
-    is learned in simulations and judged by fresh ones. An interrupted run goes on where it
-    stopped when it is started again with the same task and options.
+    Writes policy.npz, result.json, report.html and pictures; with method = "todirl", the learned
+    network.npz and the policies of the training worlds. With an environment in [world], a policy
+    network is learned in simulated episodes and evaluated by fresh ones. An interrupted run
+    resumes when it is started again with the same task and options.
 
-    With --mesh the seeds lie over devices, also over those of several processes, each of which is
-    started with the same arguments; see docs/devices.md.
+    With --mesh the seeds are distributed over devices, also over those of several processes, each
+    of which is started with the same arguments; see docs/devices.md.
     """
     launch = several.launched(asked)
-    say = _first_says(launch)
+    say = _say_once(launch)
     say(_first_line(f"learning from {task_file}"))
-    # Of several processes none has others of its own, which could outlive it.
-    apart = programs.is_alone() and launch.processes == 1
-    # Before anything else, so that it can load.
+    # No subprocesses of several processes: they could outlive them.
+    apart = compilation.is_fresh() and launch.processes == 1
+    # First, so that matplotlib is imported in the background.
     with artist(apart=apart) as begin, several.taking_part(asked, launch, say) as place:
         job = place.together(lambda: run_job.job_of(task_file))
+        from jaxltl.app.job import fingerprint
+
         task = place.together(lambda: job.read_task(task_file))
         out = _place(out, task.name)
         with _precision(job):
-            mark = job.fingerprint(task, seed, seeds)
+            mark = fingerprint(task, seed, seeds)
             place.agree(
                 {
                     "--out": out,
                     "--seed": seed,
                     "--seeds": seeds,
                     "--again": again,
-                    "as job the task and versions": mark,
+                    "the task or versions": mark,
                 }
             )
             result = None if again else run_job.finished(out, mark)
             done = place.sees(f"{out}/result.json", result is not None)
+            request = run_job.Request(out, seed, seeds, mark)
             result = result or run_job.run_job(
-                job, task, out, (seed, seeds), mark, begin, say, place
+                job, task, request, run_job.Console(begin, say, place)
             )
     if not place.is_first or result is None:
         return
-    click.echo(run_job.report_of(result).table(result))
+    click.echo(job.report.table(result))
     click.echo(
-        f"\n{'done before: see' if done else 'wrote'} {out}/report.html and the files "
-        f"beside it{'; --again does it again' if done else ''}"
+        f"\n{'finished before: see' if done else 'wrote'} {out}/report.html and the files "
+        f"beside it{'; --again repeats it' if done else ''}"
     )
     if as_json:
         _print_json(result)
 
 
-def _precision(job: Any) -> contextlib.AbstractContextManager[None]:
-    """Double for solvers; what others have written for simulators is for single precision."""
+def _precision(job: Job[Any, Any, Any]) -> contextlib.AbstractContextManager[None]:
+    """Double precision for solvers; simulators are written for single precision."""
     return _float64() if job.DOUBLE else contextlib.nullcontext()
 
 
 @main.command()
 @click.argument("task_file", metavar="TASK.toml", type=click.Path(path_type=Path))
-@_compiling(soon=True)
+@_compiling(fast=True)
 @_plain_errors
 def check(task_file: Path) -> None:
-    """Check a task or game file and all that it names, without learning."""
+    """Check a task or game file and the files that it names, without learning."""
     _begin(f"checking {task_file}")
-    from jaxltl.app.files.tables import read_toml
+    from jaxltl.app.files.schema import read_toml
 
     if "game" in read_toml(task_file, "the file")[0]:
         from jaxltl.app.files import game
@@ -276,7 +279,7 @@ def check(task_file: Path) -> None:
         file = game.read_game(task_file)
         world = game.load_game(file)
         play, _ = game.load_objective(file, world)
-        click.echo(f"ok: {world.game.num_states} states, {play.num_states} with the task's memory")
+        click.echo(f"ok: {world.game.num_states} states, {play.num_states} in the product")
         return
     job = run_job.job_of(task_file)
     with _precision(job):
@@ -295,23 +298,22 @@ def check(task_file: Path) -> None:
     type=int,
     metavar="ROW COLUMN",
     help="The cell of the environment's robot in moves.svg, from 1.  "
-    "[default: where the strategy forbids most]",
+    "[default: the cell where the strategy forbids most moves]",
 )
 @click.option("--json", "as_json", is_flag=True, help="End with the result as one JSON line.")
-@_compiling(soon=True)
+@_compiling(fast=True)
 @_plain_errors
 def synthesize(
     game_file: Path, out: Path | None, environment: tuple[int, int] | None, as_json: bool
 ) -> None:
-    """Find who wins a game from where, and all the ways to win that one strategy can hold.
+    """Solve a game: winning region, permissive strategy, and counter-strategy.
 
-    Prints the winning region, a permissive strategy of the system, which allows many moves and
-    wins whichever it makes, what an independent check says of them, and a play that the
-    environment wins where it does. Writes strategy.npz, counter_strategy.npz, result.json,
-    report.html and pictures, those that there are.
+    Prints the winning region, a permissive strategy of the system, with which any choice among its
+    moves wins, the result of an independent check, and a play that the environment wins, if there
+    is one. Writes strategy.npz, counter_strategy.npz, result.json, report.html and pictures.
 
-    The exit status is 0 whoever wins; 2 for mistakes, and for a task that is unrealizable from
-    every initial state where the file demands a strategy by a table [strategy].
+    The exit status is 0 for either winner; 2 for errors, and for a task that is unrealizable from
+    every initial state if the file demands a strategy by a table [strategy].
     """
     begin = time.perf_counter()
     _begin(f"solving {game_file}")
@@ -322,7 +324,7 @@ def synthesize(
 
     file = read_game(game_file)
     out = run_job.make_directory(_place(out, file.name))
-    # A place that cannot be written to must be known before the work, not after.
+    # Before the work, since the directory may not be writable.
     with atomic_write(out / "game.toml") as copy:
         copy.write(game_file.read_bytes())
     with _float64(), _stages(synthesis.STAGES) as progress:
@@ -336,24 +338,24 @@ def synthesize(
         _print_json(written)
     if not report.is_confirmed(written):
         raise _Failure(
-            "the independent check refutes the result, which is a mistake of jaxltl; "
+            "the independent check refutes the result, which is a bug of jaxltl; "
             "please report it with the game file."
         )
     synthesis.demand(found)
 
 
 def _place(out: Path | None, name: str) -> Path:
-    """The directory for results, which may still have to be made."""
+    """The directory of results."""
     return out or Path("out") / name.replace(" ", "_")
 
 
 @contextlib.contextmanager
 def _stages(names: tuple[str, ...]) -> Iterator[Callable[[str], None]]:
-    """A progress bar over named stages, which shows itself if they take long."""
+    """A progress bar over named stages, shown after a second."""
     from tqdm import tqdm
 
     form = "{desc} {bar} {elapsed}"
-    # disable=None: none where standard error is no terminal.
+    # disable=None hides the bar if standard error is no terminal.
     with tqdm(total=len(names), leave=False, delay=1, bar_format=form, disable=None) as bar:
 
         def begin(name: str) -> None:
@@ -377,7 +379,7 @@ def _write_synthesis(found: Any, out: Path, place: int | None, begin: float) -> 
     for name, content in (*pictures, ("report.html", text.encode())):
         with atomic_write(out / name) as file:
             file.write(content)
-    # Last, so that its presence says that all the rest is there.
+    # Last, so that its presence implies that all other files are complete.
     with atomic_write(out / "result.json") as file:
         file.write((json.dumps(result, indent=2, allow_nan=False) + "\n").encode())
     return result
@@ -404,7 +406,7 @@ def _write_synthesis(found: Any, out: Path, place: int | None, begin: float) -> 
     default="auto",
     show_default=True,
     type=click.Choice(["auto", "dfa", "buchi", "parity"]),
-    help="What an automaton accepts by: auto takes the simplest that the language has.",
+    help="Acceptance condition; auto takes the simplest one of the language.",
 )
 @_plain_errors
 def automaton(
@@ -481,21 +483,21 @@ def _render(result: Automaton, form: str, formula: str) -> str:
     "--strategy",
     type=click.Path(path_type=Path),
     metavar="FILE",
-    help="Write the strategies that attain the values to this file, as JSON.",
+    help="File for optimal strategies, as JSON.",
 )
 @click.option(
     "--tolerance",
     default=1e-6,
     show_default=True,
     type=click.FloatRange(0, 1, min_open=True),
-    help="The width of the bounds: absolute of probabilities, else relative.",
+    help="Width of the bounds: absolute for probabilities, else relative.",
 )
 @click.option("--json", "as_json", is_flag=True, help="End with the results as one JSON line.")
 @click.option(
     "--checkpoint",
     type=click.Path(path_type=Path),
     metavar="DIRECTORY",
-    help="With --mesh: keep the bounds of long solves here, and go on from them.",
+    help="With --mesh: directory of checkpoints, from which long solves resume.",
 )
 @_over_devices
 @_plain_errors
@@ -514,14 +516,14 @@ def solve(
     'R{"time"}min=? [ C<=10 ]', 'P>=0.9 [ G !"crash" ]', or any formula of linear temporal logic in
     P; or it is a file of properties that ends in .props, .prop or .pctl. See docs/solve.md.
 
-    Values are those of the initial states. The exit status is 0 where all were solved, 1 where
-    some value did not converge or threshold was not decided, 2 for mistakes in what was asked.
+    Values are those of the initial states. The exit status is 0 if all properties are solved, 1 if
+    some value did not converge or some threshold is undecided, 2 for errors of usage.
 
-    With --mesh the model lies over devices, also over those of several processes, each of which is
-    started with the same arguments; see docs/devices.md.
+    With --mesh the model is distributed over devices, also over those of several processes, each of
+    which is started with the same arguments; see docs/devices.md.
     """
     launch = several.launched(asked)
-    say = _first_says(launch)
+    say = _say_once(launch)
     say(_first_line(f"solving {model_file}"))
     for option, given, with_mesh in (
         ("--strategy", strategy, False),
@@ -530,7 +532,7 @@ def solve(
         if given is not None and (asked.mesh is not None) != with_mesh:
             raise ValueError(f"{option} goes {'with' if with_mesh else 'without'} --mesh alone.")
     if asked.mesh is not None:
-        programs.keep_programs(True)
+        compilation.use_cache(True)
     from jaxltl.app import solve as solving
 
     questions = solving.asked_for(properties)
@@ -538,7 +540,7 @@ def solve(
         raise ValueError("\n".join(str(one.error) for one in questions))
     from jaxltl.algos.common.checkpoint import atomic_write
 
-    # A place that cannot be written to must be known before the work, not after.
+    # Before the work, since the directory may not be writable.
     written = contextlib.nullcontext() if strategy is None else atomic_write(strategy)
     double = contextlib.nullcontext if asked.mesh is None else _float64
     with written as file, several.taking_part(asked, launch, say) as place, double():
@@ -578,16 +580,18 @@ def solve(
 @click.argument("log", metavar="LOG", type=click.Path(path_type=Path))
 @click.argument("formula")
 @click.option("--confidence", required=True, type=float, help="In (0, 1), such as 0.95.")
-@click.option("--initial", multiple=True, metavar="STATE", help="Where runs start.")
-@click.option("--terminal", multiple=True, metavar="STATE", help="Where they stay.")
-@click.option("--labels", type=click.Path(path_type=Path), help="A table of states and labels.")
-@click.option("--model", type=click.Path(path_type=Path), help="A model file that has the graph.")
+@click.option("--initial", multiple=True, metavar="STATE", help="Initial state.")
+@click.option("--terminal", multiple=True, metavar="STATE", help="State where episodes end.")
+@click.option("--labels", type=click.Path(path_type=Path), help="Table of states and labels.")
+@click.option(
+    "--model", type=click.Path(path_type=Path), help="Model file with the transition graph."
+)
 @click.option(
     "--graph",
     type=click.Choice(["seen", "complete"]),
     default="seen",
     show_default=True,
-    help="Whether other transitions than those seen are possible.",
+    help="Assumption on possible transitions: those in the log, or all.",
 )
 @click.option(
     "--method",
@@ -595,8 +599,8 @@ def solve(
     show_default=True,
     type=click.Choice(["anytime", "clopper-pearson", "hoeffding", "weissman"]),
 )
-@click.option("--min", "smallest", is_flag=True, help="Make the probability small.")
-@click.option("--policy", type=click.Path(path_type=Path), help="Write the policy, as JSON.")
+@click.option("--min", "smallest", is_flag=True, help="Minimise the probability.")
+@click.option("--policy", type=click.Path(path_type=Path), help="File for the policy, as JSON.")
 @click.option(
     "--curve",
     type=click.Path(path_type=Path),
@@ -615,10 +619,10 @@ def certify(
     as_json: bool,
     **world: Any,
 ) -> None:
-    """A policy for a formula from logged transitions, and what is guaranteed of it.
+    """Learn a policy from logged transitions, with a guaranteed satisfaction probability.
 
     LOG is a table with the columns state, action and next; see docs/data.md. The exit status is 1
-    where the bounds could not be made narrow, 2 for mistakes in what was asked.
+    if the solver's bounds did not converge, 2 for errors of usage.
     """
     _begin(f"certifying {formula!r} from {log}")
     from jaxltl.app import certify as app
@@ -630,10 +634,10 @@ def certify(
 
 _EXPERIMENTS = {
     "mlirl": "section 2.5, inverse reinforcement learning with a temporal-logic task",
-    "todirl": "section 3.5, reward networks that plan in worlds never seen",
-    "synthesis": "chapter 5, permissive strategies and learning inside them",
-    "pac": "section 6.7, learning with a guarantee while winning almost surely",
-    "cce": "section 4.5, search under constraints, beside TRPO and CPO",
+    "todirl": "section 3.5, reward networks that transfer to new worlds",
+    "synthesis": "chapter 5, permissive strategies, and learning under them",
+    "pac": "section 6.7, PAC learning under almost-sure winning strategies",
+    "cce": "section 4.5, constrained cross-entropy search, beside TRPO and CPO",
 }
 
 
@@ -642,24 +646,24 @@ _EXPERIMENTS = {
 @click.option(
     "--out",
     type=click.Path(path_type=Path),
-    help="Directory for the pictures, if there are any.  [default: out/reproduce]",
+    help="Directory of the pictures.  [default: out/reproduce]",
 )
 @click.option(
     "--seeds",
     type=click.IntRange(1),
-    help="How often learning is repeated, in todirl, pac and cce.  [default: 10; in cce "
+    help="Number of seeds, in todirl, pac and cce.  [default: 10; in cce "
     "50 for the regulator, 5 for the robot]",
 )
 @click.option("--json", "as_json", is_flag=True, help="End with the figures as one JSON line.")
-@_compiling(soon=False)
+@_compiling(fast=False)
 @_plain_errors
 def reproduce(what: str, out: Path | None, seeds: int | None, as_json: bool) -> None:
-    """Print published figures beside ours."""
+    """Print published figures beside measured ones."""
     _begin(f"reproducing {what}")
     experiment = importlib.import_module(f"jaxltl.reproduce.{what}")
     options = {} if seeds is None else {"seeds": seeds}
     if seeds is not None and "seeds" not in inspect.signature(experiment.figures).parameters:
-        raise ValueError(f"reproduce {what} does not learn with several seeds; leave --seeds out.")
+        raise ValueError(f"reproduce {what} has no seeds; leave --seeds out.")
     with _float64():
         result = experiment.figures(progress=_say, **options)
         pictures = experiment.pictures(result) if hasattr(experiment, "pictures") else []

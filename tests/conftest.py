@@ -22,7 +22,7 @@ from pathlib import Path
 import jaxlib
 import pytest
 
-from jaxltl.app.programs import keep_all_programs, known_flags
+from jaxltl.app.compilation import cache_all_programs, xla_flags
 
 _HASTE = {
     "xla_backend_optimization_level": "0",
@@ -47,10 +47,10 @@ def _cache() -> Path | None:
 
 # Before JAX reads them; workers and subprocesses inherit them.
 if "XLA_FLAGS" not in os.environ:
-    os.environ["XLA_FLAGS"] = known_flags(_HASTE)
+    os.environ["XLA_FLAGS"] = xla_flags(_HASTE)
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ and (place := _cache()):
     os.environ["JAX_COMPILATION_CACHE_DIR"] = str(place)
-keep_all_programs()
+cache_all_programs()
 
 import jax  # noqa: E402
 

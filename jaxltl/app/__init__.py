@@ -1,1 +1,1 @@
-"""What the command line does, one module a job."""
+"""Jobs of the command line, one module for each."""

@@ -1,4 +1,4 @@
-"""From a log to a certified policy: what `jaxltl certify` does, without compiling anything."""
+"""Certified policies from logs of transitions: the command ``jaxltl certify``."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from jaxltl.core.values.evaluation.data_guarantee import (
     learn_guarantee,
 )
 
-SHOWN = 5  # choices where more samples help
-DIGITS = 5  # of bounds: solvers find them within 1e-6
+SHOWN = 5  # choices for which more samples are recommended
+DIGITS = 5  # of printed bounds, which solvers compute to 1e-6
 POINTS = 13  # of a curve
 PICTURES = (".svg", ".png", ".pdf")
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a log shows of a world.
+    """A model and its transition counts.
 
     Attributes:
-      model: the world; its probabilities are frequencies, or those of a given model.
-      counts: ``int64[T]``, beside its entries.
-      states, actions: the names of states, and of each choice's action.
+      model: its probabilities are frequencies, or those of a given model.
+      counts: ``int64[T]``, of the model's entries.
+      states, actions: names of states, and of each choice's action.
     """
 
     model: SparseMDP
@@ -47,11 +47,11 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Asked:
-    """What is to be certified.
+    """A question: the formula, and the confidence of the answer.
 
     Attributes:
-      formula: the task.
-      confidence, method: of the sets.
+      formula: of linear temporal logic.
+      confidence, method: of the confidence sets.
       objective: ``"max"`` or ``"min"``.
     """
 
@@ -71,13 +71,13 @@ def read_evidence(
     graph: str = "seen",
     option: str = "--{} ",
 ) -> Evidence:
-    """A log, with its world: a given model, or one that is made of what was counted.
+    """The transition counts of a log, with a given model or one of the log's frequencies.
 
     Args:
       log, labels, model: files.
       initial, terminal: names of states.
-      graph: what is known of successors; see :func:`~jaxltl.core.models.construct.counts.model_from_counts`.
-      option: how an option stands where it was given, for messages.
+      graph: assumption on successors; see :func:`~jaxltl.core.models.construct.counts.model_from_counts`.
+      option: format of an option's name in errors.
 
     Returns:
       :class:`Evidence`.
@@ -100,7 +100,7 @@ def read_evidence(
             )
         return _named(given, align_counts(given, read_log(log, given)))
     if not initial:
-        raise ValueError(f"name the state in which runs start: {option.format('initial')}STATE.")
+        raise ValueError(f"name the initial state: {option.format('initial')}STATE.")
     counts = read_log(log)
     for what, names in (("initial", initial), ("terminal", terminal)):
         unknown = [x for x in names if x not in counts.states]
@@ -136,17 +136,17 @@ def _named(model: SparseMDP, counts: np.ndarray) -> Evidence:
 
 
 def certify(evidence: Evidence, asked: Asked) -> DataGuarantee:
-    """What the log guarantees, by :func:`~jaxltl.core.values.evaluation.data_guarantee.learn_guarantee`.
+    """The guarantee of a log, by :func:`~jaxltl.core.values.evaluation.data_guarantee.learn_guarantee`.
 
     Args:
       evidence: of :func:`read_evidence`.
-      asked: the formula, and with which confidence.
+      asked: the formula and the confidence.
 
     Returns:
       :class:`~jaxltl.core.values.evaluation.data_guarantee.DataGuarantee`.
 
     Raises:
-      ValueError: an unknown label, or a confidence that is none.
+      ValueError: an unknown label, or an invalid confidence.
 
     Example:
       >>> import tempfile
@@ -170,18 +170,18 @@ def certify(evidence: Evidence, asked: Asked) -> DataGuarantee:
 
 
 def text(evidence: Evidence, asked: Asked, found: DataGuarantee, seconds: float) -> str:
-    """The guarantee for people."""
+    """The guarantee as text."""
     side, other = (">=", "more") if asked.objective == "max" else ("<=", "less")
     lines = [
         f"P {side} {_outward(found.bound, side == '<=')} with confidence {found.confidence:g}",
-        f"  of {asked.formula!r}, under the policy found; none has {other} than "
+        f"  of {asked.formula!r}, under the policy found; no policy has {other} than "
         f"{_outward(found.optimistic, side == '>=')}",
         f"  {int(evidence.counts.sum())} transitions of {evidence.model.num_rows} choices in "
         f"{evidence.model.num_states} states, {found.sets.num_claims} claims of {asked.method}",
     ]
     status = Status(int(found.satisfaction.solution.status))
     if status != Status.CONVERGED:
-        lines.append(f"  the bounds could not be made narrow ({status.name})")
+        lines.append(f"  the solver's bounds did not converge ({status.name})")
     for row in most_helpful(found):
         lines.append(
             f"  more samples of {evidence.actions[row]} in {_state(evidence, row)} "
@@ -191,13 +191,13 @@ def text(evidence: Evidence, asked: Asked, found: DataGuarantee, seconds: float)
 
 
 def _outward(bound: float, up: bool) -> str:
-    """A bound in digits that claim no more than it does."""
+    """A bound, rounded outward."""
     context = Context(prec=DIGITS, rounding=ROUND_CEILING if up else ROUND_FLOOR)
     return f"{float(context.create_decimal(float(bound))):.{DIGITS}g}"
 
 
 def most_helpful(found: DataGuarantee) -> list[int]:
-    """The choices where more samples help, the most first."""
+    """The choices for which more samples raise the guarantee, in decreasing order."""
     order = np.argsort(-found.gain, kind="stable")[:SHOWN]
     return [int(r) for r in order if found.gain[r] > 1e-12]
 
@@ -226,7 +226,7 @@ def entry(evidence: Evidence, asked: Asked, found: DataGuarantee, seconds: float
 
 
 def sample_next(evidence: Evidence, found: DataGuarantee) -> list[dict[str, Any]]:
-    """Where more samples help, the most first, as JSON objects."""
+    """:func:`most_helpful` as JSON objects."""
     return [
         {
             "state": _state(evidence, r),
@@ -239,7 +239,7 @@ def sample_next(evidence: Evidence, found: DataGuarantee) -> list[dict[str, Any]
 
 
 def policy_file(evidence: Evidence, asked: Asked, found: DataGuarantee) -> bytes:
-    """The policy as JSON: what to do in a state with a memory, which letters update."""
+    """The policy as JSON: an action for each state and memory state, and the memory's update."""
     of = found.satisfaction
     product, automaton = of.product, of.automaton
     rows = np.asarray(of.solution.policy)
@@ -274,7 +274,7 @@ def policy_file(evidence: Evidence, asked: Asked, found: DataGuarantee) -> bytes
 
 
 def curve(evidence: Evidence, asked: Asked) -> tuple[list[int], list[float]]:
-    """The bound over the number of samples, in one random order of the log."""
+    """The guarantee by number of samples, for one random order of the log."""
     total = int(evidence.counts.sum())
     sizes = np.unique(np.geomspace(max(total / 10**3, 1), max(total, 1), POINTS).astype(int))
     bound = guarantee_curve(
@@ -304,9 +304,9 @@ def certify_and_write(
     as_json: bool,
     say: Callable[[str], None],
 ) -> bool:
-    """The whole command; whether some bound could not be made narrow.
+    """Runs the command; returns whether some bound did not converge.
 
-    Places that cannot be written to are known before the work, not after.
+    Opens its output files first, since they may not be writable.
     """
     from jaxltl.algos.common.checkpoint import atomic_write
 

@@ -1,4 +1,4 @@
-"""The environment that a task file names, made by a function that is imported only then."""
+"""Environments that task files name, by importing and calling their functions."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from jaxltl.app.files.tables import errors_in
+from jaxltl.app.files.schema import errors_in
 from jaxltl.app.files.task_environment import EnvironmentTask
 from jaxltl.core.environments.environment import Environment, make_environment
 from jaxltl.core.environments.time_limit import with_time_limit
 
-OWN = {
+BUILT_IN = {
     "flat_world": "jaxltl.envs.flat_world:flat_world",
     "letter_world": "jaxltl.envs.letter_world:letter_world",
     "zone_world": "jaxltl.envs.zone_world:zone_world",
 }
-# Of each package, the module and the function that make what its adapter takes.
+# By package, the module and function that make the argument of its adapter.
 PACKAGES = {
     "brax": ("brax.envs", "get_environment"),
     "craftax": ("craftax.craftax_env", "make_craftax_env_from_name"),
@@ -34,30 +34,26 @@ PACKAGES = {
 
 
 def load_environment(task: EnvironmentTask, world: Environment | None = None) -> Environment:
-    """The world of a task file, with its labels, and truncated at its horizon if it gives one.
+    """The environment of a task file, with its labels and its horizon.
 
     Args:
       task: the file.
-      world: in place of what the file names; then nothing is imported.
+      world: in place of the one that the file names; then nothing is imported.
 
     Raises:
-      ValueError: what is named is not there, fails, or returns no environment. The message names
-        the file, the table and the key.
+      ValueError: a function is missing, fails, or returns no environment; names the file, the
+        table and the key.
     """
-    spec, folder = task.world, task.path.parent
+    table, folder = task.world, task.path.parent
     if world is None:
         with errors_in(f"{task.path}: [world] labels: "):
-            labels = _function(spec["labels"], folder) if "labels" in spec else None
+            labels = None if table.labels is None else _function(table.labels, folder)
         with errors_in(f"{task.path}: [world] environment: "):
             world = _made(
-                spec["environment"],
-                spec.get("arguments", {}),
-                folder,
-                labels,
-                spec.get("propositions", ()),
+                table.environment, table.arguments, folder, labels, table.propositions or []
             )
     with errors_in(f"{task.path}: [world] "):
-        return with_time_limit(world, spec["horizon"]) if "horizon" in spec else world
+        return world if table.horizon is None else with_time_limit(world, table.horizon)
 
 
 def _made(
@@ -70,12 +66,12 @@ def _made(
     root, _, rest = name.partition(":")
     if root in PACKAGES and rest:
         return _of_package(root, rest, arguments, labels, propositions)
-    function = _function(OWN.get(name, name), folder)
+    function = _function(BUILT_IN.get(name, name), folder)
     try:
         inspect.signature(function).bind(**arguments)
     except TypeError as problem:
         raise ValueError(f"{name!r} does not take [world.arguments]: {problem}.") from None
-    with _theirs(name):
+    with _user_errors(name):
         found = function(**arguments)
     if not isinstance(found, Environment):
         raise ValueError(
@@ -84,7 +80,7 @@ def _made(
         )
     if labels is None:
         return found
-    with _theirs("labels"):
+    with _user_errors("labels"):
         return make_environment(
             found.reset,
             found.step,
@@ -103,7 +99,7 @@ def _made(
 def _of_package(
     root: str, name: str, arguments: Mapping[str, Any], labels: Any, propositions: Any
 ) -> Environment:
-    """One of another package, by its adapter."""
+    """An environment of another package, by its adapter."""
     adapters = importlib.import_module(f"jaxltl.envs.adapters.{root}")
     module, function = PACKAGES[root]
     try:
@@ -115,17 +111,17 @@ def _of_package(
     extra = {"auto_reset": False} if root == "craftax" else {}
     adapter = getattr(adapters, f"from_{root}")
     ours = {x: arguments[x] for x in inspect.getfullargspec(adapter).kwonlyargs if x in arguments}
-    with _theirs(f"{root}:{name}"):
+    with _user_errors(f"{root}:{name}"):
         made = make(name, **extra, **{k: v for k, v in arguments.items() if k not in ours})
         pair = made if isinstance(made, tuple) else (made,)
         return adapter(*pair, **ours | {"labels": labels, "propositions": propositions})
 
 
 def _function(name: str, folder: Path) -> Callable[..., Any]:
-    """What ``"package.module:function"`` or ``"file.py:function"`` names."""
+    """The function of a name ``"package.module:function"`` or ``"file.py:function"``."""
     place, _, attribute = name.rpartition(":")
     if not place or not attribute.isidentifier():
-        known = ", ".join((*OWN, *(f"{p}:NAME" for p in PACKAGES)))
+        known = ", ".join((*BUILT_IN, *(f"{p}:NAME" for p in PACKAGES)))
         raise ValueError(
             f'{name!r} names no function; write "package.module:function", "file.py:function" '
             f"for a file beside the task file, or one of {known}."
@@ -164,11 +160,11 @@ def _module(name: str) -> Any:
             'the task file, "file.py:function".'
         ) from None
     except (Exception, SystemExit) as problem:
-        raise ValueError(_told(name, problem)) from problem
+        raise ValueError(_error_line(name, problem)) from problem
 
 
 def _module_of_file(path: Path) -> Any:
-    """A file as a module, which finds its neighbours while it is read."""
+    """Imports a file, with its directory on the module path."""
     if not path.is_file():
         raise ValueError(f"there is no file {str(path)!r}.")
     spec = importlib.util.spec_from_file_location(path.stem, path)
@@ -176,11 +172,11 @@ def _module_of_file(path: Path) -> Any:
     module = importlib.util.module_from_spec(spec)
     sys.path.insert(0, str(path.parent.absolute()))
     before = sys.modules.get(path.stem)
-    sys.modules[path.stem] = module  # where dataclasses look for their module
+    sys.modules[path.stem] = module  # needed by dataclasses
     try:
         spec.loader.exec_module(module)
     except (Exception, SystemExit) as problem:
-        raise ValueError(_told(path.name, problem)) from problem
+        raise ValueError(_error_line(path.name, problem)) from problem
     finally:
         sys.path.pop(0)
         if before is not None:
@@ -189,16 +185,16 @@ def _module_of_file(path: Path) -> Any:
 
 
 @contextlib.contextmanager
-def _theirs(name: str) -> Iterator[None]:
-    """Errors of somebody else's function, told with the place that they come from."""
+def _user_errors(name: str) -> Iterator[None]:
+    """Reports errors of a user's function in one line."""
     try:
         yield
     except (Exception, SystemExit) as problem:
-        raise ValueError(_told(name, problem)) from problem
+        raise ValueError(_error_line(name, problem)) from problem
 
 
-def _told(name: str, problem: BaseException) -> str:
-    """An error in one line: that of many says first what is wrong."""
+def _error_line(name: str, problem: BaseException) -> str:
+    """The first line of an error, with its place in the user's code."""
     text = (str(problem).strip().splitlines() or [""])[0].rstrip(".: ")
     if isinstance(problem, ValueError) and text:
         return f"{name!r}: {text}."

@@ -1,14 +1,14 @@
-"""What a policy is to guarantee of its task, beside being likely, and how that is reached."""
+"""Guarantees of learned policies: optimal actions, or a satisfaction probability to attain."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from jaxltl.app.files.task import World
+from jaxltl.app.files.worlds import World
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.environments.monitor import Verdict, verdicts
 from jaxltl.core.models.construct.lifting import memory_along
@@ -25,23 +25,23 @@ from jaxltl.core.values.undiscounted.mixture import (
 from jaxltl.core.values.undiscounted.optimal_actions import OptimalActions, optimal_actions
 from jaxltl.core.values.undiscounted.reachability import action_matrices
 
-_AIM = WINDOW / 4  # how far above an asked probability the certified one is aimed to be
-_WEIGHTS = 10.0 ** np.arange(-1, 5.5, 0.5)  # of the task's probability, tried in this order
+_AIM = WINDOW / 4  # margin of the certified probability over the asked one
+_WEIGHTS = 10.0 ** np.arange(-1, 5.5, 0.5)  # of the satisfaction probability, in this order
 _HALVINGS = 30
 
 
 @dataclass(frozen=True)
 class Guarantee:
-    """What is asked, and what is known before anything is learned.
+    """An asked guarantee, and the optimal actions.
 
     Attributes:
       asked: ``"best"``, ``"none"`` or a probability.
-      over: of which initial states, if it is a probability: their ``"mean"`` or the ``"worst"``.
-      best: the best probability of the task.
-      actions: the actions that lose nothing of it; None where they are not asked for.
-      forbidden: ``bool[N, T]``, the demonstrated steps that are left out, as they lose something.
-      cost: of the first of them, the best probability before it and after it.
-      usable: whether each demonstration has a step that loses nothing.
+      over: initial states of an asked probability, their ``"mean"`` or the ``"worst"``.
+      best: the maximal satisfaction probability.
+      actions: the optimal actions; None without a guarantee.
+      forbidden: ``bool[N, T]``, demonstrated steps that are not optimal, and are left out.
+      cost: maximal satisfaction probability before and after the first of them.
+      usable: whether each demonstration has an optimal step.
     """
 
     asked: str | float
@@ -54,7 +54,7 @@ class Guarantee:
 
     @property
     def allowed(self) -> np.ndarray | None:
-        """``bool[S, Q, A]``, the actions to choose from; None: all."""
+        """``bool[S, Q, A]``, the actions to choose from; None for all."""
         return np.asarray(self.actions.allowed) if self.asked == "best" and self.actions else None
 
 
@@ -66,18 +66,18 @@ def ask(
     asked: str | float,
     over: str = "mean",
 ) -> Guarantee:
-    """What is to be guaranteed of a product's task.
+    """The guarantee that is asked for a product.
 
     Raises:
-      ValueError: the probability is more than any policy has, with what is possible and from
-        where; or a demonstration of which nothing is left.
+      ValueError: no policy attains the probability, with the attainable one; or a demonstration
+        has no optimal step.
     """
     nothing = np.zeros(np.shape(shown.state), bool)
     if asked == "none":
         return Guarantee(asked, over, best, None, nothing, None)
     if not isinstance(asked, str):
         require_attainable(model, best, asked, over, world.place)
-        if asked == 1:  # which the best policies alone have
+        if asked == 1:  # attained by optimal policies alone
             asked = "best"
     actions = optimal_actions(model, best)
     lost, cost = _losing(model, best, np.asarray(actions.allowed), shown)
@@ -88,8 +88,8 @@ def ask(
         n, count = useless[0], int(lost[useless[0]].sum())
         what = "its only step" if count == 1 else f"each of its {count} steps"
         raise ValueError(
-            f"demonstration {n + 1}: {what} lowers the best probability of the task, so that "
-            'nothing of it is left to learn from; leave it out, or write guarantee = "none".'
+            f"demonstration {n + 1}: {what} lowers the best probability of satisfying the formula, "
+            'so that none is left to learn from; leave it out, or write guarantee = "none".'
         )
     return Guarantee(asked, over, best, actions, lost, cost)
 
@@ -97,7 +97,7 @@ def ask(
 def _losing(
     model: Product, best: Solution, allowed: np.ndarray, shown: Trajectories
 ) -> tuple[np.ndarray, tuple[float, float] | None]:
-    """The steps that are not allowed, and the best probability before and after the first."""
+    """The steps that are not allowed, and the maximal probability before and after the first."""
     state, action, inside = (np.asarray(x) for x in (shown.state, shown.action, shown.mask))
     memory = memory_along(model, state)
     lost = inside & ~allowed[state, memory, action]
@@ -111,16 +111,10 @@ def _losing(
 
 
 def check_formula(automaton: Automaton) -> str | None:
-    """What is to be said of a formula that is true of every run.
-
-    Args:
-      automaton: of the formula.
-
-    Returns:
-      A sentence, or None.
+    """A remark on a formula that every trajectory satisfies, or None.
 
     Raises:
-      ValueError: no run can satisfy it.
+      ValueError: no trajectory satisfies it.
 
     Example:
       >>> from jaxltl import to_automaton
@@ -130,18 +124,18 @@ def check_formula(automaton: Automaton) -> str | None:
     verdict = verdicts(automaton)[int(automaton.initial)]
     if verdict == Verdict.VIOLATED:
         raise ValueError(
-            "formula: nothing satisfies it, whichever cells a run visits; it contradicts itself "
-            "or asks for labels that no state of this world shows together."
+            "formula: nothing satisfies it: no trajectory of this world does. It is contradictory, or "
+            "needs labels that no state has together."
         )
     if verdict == Verdict.SATISFIED:
-        return "The formula is true of every run in this world, so any policy does the task."
+        return "Every trajectory of this world satisfies the formula, so any policy does."
     return None
 
 
 def left_out(
     model: Product, guarantee: Guarantee, shown: Trajectories
 ) -> list[tuple[int, int, int]]:
-    """State, memory and action of the demonstrated steps that are left out, each once."""
+    """World state, memory state and action of the steps that are left out, each once."""
     state, action = np.asarray(shown.state), np.asarray(shown.action)
     if not guarantee.forbidden.any():
         return []
@@ -157,7 +151,7 @@ def kept(
     shown: Trajectories,
     solution: Solution,
 ) -> dict[str, Any]:
-    """What was asked and done, for ``result.json``."""
+    """The guarantee and how it was attained, for ``result.json``."""
     found: dict[str, Any] = {"asked": guarantee.asked, "over": guarantee.over}
     if guarantee.asked == "best" and guarantee.actions is not None:
         found["loss"] = guarantee.actions.loss
@@ -177,7 +171,7 @@ def kept(
         }
     if guarantee.asked == "none":
         missing = at_starts(model, np.subtract(guarantee.best.value, solution.value), "mean")[0]
-        if missing > 1e-3:  # what the remedy would give
+        if missing > 1e-3:  # the guarantee of the remedy
             sure = optimal_actions(model, guarantee.best).attained
             found["remedy"] = at_starts(model, sure.lower, "mean")[0]
     return found
@@ -186,16 +180,17 @@ def kept(
 # --- a probability ---------------------------------------------------------------------------
 
 
-class Attempt(NamedTuple):
-    """A policy that was learned or mixed, ``float[S, Q, A]``.
+@dataclass(frozen=True)
+class Attempt:
+    """A policy that was learned or mixed.
 
     Attributes:
-      policy: the policy.
+      policy: ``float[S, Q, A]``.
       neg_log_likelihood: of the demonstrations.
-      attained: its certified probability, of the mean or the worst start.
+      attained: certified probability, of the mean or the worst initial state.
       weight: mu, if it was learned with one.
-      share: of the actions that lose nothing, if they were mixed in.
-      learned: what it was made from.
+      share: of optimal actions, if they were mixed in.
+      learned: the underlying result of learning.
     """
 
     policy: np.ndarray
@@ -206,81 +201,93 @@ class Attempt(NamedTuple):
     learned: Any
 
 
-Train = Callable[[float, Any], Any]
+Learned = TypeVar("Learned")
+Train = Callable[[float, Learned], Learned]
 
 
-def at_least(
-    model: Product,
-    guarantee: Guarantee,
-    counts: np.ndarray,
-    free: Any,
-    inside: Callable[[], tuple[np.ndarray, Any]],
-    train: Train,
-    policy_of: Callable[[Any], np.ndarray],
-) -> Attempt:
-    """The most likely policy found whose certified probability is at least the one asked for.
+@dataclass(frozen=True)
+class Search(Generic[Learned]):
+    """Search for the most likely policy whose certified probability is at least a given one.
 
-    The least weight mu of the task's probability (2.6) that reaches it is searched for. Where a
-    little more weight makes the probability jump, or none reaches it, policies of both sides are
-    mixed; and the likeliest policy is with the likeliest of those that lose nothing, or, if that
-    gives no probability near the one asked for, with the quickest of them.
-
-    Args:
+    Attributes:
       model: the product.
-      guarantee: what is asked.
-      counts: ``float[S, Q, A]``, how often each pair was demonstrated.
-      free: what is learned without any weight.
-      inside: a policy of the actions that lose nothing, and what it was learned as.
-      train: what is learned with a weight, from what was learned before.
+      guarantee: the probability.
+      counts: ``float[S, Q, A]``, the number of demonstrations of each pair.
+      train: learns with a weight mu of the satisfaction probability (2.6), starting from what was
+        learned before.
       policy_of: the policy ``float[S, Q, A]`` of what was learned.
     """
-    asked = float(guarantee.asked)
 
-    def loss_of(policy: np.ndarray) -> float:
-        seen = counts > 0
-        with np.errstate(divide="ignore"):
-            return float(-np.sum(counts[seen] * np.log(policy[seen])))
+    model: Product
+    guarantee: Guarantee
+    counts: np.ndarray
+    train: Train[Learned]
+    policy_of: Callable[[Learned], np.ndarray]
 
-    def attempt(policy: np.ndarray, learned: Any, weight: float | None, share: float) -> Attempt:
-        reached = attained(model, policy, guarantee.over)
-        return Attempt(policy, loss_of(policy), reached, weight, share, learned)
+    def at_least(self, free: Learned, inside: Callable[[], tuple[np.ndarray, Learned]]) -> Attempt:
+        """The most likely policy found.
 
-    def between(below: Attempt, above: Attempt) -> Attempt:
-        found = least_mixture(model, below.policy, above.policy, asked, over=guarantee.over)
-        return (
-            above
-            if found.share == 1
-            else Attempt(
-                found.policy,
-                loss_of(found.policy),
-                found.attained,
-                above.weight,
-                found.share,
-                above.learned,
-            )
+        The least weight mu that attains the probability is searched for. Where the probability
+        jumps with the weight, or no weight attains it, policies of both sides are mixed; and the
+        likeliest policy is mixed with the likeliest one of optimal actions or, if that gives no
+        probability near the asked one, with the quickest of these.
+
+        Args:
+          free: learned without a weight.
+          inside: a policy of optimal actions alone, and what it was learned as.
+        """
+        asked = float(self.guarantee.asked)
+        first = self._attempt(self.policy_of(free), free, 0.0, 0.0)
+        if first.attained >= asked:
+            return first
+        below, above, found = first, None, []
+        tries = bracket(
+            self.train, first, lambda x, mu: self._attempt(self.policy_of(x), x, mu, 0.0), asked
         )
+        for tried in tries:
+            if tried.attained < asked:
+                below = tried
+            else:
+                above = tried
+                found.append(tried)
+        if above is not None and above.attained > asked + WINDOW:
+            found.append(self._between(below, above))
+        policy, learned = inside()
+        sure = self._attempt(policy, learned, None, 1.0)
+        found += [self._between(x, sure) for x in ([first] if below is first else [first, below])]
+        if all(one.attained > asked + WINDOW for one in found):
+            # A learned policy that delays satisfaction leaves no share for other actions.
+            best = np.asarray(self.guarantee.best.policy)
+            quick = best[..., None] == np.arange(policy.shape[-1])
+            sure = self._attempt(quick.astype(float), learned, None, 1.0)
+            found.append(self._between(first, sure))
+        return min(found, key=lambda one: one.neg_log_likelihood)
 
-    first = attempt(policy_of(free), free, 0.0, 0.0)
-    if first.attained >= asked:
-        return first
-    below, above, found = first, None, []
-    for tried in bracket(train, first, lambda x, mu: attempt(policy_of(x), x, mu, 0.0), asked):
-        if tried.attained < asked:
-            below = tried
-        else:
-            above = tried
-            found.append(tried)
-    if above is not None and above.attained > asked + WINDOW:
-        found.append(between(below, above))
-    policy, learned = inside()
-    sure = attempt(policy, learned, None, 1.0)
-    found += [between(x, sure) for x in ([first] if below is first else [first, below])]
-    if all(one.attained > asked + WINDOW for one in found):
-        # Where what was learned takes its time, any share of steps that lose is too much.
-        quick = np.asarray(guarantee.best.policy)[..., None] == np.arange(policy.shape[-1])
-        sure = attempt(quick.astype(float), learned, None, 1.0)
-        found.append(between(first, sure))
-    return min(found, key=lambda one: one.neg_log_likelihood)
+    def _loss(self, policy: np.ndarray) -> float:
+        """Negative log-likelihood of the demonstrations."""
+        seen = self.counts > 0
+        with np.errstate(divide="ignore"):
+            return float(-np.sum(self.counts[seen] * np.log(policy[seen])))
+
+    def _attempt(
+        self, policy: np.ndarray, learned: Learned, weight: float | None, share: float
+    ) -> Attempt:
+        reached = attained(self.model, policy, self.guarantee.over)
+        return Attempt(policy, self._loss(policy), reached, weight, share, learned)
+
+    def _between(self, below: Attempt, above: Attempt) -> Attempt:
+        """The mixture of two policies with the least share of the second."""
+        asked, over = float(self.guarantee.asked), self.guarantee.over
+        found = least_mixture(self.model, below.policy, above.policy, asked, over=over)
+        if found.share == 1:
+            return above
+        return replace(
+            above,
+            policy=found.policy,
+            neg_log_likelihood=self._loss(found.policy),
+            attained=found.attained,
+            share=found.share,
+        )
 
 
 def bracket(
@@ -290,17 +297,17 @@ def bracket(
     asked: float,
     halvings: int = _HALVINGS,
 ) -> Iterator[Any]:
-    """Attempts with more and more weight until it is enough, then between the last two.
+    """Yields attempts with increasing weights until one suffices, then by bisection.
 
-    Each is learned from the one of the next lesser weight: the likelihood has other maxima, and
-    those that are found from too great a weight are lesser ones.
+    Each starts from the result of the next smaller weight: the likelihood has several maxima, and
+    those found from too large a weight are lower.
 
     Args:
-      train: what is learned with a weight, from what was learned before.
-      first: what was found without any weight: with `learned`, and what is `attained`.
-      judged: the same of what was learned with a weight.
-      asked: what is to be attained.
-      halvings: attempts between two weights, at most.
+      train: learns with a weight, starting from an earlier result.
+      first: the attempt without a weight, with `learned` and `attained`.
+      judged: the attempt of a result and its weight.
+      asked: the probability to attain.
+      halvings: bisections, at most.
     """
     low, below = 0.0, first
     for high in map(float, _WEIGHTS):

@@ -1,4 +1,4 @@
-"""What all jobs of learning share: seeds side by side, results, files and pictures."""
+"""Shared parts of learning jobs: parallel seeds, fingerprints, result entries, files."""
 
 from __future__ import annotations
 
@@ -6,68 +6,65 @@ import contextlib
 import dataclasses
 import functools
 import hashlib
+import inspect
 import json
 import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh
 
 import jaxltl
 from jaxltl.algos.common.checkpoint import atomic_write
 from jaxltl.algos.common.chunks import Chunks, run_in_chunks, trace_lanes
-from jaxltl.app.drawing import Picture, drawing
-from jaxltl.app.files.task import Task
+from jaxltl.app.protocols import LearningTask, Training
+from jaxltl.app.reports.drawing import Picture, drawing
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.models.mesh.lanes import on_host, vmap_over_mesh
 from jaxltl.core.models.product import Product
 
-Report = Callable[[int, Mapping[str, np.ndarray]], None]
+Hparams = TypeVar("Hparams")
 
 
-def settings(kind: Any, spec: Mapping[str, Any]) -> Any:
-    """A learner's Hparams of the keys of ``[learner]`` that it has; the method is another's."""
-    names = [field.name for field in dataclasses.fields(kind) if field.name != "method"]
-    return kind(**{name: spec[name] for name in names if name in spec})
+def settings(kind: Callable[..., Hparams], given: Mapping[str, Any]) -> Hparams:
+    """A learner's Hparams with the given keys that it has; ``method`` names the learner."""
+    names = inspect.signature(kind).parameters.keys() - {"method"}
+    return kind(**{name: value for name, value in given.items() if name in names})
 
 
 def run_seeds(
-    algorithm: Any,
-    seeds: tuple[int, int],
-    problem: Any,
-    hparams: Any,
-    report: Report | None,
-    mesh: Mesh | None = None,
-    **options: Any,
+    algorithm: Any, problem: Any, hparams: Any, training: Training, **options: Any
 ) -> tuple[Chunks, dict[str, np.ndarray]]:
-    """Runs of a learner from N seeds side by side, and their figures ``[T, N]`` by name.
+    """Runs a learner from N seeds in parallel; returns its chunks and metrics ``[T, N]`` by name.
 
-    Args:
-      algorithm: the learner's module.
-      seeds: the first, and how many.
-      mesh: devices that several seeds are learned on; the same in every process.
-      options: for :func:`~jaxltl.algos.common.chunks.run_in_chunks`.
+    `options` are those of :func:`~jaxltl.algos.common.chunks.run_in_chunks`.
     """
-    if seeds[1] == 1:
-        mesh = None
-    given = (algorithm.init, *seeds, problem, hparams)
+    mesh = training.mesh if training.num_seeds > 1 else None
+    first = (algorithm.init, training.seed, training.num_seeds, problem, hparams)
     if mesh is None:
-        wait = compile_beside(_first_states, *given)
-        trace_lanes(algorithm.step, jax.eval_shape(_first_states, *given), problem, hparams)
+        wait = compile_in_background(_first_states, *first)
+        trace_lanes(algorithm.step, jax.eval_shape(_first_states, *first), problem, hparams)
         wait()
-        states = _first_states(*given)
+        states = _first_states(*first)
     else:
-        first = vmap_over_mesh(_first_of(algorithm.init), mesh, in_axes=(0, None, None, None))
-        states = first(np.arange(seeds[1]), np.int32(seeds[0]), problem, hparams)
-    by_name = report and (lambda step, metrics: report(step, vars(metrics)))
+        make = vmap_over_mesh(_first_of(algorithm.init), mesh, in_axes=(0, None, None, None))
+        states = make(np.arange(training.num_seeds), np.int32(training.seed), problem, hparams)
+    report = training.report
     found = run_in_chunks(
-        algorithm.step, states, problem, hparams, lanes=True, report=by_name, mesh=mesh, **options
+        algorithm.step,
+        states,
+        problem,
+        hparams,
+        lanes=True,
+        report=report and (lambda step, metrics: report(step, vars(metrics))),
+        checkpoint=training.checkpoint,
+        mesh=mesh,
+        **options,
     )
-    if mesh is not None:  # what comes then is each process's own
+    if mesh is not None:  # later work is done in each process
         found = found._replace(state=jax.tree.map(jnp.asarray, on_host(found.state)))
     return found, {"step": found.step, **vars(found.metrics)}
 
@@ -76,19 +73,19 @@ def run_seeds(
 def _first_states(
     init: Callable[..., Any], seed: int, num_seeds: int, problem: Any, hparams: Any
 ) -> Any:
-    """A learner's N first states, each from a key of its own; one program."""
+    """The initial states of N seeds, by one program."""
 
     def first(n: Any) -> Any:
         return _first_of(init)(n, seed, problem, hparams)
 
-    if num_seeds == 1:  # without vmap, a smaller program
+    if num_seeds == 1:  # a smaller program than with vmap
         return jax.tree.map(lambda x: x[None], first(0))
     return jax.vmap(first)(jnp.arange(num_seeds))
 
 
-@functools.cache  # compiled once for each learner, so it must stay the same function
+@functools.cache  # the same function for each learner, so that it is compiled once
 def _first_of(init: Callable[..., Any]) -> Callable[..., Any]:
-    """The first state of lane n."""
+    """The initial state of lane n."""
 
     def first(n: Any, seed: Any, problem: Any, hparams: Any) -> Any:
         root = jax.random.fold_in(jax.random.key(seed), 1)
@@ -98,29 +95,26 @@ def _first_of(init: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def one_seed(learned: Any, i: int) -> Any:
-    """One of N seeds alone, of a frozen dataclass of arrays ``[N, ...]`` with a history ``[T, N]``."""
+    """Seed i of a frozen dataclass of arrays ``[N, ...]`` with a history ``[T, N]``."""
     one = {k: v[i : i + 1] for k, v in vars(learned).items() if isinstance(v, np.ndarray)}
     history = {k: v if v.ndim == 1 else v[:, i : i + 1] for k, v in learned.history.items()}
     return dataclasses.replace(learned, **one, history=history)
 
 
 def postfix(figures: Mapping[str, np.ndarray]) -> dict[str, str]:
-    """What the progress bar tells of the newest figures of a gradient's descent."""
+    """Loss and gradient norm for the progress bar."""
     return {
         "loss": f"{figures['loss'].min():.4f}",
         "gradient": f"{figures['gradient_norm'].max():.1e}",
     }
 
 
-def compile_beside(function: Any, *given: Any) -> Callable[[], None]:
-    """Begins to compile a jitted function in another thread; returns what waits for that.
-
-    A call of the function with as much then finds its program.
-    """
+def compile_in_background(function: Any, *given: Any) -> Callable[[], None]:
+    """Compiles a jitted function in another thread; returns a function that waits for it."""
     lowered = function.lower(*given)
 
     def work() -> None:
-        with contextlib.suppress(Exception):  # which the call itself will raise
+        with contextlib.suppress(Exception):  # the call itself raises it
             lowered.compile()
 
     thread = threading.Thread(target=work, daemon=True)
@@ -128,8 +122,8 @@ def compile_beside(function: Any, *given: Any) -> Callable[[], None]:
     return thread.join
 
 
-def fingerprint(task: Any, seed: int, num_seeds: int) -> str:
-    """What a checkpoint must agree on to be gone on from."""
+def fingerprint(task: LearningTask, seed: int, num_seeds: int) -> str:
+    """Fingerprint of a run, which a checkpoint must have to be resumed."""
     parts = [
         task.digest,
         seed,
@@ -141,24 +135,19 @@ def fingerprint(task: Any, seed: int, num_seeds: int) -> str:
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:12]
 
 
-def about(task: Task) -> dict[str, Any]:
-    """What a result begins with."""
-    return {"task": task.name, "formula": task.formula, "method": task.learner["method"]}
-
-
-def hyperparameters(task: Task) -> dict[str, Any]:
-    """What a task file says of the learner."""
-    return {k: v for k, v in task.learner.items() if k != "method"}
+def about(task: LearningTask) -> dict[str, Any]:
+    """The first entries of a result."""
+    return {"task": task.name, "formula": task.formula, "method": task.learner.method}
 
 
 def took(seconds: float) -> dict[str, Any]:
-    """What a result ends with."""
+    """The last entries of a result."""
     versions = {"jaxltl": jaxltl.__version__, "jax": jax.__version__}
     return {"seconds": round(seconds, 2), "versions": versions}
 
 
 def plain(value: Any) -> Any:
-    """Arrays and NumPy numbers as lists and numbers that JSON has; NaN and infinity as None."""
+    """A value of JSON: arrays become lists, NaN and infinity become None."""
     if isinstance(value, Mapping):
         return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
@@ -169,7 +158,7 @@ def plain(value: Any) -> Any:
 
 
 def memory_arrays(model: Product, size: int | None = None) -> dict[str, Any]:
-    """How the memory of a policy goes on, in the first states of a product."""
+    """The memory update of a policy in the first states of a product."""
     return {
         "initial_memory": model.initial_memory[:size],
         "next_memory": model.next_memory[:size],
@@ -181,30 +170,30 @@ def save_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
     """Writes arrays as an ``.npz``, atomically.
 
     Raises:
-      ValueError: the place cannot be written to.
+      ValueError: the file is not writable.
     """
     with atomic_write(path) as file:
         np.savez(file, allow_pickle=False, **{k: np.asarray(v) for k, v in arrays.items()})
 
 
 def automaton_picture(automaton: Automaton, live: str) -> Picture:
-    """The task's automaton."""
+    """The picture of the formula's automaton."""
     return Picture(
         "automaton.svg",
-        "The task as an automaton",
+        "Automaton of the formula",
         drawing("automaton", automaton),
-        "States with a double circle: the task is done, whatever follows. Grey: it has failed. "
-        "Each state is named by the formula that is left to satisfy.",
+        "Double circle: any continuation satisfies the formula. Grey: it is violated. States are "
+        "named by the remaining formula.",
         live,
     )
 
 
 def over_seeds(count: int) -> str:
-    """How the caption of learning curves ends."""
-    band = "; the line is the median over seeds, the band holds all of them"
+    """The end of a caption of learning curves."""
+    band = "; the line is the median over seeds, the band their range"
     return f"{band if count > 1 else ''}."
 
 
 def short_name(text: str, width: int = 44) -> str:
-    """The text, or its beginning where it is longer than that."""
+    """A text, shortened to a width."""
     return text if len(text) <= width else text[: width - 1] + "…"

@@ -1,4 +1,4 @@
-"""From a task to a policy with its evidence: what `jaxltl learn` computes."""
+"""Inverse reinforcement learning from a task file: the job of ``method = "mlirl"``."""
 
 from __future__ import annotations
 
@@ -12,36 +12,30 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh
 
 from jaxltl.algos import mlirl
 from jaxltl.algos.common import learner
-from jaxltl.app._learn_pictures import live as live
-from jaxltl.app._learn_pictures import pictures as pictures
-from jaxltl.app._learn_pictures import task_pictures as task_pictures
-from jaxltl.app.files.tables import errors_in
-from jaxltl.app.files.task import (
-    Task,
-    World,
-    load_demonstrations,
-    load_world,
-    many,
-    synthetic_demonstrations,
-)
-from jaxltl.app.files.task import read_task as read_task
+from jaxltl.app.protocols import Training
+from jaxltl.app.reports import learn as report  # noqa: F401 - part of the job
+from jaxltl.app.reports.learn_pictures import live as live
+from jaxltl.app.reports.learn_pictures import pictures as pictures
+from jaxltl.app.reports.learn_pictures import task_pictures as task_pictures
+from jaxltl.app.files.demonstrations import load_demonstrations, synthetic_demonstrations
+from jaxltl.app.files.schema import errors_in
+from jaxltl.app.files.task_mlirl import MlirlTask
+from jaxltl.app.files.task_mlirl import read_task as read_task
+from jaxltl.app.files.worlds import World, load_world
 from jaxltl.app.guarantee import (
     Attempt,
     Guarantee,
     ask,
-    at_least,
+    Search,
     check_formula,
     kept,
 )
 from jaxltl.app.job import (
-    Report,
     about,
-    compile_beside,
-    hyperparameters,
+    compile_in_background,
     memory_arrays,
     one_seed,
     plain,
@@ -52,6 +46,7 @@ from jaxltl.app.job import (
 )
 from jaxltl.app.job import fingerprint as fingerprint
 from jaxltl.app.job import postfix as postfix
+from jaxltl.app.wording import many
 from jaxltl.core.models.construct.lifting import lift_policy
 from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.models.product import Product, product
@@ -65,9 +60,7 @@ from jaxltl.core.values.undiscounted.satisfaction import (
     satisfaction_probability,
 )
 
-DOUBLE = True  # the precision of its figures
-STEPS = 500  # at most, unless the task says otherwise
-_TOLERANCE = 1e-6  # of the gradient's norm
+DOUBLE = True
 
 
 # --- the learners ---------------------------------------------------------------------------
@@ -75,15 +68,15 @@ _TOLERANCE = 1e-6  # of the gradient's norm
 
 @dataclass(frozen=True)
 class Learned:
-    """What a method learned, with N seeds side by side.
+    """Weights and policies of N seeds.
 
     Attributes:
       policy: ``float[N, S, Q, A]``, policies of the product.
       weights: ``float[N, F]``, and the features' names.
       loss, neg_log_likelihood, gradient_norm: ``float[N]``.
-      status: ``int32[N]``, of the solver that yielded the policies.
-      num_steps: ``int[N]``, until the gradient vanished, or all.
-      converged: ``bool[N]``: the gradient vanished and the policy's solver converged.
+      status: ``int32[N]``, of the policies' solver.
+      num_steps: ``int[N]``, until convergence, or all.
+      converged: ``bool[N]``: the gradient is below the tolerance and the solver converged.
       history: metrics ``[T, N]`` and ``step [T]``.
     """
 
@@ -100,63 +93,51 @@ class Learned:
 
 
 def _features(setup: Setup) -> mlirl.Features:
-    """What inverse RL learns by, in the world or in the product (chapter 2)."""
-    spec, model, shown = setup.task.learner, setup.model, setup.demonstrations
-    avoid, progress = spec.get("avoid", ()), spec.get("progress")
-    if spec.get("in", "product") == "world":
+    """The features of the reward, in the world or in the product (chapter 2)."""
+    table, model, shown = setup.task.learner, setup.model, setup.demonstrations
+    avoid, progress = table.avoid or (), table.progress
+    if table.in_world:
         return mlirl.world_features(
-            model.mdp, shown, goal=spec["goal"], progress=progress or (), avoid=avoid
+            model.mdp, shown, goal=table.goal or (), progress=progress or (), avoid=avoid
         )
-    # The dissertation's learners, without a guarantee, have Table 1's alone.
+    # Without a guarantee, those of the dissertation's Table 1 alone.
     best = None if setup.guarantee.asked == "none" else setup.guarantee.best
     return mlirl.task_features(model, shown, avoid=avoid, progress=progress, best=best)
 
 
-def _problem(setup: Setup, allowed: np.ndarray | None) -> tuple[tuple[str, ...], mlirl.Problem]:
-    """What inverse RL learns from, with the names of its features."""
-    spec, model, features = setup.task.learner, setup.model, setup.features
-    in_world = spec.get("in", "product") == "world"
-    start = spec.get("start")
+def _problem(setup: Setup, allowed: np.ndarray | None) -> mlirl.Problem:
+    """The learning problem of inverse RL, with some of the actions or all."""
+    table, model, features = setup.task.learner, setup.model, setup.features
+    start = table.start
     if start is not None and len(start) != len(features.names):
         raise ValueError(
             f"start has {len(start)} numbers; there are {len(features.names)} "
             f"features: {', '.join(features.names)}."
         )
-    problem = mlirl.make_problem(
-        model.mdp if in_world else model,
+    return mlirl.make_problem(
+        model.mdp if table.in_world else model,
         features.values,
         setup.demonstrations,
         start=start,
-        satisfaction_over=spec.get("satisfaction_over", "initial"),
+        satisfaction_over=table.satisfaction_over,
         allowed=None if allowed is None else to_jax(allowed),
     )
-    return features.names, problem
 
 
-def _trained(
-    setup: Setup,
-    names: tuple[str, ...],
-    problem: mlirl.Problem,
-    hparams: mlirl.Hparams,
-    seeds: tuple[int, int],
-    report: Report | None,
-    checkpoint: Path | None,
-    mesh: Mesh | None = None,
+def _train(
+    setup: Setup, problem: mlirl.Problem, hparams: mlirl.Hparams, training: Training
 ) -> Learned:
-    """What N seeds learn of a problem."""
-    spec, model = setup.task.learner, setup.model
+    """Reward weights and policies of N seeds."""
+    table, model = setup.task.learner, setup.model
     wait = _compile_policy(problem, hparams)
     found, history = run_seeds(
         mlirl,
-        seeds,
         problem,
         hparams,
-        report,
-        num_steps=spec.get("steps", STEPS),
+        training,
+        num_steps=table.steps,
         keep="before",
-        until=learner.gradient_vanishes(spec.get("tolerance", _TOLERANCE)),
-        checkpoint=checkpoint,
-        mesh=mesh,
+        until=learner.gradient_vanishes(table.tolerance),
     )
     wait()
     states = jax.device_get(dataclasses.replace(found.state, key=None))
@@ -164,56 +145,49 @@ def _trained(
     lanes = [jax.tree.map(lambda x, i=i: x[i], states) for i in range(len(weights))]
     each = [jax.device_get(_policy_and_likelihood(one, problem, hparams)) for one in lanes]
     policy, nll, codes = (np.stack(column) for column in zip(*each, strict=True))
-    if spec.get("in", "product") == "world":
+    if table.in_world:
         policy = jax.jit(jax.vmap(lift_policy, (None, 0)))(model, policy)
     gradient_norm, status = history["gradient_norm"][-1], np.asarray(codes)
     return Learned(
         policy=np.asarray(policy),
         weights=weights,
-        names=names,
+        names=setup.features.names,
         loss=history["loss"][-1],
         neg_log_likelihood=np.asarray(nll),
         gradient_norm=gradient_norm,
         status=status,
         num_steps=np.asarray(states.step),
-        # Beyond contraction no value of a softmax policy has a certificate.
+        # Values of softmax policies have no certificate without contraction.
         converged=found.done & (status <= Status.UNCERTIFIED),
         history=history,
     )
 
 
-def _with_guarantee(
-    setup: Setup,
-    seeds: tuple[int, int],
-    report: Report | None,
-    checkpoint: Path | None,
-    mesh: Mesh | None,
-) -> tuple[Learned, int, Attempt | None]:
-    """What is learned under the guarantee, which seed is kept, and how a probability was reached."""
-    guarantee = setup.guarantee
-    names, problem = setup.learning
-    hparams = settings(mlirl.Hparams, setup.task.learner)
+def _with_guarantee(setup: Setup, training: Training) -> tuple[Learned, int, Attempt | None]:
+    """Learning under the guarantee: all seeds, the kept one, and how a probability is attained."""
+    guarantee, problem = setup.guarantee, setup.problem
+    hparams = settings(mlirl.Hparams, setup.task.learner.given())
     if isinstance(guarantee.asked, str):
-        learned = _trained(setup, names, problem, hparams, seeds, report, checkpoint, mesh)
+        learned = _train(setup, problem, hparams, training)
         return learned, _least_loss(learned), None
-    # With a weight of zero it is one program for all weights.
+    # A weight of zero, not None, so that one program serves all weights.
     hparams = dataclasses.replace(hparams, mu=0.0 if hparams.mu is None else hparams.mu)
-    learned = _trained(setup, names, problem, hparams, seeds, report, checkpoint, mesh)
+    learned = _train(setup, problem, hparams, training)
     free = one_seed(learned, _least_loss(learned))
+    again = Training(training.seed, 1)
 
     def train(mu: float, before: Learned, problem: mlirl.Problem = problem) -> Learned:
+        weighted = dataclasses.replace(hparams, mu=mu)
         start = jnp.asarray(before.weights[0], problem.features.dtype)
-        there = dataclasses.replace(hparams, mu=mu)
-        # The likelihood has several maxima: on from the last weights, and from the first ones.
+        # The likelihood has several maxima: from the last weights, and from the initial ones.
         found = [
-            _trained(setup, names, one, scaled, (seeds[0], 1), None, None)
-            for one, scaled in (
-                (
-                    dataclasses.replace(problem, start=start),
-                    dataclasses.replace(there, start_scale=0.0),
-                ),
-                (problem, there),
-            )
+            _train(
+                setup,
+                dataclasses.replace(problem, start=start),
+                dataclasses.replace(weighted, start_scale=0.0),
+                again,
+            ),
+            _train(setup, problem, weighted, again),
         ]
         return found[int(np.argmin([np.nan_to_num(one.loss[0], nan=np.inf) for one in found]))]
 
@@ -221,18 +195,12 @@ def _with_guarantee(
         actions = guarantee.actions
         if actions is None or not guarantee.usable:
             return np.asarray(actions.policy if actions else free.policy[0]), free
-        one = train(0.0, free, _problem(setup, np.asarray(actions.allowed))[1])
+        one = train(0.0, free, _problem(setup, np.asarray(actions.allowed)))
         return one.policy[0], one
 
-    found = at_least(
-        setup.model,
-        guarantee,
-        np.asarray(problem.counts),
-        free,
-        inside,
-        train,
-        lambda one: one.policy[0],
-    )
+    counts = np.asarray(problem.counts)
+    search = Search(setup.model, guarantee, counts, train, lambda one: one.policy[0])
+    found = search.at_least(free, inside)
     kept = dataclasses.replace(
         found.learned,
         policy=found.policy[None],
@@ -242,7 +210,7 @@ def _with_guarantee(
 
 
 def _least_loss(learned: Learned) -> int:
-    """The seed that is kept: of those that converged, if any did, the one of least loss."""
+    """The seed of least loss, among those that converged if there are any."""
     loss = np.where(np.isfinite(learned.loss), learned.loss, np.inf)
     return int(np.argmin(np.where(learned.converged, loss, loss + 1e12)))
 
@@ -250,9 +218,9 @@ def _least_loss(learned: Learned) -> int:
 def _policy_and_likelihood(
     state: mlirl.State, problem: mlirl.Problem, hparams: mlirl.Hparams
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Of one seed's weights: the policy, its negative log-likelihood, and its solver's status."""
+    """Policy, negative log-likelihood and solver's status of one seed."""
     if hparams.optimizer == "lbfgs" and state.optimizer.known:
-        # The last evaluation was at these weights, so that there is nothing left to solve.
+        # The line search has solved for these weights.
         parts = state.optimizer.point.parts
         policy = _softmax_policy(state.parameters, parts.value, problem, hparams)
         return policy, parts.neg_log_likelihood, parts.status
@@ -260,11 +228,11 @@ def _policy_and_likelihood(
 
 
 def _compile_policy(problem: mlirl.Problem, hparams: mlirl.Hparams) -> Callable[[], None]:
-    """Begins to compile what :func:`_policy_and_likelihood` will want; returns what waits."""
+    """Compiles :func:`_softmax_policy` in the background; returns a function that waits."""
     if hparams.optimizer != "lbfgs":
         return lambda: None
     value = jax.ShapeDtypeStruct(problem.model.state_shape, problem.model.dtype)
-    return compile_beside(_softmax_policy, problem.start, value, problem, hparams)
+    return compile_in_background(_softmax_policy, problem.start, value, problem, hparams)
 
 
 @jax.jit
@@ -292,39 +260,39 @@ def _solved(
 class Setup:
     """A task file's contents as the library's objects; see :func:`prepare`."""
 
-    task: Task
+    task: MlirlTask
     world: World
     model: Product
     demonstrations: Trajectories
     dropped: int
     guarantee: Guarantee
-    trivial: str | None = None  # what is to be said of a formula that is always true
+    trivial: str | None = None  # remark on a formula that is always true
 
     @functools.cached_property
     def features(self) -> mlirl.Features:
-        """Of the learned reward."""
+        """The features of the reward."""
         return _features(self)
 
     @functools.cached_property
-    def learning(self) -> tuple[tuple[str, ...], mlirl.Problem]:
-        """The features' names, and what is learned from under the guarantee."""
+    def problem(self) -> mlirl.Problem:
+        """The learning problem under the guarantee."""
         return _problem(self, self.guarantee.allowed)
 
 
-@dataclass(frozen=True)
+@dataclass
 class Outcome:
-    """A finished job: what was asked, learned and found out about it.
+    """A finished job.
 
     Attributes:
-      setup, learned: the parts.
-      chosen: the seed's position whose loss is least; the policy that is kept.
-      solution: the kept policy's probability of doing the task, with bounds.
-      attempt: how a probability that was asked for was reached, if one was.
-      expected_steps: by who acts, from the initial states; None if a task does not end.
-      satisfaction: ``float[N, S]``, of every seed's policy from every start.
-      data: what a log guarantees of the kept policy, where the world is known from one.
-      seed: the first of the seeds.
-      seconds: spent.
+      setup, learned: the task, and the results of learning.
+      chosen: index of the kept seed, that of least loss.
+      solution: satisfaction probability of the kept policy, with bounds.
+      attempt: how an asked probability was attained, if any.
+      expected_steps: of the learned and the quickest policy; None for formulas without end.
+      satisfaction: ``float[N, S]``, satisfaction probability of every seed from initial states.
+      data: guarantee of the kept policy from a log, if the world is estimated from one.
+      seed: the first seed.
+      seconds: wall time.
     """
 
     setup: Setup
@@ -336,35 +304,36 @@ class Outcome:
     satisfaction: np.ndarray
     data: dict[str, Any] | None
     seed: int
-    seconds: float
+    seconds: float = 0.0
 
 
-def prepare(task: Task, seed: int) -> Setup:
-    """The world, product and demonstrations of a task; all of its files checked.
+def prepare(task: MlirlTask, seed: int) -> Setup:
+    """The world, product and demonstrations of a task.
 
     Raises:
-      ValueError: something in the task or its files is wrong.
+      ValueError: the task or one of its files is wrong.
     """
     world = load_world(task)
     with errors_in(f"{task.path}: [task] "):
         model = product(world.mdp, task.formula, label_on=task.label_on)
         trivial = check_formula(model.automaton)
     best = optimal_satisfaction(model)
-    if "file" in task.demonstrations:
+    table = task.demonstrations
+    if table.file is not None:
         shown, dropped = load_demonstrations(task, world), 0
     else:
         key = jax.random.fold_in(jax.random.key(seed), 0)
-        shown, dropped = synthetic_demonstrations(task, model, key, best)
+        shown, dropped = synthetic_demonstrations(task.path, table, model, key, best)
     with errors_in(f"{task.path}: [task] "):
         asked = ask(model, world, shown, best, task.guarantee, task.over)
     setup = Setup(task, world, model, shown, dropped, asked, trivial)
     with errors_in(f"{task.path}: [learner] "):
-        _ = setup.learning  # so that its mistakes are found before the work
+        _ = setup.problem  # raises its errors before learning
     return setup
 
 
 def describe(setup: Setup) -> str:
-    """What a task comes to, in one line."""
+    """Sizes of a setup, in one line."""
     lengths = np.asarray(setup.demonstrations.length)
     logged = setup.world.logged
     return (
@@ -374,48 +343,43 @@ def describe(setup: Setup) -> str:
     )
 
 
-def learn(
-    setup: Setup,
-    seed: int,
-    num_seeds: int,
-    *,
-    report: Report | None = None,
-    checkpoint: Path | None = None,
-    progress: Callable[[str], None] = lambda stage: None,
-    mesh: Mesh | None = None,
-) -> tuple[
-    Learned, int, Solution, Attempt | None, dict[str, Any] | None, np.ndarray, dict[str, Any] | None
-]:
-    """Learns with N seeds, keeps the best, and evaluates it; see :class:`Outcome`.
-
-    What it is at is told to `report`, steps and figures, and to `progress`, the stage's name.
+def learn(setup: Setup, training: Training) -> Outcome:
+    """Learns with N seeds, keeps the one of least loss, and evaluates all.
 
     Raises:
       ValueError: the learner cannot work on this task.
     """
     model = setup.model
-    learned, chosen, attempt = _with_guarantee(setup, (seed, num_seeds), report, checkpoint, mesh)
-    progress("checking")
-    solution = satisfaction_probability(model, learned.policy[chosen])
-    at_start = functools.partial(from_starts, model)
+    learned, chosen, attempt = _with_guarantee(setup, training)
+    training.stage("checking")
+    policy = learned.policy[chosen]
+    solution = satisfaction_probability(model, policy)
     each = [
         solution if i == chosen else satisfaction_probability(model, learned.policy[i])
         for i in range(len(learned.policy))
     ]
-    expected_steps = _expected_steps(setup, learned.policy[chosen])
-    values = np.stack([at_start(s.value) for s in each])
     data = None
     if setup.world.logged is not None:
-        # Deferred: only worlds that are known from a log have intervals.
+        # Import here: only worlds of logs have intervals.
         from jaxltl.app.logged import guaranteed
 
-        progress("certifying")
-        data = guaranteed(setup.world.logged, model, setup.task.formula, learned.policy[chosen])
-    return learned, chosen, solution, attempt, expected_steps, values, data
+        training.stage("certifying")
+        data = guaranteed(setup.world.logged, model, setup.task.formula, policy)
+    return Outcome(
+        setup=setup,
+        learned=learned,
+        chosen=chosen,
+        solution=solution,
+        attempt=attempt,
+        expected_steps=_expected_steps(setup, policy),
+        satisfaction=np.stack([from_starts(model, s.value) for s in each]),
+        data=data,
+        seed=training.seed,
+    )
 
 
 def summary(outcome: Outcome) -> dict[str, Any]:
-    """The outcome as numbers, lists and texts, for ``result.json``; NaN becomes None."""
+    """The outcome for ``result.json``; NaN becomes None."""
     setup, learned, i = outcome.setup, outcome.learned, outcome.chosen
     task, world, model = setup.task, setup.world, setup.model
     starts = np.flatnonzero(np.asarray(model.mdp.initial) > 0)
@@ -426,13 +390,13 @@ def summary(outcome: Outcome) -> dict[str, Any]:
     pairs = int(np.sum(np.asarray(setup.demonstrations.length)))
     result = {
         **about(task),
-        "in": task.learner.get("in", "product"),
+        "in": task.learner.in_,
         "num_states": world.mdp.num_states,
         "num_memory": model.num_memory,
         "demonstrations": {
             "number": len(np.asarray(setup.demonstrations.length)),
             "pairs": pairs,
-            "synthetic": "synthetic" in task.demonstrations,
+            "synthetic": task.demonstrations.synthetic is not None,
             "dropped": setup.dropped,
         },
         "guarantee": kept(
@@ -452,7 +416,7 @@ def summary(outcome: Outcome) -> dict[str, Any]:
             "steps": int(learned.num_steps[i]),
             "converged": bool(learned.converged[i]),
             "solver": Status(int(learned.status[i])).name,
-            "hyperparameters": hyperparameters(task),
+            "hyperparameters": task.learner.hyperparameters(),
         },
         "seeds": {
             "first": outcome.seed,
@@ -471,7 +435,7 @@ def summary(outcome: Outcome) -> dict[str, Any]:
 
 
 def _expected_steps(setup: Setup, learned: np.ndarray) -> dict[str, Any] | None:
-    """Of a co-safe task, until it is done or lost: of what was learned and of the quickest best."""
+    """Expected steps until a co-safe formula is decided: learned and quickest optimal policy."""
     model, best = setup.model, setup.guarantee.best
     if model.automaton.acceptance != "cosafe":
         return None
@@ -509,15 +473,15 @@ def _evidence(
 
 
 def save(out: Path, outcome: Outcome) -> None:
-    """Writes ``policy.npz``, the kept policy with all that it takes to run it, into a directory.
+    """Writes the kept policy to ``policy.npz`` in a directory.
 
     Its arrays: ``policy [S, Q, A]``; ``initial_memory [S]`` and ``next_memory [S, Q]``, the memory
-    at the start in s and after reading the label of s; ``label_on``; ``actions [A]``; ``weights
-    [F]`` and ``features [F]``; ``satisfaction``, ``lower`` and ``upper`` ``[S, Q]``; of a log,
-    ``states [S]``, its names.
+    state in the initial state s and after reading the label of s; ``label_on``; ``actions [A]``;
+    ``weights [F]`` and ``features [F]``; ``satisfaction``, ``lower`` and ``upper`` ``[S, Q]``; for
+    a log, the names ``states [S]``.
 
     Raises:
-      ValueError: the place cannot be written to.
+      ValueError: the directory is not writable.
     """
     model, learned, i = outcome.setup.model, outcome.learned, outcome.chosen
     logged = outcome.setup.world.logged

@@ -1,13 +1,13 @@
-"""From a simulated world and a formula to a network with its evidence, for `jaxltl learn`.
+"""Reinforcement learning in a simulated environment: the jobs of ppo, cce and cpo.
 
-Seeds learn side by side. With several, one is kept by episodes that nothing else is told of, so
-that the intervals of the kept one, which are from fresh episodes, are what they say.
+With several seeds one is kept by episodes that are used for nothing else, so that its intervals,
+which are from fresh episodes, have no selection bias.
 """
 
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,20 +15,19 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh
 
 from jaxltl.algos.common.checkpoint import atomic_write, read_arrays
-from jaxltl.app._environment_learners import Method, make_method
-from jaxltl.app.drawing import Picture, drawing
+from jaxltl.app.environment_learners import Method, make_method
+from jaxltl.app.reports.drawing import Picture, drawing
 from jaxltl.app.environment_source import load_environment
-from jaxltl.app.explorer import Curves, curves
-from jaxltl.app.files.tables import errors_in, read_bytes
-from jaxltl.app.files.task import many
-from jaxltl.app.files.task_environment import EnvironmentTask, named_files
+from jaxltl.app.protocols import Training
+from jaxltl.app.reports import learn_environment as report  # noqa: F401 - part of the job
+from jaxltl.app.reports.explorer import Curves, curves
+from jaxltl.app.files.schema import errors_in, read_bytes
+from jaxltl.app.files.task_environment import EnvironmentTask
 from jaxltl.app.files.task_environment import read_task as read_task
 from jaxltl.app.guarantee import check_formula
 from jaxltl.app.job import (
-    Report,
     about,
     automaton_picture,
     over_seeds,
@@ -38,6 +37,7 @@ from jaxltl.app.job import (
     took,
 )
 from jaxltl.app.job import fingerprint as fingerprint
+from jaxltl.app.wording import many
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.environments.environment import Environment, Finite, require_environment
@@ -53,9 +53,7 @@ from jaxltl.core.values.evaluation.evaluation import (
     evaluate,
 )
 
-DOUBLE = False  # the precision of its figures
-STEPS = 1  # never used: a file says how many
-EPISODES = 1000  # of the evaluation, unless the file says otherwise
+DOUBLE = False  # environments are written for single precision
 _DRAWN = 4  # trajectories
 
 
@@ -68,8 +66,8 @@ class Setup:
       automaton: of the formula.
       environment: the world with the task.
       method: the learner.
-      num_steps: after which an episode of the evaluation is cut off.
-      trivial: what is to be said of a formula that is always true.
+      num_steps: limit of an episode in the evaluation.
+      trivial: remark on a formula that is always true.
     """
 
     task: EnvironmentTask
@@ -80,19 +78,19 @@ class Setup:
     trivial: str | None
 
 
-@dataclass(frozen=True)
+@dataclass
 class Outcome:
-    """A finished job: what was asked, learned and found out about it.
+    """A finished job.
 
     Attributes:
-      setup: what was asked.
+      setup: the task.
       states: of the learner, with a first axis of N seeds.
       history: metrics ``[T, N]`` and ``step [T]``.
-      chosen: the seed's position that is kept.
+      chosen: index of the kept seed.
       evaluations: of every seed, from fresh episodes.
-      episodes: a few of the kept policy.
-      seed: the first of the seeds.
-      seconds: spent.
+      episodes: some of the kept policy, for pictures.
+      seed: the first seed.
+      seconds: wall time.
     """
 
     setup: Setup
@@ -102,19 +100,19 @@ class Outcome:
     evaluations: list[Evaluation]
     episodes: list[Episode]
     seed: int
-    seconds: float
+    seconds: float = 0.0
 
 
 def prepare(task: EnvironmentTask, seed: int, world: Environment | None = None) -> Setup:
-    """The world with its task, and the learner; all that the file names checked.
+    """The environment with the formula, and the learner.
 
     Args:
       task: the file.
-      seed: nothing is drawn here.
+      seed: unused.
       world: in place of the one that the file names.
 
     Raises:
-      ValueError: something in the file, or in what it names, is wrong.
+      ValueError: the file, or a function that it names, is wrong.
     """
     del seed
     world = load_environment(task, world)
@@ -124,28 +122,29 @@ def prepare(task: EnvironmentTask, seed: int, world: Environment | None = None) 
         trivial = check_formula(automaton)
     if automaton.propositions and not world.propositions:
         raise ValueError(
-            f"{task.path}: [world] environment {task.world['environment']!r} has no labels, and "
+            f"{task.path}: [world] environment {task.world.environment!r} has no labels, and "
             f"the formula mentions {', '.join(automaton.propositions)}: give labels = "
             '"file.py:function" and propositions = [...].'
         )
     with errors_in(f"{task.path}: [task] formula: "):
         require_known(automaton.propositions, world.propositions, f"{task.formula!r}")
+    reward = {key: value for key, value in task.task.given().items() if key != "formula"}
     with errors_in(f"{task.path}: [task] "):
-        environment = task_environment(world, automaton, **task.reward)
-    steps = task.evaluation.get("steps")
+        environment = task_environment(world, automaton, **reward)
+    steps = task.evaluation.steps
     if steps is None and world.horizon is None:
         raise ValueError(
-            f"{task.path}: [world] the environment's episodes never end, as far as it says: give "
-            "horizon = N, after which they are truncated, or steps = N in [evaluation]."
+            f"{task.path}: [world] the environment has no horizon: give horizon = N, after which "
+            "episodes are truncated, or steps = N in [evaluation]."
         )
     num_steps = checked_steps(environment, steps)
-    with errors_in(f"{task.path}: [{task.method}] "):
+    with errors_in(f"{task.path}: [{task.learner.method}] "):
         method = make_method(task, environment, num_steps)
     return Setup(task, automaton, environment, method, num_steps, trivial)
 
 
 def describe(setup: Setup) -> str:
-    """What a task comes to, in one line."""
+    """Sizes of a setup, in one line."""
     task, made = setup.task, setup.environment
     actions = made.actions
     seen = sum(x.size for x in jax.tree.leaves(_shapes(setup)))
@@ -154,14 +153,14 @@ def describe(setup: Setup) -> str:
         if isinstance(actions, Finite)
         else f"actions in a box {list(actions.shape)}"
     )
-    steps = task.learner["steps"]
+    steps = task.learner.steps
     return (
-        f"{task.world['environment']}: {does}, {many(seen, 'number')} observed, "
-        f"{many(len(made.propositions), 'label')}; {many(len(setup.automaton.delta), 'state')} of "
-        f"the task's memory ({setup.automaton.acceptance}); {task.method} with "
-        f"{setup.method.told}: {many(steps, 'step')} of at most "
+        f"{task.world.environment}: {does}, {many(seen, 'number')} observed, "
+        f"{many(len(made.propositions), 'label')}; {many(len(setup.automaton.delta), 'automaton state')} "
+        f"({setup.automaton.acceptance}); {task.learner.method} with "
+        f"{setup.method.description}: {many(steps, 'step')} of at most "
         f"{setup.method.transitions:,} simulated steps, {steps * setup.method.transitions:,} in "
-        f"all, a seed; judged by {_num_episodes(task):,} fresh episodes of at most "
+        f"total per seed; evaluated by {_num_episodes(task):,} fresh episodes of at most "
         f"{many(setup.num_steps, 'step')}"
     )
 
@@ -172,58 +171,43 @@ def _shapes(setup: Setup) -> Any:
 
 
 def _num_episodes(task: EnvironmentTask) -> int:
-    return int(task.evaluation.get("episodes", EPISODES))
+    return task.evaluation.episodes
 
 
 def postfix(figures: Mapping[str, np.ndarray]) -> dict[str, str]:
-    """What the progress bar tells of the newest figures."""
+    """Two of the newest metrics for the progress bar."""
     names = ("episode_return", "objective", "reward", "cost")
     known = [n for n in names if n in figures and np.isfinite(figures[n]).any()]
     return {n: f"{np.nanmedian(figures[n]):.3g}" for n in known[:2]}
 
 
-def learn(
-    setup: Setup,
-    seed: int,
-    num_seeds: int,
-    *,
-    report: Report | None = None,
-    checkpoint: Path | None = None,
-    progress: Callable[[str], None] = lambda stage: None,
-    mesh: Mesh | None = None,
-) -> tuple[Any, Mapping[str, np.ndarray], int, list[Evaluation], list[Episode]]:
-    """Learns with N seeds, keeps the best, and evaluates all of them; see :class:`Outcome`.
-
-    What it is at is told to `report`, steps and figures, and to `progress`, the stage's name.
-    """
-    task, method = setup.task, setup.method
+def learn(setup: Setup, training: Training) -> Outcome:
+    """Learns with N seeds, keeps the best by episodes of its own, and evaluates all of them."""
+    method, seed, num_seeds = setup.method, training.seed, training.num_seeds
     found, history = run_seeds(
         method.algorithm,
-        (seed, num_seeds),
         method.problem,
         method.hparams,
-        report,
-        num_steps=task.learner["steps"],
-        checkpoint=checkpoint,
-        mesh=mesh,
+        training,
+        num_steps=setup.task.learner.steps,
     )
-    # One cost of a search is a number like the others.
+    # A single cost of a search is a curve like others.
     history = {k: v[..., 0] if v.shape[2:] == (1,) else v for k, v in history.items()}
-    # No key of the learner's is one of these.
+    # Distinct from all keys of the learner.
     keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), 2), 3)
     agents = [_agent(setup, found.state, i) for i in range(num_seeds)]
     chosen = 0
     if num_seeds > 1:
-        progress("choosing")
+        training.stage("choosing")
         chosen = max(
             range(num_seeds),
             key=lambda i: _merit(setup, _evaluated(keys[0], agents[i], setup, threshold=False)),
         )
-    progress("evaluating")
+    training.stage("evaluating")
     each = [
         _evaluated(keys[1], agent, setup, threshold=i == chosen) for i, agent in enumerate(agents)
     ]
-    progress("drawing")
+    training.stage("drawing")
     run = jax.jit(run_episode, static_argnames="num_steps")
     shown = [
         jax.device_get(
@@ -236,16 +220,16 @@ def learn(
         )
         for i in range(_DRAWN)
     ]
-    return found.state, history, chosen, each, shown
+    return Outcome(setup, found.state, history, chosen, each, shown, seed)
 
 
 def _agent(setup: Setup, states: Any, i: int) -> Agent:
-    """What a seed learned."""
+    """The policy of a seed."""
     return _acting(setup, jax.tree.map(lambda x: x[i], states))
 
 
 def _acting(setup: Setup, state: Any) -> Agent:
-    likeliest = setup.task.evaluation.get("policy") == "likeliest"
+    likeliest = setup.task.evaluation.policy == "likeliest"
     return setup.method.agent(state, likeliest)
 
 
@@ -257,38 +241,38 @@ def _evaluated(key: jax.Array, agent: Agent, setup: Setup, *, threshold: bool) -
         setup.environment,
         num_episodes=_num_episodes(setup.task),
         num_steps=setup.num_steps,
-        confidence=asked.get("confidence", 0.95),
-        discount=asked.get("discount"),
-        threshold=asked.get("threshold") if threshold else None,
+        confidence=asked.confidence,
+        discount=asked.discount,
+        threshold=asked.threshold if threshold else None,
     )
 
 
 def _merit(setup: Setup, found: Evaluation) -> tuple[float, float, float]:
-    """By which seeds are compared: what is decided first, then how often it accepts."""
+    """Lexicographic criterion of seeds: verdicts, then accepting visits or length."""
     success, violation, visits = found.success, found.violation, found.visits
     assert success is not None and violation is not None and visits is not None
-    if setup.automaton.acceptance == "safety":  # which a run that goes on does not violate
+    if setup.automaton.acceptance == "safety":  # an undecided episode does not violate it
         return -violation.mean, success.mean, 0.0
     if setup.automaton.acceptance == "cosafe":
         return success.mean, -violation.mean, -found.length.mean
     return success.mean - violation.mean, visits.mean, 0.0
 
 
-# --- what is told -----------------------------------------------------------------------------
+# --- results ----------------------------------------------------------------------------------
 
 
 def summary(outcome: Outcome) -> dict[str, Any]:
-    """The outcome as numbers, lists and texts, for ``result.json``; NaN becomes None."""
+    """The outcome for ``result.json``; NaN becomes None."""
     setup, history = outcome.setup, outcome.history
     task, made, kept = setup.task, setup.environment, outcome.evaluations[outcome.chosen]
     last = {name: history[name][-1, outcome.chosen] for name in _drawn(outcome)}
     status = history["status"][:, outcome.chosen]
     return plain(
         {
-            **about(task),  # type: ignore[arg-type]
+            **about(task),
             "environment": {
-                "name": task.world["environment"],
-                "arguments": task.world.get("arguments", {}),
+                "name": task.world.environment,
+                "arguments": task.world.arguments,
                 "propositions": list(made.propositions),
                 "horizon": made.horizon,
                 "actions": made.actions.num
@@ -299,16 +283,16 @@ def summary(outcome: Outcome) -> dict[str, Any]:
             "acceptance": setup.automaton.acceptance,
             "trivial": setup.trivial,
             "policy": {
-                "made_of": setup.method.told,
-                "acts": task.evaluation.get("policy", "drawn"),
+                "made_of": setup.method.description,
+                "acts": task.evaluation.policy or "drawn",
             },
             "evaluation": _as_numbers(kept),
             "training": {
-                "steps": int(task.learner["steps"]),
+                "steps": task.learner.steps,
                 "transitions": _transitions(outcome),
                 "troubled_rows": int((status != 0).sum()),
                 "last": last,
-                "hyperparameters": dict(task.settings),
+                "hyperparameters": task.given,
             },
             "seeds": {
                 "first": outcome.seed,
@@ -323,9 +307,9 @@ def summary(outcome: Outcome) -> dict[str, Any]:
 
 
 def _transitions(outcome: Outcome) -> int:
-    """Simulated steps of a seed: counted by the learner, or at most."""
+    """Simulated steps of a seed: the learner's count, or an upper bound."""
     counted = outcome.history.get("transitions")
-    most = outcome.setup.task.learner["steps"] * outcome.setup.method.transitions
+    most = outcome.setup.task.learner.steps * outcome.setup.method.transitions
     return int(counted[-1, 0]) if counted is not None else most
 
 
@@ -341,7 +325,7 @@ def _as_numbers(found: Evaluation) -> dict[str, Any]:
 
 
 def _drawn(outcome: Outcome) -> list[str]:
-    """The names of the learning curves: those that are numbers, one for each seed."""
+    """Names of the scalar metrics with finite values."""
     history = outcome.history
     return [
         n
@@ -351,19 +335,19 @@ def _drawn(outcome: Outcome) -> list[str]:
 
 
 def task_pictures(setup: Setup) -> list[Picture]:
-    """The report's pictures that nothing has to be learned for."""
+    """The pictures that need no outcome."""
     return [automaton_picture(setup.automaton, "")]
 
 
 def pictures(outcome: Outcome) -> list[Picture]:
-    """The report's pictures of what was learned."""
+    """The pictures of an outcome."""
     history, names = outcome.history, _drawn(outcome)
     found = [
         Picture(
             "learning.svg",
             "Learning",
             drawing("curves", {k: history[k].T for k in names}, steps=history["step"], show=names),
-            "Figures of each step of the learner" + over_seeds(len(outcome.evaluations)),
+            "Metrics of each step of the learner" + over_seeds(len(outcome.evaluations)),
             "learning",
         )
     ]
@@ -372,16 +356,20 @@ def pictures(outcome: Outcome) -> list[Picture]:
 
 
 def live(outcome: Outcome) -> list[Curves]:
-    """The parts of the report that are drawn by the page."""
-    caption = "Figures of each step of the learner" + over_seeds(len(outcome.evaluations))
+    """The learning curves."""
+    caption = "Metrics of each step of the learner" + over_seeds(len(outcome.evaluations))
     return [curves("learning", "Learning", caption, outcome.history, _drawn(outcome))]
 
 
-_SAYS = {Verdict.SATISFIED: "done", Verdict.VIOLATED: "failed", Verdict.UNDECIDED: "undecided"}
+_VERDICTS = {
+    Verdict.SATISFIED: "satisfied",
+    Verdict.VIOLATED: "violated",
+    Verdict.UNDECIDED: "undecided",
+}
 
 
 def _pictured(outcome: Outcome) -> Picture | None:
-    """A few trajectories, where the world has places; drawn here, since it may be anybody's."""
+    """Some episodes, if the world has positions; drawn here, since its code is the user's."""
     # Deferred: matplotlib.
     from jaxltl.plot.episodes import draw_episodes
     from jaxltl.plot.style import to_bytes
@@ -389,7 +377,7 @@ def _pictured(outcome: Outcome) -> Picture | None:
     titles = []
     for one in outcome.episodes:
         verdict = Verdict(int(np.asarray(one.world.verdict)[int(one.valid.sum())]))
-        titles.append(f"{_SAYS[verdict]} after {many(int(one.valid.sum()), 'step')}")
+        titles.append(f"{_VERDICTS[verdict]} after {many(int(one.valid.sum()), 'step')}")
     try:
         figure = draw_episodes(outcome.setup.environment, outcome.episodes, titles=titles)
     except ValueError:
@@ -398,20 +386,18 @@ def _pictured(outcome: Outcome) -> Picture | None:
         "episodes.svg",
         "A few episodes",
         to_bytes(figure),
-        "The first episodes of the policy that is kept, chosen by nothing; episode.html plays "
-        "the first.",
+        "The first episodes of the kept policy, without selection; episode.html plays the first.",
     )
 
 
 def save(out: Path, outcome: Outcome) -> None:
-    """Writes ``policy.npz`` and, where the world has places, ``episode.html`` into a directory.
+    """Writes ``policy.npz`` and, if the world has positions, ``episode.html`` into a directory.
 
-    Arrays of ``policy.npz`` are those of the learner's state that the kept policy is made of, by
-    their place in it; with them goes the task file, and where it lay. :func:`load_policy` reads
-    them.
+    ``policy.npz`` has the arrays of the learner's state that determine the kept policy, and the
+    text and path of the task file; :func:`load_policy` reads it.
 
     Raises:
-      ValueError: the place cannot be written to.
+      ValueError: the directory is not writable.
     """
     from jaxltl.plot.episodes import play_episode
 
@@ -434,7 +420,7 @@ def save(out: Path, outcome: Outcome) -> None:
 
 
 def _parts(method: Method, state: Any) -> list[tuple[str, Any]]:
-    """The arrays of a state that a policy is made of, with their names."""
+    """Names and arrays of a state that determine a policy."""
     kept = {name: getattr(state, name) for name in method.kept}
     leaves, _ = jax.tree_util.tree_flatten_with_path(kept)
     return [(jax.tree_util.keystr(path, simple=True, separator="."), x) for path, x in leaves]
@@ -446,28 +432,28 @@ def load_policy(
     environment: Environment | None = None,
     task_file: str | Path | None = None,
 ) -> tuple[Environment, Agent]:
-    """A policy that ``jaxltl learn`` wrote, and the environment with the task that it is for.
+    """A policy that ``jaxltl learn`` wrote, and its environment with the formula.
 
     The file has the text of its task file, but no code: the function that makes the environment is
-    imported and called as the task names it. A file of functions is looked for where the task file
-    lay, and beside the policy. Do so with policies of those alone whom you trust; of others, give
-    `environment`, and nothing is imported.
+    imported and called as the task names it. Files of functions are looked up in the directory of
+    the task file, and in that of the policy. Load only policies that you trust, or give
+    `environment`: then nothing is imported.
 
     Args:
       policy_file: ``policy.npz``.
-      environment: in place of what the task names, without its task, but with its labels.
-      task_file: in place of what was kept of it.
+      environment: with its labels and without the formula, in place of the task's.
+      task_file: in place of the text in the policy file.
 
     Returns:
-      What :func:`~jaxltl.core.values.evaluation.evaluation.evaluate` and
-      :func:`~jaxltl.core.environments.episodes.run_episode` take.
+      The arguments of :func:`~jaxltl.core.values.evaluation.evaluation.evaluate` and
+      :func:`~jaxltl.core.environments.episodes.run_episode`.
 
     Raises:
-      ValueError: no such file, or none of a policy; a mistake in the task, or functions that are
-        not there; arrays that are not of its policy.
+      ValueError: a missing file, or one that is no policy of this task; an invalid task, or
+        missing functions.
 
-    Of a run into `out`, ``environment, agent = load_policy("out/policy.npz")``, and
-    ``evaluate(key, agent, environment)`` gives the evidence anew.
+    Example: ``environment, agent = load_policy("out/policy.npz")``, and ``evaluate(key, agent,
+    environment)`` repeats the evaluation.
     """
     policy_file = Path(policy_file)
     with errors_in(f"{policy_file}: "):
@@ -494,7 +480,7 @@ def load_policy(
 
 
 def _kept_task(policy_file: Path, arrays: Mapping[str, np.ndarray]) -> EnvironmentTask:
-    """The task in a policy's file, in the folder that has the files that it names."""
+    """The task of a policy file, in the directory that has the files that it names."""
     if not all(name in arrays and arrays[name].dtype.kind == "U" for name in ("task", "task_file")):
         raise ValueError(
             f"{policy_file}: no task is kept with it, as jaxltl learn does for environments; give "
@@ -502,7 +488,7 @@ def _kept_task(policy_file: Path, arrays: Mapping[str, np.ndarray]) -> Environme
         )
     path, raw = Path(str(arrays["task_file"])), str(arrays["task"]).encode()
     beside = policy_file.absolute().parent
-    named = named_files(read_task(path, raw).world)
+    named = read_task(path, raw).world.named_files()
     there = [
         folder
         for folder in (path.parent, beside)

@@ -7,7 +7,7 @@ knows the task and one that moves at random.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -17,12 +17,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.sharding import Mesh
 
 from jaxltl.algos import todirl
 from jaxltl.algos.common import learner
-from jaxltl.app._todirl_guarantee import check_attainable, hold, is_weighable, likeliest
-from jaxltl.app._todirl_parts import (
+from jaxltl.app.todirl_guarantee import check_attainable, hold, is_weighable, likeliest
+from jaxltl.app.todirl_results import (
     LENGTH,
     Judged,
     Learned,
@@ -32,26 +31,25 @@ from jaxltl.app._todirl_parts import (
     counted_worlds,
     part_of,
 )
-from jaxltl.app._todirl_pictures import live as live
-from jaxltl.app._todirl_pictures import pictures as pictures
-from jaxltl.app._todirl_pictures import task_pictures as task_pictures
-from jaxltl.app.files.tables import errors_in
-from jaxltl.app.files.task import require_end, synthetic_demonstrations
-from jaxltl.app.files.task_todirl import (
+from jaxltl.app.protocols import Training
+from jaxltl.app.reports import learn_todirl as report  # noqa: F401 - part of the job
+from jaxltl.app.reports.todirl_pictures import live as live
+from jaxltl.app.reports.todirl_pictures import pictures as pictures
+from jaxltl.app.reports.todirl_pictures import task_pictures as task_pictures
+from jaxltl.app.files.demonstrations import require_cosafe, synthetic_demonstrations
+from jaxltl.app.files.scenes import (
     Scene,
-    Task,
     cell_kinds,
-    expert_rewards,
     load_automata,
     load_demonstrations,
     load_scenes,
 )
+from jaxltl.app.files.schema import errors_in
+from jaxltl.app.files.task_todirl import TodirlTask
 from jaxltl.app.files.task_todirl import read_task as read_task
 from jaxltl.app.guarantee import check_formula
 from jaxltl.app.job import (
-    Report,
     about,
-    hyperparameters,
     memory_arrays,
     one_seed,
     plain,
@@ -88,8 +86,7 @@ from jaxltl.envs.cell_kinds import COLORS
 from jaxltl.envs.gridworld import ACTIONS
 from jaxltl.io.learned_reward import LearnedReward, save_reward
 
-DOUBLE = True  # the precision of its figures
-STEPS = 300  # at most, unless the task says otherwise
+DOUBLE = True
 
 
 _BATCH = 64  # worlds that are planned in at once
@@ -98,7 +95,7 @@ _BATCH = 64  # worlds that are planned in at once
 _EXPERT_DISCOUNT = 0.99  # at most, where the file does not give one
 
 
-def prepare(task: Task, seed: int) -> Setup:
+def prepare(task: TodirlTask, seed: int) -> Setup:
     """The worlds, products and demonstrations of a task; all of its files checked.
 
     Raises:
@@ -106,13 +103,14 @@ def prepare(task: Task, seed: int) -> Setup:
         guaranteed is more than any policy has in some world.
     """
     judge, memory = load_automata(task)
-    require_end(task, judge)
+    shown = task.demonstrations
+    require_cosafe(task.path, shown, judge)
     with errors_in(f"{task.path}: [task] "):
         trivial = check_formula(judge)
     scenes, others = load_scenes(task, judge)
-    found = load_demonstrations(task, scenes) if "files" in task.demonstrations else []
+    found = load_demonstrations(task, scenes) if shown.files is not None else []
     worlds = _stack(task, [*scenes, *others], judge, memory)
-    soft = judge.acceptance == "cosafe" and ("discount" in task.demonstrations or bool(found))
+    soft = judge.acceptance == "cosafe" and (shown.discount is not None or bool(found))
     expert, bests = _experts(task, worlds.scenes, judge, soft=soft)
     dropped = 0
     if not found:
@@ -128,12 +126,12 @@ def prepare(task: Task, seed: int) -> Setup:
                         own,
                         model,
                         expert[w, : scene.mdp.num_states],
-                        task.demonstrations["synthetic"],
-                        task.demonstrations.get("length", LENGTH),
+                        shown.synthetic or 0,
+                        shown.length or LENGTH,
                     )
                 )
             else:
-                runs, lost = synthetic_demonstrations(task, model, own, bests[w])
+                runs, lost = synthetic_demonstrations(task.path, shown, model, own, bests[w])
                 found, dropped = [*found, runs], dropped + lost
     if memory is not judge:
         expert = np.tile(expert, (1, 1, len(memory.delta), 1))  # the task's state varies fastest
@@ -170,12 +168,12 @@ def _narrowed(setup: Setup) -> Setup:
             model = product(worlds.scenes[w].mdp, setup.judge, label_on=task.label_on)
             kept = allowed_steps(with_allowed(model, allowed[w][:size]), trajectories)
         count += int(np.asarray(trajectories.mask).sum() - kept.sum())
-    worlds = worlds._replace(model=restrict_stacked_actions(worlds.model, allowed))
+    worlds = replace(worlds, model=restrict_stacked_actions(worlds.model, allowed))
     return replace(setup, worlds=worlds, left_out=count)
 
 
 def _experts(
-    task: Task, scenes: list[Scene], judge: Automaton, *, soft: bool
+    task: TodirlTask, scenes: list[Scene], judge: Automaton, *, soft: bool
 ) -> tuple[np.ndarray, list[Solution]]:
     """Policies ``[W, S, Q, A]`` of one who knows the task, and its best probability if not soft.
 
@@ -183,9 +181,11 @@ def _experts(
     """
     if soft:
         shown = task.demonstrations
-        discount = shown.get("discount", min(task.learner["discount"], _EXPERT_DISCOUNT))
+        discount = shown.discount
+        if discount is None:
+            discount = min(task.learner.discount, _EXPERT_DISCOUNT)
         models = stack_products([s.mdp for s in scenes], judge, label_on=task.label_on)
-        return np.asarray(_expert(models, discount, expert_rewards(task))), []
+        return np.asarray(_expert(models, discount, shown.rewards())), []
     bests = [optimal_satisfaction(product(s.mdp, judge, label_on=task.label_on)) for s in scenes]
     size = max(scene.mdp.num_states for scene in scenes)
     # In the padding any move does.
@@ -193,7 +193,7 @@ def _experts(
     return np.eye(len(ACTIONS))[np.stack(chosen)], bests
 
 
-def _stack(task: Task, scenes: list[Scene], judge: Automaton, memory: Automaton) -> Worlds:
+def _stack(task: TodirlTask, scenes: list[Scene], judge: Automaton, memory: Automaton) -> Worlds:
     """All worlds at once, so that what works in them is compiled once."""
     mdps = [scene.mdp for scene in scenes]
     both = judge if memory is judge else synchronize(memory, judge)
@@ -226,25 +226,14 @@ def describe(setup: Setup) -> str:
     )
 
 
-def learn(
-    setup: Setup,
-    seed: int,
-    num_seeds: int,
-    *,
-    report: Report | None = None,
-    checkpoint: Path | None = None,
-    progress: Callable[[str], None] = lambda stage: None,
-    mesh: Mesh | None = None,
-) -> tuple[Learned, int, Judged, Judged | None]:
-    """Learns with N seeds, keeps one without looking at test worlds, and judges it.
-
-    What it is at is told to `report`, steps and figures, and to `progress`, the stage's name.
+def learn(setup: Setup, training: Training) -> Outcome:
+    """Learns with N seeds, keeps one without looking at test worlds, and evaluates it.
 
     Raises:
       ValueError: the learner cannot work on this task.
     """
-    spec = setup.task.learner
-    network = todirl.RewardNetwork(tuple(spec.get("hidden", (80, 80))))
+    table = setup.task.learner
+    network = todirl.RewardNetwork(tuple(table.hidden))
     scenes = setup.worlds.scenes[: setup.num_training]
     # Stacked anew, without the padding that larger test worlds ask for.
     model = stack_products(
@@ -255,44 +244,36 @@ def learn(
         model,
         _observations(scenes, model),
         setup.demonstrations,
-        held_out=spec.get("held_out", 0.2),
+        held_out=table.held_out,
         network=network,
-        horizon=spec.get("horizon"),
+        horizon=table.horizon,
         allowed=masks if masks is None else masks[: len(scenes), : model.mdp.num_states],
     )
-    hparams = settings(todirl.Hparams, spec)
+    hparams = settings(todirl.Hparams, table.given())
     if setup.is_probability and is_weighable(setup):
         hparams = replace(hparams, mu=0.0)  # it is one program for all weights
-    learned = _trained(setup, problem, hparams, (seed, num_seeds), report, checkpoint, mesh)
+    learned = _train(setup, problem, hparams, training)
     chosen = _least_loss(learned)
     if setup.is_probability:
+        seed = training.seed
         learned, chosen = _weighed(setup, problem, hparams, _lane(learned, chosen), seed), 0
-    progress("checking")
+    training.stage("checking")
     judged, count = _judge(setup, learned, network, hparams, chosen), setup.num_training
     test = judged.part(slice(count, None)) if count < len(judged.status) else None
-    return learned, chosen, judged.part(slice(count)), test
+    return Outcome(setup, learned, chosen, judged.part(slice(count)), test, training.seed)
 
 
-def _trained(
-    setup: Setup,
-    problem: todirl.Problem,
-    hparams: todirl.Hparams,
-    seeds: tuple[int, int],
-    report: Report | None = None,
-    checkpoint: Path | None = None,
-    mesh: Mesh | None = None,
+def _train(
+    setup: Setup, problem: todirl.Problem, hparams: todirl.Hparams, training: Training
 ) -> Learned:
-    """What N seeds learn of a problem."""
+    """Reward networks of N seeds."""
     found, history = run_seeds(
         todirl,
-        seeds,
         problem,
         hparams,
-        report,
-        num_steps=setup.task.learner.get("steps", STEPS),
+        training,
+        num_steps=setup.task.learner.steps,
         until=learner.has_stopped,
-        checkpoint=checkpoint,
-        mesh=mesh,
     )
     states, best = found.state, found.state.best
     score = np.asarray(best.neg_log_likelihood)
@@ -327,7 +308,7 @@ def _weighed(
     """What is kept of what one seed learns with more and more weight of the task."""
 
     def train(mu: float, _: Learned) -> Learned:
-        return _trained(setup, problem, replace(hparams, mu=mu), (seed, 1))
+        return _train(setup, problem, replace(hparams, mu=mu), Training(seed, 1))
 
     def plans(learned: Learned) -> tuple[np.ndarray, np.ndarray]:
         parameters = part_of(learned.parameters, 0)
@@ -496,8 +477,8 @@ def summary(outcome: Outcome) -> dict[str, Any]:
         **about(task),
         "memory": task.memory,
         "label_on": task.label_on,
-        "radius": task.radius,
-        "horizon": task.learner.get("horizon"),
+        "radius": task.learner.radius,
+        "horizon": task.learner.horizon,
         "guarantee": {
             "asked": setup.asked,
             "over": task.over,
@@ -512,16 +493,17 @@ def summary(outcome: Outcome) -> dict[str, Any]:
         "demonstrations": {
             "number": [len(shown.length) for shown in setup.demonstrations],
             "pairs": [int(np.sum(shown.length)) for shown in setup.demonstrations],
-            "synthetic": "synthetic" in task.demonstrations,
+            "synthetic": task.demonstrations.synthetic is not None,
             "dropped": setup.dropped,
         },
         "training": _about_worlds(setup.training, outcome.training, infeasible[:count], ()),
         "test": outcome.test
         and setup.test
-        and _about_worlds(
-            setup.test, outcome.test, infeasible[count:], task.test.get("leave_out", ())
-        ),
-        "learning": {**_about_learning(learned, i), "hyperparameters": hyperparameters(task)},
+        and _about_worlds(setup.test, outcome.test, infeasible[count:], task.left_out),
+        "learning": {
+            **_about_learning(learned, i),
+            "hyperparameters": task.learner.hyperparameters(),
+        },
         "history": {
             "step": history["step"],
             **{k: history[k][:, i] for k in ("loss", "per_pair", "held_out", "gradient_norm")},
@@ -540,7 +522,7 @@ def summary(outcome: Outcome) -> dict[str, Any]:
         "network": {
             "file": "network.npz",
             "load": 'jaxltl.io.learned_reward.load_reward("network.npz")',
-            "hidden": list(task.learner.get("hidden", (80, 80))),
+            "hidden": task.learner.hidden,
         },
         **took(outcome.seconds),
     }
@@ -641,16 +623,15 @@ def save(out: Path, outcome: Outcome) -> None:
 def learned_reward(outcome: Outcome) -> LearnedReward:
     """The kept seed's reward, with all that planning with it needs."""
     task, i = outcome.setup.task, outcome.chosen
-    spec = task.learner
     kinds = COLORS if task.is_colored else (*cell_kinds(task.world), "off the map")
     return LearnedReward(
         parameters=part_of(outcome.learned.parameters, i),
-        hidden=tuple(spec.get("hidden", (80, 80))),
+        hidden=tuple(task.learner.hidden),
         memory=outcome.setup.memory,
         label_on=task.label_on,
-        discount=spec["discount"],
-        horizon=spec.get("horizon"),
-        radius=task.radius,
+        discount=task.learner.discount,
+        horizon=task.learner.horizon,
+        radius=task.learner.radius,
         formula=task.formula,
         kinds=tuple(kinds),
         guarantee=outcome.setup.asked,

@@ -1,8 +1,7 @@
-"""Worlds that are known from a log: as they are learned in, and what is guaranteed there."""
+"""Worlds estimated from logs: the model of frequencies, and guarantees of policies."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 
 from jaxltl.app.certify import Asked, Evidence, certify, read_evidence, sample_next
 from jaxltl.app.files.models import padded
+from jaxltl.app.files.task_mlirl import WorldTable
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.product import Product, product
 from jaxltl.core.types import Status
@@ -20,12 +20,12 @@ from jaxltl.core.values.undiscounted.satisfaction import satisfaction_probabilit
 
 @dataclass(frozen=True)
 class Logged:
-    """The log that a world was counted from.
+    """The log from which a world was estimated.
 
     Attributes:
-      evidence: the world with its frequencies, choice by choice, and the counts.
-      column: ``int[R]``, the action that each choice is where the world is padded.
-      confidence, method: of the sets of distributions.
+      evidence: the world with its frequencies, and the counts.
+      column: ``int[R]``, the action of each choice in the padded world.
+      confidence, method: of the confidence sets.
     """
 
     evidence: Evidence
@@ -40,53 +40,54 @@ class Logged:
 
     @property
     def num_samples(self) -> int:
-        """How many transitions were logged."""
+        """The number of logged transitions."""
         return int(self.evidence.counts.sum())
 
 
-def load_logged(beside: Path, spec: Mapping[str, Any]) -> tuple[MDP, tuple[str, ...], Logged]:
-    """The world of a log, with frequencies as probabilities, and the names of its actions.
+def load_logged(folder: Path, table: WorldTable) -> tuple[MDP, tuple[str, ...], Logged]:
+    """The world of a log, with frequencies as probabilities, the names of its actions, and the log.
 
     Args:
-      beside: the folder of the files that are named.
-      spec: ``[world]`` of a task file.
+      folder: of the files that are named.
+      table: ``[world]`` of a task file.
 
     Raises:
       ValueError: naming the file and the line, or the key.
     """
-    initial = spec["initial"]
+    initial, confidence = table.initial or [], table.confidence
+    assert table.transitions is not None and confidence is not None
     evidence = read_evidence(
-        beside / spec["transitions"],
-        labels=beside / spec["labels"] if "labels" in spec else None,
+        folder / table.transitions,
+        labels=None if table.labels is None else folder / table.labels,
         initial=[initial] if isinstance(initial, str) else initial,
-        terminal=spec.get("terminal", ()),
-        graph=spec.get("graph", "seen"),
+        terminal=table.terminal or (),
+        graph=table.graph or "seen",
         option="{} = ",
     )
     mdp, actions, column = padded(evidence.model)
     return (
         mdp,
         actions,
-        Logged(evidence, column, float(spec["confidence"]), spec.get("method", "anytime")),
+        Logged(evidence, column, confidence, table.method or "anytime"),
     )
 
 
 def guaranteed(logged: Logged, model: Product, formula: str, policy: Any) -> dict[str, Any]:
-    """What the log guarantees of a policy of the world's product with a formula.
+    """Guaranteed satisfaction probability of a policy, from the log alone.
 
-    The policy may have been chosen by the same log: the sets hold the true distributions all at
-    once, so that what holds against nature holds for any policy.
+    The policy may depend on the log: with the given confidence all sets hold the true
+    distributions at once, so that the worst case over them bounds every policy.
 
     Args:
       logged: the log.
       model: the product of the padded world.
-      formula: its task.
+      formula: of the product.
       policy: ``float[S, Q, A]``.
 
     Returns:
-      For ``result.json``: ``guaranteed``, which the task's probability under the policy is at
-      least, ``best_guaranteed``, that of the best policy against nature, and ``optimistic``, which
-      no policy exceeds; all with one ``confidence``.
+      For ``result.json``: ``guaranteed``, a lower bound of the policy's satisfaction probability,
+      ``best_guaranteed``, the greatest such bound of any policy, and ``optimistic``, an upper
+      bound for all policies; all with one ``confidence``.
     """
     evidence = logged.evidence
     best = certify(evidence, Asked(formula, logged.confidence, logged.method, "max"))

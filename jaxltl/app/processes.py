@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from jaxltl.app import _teller
+from jaxltl.app import exit_message
 
 if TYPE_CHECKING:
     from jax.sharding import Mesh
@@ -271,8 +271,10 @@ def taking_part(asked: Asked, launch: Launch, say: Callable[[str], None]) -> Ite
     except Exception as error:
         if not is_loss(error):
             raise
-        line = f"process {launch.process} stops, for another process has ended; {_teller.AGAIN}."
-        os.write(2, f"{_teller.END}{line}\n".encode())
+        line = (
+            f"process {launch.process} stops, for another process has ended; {exit_message.AGAIN}."
+        )
+        os.write(2, f"{exit_message.END}{line}\n".encode())
         raise SystemExit(LOST) from None
     _leave()
 
@@ -422,7 +424,7 @@ def _read_apart(launch: Launch) -> None:
     out, err = os.dup(1), os.dup(2)
     source, sink = os.pipe()
     subprocess.Popen(
-        [sys.executable, "-I", "-S", str(Path(_teller.__file__)), str(launch.process)],
+        [sys.executable, "-I", "-S", str(Path(exit_message.__file__)), str(launch.process)],
         stdin=source,
         stdout=err,
         stderr=err,

@@ -1,7 +1,6 @@
-"""A job of learning from a task file to a directory of results: shown, and gone on from.
+"""Runs a learning job from its task file to a directory of results, with progress and resumption.
 
-A job is a module such as :mod:`jaxltl.app.learn`, with its `Outcome` and its functions by the same
-names. Heavy modules are imported inside, so that the command's first line comes at once.
+Heavy modules are imported inside functions, so that the command's first line comes at once.
 """
 
 from __future__ import annotations
@@ -11,18 +10,54 @@ import json
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from jaxltl.app.protocols import Job, LearningTask, O, Result, S, T, Training
+
 if TYPE_CHECKING:
     import numpy as np
+    from tqdm import tqdm
 
-    from jaxltl.app.drawing import Artist, Picture
     from jaxltl.app.processes import Place
+    from jaxltl.app.reports.drawing import Artist, Drawing, Picture
+
+Drawn = Callable[[], bytes]  # waits for a picture
 
 
-def job_of(task_file: Path) -> Any:
-    """The module that does what a task file asks for."""
+@dataclass(frozen=True)
+class Request:
+    """A run of a job.
+
+    Attributes:
+      out: directory of results, in which an interrupted job leaves its checkpoint.
+      seed, num_seeds: the first seed, and the number of seeds.
+      mark: the job's fingerprint, which the checkpoint must have.
+    """
+
+    out: Path
+    seed: int
+    num_seeds: int
+    mark: str
+
+    @property
+    def checkpoint(self) -> Path:
+        """File from which an interrupted job resumes."""
+        return self.out / f"checkpoint-{self.mark}.npz"
+
+
+@dataclass(frozen=True)
+class Console:
+    """Where a job draws, reports its progress, and runs."""
+
+    artist: Artist
+    say: Callable[[str], None]
+    place: Place
+
+
+def job_of(task_file: Path) -> Job[Any, Any, Any]:
+    """The kind of job that a task file describes."""
     from jaxltl.app.files.task import method_of
     from jaxltl.app.files.task_environment import is_environment_task
 
@@ -39,8 +74,8 @@ def job_of(task_file: Path) -> Any:
     return learn
 
 
-def finished(out: Path, mark: str) -> dict[str, Any] | None:
-    """The result of the same task and options, if a directory has it."""
+def finished(out: Path, mark: str) -> Result | None:
+    """The result in a directory, if it has the job's fingerprint."""
     try:
         result = json.loads((out / "result.json").read_text())
     except (OSError, ValueError):
@@ -50,7 +85,7 @@ def finished(out: Path, mark: str) -> dict[str, Any] | None:
 
 
 def make_directory(out: Path) -> Path:
-    """A directory for results, made if it is not there.
+    """Makes a directory for results.
 
     Raises:
       ValueError: it cannot be made.
@@ -64,89 +99,62 @@ def make_directory(out: Path) -> Path:
     return out
 
 
-def run_job(
-    job: Any,
-    task: Any,
-    out: Path,
-    seeds: tuple[int, int],
-    mark: str,
-    begin: Artist,
-    say: Callable[[str], None],
-    place: Place,
-) -> dict[str, Any] | None:
-    """Does the whole job, shows how far it is, and returns what ``result.json`` holds.
+def run_job(job: Job[T, S, O], task: T, request: Request, console: Console) -> Result | None:
+    """Runs a job, and returns the contents of ``result.json``; None in all processes but the first.
 
-    In several processes the first alone draws and writes, and returns something.
-
-    Args:
-      job: of :func:`job_of`; `task` is what its ``read_task`` gives.
-      out: the directory of results, in which an interrupted job leaves its checkpoint.
-      seeds: the first, and how many.
-      mark: the job's fingerprint, which a checkpoint must have to be gone on from.
-      begin: begins to draw a picture.
-      say: takes lines on how far it is.
-      place: the devices and processes.
+    Raises:
+      SystemExit: interrupted, with status 130; the same request resumes from the checkpoint.
     """
-    checkpoint = out / f"checkpoint-{mark}.npz"
     try:
-        return _done(job, task, out, seeds, mark, begin, say, place, checkpoint)
+        return _run(job, task, request, console)
     except KeyboardInterrupt:
         kept = "; the same command goes on from the last checkpoint"
-        say(f"interrupted{kept if checkpoint.exists() else ''}")
+        console.say(f"interrupted{kept if request.checkpoint.exists() else ''}")
         raise SystemExit(130) from None
 
 
-def _done(
-    job: Any,
-    task: Any,
-    out: Path,
-    seeds: tuple[int, int],
-    mark: str,
-    begin: Artist,
-    say: Callable[[str], None],
-    place: Place,
-    checkpoint: Path,
-) -> dict[str, Any] | None:
+def _run(job: Job[T, S, O], task: T, request: Request, console: Console) -> Result | None:
     from jaxltl.algos.common import checkpoint as files
 
     start = time.perf_counter()
-    setup = place.together(lambda: job.prepare(task, seeds[0]))
-    say(job.describe(setup))
+    place, begin, checkpoint = console.place, console.artist, request.checkpoint
+    setup = place.together(lambda: job.prepare(task, request.seed))
+    console.say(job.describe(setup))
     if place.mesh is not None:
-        say(spread(seeds[1], place))
-    place.together(lambda: _claim(out, task, place))
+        console.say(spread(request.num_seeds, place.num_devices))
+    place.together(lambda: _claim(request.out, task, place))
     if place.sees(str(checkpoint), checkpoint.exists()):
-        say(f"going on from {checkpoint}")
-    place.sees(str(out), (out / "task.toml").exists())
-    steps = task.learner.get("steps", job.STEPS)
-    with _learning(steps, shown=place.is_first) as bar:
-        pictures = [(p, begin(p.drawing)) for p in job.task_pictures(setup) if place.is_first]
+        console.say(f"going on from {checkpoint}")
+    place.sees(str(request.out), (request.out / "task.toml").exists())
+    with _progress_bar(task.learner.steps, shown=place.is_first) as bar:
+        early = job.task_pictures(setup) if place.is_first else []
+        pictures = [(p, _begun(begin, p)) for p in early]
 
         def report(step: int, figures: Mapping[str, np.ndarray]) -> None:
             bar.set_description_str("learning", refresh=False)
             bar.update(step - bar.n)
             bar.set_postfix(job.postfix(figures))
 
-        parts = job.learn(
-            setup,
-            *seeds,
+        training = Training(
+            request.seed,
+            request.num_seeds,
             report=report,
+            stage=bar.set_description_str,
             checkpoint=checkpoint,
-            progress=bar.set_description_str,
             mesh=place.mesh,
         )
+        outcome = job.learn(setup, training)
         if not place.is_first:
             return None
         files.remove(checkpoint)
-        outcome = job.Outcome(setup, *parts, seed=seeds[0], seconds=time.perf_counter() - start)
+        outcome.seconds = time.perf_counter() - start
         bar.set_description_str("drawing")
         pictures += [(p, _begun(begin, p)) for p in job.pictures(outcome)]
-        live = [(x, {k: begin(d) for k, d in x.drawings.items()}) for x in job.live(outcome)]
-        return _write(job, outcome, out, mark, pictures, live)
+        return _write(job, outcome, request, pictures, begin)
 
 
-def _claim(out: Path, task: Any, place: Place) -> None:
-    """The directory of results; one that cannot be written to must be known before the work."""
+def _claim(out: Path, task: LearningTask, place: Place) -> None:
+    """Makes the directory of results; before the work, since it may not be writable."""
     from jaxltl.algos.common.checkpoint import atomic_write
 
     if place.is_first:
@@ -155,36 +163,34 @@ def _claim(out: Path, task: Any, place: Place) -> None:
             file.write(task.path.read_bytes())
 
 
-def spread(num_seeds: int, place: Place) -> str:
-    """How seeds come to lie on several devices, and what that brings, in one line.
+def spread(num_seeds: int, num_devices: int) -> str:
+    """Distribution of seeds over devices, in one line.
 
     Example:
-      >>> from types import SimpleNamespace
-      >>> spread(6, SimpleNamespace(num_devices=4))
+      >>> spread(6, 4)
       '6 seeds on 4 devices, at most 2 on each; 3 devices are enough for that'
     """
-    number = place.num_devices
     if num_seeds == 1:
         return "one seed is learned on one device" + (
-            "" if number == 1 else ", and the others bring nothing; --seeds N uses them"
+            "" if num_devices == 1 else ", and the others are idle; --seeds N uses them"
         )
-    most = -(-num_seeds // number)
+    most = -(-num_seeds // num_devices)
     used = -(-num_seeds // most)
     enough = f"{used} devices are" if used > 1 else "one device is"
-    idle = f"; {enough} enough for that" if used < number else ""
-    many = "devices" if number > 1 else "device"
-    return f"{num_seeds} seeds on {number} {many}, at most {most} on each{idle}"
+    idle = f"; {enough} enough for that" if used < num_devices else ""
+    noun = "devices" if num_devices > 1 else "device"
+    return f"{num_seeds} seeds on {num_devices} {noun}, at most {most} on each{idle}"
 
 
-def _begun(begin: Artist, picture: Picture) -> Callable[[], bytes]:
-    """How to get a picture, which may be drawn already."""
-    drawn: Any = picture.drawing
-    return (lambda: drawn) if isinstance(drawn, bytes) else begin(drawn)
+def _begun(begin: Artist, picture: Picture) -> Drawn:
+    """Begins a picture, unless it is drawn already."""
+    drawing: Drawing | bytes = picture.drawing or b""
+    return (lambda: drawing) if isinstance(drawing, bytes) else begin(drawing)
 
 
 @contextlib.contextmanager
-def _learning(total: int, *, shown: bool) -> Iterator[Any]:
-    """A progress bar that moves each second, whatever the work is at."""
+def _progress_bar(total: int, *, shown: bool) -> Iterator[tqdm[Any]]:
+    """A progress bar that refreshes its clock each second, also while the work blocks."""
     from tqdm import tqdm
 
     done = threading.Event()
@@ -204,16 +210,17 @@ def _learning(total: int, *, shown: bool) -> Iterator[Any]:
 
 
 def _write(
-    job: Any,
-    outcome: Any,
-    out: Path,
-    mark: str,
-    pictures: list[tuple[Picture, Callable[[], bytes]]],
-    live: list[tuple[Any, dict[str, Callable[[], bytes]]]],
-) -> dict[str, Any]:
+    job: Job[T, S, O],
+    outcome: O,
+    request: Request,
+    pictures: list[tuple[Picture, Drawn]],
+    begin: Artist,
+) -> Result:
     from jaxltl.algos.common.checkpoint import atomic_write
 
-    result = {**job.summary(outcome), "fingerprint": mark}
+    out = request.out
+    live = [(x, {k: begin(d) for k, d in x.drawings.items()}) for x in job.live(outcome)]
+    result = {**job.summary(outcome), "fingerprint": request.mark}
     job.save(out, outcome)
     shown = []
     for picture, drawn in pictures:
@@ -221,22 +228,10 @@ def _write(
         with atomic_write(out / picture.name) as file:
             file.write(shown[-1][1])
     parts = [(x, {k: drawn().decode() for k, drawn in each.items()}) for x, each in live]
-    page = report_of(result).page(result, parts, shown, (out / "task.toml").read_text())
+    page = job.report.page(result, parts, shown, (out / "task.toml").read_text())
     with atomic_write(out / "report.html") as file:
         file.write(page.encode())
-    # Last, so that its presence says that all the rest is there.
+    # Last, so that its presence implies that all other files are complete.
     with atomic_write(out / "result.json") as file:
         file.write((json.dumps(result, indent=2, allow_nan=False) + "\n").encode())
     return result
-
-
-def report_of(result: Mapping[str, Any]) -> Any:
-    """The module that shows a result."""
-    from jaxltl.app.files.task_environment import METHODS
-    from jaxltl.app.reports import learn as report
-    from jaxltl.app.reports import learn_environment as report_environment
-    from jaxltl.app.reports import learn_todirl as report_todirl
-
-    if result["method"] in METHODS:
-        return report_environment
-    return report_todirl if result["method"] == "todirl" else report

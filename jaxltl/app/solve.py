@@ -1,4 +1,4 @@
-"""Solving properties of a model file: what `jaxltl solve` does, without compiling anything."""
+"""Model checking of a model file: the command ``jaxltl solve``, without compilation."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ Found = Answer | Achievable | ConstrainedOptimum | Pareto
 
 PROPERTY_FILES = (".props", ".prop", ".pctl")
 SHOWN = 10  # initial states whose values are printed
-MAX_FILE = 2**24  # bytes of a file of properties
+MAX_FILE = 2**24  # bytes of a property file
 
-SOLVED, NOT_CONVERGED, MISTAKEN = 0, 1, 2
+SOLVED, NOT_CONVERGED, INVALID = 0, 1, 2  # exit statuses
 
 
 @dataclass(frozen=True)
 class Asked:
-    """One property as it was asked for.
+    """A property of the command or of a file.
 
     Attributes:
-      text: as it stands in the command or file.
-      parsed: what it says; None where it is no property.
-      error: why, or None.
+      text: as given.
+      parsed: the property; None for a malformed one.
+      error: of parsing, or None.
     """
 
     text: str
@@ -53,14 +53,14 @@ class Asked:
 
 @dataclass(frozen=True)
 class Result:
-    """What became of one property.
+    """The answer to a property.
 
     Attributes:
       asked: the property.
       answer: its answer, or None.
-      seconds: how long it took.
+      seconds: wall time.
       error: why there is no answer, or None.
-      fault: whose: NOT_CONVERGED the solver's, MISTAKEN the question's.
+      fault: NOT_CONVERGED for the solver, INVALID for the property.
     """
 
     asked: Asked
@@ -77,15 +77,7 @@ class Result:
 
 
 def asked_for(arguments: Sequence[str]) -> list[Asked]:
-    """The properties of some arguments, each properties or the name of a file of them.
-
-    A mistake in one does not hide the others.
-
-    Args:
-      arguments: texts.
-
-    Returns:
-      One for each property, or for each text that is none.
+    """Parses arguments: properties, or names of property files; errors are kept by property.
 
     Raises:
       ValueError: a file cannot be read.
@@ -120,16 +112,10 @@ def _text_of(path: Path) -> str:
 
 
 def load(path: Path) -> SparseMDP | IntervalMDP:
-    """A chain or decision process from a model file, with intervals or without.
-
-    Args:
-      path: the file, of any format that :func:`~jaxltl.io.model_files.read_model` knows.
-
-    Returns:
-      The model, in double precision.
+    """A Markov chain or decision process, or an interval one, from a model file.
 
     Raises:
-      ValueError: it is none.
+      ValueError: the file is malformed, or holds another kind of model.
     """
     from jaxltl.io.model_files import read_model
 
@@ -150,15 +136,12 @@ def load(path: Path) -> SparseMDP | IntervalMDP:
 def solve(
     model: SparseMDP | IntervalMDP, asked: Sequence[Asked], tolerance: float
 ) -> Iterator[Result]:
-    """The result of each property, as soon as it is there.
+    """Yields the result of each property in order; errors of one do not end the others.
 
     Args:
       model: of :func:`load`.
       asked: of :func:`asked_for`.
-      tolerance: the width of the bounds, absolute for probabilities and relative for the rest.
-
-    Yields:
-      :class:`Result`, in the order of the properties; a mistake in one does not end the others.
+      tolerance: width of the bounds, absolute for probabilities and relative otherwise.
 
     Example:
       >>> from jaxltl import make_sparse
@@ -168,12 +151,12 @@ def solve(
       >>> first.answer.value.tolist(), first.exit_status, "b" in second.error
       ([0.5], 0, True)
     """
-    from scipy.sparse import csgraph, linalg  # noqa: F401 - their time is no property's
+    from scipy.sparse import csgraph, linalg  # noqa: F401 - not in the first property's time
 
     for one in asked:
         begin = time.perf_counter()
         found: Found | None = None
-        error, fault = one.error, MISTAKEN
+        error, fault = one.error, INVALID
         if one.parsed is not None:
             try:
                 if one.parsed.operator == "multi":
@@ -189,7 +172,7 @@ def solve(
                 error = str(mistake)
             except NotConverged as failure:
                 error, fault = str(failure), NOT_CONVERGED
-            except Exception as failure:  # a mistake of ours must not lose the other answers
+            except Exception as failure:  # a bug must not lose the other answers
                 traceback.print_exc()
                 error, fault = f"{type(failure).__name__}: {failure}", NOT_CONVERGED
         yield Result(one, found, time.perf_counter() - begin, error, fault)
@@ -199,7 +182,7 @@ def solve(
 
 
 def model_entry(model: SparseMDP | IntervalMDP, seconds: float) -> dict[str, Any]:
-    """The model's part of the JSON object."""
+    """The model as its JSON object."""
     kinds = ("idtmc", "imdp") if isinstance(model, IntervalMDP) else ("chain", "mdp")
     return {
         "kind": kinds[not model.is_chain],
@@ -242,7 +225,7 @@ def result_entry(result: Result) -> dict[str, Any]:
 
 
 def _several_entry(found: Achievable | ConstrainedOptimum | Pareto) -> dict[str, Any]:
-    """Of several objectives: whether they are met, the best value, or the points of the curve."""
+    """A multi-objective answer: achievability, optimum, or points of the Pareto curve."""
     entry: dict[str, Any] = {"status": Status(found.status).name}
     if isinstance(found, Pareto):
         points = found.points.tolist()
@@ -265,7 +248,7 @@ def _several_entry(found: Achievable | ConstrainedOptimum | Pareto) -> dict[str,
 
 
 def _over_states(values: list[Any]) -> Any:
-    """The value of the one state, or the list over several; JSON knows no infinity."""
+    """The value of a single initial state, or the list of several."""
     plain = [_number(x) for x in values]
     return plain[0] if len(plain) == 1 else plain
 
@@ -273,18 +256,11 @@ def _over_states(values: list[Any]) -> Any:
 def _number(x: Any) -> Any:
     if isinstance(x, float) and not np.isfinite(x):
         return None if np.isnan(x) else "inf" if x > 0 else "-inf"
-    return x + 0.0 if isinstance(x, float) else x  # without a sign of zero
+    return x + 0.0 if isinstance(x, float) else x  # no negative zero; JSON has no infinity
 
 
 def text(result: Result) -> str:
-    """A result for people.
-
-    Args:
-      result: of :func:`solve`.
-
-    Returns:
-      A line, or a few.
-    """
+    """A result as text."""
     lines = [result.asked.text]
     parsed, found = result.asked.parsed, result.answer
     if parsed is not None and parsed.name is not None:
@@ -309,7 +285,7 @@ def text(result: Result) -> str:
 
 def _several_text(found: Achievable | ConstrainedOptimum | Pareto) -> list[str]:
     if isinstance(found, Pareto):
-        head = f"  {len(found.points)} points, whose mixtures are the curve up to {found.gap:.1e}"
+        head = f"  {len(found.points)} points, whose convex hull is the curve up to {found.gap:.1e}"
         return [head, *("  " + ", ".join(f"{x:.9g}" for x in p) for p in found.points.tolist())]
     if isinstance(found, ConstrainedOptimum) and found.holds:
         return [f"  {found.value!r}, in [{found.lower!r}, {found.upper!r}]"]
@@ -341,7 +317,7 @@ def _value_text(found: Answer, i: int) -> str:
 
 
 def strategies(model: SparseMDP | IntervalMDP, results: Sequence[Result], source: Path) -> bytes:
-    """A file of the strategies that attain the answers, as JSON; see docs/solve.md."""
+    """The optimal strategies as JSON; see docs/solve.md."""
     found = [
         {"property": r.asked.text, **_strategy(model, r.answer.strategy)}
         for r in results
@@ -397,11 +373,8 @@ def _nature(
 ) -> list[list[dict[str, float]]]:
     """Nature's distribution of each choice of each state, by the numbers of successors.
 
-    Args:
-      host: the rows.
-      successor: ``int[T]``, what to call each entry's successor.
-      probability: ``float64[T]``.
-      still: ``bool[N]``, the states of which nothing is told.
+    `successor` ``int[T]`` numbers the successors of entries; states where `still` ``bool[N]`` are
+    empty.
     """
     names, mass = list(map(str, successor.tolist())), probability.tolist()
     starts = host.entry_start.tolist()

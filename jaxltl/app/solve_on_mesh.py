@@ -1,4 +1,4 @@
-"""Solving properties over the devices of a mesh, saved on the way: what `jaxltl solve --mesh` does."""
+"""Model checking over the devices of a mesh, with checkpoints: ``jaxltl solve --mesh``."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import jaxltl
 from jaxltl.algos.common import checkpoint as files
 from jaxltl.app.processes import Place, is_loss
 from jaxltl.app.run_job import make_directory
-from jaxltl.app.solve import MISTAKEN, NOT_CONVERGED, Asked, Result, load
+from jaxltl.app.solve import INVALID, NOT_CONVERGED, Asked, Result, load
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.logic.properties import Property
 from jaxltl.core.models.construct.state_formulas import BUILT_IN, label_columns
@@ -36,13 +36,13 @@ from jaxltl.core.values.properties.solve_on_mesh import (
 from jaxltl.core.values.properties.solve_property import FINER, Answer
 from jaxltl.io.umb.sharded import read_sharded
 
-_WORK = 1e9  # transitions that are gone over before bounds are saved
-_ROUND = 24  # sweeps in a step of interval iteration, about
+_WORK = 1e9  # transition updates between checkpoints
+_ROUND = 24  # approximate sweeps of a step of interval iteration
 MAX_STEPS = 1_000_000
 
 
 def on_mesh(model: SparseMDP | IntervalMDP, place: Place) -> ShardedMDP:
-    """A model over the devices, with the labels that every model has.
+    """Distributes a model over devices, with the built-in labels.
 
     Raises:
       ValueError: it has intervals, or fewer states than there are devices.
@@ -61,15 +61,15 @@ def on_mesh(model: SparseMDP | IntervalMDP, place: Place) -> ShardedMDP:
 def read(
     path: Path, asked: Sequence[Asked], place: Place
 ) -> tuple[ShardedMDP, dict[str, str], dict[str, Any]]:
-    """A model file over the devices: of a UMB file each process reads what its own ones hold.
+    """Reads a model file over the devices; of a UMB file each process reads its own states.
 
-    Where a property mentions labels that no file has, each reads all of it.
+    If a property has built-in labels, each process reads the whole file.
 
     Returns:
-      The model, what tells it apart from others, and its part of the JSON object.
+      The model, its fingerprint, and its JSON object.
 
     Raises:
-      ValueError: it is no chain or decision process, or cannot be spread.
+      ValueError: it is no chain or decision process, or cannot be distributed.
     """
     begin, mesh = time.perf_counter(), place.mesh
     assert mesh is not None
@@ -96,7 +96,7 @@ def _entry(model: ShardedMDP, seconds: float) -> dict[str, Any]:
 
     filled = model.num_states - model.num_given
     choices = count(model.available) - filled
-    ours = filled if model.place is None else model.num_devices  # rows of what is filled
+    ours = filled if model.place is None else model.num_devices  # transitions of padding states
     transitions = sum(count(table.probability) for table in model.tables) - ours
     kind = "chain" if choices == model.num_given else "mdp"
     return {
@@ -159,7 +159,7 @@ def solve_on_mesh(
     for one in asked:
         begin = time.perf_counter()
         found: Answer | None = None
-        error, fault = one.error, MISTAKEN
+        error, fault = one.error, INVALID
         if one.parsed is not None:
             try:
                 found = _answered(model, given, one.parsed, tolerance, place, directory)

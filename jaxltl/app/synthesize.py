@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxltl.app.files.game import GameFile, World, automaton_of, load_game, load_objective
-from jaxltl.app.files.tables import errors_in
+from jaxltl.app.files.schema import errors_in
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.environments.monitor import Verdict, make_monitor
 from jaxltl.core.games.objective import GR1, Parity
@@ -157,7 +157,7 @@ def make_nodes(file: GameFile, world: World) -> Nodes:
     first = 0 if automaton is None else int(automaton.initial)
     start = np.arange(world.game.num_states) * width + first
     origin, num_own = np.arange(game.num_states), game.num_states
-    if file.task.get("chance", "random") == "adversarial":
+    if file.task.chance == "adversarial":
         game, found = adversarial_chance(game)
         objective, origin = objective_at(objective, found), np.asarray(found)
     memories = 1 if len(game.state_shape) == 1 else width
@@ -179,7 +179,7 @@ def make_nodes(file: GameFile, world: World) -> Nodes:
 
 
 def _strategy(file: GameFile, nodes: Nodes) -> Permissive:
-    method, bound = file.strategy.get("method", "auto"), file.strategy.get("bound")
+    method, bound = file.strategy.method, file.strategy.bound
     with errors_in(f"{file.path}: [strategy] "):
         return permissive_strategy(nodes.game, nodes.objective, method=method, bound=bound)
 

@@ -9,6 +9,7 @@ import pytest
 
 import jaxltl as jl
 from jaxltl.app import learn as job
+from jaxltl.app.protocols import Training
 from jaxltl.app.reports.learn import _nearly_best, remarks
 from jaxltl.core.values.undiscounted.mixture import WINDOW, at_starts
 from tests.algos.test_guaranteed import bottoms, evaluate
@@ -20,7 +21,7 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 def learned(path, seed=0):
     """The outcome of a task file, and its summary."""
     setup = job.prepare(job.read_task(path), seed)
-    outcome = job.Outcome(setup, *job.learn(setup, seed, 1), seed=seed, seconds=0.0)
+    outcome = job.learn(setup, Training(seed, 1))
     return outcome, job.summary(outcome)
 
 
@@ -84,9 +85,9 @@ def test_one_demonstration_is_enough(fetched):
     assert result["satisfaction"]["minimum"]["lower"] == 1
     assert (
         "good",
-        "By the graph: from every initial state the policy does the task with "
-        "probability 1, whatever the numbers. It takes moves that keep that possible, and no "
-        "others.",
+        "By the transition graph: from every initial state the policy satisfies the formula with "
+        "probability 1, whatever the transition probabilities are. It takes only actions that "
+        "preserve this.",
     ) in remarks(result)
     *_, sure = bottoms(outcome.setup.model, kept_policy(outcome))
     start = int(outcome.setup.demonstrations.state[0, 0])
@@ -190,12 +191,10 @@ def risky_task(rng, place, over):
 def weighed(outcome, weights_of_task):
     """What the same seed learns with given weights of the task."""
     setup = outcome.setup
-    names, problem = setup.learning
-    hparams = job.settings(job.mlirl.Hparams, setup.task.learner)
+    problem = setup.problem
+    hparams = job.settings(job.mlirl.Hparams, setup.task.learner.given())
     for mu in weights_of_task:
-        yield job._trained(
-            setup, names, problem, replace(hparams, mu=float(mu)), (0, 1), None, None
-        )
+        yield job._train(setup, problem, replace(hparams, mu=float(mu)), Training(0, 1))
 
 
 def check_risky(rng, place, over, weights_of_task):
@@ -268,9 +267,9 @@ def test_a_probability_is_reached_from_the_worst_start(tmp_path, count, grid):
 @pytest.mark.parametrize(
     ("lower", "upper", "kind", "words"),
     [
-        (0.5, 0.5 + 1e-9, "good", "certified to lose at most 1.0e-09 on average"),
-        (0.5, 0.6, "warning", "the policy is certified to lose at most 0.1 on average"),
-        (None, 0.6, "warning", "the policy is certified of nothing on average"),
+        (0.5, 0.5 + 1e-9, "good", "A loss of at most 1.0e-09 on average is certified"),
+        (0.5, 0.6, "warning", "for the policy a loss of at most 0.1 is certified on average"),
+        (None, 0.6, "warning", "for the policy no bound is certified on average"),
     ],
 )
 def test_no_more_is_said_than_is_certified(lower, upper, kind, words):
@@ -319,15 +318,15 @@ def test_demonstrated_steps_that_lose_are_left_out_and_named(write):  # noqa: F8
         "to": pytest.approx(0.8 * best[1, start] + 0.1 * best[3, start] + 0.1),
     }
     assert lost["from"] > lost["to"] + 0.01
-    counts = np.asarray(setup.learning[1].counts)
+    counts = np.asarray(setup.problem.counts)
     assert counts.sum() == 3 and counts[4, start, 0] == 0
     texts = [text for kind, text in remarks(result) if kind == "note"]
     assert texts == [
-        "2 of 5 demonstrated steps lower the best probability and were left out; first at row 2, "
-        f"column 2 (demonstration 2, step 2): from {lost['from']:.4f} to {lost['to']:.4f}."
+        "2 of 5 demonstrated steps lower the maximal satisfaction probability and were left out; first at "
+        f"row 2, column 2 (demonstration 2, step 2): from {lost['from']:.4f} to {lost['to']:.4f}."
     ]
     (good,) = (text for kind, text in remarks(result) if kind == "good")
-    assert good.startswith("By construction no policy does the task with a greater probability")
+    assert good.startswith("By construction no policy has a greater satisfaction probability")
     value, _ = evaluate(model, kept_policy(outcome))
     np.testing.assert_allclose(value, best, rtol=1e-9, atol=1e-15)
 
@@ -361,7 +360,7 @@ def test_formulas_that_nothing_satisfies_are_refused_before_anything_runs(
 @pytest.mark.parametrize("formula", ["F y | G !y", "G !(r & y)"])
 def test_formulas_that_are_always_true_are_said_to_be(write, formula):  # noqa: F811
     text = prepared(write(("!r U y", formula))).trivial
-    assert text == "The formula is true of every run in this world, so any policy does the task."
+    assert text == "Every trajectory of this world satisfies the formula, so any policy does."
     assert prepared(write()).trivial is None
 
 
@@ -402,8 +401,8 @@ def test_steps_that_lose_nothing_by_themselves_are_left_out_truly_told(write):  
     assert result["guarantee"]["left_out"]["to"] == 1
     (text,) = (text for kind, text in remarks(result) if kind == "note")
     assert text == (
-        "1 of 2 demonstrated steps leaves what does the task and may come back, which again and "
-        "again would fail it, and was left out; first at row 1, column 1 (demonstration 1, step "
+        "1 of 2 demonstrated steps leads away from the goal and back, which violates the formula "
+        "if repeated for ever, and was left out; first at row 1, column 1 (demonstration 1, step "
         "1)."
     )
     assert result["satisfaction"]["minimum"]["lower"] == 1
@@ -431,7 +430,7 @@ def test_where_any_loss_is_all_the_sure_policy_is_what_there_is(write):  # noqa:
     assert result["guarantee"]["share"] == 1 and result["guarantee"]["attained"] == 1
     assert result["neg_log_likelihood"] is None  # a demonstrated step is never taken
     (text,) = (text for kind, text in remarks(result) if kind == "good")
-    assert "no policy was found to reach it but one of moves that lose nothing alone." in text
+    assert "the only policy found that attains it is one of optimal actions alone." in text
     _, sure = evaluate(outcome.setup.model, kept_policy(outcome))
     assert sure[3, int(outcome.setup.model.initial_memory[3])]
 

@@ -10,7 +10,8 @@ from jaxltl.algos import mlirl
 from jaxltl.algos.common import learner
 from jaxltl.algos.mlirl import _features
 from jaxltl.app import learn
-from jaxltl.app.files.task import read_task
+from jaxltl.app.files.task_mlirl import read_task
+from jaxltl.app.protocols import Training
 from jaxltl.app.reports.learn import remarks
 from tests.app.test_task import write  # noqa: F401
 
@@ -20,7 +21,7 @@ from tests.app.test_task import write  # noqa: F401
 def test_the_policy_is_that_of_the_weights(write, optimizer):  # noqa: F811
     """Whether or not the last evaluation was at them, before the first step too."""
     setup = learn.prepare(read_task(write()), 0)
-    _, problem = setup.learning
+    problem = setup.problem
     hparams = mlirl.Hparams(discount=0.9, optimizer=optimizer)
     state = mlirl.init(jax.random.key(0), problem, hparams)
     for _ in range(2):
@@ -39,7 +40,7 @@ def test_the_policy_is_that_of_the_weights(write, optimizer):  # noqa: F811
 def test_a_feature_that_is_left_out_is_named(write, monkeypatch):  # noqa: F811
     monkeypatch.setattr(_features, "steps_until", lambda *_: None)
     setup = learn.prepare(read_task(write()), 0)
-    assert "nearer" not in setup.learning[0]
-    outcome = learn.Outcome(setup, *learn.learn(setup, 0, 1), seed=0, seconds=0.0)
+    assert "nearer" not in setup.features.names
+    outcome = learn.learn(setup, Training(0, 1))
     notes = [text for kind, text in remarks(learn.summary(outcome)) if kind == "note"]
     assert [text for text in notes if text.startswith("The feature nearer is left out")]

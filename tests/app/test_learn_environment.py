@@ -292,7 +292,7 @@ def test_other_methods(write, tmp_path, method, table, boxed):
 def test_tasks_without_end_are_told_by_visits(write, tmp_path):
     path = write(("!pit U goal", "G F goal & G F !goal"), ("steps = 20", "steps = 1"))
     told = run("learn", path, "--out", tmp_path / "out")
-    assert "visits" in told.stdout and "without end" in told.stdout
+    assert "visits" in told.stdout and "accepting visits" in told.stdout
     page = (tmp_path / "out" / "report.html").read_text()
     assert "accepting visits" in page
 
@@ -301,10 +301,9 @@ def test_check_tells_the_sizes(write):
     told = run("check", write())
     assert told.exit_code == 0, told.output
     assert (
-        "own.py:corridor: 2 actions, 4 numbers observed, 2 labels; 3 states of the task's "
-        "memory (cosafe); ppo with two networks with hidden layers [8]: 20 steps of at most "
-        "64 simulated steps, 1,280 in all, a seed; judged by 200 fresh episodes of at most 8 "
-        "steps"
+        "own.py:corridor: 2 actions, 4 numbers observed, 2 labels; 3 automaton states "
+        "(cosafe); ppo with two networks with hidden layers [8]: 20 steps of at most 64 simulated "
+        "steps, 1,280 in total per seed; evaluated by 200 fresh episodes of at most 8 steps"
     ) in told.stdout
 
 
@@ -345,7 +344,7 @@ WORLD_ = 'environment = "own.py:corridor"'
             "'own.py:says_nothing' raises ValueError (own.py, line ",
         ),
         ("boxed = false", "boxes = false", "does not take [world.arguments]: got an unexpected"),
-        ("boxed = false", "ends = false", "[world] the environment's episodes never end"),
+        ("boxed = false", "ends = false", "[world] the environment has no horizon"),
         (
             WORLD_ + "\n[world.arguments]\nboxed = false",
             'environment = "own.py:bare"',
@@ -386,7 +385,7 @@ def test_mistakes_are_named_by_file_table_and_key(write, old, new, message):
 
 def test_mistakes_of_methods(write):
     cpo = (CPO, ('"ppo"', '"cpo"'))
-    assert "[cpo] the actions are finitely many" in failure("check", write(*cpo))
+    assert "[cpo] the environment has finitely many actions" in failure("check", write(*cpo))
     assert "[cpo] lacks limit" in failure("check", write(*cpo, ("limit = 0.5\n", "")))
     cce = (CCE, ('"ppo"', '"cce"'))
     assert "[cce] limit is that of a cost" in failure(
@@ -462,6 +461,6 @@ def test_the_page_in_a_browser(learned, browser, tmp_path, width):  # noqa: F811
     assert found["headings"] == [
         "Evaluation",
         "Learning",
-        "The task as an automaton",
-        "The task file",
+        "Automaton of the formula",
+        "Task file",
     ]

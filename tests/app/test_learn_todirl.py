@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from jaxltl.app import learn_todirl
+from jaxltl.app.files.scenes import cell_observations, load_automata, load_scenes
 from jaxltl.app.files.task import method_of
-from jaxltl.app.files.task_todirl import cell_observations, load_automata, load_scenes, read_task
+from jaxltl.app.files.task_todirl import read_task
 from jaxltl.app.reports import learn_todirl as report_todirl
 from jaxltl.core.models.construct.batch import stack_products
 from jaxltl.core.models.mdp import from_dense
@@ -224,7 +225,7 @@ def test_mistakes_in_the_task_file(write, replacement, message):
         (("!ob U o2", "!ob U o7"), r"\[task\] formula: .*'o7'"),
         (
             ("(!o2 & !ob) U (o1 & (!ob U o2))", 'G F o1"\nguarantee = "none'),
-            r"\[demonstrations\] discount is that of the reward of doing a task that ends",
+            r"\[demonstrations\] discount is that of the reward for satisfying the formula",
         ),
         (
             ("(!o2 & !ob) U (o1 & (!ob U o2))", "F (o1 & ob)"),
@@ -288,7 +289,7 @@ def test_the_reward_carries_over(learned):
     worst = min(result["test"]["worlds"], key=lambda world: world["mean"]["value"])
     assert worst["name"] == result["test"]["learned"]["worst_world"]["name"]
     assert worst["minimum"]["value"] <= worst["mean"]["value"]
-    for words in ("in 2 test worlds", "certified", "expert, who knows", "random moves", "worst"):
+    for words in ("in 2 test worlds", "certified", "expert, who knows", "random actions", "worst"):
         assert words in printed
 
 
@@ -385,10 +386,10 @@ def test_what_must_be_known_before_trusting_the_figures(learned):
     told = " ".join(report_todirl.warnings(result))
     starts = test["worlds"][0]["num_starts"]
     for words in (
-        f"from 3 of {starts} starts of the test world seed 0; it counts in the mean "
+        f"from 3 of {starts} initial states of the test world seed 0; it counts in the mean "
         "unless [test] leave_out names it",
         "seed 1; it is left out.",
-        "(expert, who knows the task) is known only within its bounds in seed 1",
+        "(expert, who knows the formula) is known only within its bounds in seed 1",
         "soft values ended with MAX_STEPS",
         "still improving",
     ):
@@ -410,8 +411,8 @@ def test_text_maps_files_horizon_and_another_memory(tmp_path):
     for words in (
         "within 9 steps",
         "in 2 of 3 test worlds",
-        "warning: No policy can do the task from 4 of 4 starts of the test world "
-        "walled.txt; it is left out.",
+        "warning: No policy can satisfy the formula from 4 of 4 initial states of the "
+        "test world walled.txt; it is left out.",
         "walled_too.txt; it counts in the mean unless [test] leave_out names it.",
     ):
         assert words in result.stdout

@@ -5,7 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from jaxltl.app.files.task import load_demonstrations, load_world, read_task
+from jaxltl.app.files.demonstrations import load_demonstrations
+from jaxltl.app.files.task_mlirl import read_task
+from jaxltl.app.files.worlds import load_world
 from jaxltl.app.logged import guaranteed
 from jaxltl.app.reports.learn import remarks
 from jaxltl.core.models.construct.counts import model_from_counts
@@ -153,7 +155,7 @@ def test_what_is_guaranteed_of_a_policy(write, label_on, method):
             ("confidence = 0.9", "confidence = 1"),
             "confidence = 1; it must be a number between 0 and 1",
         ),
-        (('initial = "dock"', ""), "[world] lacks initial, the name of the state"),
+        (('initial = "dock"', ""), "[world] lacks initial, the name of the initial state"),
         (
             ('"dock"', '["dock", "attic"]'),
             "[world] initial = attic: the log has no such state; it has",
@@ -217,7 +219,7 @@ def test_what_is_learned_is_told_with_its_guarantee(write, tmp_path):
     page = (out / "report.html").read_text()
     assert told in result.stdout and told in page
     for text in (result.stdout, page):
-        assert "by the log's frequencies" in text and "By the graph:" not in text
+        assert "by the log's frequencies" in text and "By the transition graph:" not in text
     with np.load(out / "policy.npz") as arrays:
         assert arrays["states"].tolist() == ["dock", "goal", "pit"]
     before = read_task(path).digest
@@ -225,8 +227,8 @@ def test_what_is_learned_is_told_with_its_guarantee(write, tmp_path):
     assert read_task(path).digest != before
     # Where the graph is what was logged, the page says so.
     found["satisfaction"]["minimum"]["lower"] = 1
-    ((kind, told),) = [x for x in remarks(found) if "By the graph" in x[1]]
-    assert kind == "note" and told.startswith("By the graph, which is what the log showed: ")
+    ((kind, told),) = [x for x in remarks(found) if "transition graph" in x[1]]
+    assert kind == "note" and told.startswith("By the log's transition graph: ")
     found["guarantee"] |= {"asked": 0.5, "attained": 0.6, "share": 0, "weight": 0}
     ((kind, told),) = [x for x in remarks(found) if "sked for" in x[1]]
     assert kind == "note" and told.startswith("If the log's frequencies were the truth: asked for")

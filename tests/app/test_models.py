@@ -8,7 +8,8 @@ import pytest
 
 from jaxltl.app.files.game import load_game, read_game
 from jaxltl.app.files.models import read_padded
-from jaxltl.app.files.task import load_world, read_task
+from jaxltl.app.files.task_mlirl import read_task
+from jaxltl.app.files.worlds import load_world
 from jaxltl.core.models.game import make_game
 from jaxltl.core.models.product import product
 from jaxltl.core.models.sparse import make_sparse

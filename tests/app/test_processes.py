@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from jaxltl.algos.common import checkpoint
-from jaxltl.app._teller import told
+from jaxltl.app.exit_message import told
 from jaxltl.app.processes import Asked, Launch, Place, launched
 from jaxltl.core.values.discounted.discounted import optimal_value
 from jaxltl.core.values.discounted.soft import soft_value

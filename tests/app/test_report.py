@@ -12,10 +12,18 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from jaxltl.app import explorer as exploring
-from jaxltl.app.drawing import Picture, draw, drawing
-from jaxltl.app.explorer import START, Layer, TooLarge, curves, demonstrated_runs, learned_runs
-from jaxltl.app.reports.live import Said, live_page
+from jaxltl.app.reports import explorer as exploring
+from jaxltl.app.reports.drawing import Picture, draw, drawing
+from jaxltl.app.reports.explorer import (
+    START,
+    Layer,
+    TooLarge,
+    View,
+    curves,
+    demonstrated_runs,
+    learned_runs,
+)
+from jaxltl.app.reports.page import render_page
 from jaxltl.core.models.construct.lifting import lift_trajectories
 from jaxltl.core.models.product import product
 from jaxltl.core.models.trajectories import make_trajectories
@@ -70,15 +78,15 @@ def runs():
 
 def made(**options):
     options = {"place": CELLS, "actions": ACTIONS, "label": "probability", "size": 12} | options
-    return exploring.explorer(
-        "policy", "What it does", "A caption", MODEL.automaton, layers(), runs(), **options
-    )
+    view = View(name="policy", title="Learned policy", caption="A caption", **options)
+    return exploring.explorer(view, MODEL.automaton, layers(), runs())
 
 
 def page(*parts, remarks=()):
     drawn = [(p, {k: draw(d).decode() for k, d in p.drawings.items()}) for p in parts]
-    said = Said("a sentence", remarks, "", ["<h2>Told</h2>"])
-    return live_page(RESULT, said, drawn, PICTURES, "[task]")
+    return render_page(
+        "page.html", RESULT, drawn, PICTURES, "[task]", sentence="a sentence", remarks=remarks
+    )
 
 
 def learning():
@@ -159,7 +167,7 @@ def test_pictures_are_whole_and_their_parts_can_be_found():
         str(RIGHT),
     )
     assert len([r for r in board.iter("rect") if r.get("class") == "wall"]) == 1
-    assert "Told not to:</b> row 3, column 2, memory 1, right" in page(part)
+    assert "Told not to:</b> row 3, column 2, memory state 1, right" in page(part)
 
 
 def test_the_page_is_one_file_and_nothing_in_it_is_taken_for_markup():
@@ -205,7 +213,7 @@ def test_tables_say_what_the_pictures_show():
         sign = "↑↓←→"[int(np.argmax(moves[state, 1]))]
         name = "a " if state == 2 else ""
         assert f"{name}{value[state]:.4f} {sign}" in cells
-    assert "the task is done" in cells and "the task has failed" in cells
+    assert "the formula is satisfied" in cells and "the formula is violated" in cells
     assert {"row 3, column 1", "right"} <= set(cells)
     assert "1125" in cells  # the median of the first loss
 
@@ -214,7 +222,7 @@ def test_a_model_without_a_map_and_a_marked_step():
     part = made(place=None, marked=[(9, 1, RIGHT)], marks="Told not to")
     assert set(part.drawings) == {"automaton"}
     text = page(part)
-    assert 'class="map"' not in text and "Told not to:</b> state 9, memory 1, right" in text
+    assert 'class="map"' not in text and "Told not to:</b> state 9, memory state 1, right" in text
 
 
 def test_what_is_too_large_is_said_and_shown_as_a_picture(monkeypatch):
@@ -348,7 +356,9 @@ def test_the_stepper_changes_what_is_shown(trial):
     assert found["first"]["pressed"] == ["0", "0"] and found["first"]["marked"] == []
     clicked = found["clicked"]
     assert clicked["layer"] == clicked["table"] == clicked["marked"] == ["1"]
-    assert clicked["pressed"] == ["1", "1"] and clicked["told"].startswith("Memory 1: left to")
+    assert clicked["pressed"] == ["1", "1"] and clicked["told"].startswith(
+        "Memory state 1: remaining"
+    )
     assert found["starts"]["layer"] == [START] and found["starts"]["pressed"] == [START]
 
 
@@ -356,7 +366,7 @@ def test_the_figures_of_a_cell_are_told(trial):
     _, found, _ = trial
     assert found["cell"]["readout"] == "row 3, column 1 · probability 0.5000"
     # 100 and 20 pixels from the map's corner, in cells of 40.
-    assert found["pointed"]["readout"] == "row 1, column 3 · nothing is shown here"
+    assert found["pointed"]["readout"] == "row 1, column 3 · no values here"
 
 
 def test_a_run_plays_on_map_and_automaton(trial):

@@ -290,7 +290,7 @@ def test_the_page_says_and_plays_what_was_found(won, lost):
     text = (won[2] / "report.html").read_text()
     assert "http" not in text and "<b>Warning:</b>" not in text
     assert "The task is realizable." in text and "independent check: confirmed" in text
-    assert 'class="token piece-1"' in text and "The game file" in text
+    assert 'class="token piece-1"' in text and "Game file" in text
     assert text.count("data:image") == 2  # region and moves; the automaton is live
     text = (lost[2] / "report.html").read_text()
     assert "A play that the environment wins" in text and text.count("data:image") == 1

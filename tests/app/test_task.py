@@ -8,12 +8,9 @@ import jax
 import numpy as np
 import pytest
 
-from jaxltl.app.files.task import (
-    load_demonstrations,
-    load_world,
-    read_task,
-    synthetic_demonstrations,
-)
+from jaxltl.app.files.demonstrations import load_demonstrations, synthetic_demonstrations
+from jaxltl.app.files.task_mlirl import read_task
+from jaxltl.app.files.worlds import load_world
 from jaxltl.core.models.product import product
 from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction
 from tests.support import replaced
@@ -168,7 +165,7 @@ def test_plain_names_are_taken(write, name):
 
 def test_a_learning_rate_of_an_optimizer_that_takes_one(write):
     given = 'discount = 0.9\noptimizer = "adam"\nlearning_rate = 0.1'
-    assert read_task(write(("discount = 0.9", given))).learner["learning_rate"] == 0.1
+    assert read_task(write(("discount = 0.9", given))).learner.learning_rate == 0.1
 
 
 def test_a_missing_task_file(tmp_path):
@@ -345,6 +342,10 @@ def test_an_unknown_proposition_in_a_models_initial(write):
         load_world(task)
 
 
+def simulate(task, model, key, best):
+    return synthetic_demonstrations(task.path, task.demonstrations, model, key, best)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("discount", ["discount = 0.9", ""])
 def test_synthetic_demonstrations_do_the_task(write, discount):
@@ -352,9 +353,7 @@ def test_synthetic_demonstrations_do_the_task(write, discount):
     task = read_task(write(synthetic))
     world = load_world(task)
     model = product(world.mdp, task.formula)
-    shown, dropped = synthetic_demonstrations(
-        task, model, jax.random.key(0), optimal_satisfaction(model)
-    )
+    shown, dropped = simulate(task, model, jax.random.key(0), optimal_satisfaction(model))
     lengths = np.asarray(shown.length)
     assert len(lengths) + dropped == 5 and dropped == 0
     for states, actions, n in zip(shown.state, shown.action, lengths, strict=True):
@@ -367,11 +366,13 @@ def test_synthetic_demonstrations_need_a_task_that_can_be_done(write):
     synthetic = ('file = "shown.json"', "synthetic = 5\ndiscount = 0.9\nlength = 1")
     task = read_task(write(synthetic, ('initial = "!r & !y"', 'initial = "b"')))
     model = product(load_world(task).mdp, task.formula)
-    with pytest.raises(ValueError, match=r"none of 5 synthetic runs did the task within 1 steps"):
-        synthetic_demonstrations(task, model, jax.random.key(0), optimal_satisfaction(model))
+    with pytest.raises(
+        ValueError, match=r"none of 5 synthetic rollouts satisfies the formula within 1 steps"
+    ):
+        simulate(task, model, jax.random.key(0), optimal_satisfaction(model))
     safety = product(load_world(task).mdp, "G !r")
     with pytest.raises(ValueError, match=re.escape("takes a co-safe formula")):
-        synthetic_demonstrations(task, safety, jax.random.key(0), optimal_satisfaction(safety))
+        simulate(task, safety, jax.random.key(0), optimal_satisfaction(safety))
 
 
 @pytest.mark.parametrize("runs", ["synthetic = 2000000000", "synthetic = 20\nlength = 2000000000"])
@@ -379,7 +380,7 @@ def test_more_runs_than_memory_holds_are_refused(write, runs):
     task = read_task(write(('file = "shown.json"', runs)))
     model = product(load_world(task).mdp, task.formula)
     with pytest.raises(ValueError, match=r"would take about .* GB; ask for fewer or shorter ones"):
-        synthetic_demonstrations(task, model, jax.random.key(0), optimal_satisfaction(model))
+        simulate(task, model, jax.random.key(0), optimal_satisfaction(model))
 
 
 def test_synthetic_runs_of_a_task_without_end(write):
@@ -391,9 +392,7 @@ def test_synthetic_runs_of_a_task_without_end(write):
         )
     )
     model = product(load_world(task).mdp, "G F b & G F y & G !r")
-    shown, dropped = synthetic_demonstrations(
-        task, model, jax.random.key(0), optimal_satisfaction(model)
-    )
+    shown, dropped = simulate(task, model, jax.random.key(0), optimal_satisfaction(model))
     assert dropped + len(shown.length) == 4 and (np.asarray(shown.length) == 12).all()
     for states in np.asarray(shown.state):
         assert 2 not in states and {3, 5} <= set(states.tolist())

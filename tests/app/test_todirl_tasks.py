@@ -9,9 +9,10 @@ import pytest
 
 import jaxltl as jl
 from jaxltl.app import learn_todirl as job
-from jaxltl.app._todirl_parts import part_of
 from jaxltl.app.files.task_todirl import read_task
+from jaxltl.app.protocols import Training
 from jaxltl.app.reports.learn_todirl import remarks
+from jaxltl.app.todirl_results import part_of
 from jaxltl.core.models.construct.batch import stack_products
 from jaxltl.core.models.mdp import from_dense
 from jaxltl.core.values.undiscounted.mixture import WINDOW, at_starts
@@ -87,8 +88,9 @@ def test_a_task_without_end_is_learned_and_done_in_worlds_never_seen(write, tmp_
     path = write()
     result = run("learn", path, "--out", tmp_path / "out", "--json")
     assert result.exit_code == 0, result.output
-    assert "warning: No policy can do the task from 6 of 6 starts of the test world map 2" in (
-        result.stdout
+    assert (
+        "warning: No policy can satisfy the formula from 6 of 6 initial states of the test world map 2"
+        in (result.stdout)
     )
     found = json.loads(result.stdout.splitlines()[-1])
     assert (found["acceptance"], found["expert"]) == ("buchi", "quickest")
@@ -99,7 +101,7 @@ def test_a_task_without_end_is_learned_and_done_in_worlds_never_seen(write, tmp_
         assert world["minimum"]["lower"] == world["minimum"]["upper"] == possible
         assert world["expert"] == possible and world["random"] == 0
     page = (tmp_path / "out" / "report.html").read_text()
-    assert "and of those that do it as well it is the quickest" in page
+    assert "its policy is the quickest of those with maximal" in page
     runs = json.loads(re.search(r'id="data">(.*?)</script>', page)[1])[0]["runs"]
     assert max(len(played["steps"]) for played in runs) > 100  # on and on
     assert {"automaton.svg", "training_1.svg", "test_2.svg", "learning.svg"} <= {
@@ -177,7 +179,7 @@ def test_the_learner_is_given_what_the_task_is_not(write):
 
 def test_a_horizon_is_for_tasks_that_are_decided_within_it(write):
     within = ("discount = 0.9", "discount = 0.9\nhorizon = 15")
-    with pytest.raises(ValueError, match=r"\[learner\] horizon = 15 ends a run .* has buchi"):
+    with pytest.raises(ValueError, match=r"\[learner\] horizon = 15 ends an episode .* has buchi"):
         prepared(write(within))
     assert prepared(write(within, (FORMULA, 'formula = "G !c"'))).judge.acceptance == "safety"
 
@@ -255,7 +257,7 @@ CARELESS = {
 def learned(path, seed=0):
     """The outcome of a task file, and its summary."""
     setup = prepared(path, seed)
-    outcome = job.Outcome(setup, *job.learn(setup, seed, 1), seed=seed, seconds=0.0)
+    outcome = job.learn(setup, Training(seed, 1))
     return outcome, json.loads(json.dumps(job.summary(outcome)))
 
 

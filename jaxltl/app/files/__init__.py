@@ -1,1 +1,1 @@
-"""Files that people write: tasks, games and their tables."""
+"""Task and game files: their schemas, and the worlds and demonstrations that they name."""

@@ -1,30 +1,134 @@
-"""Game files: a game and what the system is to achieve in it. Reading and checking them.
+"""Game files: a game, and the objective of the system player.
 
 A game file is TOML with the tables ``[game]`` and ``[task]``, and ``[strategy]`` where one is
-demanded; ``examples/robots.toml`` and ``examples/patrol.toml`` show the keys. Files that it names
-are looked up beside it.
+demanded; ``examples/robots.toml`` and ``examples/patrol.toml`` show the keys. Names of files are
+relative to it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated as Key
 
 import numpy as np
 
-from jaxltl.app.files import tables
+from jaxltl.app.files import schema
 from jaxltl.app.files.models import read_padded
-from jaxltl.app.files.tables import COUNT, TEXT, TRUTH, Rule, choice, is_list, number_in
-from jaxltl.app.files.task import initial_where
+from jaxltl.app.files.schema import (
+    Count,
+    File,
+    Legend,
+    Map,
+    Table,
+    Text,
+    Unit,
+    errors_in,
+    off_map,
+    read_map,
+    Meta,
+    table,
+)
+from jaxltl.app.files.worlds import initial_where
+from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.games.objective import GR1, Parity, gr1, safety
-from jaxltl.core.games.permissive import METHODS
 from jaxltl.core.games.winning import task_game
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.product import Product
 from jaxltl.envs.robots import ACTIONS, grid_game, places
 from jaxltl.envs.text_map import parse_map
+
+Start = Annotated[
+    Text | tuple[int, int],
+    Meta("a Boolean formula over the map's propositions, or a cell as [row, column], from 1"),
+]
+Formulas = Annotated[
+    list[str],
+    Meta('a list of Boolean formulas, such as ["a", "b & !c"]', bool),
+]
+
+
+@table
+class GameTable(Table):
+    """``[game]``: two robots on a map, or a model file."""
+
+    map: Key[Map | None, "Rows of a text map, or the file that has them."] = None
+    legend: Key[Legend | None, "Propositions of each kind of cell; default the kind itself."] = None
+    wall: Key[Text | None, "Kind of cell that cannot be entered; default #."] = None
+    slip: Key[Unit | None, "Probability that a move fails."] = None
+    system_start: Key[Start | None, "Initial cells of the system's robot."] = None
+    environment_start: Key[Start | None, "Initial cells of the environment's robot."] = None
+    system_stays: Key[bool | None, "Whether the system's robot may stay."] = None
+    environment_stays: Key[bool | None, "Whether the environment's robot may stay."] = None
+    model: Key[Text | None, "Model file of a game."] = None
+    initial: Key[Text | None, "Formula of a model's initial states."] = None
+
+    def __attrs_post_init__(self) -> None:
+        self.require_one(("map", "model"), "a map or a model (a file)")
+        if self.map is not None:
+            self.refuse(("initial",), "a model; on a map give system_start and environment_start")
+            return
+        of_map = (key for key in self.given() if key not in ("model", "initial"))
+        self.refuse(of_map, "a map; a model has it in its arrays")
+
+
+@table
+class TaskTable(Table):
+    """``[task]``: the objective of the system."""
+
+    formula: Key[Text | None, "Formula of linear temporal logic."] = None
+    assumptions: Key[Formulas | None, "Assumed to hold infinitely often (GR(1))."] = None
+    guarantees: Key[Formulas | None, "To hold infinitely often (GR(1))."] = None
+    safe: Key[Text | None, "To hold always."] = None
+    parity: Key[Literal["model"] | None, "Parity condition of the model's file."] = None
+    chance: Key[
+        Literal["random", "adversarial"], "Random moves: by probability, or by the environment."
+    ] = "random"
+
+    def __attrs_post_init__(self) -> None:
+        lists = [k for k in ("assumptions", "guarantees", "safe") if getattr(self, k) is not None]
+        if self.formula is not None and lists:
+            raise ValueError(
+                f"has both formula and {lists[0]}; give either a formula, or guarantees with "
+                "assumptions and safe where needed."
+            )
+        if self.parity is not None and (self.formula is not None or lists):
+            raise ValueError(
+                'has parity = "model", the condition in the file of a parity game, and another '
+                "one; keep one of them."
+            )
+        if all(x is None for x in (self.formula, self.guarantees, self.safe, self.parity)):
+            raise ValueError(
+                'lacks what the system is to achieve: formula = "...", or guarantees = ["..."], '
+                'each to hold infinitely often, or safe = "...", to hold always, or parity = '
+                '"model", of a parity game from a file.'
+            )
+        if self.assumptions is not None and self.guarantees is None:
+            raise ValueError(
+                "has assumptions but no guarantees, so that they have no effect; add guarantees "
+                "or leave them out."
+            )
+
+
+@table
+class StrategyTable(Table):
+    """``[strategy]``: how a permissive strategy is computed."""
+
+    method: Key[
+        Literal["auto", "stay", "rank", "counter", "parity"], "Method of permissive strategies."
+    ] = "auto"
+    bound: Key[Count | None, "Bound of the counters of that method."] = None
+
+
+@table
+class GameFileSchema(File):
+    """Schema of the file."""
+
+    KIND: ClassVar[str] = "the game file"
+    game: Key[GameTable, "The game."]
+    task: Key[TaskTable, "The objective of the system."]
+    strategy: Key[StrategyTable | None, "Demands a strategy."] = None
 
 
 @dataclass(frozen=True)
@@ -33,16 +137,15 @@ class GameFile:
 
     Attributes:
       path: the file; `name` is its stem, unless the file gives one.
-      game, task, strategy: the tables' keys and values, all known and of the right kind;
-        keys that were left out are absent.
+      game, task, strategy: the tables.
       demanded: whether the file has a table ``[strategy]``.
     """
 
     path: Path
     name: str
-    game: Mapping[str, Any]
-    task: Mapping[str, Any]
-    strategy: Mapping[str, Any]
+    game: GameTable
+    task: TaskTable
+    strategy: StrategyTable
     demanded: bool
 
 
@@ -53,10 +156,10 @@ class World:
     Attributes:
       game: the game, with successor lists.
       actions: A names.
-      text: the map; None for a game from arrays.
-      wall: the kind of cell that is not a place.
-      places: ``int[C, 2]``, row and column of each place from 0; None without a map.
-      objective: what the game's own file asks for, a parity condition; None if it does not.
+      text: the map; None for a game from a model file.
+      wall: the kind of cell that cannot be entered.
+      places: ``int[C, 2]``, row and column of each other cell from 0; None without a map.
+      objective: the parity condition of the game's own file, or None.
     """
 
     game: Game
@@ -67,7 +170,7 @@ class World:
     objective: Parity | None = None
 
     def where(self, state: int) -> dict[str, Any]:
-        """A state for people: both robots' rows and columns from 1, else its number from 0."""
+        """Both robots' rows and columns from 1, or the state's number from 0."""
         if self.places is None:
             return {"state": int(state)}
         count = len(self.places)
@@ -81,7 +184,7 @@ class World:
         }
 
     def describe(self, state: int) -> str:
-        """:meth:`where` as a text."""
+        """:meth:`where` as text."""
         where = self.where(state)
         if self.places is None:
             return f"state {where['state']}"
@@ -90,96 +193,23 @@ class World:
         )
 
 
-_START = Rule(
-    lambda v: (isinstance(v, str) and bool(v.strip())) or (is_list(v, int) and len(v) == 2),
-    "a Boolean formula over the map's propositions, or a cell as [row, column], from 1",
-)
-_FORMULAS = Rule(
-    lambda v: is_list(v, str) and bool(v), 'a list of Boolean formulas, such as ["a", "b & !c"]'
-)
-_KEYS: dict[str, dict[str, Rule]] = {
-    "game": {
-        "map": tables.MAP,
-        "legend": tables.LEGEND,
-        "wall": TEXT,
-        "slip": number_in(0, 1),
-        "system_start": _START,
-        "environment_start": _START,
-        "system_stays": TRUTH,
-        "environment_stays": TRUTH,
-        "model": TEXT,
-        "initial": TEXT,
-    },
-    "task": {
-        "formula": TEXT,
-        "assumptions": _FORMULAS,
-        "guarantees": _FORMULAS,
-        "safe": TEXT,
-        "parity": choice("model"),
-        "chance": choice("random", "adversarial"),
-    },
-    "strategy": {"method": choice(*METHODS), "bound": COUNT},
-}
-
-
 def read_game(path: str | Path) -> GameFile:
     """Reads a game file.
 
     Raises:
-      ValueError: the file is missing or malformed, or a key is unknown, missing or wrong.
-        The message names the file, the place and the fix.
+      ValueError: the file is missing or malformed, or a key is unknown, missing or wrong; names
+        the file, the table, the key and the fix.
     """
     path = Path(path)
-    data, _ = tables.read_tables(path, "the game file", _KEYS, {"": ("game", "task")})
-    game = data["game"]
-    tables.check_source(path, "game", game, [k for k in game if k not in ("model", "initial")])
-    if "map" in game:
-        tables.refuse(
-            path,
-            "game",
-            game,
-            ("initial",),
-            ("a model; on a map give system_start and environment_start"),
-        )
-    _check_task(path, data["task"])
+    data, _ = schema.read_toml(path, GameFileSchema.KIND)
+    file = schema.convert(path, GameFileSchema, data)
     return GameFile(
         path=path,
-        name=data.get("name", path.stem),
-        game=game,
-        task=data["task"],
-        strategy=data.get("strategy", {}),
-        demanded="strategy" in data,
-    )
-
-
-def _check_task(path: Path, task: Mapping[str, Any]) -> None:
-    lists = [k for k in ("assumptions", "guarantees", "safe") if k in task]
-    tables.reject(
-        path,
-        "task",
-        (
-            (
-                "formula" in task and bool(lists),
-                f"has both formula and {''.join(lists[:1])}; give either a formula, or guarantees with "
-                "assumptions and safe where needed",
-            ),
-            (
-                "parity" in task and ("formula" in task or bool(lists)),
-                'has parity = "model", the condition in the file of a parity game, and another one; keep '
-                "one of them",
-            ),
-            (
-                not {"formula", "guarantees", "safe", "parity"} & set(task),
-                'lacks what the system is to achieve: formula = "...", or guarantees = ["..."], each to '
-                'be met again and again, or safe = "...", to hold for ever, or parity = "model", of a '
-                "parity game from a file",
-            ),
-            (
-                "assumptions" in task and "guarantees" not in task,
-                "has assumptions but no guarantees, so that they assume in vain; add guarantees or leave "
-                "them out",
-            ),
-        ),
+        name=file.name or path.stem,
+        game=file.game,
+        task=file.task,
+        strategy=file.strategy or StrategyTable(),
+        demanded=file.strategy is not None,
     )
 
 
@@ -187,22 +217,23 @@ def load_game(file: GameFile) -> World:
     """The game that a game file describes.
 
     Raises:
-      ValueError: a malformed map or model. The message names the file and the place.
+      ValueError: a malformed map or model; names the file and the place.
     """
-    spec = dict(file.game)
-    with tables.errors_in(f"{file.path}: [game] "):
-        if "model" in spec:
-            return _from_arrays(file.path.parent / spec["model"], spec.get("initial"))
-        text = tables.read_map(file.path, spec.pop("map"))
-        wall = spec.get("wall", "#")
+    table = file.game
+    with errors_in(f"{file.path}: [game] "):
+        if table.model is not None:
+            return _from_model(file.path.parent / table.model, table.initial)
+        assert table.map is not None
+        text, wall = read_map(file.path, table.map), table.wall or "#"
+        options = {key: value for key, value in table.given().items() if key != "map"}
         for key in ("system_start", "environment_start"):
-            if isinstance(spec.get(key), list):
-                spec[key] = _cell(spec[key], key, parse_map(text), wall)
-        game = grid_game(text, **spec)
+            if isinstance(options.get(key), tuple):
+                options[key] = _cell(options[key], key, parse_map(text), wall)
+        game = grid_game(text, **options)
     return World(game, ACTIONS, text, wall, places(text, wall=wall))
 
 
-def _from_arrays(path: Path, initial: str | None) -> World:
+def _from_model(path: Path, initial: str | None) -> World:
     found = read_padded(path, ("system",))
     if "system" not in found.more:
         raise ValueError(
@@ -210,71 +241,71 @@ def _from_arrays(path: Path, initial: str | None) -> World:
             "system moves and False where the environment does."
         )
     mdp = initial_where(found.mdp, initial, path)
-    with tables.errors_in(f"{str(path)!r}: "):
+    with errors_in(f"{str(path)!r}: "):
         game = make_game(mdp, found.more["system"])
     return World(game, found.actions, objective=found.objective)
 
 
-def _cell(given: list[int], key: str, cells: np.ndarray, wall: str) -> tuple[int, int]:
+def _cell(given: tuple[int, int], key: str, cells: np.ndarray, wall: str) -> tuple[int, int]:
     (row, column), (rows, columns) = given, cells.shape
     if not (1 <= row <= rows and 1 <= column <= columns):
-        raise ValueError(f"{key} = {given} is {tables.off_map(cells.shape)}")
+        raise ValueError(f"{key} = {list(given)} is {off_map(cells.shape)}")
     if cells[row - 1, column - 1] == wall:
-        raise ValueError(f"{key} = {given} is a wall of the map; start in another cell.")
+        raise ValueError(f"{key} = {list(given)} is a wall of the map; start in another cell.")
     return row - 1, column - 1
 
 
 def load_objective(file: GameFile, world: World) -> tuple[Game, Parity | GR1]:
-    """What the system is to achieve, and the game on whose states that is written.
+    """The objective, and the game on whose states it is defined.
 
     Returns:
-      Of a formula, the product with its automaton; else the world's own game.
+      For a formula, its product game; else the world's own game.
 
     Raises:
-      ValueError: a formula is malformed or mentions an unknown proposition, or one that
-        must be Boolean is not.
+      ValueError: a formula is malformed or has an unknown proposition, or one that must be
+        Boolean is not.
     """
     task, game = file.task, world.game
-    with tables.errors_in(f"{file.path}: [task] "):
-        if "formula" in task:
-            return task_game(game, task["formula"])
-        if "parity" in task:
+    with errors_in(f"{file.path}: [task] "):
+        if task.formula is not None:
+            return task_game(game, task.formula)
+        if task.parity is not None:
             if world.objective is None:
                 raise ValueError(
                     'parity = "model" takes the file of a parity game (PGSolver, '
                     "extended HOA); this game has no condition of its own."
                 )
             return game, world.objective
-        safe = task.get("safe", "true")
-        if "guarantees" not in task:
+        safe = task.safe or "true"
+        if task.guarantees is None:
             return game, safety(game, safe)
-        return game, gr1(game, task.get("assumptions", ()), task["guarantees"], safe=safe)
+        return game, gr1(game, task.assumptions or (), task.guarantees, safe=safe)
 
 
-def task_text(task: Mapping[str, Any]) -> str:
-    """What the system is to achieve, as one formula.
+def task_text(task: TaskTable) -> str:
+    """The objective as one formula.
 
     Example:
-      >>> task_text({"assumptions": ["a"], "guarantees": ["b", "c | d"], "safe": "!e"})
+      >>> task_text(TaskTable(assumptions=["a"], guarantees=["b", "c | d"], safe="!e"))
       'G (!e) & (G F (a) -> G F (b) & G F (c | d))'
     """
-    if "formula" in task:
-        return str(task["formula"])
-    if "parity" in task:
+    if task.formula is not None:
+        return task.formula
+    if task.parity is not None:
         return "the parity condition of the model's file"
 
-    def all_of(sets: list[str]) -> str:
-        return " & ".join(f"G F ({x})" for x in sets)
+    def recurrence(formulas: list[str]) -> str:
+        return " & ".join(f"G F ({x})" for x in formulas)
 
-    parts = [f"G ({task['safe']})"] if "safe" in task else []
-    if "guarantees" in task:
-        goals = all_of(task["guarantees"])
-        if "assumptions" in task:
-            goals = f"({all_of(task['assumptions'])} -> {goals})"
+    parts = [] if task.safe is None else [f"G ({task.safe})"]
+    if task.guarantees is not None:
+        goals = recurrence(task.guarantees)
+        if task.assumptions is not None:
+            goals = f"({recurrence(task.assumptions)} -> {goals})"
         parts.append(goals)
     return " & ".join(parts)
 
 
-def automaton_of(game: Game) -> Any:
-    """The task's automaton, if the game is a product with one."""
+def automaton_of(game: Game) -> Automaton | None:
+    """The formula's automaton, if the game is a product with one."""
     return game.mdp.automaton if isinstance(game.mdp, Product) else None

@@ -1,15 +1,15 @@
-"""Models that task and game files name, whatever their format, padded for learners and games."""
+"""Models that task and game files name, of any format, with padded successor lists."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from jaxltl.app.files import tables
+from jaxltl.app.files.schema import errors_in, read_bytes
 from jaxltl.core.games.objective import Parity
 from jaxltl.core.models.construct.padded import row_actions, to_padded
 from jaxltl.core.models.game import Game
@@ -20,16 +20,17 @@ from jaxltl.io.model_files import read_model
 from jaxltl.io.npz import model_of, parse_arrays
 from jaxltl.io.pgsolver import objective_of
 
-_MOST_NAMES = 100  # a padded model has a column for each
+_MOST_NAMES = 100  # each is a column of the padded model
 
 
-class ReadModel(NamedTuple):
-    """A model with padded successor lists, and what else its file says.
+@dataclass(frozen=True)
+class ReadModel:
+    """A model with padded successor lists, and the other contents of its file.
 
     Attributes:
       mdp: the model.
       actions: A names.
-      more: arrays that were asked for; ``"system"`` of a game.
+      more: other arrays by name; ``"system"`` of a game.
       objective: the parity objective of a parity game's file, or None.
     """
 
@@ -42,20 +43,20 @@ class ReadModel(NamedTuple):
 def read_padded(path: Path, more: Sequence[str] = ()) -> ReadModel:
     """The model of a file, of a format of ``read_model`` or an ``.npz`` of padded arrays.
 
-    An action is a name where the choices of each state have different ones, of at most 100;
-    else the rank of a choice in its state.
+    Actions have the names of choices if these are distinct in each state and at most 100, else
+    the rank of a choice in its state.
 
     Args:
       path: the file.
-      more: names of arrays that an ``.npz`` may hold beside a model's; a game is refused if
-        ``"system"`` is not among them.
+      more: names of other arrays that an ``.npz`` may hold; without ``"system"`` games are
+        refused.
 
     Raises:
-      ValueError: the file is malformed, holds a game where none is asked for, or is too large
-        when padded, with the size.
+      ValueError: the file is malformed or a game, or the padded model is too large, with its
+        size.
     """
     name = str(path)
-    raw = tables.read_bytes(path, "the model")
+    raw = read_bytes(path, "the model")
     if path.suffix.lower() == ".npz" or raw.startswith(b"PK"):
         arrays = parse_arrays(raw, name, more)
         if "entry_start" not in arrays:
@@ -84,7 +85,7 @@ def read_padded(path: Path, more: Sequence[str] = ()) -> ReadModel:
         if "priority" in model.mdp.valuation:
             objective = objective_of(model)
         model = model.mdp
-    with tables.errors_in(f"{name!r}: "):
+    with errors_in(f"{name!r}: "):
         mdp, names, _ = padded(model)
     return ReadModel(mdp, names, found, objective)
 
@@ -93,7 +94,7 @@ def padded(model: SparseMDP) -> tuple[MDP, tuple[str, ...], np.ndarray]:
     """A sparse model with padded successor lists, the names of actions, and each choice's action.
 
     Raises:
-      ValueError: it is too large when padded, with the size.
+      ValueError: the padded model is too large, with its size.
     """
     names = tuple(x or "(no name)" for x in model.action_names)
     if model.action is not None and names:

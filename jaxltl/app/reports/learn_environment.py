@@ -1,201 +1,50 @@
-"""What is told of a network that was learned in a simulated world: a page, and a text."""
+"""Report of learning in an environment: estimates from fresh episodes, with intervals."""
 
 from __future__ import annotations
 
-import html
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from jaxltl.app.files.task import many
-from jaxltl.app.reports.live import Said, live_page
-from jaxltl.app.reports.page import Remark, number, probability, rows, tiles, told
+from jaxltl.app.reports.drawing import Picture
+from jaxltl.app.reports.figures import Remark, number, probability, remark_lines
+from jaxltl.app.reports.page import Part, render_page
+from jaxltl.app.wording import many
 
-_SHARES = ("success", "violation", "undecided")
+Result = Mapping[str, Any]
+
+_PROBABILITIES = ("success", "violation", "undecided")
 
 
-def page(result: Mapping[str, Any], *shown: Any) -> str:
-    """The report of :func:`jaxltl.app.learn_environment.summary`.
-
-    Args:
-      result: the summary.
-      shown: what moves, pictures and the task file, as for :func:`~.live.live_page`.
-    """
-    about = [
-        f"<h2>Evaluation</h2><p class=muted>{html.escape(_judged(result))}</p>",
-        _table(result),
-        _seeds(result),
-    ]
-    return live_page(
-        result, Said(html.escape(_sentence(result)), remarks(result), _tiles(result), about), *shown
+def page(
+    result: Result,
+    parts: Sequence[Part],
+    pictures: Sequence[tuple[Picture, bytes]],
+    task_text: str,
+) -> str:
+    """The HTML report of :func:`jaxltl.app.learn_environment.summary`."""
+    visits = [] if _is_finite(result) else ["visits"]
+    return render_page(
+        "environment.html",
+        result,
+        parts,
+        pictures,
+        task_text,
+        sentence=_sentence(result),
+        remarks=remarks(result),
+        tiles=_tiles(result),
+        evaluation=_evaluation(result),
+        estimates=_estimates(result),
+        seed_header=("seed", *_PROBABILITIES, *visits),
+        seed_rows=_seeds(result),
     )
 
 
-def _sentence(result: Mapping[str, Any]) -> str:
-    world, training = result["environment"], result["training"]
-    acts = world["actions"]
-    does = f"{acts} actions" if isinstance(acts, int) else f"actions in a box {acts}"
-    return (
-        f"{result['method']} in {world['name']}: {does}, {many(result['num_memory'], 'state')} of "
-        f"memory, {training['transitions']:,} simulated steps a seed, "
-        f"{many(result['seeds']['number'], 'seed')}; {result['policy']['made_of']}"
-    )
-
-
-def _judged(result: Mapping[str, Any]) -> str:
-    found = result["evaluation"]
-    acts = {"drawn": "its actions are drawn", "likeliest": "it takes the likeliest action"}
-    how = "" if result["method"] == "cce" else f" ({acts[result['policy']['acts']]})"
-    return (
-        f"{found['num_episodes']:,} fresh episodes of at most {found['num_steps']:,} steps of the "
-        f"policy that is kept{how}; each interval holds with {found['confidence']:g}."
-    )
-
-
-def _interval(entry: Mapping[str, Any]) -> str:
-    return f"[{number(entry['lower'])}, {number(entry['upper'])}]"
-
-
-def _rows(result: Mapping[str, Any]) -> Iterator[tuple[str, str, str, str]]:
-    """What is estimated, its value, its interval, and what that rests on."""
-    found = result["evaluation"]
-    finite = result["acceptance"] in ("cosafe", "safety")
-    for name in found["estimates"]:
-        if finite and "visits" in name:
-            continue
-        entry = found[name]
-        value = probability(entry["mean"]) if name in _SHARES else number(entry["mean"])
-        ends = (
-            f"[{entry['lower']:.4f}, {entry['upper']:.4f}]" if name in _SHARES else _interval(entry)
-        )
-        yield name.replace("_", " "), value, ends, entry["method"]
-
-
-def _table(result: Mapping[str, Any]) -> str:
-    found = result["evaluation"]
-    ended = (
-        f"{found['terminated']:,} terminated, {found['truncated']:,} truncated, "
-        f"{found['cut_off']:,} cut off"
-    )
-    return rows(
-        ("of an episode", "estimate", "interval", "by"),
-        [tuple(map(html.escape, line)) for line in _rows(result)],
-    ) + (
-        f"<p class=muted>How they ended: {ended}. Rewards are the task's, with its shaping, "
-        "and not discounted.</p>"
-    )
-
-
-def _tiles(result: Mapping[str, Any]) -> str:
-    found, shown = result["evaluation"], []
-    for name in _SHARES:
-        entry = found[name]
-        shown.append(
-            (probability(entry["mean"]), f"{name}, in [{entry['lower']:.4f}, {entry['upper']:.4f}]")
-        )
-    if result["acceptance"] not in ("cosafe", "safety"):
-        entry = found["visits"]
-        shown.append((number(entry["mean"]), f"accepting visits, in {_interval(entry)}"))
-    shown.append((number(found["length"]["mean"]), "steps of an episode"))
-    return tiles(shown)
-
-
-def remarks(result: Mapping[str, Any]) -> list[Remark]:
-    """What a reader must know first."""
-    found, said = result["evaluation"], []
-    if result["trivial"]:
-        said.append(("note", result["trivial"]))
-    if found["threshold"] is not None:
-        text = {
-            None: ("warning", "It is open whether success is"),
-            True: ("good", "Success is"),
-            False: ("warning", "Success is not"),
-        }[found["decision"]]
-        said.append(
-            (
-                text[0],
-                f"{text[1]} at least {found['threshold']:g}, with confidence "
-                f"{found['confidence']:g}.",
-            )
-        )
-    if result["acceptance"] == "safety" and found["violation"]["mean"] < 1:
-        said.append(
-            (
-                "note",
-                (
-                    "A task that forbids is never done in finite time: an episode that is undecided kept "
-                    f"to it for {found['num_steps']:,} steps, or until it was truncated."
-                ),
-            )
-        )
-    elif result["acceptance"] != "cosafe" and found["undecided"]["mean"] > 0:
-        said.append(
-            (
-                "note",
-                (
-                    "A task without end is not decided by a finite episode: what counts is how often it "
-                    "accepts, the visits."
-                ),
-            )
-        )
-    elif found["undecided"]["mean"] > 0.5:
-        said.append(
-            (
-                "warning",
-                (
-                    f"{probability(found['undecided']['mean'])} of the episodes end undecided: learn for "
-                    "more steps, give episodes more time, or shape the reward (shaping in [task])."
-                ),
-            )
-        )
-    if found["status"] == "NONFINITE":
-        said.append(("warning", "A reward or a cost of an episode is not finite."))
-    if result["training"]["troubled_rows"]:
-        said.append(
-            (
-                "warning",
-                (
-                    f"In {many(result['training']['troubled_rows'], 'reported step')} of the learner a "
-                    "number was not finite, no step was found, or no action was allowed."
-                ),
-            )
-        )
-    return said
-
-
-def _seeds(result: Mapping[str, Any]) -> str:
-    seeds = result["seeds"]
-    if seeds["number"] == 1:
-        return ""
-    lines, finite = [], result["acceptance"] in ("cosafe", "safety")
-    for i, found in enumerate(seeds["evaluations"]):
-        kept = " (kept)" if i == seeds["kept"] else ""
-        lines.append(
-            (
-                f"{i}{kept}",
-                *(
-                    f"{probability(found[n]['mean'])} [{found[n]['lower']:.4f}, {found[n]['upper']:.4f}]"
-                    for n in _SHARES
-                ),
-                *(
-                    []
-                    if finite
-                    else [f"{number(found['visits']['mean'])} {_interval(found['visits'])}"]
-                ),
-            )
-        )
-    head = ("seed", *_SHARES, *([] if finite else ["visits"]))
-    return rows(head, lines, "<caption>Every seed</caption>") + (
-        "<p class=muted>The seed that is kept was chosen by other episodes, so that its intervals "
-        "are not those of a winner.</p>"
-    )
-
-
-def table(result: Mapping[str, Any]) -> str:
-    """The result as text for the terminal."""
-    lines = [f"{result['task']}: {_sentence(result)}", "", _judged(result)]
+def table(result: Result) -> str:
+    """The report as text for the terminal."""
+    lines = [f"{result['task']}: {_sentence(result)}", "", _evaluation(result)]
     lines += [
-        f"  {name:18} {value:>10}  {ends:24} {method}"
-        for name, value, ends, method in _rows(result)
+        f"  {name:18} {value:>10}  {interval:24} {method}"
+        for name, value, interval, method in _estimates(result)
     ]
     seeds = result["seeds"]
     if seeds["number"] > 1:
@@ -205,4 +54,121 @@ def table(result: Mapping[str, Any]) -> str:
             f"success of {seeds['number']} seeds: {each}; number {seeds['kept']} is "
             "kept, chosen by other episodes",
         ]
-    return "\n".join([*lines, *told(remarks(result))])
+    return "\n".join([*lines, *remark_lines(remarks(result))])
+
+
+def _is_finite(result: Result) -> bool:
+    """Whether finite episodes can decide the formula, so that visits are of no interest."""
+    return result["acceptance"] in ("cosafe", "safety")
+
+
+def _sentence(result: Result) -> str:
+    world, training = result["environment"], result["training"]
+    actions = world["actions"]
+    kind = f"{actions} actions" if isinstance(actions, int) else f"actions in a box {actions}"
+    return (
+        f"{result['method']} in {world['name']}: {kind}, "
+        f"{many(result['num_memory'], 'automaton state')}, "
+        f"{training['transitions']:,} simulated steps per seed, "
+        f"{many(result['seeds']['number'], 'seed')}; {result['policy']['made_of']}"
+    )
+
+
+def _evaluation(result: Result) -> str:
+    found = result["evaluation"]
+    actions = {"drawn": "random actions", "likeliest": "likeliest actions"}
+    kind = "" if result["method"] == "cce" else f" ({actions[result['policy']['acts']]})"
+    return (
+        f"{found['num_episodes']:,} fresh episodes of at most {found['num_steps']:,} steps of the "
+        f"kept policy{kind}; each interval holds with confidence {found['confidence']:g}."
+    )
+
+
+def _interval(name: str, entry: Result) -> str:
+    if name in _PROBABILITIES:
+        return f"[{entry['lower']:.4f}, {entry['upper']:.4f}]"
+    return f"[{number(entry['lower'])}, {number(entry['upper'])}]"
+
+
+def _value(name: str, entry: Result) -> str:
+    return (probability if name in _PROBABILITIES else number)(entry["mean"])
+
+
+def _estimates(result: Result) -> list[tuple[str, str, str, str]]:
+    """Name, value, interval and statistical method of each estimate."""
+    found = result["evaluation"]
+    return [
+        (
+            name.replace("_", " "),
+            _value(name, found[name]),
+            _interval(name, found[name]),
+            found[name]["method"],
+        )
+        for name in found["estimates"]
+        if not (_is_finite(result) and "visits" in name)
+    ]
+
+
+def _tiles(result: Result) -> list[tuple[str, str]]:
+    found = result["evaluation"]
+    tiles = [
+        (_value(name, found[name]), f"{name}, in {_interval(name, found[name])}")
+        for name in _PROBABILITIES
+    ]
+    if not _is_finite(result):
+        entry = found["visits"]
+        tiles.append((number(entry["mean"]), f"accepting visits, in {_interval('visits', entry)}"))
+    return [*tiles, (number(found["length"]["mean"]), "steps of an episode")]
+
+
+def _seeds(result: Result) -> list[tuple[str, ...]]:
+    seeds = result["seeds"]
+    names = (*_PROBABILITIES, *([] if _is_finite(result) else ["visits"]))
+    return [
+        (
+            f"{i}{' (kept)' if i == seeds['kept'] else ''}",
+            *(f"{_value(name, found[name])} {_interval(name, found[name])}" for name in names),
+        )
+        for i, found in enumerate(seeds["evaluations"])
+    ]
+
+
+def remarks(result: Result) -> list[Remark]:
+    """The remarks at the beginning of the page."""
+    found, training = result["evaluation"], result["training"]
+    remarks: list[Remark] = [("note", result["trivial"])] if result["trivial"] else []
+    if found["threshold"] is not None:
+        kind, text = {
+            None: ("warning", "It is not decided whether the success probability is"),
+            True: ("good", "The success probability is"),
+            False: ("warning", "The success probability is not"),
+        }[found["decision"]]
+        threshold = f"{found['threshold']:g}, with confidence {found['confidence']:g}."
+        remarks.append((kind, f"{text} at least {threshold}"))
+    if result["acceptance"] == "safety" and found["violation"]["mean"] < 1:
+        text = (
+            "No finite episode satisfies a safety formula: an undecided episode did not violate "
+            f"it in {found['num_steps']:,} steps, or until it was truncated."
+        )
+        remarks.append(("note", text))
+    elif not _is_finite(result) and found["undecided"]["mean"] > 0:
+        text = (
+            "No finite episode decides this formula: the estimate of interest is the number of "
+            "accepting visits."
+        )
+        remarks.append(("note", text))
+    elif found["undecided"]["mean"] > 0.5:
+        text = (
+            f"{probability(found['undecided']['mean'])} of the episodes end undecided: learn for "
+            "more steps, give episodes more time, or shape the reward (shaping in [task])."
+        )
+        remarks.append(("warning", text))
+    if found["status"] == "NONFINITE":
+        remarks.append(("warning", "A reward or a cost of an episode is not finite."))
+    if training["troubled_rows"]:
+        text = (
+            f"In {many(training['troubled_rows'], 'reported step')} of the learner a number was "
+            "not finite, no step was found, or no action was allowed."
+        )
+        remarks.append(("warning", text))
+    return remarks

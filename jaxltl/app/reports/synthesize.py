@@ -30,7 +30,7 @@ def summary(found: Synthesis, seconds: float) -> dict[str, Any]:
     result = {
         "game": file.name,
         "task": task_text(file.task),
-        "chance": file.task.get("chance", "random"),
+        "chance": file.task.chance,
         "deterministic": is_deterministic(world.game),
         "num_states": world.game.num_states,
         "num_memory": 1 if automaton is None else len(automaton.delta),
@@ -190,7 +190,7 @@ def _ending(play: Play, found: Synthesis) -> str:
 def _missed(play: Play, found: Synthesis) -> str:
     """Which guarantee a loop never meets."""
     objective = found.winning.objective
-    guarantees = found.file.task.get("guarantees", ())
+    guarantees = found.file.task.guarantees or ()
     if not isinstance(objective, GR1):
         return ""
     loop = [step.node for step in play.steps[play.repeats_from :]]
@@ -374,6 +374,6 @@ def _title(found: Synthesis, q: int, m: int, pairs: np.ndarray) -> str:
     if len(set(pairs[:, 0])) > 1:
         parts.append(f"automaton in {q}")
     if len(set(pairs[:, 1])) > 1:
-        goals = found.file.task.get("guarantees", ())
+        goals = found.file.task.guarantees or ()
         parts.append(f"towards {goals[m]}" if m < len(goals) else f"memory {m}")
     return ", ".join(parts)

@@ -1,4 +1,4 @@
-"""The pictures of a job of todirl: its automata, curves, and worlds with what is done there."""
+"""Pictures of transferable rewards: automata, learning curves, and policies in some worlds."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jaxltl.app._todirl_parts import Judged, Outcome, Setup, Worlds, counted_worlds, part_of
-from jaxltl.app.drawing import Picture, drawing
-from jaxltl.app.explorer import (
+from jaxltl.app.todirl_results import Judged, Outcome, Setup, Worlds, counted_worlds, part_of
+from jaxltl.app.reports.drawing import Picture, drawing
+from jaxltl.app.reports.explorer import (
     LONGEST_RUN,
     START,
     Curves,
@@ -18,6 +18,7 @@ from jaxltl.app.explorer import (
     Layer,
     Run,
     TooLarge,
+    View,
     curves,
     demonstrated_runs,
     explorer,
@@ -33,23 +34,23 @@ _PICTURES = 3  # worlds that are drawn, of each kind
 
 
 _END = {
-    "cosafe": "is done or has failed",
-    **dict.fromkeys(("safety", "buchi", "parity"), f"has failed, or for {LONGEST_RUN} steps"),
+    "cosafe": "is satisfied or violated",
+    **dict.fromkeys(("safety", "buchi", "parity"), f"is violated, or for {LONGEST_RUN} steps"),
 }
 _FIGURES = ("per_pair", "held_out", "gradient_norm")
 
 
 def task_pictures(setup: Setup) -> list[Picture]:
-    """The report's pictures that nothing has to be learned for."""
+    """The pictures that need no outcome."""
     same = setup.memory is setup.judge
     found = [automaton_picture(setup.judge, "training-1" if same else "")]
     if not same:
         found.append(
             Picture(
                 "memory.svg",
-                "What the learner remembers",
+                "Memory of the learner",
                 drawing("automaton", setup.memory),
-                "The automaton whose state is the learner's memory; the task above judges it.",
+                "The automaton whose state is the learner's memory; the formula's automaton evaluates it.",
                 "training-1",
             )
         )
@@ -57,7 +58,7 @@ def task_pictures(setup: Setup) -> list[Picture]:
 
 
 def pictures(outcome: Outcome) -> list[Picture]:
-    """The report's pictures of what was learned."""
+    """The pictures of an outcome."""
     history = outcome.learned.history
     found = [
         Picture(
@@ -74,7 +75,7 @@ def pictures(outcome: Outcome) -> list[Picture]:
 
 
 def live(outcome: Outcome) -> list[Explorer | TooLarge | Curves]:
-    """The parts of the report that move."""
+    """The interactive parts of the report."""
     found: list[Explorer | TooLarge | Curves] = [
         _look_into(outcome, one) for one in _drawn_worlds(outcome)
     ]
@@ -85,18 +86,18 @@ def live(outcome: Outcome) -> list[Explorer | TooLarge | Curves]:
 def _caption_of_curves(outcome: Outcome) -> str:
     return (
         "Negative log-likelihood of the average demonstrated pair, of the average held-out pair "
-        "where there are any, and the gradient's length, before each step"
+        "if there are any, and the norm of the gradient, before each step"
         + (
             ""
             if np.isnan(outcome.learned.held_out).any()
-            else ". What is kept has the least held-out figure"
+            else ". The parameters with the least held-out figure are kept"
         )
         + over_seeds(len(outcome.learned.held_out))
     )
 
 
 class _Drawn(NamedTuple):
-    """A world that is drawn: its number among others, its policy, and its title."""
+    """A world that is drawn: its index, file stem, title, and demonstrations."""
 
     worlds: Worlds
     judged: Judged
@@ -117,7 +118,7 @@ class _Drawn(NamedTuple):
 
     @property
     def value(self) -> np.ndarray:
-        """``[S]``: the probability of doing the task from a start there."""
+        """``[S]``: the satisfaction probability from an initial state."""
         size = self.worlds.scenes[self.w].mdp.num_states
         return np.asarray(self.judged.performance["learned"].value[self.w])[:size]
 
@@ -148,8 +149,8 @@ def _drawn_worlds(outcome: Outcome) -> Iterator[_Drawn]:
 
 
 _CAPTION = (
-    "One map for each state of the learner's memory; an arrow is as long as its action is "
-    "likely{}. In the title, the mean probability of doing the task."
+    "One map for each memory state; lengths of arrows are the probabilities of actions{}. The "
+    "title has the mean satisfaction probability."
 )
 
 
@@ -159,31 +160,34 @@ def _look_into(outcome: Outcome, one: _Drawn) -> Explorer | TooLarge:
     moving = policy if stationary else policy[0]
     names = setup.memory.state_names or ("",) * len(setup.memory.delta)
     layers = {
-        str(q): Layer(f"memory {q}: {names[q]}", None, moving[:, q]) for q in _memory_shown(setup)
+        str(q): Layer(f"memory state {q}: {names[q]}", None, moving[:, q])
+        for q in _memory_shown(setup)
     }
     starts = np.asarray(scene.mdp.initial) > 0
-    layers[START] = Layer("where a run starts", np.where(starts, one.value, np.nan), None)
+    layers[START] = Layer("initial states", np.where(starts, one.value, np.nan), None)
     model = part_of(one.worlds.model, one.w)
     shown = [] if one.demonstrations is None else demonstrated_runs(model, one.demonstrations)
     place: Any = scene.cells if scene.colored is None else part_of(scene.colored, ...)
     return explorer(
-        one.live,
-        one.title,
-        _CAPTION.format("" if stationary else " at the first step"),
+        View(
+            name=one.live,
+            title=one.title,
+            caption=_CAPTION.format("" if stationary else " at the first step"),
+            size=scene.mdp.num_states,
+            place=place,
+            actions=ACTIONS,
+            label="satisfaction probability",
+            wall=setup.task.world.wall or "#",
+            goal="the formula" if setup.memory is setup.judge else "the memory's formula",
+        ),
         setup.memory,
         layers,
         [*shown, *_runs(outcome, one)],
-        size=scene.mdp.num_states,
-        place=place,
-        actions=ACTIONS,
-        label="probability of doing the task",
-        wall=setup.task.world.get("wall", "#"),
-        goal="the task" if setup.memory is setup.judge else "what it remembers",
     )
 
 
 def _chosen_worlds(setup: Setup, judged: Judged) -> list[tuple[str, int]]:
-    """The test worlds where the learned policy does worst, middling and best."""
+    """The test worlds of least, median and greatest satisfaction probability."""
     counted = np.flatnonzero(counted_worlds(setup))
     mean = np.asarray(judged.performance["learned"].mean)
     order = counted[np.argsort(mean[counted], kind="stable")]
@@ -195,14 +199,14 @@ def _chosen_worlds(setup: Setup, judged: Judged) -> list[tuple[str, int]]:
 
 
 def _draw(outcome: Outcome, one: _Drawn) -> list[Picture]:
-    """A world with runs of its policy and, if asked for, the policy itself."""
+    """Pictures of a world: its policy, and trajectories."""
     setup, scene, policy = outcome.setup, one.worlds.scenes[one.w], one.policy
     moving = policy if policy.ndim == 3 else policy[0]
     shown = _memory_shown(setup)
     names = setup.memory.state_names or ("",) * len(setup.memory.delta)
     # About as many characters as a panel is wide.
     width = int(np.clip(5 * scene.shape[1], 9, 50))
-    titles = [short_name(f"memory {q}: {names[q]}", width) for q in shown]
+    titles = [short_name(f"memory state {q}: {names[q]}", width) for q in shown]
     caption = _CAPTION.format("" if policy.ndim == 3 else " at the first step")
     if scene.colored is None:
         assert scene.cells is not None
@@ -212,10 +216,10 @@ def _draw(outcome: Outcome, one: _Drawn) -> list[Picture]:
             np.broadcast_to(one.value, (len(shown), one.value.size)),
             moving.transpose(1, 0, 2)[shown],
             titles=titles,
-            label="probability from a start there",
-            wall=setup.task.world.get("wall", "#"),
+            label="satisfaction probability",
+            wall=setup.task.world.wall or "#",
         )
-        caption += " Colours: the probability of doing the task if a run starts there."
+        caption += " Colours: the satisfaction probability from there as an initial state."
         return [Picture(f"{one.stem}.svg", one.title, drawn, caption, one.live)]
     found: list[Picture] = []
     if one.arrows:
@@ -229,10 +233,10 @@ def _draw(outcome: Outcome, one: _Drawn) -> list[Picture]:
         found.append(
             Picture(
                 f"{one.stem}_runs.svg",
-                f"Runs in {scene.name}" if one.arrows else one.title,
+                f"Trajectories in {scene.name}" if one.arrows else one.title,
                 drawing("temporal_gridworld", part_of(scene.colored, ...), trajectories=walks),
-                f"{len(walks.length)} runs of the learned policy from random starts, each until the "
-                f"task {_END[setup.judge.acceptance]}.",
+                f"{len(walks.length)} trajectories of the learned policy from random initial states, "
+                f"each until the formula {_END[setup.judge.acceptance]}.",
                 one.live,
             )
         )
@@ -240,16 +244,16 @@ def _draw(outcome: Outcome, one: _Drawn) -> list[Picture]:
 
 
 def _memory_shown(setup: Setup) -> list[int]:
-    """Memory states in which there is something left to do."""
-    open_ = np.flatnonzero(verdicts(setup.memory) == Verdict.UNDECIDED)
-    return [int(q) for q in open_] or [0]
+    """The undecided memory states."""
+    undecided = np.flatnonzero(verdicts(setup.memory) == Verdict.UNDECIDED)
+    return [int(q) for q in undecided] or [0]
 
 
 def _runs(outcome: Outcome, one: _Drawn) -> list[Run]:
-    """Runs of the learned policy with the learner's memory, until the task is decided."""
+    """Rollouts of the learned policy with the learner's memory, until the formula is decided."""
     setup, policy, count = outcome.setup, one.policy, 1
     if setup.memory is not setup.judge:
-        # The task's state varies fastest.
+        # The formula's automaton state varies fastest.
         policy, count = (
             np.asarray(lift_memory_policy(jnp.asarray(policy), setup.judge)),
             len(setup.judge.delta),

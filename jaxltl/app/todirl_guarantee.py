@@ -1,34 +1,36 @@
-"""How a job of todirl reaches a probability that is asked for, in every world.
+"""Attains an asked satisfaction probability in every world of a todirl job.
 
-In each world the policy is the plan of the learned reward with the least share of moves that lose
-nothing by which the probability is certified; so it is in worlds never seen. Which reward that is:
-of those that are learned with more and more weight of the task's probability, the one by which the
-demonstrations are most likely then.
+In each world the policy is the plan of the learned reward, mixed with the least share of optimal
+actions for which the probability is certified; the same holds in new worlds. Among the rewards
+that are learned with increasing weights of the satisfaction probability, the one is kept for which
+the demonstrations are then most likely.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from jaxltl.app._todirl_parts import Learned, Setup, part_of
-from jaxltl.app.files.task import place as name_of
-from jaxltl.app.files.task_todirl import Scene
+from jaxltl.app.todirl_results import Learned, Setup, part_of
+from jaxltl.app.wording import place as name_of
+from jaxltl.app.files.scenes import Scene
 from jaxltl.app.guarantee import bracket
 from jaxltl.core.values.undiscounted.mixture import attained, reaching, require_attainable
 
-_HALVINGS = 5  # between two weights, since what is still too much is mixed away
+_HALVINGS = 5  # few bisections of the weight, since the mixture closes the gap
 
 
-class Held(NamedTuple):
-    """Policies that have the probability asked for, and what of it is their own.
+@dataclass(frozen=True)
+class Held:
+    """Policies with the asked probability.
 
     Attributes:
       policy: ``float[W, S, Q, A]``.
-      share: ``float[W]``, of moves that lose nothing.
-      attained: ``float[W]``, certified, of the mean or the worst start.
+      share: ``float[W]``, of optimal actions.
+      attained: ``float[W]``, certified, of the mean or the worst initial state.
     """
 
     policy: np.ndarray
@@ -37,15 +39,11 @@ class Held(NamedTuple):
 
 
 def check_attainable(setup: Setup) -> None:
-    """Refuses a probability that no policy has in a world that counts.
-
-    Raises:
-      ValueError: with the world, and what is possible there.
-    """
+    """Raises ValueError for a probability that no policy attains in a world that counts."""
     task, scenes = setup.task, setup.worlds.scenes
     assert setup.sure is not None
     for w, (scene, sure) in enumerate(zip(scenes, setup.sure, strict=True)):
-        if w >= setup.num_training and scene.name in task.test.get("leave_out", ()):
+        if w >= setup.num_training and scene.name in task.left_out:
             continue
 
         def place(state: int, scene: Scene = scene) -> str:
@@ -64,10 +62,7 @@ def check_attainable(setup: Setup) -> None:
 
 
 def hold(setup: Setup, policy: Any, inside: Any) -> Held:
-    """Plans ``[W, S, Q, A]`` of all moves and of those that lose nothing, mixed as asked.
-
-    In all worlds, or in the first of them.
-    """
+    """Mixes plans ``[W, S, Q, A]`` of all actions and of optimal ones, in the first W worlds."""
     assert setup.sure is not None
     found = []
     for w, sure in enumerate(setup.sure[: len(policy)]):
@@ -86,13 +81,14 @@ def hold(setup: Setup, policy: Any, inside: Any) -> Held:
     return Held(np.stack(policies), np.array(shares), np.array(reached))
 
 
-class _Tried(NamedTuple):
-    """What was learned with a weight.
+@dataclass(frozen=True)
+class _Tried:
+    """An attempt with a weight.
 
     Attributes:
-      learned, weight: what, and with which.
-      attained: the least certified probability over the training worlds, before anything is mixed.
-      neg_log_likelihood: of the demonstrations, after it.
+      learned, weight: the network, and mu.
+      attained: least certified probability over the training worlds, before mixing.
+      neg_log_likelihood: of the demonstrations, after mixing.
     """
 
     learned: Learned
@@ -102,9 +98,9 @@ class _Tried(NamedTuple):
 
 
 def is_weighable(setup: Setup) -> bool:
-    """Whether a weight of the task changes anything: all moves alike do it now and then.
+    """Whether a weight has an effect: the uniform policy satisfies the formula sometimes.
 
-    A soft policy takes them all, so that else it never does the task, whatever its reward.
+    Soft policies have full support; else none of them satisfies it, for any reward.
     """
     for w in range(setup.num_training):
         model = part_of(setup.worlds.model, w)
@@ -121,14 +117,14 @@ def likeliest(
     train: Callable[[float, Learned], Learned] | None,
     plans: Callable[[Learned], tuple[np.ndarray, np.ndarray]],
 ) -> tuple[Learned, float]:
-    """What is kept of what is learned with some weights of the task, and its weight.
+    """The network of greatest likelihood over some weights, and its weight.
 
     Args:
-      setup: what is asked.
-      counts: ``float[W, S, Q, A]``, how often each pair was demonstrated in a training world.
-      free: what is learned without any weight.
-      train: what is learned with a weight; None where no weight changes anything.
-      plans: in the training worlds, of all moves and of those that lose nothing.
+      setup: the job.
+      counts: ``float[W, S, Q, A]``, demonstrations of each pair in a training world.
+      free: learned without a weight.
+      train: learns with a weight; None if weights have no effect.
+      plans: plans in the training worlds, of all actions and of optimal ones.
     """
     models = [part_of(setup.worlds.model, w) for w in range(setup.num_training)]
     seen = counts > 0

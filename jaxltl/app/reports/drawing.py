@@ -13,7 +13,7 @@ from multiprocessing import get_context, parent_process
 from multiprocessing.util import Finalize
 from typing import Any, NamedTuple
 
-from jaxltl.app.programs import few_collections
+from jaxltl.app.compilation import collect_rarely
 
 _PROCESSES = 2
 
@@ -119,7 +119,7 @@ def _undisturbed() -> Iterator[None]:
 
 
 def _prepare() -> None:
-    few_collections()
+    collect_rarely()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # where it could not be kept from here
     threading.Thread(target=_end_with_parent, daemon=True).start()
     # Else what was loaded is freed piece by piece, for half a second.

@@ -1,5 +1,5 @@
 "use strict";
-// Each explorer shows one memory of a policy at a time, and plays runs on map and automaton.
+// An explorer shows a policy for one memory state, and plays trajectories on map and automaton.
 (() => {
   const CELL = 40, PAUSE = 600;
   document.documentElement.classList.add("live");
@@ -22,7 +22,7 @@
 
     const show = (element, visible) => { element.style.display = visible ? "" : "none"; };
 
-    // Where a picture is wider than its frame, a part of it comes into the middle.
+    // Scrolls a wide picture so that a part of it is centred.
     function center(part) {
       const frame = part.closest(".scroll"), at = part.getBoundingClientRect();
       const around = frame.getBoundingClientRect();
@@ -43,7 +43,7 @@
       }
       const layer = data.layers[key], scale = one(".scale");
       if (scale) show(scale, Boolean(layer && layer.value));
-      one(".memory").textContent = data.told[key] ?? "";
+      one(".memory").textContent = data.memories[key] ?? "";
       if (cell !== null) describe(cell);
     }
 
@@ -58,7 +58,7 @@
         moves.sort((a, b) => b[0] - a[0]);
         parts.push(moves.map(([x, name]) => `${name} ${x.toFixed(3)}`).join(", "));
       } else if (data.first !== null && (!layer || layer.value === null || layer.value[state] === null)) {
-        parts.push("nothing is shown here");
+        parts.push("no values here");
       }
       say(parts.join(" · "));
     }
@@ -87,21 +87,21 @@
       quiet(false);
     }
 
-    // A run that plays by itself is not read aloud; its steps are in the table.
+    // Screen readers do not read a playing trajectory; its steps are in the table.
     function quiet(on) {
       for (const told of [readout, one(".memory")]) {
         told.setAttribute("aria-live", on ? "off" : "polite");
       }
     }
 
-    // The step t of the run that is chosen, on map, automaton and in words.
+    // Shows step t of the selected trajectory on map and automaton, and as text.
     function step(t) {
       const run = data.runs[Number(select.value)], [state, memory, action] = run.steps[t];
       started = true;
       slider.max = run.steps.length - 1;
       slider.value = t;
-      const did = action === null ? "the run ends here" : `goes ${data.actions[action]}`;
-      const parts = [place(state), ...(data.told[memory] ? [`memory ${memory}`] : []), did];
+      const did = action === null ? "end" : `action ${data.actions[action]}`;
+      const parts = [place(state), ...(data.memories[memory] ? [`memory state ${memory}`] : []), did];
       const text = `step ${t} of ${run.steps.length - 1}: ${parts.join(" · ")}`;
       slider.setAttribute("aria-valuetext", text);
       cell = null;
@@ -111,7 +111,7 @@
         const at = data.cells[state] ? data.cells[state][i] : state;
         const x = (at % data.columns + 0.5) * CELL;
         const y = (Math.floor(at / data.columns) + 0.5) * CELL;
-        // It glides from step to step, and appears where it first is.
+        // Moves smoothly between steps, except at its first position.
         token.style.transition = token.style.visibility === "visible" ? "" : "none";
         token.style.visibility = "visible";
         token.style.transform = `translate(${x}px, ${y}px)`;
@@ -196,7 +196,7 @@
     choose(key);
   }
 
-  // What scrolls can be reached by keys, for as long as it does.
+  // Scrollable frames are focusable while they scroll.
   function reach() {
     for (const frame of document.querySelectorAll(".scroll:not(.board)")) {
       if (frame.scrollWidth > frame.clientWidth) frame.tabIndex = 0;

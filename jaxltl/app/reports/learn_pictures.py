@@ -1,7 +1,4 @@
-"""The pictures of a job of mlirl: its automaton, curves, and the policy on the map.
-
-A setup and an outcome are those of :mod:`jaxltl.app.learn`.
-"""
+"""Pictures of inverse reinforcement learning: automaton, learning curves, policy on the map."""
 
 from __future__ import annotations
 
@@ -9,13 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from jaxltl.app.drawing import Picture, drawing
-from jaxltl.app.explorer import (
+from jaxltl.app.reports.drawing import Picture, drawing
+from jaxltl.app.reports.explorer import (
     START,
     Curves,
     Explorer,
     Layer,
     TooLarge,
+    View,
     curves,
     demonstrated_runs,
     explorer,
@@ -28,11 +26,12 @@ from jaxltl.core.models.construct.restrict import restrict
 from jaxltl.core.models.product import Product
 from jaxltl.core.values.undiscounted.mixture import from_starts
 
-LIVE = "policy"  # the name of the page's live part
+_CURVES = "Loss, satisfaction probability and gradient before each step"
+LIVE = "policy"  # name of the interactive part
 
 
 def task_pictures(setup: Any) -> list[Picture]:
-    """The report's pictures that nothing has to be learned for."""
+    """The pictures that need no outcome."""
     return [automaton_picture(setup.model.automaton, LIVE)]
 
 
@@ -40,7 +39,7 @@ _FIGURES = ("loss", "neg_log_likelihood", "satisfaction", "gradient_norm")
 
 
 def pictures(outcome: Any) -> list[Picture]:
-    """The report's pictures of what was learned."""
+    """The pictures of an outcome."""
     cells, history = outcome.setup.world.cells, outcome.learned.history
     return [
         *([] if cells is None else _maps(outcome, cells)),
@@ -53,73 +52,75 @@ def pictures(outcome: Any) -> list[Picture]:
                 steps=history["step"],
                 show=_FIGURES,
             ),
-            "Figures of the weights before each step" + over_seeds(len(outcome.learned.loss)),
+            _CURVES + over_seeds(len(outcome.learned.loss)),
             "learning",
         ),
     ]
 
 
 def live(outcome: Any) -> list[Explorer | TooLarge | Curves]:
-    """The parts of the report that move."""
+    """The interactive parts of the report."""
     setup, model = outcome.setup, outcome.setup.model
     policy = np.asarray(outcome.learned.policy[outcome.chosen])
-    caption = "Figures of the weights before each step" + over_seeds(len(outcome.learned.loss))
+    caption = _CURVES + over_seeds(len(outcome.learned.loss))
     logged = setup.world.logged
     return [
         explorer(
-            LIVE,
-            "What it does",
-            _TABLE if setup.world.cells is None else _MAP,
+            View(
+                name=LIVE,
+                title="Learned policy",
+                caption=_TABLE if setup.world.cells is None else _MAP,
+                size=setup.world.mdp.num_states,
+                place=setup.world.cells,
+                actions=setup.world.actions,
+                places={} if logged is None else dict(enumerate(logged.states)),
+                label=_LABEL,
+                wall=setup.task.world.wall or "#",
+                marked=left_out(model, setup.guarantee, setup.demonstrations),
+                marks="Demonstrated steps that lower the maximal satisfaction probability",
+            ),
             model.automaton,
             _layers(outcome),
             [
                 *demonstrated_runs(model, setup.demonstrations),
                 *learned_runs(model, policy, outcome.seed),
             ],
-            size=setup.world.mdp.num_states,
-            place=setup.world.cells,
-            actions=setup.world.actions,
-            places=None if logged is None else dict(enumerate(logged.states)),
-            label=_LABEL,
-            wall=setup.task.world.get("wall", "#"),
-            marked=left_out(model, setup.guarantee, setup.demonstrations),
-            marks="Demonstrated steps that lower the best probability and were left out",
         ),
         curves("learning", "Learning", caption, outcome.learned.history, _FIGURES),
     ]
 
 
-_LABEL = "probability of doing the task"
+_LABEL = "satisfaction probability"
 _MAP = (
-    "An arrow is as long as its action is likely; colours are the probability of doing the task "
-    "from there. Cells that cannot be met with a memory are blank."
+    "Lengths of arrows are the probabilities of actions, colours are satisfaction probabilities. "
+    "Cells that are unreachable with a memory state are blank."
 )
 _TABLE = (
-    "How likely each action is, and the probability of doing the task from there, stand in the "
-    "table below, for each memory."
+    "The table below has the probabilities of actions and the satisfaction probability for each "
+    "memory state."
 )
 
 
 def _layers(outcome: Any) -> dict[str, Layer]:
-    """By memory where the policy still matters: not done, not failed, and met on some way."""
+    """A layer for each memory state that is undecided and reachable, and one of initial states."""
     model = outcome.setup.model
     policy = np.asarray(outcome.learned.policy[outcome.chosen])
     value = np.array(outcome.solution.value)
     starts = np.asarray(model.mdp.initial) > 0
-    open_ = verdicts(model.automaton) == Verdict.UNDECIDED
+    undecided = verdicts(model.automaton) == Verdict.UNDECIDED
     met = _reached(model)
-    shown = np.flatnonzero(open_ & met.any(axis=0)).tolist()
+    shown = np.flatnonzero(undecided & met.any(axis=0)).tolist()
     names = model.automaton.state_names or ("",) * model.num_memory
     found = {
         str(q): Layer(
-            f"memory {q}: {names[q]}",
+            f"memory state {q}: {names[q]}",
             np.where(met[:, q], value[:, q], np.nan),
             np.where(met[:, q, None], policy[:, q], np.nan),
         )
         for q in shown
     }
     at_start = np.where(starts, from_starts(model, value), np.nan)
-    return {**found, START: Layer("where a run starts", at_start, None)}
+    return {**found, START: Layer("initial states", at_start, None)}
 
 
 def _maps(outcome: Any, cells: np.ndarray) -> list[Picture]:
@@ -128,9 +129,9 @@ def _maps(outcome: Any, cells: np.ndarray) -> list[Picture]:
     maps = [
         Picture(
             "values.svg",
-            "From where it works",
+            "Satisfaction probability",
             drawing("grid", cells, start.value, label=_LABEL),
-            "Probability that the learned policy does the task, from each initial state.",
+            "Satisfaction probability of the learned policy from each initial state.",
             LIVE,
         )
     ]
@@ -147,11 +148,9 @@ def _maps(outcome: Any, cells: np.ndarray) -> list[Picture]:
         maps.append(
             Picture(
                 "policy.svg",
-                "What it does",
+                "Learned policy",
                 drawn,
-                "One map for each state of the automaton, which is the policy's memory. An arrow is as "
-                "long as its action is likely; colours are the probability of doing the task from "
-                "there. Cells that cannot be met with that memory are blank.",
+                "One map for each state of the automaton, which is the policy's memory. " + _MAP,
                 LIVE,
             )
         )

@@ -1,32 +1,34 @@
-"""What a job of todirl is made of: its worlds, what was learned in them, and how well it does."""
+"""Setup and results of a todirl job: worlds, learned networks, and evaluations."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
 
-from jaxltl.app.files.task_todirl import Scene, Task
+from jaxltl.app.files.scenes import Scene
+from jaxltl.app.files.task_todirl import TodirlTask
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.values.undiscounted.optimal_actions import OptimalActions
 from jaxltl.core.values.undiscounted.performance import Performance
 
-LENGTH = 100  # of a demonstration of a soft-optimal expert, at most
+LENGTH = 100  # limit of a demonstration of a soft-optimal expert
 
 
-class Worlds(NamedTuple):
-    """Worlds beside the learner's memory, and beside what judges the learner.
+@dataclass(frozen=True)
+class Worlds:
+    """Worlds, and their products with the learner's memory and with the formula.
 
     Attributes:
       scenes: W worlds.
-      model: their products with the learner's memory, stacked; with a guarantee, narrowed to the
-        actions that lose nothing of the task.
-      judged: their products with memory and task side by side, stacked.
+      model: their products with the learner's memory, stacked; with a guarantee, restricted to
+        optimal actions.
+      judged: their products with memory and formula, stacked.
       observation: ``float[W, S, O]``.
     """
 
@@ -37,7 +39,7 @@ class Worlds(NamedTuple):
 
     @property
     def names(self) -> list[str]:
-        """Of the worlds."""
+        """Names of the worlds."""
         return [scene.name for scene in self.scenes]
 
     def part(self, chosen: slice) -> Worlds:
@@ -47,7 +49,7 @@ class Worlds(NamedTuple):
 
 
 def part_of(tree: Any, chosen: Any) -> Any:
-    """A part of arrays along their first axis; as NumPy's, which has nothing to compile for it."""
+    """Part of arrays along their first axis, as NumPy arrays, which need no compilation."""
     return jax.tree.map(lambda x: np.asarray(x)[chosen], tree)
 
 
@@ -57,20 +59,20 @@ class Setup:
 
     Attributes:
       task: the file.
-      judge, memory: the automata of the task and of the learner's memory.
-      worlds: those to learn in, and then those to test in.
-      num_training: how many there are to learn in.
-      expert: ``float[W, S, Q, A]``, the policy of an expert in the judged products.
-      soft: whether the expert is soft-optimal for a reward, not the quickest of the best policies.
+      judge, memory: the automata of the formula and of the learner's memory.
+      worlds: training worlds, then test worlds.
+      num_training: number of training worlds.
+      expert: ``float[W, S, Q, A]``, the expert's policy in the judged products.
+      soft: whether the expert is soft-optimal for a reward, not the quickest optimal policy.
       demonstrations: in each of the training worlds.
-      dropped: how many synthetic ones did not do the task.
-      asked: the guarantee; a probability of 1 is the best.
-      sure: in each world what loses nothing of the task; None without a guarantee.
-      left_out: how many demonstrated steps are not among the allowed actions.
-      trivial: what is to be said of a formula that is always true.
+      dropped: number of simulated demonstrations that do not satisfy the formula.
+      asked: the guarantee; a probability of 1 is ``"best"``.
+      sure: optimal actions in each world; None without a guarantee.
+      left_out: number of demonstrated steps that are not optimal.
+      trivial: remark on a formula that is always true.
     """
 
-    task: Task
+    task: TodirlTask
     judge: Automaton
     memory: Automaton
     worlds: Worlds
@@ -86,22 +88,22 @@ class Setup:
 
     @property
     def loss(self) -> float:
-        """What moves that lose nothing are certified to lose at most, in any world."""
+        """Certified loss of optimal actions, the largest over worlds."""
         return max((float(one.loss) for one in self.sure or ()), default=0.0)
 
     @property
     def is_probability(self) -> bool:
-        """Whether a probability is asked for."""
+        """Whether the guarantee is a probability."""
         return not isinstance(self.asked, str)
 
     @property
     def training(self) -> Worlds:
-        """The worlds to learn in."""
+        """The training worlds."""
         return self.worlds.part(slice(self.num_training))
 
     @property
     def test(self) -> Worlds | None:
-        """The worlds to test in."""
+        """The test worlds, or None."""
         if len(self.worlds.scenes) == self.num_training:
             return None
         return self.worlds.part(slice(self.num_training, None))
@@ -109,16 +111,16 @@ class Setup:
 
 @dataclass(frozen=True)
 class Learned:
-    """What was learned, with N seeds side by side.
+    """Reward networks of N seeds.
 
     Attributes:
       parameters: of the network, leading axis N.
       held_out: ``float[N]``, negative log-likelihood of the average held-out pair.
       best_step: ``int[N]``, after which the parameters were reached.
       stopped: ``bool[N]``, whether learning ended by patience.
-      num_steps: ``int``, made until all had ended.
+      num_steps: until all seeds ended.
       history: metrics ``[T, N]`` and ``step [T]``.
-      weight: of the task's probability, where one is asked for.
+      weight: mu, if a probability is asked.
     """
 
     parameters: Any
@@ -130,16 +132,17 @@ class Learned:
     weight: float | None = None
 
 
-class Judged(NamedTuple):
-    """Policies in some worlds, and how well they do.
+@dataclass(frozen=True)
+class Judged:
+    """Policies in some worlds, and their satisfaction probabilities.
 
     Attributes:
       policy: ``float[W, S, Q, A]`` with the learner's memory, of the kept seed.
-      status: ``int32[W]``, of the solver that found it.
-      performance: by the name of who acts: learned, expert, random; leading axis W.
-      seeds: ``float[N, W]``, L_phi of each seed's policy.
-      share, attained: ``float[W]``, where a probability is asked for: of moves that lose nothing,
-        and what is certified.
+      status: ``int32[W]``, of its solver.
+      performance: of the learned, expert and random policies; leading axis W.
+      seeds: ``float[N, W]``, mean satisfaction probability of each seed.
+      share, attained: ``float[W]``, share of optimal actions and certified probability, if one is
+        asked.
     """
 
     policy: np.ndarray
@@ -150,22 +153,22 @@ class Judged(NamedTuple):
     attained: np.ndarray | None = None
 
     def part(self, chosen: slice) -> Judged:
-        """In some of the worlds."""
+        """The part for some of the worlds."""
         each = part_of(self.performance, chosen)
         held = part_of((self.share, self.attained), chosen)
         return Judged(self.policy[chosen], self.status[chosen], each, self.seeds[:, chosen], *held)
 
 
-@dataclass(frozen=True)
+@dataclass
 class Outcome:
-    """A finished job: what was asked, learned and found out about it.
+    """A finished job.
 
     Attributes:
-      setup, learned: the parts.
-      chosen: the seed's position that is kept: the best held-out likelihood, or the least loss.
-      training, test: how the policies of the learned reward do; test is None without worlds.
-      seed: the first of the seeds.
-      seconds: spent.
+      setup, learned: the task, and the results of learning.
+      chosen: index of the kept seed, by held-out likelihood or loss.
+      training, test: evaluations; test is None without test worlds.
+      seed: the first seed.
+      seconds: wall time.
     """
 
     setup: Setup
@@ -174,10 +177,10 @@ class Outcome:
     training: Judged
     test: Judged | None
     seed: int
-    seconds: float
+    seconds: float = 0.0
 
 
 def counted_worlds(setup: Setup) -> np.ndarray:
-    """Which test worlds count."""
+    """``bool[W]``: the test worlds that count."""
     names = setup.worlds.names[setup.num_training :]
-    return np.array([name not in setup.task.test.get("leave_out", ()) for name in names])
+    return np.array([name not in setup.task.left_out for name in names])

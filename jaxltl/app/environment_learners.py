@@ -1,11 +1,11 @@
-"""The learners of simulated worlds, each with the hyperparameters of a task file."""
+"""Learners of simulated environments with the hyperparameters of a task file."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any
 
 import chex
 import jax
@@ -16,7 +16,7 @@ from jaxltl.algos import cce, ppo, trust_region
 from jaxltl.algos.cce.exponential_family import diagonal_gaussian
 from jaxltl.algos.common.actor_critic import default_network
 from jaxltl.algos.common.schedules import Linear
-from jaxltl.app.files.task_environment import EnvironmentTask
+from jaxltl.app.files.task_environment import CceTable, CpoTable, EnvironmentTask
 from jaxltl.app.job import settings
 from jaxltl.core.environments.environment import Box, Environment, Finite, Timestep
 from jaxltl.core.environments.episodes import Agent
@@ -25,17 +25,18 @@ from jaxltl.core.values.evaluation.episode_scores import episode_evaluator
 from jaxltl.envs.networks import make_network, network_agent
 
 
-class Method(NamedTuple):
-    """A learner with all that it takes.
+@dataclasses.dataclass(frozen=True)
+class Method:
+    """A learner with its problem and hyperparameters.
 
     Attributes:
       algorithm: its module.
-      problem, hparams: what its functions take.
-      agent: ``(state, likeliest) -> Agent``, what was learned.
+      problem, hparams: arguments of its functions.
+      agent: ``(state, likeliest) -> Agent``, the policy of a state.
       figures: names of the metrics that are drawn.
-      kept: names of the state's fields that a policy is made of.
-      transitions: at most so many steps of the environment are made by a step of the learner.
-      told: the policy in words.
+      kept: names of the state's fields that determine a policy.
+      transitions: bound of the environment's steps in a step of the learner.
+      description: of the policy.
     """
 
     algorithm: Any
@@ -45,46 +46,47 @@ class Method(NamedTuple):
     figures: tuple[str, ...]
     kept: tuple[str, ...]
     transitions: int
-    told: str
+    description: str
 
 
 def make_method(task: EnvironmentTask, environment: Environment, num_steps: int) -> Method:
-    """The learner that a task file asks for.
+    """The learner of a task file.
 
     Args:
       task: the file.
-      environment: with the task.
-      num_steps: after which an episode is cut off.
+      environment: with the formula.
+      num_steps: limit of an episode.
 
     Raises:
-      ValueError: hyperparameters, or actions, that the learner does not take.
+      ValueError: hyperparameters or actions that the learner refuses.
     """
-    make = {"ppo": _ppo, "cce": _cce, "cpo": _cpo}[task.method]
-    spec = {k: _value(k, v, task.learner["steps"]) for k, v in task.settings.items()}
-    found = make(spec, environment, num_steps)
-    if found.transitions > _MOST:
+    make = {"ppo": _ppo, "cce": _cce, "cpo": _cpo}[task.learner.method]
+    found = make(task, environment, num_steps)
+    if found.transitions > _LARGEST_COUNT:
         raise ValueError(
             f"a step of the learner would make {found.transitions:,} simulated steps; at most "
-            f"{_MOST:,} are counted: simulate fewer side by side, or shorter."
+            f"{_LARGEST_COUNT:,} are counted: simulate fewer or shorter episodes."
         )
-    # With numbers that are no tracers, so that the learner's own checks see them.
+    # With concrete numbers, so that the learner's own checks see them.
     jax.eval_shape(
         lambda key: found.algorithm.init(key, found.problem, found.hparams), jax.random.key(0)
     )
     return found
 
 
-_MOST = 2**31 - 1
-_SCHEDULES = ("learning_rate", "clip", "value_clip", "rate", "noise")
+_LARGEST_COUNT = 2**31 - 1  # int32 counters of the learners
 
 
-def _value(name: str, value: Any, num_steps: int) -> Any:
-    """A value of a file as a learner takes it."""
-    if not isinstance(value, list):
-        return value
-    if name not in _SCHEDULES:
-        return tuple(value)
-    return Linear(first=float(value[0]), last=float(value[1]), num_steps=num_steps)
+def _settings(task: EnvironmentTask) -> dict[str, Any]:
+    """The method's keys, with pairs of numbers as schedules and lists as tuples."""
+    steps = task.learner.steps
+    found = task.settings.given()
+    for name, value in found.items():
+        if isinstance(value, tuple):
+            found[name] = Linear(first=value[0], last=value[1], num_steps=steps)
+        elif isinstance(value, list):
+            found[name] = tuple(value)
+    return found
 
 
 def _size(shape: Any) -> int:
@@ -93,11 +95,12 @@ def _size(shape: Any) -> int:
     )
 
 
-def _ppo(spec: Mapping[str, Any], environment: Environment, num_steps: int) -> Method:
+def _ppo(task: EnvironmentTask, environment: Environment, num_steps: int) -> Method:
+    spec = _settings(task)
     parts = {k: spec[k] for k in ("hidden", "activation", "initial_deviation") if k in spec}
     network = dataclasses.replace(default_network(environment.actions), **parts)
     problem = ppo.make_problem(environment, network=network)
-    hparams = settings(ppo.Hparams, {"discount": 1.0, **spec})
+    hparams = settings(ppo.Hparams, spec)
 
     def agent(state: Any, likeliest: bool) -> Agent:
         return (ppo.greedy if likeliest else ppo.policy)(state, problem, hparams)
@@ -114,26 +117,25 @@ def _ppo(spec: Mapping[str, Any], environment: Environment, num_steps: int) -> M
     )
 
 
-def _cce(spec: Mapping[str, Any], environment: Environment, num_steps: int) -> Method:
-    actions, hidden = environment.actions, spec.get("hidden", (16,))
+def _cce(task: EnvironmentTask, environment: Environment, num_steps: int) -> Method:
+    table, actions = task.settings, environment.actions
+    assert isinstance(table, CceTable)
     outputs = actions.num if isinstance(actions, Finite) else math.prod(actions.shape)
     network = make_network(
-        (_size(environment.observations), *hidden, outputs), hidden=spec.get("activation", "tanh")
+        (_size(environment.observations), *table.hidden, outputs), hidden=table.activation
     )
-    make, episodes = network_agent(network, environment), spec.get("episodes", 10)
+    make = network_agent(network, environment)
     score = episode_evaluator(
         environment,
         make,
-        objective=spec.get("objective", "reward"),
-        costs=spec.get("cost", ()),
-        num_episodes=episodes,
+        objective=table.objective,
+        costs=table.cost or (),
+        num_episodes=table.episodes,
         num_steps=num_steps,
     )
-    first = diagonal_gaussian(
-        jnp.zeros(network.num_parameters, jnp.float32), spec.get("deviation", 1.0)
-    )
-    problem = cce.make_problem(score, first, limit=spec.get("limit"))
-    hparams = settings(cce.Hparams, {"rate": 0.5, **spec})
+    first = diagonal_gaussian(jnp.zeros(network.num_parameters, jnp.float32), table.deviation)
+    problem = cce.make_problem(score, first, limit=table.limit)
+    hparams = settings(cce.Hparams, _settings(task))
 
     def agent(state: Any, likeliest: bool) -> Agent:
         del likeliest
@@ -146,22 +148,24 @@ def _cce(spec: Mapping[str, Any], environment: Environment, num_steps: int) -> M
         agent,
         ("objective", "cost", "best_objective", "num_feasible", "spread"),
         ("family",),
-        hparams.population * episodes * num_steps,
+        hparams.population * table.episodes * num_steps,
         f"a network {'-'.join(map(str, network.sizes))} of {network.num_parameters} parameters",
     )
 
 
-def _cpo(spec: Mapping[str, Any], environment: Environment, num_steps: int) -> Method:
+def _cpo(task: EnvironmentTask, environment: Environment, num_steps: int) -> Method:
+    table = task.settings
+    assert isinstance(table, CpoTable) and table.limit is not None
     if not isinstance(environment.actions, Box):
         raise ValueError(
-            "the actions are finitely many, and this learner takes those of a box: choose "
+            "the environment has finitely many actions, and this learner needs a box: choose "
             'method = "ppo" or "cce".'
         )
-    if spec.get("cost", "world") == "violation":
+    if table.cost == "violation":
         step = Partial(_costs_where_violated, environment.step)
         environment = dataclasses.replace(environment, step=step, outcomes=None)
-    problem = trust_region.make_problem(environment, horizon=num_steps, limit=spec["limit"])
-    hparams = settings(trust_region.Hparams, {"discount": 1.0, **spec})
+    problem = trust_region.make_problem(environment, horizon=num_steps, limit=table.limit)
+    hparams = settings(trust_region.Hparams, _settings(task))
 
     def agent(state: Any, likeliest: bool) -> Agent:
         return (trust_region.greedy if likeliest else trust_region.policy)(state, problem, hparams)
@@ -181,7 +185,7 @@ def _cpo(spec: Mapping[str, Any], environment: Environment, num_steps: int) -> M
 def _costs_where_violated(
     step: Callable[..., Timestep], world: Any, action: Any, key: chex.PRNGKey
 ) -> Timestep:
-    """A cost of one where the task is violated, whose expected sum is how likely that is."""
+    """Cost 1 where the formula is violated; its expected sum is the violation probability."""
     found = Timestep(*step(world, action, key))
-    # There is but one such step: an episode ends with it.
+    # An episode ends with the first such step.
     return found._replace(cost=jnp.where(found.world.verdict == Verdict.VIOLATED, 1.0, 0.0))

@@ -1,0 +1,112 @@
+"""Compilation settings of the command line: fast compilation, and a persistent cache.
+
+All are environment variables that are set before JAX is imported; variables that the user has set
+stay. The library itself leaves the settings of JAX and Python alone.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import re
+import sys
+from collections.abc import Mapping
+from importlib import metadata
+from pathlib import Path
+
+# About 10 % less processor time for a first `learn`; loops over successors and matrix products,
+# which come from a library, run as fast (docs/benchmarks.md).
+FAST_COMPILATION = {
+    "xla_cpu_use_fusion_emitters": "false",
+    "xla_backend_optimization_level": "1",
+}
+# XLA ends the process for a flag that it does not know. Those used here and in the tests are known
+# to the first and the last of these versions of jaxlib; other versions get none.
+_TESTED = ((0, 7), (0, 11))
+
+
+def is_fresh() -> bool:
+    """Whether JAX has not been imported, so that its settings can still be made."""
+    return "jax" not in sys.modules
+
+
+def xla_flags(flags: Mapping[str, str], version: str | None = None) -> str:
+    """The value of ``XLA_FLAGS``; empty for versions of jaxlib without tested flags.
+
+    Example:
+      >>> xla_flags({"xla_backend_optimization_level": "1"}, "0.10.1")
+      '--xla_backend_optimization_level=1'
+      >>> xla_flags({"xla_backend_optimization_level": "1"}, "0.12.0")
+      ''
+    """
+    version = version or metadata.version("jaxlib")
+    first, end = _TESTED
+    release = tuple(int(part) for part in re.findall(r"\d+", version)[:2])
+    if not first <= release < end:
+        return ""
+    return " ".join(f"--{name}={value}" for name, value in flags.items())
+
+
+def compile_fast() -> None:
+    """Makes XLA optimise less, for programs that run shortly."""
+    if is_fresh() and "XLA_FLAGS" not in os.environ:
+        os.environ["XLA_FLAGS"] = xla_flags(FAST_COMPILATION)
+
+
+def use_one_thread() -> None:
+    """Makes NumPy solve linear systems in one thread.
+
+    Systems of some hundred rows gain nothing from more, and their spinning threads delay the
+    compiler and the processes that draw.
+    """
+    if "numpy" not in sys.modules:
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+
+def collect_rarely() -> None:
+    """Makes Python collect garbage less often, which saves a tenth of a short command's time.
+
+    Imports and traces make many objects that stay.
+    """
+    gc.set_threshold(20_000, 50, 100)
+
+
+def use_cache(wanted: bool) -> None:
+    """Turns JAX's persistent cache of compiled programs on or off."""
+    if not is_fresh():
+        return
+    if not wanted:
+        os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"
+        return
+    if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
+        directory = cache_directory()
+        try:
+            directory.mkdir(parents=True, exist_ok=True)
+        except OSError:
+            return
+        if not os.access(directory, os.W_OK):
+            return
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = str(directory)
+    cache_all_programs()
+
+
+def cache_all_programs() -> None:
+    """Makes the cache keep small programs too: each takes longer to compile than to read."""
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
+    # XLA mistakes its own hints to LLVM for missing features of the processor, and logs an error
+    # for each program that it reads.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+
+
+def cache_directory() -> Path:
+    """Directory of compiled programs, in the user's directory of caches."""
+    home = Path.home()
+    if sys.platform == "win32":
+        base = Path(os.environ.get("LOCALAPPDATA") or home / "AppData" / "Local")
+    elif sys.platform == "darwin":
+        base = home / "Library" / "Caches"
+    else:
+        given = os.environ.get("XDG_CACHE_HOME", "")
+        base = Path(given) if os.path.isabs(given) else home / ".cache"
+    return base / "jaxltl" / "programs"

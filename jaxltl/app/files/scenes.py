@@ -1,0 +1,281 @@
+"""Training and test worlds of todirl: maps with their observations, and automata over them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxltl.app.files.demonstrations import read_demonstrations
+from jaxltl.app.files.schema import errors_in, read_map
+from jaxltl.app.files.task_todirl import TodirlTask, WorldTable, map_file
+from jaxltl.app.files.worlds import World, grid_options
+from jaxltl.app.wording import where
+from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.automata.translate import to_automaton
+from jaxltl.core.logic.labels import require_known
+from jaxltl.core.logic.ltl import parse_ltl
+from jaxltl.core.models.mdp import MDP
+from jaxltl.core.models.trajectories import Trajectories
+from jaxltl.envs import temporal_gridworld
+from jaxltl.envs.cell_kinds import COLORS
+from jaxltl.envs.gridworld import ACTIONS, gridworld
+from jaxltl.envs.text_map import parse_map
+from jaxltl.io.colored_world import read_world
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A world and its observations.
+
+    Attributes:
+      name: for people.
+      mdp: the world.
+      observation: ``float[S, O]``.
+      shape: rows and columns.
+      colored: the coloured world, or None for a text map.
+      cells: ``str[rows, columns]``, or None for a coloured world.
+    """
+
+    name: str
+    mdp: MDP
+    observation: jax.Array
+    shape: tuple[int, int]
+    colored: temporal_gridworld.World | None
+    cells: np.ndarray | None
+
+    def place(self, state: int) -> dict[str, int]:
+        """A state with its row and column, from 1."""
+        return where(state, self.shape)
+
+
+def load_scenes(task: TodirlTask, judge: Automaton) -> tuple[list[Scene], list[Scene]]:
+    """The training worlds and the test worlds.
+
+    Args:
+      task: the task file.
+      judge: the automaton of the formula, which generated worlds can satisfy.
+
+    Raises:
+      ValueError: a malformed map, or worlds that do not fit each other; names the table, the
+        world and the place.
+    """
+    test_maps = (task.test and task.test.maps) or []
+    training = [_read_scene(task, "world", i, x) for i, x in enumerate(task.world.maps)]
+    test = [_read_scene(task, "test", i, x) for i, x in enumerate(test_maps)]
+    first = training[0]
+    for scene in [*training, *test]:
+        if scene.colored and first.colored and scene.colored.kinds != first.colored.kinds:
+            raise ValueError(
+                f"{task.path}: {scene.name} has other objects and obstacles than {first.name}; "
+                "give all of them by [world] objects and obstacles, or alike in each map."
+            )
+    if task.test is not None and task.test.generate is not None:
+        test += _generate(task, task.test.generate, first, judge)
+    for table, scenes in (("world", training), ("test", test)):
+        names = [scene.name for scene in scenes]
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(
+                    f"{task.path}: [{table}] maps has {name} twice; leave one of them out."
+                )
+    names = [scene.name for scene in test]
+    for name in task.left_out:
+        if name not in names:
+            raise ValueError(
+                f"{task.path}: [test] leave_out names {name!r}, which is no test world; there are "
+                f"{', '.join(names[:8])}{', ...' if len(test) > 8 else ''}."
+            )
+    return training, test
+
+
+def _read_scene(task: TodirlTask, table: str, number: int, entry: str | dict[str, str]) -> Scene:
+    file = map_file(entry)
+    name = f"map {number + 1}" if file is None else file
+    with errors_in(f"{task.path}: [{table}] {name}: "):
+        text = (
+            entry
+            if isinstance(entry, str) and file is None
+            else read_map(task.path, {"file": str(file)})
+        )
+        make = _colored_scene if task.is_colored else _plain_scene
+        return make(name, text, task.world, task.learner.radius)
+
+
+def _colored_scene(name: str, text: str, world: WorldTable, radius: int) -> Scene:
+    found = read_world(_with_settings(text, world))
+    if _gives_kinds(world):
+        own = {
+            kind: {c: n for c, n in zip(COLORS, row, strict=True) if n} for kind, row in found.kinds
+        }
+        counts = {**_objects(world), **_obstacles(world)}
+        if own != {k: {c: n for c, n in row.items() if n} for k, row in counts.items()}:
+            raise ValueError(
+                f"the map says {', '.join(own)} by lines of its own, which differ from [world] "
+                "objects and obstacles; remove one of the two."
+            )
+    return _of_world(name, found, radius)
+
+
+def _with_settings(text: str, world: WorldTable) -> str:
+    """The text of a coloured world, followed by the settings of the task file that it lacks."""
+    own = {line.partition(":")[0].strip() for line in text.splitlines() if ":" in line}
+    given = world.given()
+    lines = [f"{key}: {given[key]}" for key in ("margin", "slip") if key in given]
+    if _gives_kinds(world) and own <= {"margin", "slip"}:
+        for name, counts in {**_objects(world), **_obstacles(world)}.items():
+            shown = ", ".join(f"{n} {color}" for color, n in counts.items())
+            lines.append(f"{name}: {shown}")
+    return "\n".join([text, *lines])
+
+
+def _gives_kinds(world: WorldTable) -> bool:
+    return world.objects is not None or world.obstacles is not None
+
+
+def _objects(world: WorldTable) -> Mapping[str, Mapping[str, int]]:
+    return temporal_gridworld.OBJECTS if world.objects is None else world.objects
+
+
+def _obstacles(world: WorldTable) -> Mapping[str, Mapping[str, int]]:
+    return temporal_gridworld.OBSTACLES if world.obstacles is None else world.obstacles
+
+
+def _of_world(name: str, world: temporal_gridworld.World, radius: int) -> Scene:
+    if radius > world.margin:
+        raise ValueError(
+            f"the learner sees {radius} cells around its own, the map has a margin of "
+            f"{world.margin}; give [learner] radius = {world.margin}, or a map with a wider margin."
+        )
+    seen = temporal_gridworld.observations(world, radius)
+    return Scene(name, world.mdp, seen, world.shape, world, None)
+
+
+def _plain_scene(name: str, text: str, world: WorldTable, radius: int) -> Scene:
+    cells = parse_map(text)
+    mdp = gridworld(text, **grid_options(world))
+    seen = cell_observations(cells, cell_kinds(world), radius)
+    rows, columns = cells.shape
+    return Scene(name, mdp, jnp.asarray(seen, mdp.dtype), (rows, columns), None, cells)
+
+
+def cell_kinds(world: WorldTable) -> list[str]:
+    """The kinds of cells of maps with a legend, in the order of observations."""
+    wall = world.wall or "#"
+    return [*(kind for kind in world.legend or () if kind != wall), wall]
+
+
+def cell_observations(cells: np.ndarray, kinds: Sequence[str], radius: int) -> np.ndarray:
+    """One-hot kinds of the cells around each cell: ``float[S, O]``.
+
+    ``O = (2 * radius + 1)**2 * (K + 1)`` for K kinds, and one for cells off the map.
+
+    Example:
+      >>> cell_observations(np.array([["a", "b"]]), ["a", "b"], 0).tolist()
+      [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
+    """
+    number = np.full(tuple(n + 2 * radius for n in cells.shape), len(kinds))
+    inside = tuple(slice(radius, radius + n) for n in cells.shape)
+    number[inside] = np.searchsorted(sorted(kinds), cells)
+    order = np.append(np.argsort(kinds), len(kinds))  # from sorted kinds to their places
+    width = 2 * radius + 1
+    around = np.lib.stride_tricks.sliding_window_view(order[number], (width, width))
+    return np.eye(len(kinds) + 1)[around].reshape(cells.size, -1)
+
+
+def _generate(task: TodirlTask, number: int, first: Scene, judge: Automaton) -> list[Scene]:
+    table, colored = task.test, first.colored
+    assert table is not None and colored is not None
+    objects, obstacles = _objects(task.world), _obstacles(task.world)
+    kinds = [name for name, _ in colored.kinds]
+    if kinds != [*objects, *obstacles]:
+        raise ValueError(
+            f"{task.path}: [test] generate must know which kinds of cells are objects, of which "
+            "there is one each; give [world] objects and obstacles, not lines in the maps."
+        )
+    label = np.asarray(first.mdp.label)
+    shown = [int(label[:, kinds.index(name)].sum()) for name in obstacles]
+    slip = 0.0
+    if first.mdp.num_successors > 1:
+        slip = 1 - float(first.mdp.probability[0, 0, 0])
+    start = table.seed or 0
+    seeds = range(start, start + number)
+    with errors_in(f"{task.path}: [test] generate: "):
+        worlds = temporal_gridworld.random_worlds(
+            seeds,
+            judge,
+            shape=table.shape or first.shape,
+            objects=objects,
+            obstacles=obstacles,
+            num_obstacles=(max(shown, default=0) if table.obstacles is None else table.obstacles),
+            min_distance=table.min_distance or 3,
+            margin=colored.margin,
+            slip=slip,
+        )
+    return [
+        _of_world(f"seed {seed}", world, task.learner.radius)
+        for seed, world in zip(seeds, worlds, strict=True)
+    ]
+
+
+# --- automata -------------------------------------------------------------------------------
+
+
+def load_automata(task: TodirlTask) -> tuple[Automaton, Automaton]:
+    """The automaton of the formula, and that of the learner's memory.
+
+    Both are over the labels of all kinds of cells, so that memory states mean the same in every
+    world.
+
+    Raises:
+      ValueError: a malformed formula, an unknown proposition, or a horizon for a formula that no
+        finite episode decides.
+    """
+    alphabet = _alphabet(task)
+    judge = _translate(task, "[task] formula", task.formula, alphabet)
+    if task.learner.horizon is not None and judge.acceptance not in ("cosafe", "safety"):
+        raise ValueError(
+            f"{task.path}: [learner] horizon = {task.learner.horizon} ends an episode after so "
+            "many steps, which satisfy co-safe formulas and violate safety formulas only (the "
+            f"formula has {judge.acceptance} acceptance); leave it out, with a discount below 1."
+        )
+    if task.memory == task.formula:
+        return judge, judge
+    return judge, _translate(task, "[learner] memory", task.memory, alphabet)
+
+
+def _alphabet(task: TodirlTask) -> list[frozenset[str]]:
+    if task.world.legend is not None:
+        shown = [frozenset(names) for names in task.world.legend.values()]
+        return list(dict.fromkeys([frozenset(), *shown]))
+    colored = _read_scene(task, "world", 0, task.world.maps[0]).colored
+    assert colored is not None
+    return [frozenset(), *(frozenset({name}) for name, _ in colored.kinds)]
+
+
+def _translate(
+    task: TodirlTask, place: str, text: str, alphabet: list[frozenset[str]]
+) -> Automaton:
+    names = sorted(frozenset().union(*alphabet))
+    with errors_in(f"{task.path}: {place}: "):
+        formula = parse_ltl(text)
+        require_known(formula.propositions, names, "the formula")
+        letters = dict.fromkeys(letter & set(formula.propositions) for letter in alphabet)
+        return to_automaton(formula, letters=list(letters))
+
+
+def load_demonstrations(task: TodirlTask, scenes: Sequence[Scene]) -> list[Trajectories]:
+    """The demonstrations in each of the training worlds, from their files.
+
+    Raises:
+      ValueError: see :func:`jaxltl.app.files.demonstrations.read_demonstrations`.
+    """
+    found = []
+    for name, scene in zip(task.demonstrations.files or (), scenes, strict=True):
+        cells = np.arange(scene.mdp.num_states).reshape(scene.shape).astype(str)
+        world = World(scene.mdp, cells, ACTIONS)
+        found.append(read_demonstrations(task.path.parent / name, world))
+    return found

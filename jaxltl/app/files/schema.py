@@ -1,0 +1,324 @@
+"""Schemas of TOML files, and errors that name the file, table, key, value and fix.
+
+A table is a :class:`Table`: each key has a type, whose title says what a value must be, one line
+of help and a default. ``None`` stands for a key that a file leaves out.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import difflib
+import hashlib
+import math
+import re
+import tomllib
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from types import UnionType
+from typing import (
+    Annotated,
+    Any,
+    ClassVar,
+    Literal,
+    NamedTuple,
+    TypeVar,
+    Union,
+    dataclass_transform,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
+from typing import Annotated as Key
+
+import attrs
+
+_Table = TypeVar("_Table", bound="Table")
+LARGEST_INT = 2**31 - 1  # int32 of compiled loops
+
+
+class Meta(NamedTuple):
+    """What a value must be beyond its type: in words, and as a predicate."""
+
+    title: str
+    holds: Callable[[Any], bool] = lambda value: True
+
+
+def _in(low: float, high: float = math.inf) -> Callable[[Any], bool]:
+    return lambda value: low <= value <= high
+
+
+Count = Annotated[
+    int, Meta(f"a whole number of at least 1 and at most {LARGEST_INT}", _in(1, LARGEST_INT))
+]
+WholeNumber = Annotated[int, Meta("a whole number of at least 0", _in(0, LARGEST_INT))]
+Number = Annotated[float, Meta("a finite number")]
+NonNegative = Annotated[float, Meta("a finite number of at least 0", _in(0))]
+Unit = Annotated[float, Meta("a finite number in [0, 1]", _in(0, 1))]
+Discount = Annotated[float, Meta("a finite number in [0, 1)", lambda v: 0 <= v < 1)]
+Confidence = Annotated[float, Meta("a number between 0 and 1, such as 0.95", lambda v: 0 < v < 1)]
+Text = Annotated[str, Meta("a text", lambda v: bool(v.strip()))]
+Name = Annotated[
+    str,
+    Meta(
+        "a plain name of letters, digits, spaces, -, _ and ., that begins with neither a dot nor "
+        "a space",
+        lambda v: re.fullmatch(r"[\w-][\w .-]*", v) is not None,
+    ),
+]
+Propositions = Annotated[list[str], Meta('a list of propositions, such as ["r"]')]
+StateNames = Annotated[list[str], Meta("a list of names of states", bool)]
+Widths = Annotated[list[Count], Meta("a list of the widths of the hidden layers, such as [64, 64]")]
+Map = Annotated[
+    Text | dict[Literal["file"], str],
+    Meta('the rows as a text, or { file = "map.txt" }', bool),
+]
+Legend = Annotated[
+    dict[str, list[str]],
+    Meta('a table of cells and their propositions, such as { w = [], r = ["r"] }'),
+]
+
+
+def key_name(field: attrs.Attribute[Any]) -> str:
+    """The key of a field in a file; that of a Python keyword ends in an underscore in Python."""
+    return field.name.rstrip("_")
+
+
+def _resolve(kind: type, fields: list[attrs.Attribute[Any]]) -> list[attrs.Attribute[Any]]:
+    """Evaluates annotations, which are strings until then."""
+    hints = get_type_hints(kind, include_extras=True)
+    return [field.evolve(type=hints[field.name]) for field in fields]
+
+
+@dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(attrs.field,))
+def table(kind: type[Any]) -> Any:
+    """Class decorator of a :class:`Table`: a frozen attrs class with keyword arguments."""
+    return attrs.frozen(kw_only=True, slots=False, field_transformer=_resolve)(kind)
+
+
+@table
+class Table:
+    """A table of a file; ``__attrs_post_init__`` checks what concerns several of its keys."""
+
+    def given(self) -> dict[str, Any]:
+        """The keys that have a value."""
+        pairs = ((key_name(x), getattr(self, x.name)) for x in attrs.fields(type(self)))
+        return {name: value for name, value in pairs if value is not None}
+
+    def refuse(self, keys: Iterable[str], owner: str) -> None:
+        """Raises ValueError for the first of some keys that has a value."""
+        given = self.given()
+        if wrong := next((key for key in keys if key in given), None):
+            raise ValueError(f"{wrong} belongs to {owner}.")
+
+    def require_one(self, keys: Iterable[str], expected: str) -> None:
+        """Raises ValueError unless exactly one of some keys has a value."""
+        if len(self.given().keys() & set(keys)) != 1:
+            raise ValueError(f"must have either {expected}.")
+
+
+@table
+class File(Table):
+    """The tables of a file; a field that is a :class:`Table` is a table, others are keys."""
+
+    KIND: ClassVar[str] = "the file"  # begins the error if it cannot be read
+    name: Key[Name | None, "Name of the results' folder; default the file's own name."] = None
+
+
+@contextlib.contextmanager
+def errors_in(place: str) -> Iterator[None]:
+    """Prepends a place to the message of a ValueError."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{place}{error}") from None
+
+
+# --- reading --------------------------------------------------------------------------------
+
+
+def read_toml(path: Path, kind: str, raw: bytes | None = None) -> tuple[dict[str, Any], bytes]:
+    """The tables of a TOML file, and its bytes, which are read unless `raw` has them.
+
+    Raises:
+      ValueError: the file cannot be read or is malformed.
+    """
+    raw = read_bytes(path, kind) if raw is None else raw
+    try:
+        return tomllib.loads(raw.decode()), raw
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: this is not TOML: {error}") from None
+
+
+def read_bytes(path: Path, kind: str) -> bytes:
+    """The bytes of a file; an error begins with its kind."""
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise ValueError(f"{kind} cannot be read: {str(path)!r}: {error.strerror}.") from None
+
+
+def read_map(path: Path, given: str | Mapping[str, str]) -> str:
+    """The text of a map in a task file, or in the file that it names."""
+    return (
+        given
+        if isinstance(given, str)
+        else read_bytes(path.parent / given["file"], "the map").decode()
+    )
+
+
+def digest(path: Path, raw: bytes, names: Iterable[str]) -> str:
+    """SHA-256 of a file's bytes and of the files that it names, which lie beside it."""
+    found = hashlib.sha256(raw)
+    for name in names:
+        found.update(read_bytes(path.parent / name, f"{path} names a file that"))
+    return found.hexdigest()
+
+
+def off_map(shape: Sequence[int]) -> str:
+    """End of an error about a cell that is not on a map."""
+    return f"off the map, which has rows 1 to {shape[0]} and columns 1 to {shape[1]}."
+
+
+# --- conversion -----------------------------------------------------------------------------
+
+
+def convert(path: Path, schema: type[_Table], data: Mapping[str, Any], name: str = "") -> _Table:
+    """A table of a file as an instance of its schema.
+
+    Args:
+      path: the file.
+      schema: of the table, or of the whole file.
+      data: keys and values as TOML has them.
+      name: of the table; empty for the whole file.
+
+    Raises:
+      ValueError: a key is unknown, with the nearest known one; has a wrong value; or is missing.
+    """
+    where = f"{path}: [{name}]" if name else f"{path}:"
+    fields = {key_name(field): field for field in attrs.fields(schema)}
+    for key in data:
+        if key not in fields:
+            guess = difflib.get_close_matches(key, fields, n=1, cutoff=0.5)
+            hint = f"; did you mean {guess[0]!r}? " if guess else ". "
+            raise ValueError(f"{where} has no key {key!r}{hint}Its keys are {', '.join(fields)}.")
+    values = {}
+    for key, value in data.items():
+        kind = fields[key].type
+        try:
+            values[fields[key].name] = _converted(value, kind)
+        except TypeError:
+            raise ValueError(
+                f"{where} {key} = {value!r}; it must be {requirement(kind)}."
+            ) from None
+    for key, field in fields.items():
+        if field.default is attrs.NOTHING and key not in data:
+            missing = f"{key}, {requirement(field.type)}" if name else f"the table [{key}]"
+            raise ValueError(f"{where} lacks {missing}.")
+    for key, field in fields.items():
+        if key in data and (part := _table_of(field.type)):
+            values[field.name] = convert(path, part, data[key], key)
+    with errors_in(f"{where} "):
+        return schema(**values)
+
+
+def _converted(value: Any, kind: Any) -> Any:
+    """A value in the type of its key; a table's own keys are converted later.
+
+    Raises:
+      TypeError: it has another type, or a condition of :class:`Meta` does not hold.
+    """
+    origin, parts = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        found = _converted(value, parts[0])
+        if all(x.holds(found) for x in parts[1:] if isinstance(x, Meta)):
+            return found
+    elif origin in (Union, UnionType):
+        for part in parts:
+            with contextlib.suppress(TypeError):
+                return _converted(value, part)
+    elif origin is Literal:
+        if isinstance(value, str) and value in parts:
+            return value
+    elif origin is list and isinstance(value, list):
+        return [_converted(x, parts[0]) for x in value]
+    elif origin is tuple and isinstance(value, list) and len(value) == len(parts):
+        return tuple(_converted(x, part) for x, part in zip(value, parts, strict=True))
+    elif origin is dict and isinstance(value, dict):
+        return {_converted(k, parts[0]): _converted(v, parts[1]) for k, v in value.items()}
+    elif kind is float and type(value) in (int, float):
+        with contextlib.suppress(OverflowError):  # integers of TOML are unbounded
+            if math.isfinite(value):
+                return float(value)
+    elif kind is Any or type(value) is kind or (_table_of(kind) and isinstance(value, dict)):
+        return value
+    raise TypeError
+
+
+def _parts(kind: Any) -> Iterator[Any]:
+    """A type and its arguments, outermost first."""
+    yield kind
+    for part in get_args(kind) if get_origin(kind) is not Literal else ():
+        yield from _parts(part)
+
+
+def _table_of(kind: Any) -> type[Table] | None:
+    tables = (x for x in _parts(kind) if isinstance(x, type) and issubclass(x, Table))
+    return next(tables, None)
+
+
+def requirement(kind: Any) -> str:
+    """What a value of a type must be, for people.
+
+    Example:
+      >>> requirement(Discount | None), requirement(Literal["a", "b"]), requirement(bool)
+      ('a finite number in [0, 1)', '"a" or "b"', 'true or false')
+    """
+    names = {bool: "true or false", str: "a text", dict: "a table"}
+    if _table_of(kind):
+        return "a table"
+    for part in _parts(kind):
+        if get_origin(part) is Annotated:
+            title = next((x.title for x in part.__metadata__ if isinstance(x, Meta)), None)
+            if title is not None:
+                return title
+        if get_origin(part) is Literal:
+            return " or ".join(f'"{option}"' for option in get_args(part))
+        if part in names or get_origin(part) in names:
+            return names[part if part in names else get_origin(part)]
+    return "left out"
+
+
+class KeyHelp(NamedTuple):
+    """A key of a table, for the reference: its name, what it must be, its default, its help."""
+
+    name: str
+    requirement: str
+    default: Any
+    help: str
+
+
+def keys_of(schema: type[Table]) -> list[KeyHelp]:
+    """The keys of a table in the order of the schema; a required key has the default ``...``.
+
+    Example:
+      >>> @table
+      ... class Training(Table):
+      ...     steps: Key[Count, "Largest number of steps."] = 500
+      >>> keys_of(Training)[0].default, keys_of(Training)[0].help
+      (500, 'Largest number of steps.')
+    """
+    return [
+        KeyHelp(
+            key_name(field),
+            requirement(field.type),
+            _default(field.default),
+            next((x for x in field.type.__metadata__ if isinstance(x, str)), ""),
+        )
+        for field in attrs.fields(schema)
+    ]
+
+
+def _default(default: Any) -> Any:
+    if default is attrs.NOTHING:
+        return ...
+    return default.factory() if isinstance(default, attrs.Factory) else default

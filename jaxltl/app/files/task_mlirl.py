@@ -1,0 +1,202 @@
+"""Task files with ``method = "mlirl"``: maximum-likelihood inverse reinforcement learning.
+
+A task file is TOML with the tables ``[world]``, ``[task]``, ``[demonstrations]`` and
+``[learner]``; ``examples/two_goals.toml`` shows every key. Names of files are relative to it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+from typing import Annotated as Key
+
+
+from jaxltl.app.files import schema
+from jaxltl.app.files.schema import (
+    Confidence,
+    Count,
+    Discount,
+    Map,
+    NonNegative,
+    Number,
+    Propositions,
+    StateNames,
+    Text,
+    Meta,
+    table,
+)
+from jaxltl.app.files.task import (
+    GridTable,
+    OptimizerTable,
+    SyntheticTable,
+    Task,
+    TaskFile,
+    common_fields,
+)
+from jaxltl.io.prism.explicit import files_beside
+
+Initial = Annotated[
+    Text | StateNames, Meta("a text; of a log, the name of a state or a list of names")
+]
+Progress = Annotated[
+    list[str | int],
+    Meta("a list of propositions (in the world) or of automaton states (in the product)"),
+]
+Start = Annotated[list[Number], Meta("a list of finite numbers, one per feature")]
+
+
+@table
+class WorldTable(GridTable):
+    """``[world]``: a map, a model file, or a log of transitions."""
+
+    map: Key[Map | None, "Rows of a text map, or the file that has them."] = None
+    model: Key[Text | None, "Model file."] = None
+    transitions: Key[Text | None, "Log of transitions, from which the model is estimated."] = None
+    initial: Key[
+        Initial | None, "Formula of the initial states; of a log, the names of these states."
+    ] = None
+    confidence: Key[Confidence | None, "Of the guarantee that a log gives."] = None
+    labels: Key[Text | None, "Table of the states' labels, for a log."] = None
+    terminal: Key[StateNames | None, "States of a log where episodes end."] = None
+    graph: Key[
+        Literal["seen", "complete"] | None,
+        "Possible successors of a log: those seen, or all states.",
+    ] = None
+    method: Key[
+        Literal["anytime", "clopper-pearson", "hoeffding", "weissman"] | None,
+        "Confidence sets of a log; default anytime.",
+    ] = None
+
+    def __attrs_post_init__(self) -> None:
+        sources = ("map", "model", "transitions")
+        self.require_one(sources, "a map, a model (a file) or transitions (a log)")
+        of_map = ("legend", "wall", "slip", "absorbing")
+        if self.transitions is None:
+            of_log = ("confidence", "labels", "terminal", "graph", "method")
+            self.refuse(of_log, "transitions, a log")
+            if isinstance(self.initial, list):
+                raise ValueError(
+                    "initial is a list of names of states, which a log has; here it must be a text."
+                )
+            if self.model is not None:
+                self.refuse(of_map, "a map; a model has it in its arrays")
+            return
+        self.refuse(of_map, "a map; of a log, labels name states in a file")
+        if self.confidence is None:
+            raise ValueError("lacks confidence of the guarantee from the log, such as 0.95.")
+        if self.initial is None:
+            raise ValueError("lacks initial, the name of the initial state, or a list of names.")
+
+
+@table
+class DemonstrationsTable(SyntheticTable):
+    """``[demonstrations]``: a file, or simulated ones."""
+
+    file: Key[Text | None, "JSON file of demonstrations."] = None
+
+    def __attrs_post_init__(self) -> None:
+        self.require_one(("file", "synthetic"), 'file = "..." or synthetic = N')
+        if self.file is not None:
+            self.refuse(("discount", "length"), "synthetic = N")
+
+
+@table
+class LearnerTable(OptimizerTable):
+    """``[learner]``: hyperparameters; see ``jaxltl.algos.mlirl.Hparams`` for other defaults."""
+
+    # Files of todirl are read by task_todirl.
+    method: Key[Annotated[Literal["mlirl"], Meta('"mlirl" or "todirl"')], "Learning algorithm."]
+    in_: Key[
+        Literal["product", "world"], "State space of the reward: the product, or the world alone."
+    ] = "product"
+    discount: Key[Discount, "Discount of the learned reward."]
+    mu: Key[NonNegative | None, "Weight of the satisfaction probability, equation (2.6)."] = None
+    steps: Key[Count, "At most so many steps of the optimizer."] = 500
+    policy: Key[Literal["boltzmann", "soft"] | None, "Policy of a reward."] = None
+    adjoint: Key[Literal["exact", "approximate"] | None, "Gradient of the policy."] = None
+    optimizer: Key[Literal["lbfgs", "adam", "sgd"], "Optimizer of the likelihood."] = "lbfgs"
+    tolerance: Key[NonNegative, "Gradient norm at which learning has converged."] = 1e-6
+    start: Key[Start | None, "Initial weights; default zeros."] = None
+    start_scale: Key[NonNegative | None, "Standard deviation of the initial weights."] = None
+    satisfaction_over: Key[
+        Literal["initial", "all"], "States over which mu weighs the satisfaction probability."
+    ] = "initial"
+    avoid: Key[Propositions | None, "Propositions that add the feature avoid."] = None
+    goal: Key[Propositions | None, 'Propositions of goal cells, for in = "world".'] = None
+    progress: Key[Progress | None, "Propositions or automaton states of the feature progress."] = (
+        None
+    )
+
+    def __attrs_post_init__(self) -> None:
+        if self.in_world and self.goal is None:
+            raise ValueError(
+                'lacks goal, the propositions of the goal cells, which in = "world" needs since '
+                "the learner does not see the formula."
+            )
+        if self.in_world and self.mu is not None:
+            raise ValueError('mu weighs the satisfaction probability; it needs in = "product".')
+        if not self.in_world:
+            self.refuse(("goal",), 'in = "world"')
+        if self.learning_rate is not None and self.optimizer == "lbfgs":
+            raise ValueError(
+                'learning_rate belongs to optimizer = "adam" or "sgd"; "lbfgs", the default, '
+                "searches for its own."
+            )
+        kind = str if self.in_world else int
+        if any(not isinstance(x, kind) for x in self.progress or ()):
+            expected = "propositions" if self.in_world else "automaton states (or left out)"
+            raise ValueError(f"progress = {self.progress!r}; it must be a list of {expected}.")
+
+    @property
+    def in_world(self) -> bool:
+        """Whether the reward is one of world states, without the automaton."""
+        return self.in_ == "world"
+
+
+@table
+class MlirlFile(TaskFile):
+    """Schema of the file."""
+
+    world: Key[WorldTable, "Where demonstrations were made."]
+    demonstrations: Key[DemonstrationsTable, "What was demonstrated."]
+    learner: Key[LearnerTable, "The learner and its hyperparameters."]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MlirlTask(Task):
+    """A checked task file; see :class:`~jaxltl.app.files.task.Task`."""
+
+    world: WorldTable
+    demonstrations: DemonstrationsTable
+    learner: LearnerTable
+
+
+def read_task(path: str | Path) -> MlirlTask:
+    """Reads a task file.
+
+    Raises:
+      ValueError: the file, or one that it names, is missing or malformed, or a key is
+        unknown, missing or wrong. The message names the file, the table, the key and the fix.
+    """
+    path = Path(path)
+    data, raw = schema.read_toml(path, MlirlFile.KIND)
+    file = schema.convert(path, MlirlFile, data)
+    world, learner = file.world, file.learner
+    hidden = 'in = "world"' if learner.in_world else None
+    digest = schema.digest(path, raw, _named_files(path, world, file.demonstrations))
+    fields = common_fields(path, file, hidden, digest, "entry")
+    if learner.mu is not None and not isinstance(fields["guarantee"], str):
+        raise ValueError(
+            f"{path}: [task] guarantee = {fields['guarantee']} finds the weight mu that reaches "
+            "it: leave mu out of [learner]."
+        )
+    return MlirlTask(**fields, world=world, demonstrations=file.demonstrations, learner=learner)
+
+
+def _named_files(path: Path, world: WorldTable, shown: DemonstrationsTable) -> list[str]:
+    named = [world.map["file"]] if isinstance(world.map, dict) else []
+    named += [x for x in (world.model, world.transitions, world.labels, shown.file) if x]
+    if world.model is not None:  # PRISM keeps labels in another file
+        named += [str(x.absolute()) for x in files_beside(path.parent / world.model)]
+    return named

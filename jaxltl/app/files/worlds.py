@@ -1,0 +1,96 @@
+"""Worlds of task files: maps, models from files, and models estimated from logs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxltl.app.files.schema import errors_in, read_map
+from jaxltl.app.files.task import GridTable
+from jaxltl.app.files.task_mlirl import MlirlTask
+from jaxltl.app.wording import place, where
+from jaxltl.core.logic.labels import satisfying
+from jaxltl.core.models.mdp import MDP
+from jaxltl.envs.gridworld import ACTIONS, gridworld
+from jaxltl.envs.text_map import parse_map
+
+if TYPE_CHECKING:
+    from jaxltl.app.logged import Logged
+
+
+@dataclass(frozen=True)
+class World:
+    """A model, with its map if it has one.
+
+    Attributes:
+      mdp: the model.
+      cells: ``str[rows, columns]``, or None for a model without a map.
+      actions: A names.
+      logged: the log that the model was estimated from, or None.
+    """
+
+    mdp: MDP
+    cells: np.ndarray | None
+    actions: tuple[str, ...]
+    logged: Logged | None = None
+
+    def where(self, state: int) -> dict[str, Any]:
+        """A state's number from 0 and, on a map, its row and column from 1; of a log, its name."""
+        found = where(state, None if self.cells is None else self.cells.shape)
+        return found if self.logged is None else {**found, "name": self.logged.states[state]}
+
+    def place(self, state: int) -> str:
+        """:meth:`where` as text."""
+        return place(self.where(state))
+
+
+def grid_options(table: GridTable) -> dict[str, Any]:
+    """The arguments of :func:`~jaxltl.envs.gridworld.gridworld` that a table gives."""
+    names = ("legend", "wall", "slip", "absorbing", "initial")
+    return {name: value for name, value in table.given().items() if name in names}
+
+
+def load_world(task: MlirlTask) -> World:
+    """The model that a task file describes.
+
+    Raises:
+      ValueError: a malformed map or model; names the file and the place.
+    """
+    table, folder = task.world, task.path.parent
+    with errors_in(f"{task.path}: [world] "):
+        # Imports here: most tasks have a map, and need no reader of logs or models.
+        if table.transitions is not None:
+            from jaxltl.app.logged import load_logged
+
+            mdp, actions, logged = load_logged(folder, table)
+            return World(mdp, None, actions, logged)
+        if table.model is not None:
+            from jaxltl.app.files.models import read_padded
+
+            path = folder / table.model
+            found = read_padded(path)
+            assert not isinstance(table.initial, list)
+            return World(initial_where(found.mdp, table.initial, path), None, found.actions)
+        assert table.map is not None
+        text = read_map(task.path, table.map)
+        return World(gridworld(text, **grid_options(table)), parse_map(text), ACTIONS)
+
+
+def initial_where(mdp: MDP, formula: str | None, path: Path) -> MDP:
+    """A model with uniform initial distribution over the states of a Boolean formula, if any."""
+    if formula is None:
+        return mdp
+    with errors_in(f"{str(path)!r}: "):
+        return replace(mdp, initial=_uniform_where(formula, mdp))
+
+
+def _uniform_where(formula: str, mdp: MDP) -> jax.Array:
+    holds = satisfying(np.asarray(mdp.label), mdp.propositions, formula, "initial")
+    if not holds.any():
+        raise ValueError(f"initial={formula!r} holds in no state.")
+    return jnp.asarray(holds / holds.sum(), mdp.dtype)

@@ -1,0 +1,143 @@
+"""Protocols of learning jobs, which ``jaxltl learn`` runs from a task file to a report."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+
+if TYPE_CHECKING:
+    import numpy as np
+    from jax.sharding import Mesh
+
+    from jaxltl.app.reports.drawing import Picture
+    from jaxltl.app.reports.explorer import Curves, Explorer, TooLarge
+    from jaxltl.app.reports.page import Part
+
+Result = Mapping[str, Any]  # the contents of result.json
+Progress = Callable[[int, Mapping[str, "np.ndarray"]], None]  # steps, and metrics ``[T, N]``
+
+T = TypeVar("T", bound="LearningTask")
+S = TypeVar("S")
+O = TypeVar("O", bound="Outcome")  # noqa: E741
+
+
+class Learner(Protocol):
+    """``[learner]`` of a task file."""
+
+    @property
+    def method(self) -> str: ...
+    @property
+    def steps(self) -> int: ...
+
+
+class LearningTask(Protocol):
+    """A checked task file."""
+
+    @property
+    def path(self) -> Path: ...
+    @property
+    def name(self) -> str: ...
+    @property
+    def formula(self) -> str: ...
+    @property
+    def learner(self) -> Learner: ...
+    @property
+    def digest(self) -> str: ...
+
+
+class Outcome(Protocol):
+    """A finished job; `seconds` is its wall time."""
+
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Training:
+    """How a job is run.
+
+    Attributes:
+      seed, num_seeds: the first seed, and the number of seeds, which learn in parallel.
+      report: called with the steps made and the newest metrics.
+      stage: called with the name of each stage after learning.
+      checkpoint: file from which an interrupted run resumes.
+      mesh: devices over which several seeds are distributed.
+    """
+
+    seed: int
+    num_seeds: int
+    report: Progress | None = None
+    stage: Callable[[str], None] = lambda name: None
+    checkpoint: Path | None = None
+    mesh: Mesh | None = None
+
+
+class Report(Protocol):
+    """The report of a job's result."""
+
+    def page(
+        self,
+        result: Result,
+        parts: Sequence[Part],
+        pictures: Sequence[tuple[Picture, bytes]],
+        task_text: str,
+    ) -> str:
+        """The report as an HTML page."""
+        ...
+
+    def table(self, result: Result) -> str:
+        """The report as text for the terminal."""
+        ...
+
+
+class Job(Protocol[T, S, O]):
+    """A kind of learning job, with its task, setup and outcome; implemented by modules."""
+
+    @property
+    def DOUBLE(self) -> bool:
+        """Whether figures are computed in double precision."""
+        ...
+
+    @property
+    def report(self) -> Report: ...
+
+    def read_task(self, path: Path) -> T:
+        """The checked task file."""
+        ...
+
+    def prepare(self, task: T, seed: int) -> S:
+        """The objects that a task file describes."""
+        ...
+
+    def describe(self, setup: S) -> str:
+        """Sizes of a setup, in one line."""
+        ...
+
+    def learn(self, setup: S, training: Training) -> O:
+        """Learns with several seeds, keeps one, and evaluates it."""
+        ...
+
+    def postfix(self, figures: Mapping[str, np.ndarray]) -> dict[str, str]:
+        """The newest metrics for the progress bar."""
+        ...
+
+    def summary(self, outcome: O) -> Result:
+        """The contents of ``result.json``."""
+        ...
+
+    def save(self, out: Path, outcome: O) -> None:
+        """Writes the policy into a directory."""
+        ...
+
+    def task_pictures(self, setup: S) -> list[Picture]:
+        """The pictures that need no outcome."""
+        ...
+
+    def pictures(self, outcome: O) -> list[Picture]:
+        """The pictures of an outcome."""
+        ...
+
+    def live(self, outcome: O) -> Sequence[Explorer | TooLarge | Curves]:
+        """The interactive parts of the report."""
+        ...

@@ -1,0 +1,61 @@
+"""Formats of numbers, probabilities and certificates in reports."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import click
+
+Remark = tuple[str, str]  # kind, "warning" (red), "note" or "good", and text
+
+
+def remark_lines(remarks: Iterable[Remark]) -> list[str]:
+    """Remarks as paragraphs for the terminal, warnings in red."""
+    return [
+        "\n" + (click.style(f"warning: {text}", fg="red") if kind == "warning" else text)
+        for kind, text in remarks
+    ]
+
+
+def mean_deviation(values: Iterable[float | None]) -> str:
+    """Mean and standard deviation of the finite values."""
+    known = [v for v in values if v is not None]
+    if not known:
+        return "unknown"
+    mean = sum(known) / len(known)
+    deviation = (sum((v - mean) ** 2 for v in known) / max(1, len(known) - 1)) ** 0.5
+    return f"{number(mean)} ± {deviation:.2g}"
+
+
+def probability(value: float | None) -> str:
+    """A probability to four places; a small one with its exponent."""
+    if value is None:
+        return "unknown"
+    return f"{value:.4f}" if value >= 0.00095 or value == 0 else f"{value:.1e}"
+
+
+def rounded_down(value: float) -> str:
+    """A lower bound, rounded down to four places."""
+    return f"{math.floor(value * 1e4) / 1e4:.4f}"
+
+
+def certified(entry: Mapping[str, Any]) -> str:
+    """The certificate of a value: exact, an error bound, or the interval if it is wide."""
+    value, lower, upper = entry["value"], entry["lower"], entry["upper"]
+    if value is None or lower is None or upper is None:
+        return "no bounds"
+    width = max(value - lower, upper - value)
+    if width <= 0:
+        return "exact"
+    if width < 5e-4:
+        return f"within {width:.1e}"
+    return f"in [{rounded_down(lower)}, {math.ceil(upper * 1e4) / 1e4:.4f}]"
+
+
+def number(value: float | None) -> str:
+    """A number to four digits."""
+    if value is None:
+        return "unknown"
+    return f"{value:.1e}" if value != 0 and abs(value) < 1e-3 else f"{value:.4g}"

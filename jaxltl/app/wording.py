@@ -1,0 +1,31 @@
+"""Wording of counts and of positions of states."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+
+def where(state: int, shape: Sequence[int] | None) -> dict[str, Any]:
+    """A state's number from 0 and, on a map of a shape, its row and column from 1."""
+    if shape is None:
+        return {"state": int(state)}
+    row, column = divmod(int(state), shape[1])
+    return {"state": int(state), "row": row + 1, "column": column + 1}
+
+
+def place(where: Mapping[str, Any]) -> str:
+    """Text of a position: row and column on a map, else the state's name or number."""
+    if "row" in where:
+        return f"row {where['row']}, column {where['column']}"
+    return f"state {where.get('name', where['state'])}"
+
+
+def many(number: int, noun: str) -> str:
+    """A number with its noun, in the plural unless the number is 1.
+
+    Example:
+      >>> many(1, "state"), many(12, "state")
+      ('1 state', '12 states')
+    """
+    return f"{number} {noun}{'' if number == 1 else 's'}"
