@@ -1,8 +1,8 @@
-"""Sets of values that policies attain together: between the hull of points and half-spaces.
+"""Geometry of Pareto fronts: convex hulls of attained points, and half-spaces.
 
-Every objective is to be made large. What is attained lies below points' mixtures; what is not
-exceeded, in half-spaces with normals that are not negative. Linear programs find where the two are
-farthest apart; what is certified is checked in the arithmetic of floats, with its rounding.
+All objectives are maximised. Vectors below mixtures of points are attained; values lie in
+half-spaces with nonnegative normals. Linear programs find where the two are farthest apart; results
+are certified in floating point with its rounding, or in fractions.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ _EXACT = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1
 
 
 class Separation(NamedTuple):
-    """How far a vector is beyond what is attained.
+    """Distance of a vector beyond the attained values.
 
     Attributes:
-      distance: the least t for which all of the vector less t times the scale is attained.
-      normal: ``float64[n]``, the direction that shows it; sums to one in units of the scale.
-      share: ``float64[N]``, the mixture of points nearest to it.
+      distance: the least t for which the vector less t times the scale is attained.
+      normal: ``float64[n]``, of the separating hyperplane; sums to one in units of the scale.
+      share: ``float64[N]``, the nearest mixture of points.
     """
 
     distance: float
@@ -36,15 +36,11 @@ class Separation(NamedTuple):
 
 
 def separation(points: Floats, vector: Floats, scale: Floats) -> Separation:
-    """How far a vector is beyond the mixtures of points.
+    """Distance of a vector ``float64[n]`` beyond the mixtures of points ``float64[N, n]``.
 
-    A program tells distances as shares of its largest one. So it is solved again for the points
-    near the face that it finds, measured from the vector, until all of these are far apart.
-
-    Args:
-      points: ``float64[N, n]``.
-      vector: ``float64[n]``.
-      scale: ``float64[n]``, the unit of each objective.
+    A linear program resolves distances relative to its largest one. It is therefore solved again for
+    the points near the face that it finds, relative to the vector, until all of these are far apart.
+    `scale` ``float64[n]`` is the unit of each objective.
     """
     ahead = (points - vector) / scale
     chosen = np.arange(len(points))
@@ -97,18 +93,18 @@ def _apart(ahead: Floats) -> tuple[float, Floats, Floats] | None:
 
 
 def mixture(lower: Floats, share: Floats) -> Floats:
-    """What a mixture of policies attains at least, ``float64[n]``."""
+    """Lower bound of the value of a mixture of policies, ``float64[n]``."""
     sums = share @ lower
     return sums - 4 * _EPS * (len(share) + 2) * (share @ np.abs(lower)) / max(share.sum(), 1e-300)
 
 
 def meets(lower: Floats, share: Floats, wanted: Floats) -> bool:
-    """Whether a mixture surely attains a vector, in exact arithmetic.
+    """Whether a mixture certainly attains a vector, in exact arithmetic.
 
     Args:
       lower: ``float64[N, n]``.
-      share: ``float64[N]``, not negative; taken as parts of its sum.
-      wanted: ``float64[n]``, minus infinity where nothing is asked.
+      share: ``float64[N]``, not negative; relative to its sum.
+      wanted: ``float64[n]``, minus infinity for objectives without a threshold.
 
     Example:
       >>> meets(np.eye(2), np.array([0.5, 0.5]), np.array([0.5, 0.5]))
@@ -128,7 +124,7 @@ def meets(lower: Floats, share: Floats, wanted: Floats) -> bool:
 
 
 def plain(share: Floats) -> Floats:
-    """A mixture with simple fractions in place of what rounding made of them.
+    """A mixture with simple fractions in place of numbers within rounding of them.
 
     >>> plain(np.array([0.25000000000000006, 0.75])).tolist()
     [0.25, 0.75]
@@ -138,19 +134,19 @@ def plain(share: Floats) -> Floats:
 
 
 def exceeds(normal: Floats, bound: float, vector: Floats) -> bool:
-    """Whether a vector is surely outside of a half-space ``normal @ y <= bound``."""
+    """Whether a vector is certainly outside of a half-space ``normal @ y <= bound``."""
     slack = 4 * _EPS * (vector.size + 2) * (normal @ np.abs(vector) + abs(bound))
     return bool(normal @ vector - slack > bound)
 
 
 class Largest(NamedTuple):
-    """The largest value of one objective when others must be at least something.
+    """Largest value of one objective under thresholds on the others.
 
     Attributes:
-      lower: attained by the mixture; minus infinity where none was found.
+      lower: attained by the mixture; minus infinity without any.
       share: ``float64[N]``.
-      upper: what nothing exceeds.
-      vector: ``float64[n]``, the farthest vector that the half-spaces allow; None if none.
+      upper: not exceeded.
+      vector: ``float64[n]``, the extreme vector within the half-spaces; None without any.
     """
 
     lower: float
@@ -161,20 +157,19 @@ class Largest(NamedTuple):
 
 def largest(
     points: Floats,
-    normals: Floats,
-    bounds: Floats,
+    half_spaces: tuple[Floats, Floats],
     index: int,
     least: Floats,
     scale: Floats,
     known: Floats | None = None,
 ) -> Largest:
-    """The largest value of an objective, by what is known.
+    """Bounds of the largest value of an objective under thresholds on the others.
 
     Args:
       points: ``float64[N, n]``, lower bounds of attained vectors.
-      normals, bounds: ``float64[K, n]``, ``[K]``, half-spaces.
-      index: which objective.
-      least: ``float64[n]``, what the others must be; minus infinity where nothing is asked.
+      half_spaces: their normals ``float64[K, n]`` and bounds ``float64[K]``.
+      index: the objective.
+      least: ``float64[n]``, the thresholds; minus infinity for objectives without one.
       scale: ``float64[n]``.
       known: a mixture of the first points, to be tried too.
     """
@@ -191,14 +186,14 @@ def largest(
     for i in np.flatnonzero((points[:, asked] >= least[asked]).all(1)):
         if points[i, index] > lower:
             lower, share = float(points[i, index]), np.eye(count)[i]
-    upper, vector = _outer(normals, bounds, index, least, asked, scale)
+    upper, vector = _outer(*half_spaces, index, least, asked, scale)
     return Largest(lower, share, upper, vector)
 
 
 def _largest_mixtures(
     points: Floats, index: int, least: Floats, asked: Any, scale: Floats
 ) -> list[Floats]:
-    """Mixtures that may be the best of an objective, the others being at least something."""
+    """Candidates for the best mixture under thresholds."""
     from scipy import optimize
 
     count = len(points)

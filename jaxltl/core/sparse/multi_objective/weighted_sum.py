@@ -1,10 +1,10 @@
-"""Weighted sums of several objectives: the best, a bound on it, and a policy that attains it.
+"""Optimal weighted sums of probabilities and total rewards, as optimal stopping.
 
-A run ends in an end component, and there in one whose least priorities are even for as many
-probability objectives at once as it chooses to satisfy. So a weighted sum is an optimal stopping
-problem: rewards on the way, and for stopping in a component the weight of the best set of
-objectives that can be satisfied together in it (Etessami, Kwiatkowska, Vardi and Yannakakis 2008;
-Forejt, Kwiatkowska, Norman, Parker and Qu 2011).
+A run ends in an end component, and there in one whose least priorities are even for the set of
+probability objectives that it satisfies. A weighted sum is therefore an optimal stopping problem:
+rewards on the way, and on stopping in a component the weight of the best set of objectives that can
+be satisfied together in it (Etessami, Kwiatkowska, Vardi and Yannakakis 2008; Forejt, Kwiatkowska,
+Norman, Parker and Qu 2011).
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ _ROUNDS = 100
 
 
 class WeightedProblem(NamedTuple):
-    """A model with several objectives, all to be made large.
+    """A model with several objectives, all to be maximised.
 
     Attributes:
-      mdp: the model, N states, all of them reached.
+      mdp: the model, N reachable states.
       start: ``float64[N]``, the initial distribution.
-      priority: ``int[B, R]``, the least priority that a row reads, of each probability objective;
-        it is satisfied where the least that is read for ever is even.
-      gain: ``float64[K, R]``, at least 0: rewards to be made large.
-      cost: ``float64[C, R]``, at least 0: rewards to be made small.
-      ended: ``bool[N]``, where all rewards that have a target have met it.
+      priority: ``int[B, R]``, for each probability objective the least priority that a row reads; it is
+        satisfied where the least recurring one is even.
+      gain: ``float64[K, R]``, at least 0: rewards to maximise.
+      cost: ``float64[C, R]``, at least 0: rewards to minimise.
+      ended: ``bool[N]``, where all rewards with a target have reached it.
     """
 
     mdp: HostMDP
@@ -53,10 +53,10 @@ class WeightedProblem(NamedTuple):
 
 
 class FinalComponents(NamedTuple):
-    """Where runs may end: end components without cost, by the sets of what is satisfied there.
+    """End components without cost in which runs may end, by sets of satisfied objectives.
 
     Attributes:
-      rows: ``bool[R]``, the rows that may be taken at all.
+      rows: ``bool[R]``, the rows that may be taken.
       sets: ``bool[M, B]``, sets of objectives.
       inside: for each set, the rows of end components in which it can be satisfied.
     """
@@ -67,7 +67,7 @@ class FinalComponents(NamedTuple):
 
 
 def final_components(sums: WeightedProblem) -> FinalComponents | None:
-    """Where runs may end; None if some initial state is not surely left for there."""
+    """Where runs may end; None if some initial state does not reach that almost surely."""
     mdp = sums.mdp
     free = (sums.cost == 0).all(0) & sums.ended[mdp.state]
     homes = end_components(mdp, rows=free)
@@ -90,7 +90,7 @@ def final_components(sums: WeightedProblem) -> FinalComponents | None:
 def _satisfying(mdp: HostMDP, priority: NDArray[Any], rows: Booleans) -> Booleans:
     """The rows of end components whose least priorities are all even.
 
-    A component whose least priority is odd is searched without the rows that read it.
+    A component whose least priority is odd is searched again without the rows that read it.
     """
     while True:
         found = end_components(mdp, rows=rows)
@@ -106,11 +106,11 @@ def _satisfying(mdp: HostMDP, priority: NDArray[Any], rows: Booleans) -> Boolean
 
 
 class WeightedOptimum(NamedTuple):
-    """The best of a weighted sum.
+    """The optimum of a weighted sum.
 
     Attributes:
-      bound: what no policy exceeds.
-      weight: ``float64[R]``, a policy: the weights of each state's rows, one or equal ones.
+      bound: not exceeded by any policy.
+      weight: ``float64[R]``, a policy: the weights of each state's rows, one or uniform ones.
       home: ``bool[N]``, the states in which it ends.
     """
 
@@ -127,12 +127,12 @@ def weighted_optimum(
     cost: Floats,
     tolerance: float,
 ) -> WeightedOptimum:
-    """The largest weighted sum over all policies that surely end.
+    """The largest weighted sum over all policies that end almost surely.
 
     Args:
       sums, where: the objectives, and where runs may end.
       sure, gain, cost: ``float64[B]``, ``[K]``, ``[C]``, weights of at least 0.
-      tolerance: the width asked for.
+      tolerance: the width of the bound.
     """
     mdp = sums.mdp
     earned, spent = gain @ sums.gain, cost @ sums.cost
@@ -157,13 +157,13 @@ def weighted_optimum(
 
 
 class _Quotient(NamedTuple):
-    """Components as one node each, and a last node where runs stop.
+    """End components as one node each, and a last node where runs stop.
 
     Attributes:
       mdp: the model.
-      node: ``int[N]``, the node of each state; -1 where none may be.
-      row: ``int[R']``, the row that each row is; -1 for stops.
-      known: ``float64[R']``, what stopping is worth.
+      node: ``int[N]``, the node of each state.
+      row: ``int[R']``, the row of each row; -1 for stopping.
+      known: ``float64[R']``, the value of stopping.
       stop: ``int[nodes]``, the state in which a node stops, or -1.
     """
 
@@ -210,7 +210,7 @@ def _quotient(
 def _solved(
     quotient: _Quotient, earned: Floats, spent: Floats, tolerance: float
 ) -> tuple[Floats, Integers]:
-    """An upper bound for each node, and the rows of a policy that comes near it."""
+    """An upper bound for each node, and the rows of a policy close to it."""
     mdp, moves = quotient.mdp, quotient.row >= 0
     own = np.where(moves, quotient.row, 0)
     gain = np.where(moves, earned[own], quotient.known)
@@ -242,7 +242,7 @@ def _signed(
 ) -> tuple[Floats, Integers]:
     """The same with rewards of both signs, by policy iteration (Howard 1960).
 
-    Every step earns a little more than it does, so that the value is one that no step exceeds.
+    Every step earns a small extra, so that the value is one that no step exceeds.
     """
     from jaxltl.core.sparse.linear.elimination import factorize
     from jaxltl.core.sparse.linear.topological_order import Edges, ordered_components

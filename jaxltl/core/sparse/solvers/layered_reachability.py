@@ -1,10 +1,10 @@
-"""Reaching pairs of a large world's state and an automaton's, one part of the automaton at a time.
+"""Reachability on a large padded product, one component of the automaton at a time.
 
-The automaton's strongly connected components (most of them single states) are left for ever in one
-order. From the last one on, each asks a question of the world alone, in which entering a state that
-leads on is worth what is known of it by then, between two bounds. The graph is searched for all
-memories at once (:mod:`jaxltl.core.sparse.graph.bitsets`), and what it leaves open is found by sweeps
-(:mod:`jaxltl.core.sparse.linear.gauss_seidel`).
+The strongly connected components of the automaton (most of them single states) are left for good in
+topological order. From the last one on, each is a reachability problem on the model alone, in which
+entering a state that leaves the component has a known value, between two bounds. Qualitative sets
+are computed for all automaton states at once (:mod:`jaxltl.core.sparse.graph.bitsets`), and the
+other values by sweeps (:mod:`jaxltl.core.sparse.linear.gauss_seidel`).
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _MOST = 2**27  # transitions of a component that is written out, at most
 
 
 class PaddedProduct(NamedTuple):
-    """A padded world beside an automaton, whose letters are read where states are entered.
+    """A padded MDP and an automaton, whose letters are read where states are entered.
 
     Attributes:
       successor: ``int[S, A, K]``.
@@ -62,12 +62,12 @@ class PaddedProduct(NamedTuple):
 
 
 class LayeredBounds(NamedTuple):
-    """An optimum, enclosed.
+    """Bounds of a reachability probability.
 
     Attributes:
-      lower, upper: ``float64[S, Q]``, exactly 0 or 1 where the graph says so.
+      lower, upper: ``float64[S, Q]``, exactly 0 or 1 where the graph decides.
       action: ``int32[S, Q]``, a policy that attains the bound on the safe side.
-      sweeps: over the world.
+      sweeps: over the model.
     """
 
     lower: Floats
@@ -77,7 +77,7 @@ class LayeredBounds(NamedTuple):
 
 
 class _Rows:
-    """The world's rows, their actions, and in blocks."""
+    """The model's rows, their actions, and their blocks."""
 
     def __init__(self, world: PaddedProduct) -> None:
         available, used = world.available, world.used
@@ -105,30 +105,23 @@ class _Rows:
 
     @cached_property
     def cut(self) -> RowBlocks:
-        """Of all rows."""
+        """Blocks of all rows."""
         host = self.host
         return row_blocks(
             host.row_start, host.entry_start, host.successor, host.probability, host.num_states
         )
 
     def of(self, choices: Booleans) -> Booleans:
-        """What holds of actions ``bool[S, A]``, of rows."""
+        """A mask of actions ``bool[S, A]`` as a mask of rows."""
         return choices.reshape(-1) if self.regular else choices[self.available]
 
 
 def layered_reachability(
     world: PaddedProduct, target: Booleans, *, maximize: bool, tolerance: float
 ) -> LayeredBounds | None:
-    """The largest or smallest probability of reaching a target.
+    """Optimal probability of reaching a target ``bool[S, Q]``, with bounds of width `tolerance`.
 
-    Args:
-      world: the product.
-      target: ``bool[S, Q]``.
-      maximize: which of the two.
-      tolerance: how far apart the bounds may be.
-
-    Returns:
-      The bounds; None where sweeps would take long, or could not prove them.
+    None where sweeps would take long, or could not prove the bounds.
     """
     num_memory = world.delta.shape[0]
     if num_memory > LARGEST or not _mixes(world):
@@ -157,7 +150,7 @@ def _mixes(world: PaddedProduct) -> bool:
 
 
 class _Search:
-    """Bounds by memory, ``float64[Q, S]``, that are filled in component after component."""
+    """Bounds by automaton state, ``float64[Q, S]``, filled in component after component."""
 
     def __init__(self, world: PaddedProduct, sets: BitSets, sign: int, tolerance: float) -> None:
         self.world, self.sets, self.sign, self.tolerance = world, sets, sign, tolerance
@@ -174,7 +167,7 @@ class _Search:
 
     @staticmethod
     def has(words: Any, q: Any) -> Booleans:
-        """The states in which a set has a memory."""
+        """The states in which a set holds an automaton state."""
         return (words >> q & 1).astype(bool)
 
     def open(self, q: Any) -> Booleans:
@@ -182,7 +175,7 @@ class _Search:
         return ~self.has(self.sets.one | self.sets.zero, q)
 
     def solve(self) -> bool:
-        """Fills in all components; whether that succeeded."""
+        """Solves all components; whether that succeeded."""
         num_memory = self.world.delta.shape[0]
         read = np.unique(self.world.letter)
         label = ordered_components(
@@ -200,7 +193,7 @@ class _Search:
         return True
 
     def component(self, part: Integers, budget: float) -> bool:
-        """One component, whose bounds may be that much farther apart than those that are known."""
+        """Solves one component, to bounds at most `budget` wider than the known ones."""
         host = self.rows.host
         if part.size > 1 and host.num_transitions * part.size > _MOST:
             return False
@@ -231,7 +224,7 @@ class _Search:
         return (4 * self.world.used.shape[2] + 16) * _EPS
 
     def found(self) -> LayeredBounds:
-        """The bounds as they were asked for."""
+        """The final bounds."""
         low, high = (self.near, self.far) if self.sign > 0 else (self.far, self.near)
         # Products too small for a float to hold are lost; relative errors do not count them.
         open_ = low != high
@@ -241,14 +234,14 @@ class _Search:
 
 
 class _Problem(NamedTuple):
-    """What is asked of a component: :class:`BlockProblem`, and where end components are.
+    """Problem of a component: :class:`BlockProblem`, and where end components may be.
 
     Attributes:
-      host: as many states as there are columns; the first ones are nodes.
-      cut: of its rows, if that is known.
-      open, live, near, far: as of Sums, all of the columns.
+      host: as many states as columns; the first ones are nodes.
+      cut: the blocks of its rows, if known.
+      open, live, near, far: as of BlockProblem, for all columns.
       rows: ``bool[R]``, or None.
-      stays: ``bool[M]``, where end components are looked for.
+      stays: ``bool[M]``, where end components are searched.
       inner: ``bool[M]``, the columns that are read as nodes.
     """
 
@@ -264,7 +257,7 @@ class _Problem(NamedTuple):
 
 
 def _alone(search: _Search, q: int) -> _Problem:
-    """Of one memory: entering a state leads to it, or on to another one."""
+    """The problem of one automaton state: entering a state stays in it, or leads to another one."""
     world, rows = search.world, search.rows
     after = world.delta[q][world.letter]
     place = np.arange(after.size)
@@ -284,7 +277,7 @@ def _alone(search: _Search, q: int) -> _Problem:
 
 
 def _together(search: _Search, part: Integers) -> _Problem:
-    """Of several memories: their rows written out, and a state for each pair that leads on."""
+    """The problem of several automaton states: their rows written out, with a state for each exit."""
     world, host = search.world, search.rows.host
     size = host.num_states
     after = world.delta[part][:, world.letter]  # [C, S]

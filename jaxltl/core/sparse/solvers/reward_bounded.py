@@ -1,8 +1,9 @@
-"""Probability of a target before so much reward is spent, level by level of what is left.
+"""Reward-bounded reachability: the probability of a target before a reward bound is exceeded.
 
-With l units left a step that costs c leads to level ``l - c``. Steps that cost nothing stay on a
-level, where they make a system of equations: it is the same on every level, so its factors are
-kept, and one bound on how long a run can go on without cost proves them all.
+By induction over the remaining budget: with l units left, a step of cost c leads to level ``l - c``
+(Andova, Hermanns and Katoen 2003). Steps without cost stay on a level, as a linear system that is
+the same on every level: it is factored once, and one bound on the number of consecutive steps
+without cost bounds the error of all levels.
 """
 
 from __future__ import annotations
@@ -32,13 +33,13 @@ _ROUNDS = 100
 
 
 class Level(NamedTuple):
-    """What can be had with everything left to spend.
+    """Probabilities with the whole budget left.
 
     Attributes:
       value: ``float64[S]``.
-      open: ``bool[S]``, where that is not exact.
-      error: how far it may be off there.
-      row: ``int32[S]``, the choices with everything left; ``int32[L + 1, S]`` if all are asked for.
+      open: ``bool[S]``, where the value is not exact.
+      error: of the value there.
+      row: ``int32[S]``, the choices with the whole budget left; ``int32[L + 1, S]`` with `by_level`.
     """
 
     value: Floats
@@ -48,9 +49,9 @@ class Level(NamedTuple):
 
 
 def in_units(cost: Floats, bound: float) -> tuple[Integers, int]:
-    """Costs as whole multiples of their greatest common unit, and how many units a bound has.
+    """Costs as multiples of their greatest common unit, and the bound in units.
 
-    Each number is taken for the simplest fraction that is rounded to it.
+    Each number is read as the simplest fraction that rounds to it.
 
     Args:
       cost: ``float64[T]``, not negative.
@@ -60,7 +61,7 @@ def in_units(cost: Floats, bound: float) -> tuple[Integers, int]:
       ``int64[T]`` and an integer.
 
     Raises:
-      ValueError: a cost has no unit in common with the others of which the bound has at most 10^7.
+      ValueError: the bound has more than 10^7 units.
 
     Example:
       >>> units, most = in_units(np.array([0.1, 0.0, 0.3]), 0.7)
@@ -103,15 +104,15 @@ def bounded_cost(
     maximal: bool,
     by_level: bool = False,
 ) -> Level:
-    """Optimal probability of a target through states where one may stay, at a cost.
+    """Optimal probability of a target through states where one may stay, within a budget.
 
     Args:
       mdp: the model.
       target, stay: ``bool[S]``.
       cost: ``int64[T]``, of each entry.
-      most: what may be spent.
-      maximal: whether the largest probability is meant, or the smallest.
-      by_level: whether the choices of all levels are asked for.
+      most: the budget.
+      maximal: whether to maximise.
+      by_level: whether the choices of all levels are returned.
     """
     open_ = stay & ~target
     shape = _shape(mdp, target, open_, cost, maximal)
@@ -143,14 +144,14 @@ def bounded_cost(
 
 
 class _Shape(NamedTuple):
-    """The nodes of the system: states that are not decided, those of an end component as one.
+    """Nodes of the linear system: undecided states, those of an end component as one.
 
     Attributes:
-      member: ``bool[S]``, the states that are no constant.
+      member: ``bool[S]``, the undecided states.
       node: ``int[S]``, the node of a member.
       row: ``int[R']``, the rows of the nodes, in order.
       starts: ``int[N]``, where those of each node begin.
-      inside: ``bool[R]``, rows without cost of end components that stay in them.
+      inside: ``bool[R]``, rows without cost that stay in their end component.
     """
 
     member: Booleans
@@ -182,7 +183,7 @@ def _shape(
 def _parts(
     mdp: HostMDP, shape: _Shape, target: Booleans, cost: Integers, most: int
 ) -> list[tuple[int, Any, Floats]]:
-    """By cost: the matrix of the entries of that cost, and what of it hits the target."""
+    """For each cost: the matrix of the entries of that cost, and the probability of the target."""
     from scipy import sparse
 
     count = np.diff(mdp.entry_start)[shape.row]
@@ -206,7 +207,7 @@ def _parts(
 
 
 def _policy(mdp: HostMDP, shape: _Shape, chosen: Integers) -> Integers:
-    """The rows that were chosen, and in end components the ways to where they are."""
+    """The chosen rows, and in end components the rows that lead to them."""
     found = mdp.row_start[:-1].astype(np.int32)
     row = shape.row[chosen].astype(np.int32)
     found[mdp.state[row]] = row
@@ -221,15 +222,15 @@ def _policy(mdp: HostMDP, shape: _Shape, chosen: Integers) -> Integers:
 
 @dataclass
 class _System:
-    """``x = opt (b + P x)`` where all runs end, with what is known of it.
+    """``x = opt (b + P x)``, which every policy leaves.
 
     Attributes:
-      shape: whose rows these are.
+      shape: the nodes.
       matrix: ``P``, of the rows without cost.
-      maximal: which optimum.
-      chosen: ``int[N]``, the number of each node's row.
-      factors: of the rows chosen; None where ``P`` is zero.
-      longest: ``float``, a bound on the number of steps in a row without cost.
+      maximal: whether to maximise.
+      chosen: ``int[N]``, the row of each node.
+      factors: of these rows; None where ``P`` is zero.
+      longest: a bound on the expected number of consecutive steps without cost.
     """
 
     shape: _Shape
@@ -254,7 +255,7 @@ class _System:
         return operation.reduceat(image, self.shape.starts) if image.size else image
 
     def solve(self, b: Floats, unit: float) -> tuple[Floats, float]:
-        """The solution and how far it may be off if each sum is off by so many roundings."""
+        """The solution, and its error if each sum has a relative error `unit`."""
         if not self.matrix.nnz:
             value = self.best(b)
             self._choose(b, value, np.zeros_like(value, bool))
@@ -264,7 +265,7 @@ class _System:
         return value, float(residual + unit) * self.longest
 
     def _iterate(self, b: Floats) -> Floats:
-        """Policy iteration (Howard 1960) from the last policy, whose factors are at hand."""
+        """Policy iteration (Howard 1960) from the last policy, whose factors are known."""
         for _ in range(_ROUNDS):
             value = self.factors.solve(b[self.chosen])
             image = b + self.matrix @ value

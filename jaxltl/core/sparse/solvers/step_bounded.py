@@ -1,7 +1,7 @@
-"""Questions about so many steps, or so much reward: sweeps over sparse rows, with their rounding.
+"""Step-bounded probabilities and rewards by backward induction, with bounds of their rounding.
 
-Sums of what is not negative have small relative errors however many there are, so n sweeps are
-enclosed in advance: each product and sum adds less than a unit of rounding to the relative error.
+Sums of nonnegative terms have small relative errors: each product and sum adds less than one unit of
+rounding, so that the error of n backups is known in advance.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from jaxltl.core.sparse.rows import sorted_unique, concatenated_ranges, offsets_
 from jaxltl.core.sparse.solvers.total_cost import Enclosure
 from jaxltl.core.sparse.solvers.reachability import reachability, reward_forever, total_reward
 
-UNDERFLOW = 1e-300  # more than all that is lost where numbers are too small
+UNDERFLOW = 1e-300  # bounds the loss by underflow
 _HUGE = 1e150
 _LARGEST = 8.0 * 2**30  # bytes of the choices of all steps
 _LONG = 4096  # backups after which the effect of all further ones is bounded, then at each doubling
@@ -32,17 +32,17 @@ _WORK = (
     2.0**38
 )  # multiplications of one iteration; beyond these, bounds of what is left are returned
 _OVERHEAD = 10_000  # multiplications in the time that NumPy's calls of one backup take
-_MANY = 32  # steps from which it pays to leave out the states that these do not lead to the target
+_MANY = 32  # steps from which states that cannot reach the target in time are left out
 
 
 class Steps(NamedTuple):
-    """What some sweeps found.
+    """Result of backward induction.
 
     Attributes:
       value: ``float64[S]``.
-      error: ``float64[S]``, how far that may be off.
-      row: ``int32[S]``, the first choices; ``int32[n, S]`` if all are asked for.
-      num_steps: sweeps that were done until nothing changed.
+      error: ``float64[S]``, a bound.
+      row: ``int32[S]``, the first choices; ``int32[n, S]`` if all are returned.
+      num_steps: the number of backups.
     """
 
     value: Floats
@@ -52,22 +52,22 @@ class Steps(NamedTuple):
 
 
 def backup_unit(mdp: HostMDP) -> float:
-    """The relative rounding of one backup, and by how much its row may miss one."""
+    """The relative rounding of one backup, including that of row sums."""
     width = int(np.diff(mdp.entry_start).max(initial=1))
     return (2 * width + 6) * float(np.finfo(np.float64).eps)
 
 
 def relative_error(unit: float, num_steps: int) -> float:
-    """The relative error of so many backups of what is not negative; huge if they are too many."""
+    """The relative error of n backups of nonnegative values; huge if there are too many."""
     total = unit * num_steps
     return total / (1 - total) if total < 0.5 else _HUGE
 
 
 class Backup(NamedTuple):
-    """``x -> opt (cost + P x)`` over the choices of N states, the other states being zero.
+    """``x -> opt (cost + P x)`` over the choices of N states, with zero on all other states.
 
     Attributes:
-      matrix: ``P``, SciPy's sparse ``float64[R', N]``.
+      matrix: SciPy's ``float64[R', N]``.
       taken: the same with the columns of all states, ``float64[R', S]``.
       choices: the order of the states and of their choices.
       row: ``int[R']``, the model's rows, in that order.
@@ -88,11 +88,11 @@ class Backup(NamedTuple):
         return self.choices.is_chain and self.places.size <= _POWER_STATES
 
     def best(self, quantity: Floats) -> Floats:
-        """The optimum over each state's choices: ``[N]`` of a number a row."""
+        """The optimum over each state's choices, ``float64[N]``."""
         return self.choices.best(quantity, self.operation)
 
     def first(self, quantity: Floats, best: Floats) -> Integers:
-        """The model's row of each state's first best choice: ``int32[N]``."""
+        """The model's row of each state's first best choice, ``int32[N]``."""
         return self.row[self.choices.first(quantity, best)].astype(np.int32)
 
     def iterate(
@@ -184,14 +184,14 @@ def backup_on(mdp: HostMDP, places: Integers, operation: Any) -> Backup:
 
 
 def _policy(mdp: HostMDP, backup: Backup, row: Integers) -> Integers:
-    """Choices of some states, and the first row of the others: ``int32[S]``."""
+    """The choices of some states, and the first rows of the others: ``int32[S]``."""
     found = mdp.row_start[:-1].astype(np.int32)
     found[backup.places] = row
     return found
 
 
 def _policies(mdp: HostMDP, backup: Backup, every: list[Integers], num_steps: int) -> Integers:
-    """All choices, the first step's first: ``int32[n, S]``. What came to rest goes on so."""
+    """The choices of all steps, the first step first: ``int32[n, S]``; constant after a fixed point."""
     found = np.tile(mdp.row_start[:-1].astype(np.int32), (num_steps, 1))
     for i in range(num_steps):
         found[num_steps - 1 - i, backup.places] = every[min(i, len(every) - 1)]
@@ -206,14 +206,14 @@ def until(
     operation: Any,
     by_step: bool = False,
 ) -> Steps:
-    """Optimal probability of a target within so many steps, through states where one may stay.
+    """Optimal probability of a target within n steps, through states where one may stay.
 
     Args:
       mdp: the model.
       target, stay: ``bool[S]``.
       num_steps: n.
       operation: ``np.maximum`` or ``np.minimum``.
-      by_step: whether the choices of all steps are asked for.
+      by_step: whether the choices of all steps are returned.
     """
     _require_memory(mdp, num_steps, by_step)
     open_ = stay & ~target
@@ -327,7 +327,7 @@ def _require_memory(mdp: HostMDP, num_steps: int, by_step: bool) -> None:
 
 
 def _near(mdp: HostMDP, target: Booleans, open_: Booleans, num_steps: int) -> Booleans:
-    """The states that some choices may lead to a target in so many steps."""
+    """The states from which a target is reachable in n steps."""
     start, pred = mdp.predecessors
     seen = target.copy()
     frontier: Integers = np.flatnonzero(target)
@@ -351,7 +351,7 @@ def _within(
     surely: bool,
     choose_some: bool,
 ) -> Booleans:
-    """Whether a target is met in so many steps possibly, or surely, by some choice or by all."""
+    """Whether a target is reached in n steps possibly, or surely, by some choices or by all."""
     region = target
     choose = np.logical_or if choose_some else np.logical_and
     for _ in range(num_steps):
@@ -376,13 +376,13 @@ def total(
     operation: Any,
     by_step: bool = False,
 ) -> Steps:
-    """Optimal expected reward of so many steps, and then of the state where one is.
+    """Optimal expected reward of n steps, plus a terminal reward.
 
     Args:
       mdp: the model.
       reward: ``float64[R]``, of each step.
-      magnitude: ``float64[R]``, the same with absolute values of all that it is a sum of.
-      start: ``float64[S]``, of the last state.
+      magnitude: ``float64[R]``, the sum of absolute values behind each reward.
+      start: ``float64[S]``, the terminal reward.
       num_steps, operation, by_step: as for :func:`until`.
     """
     _require_memory(mdp, num_steps, by_step)

@@ -26,30 +26,28 @@ def average_reward(
     tolerance: float = 1e-6,
     max_steps: int = 1_000_000,
 ) -> Solution:
-    """Largest or smallest expected long-run average of a reward, a step.
+    """Optimal expected long-run average reward per step: ``lim 1/n E[r_1 + ... + r_n]``.
 
-    ``lim 1/n E[r_1 + ... + r_n]`` from every state, of multichain models too (Puterman 1994,
-    chapter 9). It is the best expected gain of the end component in which a run ends: in each of
-    these the optimal gain is enclosed by the span of ``T v - v``, by value iteration, then policy
-    iteration with sparse elimination; and they are the terminal rewards of an optimal stopping
-    problem, whose every policy ends. Solved on the host, in double precision; every bound
-    includes its rounding. Games have :func:`~jaxltl.core.values.average.mean_payoff.mean_payoff`.
+    For multichain models too (Puterman 1994, chapter 9): the best expected gain of the end component in
+    which a run ends. Gains are enclosed by the span of ``T v - v``, from value iteration and policy
+    iteration, and are the terminal rewards of an optimal stopping problem. Solved in double precision;
+    bounds include all rounding. Games have :func:`~jaxltl.core.values.average.mean_payoff.mean_payoff`.
 
     Args:
       model: a SparseMDP, or any concrete model that :func:`to_sparse` takes.
-      reward: as for :func:`~jaxltl.core.models.sparse.choice_reward`; finite.
-      objective: ``"max"`` or ``"min"``; of chains either.
-      tolerance: the width of the enclosure asked for, as a share of the value; where that is
-        small, of a millionth of the largest reward (a thousandth, if some are negative).
+      reward: as for :func:`~jaxltl.core.models.sparse.row_reward`; finite.
+      objective: ``"max"`` or ``"min"``; irrelevant for chains.
+      tolerance: the width of the enclosure, relative to the value; for small values relative to a
+        millionth of the largest reward (a thousandth, if some are negative).
       max_steps: sweeps of value iteration at most.
 
     Returns:
-      :class:`Solution`; `value` is ``float64[S]``, `policy` rows ``int32[S]``: it attains the bound
-      on the safe side (`lower` of a maximum). `residual` is half the width of the gain's widest
+      :class:`Solution`; `value` is ``float64[S]``, `policy` rows ``int32[S]`` that attain the bound on
+      the safe side (`lower` of a maximum). `residual` is half the width of the gain's widest
       enclosure.
 
     Raises:
-      ValueError: the reward, the objective, or probabilities that are intervals.
+      ValueError: the reward, the objective, or a model with intervals.
 
     Concrete arrays only, on the host; not differentiable.
 

@@ -1,4 +1,4 @@
-"""Certified answers of the host engine as solutions, for sparse and for padded models."""
+"""Solutions from certified enclosures of the sparse engine, for sparse and padded models."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from jaxltl.core.values.undiscounted.step_bounded import finite_reward
 def status_between(
     low: np.ndarray, high: np.ndarray, tolerance: float, *, relative: bool
 ) -> Status:
-    """Whether bounds are as narrow as asked; where both are infinite they are."""
+    """CONVERGED if bounds are as narrow as the tolerance, or both infinite; else PRECISION."""
     finite = np.isfinite(high)
     width = np.where(finite, high, 0) - np.where(finite, low, 0)
     scale = np.where(finite, high, 1) if relative else 1
@@ -41,10 +41,10 @@ def status_between(
 def solution_from_enclosure(
     model: Any, sparse: SparseMDP, found: Enclosure, tolerance: float, *, relative: bool
 ) -> Solution:
-    """A solution with the model's shapes; bounds in its precision, rounded outwards.
+    """A solution in the shapes and precision of a model, with bounds rounded outwards.
 
     Args:
-      model: the model that was asked about.
+      model: the model of the question.
       sparse: the same as sparse rows.
       found: the enclosure.
       tolerance: the width that was asked for.
@@ -90,12 +90,12 @@ def solution_from_enclosure(
 
 @brief
 class Chain(NamedTuple):
-    """The Markov chain of a policy.
+    """Markov chain of a policy.
 
     Attributes:
       mdp: the chain.
-      weight: ``float64[R]``, how much of each row it takes; a state's sum to one.
-      depth: how many roundings stand behind a number of the chain.
+      weight: ``float64[R]``, the weight of each row; those of a state sum to one.
+      depth: the number of roundings behind each probability.
     """
 
     mdp: HostMDP
@@ -103,22 +103,22 @@ class Chain(NamedTuple):
     depth: int
 
     def mean(self, quantity: np.ndarray, row_start: np.ndarray) -> np.ndarray:
-        """The mean of a quantity on rows in each state, ``float64[S]``; 0 of rows not taken."""
+        """The mean of a quantity on rows in each state, ``float64[S]``."""
         taken = np.where(self.weight > 0, self.weight * quantity, 0)
         return np.add.reduceat(taken, row_start[:-1])
 
 
 def induced_chain(model: Any, sparse: SparseMDP, policy: Any) -> Chain:
-    """The Markov chain of a policy.
+    """Markov chain induced by a policy.
 
     Args:
-      model: the model that the policy is for.
+      model: the model of the policy.
       sparse: the same as sparse rows.
       policy: rows ``int32[S]`` or their weights ``float[R]``; for a padded model actions
         ``int32[S]`` or ``float[S, A]``.
 
     Raises:
-      ValueError: a shape is wrong, or a state's row is no distribution over its choices.
+      ValueError: a shape is wrong, or a state's weights are not a distribution.
     """
     host = sparse.host
     if is_sparse(model):
@@ -157,7 +157,7 @@ def _weights(model: Any, sparse: SparseMDP, policy: np.ndarray) -> np.ndarray:
 
 
 def with_given_policy(solution: Solution, policy: Any) -> Solution:
-    """A solution with the policy that it is of, where one was given."""
+    """A solution with the policy that was evaluated, if one was given."""
     if policy is None:
         return solution
     table = np.asarray(policy)
@@ -229,5 +229,5 @@ def discounted(
 
 
 def default_tolerance(model: Any) -> float:
-    """The width that is asked for where nothing is said."""
+    """The default width of an enclosure."""
     return 1e-6 if np.dtype(model.dtype) == np.float64 else 1e-3

@@ -175,6 +175,11 @@ class FrontSearch:
         # The policy made the opposite event's probability large.
         return (value - 1, *((low - 1, high - 1) if exact else (low - 1 - 1e-16, high - 1 + 1e-16)))
 
+    @property
+    def half_spaces(self) -> tuple[np.ndarray, np.ndarray]:
+        """Normals and bounds, ``float64[K, n]`` and ``float64[K]``."""
+        return np.stack(self.normals), np.array(self.bounds)
+
     def front(self) -> Front:
         values, lower, upper = (
             np.stack(x) * self.signs for x in (self.values, self.lower, self.upper)
@@ -236,9 +241,7 @@ class FrontSearch:
         share = apart.share
         if index is not None:
             enough = wanted - (apart.distance + 1e-15) * self.scale
-            found = frontier.largest(
-                lower, np.stack(self.normals), np.array(self.bounds), index, enough, self.scale
-            )
+            found = frontier.largest(lower, self.half_spaces, index, enough, self.scale)
             share = found.share if np.isfinite(found.lower) else share
         return nearest_mixture(self.front(), share, self.signs * wanted, self.signs)
 
@@ -255,8 +258,7 @@ class FrontSearch:
             lower = np.stack(self.lower)
             known = frontier.largest(
                 lower,
-                np.stack(self.normals),
-                np.array(self.bounds),
+                self.half_spaces,
                 index,
                 wanted,
                 self.scale,
@@ -294,7 +296,7 @@ class FrontSearch:
             if not np.array_equal(before, self.scale):
                 held.clear()
             floor = lower.min(0) - self.scale
-            far = frontier.corners(np.stack(self.normals), np.array(self.bounds), floor)
+            far = frontier.corners(*self.half_spaces, floor)
             if not len(far):
                 return float("inf")
             worst = self._farthest(np.maximum(far, lower.min(0)), held)

@@ -1,8 +1,9 @@
-"""The best probability of a formula of linear temporal logic on a sparse model, on the host."""
+"""Optimal probability of an LTL formula on a sparse model."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -108,21 +109,16 @@ def sparse_satisfaction(
         raise ValueError(f'label_on={label_on!r}; it must be "entry" or "exit".')
     automaton, letter = automaton_and_letters(model, task)
     states = starting_states(model, states)
-    yes, no = universal_states(automaton), ~live_states(automaton)
-    on_entry = label_on == "entry"
-    product = _product(model, automaton, letter, states, on_entry, yes | no)
-    found, row = _best(product, automaton, letter, yes, no, on_entry, objective, tolerance)
+    reader = _Reader(automaton, letter, label_on == "entry")
+    product = _product(model, reader, states)
+    found, row = _best(product, reader, objective, tolerance)
     return Satisfaction(
         at_states(found, product.start), automaton, letter, product, product.base_row[row]
     )
 
 
 def starting_states(model: Any, states: Any) -> np.ndarray:
-    """Where runs start, ``int64[I]``: the numbers that are given, else the initial states.
-
-    Raises:
-      ValueError: they are no numbers of states.
-    """
+    """The given states ``int64[I]``, else the initial states; ValueError if they are not states."""
     if states is None:
         return np.flatnonzero(np.asarray(model.initial) > 0)
     given = np.asarray(states)
@@ -138,31 +134,45 @@ def starting_states(model: Any, states: Any) -> np.ndarray:
     return given.astype(np.int64)
 
 
+@dataclass(frozen=True)
+class _Reader:
+    """An automaton, the letter of each state ``int[S]``, and whether it is read on entry."""
+
+    automaton: Automaton
+    letter: np.ndarray
+    on_entry: bool
+
+    @cached_property
+    def accepting(self) -> np.ndarray:
+        """The states from which every word is accepted, ``bool[Q]``."""
+        return universal_states(self.automaton)
+
+    @cached_property
+    def rejecting(self) -> np.ndarray:
+        """The states from which no word is accepted, ``bool[Q]``."""
+        return ~live_states(self.automaton)
+
+
 def _best(
     product: SparseProduct,
-    automaton: Automaton,
-    letter: np.ndarray,
-    yes: np.ndarray,
-    no: np.ndarray,
-    on_entry: bool,
+    reader: _Reader,
     objective: str,
     tolerance: float | None,
     depth: int = 0,
 ) -> tuple[Solution, np.ndarray]:
-    """The best probability from all states of a product, and the rows that attain it."""
+    """The optimal probability from all states of a product, and the rows that attain it."""
+    automaton = reader.automaton
     opposite = automaton.acceptance == "safety" or (
         automaton.acceptance in ("buchi", "parity") and objective == "min"
     )
-    goal: Any = (no if opposite else yes)[product.memory]
+    goal: Any = (reader.rejecting if opposite else reader.accepting)[product.memory]
     visiting = None
     if automaton.acceptance in ("buchi", "parity"):
-        entry_letter = product.entry_letter(letter, on_entry)
-        priority = (
-            automaton.priority[product.memory[product.host.state[product.host.row]], entry_letter]
-            + opposite
-        )
-        # What stands still has its verdict, and no end component of its own.
-        priority[product.still[product.host.state[product.host.row]]] = 1
+        entry_letter = product.entry_letter(reader.letter, reader.on_entry)
+        source = product.host.state[product.host.row]
+        priority = automaton.priority[product.memory[source], entry_letter] + opposite
+        # Absorbing states have their verdict, and no end component beside it.
+        priority[product.still[source]] = 1
         visiting = accepting_region(product.host, priority)
         goal = goal | visiting.region
         aim = "max"
@@ -186,20 +196,20 @@ def _best(
 def product_satisfaction(
     model: Product, *, policy: Any = None, objective: str = "max", tolerance: Any = None
 ) -> Solution:
-    """The same from every pair of a state and a memory of a product of a sparse model.
+    """Optimal probability of acceptance on every state of a lazy product of a sparse model.
 
     Args:
       model: a product of a concrete sparse model.
-      policy: rows of the world ``int32[S, Q]``, or their weights ``float[R, Q]``, to be evaluated;
+      policy: rows of the model ``int32[S, Q]``, or their weights ``float[R, Q]``, to be evaluated;
         default: optimise.
       objective: ``"max"`` or ``"min"``; ignored when a policy is given.
       tolerance: of :func:`~jaxltl.core.values.undiscounted.reachability.reachability_probability`.
 
     Returns:
-      :class:`Solution`; `value` is ``float64[S, Q]``, `policy` rows of the world, ``int32[S, Q]``.
+      :class:`Solution`; `value` is ``float64[S, Q]``, `policy` rows of the model, ``int32[S, Q]``.
 
     Raises:
-      ValueError: the product's actions are restricted, or a policy is none.
+      ValueError: the product's actions are restricted, or the policy is invalid.
 
     Concrete arrays only, on the host; not differentiable.
 
@@ -226,17 +236,8 @@ def product_satisfaction(
     if policy is not None:
         chain = _chain(product, model, policy)
         product, depth, objective = product._replace(host=chain.mdp), chain.depth, "max"
-    found, row = _best(
-        product,
-        automaton,
-        letter,
-        universal_states(automaton),
-        ~live_states(automaton),
-        on_entry,
-        objective,
-        tolerance,
-        depth,
-    )
+    reader = _Reader(automaton, letter, on_entry)
+    found, row = _best(product, reader, objective, tolerance, depth)
     parts: dict[str, Any] = {
         name: np.asarray(getattr(found, name)).reshape(shape)
         for name in ("value", "lower", "upper")
@@ -250,7 +251,7 @@ def product_satisfaction(
 
 
 def _chain(product: SparseProduct, model: Product, policy: Any) -> Chain:
-    """The chain of a policy of the world's rows."""
+    """The chain of a policy of the model's rows."""
     policy = np.asarray(policy)
     written = sparse_mdp_of_product(product)
     memory = product.memory[product.host.state]
@@ -265,14 +266,9 @@ def _chain(product: SparseProduct, model: Product, policy: Any) -> Chain:
     return induced_chain(written, written, weight)
 
 
-def _product(
-    model: SparseMDP,
-    automaton: Automaton,
-    letter: np.ndarray,
-    states: np.ndarray,
-    on_entry: bool,
-    still: np.ndarray,
-) -> SparseProduct:
+def _product(model: SparseMDP, reader: _Reader, states: np.ndarray) -> SparseProduct:
+    automaton, letter, on_entry = reader.automaton, reader.letter, reader.on_entry
+    still = reader.accepting | reader.rejecting
     if still.size == 1 and not still.any():
         return product_without_memory(model.host, states)
     initial = np.broadcast_to(automaton.initial, states.shape)
@@ -301,7 +297,7 @@ def automaton_and_letters(model: SparseMDP, task: Task) -> tuple[Automaton, np.n
 
 
 def sparse_mdp_of_product(product: SparseProduct) -> SparseMDP:
-    """A product as a model without labels, that starts where its runs do."""
+    """A product as a model without labels, with its starts as initial states."""
     host = product.host
     initial = np.zeros(host.num_states)
     initial[product.start] = 1

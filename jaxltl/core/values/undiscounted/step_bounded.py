@@ -1,6 +1,6 @@
-"""What can be had in so many steps, or for so much reward: probabilities and expected rewards.
+"""Step-bounded and reward-bounded probabilities and rewards, of concrete models.
 
-All are solved on the host, in double precision, and enclosed with their rounding.
+Solved in double precision; bounds include all rounding.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ TOLERANCE = 1e-6  # half the width of an enclosure up to which it counts as narr
 
 
 def next_probability(model: Any, target: Any, *, objective: str = "max") -> Solution:
-    """Probability that the next state is in a set.
+    """Probability that the next state is in a set: ``opt_a P(target | s, a)``.
 
-    ``max_a P(target | s, a)``, or the minimum (Baier and Katoen 2008, section 10.6.1).
+    (Baier and Katoen 2008, section 10.6.1.)
 
     Args:
       model: a SparseMDP, or any concrete model that :func:`to_sparse` takes.
       target: ``bool[S]``, or the name of a label.
-      objective: ``"max"`` or ``"min"``; of chains either.
+      objective: ``"max"`` or ``"min"``; irrelevant for chains.
 
     Returns:
       :class:`Solution`; `value` is ``float64[S]``, `policy` the row of each state ``int32[S]``.
@@ -70,24 +70,24 @@ def bounded_reachability(
     objective: str = "max",
     by_step: bool = False,
 ) -> Solution:
-    """Probability to reach a set within so many steps, through states where one may stay.
+    """Probability of reaching a set within n steps through states where one may stay.
 
-    ``x_0 = [s in target]``, and ``x_{k+1}(s) = 1`` on the target, ``max_a (P x_k)(s, a)`` where
-    one may stay, else 0 (Baier and Katoen 2008, section 10.1.1).
+    ``x_0 = [s in target]``, and ``x_{k+1}(s) = 1`` in the target, ``opt_a (P x_k)(s, a)`` where one may
+    stay, else 0 (Baier and Katoen 2008, section 10.1.1). Where n is large, what further steps change is
+    bounded, so that they need not be taken.
 
     Args:
       model: a SparseMDP, or any concrete model that :func:`to_sparse` takes.
       target: ``bool[S]``, or the name of a label.
-      num_steps: how many steps there are at most.
-      stay: ``bool[S]`` or a label, what must hold before the target is reached; default anything.
-      objective: ``"max"`` or ``"min"``; of chains either.
-      by_step: give the choices of all steps.
+      num_steps: n.
+      stay: ``bool[S]`` or a label that must hold before the target is reached; default everywhere.
+      objective: ``"max"`` or ``"min"``; irrelevant for chains.
+      by_step: return the choices of all steps.
 
     Returns:
-      :class:`Solution`; `value` is ``float64[S]``, exactly 0 or 1 where the graph says so.
-      `policy` is the first choice, with all steps left, as a row, ``int32[S]``; with `by_step` the
-      choices of all steps, the first step's first, ``int32[n, S]``. `num_steps` is after how many
-      steps nothing changes any more, at most n.
+      :class:`Solution`; `value` is ``float64[S]``, exactly 0 or 1 where the graph decides. `policy` is
+      the first choice, as a row, ``int32[S]``; with `by_step` the choices of all steps, the first
+      step's first, ``int32[n, S]``. `num_steps` is the number of steps that were taken.
 
     Raises:
       ValueError: a shape, the objective, or a negative number of steps.
@@ -110,14 +110,13 @@ def bounded_reachability(
 def cumulative_reward(
     model: Any, reward: Any, num_steps: int, *, objective: str = "max", by_step: bool = False
 ) -> Solution:
-    """Expected reward of the next so many steps.
+    """Expected reward of the next n steps.
 
-    ``x_{k+1}(s) = max_a r(s, a) + (P x_k)(s, a)`` from ``x_0 = 0`` (Puterman 1994, section 4.3).
+    ``x_{k+1}(s) = opt_a r(s, a) + (P x_k)(s, a)`` from ``x_0 = 0`` (Puterman 1994, section 4.3).
 
     Args:
-      model: a SparseMDP, or any concrete model that :func:`to_sparse` takes.
-      reward: as for :func:`~jaxltl.core.models.sparse.choice_reward`; finite.
-      num_steps, objective, by_step: as for :func:`bounded_reachability`.
+      model, num_steps, objective, by_step: as for :func:`bounded_reachability`.
+      reward: as for :func:`~jaxltl.core.models.sparse.row_reward`; finite.
 
     Returns:
       :class:`Solution`, as of :func:`bounded_reachability`.
@@ -143,16 +142,15 @@ def cumulative_reward(
 def instantaneous_reward(
     model: Any, reward: Any, num_step: int, *, objective: str = "max", by_step: bool = False
 ) -> Solution:
-    """Expected reward of the state in which one is after so many steps.
+    """Expected reward of the state after n steps.
 
-    ``x_{k+1}(s) = max_a (P x_k)(s, a)`` from the rewards of states ``x_0 = r``.
+    ``x_{k+1}(s) = opt_a (P x_k)(s, a)`` from the rewards of states ``x_0 = r``.
 
     Args:
-      model: a SparseMDP, or any concrete model that :func:`to_sparse` takes.
-      reward: the name of a reward, a structure, or an array ``[S]``; of a structure what states
-        earn counts alone. None is the only reward that the model has.
-      num_step: after how many steps.
-      objective, by_step: as for :func:`bounded_reachability`.
+      model, objective, by_step: as for :func:`bounded_reachability`.
+      reward: the name of a reward, a structure, or an array ``[S]``; of a structure only the rewards of
+        states count. None is the only reward of the model.
+      num_step: n.
 
     Returns:
       :class:`Solution`, as of :func:`bounded_reachability`.
@@ -185,29 +183,27 @@ def reward_bounded_reachability(
     objective: str = "max",
     by_level: bool = False,
 ) -> Solution:
-    """Probability to reach a set before more than so much reward is earned.
+    """Probability of reaching a set before more than a bound of reward is earned.
 
-    With ``x_l`` for l units left, ``x_l(s) = 1`` on the target, and the least solution of
-    ``x_l(s) = max_a sum_t P(t | s, a) x_{l - c(s, a, t)}(t)`` elsewhere, zero below level 0
-    (Andova, Hermanns and Katoen 2003). What is earned in the target does not count.
+    With l units left, ``x_l(s) = 1`` in the target, and the least solution of
+    ``x_l(s) = opt_a sum_t P(t | s, a) x_{l - c(s, a, t)}(t)`` elsewhere, zero below level 0 (Andova,
+    Hermanns and Katoen 2003). Rewards in the target do not count.
 
     Args:
-      model: a SparseMDP, or any concrete model that :func:`to_sparse` takes.
-      target: ``bool[S]``, or the name of a label.
-      reward: as for :func:`~jaxltl.core.models.sparse.choice_reward`, not negative, multiples of one
+      model, target, stay, objective: as for :func:`bounded_reachability`.
+      reward: as for :func:`~jaxltl.core.models.sparse.row_reward`, not negative, multiples of one
         unit; numbers are read as the simplest fractions that round to them.
-      bound: what may be earned at most.
-      stay, objective: as for :func:`bounded_reachability`.
-      by_level: give the choices for all amounts left.
+      bound: the largest reward.
+      by_level: return the choices for all amounts left.
 
     Returns:
       :class:`Solution`; `value` is ``float64[S]``. `policy` is the first choice, ``int32[S]``; with
-      `by_level`, row l are the choices with l units left, ``int32[L + 1, S]``. `num_steps` is
-      the number of levels, L + 1.
+      `by_level`, row l has the choices with l units left, ``int32[L + 1, S]``. `num_steps` is the
+      number of levels, L + 1.
 
     Raises:
-      ValueError: a shape, the objective, a reward that is negative, or has no unit in common with
-        the others of which the bound has at most 10^7.
+      ValueError: a shape, the objective, a negative reward, or rewards without a common unit of which
+        the bound has at most 10^7.
 
     Concrete arrays only, on the host; not differentiable.
 
@@ -244,18 +240,14 @@ def _problem(model: Any, objective: str, num_steps: int = 0) -> tuple[SparseMDP,
 
 
 def reduction_for(objective: str) -> Any:
-    """``np.maximum`` or ``np.minimum``.
-
-    Raises:
-      ValueError: it is neither "max" nor "min".
-    """
+    """``np.maximum`` or ``np.minimum``; ValueError if the objective is neither "max" nor "min"."""
     if not isinstance(objective, str) or objective not in ("max", "min"):
         raise ValueError(f'objective={validation.shorten(objective)}; it must be "max" or "min".')
     return np.maximum if objective == "max" else np.minimum
 
 
 def state_mask(model: SparseMDP, given: Any, name: str) -> np.ndarray:
-    """A set of states as ``bool[S]``, given so (in the model's shape) or by a label."""
+    """A set of states as ``bool[S]``, from one in the model's shape or a label."""
     if isinstance(given, str):
         return np.asarray(model.states_with_label(given), bool)
     given = np.asarray(given).reshape(-1)
@@ -268,11 +260,7 @@ def state_mask(model: SparseMDP, given: Any, name: str) -> np.ndarray:
 
 
 def state_reward(model: SparseMDP, reward: Any) -> np.ndarray:
-    """What states earn, ``float64[S]``.
-
-    Raises:
-      ValueError: nothing of the reward is on states, or some is not finite.
-    """
+    """The rewards of states, ``float64[S]``; ValueError without any, or if some are not finite."""
     given = reward_structure(model, reward)
     if given.state is None:
         raise ValueError(
@@ -283,11 +271,7 @@ def state_reward(model: SparseMDP, reward: Any) -> np.ndarray:
 
 
 def finite_reward(model: SparseMDP, reward: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Expected rewards of choices, and the same of absolute values: ``float64[R]`` each.
-
-    Raises:
-      ValueError: some reward is not finite.
-    """
+    """Expected rewards of rows, and those of absolute values: ``float64[R]``; ValueError if not finite."""
     given = reward_structure(model, reward)
     earned = choice_reward(model, given)
     if not np.isfinite(earned).all():
@@ -314,7 +298,7 @@ def finite_reward(model: SparseMDP, reward: Any) -> tuple[np.ndarray, np.ndarray
 
 
 def _entry_reward(model: SparseMDP, given: Rewards) -> np.ndarray:
-    """What each entry earns, ``float64[T]``."""
+    """The reward of each entry, ``float64[T]``."""
     mdp = model.host
     found = np.zeros(mdp.num_transitions)
     if given.transition is not None:
@@ -343,17 +327,17 @@ def solution_from_error(
     least: float = 1.0,
     residual: float = 0.0,
 ) -> Solution:
-    """A host solver's :class:`Solution`.
+    """A :class:`Solution` from a value and its error.
 
     Args:
       value: ``float64[S]``.
-      error: how far it may be off, of any shape that goes with it.
+      error: broadcastable to it.
       policy: rows.
-      num_steps: what was spent.
+      num_steps: steps taken.
       highest: 1 for probabilities.
-      tolerance: the error up to which it has converged, as a share of the value.
-      least: or of this, where that is more.
-      residual: what the solution says.
+      tolerance: the error up to which it has converged, relative to the value,
+      least: or to this, if that is larger.
+      residual: of the solution.
     """
     error = np.broadcast_to(np.asarray(error, np.float64), value.shape)
     out = error > 0
