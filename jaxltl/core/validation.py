@@ -322,3 +322,9 @@ def unsupported_model(model: Any) -> str:
         f"{name} has no transitions; give an MDP, a DenseMDP, a SparseMDP, or a product of one of "
         "them."
     )
+
+
+def keywords(function: str, given: Iterable[str], options: type) -> None:
+    """Raises TypeError, as Python does, for a keyword that a TypedDict of options lacks."""
+    if unknown := sorted(set(given) - set(options.__annotations__)):
+        raise TypeError(f"{function}() got an unexpected keyword argument {unknown[0]!r}")

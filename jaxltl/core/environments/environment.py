@@ -269,8 +269,7 @@ def make_environment(
       >>> corridor.actions.num, corridor.observations.shape
       (2, (1,))
     """
-    if unknown := sorted(set(options) - set(EnvironmentOptions.__annotations__)):
-        raise TypeError(f"make_environment() got an unexpected keyword argument {unknown[0]!r}")
+    validation.keywords("make_environment", options, EnvironmentOptions)
     names = validation.distinct_names("propositions", options.get("propositions", ()))
     horizon, observations = options.get("horizon"), options.get("observations")
     if horizon is not None:
@@ -287,8 +286,11 @@ def make_environment(
         if names:
             raise ValueError(f"propositions={list(names)}, but no labels; give both or neither.")
         functions["labels"] = Partial(no_labels)
+    parts: dict[str, Any] = {
+        name: None if f is None else as_partial(f, name) for name, f in functions.items()
+    }
     made = Environment(
-        **{n: None if f is None else as_partial(f, n) for n, f in functions.items()},
+        **parts,
         actions=actions,
         observations=observations,
         propositions=names,

@@ -1,10 +1,9 @@
-"""Temporal logic on finite trajectories, as objectives and constraints of a search.
+"""Temporal logic on finite trajectories, for objectives and constraints of black-box optimisation.
 
-A trajectory of N states says of a formula what all its continuations agree on: it is satisfied,
-violated, or not decided yet (see ``monitor``). The shares of the three among sampled
-trajectories are numbers to maximise or to bound: reaching a goal while avoiding an obstacle with
-probability .9 is ``-shares.satisfied <= -.9``, and leaving a corridor at most once in a hundred
-times is ``shares.violated <= .01``.
+A finite trajectory satisfies a formula, violates it, or leaves it undecided (see ``monitor``). The
+frequencies of the three verdicts among sampled trajectories are maximised or bounded: reaching a
+goal with probability .9 is ``-frequencies.satisfied <= -.9``, and leaving a corridor with
+probability at most .01 is ``frequencies.violated <= .01``.
 """
 
 from __future__ import annotations
@@ -29,14 +28,14 @@ from jaxltl.core.pretty_print import brief
 @brief
 @struct.dataclass
 class FiniteTask:
-    """A formula to be read on rows of labels; made by :func:`make_finite_task`.
+    """A formula over the columns of a label matrix; see :func:`make_finite_task`.
 
     Attributes:
-      monitor: of the formula.
-      letter: ``int32[2^n]``, the monitor's letter in which exactly the propositions of a binary
-        number hold; bit i is that of the i-th of `columns`.
-      columns: where the formula's n propositions are in a row of labels; static.
-      num_columns: P, the length of a row; static.
+      monitor: the runtime monitor of the formula.
+      letter: ``int32[2^n]``, the monitor's letter for each subset of the formula's propositions, as a
+        binary number; bit i is the i-th of `columns`.
+      columns: the columns of the formula's n propositions; static.
+      num_columns: P, the number of columns; static.
 
     Example:
       >>> task = make_finite_task("!wet U dry", ["wet", "dry"])
@@ -52,14 +51,14 @@ class FiniteTask:
 
 @brief
 class VerdictFrequencies(NamedTuple):
-    """What part of some trajectories satisfies, violates or leaves undecided; the sum is 1.
+    """Frequencies of the verdicts among trajectories; their sum is 1.
 
     Attributes:
       satisfied, violated, undecided: ``float[...]``.
 
     Example:
-      >>> shares = VerdictFrequencies(satisfied=0.5, violated=0.25, undecided=0.25)
-      >>> shares.satisfied + shares.undecided  # at most that many satisfy it in the end
+      >>> found = VerdictFrequencies(satisfied=0.5, violated=0.25, undecided=0.25)
+      >>> found.satisfied + found.undecided  # an upper bound on eventual satisfaction
       0.75
     """
 
@@ -114,14 +113,6 @@ def finite_verdicts(
 ) -> jax.Array:
     """The verdict of each trajectory at its end.
 
-    Args:
-      task: from :func:`make_finite_task`.
-      label: ``bool[..., T, P]``, what holds in each state, the first included.
-      length: ``int[...]``, how many states of each trajectory count; default all.
-
-    Returns:
-      ``int32[...]``, of :class:`~jaxltl.core.environments.monitor.Verdict`. Under ``jit`` and ``vmap``.
-
     Raises:
       ValueError: labels that are not Boolean, or have not P columns.
 
@@ -147,14 +138,7 @@ def finite_verdicts(
 def verdict_frequencies(
     verdict: chex.Array, axis: int | tuple[int, ...] | None = -1
 ) -> VerdictFrequencies:
-    """The shares of the three verdicts among trajectories.
-
-    Args:
-      verdict: ``int[..., M]``, from :func:`finite_verdicts`.
-      axis: of the trajectories.
-
-    Returns:
-      Arrays ``float[...]``.
+    """Frequencies of the three verdicts among trajectories, along an axis.
 
     Example:
       >>> [float(x) for x in verdict_frequencies(jnp.array([1, 1, 0, 2]))]

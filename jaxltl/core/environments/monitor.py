@@ -1,10 +1,9 @@
-"""Verdicts on finite traces: satisfied, violated, or not decided yet, and never a guess.
+"""Three-valued verdicts on finite traces: satisfied, violated or undecided.
 
-Linear temporal logic speaks of infinite words. What a finite trace decides is what all its
-continuations agree on (Bauer, Leucker & Schallhart 2011, "Runtime verification for LTL and
-TLTL"). A world that terminates is modelled by an absorbing last state, whose letter repeats
-for ever; then `accepts_lasso` decides its trace. A trace that was merely cut off stays undecided:
-an unmet "eventually" is no violation, and an "always" kept so far is not satisfied.
+A verdict is decided if all infinite continuations agree (Bauer, Leucker & Schallhart 2011, "Runtime
+verification for LTL and TLTL"). A terminal state is an absorbing state whose letter repeats for
+ever, so that `accepts_lasso` decides its trace. A truncated trace stays undecided: an unmet
+"eventually" is not violated, and an "always" is not satisfied.
 """
 
 from __future__ import annotations
@@ -27,15 +26,15 @@ from jaxltl.core.pretty_print import brief
 
 
 class Verdict(enum.IntEnum):
-    """What a finite word says of its infinite continuations.
+    """The verdict of a finite word on its infinite continuations.
 
     - ``UNDECIDED``: some are accepted, and some are not.
-    - ``SATISFIED``: every one is accepted.
-    - ``VIOLATED``: none is.
+    - ``SATISFIED``: all are accepted.
+    - ``VIOLATED``: none is accepted.
 
     Example:
       >>> import jaxltl as jl
-      >>> jl.environments.verdict(jl.to_automaton("G a"), [{"a"}, set()]).name
+      >>> jl.environments.verdict(jl.automata.to_automaton("G a"), [{"a"}, set()]).name
       'VIOLATED'
     """
 
@@ -47,12 +46,11 @@ class Verdict(enum.IntEnum):
 @brief(facts=partial(facts.monitor, codes=Verdict))
 @struct.dataclass
 class Monitor:
-    """An automaton that tells its verdict in every state.
+    """A runtime monitor: an automaton with a verdict in each state.
 
     Attributes:
-      delta: ``int32[Q, L]``, the state after reading a letter. Letters are indices into the
-        automaton's, such as ``Product.letter`` holds for each state of a world.
-      initial: ``int32``, the state before anything is read.
+      delta: ``int32[Q, L]``, the successor state by letter number, as in ``Product.letter``.
+      initial: ``int32``, the state before the first letter.
       verdict: ``int32[Q]``, the :class:`Verdict` in each state.
 
     Example:
@@ -91,7 +89,7 @@ def verdict(automaton: Automaton, word: Iterable[Letter]) -> Verdict:
 
 
 def verdicts(automaton: Automaton) -> np.ndarray:
-    """``int32[Q]``: the verdict in each state of an automaton, on the host."""
+    """``int32[Q]``: the verdict in each state of an automaton."""
     table = np.full(len(automaton.delta), Verdict.UNDECIDED, np.int32)
     table[universal_states(automaton)] = Verdict.SATISFIED
     table[~live_states(automaton)] = Verdict.VIOLATED
@@ -99,10 +97,9 @@ def verdicts(automaton: Automaton) -> np.ndarray:
 
 
 def lasso_verdicts(automaton: Automaton) -> np.ndarray:
-    """``int32[Q, L]``: the verdict on a word that led to a state, if one letter repeats for ever.
+    """``int32[Q, L]``: the verdict on a word that leads to a state and then repeats one letter for ever.
 
-    Of a world that terminates: the state after its last label, and the letter of that label. It is
-    never undecided. On the host.
+    For terminal states: the automaton state after the last label, and its letter. Never undecided.
 
     Example:
       >>> from jaxltl import to_automaton
@@ -258,7 +255,7 @@ def _check_shape(letters: jax.Array, length: jax.Array) -> None:
 def _check_range(
     monitor: Monitor, letters: jax.Array, length: jax.Array, counts: jax.Array
 ) -> None:
-    """Refuses what does not exist, which indexing would silently clip to what does."""
+    """Raises ValueError for letters and lengths out of range, which indexing would clip."""
     traced = (jax.core.Tracer,)
     if any(isinstance(x, traced) for x in (monitor.delta, letters, length, counts)):
         return

@@ -1,8 +1,8 @@
-"""Worlds in which a drawn sequence of what to reach and what to avoid is the task.
+"""Environments with random sequences of reach-avoid subtasks, for zero-shot generalisation.
 
-Who can follow any such sequence can do any formula: its automaton tells which sequences lead to
-acceptance (see ``core/automata/sequences.py``). So an agent is trained on sequences that are drawn
-anew with each episode, and does formulas that it never saw.
+A policy that follows all such sequences satisfies any formula, whose automaton gives the sequences
+that lead to acceptance (see ``core/automata/sequences.py``). Training draws a new sequence for each
+episode.
 """
 
 from __future__ import annotations
@@ -28,17 +28,18 @@ from jaxltl.core.environments.environment import (
     require_environment,
 )
 from jaxltl.core.environments.monitor import Verdict
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.pretty_print import brief
 
 
 @brief
 class Sequence(NamedTuple):
-    """What to do, step after step; rows from `length` on are False.
+    """A sequence of reach-avoid steps; rows from `length` on are False.
 
     Attributes:
-      reach: ``bool[D, E]``, of which events a step asks for one.
-      avoid: ``bool[D, E]``, those that must not happen before it.
-      length: ``int32[]``, the number of steps; more than D where later ones are not told.
+      reach: ``bool[D, E]``, the events that complete each step.
+      avoid: ``bool[D, E]``, the events that must not occur before.
+      length: ``int32[]``, the number of steps; above D if later steps are hidden.
     """
 
     reach: jax.Array
@@ -49,18 +50,19 @@ class Sequence(NamedTuple):
 @brief
 @struct.dataclass
 class SequenceSampler:
-    """A distribution of sequences; made by :func:`sequence_sampler`. Its numbers are traced.
+    """A distribution of sequences, with traced weights; see :func:`sequence_sampler`.
 
     Attributes:
-      length: ``float[D]``, how often there are 1 to D steps.
-      reach: ``float[N]``, how often a step asks for one of 1 to N sets of events.
-      avoid: ``float[N]``, how often 0 to N - 1 sets are to be avoided.
-      sets: ``bool[G, E]``, the sets of events that are drawn.
+      length: ``float[D]``, weights of 1 to D steps.
+      reach: ``float[N]``, weights of 1 to N sets of events to reach in a step.
+      avoid: ``float[N]``, weights of 0 to N - 1 sets to avoid.
+      sets: ``bool[G, E]``, the sets of events.
 
     Example:
-      >>> import jaxltl as jl
-      >>> events = jl.environments.make_events(["a", "b"])
-      >>> sampler = jl.environments.sequence_sampler([1, 1], [1], [1, 1], jl.environments.proposition_sets(events))
+      >>> from jaxltl import environments
+      >>> events = environments.make_events(["a", "b"])
+      >>> sets = environments.proposition_sets(events)
+      >>> sampler = environments.sequence_sampler([1, 1], [1], [1, 1], sets)
       >>> sampler.sets.shape, sampler.length.tolist()
       ((2, 3), [1.0, 1.0])
     """
@@ -73,16 +75,16 @@ class SequenceSampler:
 
 @brief(codes={"verdict": Verdict})
 class SequenceWorld(NamedTuple):
-    """A world and how far its sequence has come.
+    """A state of an environment with its sequence and the progress on it.
 
     Attributes:
-      world: the inner one.
-      sequence: what was asked for.
-      stage: ``int32[]``, the steps that are done.
-      verdict: ``int32[]``, a :class:`~jaxltl.environments.Verdict`.
+      world: the environment's state.
+      sequence: the sequence of the episode.
+      stage: ``int32[]``, the number of completed steps.
+      verdict: ``int32[]``, a :class:`~jaxltl.core.environments.monitor.Verdict`.
     """
 
-    world: Any
+    world: PyTree
     sequence: Sequence
     stage: jax.Array
     verdict: jax.Array
@@ -90,24 +92,24 @@ class SequenceWorld(NamedTuple):
 
 @brief
 class SequenceObservation(NamedTuple):
-    """What an agent sees of the world, and what it still has to do, the next step first."""
+    """An observation of the environment, and the remaining sequence."""
 
-    world: Any
+    world: PyTree
     sequence: Sequence
 
 
 def make_events(propositions: Ordered[str], at_most: int = 1) -> np.ndarray:
-    """The labels in which at most so many propositions hold, first that of none.
+    """The labels with at most `at_most` propositions, starting with the empty one.
 
     Args:
       propositions: the P names.
-      at_most: how many may hold at once.
+      at_most: the most propositions that hold at once.
 
     Returns:
       ``bool[E, P]``, NumPy's.
 
     Raises:
-      ValueError: a name twice, or a number below 0.
+      ValueError: a repeated name, or a negative number.
 
     Example:
       >>> make_events(["a", "b"]).astype(int).tolist()
@@ -123,17 +125,12 @@ def make_events(propositions: Ordered[str], at_most: int = 1) -> np.ndarray:
 
 
 def nearest_event(events: chex.Array, label: chex.Array) -> jax.Array:
-    """``int32[]``: which event a label is; of labels that are none, the one most like it.
-
-    Args:
-      events: ``bool[E, P]``.
-      label: ``bool[P]``.
-    """
+    """``int32[]``: the event with the least Hamming distance to a label."""
     return jnp.argmin((events != label).sum(-1)).astype(jnp.int32)
 
 
 def proposition_sets(events: ArrayLike) -> np.ndarray:
-    """For each proposition the events in which it holds, to be drawn as sets.
+    """For each proposition, the set of the events in which it holds.
 
     Args:
       events: ``bool[E, P]``, as of :func:`make_events`.
@@ -155,15 +152,13 @@ def sequence_sampler(
 
     Args:
       length, reach, avoid: see :class:`SequenceSampler`.
-      sets: ``bool[G, E]``, as of :func:`proposition_sets`; or ``bool[E]``, the events that are
-        drawn one by one.
+      sets: ``bool[G, E]``, as of :func:`proposition_sets`; or ``bool[E]``, for sets of one event.
 
     Returns:
       :class:`SequenceSampler`.
 
     Raises:
-      ValueError: weights that are negative or all zero, an empty set, or more sets a step than
-        there are.
+      ValueError: negative or zero weights, an empty set, or more sets in a step than there are.
 
     Example:
       >>> sampler = sequence_sampler([1, 1], [1], [1, 1], [False, True, True, True])
@@ -206,11 +201,10 @@ def _booleans(table: ArrayLike) -> np.ndarray:
 
 
 def draw_sequence(key: chex.PRNGKey, sampler: SequenceSampler) -> Sequence:
-    """A sequence: for each step some sets to reach and others to avoid, without repetition.
+    """A random sequence: disjoint sets to reach and to avoid in each step.
 
-    Of the sets to avoid the events that are to be reached are taken out, as automata do. A set is
-    left out if any of its events may have ended the step before: who has just done that step could
-    not help it.
+    Events to reach are removed from the sets to avoid, as in automata. A set with an event that may
+    have completed the step before is not drawn: avoiding it would be impossible.
     """
     keys = jax.random.split(key, 4)
     depth, count = sampler.length.shape[0], sampler.sets.shape[0]
@@ -238,21 +232,20 @@ def sequence_environment(
     violation: float = -1.0,
     progress: float = 0.0,
 ) -> Environment:
-    """A world in which each episode's task is a sequence that is drawn at its start.
+    """An environment whose task is a random sequence, drawn at the start of each episode.
 
-    The event of the first world is read at once, then that of each world that is entered. One of
-    the step's events to reach makes the next step the current one; one to avoid ends the episode,
-    as does the last step's. With T steps in all, the rewards are 1 for doing all, `violation`, and
-    ``progress / T`` for each step that is done.
+    The event of each state is read, that of the initial state included. An event to reach completes
+    the step, and an event to avoid ends the episode, as does the last step. With T steps in all, the
+    rewards are 1 for completing all, `violation`, and ``progress / T`` for each completed step.
 
     Args:
-      environment: the inner world, whose rewards do not count.
+      environment: the environment, whose rewards are replaced.
       events: ``bool[E, P]``, the labels that occur, as of :func:`make_events`.
-      sampler: of sequences over these events.
+      sampler: the distribution of sequences over these events.
       violation, progress: rewards.
 
     Returns:
-      An :class:`~jaxltl.core.environments.environment.Environment` of worlds :class:`SequenceWorld` and
+      :class:`~jaxltl.core.environments.environment.Environment` with states :class:`SequenceWorld` and
       observations :class:`SequenceObservation`.
 
     Raises:
@@ -260,8 +253,8 @@ def sequence_environment(
 
     Example:
       >>> import jaxltl as jl
-      >>> coin = jl.make_environment(
-      ...     lambda key: jnp.int32(0), lambda world, action, key: jl.environments.Timestep(action, 0.0, False),
+      >>> coin = jl.environments.make_environment(
+      ...     lambda key: jnp.int32(0), lambda world, action, key: Timestep(action, 0.0, False),
       ...     lambda world: world[None], actions=2,
       ...     labels=lambda world: world == jnp.array([1]), propositions=["a"])
       >>> events = make_events(["a"])
@@ -308,7 +301,7 @@ def sequence_environment(
 
 
 def remaining(sequence: Sequence, index: chex.Numeric) -> Sequence:
-    """What is left of a sequence when `index` steps are done, the next one first."""
+    """The sequence after `index` completed steps."""
     depth = sequence.reach.shape[-2]
     row = jnp.arange(depth) + index
     kept, row = (row < depth)[:, None], jnp.minimum(row, depth - 1)
@@ -316,9 +309,9 @@ def remaining(sequence: Sequence, index: chex.Numeric) -> Sequence:
 
 
 def _read(
-    inner: Environment, events: jax.Array, world: Any, sequence: Sequence, index: jax.Array
+    inner: Environment, events: jax.Array, world: PyTree, sequence: Sequence, index: jax.Array
 ) -> SequenceWorld:
-    """A world, once its event is read."""
+    """A state after reading the event of its label."""
     event = nearest_event(events, inner.labels(world))
     wanted, shunned = sequence.reach[index, event], sequence.avoid[index, event]
     after = index + wanted

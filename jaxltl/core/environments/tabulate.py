@@ -1,4 +1,4 @@
-"""Simulated worlds that are finite, listed as models that the exact solvers take."""
+"""Tabulation: the reachable states of a simulated environment as a sparse MDP."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import numpy as np
 from flax import struct
 
 from jaxltl.core import validation
+from jaxltl.core.environments.dependence import marked_results, reads_key
 from jaxltl.core.environments.environment import (
     Environment,
     Finite,
@@ -23,6 +24,7 @@ from jaxltl.core.environments.environment import (
 )
 from jaxltl.core.environments.time_limit import without_time_limit
 from jaxltl.core.models import facts
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.rows import offsets_from_counts
@@ -35,24 +37,23 @@ _LIVE, _TERMINATED, _TRUNCATED = range(3)
 @brief(facts=facts.table)
 @struct.dataclass
 class Table:
-    """A world that was listed by :func:`tabulate`.
+    """A tabulated environment; see :func:`tabulate`.
 
     Attributes:
-      model: S states, one for each world that is reached; of a world in which an episode may end or
-        not, one for each. What has ended is absorbing. Row actions are the environment's, and the
-        rewards ``"reward"`` and ``"cost"`` its own; its discounts are left out.
-      world: which world each state is, a tree with a first axis of S.
-      start: ``int32[N]``, the states of the worlds from which the listing began.
-      terminated, truncated: ``bool[S]``, where an episode is over, and where it was cut off. The
-        model is absorbing in the latter too, though more would come: ask it for what happens
-        before, as :func:`~jaxltl.core.values.evaluation.optimality_gap.optimality_gap` does.
-      num_steps: the limit of :func:`~jaxltl.core.environments.time_limit.with_time_limit`, which is no
-        part of the states; None: there is none; static.
-      evidence: why the probabilities are the environment's; static. ``"keyless"``: nothing depends
-        on a key, read off the program; ``"told"``: by its `starts` and `outcomes`, which agreed
-        with what was drawn; ``"keys"``: all keys that were tried led to the same; ``"distinct"``:
-        the caller says so, as the program does not rule out that something depends on what
-        `distinct` leaves out. Where several hold, the last of them in this order.
+      model: one state for each reachable state of the environment and each way in which the episode
+        continues or ends there; ended states are absorbing. Row actions are the environment's, and the
+        rewards ``"reward"`` and ``"cost"`` its own; discounts are left out.
+      world: the environment's states, a tree with a leading axis of S.
+      start: ``int32[N]``, the initial states.
+      terminated, truncated: ``bool[S]``, the absorbing states. Truncated states would continue:
+        properties hold for the time before truncation, as in
+        :func:`~jaxltl.core.values.evaluation.optimality_gap.optimality_gap`.
+      num_steps: the limit of :func:`~jaxltl.core.environments.time_limit.with_time_limit`, which is not
+        part of the states, or None; static.
+      evidence: the justification of the probabilities; static. ``"keyless"``: the program does not
+        read the key; ``"told"``: `starts` and `outcomes`, which agreed with samples; ``"keys"``: all
+        sampled keys gave the same result; ``"distinct"``: the caller's claim about `distinct`, which the
+        program does not imply. The weakest, in this order, of all parts.
 
     Example:
       >>> over = Table(
@@ -63,7 +64,7 @@ class Table:
     """
 
     model: SparseMDP
-    world: Any
+    world: PyTree
     start: Any
     terminated: Any
     truncated: Any
@@ -74,42 +75,40 @@ class Table:
 def tabulate(
     environment: Environment,
     *,
-    worlds: Any = None,
+    worlds: PyTree = None,
     max_states: int = 100_000,
     num_keys: int = 4,
     key: chex.PRNGKey | None = None,
     distinct: Callable[[Any], Any] | None = None,
 ) -> Table:
-    """All worlds that are reached, and how likely each follows from each: a model.
+    """The reachable states of an environment and their transition probabilities, as a model.
 
-    A breadth-first search, whose steps are a vmapped program over batches of worlds. Two worlds are
-    one if all of their bytes agree. A time limit is taken off and told (`num_steps`), so that time
-    is no part of the states. Where chance has a part, the environment must tell it by its fields
-    `starts` and `outcomes`; otherwise its functions must be of one outcome. That is known if no
-    result depends on the key; else several keys are tried, and what differs is refused. (A
-    difference that is rare enough is then not seen: `evidence` of the table says which it was.)
+    Breadth-first search by a vmapped program on batches of states; states are equal if their bytes
+    are. A time limit is removed and reported as `num_steps`, so that time is not part of the states.
+    A random environment gives its distributions as `starts` and `outcomes`; any other must be
+    deterministic, which is proven if no result depends on the key, and otherwise tested with several
+    keys. (The test misses rare differences: `evidence` of the table reports it.)
 
     Args:
       environment: with finitely many actions.
-      worlds: what to begin from instead, equally likely: a tree with a first axis, such as
-        ``vmap(environment.reset)(keys)``. Worlds that stay apart, like those on different maps,
-        are listed side by side in one model.
-      max_states: how many states there may be.
-      num_keys: how many keys are tried.
-      key: of the keys; default ``jax.random.key(0)``.
-      distinct: ``world -> tree``, what tells worlds apart; default everything. Leave out only what
-        has no part in what follows, like a counter, or a key from which nothing is drawn. The rest
-        as it is, and the program shows that; else it is your word, and `evidence` says so.
+      worlds: initial states, equally likely, instead of those of `reset`: a tree with a leading axis,
+        such as ``vmap(environment.reset)(keys)``. Different maps are tabulated side by side.
+      max_states: an upper bound on the number of states.
+      num_keys: the number of keys for the test.
+      key: of these keys; default ``jax.random.key(0)``.
+      distinct: ``world -> tree``, the part of a state that distinguishes it; default: all of it. It may
+        leave out parts without influence on later steps, such as counters or unused keys; `evidence`
+        is ``"distinct"`` if the program does not show that.
 
     Returns:
       :class:`Table`.
 
     Raises:
-      ValueError: a box of actions, a reset or a step that is random and not told, or told
-        otherwise than it is drawn, more states than `max_states`, or a world without any action.
+      ValueError: a box of actions, an undeclared random reset or step, distributions that disagree with
+        samples, more than `max_states` states, or a state without an available action.
 
     Example:
-      >>> from jaxltl import make_environment
+      >>> from jaxltl.core.environments.environment import make_environment
       >>> def step(place, action, key):
       ...     place = jnp.clip(place + 2 * action - 1, 0, 4)
       ...     return Timestep(place, reward=1.0, terminated=place == 4)
@@ -155,12 +154,12 @@ def tabulate(
     )
 
 
-def _itself(world: Any) -> Any:
+def _itself(world: PyTree) -> Any:
     return world
 
 
 class _Kind(NamedTuple):
-    """What is listed: the environment, what tells its worlds apart, keys to try, and a world."""
+    """The environment, the distinguishing part of its states, test keys, and an example state."""
 
     environment: Environment
     distinct: Callable[[Any], Any]
@@ -177,26 +176,24 @@ def _is_key(x: Any) -> bool:
     )
 
 
-def _plain(world: Any) -> Any:
-    """The same with keys as numbers, so that the host can hold it."""
+def _plain(world: PyTree) -> Any:
+    """The state with keys as integers, for NumPy."""
     return jax.tree.map(lambda x: jax.random.key_data(x) if _is_key(x) else jnp.asarray(x), world)
 
 
-def _typed(kind: _Kind, plain: Any) -> Any:
-    """What :func:`_plain` was made of."""
+def _typed(kind: _Kind, plain: PyTree) -> Any:
+    """The inverse of :func:`_plain`."""
 
     def back(x: Any, y: Any) -> Any:
-        return (
-            jax.random.wrap_key_data(jnp.asarray(x), impl=jax.random.key_impl(y))
-            if (_is_key(y))
-            else x
-        )
+        if not _is_key(y):
+            return x
+        return jax.random.wrap_key_data(jnp.asarray(x), impl=jax.random.key_impl(y))
 
     return jax.tree.map(back, plain, kind.like)
 
 
-def _bytes(world: Any) -> jax.Array:
-    """``uint8[W]``, the same for worlds whose numbers are equal."""
+def _bytes(world: PyTree) -> jax.Array:
+    """``uint8[W]``, equal for equal states."""
 
     def of(x: Any) -> jax.Array:
         if jnp.issubdtype(x.dtype, jnp.inexact):
@@ -212,7 +209,7 @@ def _bytes(world: Any) -> jax.Array:
 
 
 def _rows(table: np.ndarray) -> np.ndarray:
-    """Rows of bytes as single values that can be compared."""
+    """Rows of bytes as single comparable values."""
     table = np.ascontiguousarray(table)
     return table.view(np.dtype((np.void, table.shape[-1])))[..., 0]
 
@@ -220,8 +217,8 @@ def _rows(table: np.ndarray) -> np.ndarray:
 # --- where it begins ------------------------------------------------------------------------------
 
 
-def _begin(kind: _Kind, environment: Environment, worlds: Any) -> tuple[Any, np.ndarray, str]:
-    """The worlds to begin from, the probability of each, and why it is so."""
+def _begin(kind: _Kind, environment: Environment, worlds: PyTree) -> tuple[Any, np.ndarray, str]:
+    """Initial states, their probabilities, and the evidence."""
     inner = kind.environment
     shape = jax.eval_shape(inner.reset, kind.keys[0])
     if worlds is not None:
@@ -266,17 +263,17 @@ def _resets(kind: _Kind) -> Any:
     return jax.vmap(lambda key: _plain(kind.environment.reset(key)))(kind.keys)
 
 
-def _seen(kind: _Kind, world: Any) -> jax.Array:
+def _seen(kind: _Kind, world: PyTree) -> jax.Array:
     return _bytes(kind.distinct(world))
 
 
 @jax.jit
-def _codes(kind: _Kind, plain: Any) -> jax.Array:
+def _codes(kind: _Kind, plain: PyTree) -> jax.Array:
     return jax.vmap(lambda x: _seen(kind, _typed(kind, x)))(plain)
 
 
-def _told_apart(kind: _Kind, plain: Any) -> np.ndarray:
-    """``uint8[N, W]``, the bytes of worlds."""
+def _told_apart(kind: _Kind, plain: PyTree) -> np.ndarray:
+    """``uint8[N, W]``, the distinguishing bytes of states."""
     plain = jax.tree.map(np.asarray, plain)
     count = len(jax.tree.leaves(plain)[0])
     return np.concatenate(
@@ -284,7 +281,7 @@ def _told_apart(kind: _Kind, plain: Any) -> np.ndarray:
     )
 
 
-def _fits(worlds: Any, shape: Any) -> bool:
+def _fits(worlds: PyTree, shape: Any) -> bool:
     same: Any = jax.tree.structure(shape)
     return same == jax.tree.structure(worlds) and all(
         np.shape(x)[1:] == y.shape and _same_type(x, y)
@@ -293,7 +290,7 @@ def _fits(worlds: Any, shape: Any) -> bool:
 
 
 def _same_type(x: Any, like: Any) -> bool:
-    """In single precision also of NumPy's numbers of double precision."""
+    """True also for NumPy's double-precision numbers in single precision."""
     kind = getattr(x, "dtype", None)
     return kind == like.dtype or (
         isinstance(kind, np.dtype)
@@ -302,7 +299,7 @@ def _same_type(x: Any, like: Any) -> bool:
     )
 
 
-def _count(name: str, worlds: Any, shape: Any) -> int:
+def _count(name: str, worlds: PyTree, shape: Any) -> int:
     lengths = {np.shape(x)[:1] for x in jax.tree.leaves(worlds)}
     if not _fits(worlds, shape) or len(lengths) != 1 or lengths & {(), (0,)}:
         raise ValueError(
@@ -312,43 +309,11 @@ def _count(name: str, worlds: Any, shape: Any) -> int:
     return int(lengths.pop()[0])
 
 
-def reads_key(function: Callable[..., Any], *arguments: Any) -> bool:
-    """Whether any result may depend on the last argument, by the function's program.
-
-    False is a proof; what calls of other compiled programs do is looked into.
-
-    Example:
-      >>> reads_key(lambda x, key: x + 1, 0.0, jax.random.key(0))
-      False
-      >>> reads_key(lambda x, key: x + jax.random.normal(key), 0.0, jax.random.key(0))
-      True
-    """
-    program = jax.make_jaxpr(function)(*arguments).jaxpr
-    count = len(jax.tree.leaves(arguments[-1]))
-    marked = [False] * (len(program.invars) - count) + [True] * count
-    return any(_marked(program, marked))
-
-
-def _marked(program: Any, given: list[bool]) -> list[bool]:
-    """Which results depend on the arguments that are marked, or may do so."""
-    marks = {id(x) for x, mark in zip(program.invars, given, strict=True) if mark}
-    for line in program.eqns:
-        reads = [id(x) in marks for x in line.invars]
-        if not any(reads):
-            continue
-        written = [True] * len(line.outvars)
-        part = line.params.get("jaxpr") if line.primitive.name in ("pjit", "jit") else None
-        if part is not None:
-            written = _marked(part.jaxpr, reads)
-        marks |= {id(x) for x, mark in zip(line.outvars, written, strict=True) if mark}
-    return [id(x) in marks for x in program.outvars]
-
-
 def _left_out_is_idle(kind: _Kind) -> bool:
-    """Whether nothing that is listed depends on what `distinct` leaves out; True is a proof."""
+    """True proves that no result depends on the parts that `distinct` leaves out."""
     environment = kind.environment
 
-    def listed(world: Any, action: Any, key: Any) -> Any:
+    def listed(world: PyTree, action: Any, key: Any) -> Any:
         found = Timestep(*environment.step(world, action, key))
         told = None
         if environment.outcomes is not None:
@@ -364,25 +329,24 @@ def _left_out_is_idle(kind: _Kind) -> bool:
         return True
     action = jax.ShapeDtypeStruct((), jnp.int32)
     program = jax.make_jaxpr(listed)(kind.like, action, kind.keys[0]).jaxpr
-    return not any(_marked(program, left + [False] * (len(program.invars) - len(left))))
+    return not any(marked_results(program, left + [False] * (len(program.invars) - len(left))))
 
 
 # --- the search -----------------------------------------------------------------------------------
 
 
 class _Followers(NamedTuple):
-    """What follows from a batch of B worlds: the axes are B, A and K outcomes.
+    """Successors of a batch of B states; the axes are B, A and K outcomes.
 
     Attributes:
-      world: which worlds.
-      seen: ``uint8[B, A, K, W + 1]``, their bytes, and whether the episode goes on.
+      world: the successor states.
+      seen: ``uint8[B, A, K, W + 1]``, their bytes, and the way in which the episode continues or ends.
       probability, reward, cost: ``float[B, A, K]``.
       allowed: ``bool[B, A]``.
-      drawn: ``uint8[B, A, N, W']``, the bytes of what was drawn by the keys; where outcomes are
-        not told also of what was earned.
+      drawn: ``uint8[B, A, N, W']``, bytes of the samples by key; without `outcomes` also of the rewards.
     """
 
-    world: Any
+    world: PyTree
     seen: Any
     probability: Any
     reward: Any
@@ -392,7 +356,7 @@ class _Followers(NamedTuple):
 
 
 class _Listed(NamedTuple):
-    """All that a search found, as parts to be joined; `world` and `ended` are of states."""
+    """The result of the search, as parts; `world` and `ended` are of states."""
 
     world: list[Any]
     ended: np.ndarray
@@ -407,8 +371,8 @@ def _ended(found: Timestep) -> jax.Array:
     return jnp.where(jnp.asarray(found.terminated, bool), _TERMINATED, cut).astype(jnp.uint8)
 
 
-def _follow(kind: _Kind, draws: int, world: Any) -> _Followers:
-    """What follows from one world, by each action."""
+def _follow(kind: _Kind, draws: int, world: PyTree) -> _Followers:
+    """The successors of one state, by action."""
     environment = kind.environment
 
     def seen(found: Timestep) -> jax.Array:
@@ -451,12 +415,12 @@ def _follow(kind: _Kind, draws: int, world: Any) -> _Followers:
 
 
 @partial(jax.jit, static_argnums=0)  # so that worlds of one shape share one compilation
-def _followers(draws: int, kind: _Kind, plain: Any) -> _Followers:
+def _followers(draws: int, kind: _Kind, plain: PyTree) -> _Followers:
     return jax.vmap(lambda x: _follow(kind, draws, _typed(kind, x)))(plain)
 
 
 def _search(kind: _Kind, begun: Any, max_states: int) -> _Listed:
-    """Breadth first, batch after batch."""
+    """Breadth-first search in batches."""
     environment = kind.environment
     shape = kind.like
     action = jax.ShapeDtypeStruct((), jnp.int32)
@@ -516,7 +480,7 @@ def _search(kind: _Kind, begun: Any, max_states: int) -> _Listed:
 
 
 def _batches(frontier: Any, count: int, size: int) -> Iterator[tuple[int, Any]]:
-    """Batches of one size, the last one filled up, and how many are meant."""
+    """Batches of one size, the last one padded, with their numbers of valid rows."""
     for begin in range(0, count, size):
         place = np.minimum(np.arange(begin, begin + size), count - 1)
         yield (
@@ -528,7 +492,7 @@ def _batches(frontier: Any, count: int, size: int) -> Iterator[tuple[int, Any]]:
 def _numbered(
     rows: np.ndarray, number: dict[bytes, int], ended: list[int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The number of each row's state, ``int[N]``, and the rows that were not seen before."""
+    """The state number of each row, ``int[N]``, and the rows that are new."""
     unique, first, inverse = np.unique(rows, return_index=True, return_inverse=True)
     order = np.argsort(first)  # numbers in the order in which worlds are met
     place, new = np.empty(len(unique), np.int64), []
@@ -543,7 +507,7 @@ def _numbered(
 
 
 def _check(found: _Followers, base: int, told: bool) -> None:
-    """Refuses what is random and not told, or is drawn but not told, and dead ends."""
+    """Refuses undeclared randomness, disagreeing distributions and states without actions."""
     stuck = np.flatnonzero(~found.allowed.any(axis=1))
     if stuck.size:
         raise ValueError(
@@ -586,11 +550,11 @@ def _joined(parts: list[Any]) -> Any:
 
 
 @jax.jit
-def _labeled(kind: _Kind, plain: Any) -> jax.Array:
+def _labeled(kind: _Kind, plain: PyTree) -> jax.Array:
     return jax.vmap(lambda x: kind.environment.labels(_typed(kind, x)))(plain)
 
 
-def _labels(kind: _Kind, plain: Any, count: int) -> np.ndarray:
+def _labels(kind: _Kind, plain: PyTree, count: int) -> np.ndarray:
     """``bool[S, P]``."""
     return np.concatenate(
         [np.asarray(_labeled(kind, batch))[:rows] for rows, batch in _batches(plain, count, _BATCH)]

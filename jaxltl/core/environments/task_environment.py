@@ -1,12 +1,12 @@
-"""A simulated world and a task in linear temporal logic, as one world that is simulated.
+"""Environments with a temporal-logic task: the product of an environment and an automaton.
 
-:func:`task_environment` steps a world and the automaton of a formula together. What it returns is
-an :class:`~jaxltl.core.environments.environment.Environment` again: its observations carry the
-automaton's state, its episodes end as soon as every continuation agrees on the formula (see
-``monitor``), and its rewards are those of the task. The label of the world that ``reset`` returns
-is read first, then that of each world that a step enters.
+:func:`task_environment` steps an environment and the automaton of a formula together. The result is
+an :class:`~jaxltl.core.environments.environment.Environment`: its observations include the automaton
+state, its episodes end as soon as the verdict is decided (see ``monitor``), and its rewards are
+those of the task. The automaton first reads the label of the initial state, then that of each
+successor state.
 
-All tables of the task are arrays: new ones do not recompile, and tasks of different formulas,
+The tables of a task are arrays: new tables do not recompile, and tasks of different formulas,
 padded to one shape by :func:`stack_tasks`, run in one vmapped program.
 """
 
@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Unpack, cast
 
 import chex
 import jax
@@ -35,10 +35,11 @@ from jaxltl.core.environments.environment import (
 )
 from jaxltl.core.environments.finite_task import make_finite_task
 from jaxltl.core.environments.monitor import Verdict, lasso_verdicts, verdicts
-from jaxltl.core.environments.task_reward import TaskReward, make_task_reward
+from jaxltl.core.environments.task_reward import RewardOptions, make_task_reward
 from jaxltl.core.logic.labels import require_known
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.models.ops.annotated_pytree import register_annotated_pytree
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.pretty_print import brief
 
 ENDINGS = ("repeat", "violated", "undecided")
@@ -46,30 +47,29 @@ ENDINGS = ("repeat", "violated", "undecided")
 
 @brief(codes={"verdict": Verdict})
 class TaskWorld(NamedTuple):
-    """A world beside the automaton of a task.
+    """A state of the product of an environment and a task.
 
     Attributes:
-      world: the inner one.
-      memory: ``int32[]``, the automaton's state after reading the label of `world`.
-      verdict: ``int32[]``, a :class:`~jaxltl.core.environments.monitor.Verdict`: what all continuations
-        agree on; where the world ended by itself without that, what the task's `ending` says.
-      accepted: ``bool[]``, whether the last reading was accepting: of even priority; of a co-safe
-        or safety task, whether the state that it led to is final.
-      visits: ``int32[]``, how many readings were accepting so far, that of the first label
-        included.
+      world: the environment's state.
+      memory: ``int32[]``, the automaton state after reading the label of `world`.
+      verdict: ``int32[]``, the :class:`~jaxltl.core.environments.monitor.Verdict`; in a terminal
+        state, as the option `ending` defines it.
+      accepted: ``bool[]``, True if the last transition of the automaton was accepting: of even
+        priority, or for a co-safe or safety task into a final state.
+      visits: ``int32[]``, the number of accepting transitions so far, the first label included.
 
     Example:
       >>> import jaxltl as jl
-      >>> coin = jl.make_environment(
-      ...     lambda key: jnp.int32(0), lambda world, action, key: jl.environments.Timestep(action, 0.0, False),
+      >>> coin = jl.environments.make_environment(
+      ...     lambda key: jnp.int32(0), lambda world, action, key: Timestep(action, 0.0, False),
       ...     lambda world: world[None], actions=2,
       ...     labels=lambda world: world == jnp.array([1]), propositions=["a"])
-      >>> begun = jax.eval_shape(jl.task_environment(coin, "F a").reset, jax.random.key(0))
+      >>> begun = jax.eval_shape(jl.environments.task_environment(coin, "F a").reset, jax.random.key(0))
       >>> begun.world.dtype.name, begun.memory.shape, begun.visits.dtype.name
       ('int32', (), 'int32')
     """
 
-    world: Any
+    world: PyTree
     memory: jax.Array
     verdict: jax.Array
     accepted: jax.Array
@@ -78,47 +78,46 @@ class TaskWorld(NamedTuple):
 
 @brief
 class TaskObservation(NamedTuple):
-    """What is seen of a :class:`TaskWorld`.
+    """An observation of a :class:`TaskWorld`.
 
     Attributes:
-      world: the observation of the inner world.
-      memory: ``float[Q]``, one-hot, the automaton's state; or its row of an embedding.
+      world: the observation of the environment.
+      memory: ``float[Q]``, the automaton state one-hot, or its row of an embedding.
 
     Example:
       >>> import jaxltl as jl
-      >>> coin = jl.make_environment(
-      ...     lambda key: jnp.int32(0), lambda world, action, key: jl.environments.Timestep(action, 0.0, False),
+      >>> coin = jl.environments.make_environment(
+      ...     lambda key: jnp.int32(0), lambda world, action, key: Timestep(action, 0.0, False),
       ...     lambda world: world[None], actions=2,
       ...     labels=lambda world: world == jnp.array([1]), propositions=["a"])
-      >>> task = jl.task_environment(coin, "F a")
-      >>> task.observations.world.shape, task.observations.memory.shape  # of two states
+      >>> task = jl.environments.task_environment(coin, "F a")
+      >>> task.observations.world.shape, task.observations.memory.shape  # the automaton has 2 states
       ((1,), (2,))
     """
 
-    world: Any
+    world: PyTree
     memory: jax.Array
 
 
 @brief
 @dataclass(frozen=True)
 class TaskTables:
-    """A task over the labels of a world, as arrays; made by :func:`make_task_tables`.
+    """A task over the labels of an environment, as arrays; see :func:`make_task_tables`.
 
     Attributes:
-      weight: ``int32[P]``, what each proposition that holds adds to the code of a label.
+      weight: ``int32[P]``, the contribution of each proposition to the code of a label.
       letter: ``int32[C]``, the automaton's letter of each code.
-      delta: ``int32[Q, L]``, the state after reading.
-      initial: ``int32[]``, the state before anything is read.
+      delta: ``int32[Q, L]``, the successor state.
+      initial: ``int32[]``, the state before the first label.
       verdict: ``int32[Q]``, in each state.
-      repeated: ``int32[Q, L]``, the verdict of a world that ends in a state in which the letter was
-        the last one.
-      accepting: ``bool[Q, L]``, of reading a letter in a state.
-      reward, discount: ``float[Q, L]``, of the same reading.
-      decided: ``float[3]``, the reward at each verdict, which at a decided one is all there is.
-      potential: ``float[Q]``, of shaping; zero for none.
-      learner_discount: ``float[]``, with which shaping reckons.
-      embedding: ``float[Q, ...]``, how a state is shown, or None: one-hot.
-      state_names: the residual formula of each state, `[Q]` texts, or empty; not part of the tree.
+      repeated: ``int32[Q, L]``, the verdict of a terminal state by its automaton state and letter.
+      accepting: ``bool[Q, L]``, the accepting transitions.
+      reward, discount: ``float[Q, L]``, of the transitions.
+      decided: ``float[3]``, the reward at each verdict, which replaces that of the transition.
+      potential: ``float[Q]``, for reward shaping; zero for none.
+      learner_discount: ``float[]``, the learner's discount, for shaping.
+      embedding: ``float[Q, ...]``, observations of the states, or None: one-hot.
+      state_names: the residual formulas of the states, or empty; not part of the tree.
 
     Example:
       >>> tables = make_task_tables("F goal", ["wall", "goal"])
@@ -150,27 +149,32 @@ register_annotated_pytree(
 )
 
 
+class TaskOptions(RewardOptions, total=False):
+    """Options of a task; those of the reward as of :class:`RewardOptions`.
+
+    Attributes:
+      ending: the verdict of a terminal state of the environment while the task is undecided:
+        ``"repeat"`` (default): that of the last label repeated for ever, as in an absorbing state;
+        ``"violated"``; or ``"undecided"``.
+      embedding: ``float[Q, ...]``, observations of the automaton states; default: one-hot.
+    """
+
+    ending: str
+    embedding: ArrayLike | None
+
+
 def make_task_tables(
-    formula: Formula | str | Automaton,
-    propositions: Sequence[str],
-    *,
-    reward: str = "auto",
-    discount: float | None = None,
-    ratio: float | None = None,
-    shaping: str | ArrayLike | None = None,
-    learner_discount: float = 1.0,
-    ending: str = "repeat",
-    embedding: ArrayLike | None = None,
+    formula: Formula | str | Automaton, propositions: Sequence[str], **options: Unpack[TaskOptions]
 ) -> TaskTables:
-    """The tables of a task, on the host; see :func:`task_environment`, which makes them itself.
+    """The tables of a task.
 
     Args:
-      formula: a formula, its text, or an automaton that reads every subset of its propositions.
-      propositions: the names of the world's P labels.
-      reward, discount, ratio, shaping, learner_discount: see
-        :func:`~jaxltl.core.environments.task_reward.make_task_reward`.
-      ending: see :func:`task_environment`.
-      embedding: ``float[Q, ...]``, or None.
+      formula: a formula, its text, or an automaton over all subsets of its propositions.
+      propositions: the names of the environment's P labels.
+      options: see :class:`TaskOptions`.
+
+    Returns:
+      :class:`TaskTables`.
 
     Raises:
       ValueError: as :func:`task_environment`.
@@ -179,6 +183,8 @@ def make_task_tables(
       >>> make_task_tables("F goal", ["wall", "goal"]).weight.tolist()
       [0, 1]
     """
+    validation.keywords("make_task_tables", options, TaskOptions)
+    ending, embedding = options.get("ending", "repeat"), options.get("embedding")
     validation.choice("ending", ending, ENDINGS)
     propositions = validation.distinct_names("propositions", propositions)
     automaton = formula if isinstance(formula, Automaton) else to_automaton(formula)
@@ -187,15 +193,8 @@ def make_task_tables(
     with jax.ensure_compile_time_eval():  # tables are made on the host wherever it is called
         reading = make_finite_task(automaton, propositions)
     decisions = verdicts(automaton)
-    pay: TaskReward = make_task_reward(
-        automaton,
-        decisions,
-        reward=reward,
-        discount=discount,
-        ratio=ratio,
-        shaping=shaping,
-        learner_discount=learner_discount,
-    )
+    reward_options = {n: x for n, x in options.items() if n not in ("ending", "embedding")}
+    pay = make_task_reward(automaton, decisions, **cast(RewardOptions, reward_options))
     weight = np.zeros(len(propositions), np.int32)
     weight[list(reading.columns)] = 1 << np.arange(len(reading.columns))
     shown = None if embedding is None else validation.float_array("embedding", embedding)
@@ -219,7 +218,7 @@ def make_task_tables(
         discount=pay.discount.astype(number),
         decided=pay.decided.astype(number),
         potential=pay.potential.astype(number),
-        learner_discount=np.asarray(learner_discount, number),
+        learner_discount=np.asarray(options.get("learner_discount", 1.0), number),
         embedding=None if shown is None else shown.astype(number),
         state_names=automaton.state_names,
     )
@@ -231,59 +230,34 @@ def task_environment(
     *,
     labels: Callable[..., jax.Array] | None = None,
     propositions: Sequence[str] | None = None,
-    reward: str = "auto",
-    discount: float | None = None,
-    ratio: float | None = None,
-    shaping: str | ArrayLike | None = None,
-    learner_discount: float = 1.0,
-    ending: str = "repeat",
-    embedding: ArrayLike | None = None,
+    **options: Unpack[TaskOptions],
 ) -> Environment:
-    """A world with a task, as one :class:`~jaxltl.core.environments.environment.Environment`.
+    """The product of an environment and a temporal-logic task, as an environment.
 
-    Its worlds are :class:`TaskWorld`, its observations :class:`TaskObservation`. The world's own
-    rewards are not used; its costs, discounts, actions and masks are as they were. An episode
-    terminates where the world's does, and as soon as the task is decided; a task that the first
-    label decides ends with the first step. What is truncated stays undecided.
+    Its states are :class:`TaskWorld`, its observations :class:`TaskObservation`. Costs, discounts,
+    actions and masks are the environment's, and its rewards are replaced by those of the task, whose
+    discounts come as ``Timestep.discount``: the learner's own discount is 1. Episodes terminate where
+    the environment's do and as soon as the verdict is decided; a task that the first label decides
+    ends with the first step. Truncation leaves the verdict undecided.
 
-    What a world that terminates by itself means for a task that is not decided then, `ending`
-    tells:
-
-    - ``"repeat"``: its last label repeats for ever, as in an absorbing state. "Always" was kept,
-      "eventually" is missed, and "infinitely often" is what the last label says.
-    - ``"violated"``: what is not satisfied by then is violated.
-    - ``"undecided"``: nothing; no continuation is known.
-
-    The rewards of the task are chosen by name. ``"auto"`` takes ``"reach"`` for co-safe tasks,
-    ``"keep"`` for safety, ``"eventual"`` for Buchi and ``"parity"`` for the others;
-    ``"two-discount"`` is the fifth. :func:`~jaxltl.core.environments.task_reward.make_task_reward` tells their
-    equations, their theorems and what these ask for. All their discounts come with the steps, as
-    ``Timestep.discount``: let the learner's own discount be 1.
+    The rewards are named by the option `reward`; see
+    :func:`~jaxltl.core.environments.task_reward.make_task_reward` for equations and theorems.
 
     Args:
-      environment: the inner world.
-      formula: a formula, its text, an automaton that reads every subset of its propositions, or
-        the tables of :func:`make_task_tables`, which then say all that follows.
-      labels: ``world -> bool[P]``, instead of the environment's own.
-      propositions: their names; default the environment's.
-      reward: see above.
-      discount: of the reward; default 1 for ``"reach"`` and ``"keep"`` (.99 with shaping), else
-        .99.
-      ratio: of ``"two-discount"`` and ``"parity"``: how much less a reading discounts than one of
-        the priority before; default ``1 - discount``.
-      shaping: None, ``"distance"`` (in the automaton), or a potential ``float[Q]``.
-      learner_discount: the learner's own discount, with which shaping reckons.
-      ending: see above.
-      embedding: ``float[Q, ...]``, what is seen of each state of the automaton; default one-hot.
+      environment: the environment.
+      formula: a formula, its text, an automaton over all subsets of its propositions, or the tables
+        of :func:`make_task_tables`, which take no further options.
+      labels: ``world -> bool[P]``; default: the environment's.
+      propositions: names of the labels; default: the environment's.
+      options: rewards, terminal states and observations of the task, see :class:`TaskOptions`.
 
     Returns:
-      The environment; its numbers are arrays, so that another task of the same shape does not
-      recompile.
+      :class:`~jaxltl.core.environments.environment.Environment`.
 
     Raises:
-      ValueError: functions that are not pure or of other shapes, labels that are not ``bool[P]``,
-        a formula over labels that the world does not have, a reward that does not fit the task, a
-        discount outside its range, a potential or an embedding of another shape.
+      ValueError: functions that are not pure or return other shapes, labels that are not ``bool[P]``,
+        a formula over unknown propositions, a reward that does not fit the task, a discount out of
+        range, or a potential or an embedding of another shape.
 
     Example:
       >>> def reset(key):
@@ -308,6 +282,8 @@ def task_environment(
     """
     environment = require_environment(environment)
     names = environment.propositions if propositions is None else propositions
+    kept = ("allowed", "observations", "horizon", "starts", "outcomes")
+    others: Any = {name: getattr(environment, name) for name in kept}
     inner = make_environment(
         environment.reset,
         environment.step,
@@ -315,27 +291,14 @@ def task_environment(
         actions=environment.actions,
         labels=environment.labels if labels is None else labels,
         propositions=names,
-        allowed=environment.allowed,
-        observations=environment.observations,
-        horizon=environment.horizon,
-        starts=environment.starts,
-        outcomes=environment.outcomes,
+        **others,
     )
-    tables = (
-        formula
-        if isinstance(formula, TaskTables)
-        else make_task_tables(
-            formula,
-            inner.propositions,
-            reward=reward,
-            discount=discount,
-            ratio=ratio,
-            shaping=shaping,
-            learner_discount=learner_discount,
-            ending=ending,
-            embedding=embedding,
-        )
-    )
+    if not isinstance(formula, TaskTables):
+        tables = make_task_tables(formula, inner.propositions, **options)
+    elif options:
+        raise ValueError(f"{', '.join(options)}: give options to make_task_tables instead.")
+    else:
+        tables = formula
     names = inner.propositions
     if tables.weight.shape != (len(names),):
         raise ValueError(
@@ -346,12 +309,7 @@ def task_environment(
 
 
 def with_task_tables(environment: Environment, tables: TaskTables) -> Environment:
-    """The environment of a task with another task in its place, also under ``jit`` and ``vmap``.
-
-    Args:
-      environment: from :func:`task_environment`.
-      tables: of the other task, over the same propositions.
-    """
+    """The task environment with another task over the same propositions; runs under ``jit`` and ``vmap``."""
     task_tables(environment)
     validation.instance("tables", tables, TaskTables, "those of make_task_tables")
     made: Any = environment
@@ -363,11 +321,7 @@ def with_task_tables(environment: Environment, tables: TaskTables) -> Environmen
 
 
 def task_tables(environment: Environment) -> TaskTables:
-    """The tables of a task's environment.
-
-    Raises:
-      ValueError: it was not made by :func:`task_environment`.
-    """
+    """The tables of a task environment; ValueError for any other environment."""
     arguments = getattr(getattr(environment, "reset", None), "args", ())
     if not arguments or not isinstance(arguments[0], TaskTables):
         raise ValueError("this environment has no task; make it with task_environment.")
@@ -375,16 +329,12 @@ def task_tables(environment: Environment) -> TaskTables:
 
 
 def stack_tables(tables: Sequence[TaskTables]) -> TaskTables:
-    """Tasks of different formulas, padded to one shape, with a first axis of N.
+    """Tasks of different formulas, padded to one shape, with a leading axis; for ``vmap``.
 
-    States of padding are violated, and no run enters them. For ``vmap`` of a function that calls
-    :func:`with_task_tables`.
-
-    Args:
-      tables: N of them, over the same P propositions.
+    States in padding are violated and unreachable.
 
     Raises:
-      ValueError: none, or tasks over different propositions or with embeddings of different width.
+      ValueError: no task, or tasks over different propositions or with embeddings of different width.
     """
     tables = validation.sequence("tables", tables)
     if not tables:
@@ -395,24 +345,23 @@ def stack_tables(tables: Sequence[TaskTables]) -> TaskTables:
 
 
 def stack_tasks(environments: Sequence[Environment]) -> Environment:
-    """Environments of one world with different tasks, padded to one shape, with a first axis of N.
+    """Task environments of one environment, padded to one shape, with a leading axis of N.
 
     One compiled program runs all of them: ``vmap(run_episode, in_axes=(0, 0, None))(keys, stacked,
     agent)``.
 
     Args:
-      environments: N of them, from :func:`task_environment`, of worlds of one structure.
+      environments: N results of :func:`task_environment`, of environments of one structure.
 
     Returns:
-      An environment whose arrays have a first axis of N.
+      An environment whose arrays have a leading axis of N.
 
     Raises:
-      ValueError: none, or worlds of different structure.
+      ValueError: no environment, or environments of different structure.
 
     Example:
-      >>> from jaxltl import from_dense
-      >>> from jaxltl.core.environments import model_environment
-      >>> walk = model_environment(from_dense(
+      >>> from jaxltl import environments, from_dense
+      >>> walk = environments.model_environment(from_dense(
       ...     [[[.5, .5]], [[.5, .5]]], label=[[0], [1]], propositions=["a"]))
       >>> both = stack_tasks([task_environment(walk, "F a"), task_environment(walk, "G F a")])
       >>> jax.vmap(lambda e, key: e.reset(key).memory, (0, None))(both, jax.random.key(0)).shape
@@ -434,21 +383,20 @@ def stack_tasks(environments: Sequence[Environment]) -> Environment:
 
 
 def residual_formula(task: Environment | TaskTables | Automaton, memory: Any) -> str:
-    """What is left of a formula in a state of its automaton, as text, on the host.
+    """The residual formula in a state of a task's automaton: the obligation on the remaining word.
 
-    The formula that the rest of the word must satisfy. Of a state without a name (automata from
-    files, or with very many states) its number is told.
+    States of automata from files, very large automata, stacks and results of ``jit`` have no text, and
+    are numbered instead.
 
     Args:
-      task: an environment of :func:`task_environment`, its tables, or an automaton. Of a stack,
-        ask the single environments.
-      memory: the state, such as ``world.memory`` of a :class:`TaskWorld`.
+      task: a task environment, its tables, or an automaton.
+      memory: the automaton state, such as ``world.memory`` of a :class:`TaskWorld`.
 
     Returns:
-      The formula's text.
+      The formula as text.
 
     Raises:
-      ValueError: there is no such state.
+      ValueError: an unknown state.
 
     Example:
       >>> residual_formula(to_automaton("F (a & X b)"), 0)
@@ -510,8 +458,8 @@ def _starts(
     return jax.vmap(lambda world: _begin(tables, labels, world))(worlds), probability
 
 
-def _begin(tables: TaskTables, labels: Callable[..., Any], world: Any) -> TaskWorld:
-    """Before the first step: one label is read."""
+def _begin(tables: TaskTables, labels: Callable[..., Any], world: PyTree) -> TaskWorld:
+    """The initial product state, after the automaton has read the first label."""
     tables = jax.tree.map(jnp.asarray, tables)
     letter = _read(tables, labels(world))
     memory = tables.delta[tables.initial, letter]
@@ -548,7 +496,7 @@ def _outcomes(
 def _read_on(
     tables: TaskTables, labels: Callable[..., Any], before: TaskWorld, found: Timestep
 ) -> Timestep:
-    """A step of the joint world, from that of the inner one."""
+    """A step of the product, from a step of the environment."""
     tables = jax.tree.map(jnp.asarray, tables)
     reading = before.memory, _read(tables, labels(found.world))
     memory, accepted = tables.delta[reading], tables.accepting[reading]
@@ -586,7 +534,7 @@ def _of_world(function: Callable[..., Any], joint: TaskWorld) -> Any:
 
 
 def _at_the_end(automaton: Automaton, ending: str) -> np.ndarray:
-    """``int32[Q, L]``: the verdict of a world that ends in a state after a letter."""
+    """``int32[Q, L]``: the verdict of a terminal state by automaton state and letter."""
     if ending == "repeat":
         return lasso_verdicts(automaton)
     verdict = Verdict.VIOLATED if ending == "violated" else Verdict.UNDECIDED
@@ -594,7 +542,7 @@ def _at_the_end(automaton: Automaton, ending: str) -> np.ndarray:
 
 
 def _padded(tables: Sequence[TaskTables]) -> list[TaskTables]:
-    """The same tasks, with as many states, letters and codes as the largest."""
+    """The tasks with the numbers of states, letters and codes of the largest."""
     num_memory = max(t.delta.shape[0] for t in tables)
     num_letters = max(t.delta.shape[1] for t in tables)
     num_codes = max(len(t.letter) for t in tables)

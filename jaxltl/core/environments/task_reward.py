@@ -1,12 +1,12 @@
-"""Rewards of tasks in linear temporal logic, as tables of their automata, each with its theory.
+"""Rewards of temporal-logic tasks, as tables on the transitions of their automata.
 
-All are of one form. A reading of a letter in an undecided state of the automaton earns a reward
-and discounts what comes after it; a decided verdict earns its own reward and ends the episode.
+All have one form: a transition from an undecided state earns a reward and discounts later rewards;
+a decided verdict earns a reward of its own and ends the episode.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, TypedDict, Unpack
 
 import jax.numpy as jnp
 import numpy as np
@@ -24,12 +24,12 @@ _DEFAULT = 0.99
 
 @brief
 class TaskReward(NamedTuple):
-    """What the readings of an automaton earn.
+    """The reward of a task on the transitions of its automaton.
 
     Attributes:
-      name: of the reward; ``"auto"`` is resolved.
-      accepting: ``bool[Q, L]``, whether reading the letter in the state is accepting: of even
-        priority; of a co-safe or safety task, whether it leads to a final state.
+      name: of the reward, with ``"auto"`` resolved.
+      accepting: ``bool[Q, L]``, the accepting transitions: of even priority, or for a co-safe or safety
+        task into a final state.
       reward, discount: ``float[Q, L]``.
       decided: ``float[3]``, the reward at each :class:`~jaxltl.core.environments.monitor.Verdict`.
       potential: ``float[Q]``.
@@ -43,69 +43,73 @@ class TaskReward(NamedTuple):
     potential: np.ndarray
 
 
+class RewardOptions(TypedDict, total=False):
+    """Options of a task's reward, see :func:`make_task_reward`.
+
+    Attributes:
+      reward: its name; ``"auto"`` (default) takes ``"reach"`` for co-safe tasks, ``"keep"`` for
+        safety, ``"eventual"`` for Buchi and ``"parity"`` for other tasks.
+      discount: g; default: 1 for ``"reach"`` and ``"keep"`` (.99 with shaping), else .99.
+      ratio: of ``"two-discount"`` and ``"parity"``; default: 1 - g.
+      shaping: None, ``"distance"``, or a potential ``float[Q]``.
+      learner_discount: the learner's own discount, which shaping takes into account; default: 1.
+    """
+
+    reward: str
+    discount: float | None
+    ratio: float | None
+    shaping: str | ArrayLike | None
+    learner_discount: float
+
+
 def make_task_reward(
-    automaton: Automaton,
-    decisions: np.ndarray,
-    *,
-    reward: str = "auto",
-    discount: float | None = None,
-    ratio: float | None = None,
-    shaping: str | ArrayLike | None = None,
-    learner_discount: float = 1.0,
+    automaton: Automaton, decisions: np.ndarray, **options: Unpack[RewardOptions]
 ) -> TaskReward:
-    """The reward of a task by its name, on the host.
+    """The reward of a task, by name.
 
-    The learner maximises ``E[sum_t (d_0 ... d_{t-1}) r_t]`` of the rewards r and discounts d below;
-    its own discount is 1. Write g for `discount` and P for the probability that the task is
-    satisfied. Limits are those of finite worlds, whose optimal policies are then optimal for P from
-    some g below 1 on.
+    The learner maximises ``E[sum_t (d_0 ... d_{t-1}) r_t]`` of the rewards r and discounts d below; its
+    own discount is 1. Let g be `discount` and P the satisfaction probability. Limits hold for finite
+    environments, whose optimal policies are optimal for P from some g below 1 on.
 
-    - ``"reach"``, for co-safe tasks: 1 where the verdict becomes satisfied, d = g. With g = 1 the
-      value is P. With g < 1 it is ``E[g^(T - 1)]``, T the number of steps until then: what is
-      reached sooner counts more, and P is the limit.
-    - ``"keep"``, for safety: -1 where the verdict becomes violated, d = g. With g = 1 the value is
-      P - 1; with g < 1 later violations count less, and that is the limit.
+    - ``"reach"``, for co-safe tasks: r = 1 where the verdict becomes satisfied, d = g. The value is P
+      for g = 1, and ``E[g^(T - 1)]`` with T steps until satisfaction for g < 1.
+    - ``"keep"``, for safety tasks: r = -1 where the verdict becomes violated, d = g. The value is P - 1
+      for g = 1, which is the limit for g < 1.
     - ``"eventual"``, for two priorities (Voloshin, Verma & Yue 2023, "Eventual discounting temporal
-      logic counterfactual experience replay"): r = 1 - g and d = g at accepting readings, r = 0 and
-      d = 1 at others; how long it takes from one to the next does not matter. With K accepting
-      readings the return is ``1 - g^K``, hence ``P <= value <= P + (1 - g) E[K; K finite]``, and
-      the optimal policy loses at most ``(1 - g) max E[K; K finite]``.
-    - ``"two-discount"``, for two priorities (Bozkurt, Wang, Zavlanos & Pajic 2020, "Control
-      synthesis from linear temporal logic specifications using model-free reinforcement
-      learning"): r = 1 - g and d = g at accepting readings, r = 0 and d = h at others. The value
-      has the limit P as g goes to 1 with ``(1 - h) / (1 - g)``, the argument `ratio`, to 0. All
-      steps discount, so that values are bounded in any world and shaping is sound.
-    - ``"parity"``, for any automaton: reading priority p stops with probability
-      ``e_p = (1 - g) ratio^(p - p_0)``, p_0 the least, which wins if p is even (Hahn, Perez,
-      Schewe, Somenzi, Trivedi & Wojtczak 2020, "Model-free reinforcement learning for stochastic
-      parity games"). In expectation: r = e_p at even priorities and 0 at odd ones, d = 1 - e_p;
-      with two priorities that is ``"two-discount"``. The value has the limit P as g goes to 1 and
-      `ratio` to 0: among the priorities that recur the least one then stops first. Neighbouring
-      priorities of one parity are taken as one.
+      logic counterfactual experience replay"): r = 1 - g and d = g on accepting transitions, r = 0 and
+      d = 1 on others. With K accepting transitions the return is ``1 - g^K``, hence
+      ``P <= value <= P + (1 - g) E[K; K finite]``, and the optimal policy loses at most
+      ``(1 - g) max E[K; K finite]``.
+    - ``"two-discount"``, for two priorities (Bozkurt, Wang, Zavlanos & Pajic 2020, "Control synthesis
+      from linear temporal logic specifications using model-free reinforcement learning"): r = 1 - g and
+      d = g on accepting transitions, r = 0 and d = h on others. The value tends to P as g tends to 1
+      with `ratio` = ``(1 - h) / (1 - g)`` to 0. All steps discount, so that values are bounded and
+      shaping is sound.
+    - ``"parity"``, for any automaton: priority p stops with probability
+      ``e_p = (1 - g) ratio^(p - p_0)``, p_0 the least, and wins if p is even (Hahn, Perez, Schewe,
+      Somenzi, Trivedi & Wojtczak 2020, "Model-free reinforcement learning for stochastic parity
+      games"). In expectation r = e_p at even and 0 at odd priorities, d = 1 - e_p; with two priorities
+      this is ``"two-discount"``. The value tends to P as g tends to 1 and `ratio` to 0, since the least
+      recurring priority then stops first. Adjacent priorities of one parity are merged.
 
-    The last three earn 1 and end where the verdict becomes satisfied, and 0 where violated, which
-    is what P is there.
+    The last three earn 1 and end where the verdict becomes satisfied, and 0 where violated, as P does.
 
-    A potential f of the automaton's states q adds ``d f(q') - f(q)``, with the learner's own
-    discount as a factor of d and f = 0 after the end (Ng, Harada & Russell 1999, "Policy invariance
-    under reward transformations"). The sum of these telescopes to ``-f(q_0)`` whatever is done, so
-    that no order of policies changes, provided that all discounts are below 1: otherwise a run that
-    never ends keeps f of where it stays. That is refused. ``"distance"`` is the potential
-    ``1 - n(q) / max n``, with n the least number of readings to a satisfied verdict (``"reach"``)
-    or an accepting reading, and ``n(q) / max n`` to a violated verdict with ``"keep"``.
+    A potential f of the automaton states adds ``d f(q') - f(q)``, with the learner's own discount as a
+    factor of d and f = 0 after the end (Ng, Harada & Russell 1999, "Policy invariance under reward
+    transformations"). The sum telescopes to ``-f(q_0)`` for every policy if all discounts are below 1;
+    otherwise an infinite run keeps the potential of its last state, and shaping is refused.
+    ``"distance"`` is the potential ``1 - n(q) / max n``, with n the least number of transitions to a
+    satisfied verdict (``"reach"``) or an accepting transition, and ``n(q) / max n`` to a violated
+    verdict for ``"keep"``.
 
-    Args:
-      automaton: of the task.
-      decisions: ``int32[Q]``, its verdicts.
-      reward: see above; ``"auto"`` by the kind of the automaton.
-      discount: g; default 1 for ``"reach"`` and ``"keep"`` (.99 with shaping), else .99.
-      ratio: default 1 - g.
-      shaping: None, ``"distance"``, or ``float[Q]``.
-      learner_discount: its own, if it is not 1; only shaping reckons with it.
+    `decisions` are the verdicts ``int32[Q]`` of the automaton states.
 
     Raises:
-      ValueError: a reward that does not fit the automaton, or numbers outside their ranges.
+      ValueError: a reward that does not fit the automaton, or a number out of range.
     """
+    reward, ratio = options.get("reward", "auto"), options.get("ratio")
+    discount, shaping = options.get("discount"), options.get("shaping")
+    learner_discount = options.get("learner_discount", 1.0)
     reward = validation.choice("reward", reward, REWARDS)
     name = _BY_KIND[automaton.acceptance] if reward == "auto" else reward
     _require_fit(automaton, name)
@@ -153,7 +157,7 @@ def _require_fit(automaton: Automaton, name: str) -> None:
 
 
 def _ranks(automaton: Automaton) -> np.ndarray:
-    """``int[Q, L]``: the priority of each reading, with neighbours of one parity taken as one."""
+    """``int[Q, L]``: the priorities, with adjacent ones of one parity merged."""
     if automaton.acceptance in ("cosafe", "safety"):  # known as soon as the state is entered
         return (~automaton.final[np.asarray(automaton.delta)]).astype(int)
     values, place = np.unique(automaton.priority, return_inverse=True)
@@ -164,7 +168,7 @@ def _ranks(automaton: Automaton) -> np.ndarray:
 def _stopping(
     rank: np.ndarray, name: str, discount: float, ratio: float | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What a reading earns and by what it discounts, if it stops as often as its rank says."""
+    """Rewards and discounts of transitions that stop with the probability of their rank."""
     ratio = 1 - discount if ratio is None else ratio
     ratio = validation.fraction("ratio", ratio, ends=(False, False))
     stops = (1 - discount) * ratio ** (rank - rank.min())
@@ -215,7 +219,7 @@ def _potential(
 
 
 def _distance(delta: np.ndarray, start: np.ndarray, by_reading: np.ndarray | float) -> np.ndarray:
-    """The least numbers n with ``n = min(start, min over letters of by_reading and 1 + n')``."""
+    """Shortest distances ``n = min(start, min over letters of by_reading and 1 + n')``."""
     steps = start
     while True:
         nearer = np.minimum(steps, np.minimum(by_reading, 1 + steps[delta]).min(axis=1))

@@ -344,8 +344,7 @@ def sparse_part(
     check_entries(
         row_start, entry_start, successor, probability, first=first, num_states=num_states
     )
-    if unknown := sorted(set(annotations) - set(Annotations.__annotations__)):
-        raise TypeError(f"make_sparse() got an unexpected keyword argument {unknown[0]!r}")
+    validation.keywords("make_sparse", annotations, Annotations)
     structures, valuation = annotations.get("rewards") or {}, annotations.get("valuation") or {}
     for of, each in (("rewards", structures), ("valuation", valuation)):
         if not isinstance(each, Mapping):
