@@ -23,7 +23,7 @@ from jaxltl.core.values.undiscounted.mixture import (
     require_attainable,
 )
 from jaxltl.core.values.undiscounted.optimal_actions import OptimalActions, optimal_actions
-from jaxltl.core.values.undiscounted.reachability import action_matrices
+from jaxltl.core.values.undiscounted.reachability import rows_of_model
 
 _AIM = WINDOW / 4  # margin of the certified probability over the asked one
 _WEIGHTS = 10.0 ** np.arange(-1, 5.5, 0.5)  # of the satisfaction probability, in this order
@@ -106,8 +106,10 @@ def _losing(
     first = tuple(np.argwhere(lost)[0])
     s, q, a = state[first], memory[first], action[first]
     value = np.asarray(best.value, float)
-    row = action_matrices(model)[a][[s * model.num_memory + q]]
-    return lost, (float(value[s, q]), float(np.asarray(row @ value.ravel()).item()))
+    sparse = rows_of_model(model)
+    chosen = (sparse.host.state == s * model.num_memory + q) & (np.asarray(sparse.action) == a)
+    after = sparse.host.expectation(value.ravel())[chosen]
+    return lost, (float(value[s, q]), float(after.sum()))
 
 
 def check_formula(automaton: Automaton) -> str | None:

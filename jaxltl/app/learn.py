@@ -53,12 +53,12 @@ from jaxltl.core.models.product import Product, product
 from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.types import Solution, Status
 from jaxltl.core.values.discounted.soft import softmax_policy
-from jaxltl.core.values.undiscounted.hitting_time import hitting_time
 from jaxltl.core.values.undiscounted.mixture import at_starts, from_starts
 from jaxltl.core.values.undiscounted.satisfaction import (
     optimal_satisfaction,
     satisfaction_probability,
 )
+from jaxltl.core.values.undiscounted.total_reward import hitting_time
 
 DOUBLE = True
 

@@ -8,7 +8,7 @@ import pytest
 
 from jaxltl.algos import mlirl
 from jaxltl.algos.common import learner
-from jaxltl.algos.mlirl import _features
+from jaxltl.algos.mlirl import features
 from jaxltl.app import learn
 from jaxltl.app.files.task_mlirl import read_task
 from jaxltl.app.protocols import Training
@@ -38,7 +38,7 @@ def test_the_policy_is_that_of_the_weights(write, optimizer):  # noqa: F811
 
 
 def test_a_feature_that_is_left_out_is_named(write, monkeypatch):  # noqa: F811
-    monkeypatch.setattr(_features, "steps_until", lambda *_: None)
+    monkeypatch.setattr(features, "expected_steps", lambda *_: None)
     setup = learn.prepare(read_task(write()), 0)
     assert "nearer" not in setup.features.names
     outcome = learn.learn(setup, Training(0, 1))

@@ -32,11 +32,14 @@ from jaxltl.core.models.product import Product, read_probability
 from jaxltl.core.models.protocols import ActionModel, Array
 from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.pretty_print import brief
-from jaxltl.core.sparse.solvers.dense_reachability import policy_row, steps_until
-from jaxltl.core.sparse.solvers.shortest_path import until_read
+from jaxltl.core.sparse.solvers.shortest_path import expected_steps
 from jaxltl.core.types import Solution
-from jaxltl.core.values.undiscounted.reachability import action_matrices
-from jaxltl.core.values.undiscounted.satisfaction import as_reachability, visiting
+from jaxltl.core.values.undiscounted.reachability import (
+    on_actions,
+    row_of_action,
+    rows_of_model,
+)
+from jaxltl.core.values.undiscounted.satisfaction import as_reachability, until_visit
 
 
 def pair_counts(
@@ -151,34 +154,24 @@ def _nearer(model: Product, best: Solution) -> np.ndarray | None:
     """
     problem, lost = as_reachability(model, "max"), np.asarray(best.upper).ravel() <= 0
     reached = np.asarray(problem.target).ravel()
-    rows = action_matrices(model)
-    ahead = _steps(rows, best.policy, reached | lost)
-    far: np.ndarray | None
-    if problem.accepting is None:
-        far, visits = np.zeros(reached.size), rows
-    else:
-        visits = until_read(rows, *visiting(problem))
-        far = _steps(visits, best.policy, ~reached)
+    sparse = rows_of_model(model)
+    mdp, row = sparse.host, row_of_action(sparse, best.policy)
+    ahead = expected_steps(mdp, row, reached | lost)
+    far: np.ndarray | None = np.zeros(reached.size)
+    visits = mdp
+    if problem.accepting is not None:
+        visits = until_visit(problem, mdp)
+        far = expected_steps(visits, np.append(row, mdp.num_rows), np.append(~reached, True))
     if ahead is None or far is None:
         return None
-    inside = np.where(reached, far, 0)
+    inside = np.where(reached, far[: reached.size], 0)
     most = inside.max(initial=0)  # outside of the component, a longest visit inside is added
     ahead = np.where(reached, 0, np.where(lost, ahead.max(initial=0), ahead)) + most
     way = np.where(reached, inside, ahead)
     entered = np.where(reached, most, ahead)
-    decrease = [
-        np.where(reached, way - visit @ way, way - row @ entered)
-        for row, visit in zip(rows, visits, strict=True)
-    ]
-    available = np.asarray(model.available)
-    table = np.stack(decrease, -1).reshape(available.shape)
-    return np.where(available, table, 0).astype(model.dtype)
-
-
-def _steps(rows: list[Any], policy: Any, ended: np.ndarray) -> np.ndarray | None:
-    """Expected steps of a policy until it enters a set or leaves the given rows; None if unknown."""
-    chosen = np.asarray(policy).reshape(-1, 1) == np.arange(len(rows))
-    return steps_until(policy_row(rows, chosen.astype(float)), ~ended)
+    next_way = visits.expectation(np.append(way, 0)[: visits.num_states])[: mdp.num_rows]
+    decrease = way[mdp.state] - np.where(reached[mdp.state], next_way, mdp.expectation(entered))
+    return on_actions(sparse, decrease, model).astype(model.dtype)
 
 
 @partial(jax.jit, static_argnames=("avoid", "progress"))

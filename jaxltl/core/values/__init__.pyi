@@ -74,7 +74,7 @@ from .properties.solve_property import (
     PropertyStrategy as PropertyStrategy,
     solve_property as solve_property,
 )
-from .undiscounted.hitting_time import hitting_time as hitting_time
+from .undiscounted.total_reward import hitting_time as hitting_time
 from .undiscounted.optimal_actions import (
     OptimalActions as OptimalActions,
     optimal_actions as optimal_actions,

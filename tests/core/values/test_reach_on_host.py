@@ -8,7 +8,6 @@ import pytest
 import jaxltl as jl
 from jaxltl.core.models.mdp import make_mdp
 from jaxltl.core.models.ops.operators import induced_chain
-from jaxltl.core.sparse.solvers import dense_reachability as host
 from jaxltl.core.types import Status
 from jaxltl.core.values.undiscounted.reachability import reachability_probability
 from tests.core.graphs.test_engines import counted_programs
@@ -70,9 +69,7 @@ traced = jax.jit(solve, static_argnames="objective")
 
 @pytest.mark.few(1)
 @pytest.mark.parametrize("objective", ["max", "min", "policy"])
-@pytest.mark.parametrize("dense_limit", [host.DENSE_LIMIT, 0])
-def test_both_engines_give_the_same_bounds_and_regions(objective, dense_limit, monkeypatch):
-    monkeypatch.setattr(host, "DENSE_LIMIT", dense_limit)
+def test_both_engines_give_the_same_bounds_and_regions(objective):
     rng = np.random.default_rng(3)
     compared = 0
     for _ in range(20):

@@ -23,6 +23,11 @@ def rounding_unit(model: Any) -> Any:
     return terms * float(jnp.finfo(model.dtype).eps)
 
 
+def underflow(model: Any) -> Any:
+    """Absolute error of one backup by products that underflow, where XLA flushes them to zero."""
+    return (widest_row(model) + most_choices(model) + 4) * float(jnp.finfo(model.dtype).tiny)
+
+
 def most_choices(model: Any) -> Any:
     """The most choices that a state has: static, but of a sparse model ``int32[]``."""
     world = getattr(model, "mdp", model)

@@ -10,18 +10,16 @@ import numpy as np
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.compiled.compiled import flatten_policy
 from jaxltl.core.models.compiled.compiled import is_sparse as is_sparse
-from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
+from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.models.ops.operators import is_deterministic, require_weights, row_weights
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.solvers import reachability as optimal
 from jaxltl.core.sparse.solvers.discounted import discounted_value
 from jaxltl.core.sparse.solvers.total_cost import Enclosure
 from jaxltl.core.types import (
     Solution,
     Status,
-    require_shape,
     row_tolerance,
 )
 from jaxltl.core.values.undiscounted.step_bounded import finite_reward
@@ -39,22 +37,21 @@ def status_between(
 
 
 def solution_from_enclosure(
-    model: Any, sparse: SparseMDP, found: Enclosure, tolerance: float, *, relative: bool
+    model: Any, sparse: SparseMDP | None, found: Enclosure, tolerance: float, *, relative: bool
 ) -> Solution:
     """A solution in the shapes and precision of a model, with bounds rounded outwards.
 
     Args:
       model: the model of the question.
-      sparse: the same as sparse rows.
+      sparse: the same as sparse rows; None if the policy is one of actions already.
       found: the enclosure.
       tolerance: the width that was asked for.
       relative: whether that is a share of the value.
     """
     low, high = found.lower, found.upper
     status = status_between(low, high, tolerance, relative=relative)
-    policy = found.row
-    shape = model.state_shape
-    if not is_sparse(model):
+    policy, shape = found.row, model.state_shape
+    if sparse is not None and not is_sparse(model):
         policy = np.asarray(sparse.action)[found.row]
     policy = policy.astype(np.int32).reshape(shape)
     parts: dict[str, Any] = {
@@ -78,7 +75,10 @@ def solution_from_enclosure(
     low = np.maximum(low, 0)
     if not relative:
         high = np.minimum(high, 1)
-    low, high = low.reshape(shape), high.reshape(shape)
+    # XLA flushes subnormal numbers to zero.
+    tiny = np.finfo(dtype).tiny
+    low = np.where(low < tiny, 0, low).astype(dtype).reshape(shape)
+    high = np.where(high > 0, np.maximum(high, tiny), high).astype(dtype).reshape(shape)
     parts |= {
         "value": np.clip(parts["value"].astype(dtype), low, high),
         "lower": low,
@@ -164,35 +164,6 @@ def with_given_policy(solution: Solution, policy: Any) -> Solution:
     kind: Any = np.int32 if is_deterministic(table) else table.dtype
     given: Any = table.astype(kind)
     return replace(solution, policy=given)
-
-
-def reachability(
-    model: Any, target: Any, *, stay: Any, policy: Any, objective: str, tolerance: Any
-) -> Solution:
-    """Probabilities of reaching a target through some states, by the host engine.
-
-    Arguments as of :func:`~jaxltl.core.values.undiscounted.reachability.reachability_probability`.
-    """
-    if is_traced((model, target, stay, policy)):
-        raise ValueError(
-            "a sparse model, or what may be passed (stay), is read on the host: give concrete "
-            "arrays; inside jit use prepare(model, target), or the formula's product."
-        )
-    sparse = to_sparse(model)
-    target = np.asarray(target, bool).ravel()
-    if stay is not None:
-        require_shape("stay", stay, model.state_shape)
-        stay = np.asarray(stay, bool).ravel()
-    asked = default_tolerance(model) if tolerance is None else float(tolerance)
-    host, depth = sparse.host, 0
-    if policy is not None:
-        host, _, depth = induced_chain(model, sparse, policy)
-    found = optimal.reachability(
-        host, target, maximize=objective == "max", stay=stay, tolerance=asked, depth=depth
-    )
-    return with_given_policy(
-        solution_from_enclosure(model, sparse, found, asked, relative=False), policy
-    )
 
 
 def discounted(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple, Protocol
 
 import jax
 from jax import lax
@@ -15,26 +15,41 @@ Operator = Callable[[jax.Array], jax.Array]
 LinearSolver = Callable[[jax.Array], jax.Array]
 
 
+class LinearSystem(Protocol):
+    """Solvers of ``A(x) = b`` for one operator A and for its transpose; a tree of arrays."""
+
+    def solve(self, matvec: Operator, b: jax.Array) -> jax.Array:
+        """x with ``A(x) = b`` for the operator."""
+
+    def transpose_solve(self, matvec: Operator, b: jax.Array) -> jax.Array:
+        """x with ``A(x) = b`` for the transpose, whose products `matvec` gives."""
+
+
+class Krylov(NamedTuple):
+    """The solvers of :func:`~jaxltl.core.values.engine.linear.solve_linear`."""
+
+    solve = transpose_solve = staticmethod(solve_linear)
+
+
 def implicit(
     operator: Operator,
     fixed_point: jax.Array,
     *,
     solve: LinearSolver | None = None,
     transpose_solve: LinearSolver | None = None,
-    linear: Callable[[Operator, jax.Array], jax.Array] = solve_linear,
+    system: LinearSystem = Krylov(),  # noqa: B008
 ) -> jax.Array:
-    """A fixed point ``v = operator(v)`` with its implicit derivative attached.
+    """A fixed point ``v = operator(v)`` with its implicit derivative.
 
-    However `fixed_point` was found, the result is differentiable, forward and reverse, in
-    everything that `operator` closes over: ``dv = (I - J)^-1 d(operator)`` with J the
-    Jacobian in v (implicit function theorem). No iteration is unrolled; one linear
-    system is solved per derivative, with the operator itself or with its transpose.
+    The result is differentiable, forward and reverse, in everything that `operator` closes over:
+    ``dv = (I - J)^-1 d(operator)`` with J the Jacobian in v (implicit function theorem). No
+    iteration is unrolled; each derivative solves one linear system, or its transpose.
 
     Args:
       operator: a differentiable map from values to values of the same shape.
-      fixed_point: a value that satisfies the equation.
-      solve, transpose_solve: x with ``(I - J) x = b``, or of the transpose; default `linear`.
-      linear: x with ``A(x) = b`` from A and b.
+      fixed_point: a value that satisfies the equation, however it was found.
+      solve, transpose_solve: x with ``(I - J) x = b``, or for the transpose; both or neither.
+      system: the solvers if these are not given.
 
     Returns:
       `fixed_point`.
@@ -44,17 +59,16 @@ def implicit(
       >>> round(slope.item(), 3)
       4.0
     """
-    if solve is None and transpose_solve is None:
-        return _seldom_differentiated(operator, lax.stop_gradient(fixed_point), linear)
-
-    def forward(jacobian: Operator, b: jax.Array) -> jax.Array:
-        return linear(jacobian, b) if solve is None else solve(b)
-
-    def backward(jacobian: Operator, b: jax.Array) -> jax.Array:
-        return linear(jacobian, b) if transpose_solve is None else transpose_solve(b)
+    if solve is None or transpose_solve is None:
+        return _traced_when_differentiated(operator, lax.stop_gradient(fixed_point), system)
 
     def solve_tangent(jacobian: Operator, b: jax.Array) -> jax.Array:
-        return lax.custom_linear_solve(jacobian, b, solve=forward, transpose_solve=backward)
+        return lax.custom_linear_solve(
+            jacobian,
+            b,
+            solve=lambda _, b: solve(b),
+            transpose_solve=lambda _, b: transpose_solve(b),
+        )
 
     return lax.custom_root(
         lambda v: v - operator(v),
@@ -64,13 +78,12 @@ def implicit(
     )
 
 
-def _seldom_differentiated(
-    operator: Operator, fixed_point: jax.Array, linear: Callable[[Operator, jax.Array], jax.Array]
+def _traced_when_differentiated(
+    operator: Operator, fixed_point: jax.Array, system: LinearSystem
 ) -> jax.Array:
-    """The same with a linear solver for the system and its transpose.
+    """The same, whose system is traced only where a derivative is taken.
 
-    It is traced only where a derivative is taken, which ``lax.custom_root`` does in any case:
-    half of a solver's trace.
+    ``lax.custom_root`` traces it in any case, which is half of a solver's trace.
     """
     closed = jax.make_jaxpr(operator)(fixed_point)
 
@@ -78,17 +91,20 @@ def _seldom_differentiated(
         return jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, constants))(v)[0]
 
     @jax.custom_jvp
-    def root(constants: list[Any], v: jax.Array) -> jax.Array:
+    def root(constants: list[Any], system: LinearSystem, v: jax.Array) -> jax.Array:
         return v
 
     @root.defjvp
     def _(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
-        constants, v = primals
-        v = root(constants, v)
+        constants, system, v = primals
+        v = root(constants, system, v)
         _, change = jax.jvp(lambda c: image(c, v), (constants,), (tangents[0],))
         _, jacobian = jax.linearize(lambda x: image(constants, x), v)
         return v, lax.custom_linear_solve(
-            lambda x: x - jacobian(x), change, solve=linear, transpose_solve=linear
+            lambda x: x - jacobian(x),
+            change,
+            solve=system.solve,
+            transpose_solve=system.transpose_solve,
         )
 
-    return root(closed.consts, fixed_point)
+    return root(closed.consts, lax.stop_gradient(system), fixed_point)

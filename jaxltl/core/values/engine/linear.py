@@ -30,6 +30,9 @@ Operator = Callable[[jax.Array], jax.Array]
 DENSE_LIMIT = 512  # states up to which a system is inverted
 _BLOCK = 32
 _REFINEMENTS = 2
+_KRYLOV_REFINEMENTS = 16
+_INNER_TOLERANCE = 1e-2  # relative residual of one system of these
+_MOST_PRODUCTS = 20_000  # with the system, in one run of BiCGSTAB
 _GOOD_RATE = 0.7  # a contraction at least this fast needs no Krylov method
 _STRETCH = 64  # steps between two looks at the true residual
 
@@ -453,6 +456,52 @@ def _look(wanted: _Wanted, k: _Search, image: jax.Array) -> _Search:
         forced=jnp.where(returning, k.forced, ~halved),
         returning=returning,
     )
+
+
+def bicgstab(matvec: Operator, b: jax.Array, *, tolerance: float) -> tuple[jax.Array, jax.Array]:
+    """x with ``matvec(x) = b`` up to a relative residual, if that converges, and the products."""
+
+    def flat(x: jax.Array) -> jax.Array:
+        return matvec(x.reshape(b.shape)).ravel()
+
+    right = b.ravel()
+    # In a chain that seldom returns, residuals soon become orthogonal to the first one, and then
+    # the recurrence makes no progress; they do not become orthogonal to a random vector.
+    shadow = jax.random.normal(jax.random.key(0), right.shape, right.dtype)
+    start = start_bicgstab(jnp.zeros_like(right), right)._replace(
+        shadow=shadow, rho=dot(shadow, right)
+    )
+    goal, most = tolerance * norm(right), min(_MOST_PRODUCTS, 8 * right.size + 64)
+
+    def body(carry: tuple[Bicgstab, jax.Array]) -> tuple[Bicgstab, jax.Array]:
+        k, n = carry
+        k = k.first(flat(k.p))
+        return k.second(flat(k.r)), n + 2
+
+    def unfinished(carry: tuple[Bicgstab, jax.Array]) -> jax.Array:
+        k, n = carry
+        return (k.size > goal) & jnp.isfinite(k.size) & (n < most)
+
+    k, n = lax.while_loop(unfinished, body, (start, jnp.int32(0)))
+    return k.x.reshape(b.shape), n
+
+
+def krylov_refined(matvec: Operator, b: jax.Array) -> jax.Array:
+    """x with ``matvec(x) = b`` as nearly as the dtype allows, by iterative refinement."""
+    goal = float(jnp.finfo(b.dtype).eps) ** 0.8 * norm(b.ravel())
+
+    def body(carry: Any) -> Any:
+        x, residual, _, n = carry
+        better = x + bicgstab(matvec, residual, tolerance=_INNER_TOLERANCE)[0]
+        residual = b - matvec(better)
+        return better, residual, norm(residual.ravel()), n + 1
+
+    def unfinished(carry: Any) -> jax.Array:
+        _, _, size, n = carry
+        return (size > goal) & (n < _KRYLOV_REFINEMENTS)
+
+    start = jnp.zeros_like(b), b, norm(b.ravel()), jnp.int32(0)
+    return lax.while_loop(unfinished, body, start)[0]
 
 
 def dot(x: jax.Array, y: jax.Array) -> jax.Array:

@@ -22,13 +22,18 @@ from jaxltl.core.models.mesh.sharded import refuse_sharded
 from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
 from jaxltl.core.models.product import Product
 from jaxltl.core.pretty_print import brief
+from jaxltl.core.sparse.graph.qualitative import backward_reachable
 from jaxltl.core.types import Solution, Status
 from jaxltl.core.values import facts
 from jaxltl.core.values.engine.certificates import rounding_unit
+from jaxltl.core.values.engine.host_solution import solution_from_enclosure
 from jaxltl.core.values.undiscounted.complement import opposite_event
 from jaxltl.core.values.undiscounted.reachability import (
-    action_matrices,
-    attaining_actions,
+    QUICK_LIMIT,
+    Question,
+    conserving_rows,
+    on_actions,
+    rows_of_model,
 )
 from jaxltl.core.values.undiscounted.satisfaction import (
     Reaching,
@@ -137,7 +142,7 @@ def optimal_actions(
     if int(found.status) == Status.CONVERGED:
         return found
     # What is left of it attains bounds whatever the shares of its actions.
-    sure = attaining_actions(problem.model, problem.target, objective=problem.objective)
+    sure = _attaining(problem)
     if sure is not None:
         keeps, bounds = sure
         bounds = opposite_event(bounds) if problem.opposite else bounds
@@ -177,11 +182,29 @@ def _by_bounds(model: Product, solution: Solution, objective: str) -> Booleans:
     sign = 1
     if objective == "min":
         near, far, sign = far, near, -1
-    rows = action_matrices(model)
-    ahead = np.stack([row @ far.ravel() for row in rows], -1).reshape(*far.shape, -1)
+    sparse = rows_of_model(model)
+    ahead = on_actions(sparse, sparse.host.expectation(far.ravel()), model)
     # A model's probabilities are rounded, and so may be what it is a model of.
     slack = rounding_unit(model) * np.maximum(ahead, near[..., None])
     return sign * ahead + slack >= sign * near[..., None]
+
+
+def _attaining(problem: Reaching) -> tuple[Booleans, Solution] | None:
+    """Actions by which every policy that takes them all attains a bound, and that bound.
+
+    None if such a policy may stay undecided for ever.
+    """
+    if problem.model.num_states > QUICK_LIMIT:
+        return None
+    sparse = rows_of_model(problem.model)
+    host = sparse.host
+    found = Question.of(problem.target, None, problem.objective).solve(host, 1e-11)
+    keeps = conserving_rows(host, problem.objective, found)
+    decided = found.lower == found.upper
+    if not backward_reachable(host, decided, keeps).all():
+        return None
+    bounds = solution_from_enclosure(problem.model, sparse, found, np.inf, relative=False)
+    return on_actions(sparse, keeps, problem.model), bounds
 
 
 def _bounded(

@@ -1,65 +1,50 @@
-"""Probabilities of reaching a set and of satisfying a formula, with certified bounds.
-
-Where a probability is exactly 0 or exactly 1 is decided on the graph. In between, a fixed
-policy is a linear system, certified by its residual, and an optimum is enclosed by
-interval iteration with end components collapsed. No bound rests on a small change.
-"""
+"""Reachability probabilities, with certified bounds."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
-from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import lax
 
-from jaxltl.core.values.engine.validated import validated
-from jaxltl.core.graphs.attractor import attract, surely
-from jaxltl.core.graphs.end_components import EndComponents, components_within
-from jaxltl.core.graphs.graph import Graph, TracedGraph, graph_of, is_table, take
-from jaxltl.core.graphs.reaching import Sets, max_sets, min_sets, policy_sets
+from jaxltl.core.array_types import Booleans, Floats, Integers
+from jaxltl.core.graphs.graph import is_table
+from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
-from jaxltl.core.models.mdp import MDP, DenseMDP, support
+from jaxltl.core.models.mdp import MDP, support
 from jaxltl.core.models.mesh.sharded import is_sharded
-from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
-from jaxltl.core.models.ops.operators import (
-    action_argmax,
-    action_mean,
-    expectation,
-    policy_operator,
-    is_deterministic,
-    require_policy,
-    valid_policy,
-)
-from jaxltl.core.models.ops.successor_tables import action_columns, sweep_operator
+from jaxltl.core.models.ops.array_namespace import is_traced
+from jaxltl.core.models.ops.operators import require_policy
 from jaxltl.core.models.product import Product
-from jaxltl.core.sparse.solvers import dense_reachability as host
+from jaxltl.core.models.protocols import ActionModel, Array, Model
+from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.sparse.graph.qualitative import end_components
+from jaxltl.core.sparse.mdp import HostMDP
+from jaxltl.core.sparse.solvers import reachability as solver
 from jaxltl.core.sparse.solvers.layered_reachability import PaddedProduct, layered_reachability
-from jaxltl.core.sparse.solvers.shortest_path import quickest
-from jaxltl.core.types import Solution, Status, require_shape, status_code
-from jaxltl.core.values.engine.certificates import m_matrix_error, refuse, rounding_unit
-from jaxltl.core.values.engine.host_solution import is_sparse, reachability
-from jaxltl.core.values.engine.implicit_diff import implicit
-from jaxltl.core.values.engine.iterate import in_turn, iterate
-from jaxltl.core.values.engine.linear import Inverse, System, solver
+from jaxltl.core.sparse.solvers.total_cost import Enclosure
+from jaxltl.core.sparse.solvers.shortest_path import fastest_rows
+from jaxltl.core.types import Solution, require_shape
+from jaxltl.core.values.engine.host_solution import (
+    induced_chain,
+    default_tolerance,
+    with_given_policy,
+    is_sparse,
+    solution_from_enclosure,
+)
+from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.values.interval.robust import refuse_nature, robust_reachability
+from jaxltl.core.values.undiscounted import optimum
 
-_POLICY_SWEEPS = 8  # sweeps under the greedy policy for one of the optimality operator
-_FINER = 8  # how much nearer a guess is, once the bounds are near
-_FAR_SWEEPS = 6  # sweeps of a guess, or of interval iteration after one that failed
-_HOST_LIMIT = 4096  # states up to which a concrete model is solved on the host, by elimination
-QUICK_LIMIT = 100_000  # states of a concrete model up to which its quickest policy is looked for
-_FILLED = 2048  # of these undecided, as elimination may fill a matrix of so many rows
+_FINE_LIMIT = 4096  # states up to which bounds are as narrow as the dtype allows; it costs a round
+QUICK_LIMIT = 100_000  # states up to which ties are broken by the expected time
 
 
 @validated()
 def reachability_probability(
-    model: Any,
+    model: Model,
     target: jax.Array,
     *,
     stay: jax.Array | None = None,
@@ -68,51 +53,51 @@ def reachability_probability(
     nature: str | None = None,
     method: str = "auto",
     tolerance: jax.Array | float | None = None,
-    max_steps: jax.Array | int = 1_000_000,
+    max_steps: jax.Array | int | None = None,
     start: tuple[jax.Array, jax.Array] | None = None,
 ) -> Solution:
-    """Probability of ever reaching a set of states.
+    """Probability of reaching a set of target states.
 
-    The least solution of ``y = 1`` on the target, ``y = sum_a pi(s, a) (P y)(s, a)``
-    elsewhere (2.5); for optima with a maximum or minimum over available actions
-    (Baier and Katoen 2008, section 10.6). Small concrete models are solved on the host by
-    elimination and policy iteration, and nothing is compiled. Other optima: interval iteration
-    (Haddad and Monmege 2018) with maximal end components collapsed and each bound rounded
-    outwards. Sparse models are solved by :mod:`jaxltl.core.sparse.solvers.reachability`, large products whose
-    worlds mix by :mod:`jaxltl.core.sparse.solvers.layered_reachability`.
+    The least solution of ``y = 1`` on the target and ``y = sum_a pi(s, a) (P y)(s, a)`` elsewhere
+    (2.5); for optima with the maximum or minimum over available actions (Baier and Katoen 2008,
+    section 10.6). Concrete models are solved on sparse rows by policy iteration
+    (:mod:`jaxltl.core.sparse.solvers.reachability`) and nothing is compiled. Traced and sharded
+    models are solved by interval iteration (Haddad and Monmege 2018), and policies by a linear
+    system (:mod:`jaxltl.core.values.undiscounted.optimum`).
 
     Args:
-      model: the model.
+      model: any model.
       target: ``bool[S]``.
-      stay: ``bool[S]``, the states that may be passed before (until); default all. Concrete.
-      policy: ``float[S, A]`` or ``int32[S]``: evaluate this policy. Default: optimise. Of a sparse
+      stay: ``bool[S]``, the states that a path may visit before the target (until); default all.
+        Concrete models only.
+      policy: ``float[S, A]`` or ``int32[S]``: evaluate this policy. Default: optimise. For a sparse
         model ``float[R]``, or rows ``int32[S]``.
       objective: ``"max"`` or ``"min"``; ignored when a policy is given.
-      nature: of interval models only, see
-        :func:`~jaxltl.core.values.interval.robust.robust_reachability`, which answers then.
-      method: for a given policy: ``"direct"`` (elimination, however slowly the policy
-        makes progress), ``"iterative"`` (Krylov), or ``"auto"``, direct for small models.
-      tolerance: half the width of the enclosure asked for. Default: the square root of the
-        dtype's precision must be met, and an optimum is then enclosed as closely as the dtype
-        allows, until a round of sweeps gains less than rounding takes. Of a sparse model, or with
-        `stay`: the whole width, 1e-6 by default (1e-3 in single precision).
-      max_steps: sweeps at most.
-      start: bounds of the optimum from below and above to go on from, such as those of a solution
-        that ended after `max_steps`; used where bounds are found by sweeps. They are believed.
+      nature: for interval models only, see
+        :func:`~jaxltl.core.values.interval.robust.robust_reachability`.
+      method: for a given policy: ``"direct"`` (elimination), ``"iterative"`` (Krylov) or
+        ``"auto"``, direct on the host and for small traced models.
+      tolerance: width of the enclosure. Default: twice the square root of the dtype's precision
+        must be met, and an optimum is enclosed as closely as the dtype allows; for a sparse model,
+        or with `stay`, 1e-6 (1e-3 in single precision).
+      max_steps: number of sweeps of interval iteration at most, which it selects; default 10^6.
+      start: lower and upper bounds from which interval iteration starts, which it selects, such as
+        those of a solution that ended after `max_steps`. They are not checked.
 
     Returns:
-      :class:`Solution`; `value` is ``float[S]``, exactly 0 or 1 where the graph says so. An
-      optimum's `policy` is ``int32[S]`` and attains its bound on the safe side
-      (`lower` for a maximum, `upper` for a minimum). Of the policies that do it is the
-      quickest, on a concrete model, see
+      :class:`Solution`; `value` is ``float[S]``, exactly 0 or 1 where the graph decides. An
+      optimum's `policy` is ``int32[S]`` and attains its bound on the safe side (`lower` for a
+      maximum, `upper` for a minimum). On a concrete padded model it is the fastest such policy, see
       :func:`~jaxltl.core.values.undiscounted.satisfaction.optimal_satisfaction`.
 
     Raises:
-      ValueError: a shape is wrong, or the objective or method is unknown.
+      ValueError: a shape is wrong, the objective or method is unknown, or `stay` or a sparse model
+        is traced.
 
     Differentiable in the policy and in the probabilities, with the support held fixed.
 
     Example:
+      >>> import jax.numpy as jnp
       >>> from jaxltl import from_dense
       >>> mdp = from_dense([[[0.5, 0.25, 0.25]], [[0, 1.0, 0]], [[0, 0, 1.0]]])
       >>> round(reachability_probability(mdp, jnp.array([False, True, False])).value[0].item(), 3)
@@ -134,506 +119,196 @@ def reachability_probability(
         )
     refuse_nature(nature)
     require_shape("target", target, model.state_shape)
-    if is_sparse(model) or stay is not None:
-        return reachability(
-            model, target, stay=stay, policy=policy, objective=objective, tolerance=tolerance
-        )
-    traced = is_traced((model, target, policy, tolerance, max_steps, start))
-    traced |= is_sharded(model)
-    readable = not traced and is_table(model)
-    small = readable and math.prod(model.state_shape) <= _HOST_LIMIT
-    if policy is not None:
+    if stay is not None:
+        require_shape("stay", stay, model.state_shape)
+    if policy is not None and not is_sparse(model):
         require_policy(model, policy)
-        found = None
-        if small and method != "iterative":
-            found = _policy_on_host(model, target, policy, tolerance)
-        if found is None:
-            found = _evaluate(model, target, policy, tolerance, max_steps, method=method)
-        return found
-    if traced:
-        return _inside_jit(model, target, tolerance, max_steps, start, objective=objective)
-    found = _by_layers(model, target, tolerance, objective)
-    if found is not None:
-        return found
-    graph = graph_of(model)
-    sets, components = _decided(model, np.asarray(target), objective=objective)
-    if components is not None and not components.inside.any():
-        components = None
-    found, ties = None, False
-    if small:
-        found, ties = _optimum_on_host(model, graph, sets, components, tolerance, objective)
-    if found is None:
-        arguments = to_jax((sets, components))
-        found = _optimize(model, *arguments, tolerance, max_steps, start, objective=objective)
-    if not readable:
-        return found
-    decided = sets.zero | (np.asarray(target) if objective == "max" else sets.one)
-    action = np.asarray(found.policy)
-    good = _attaining(graph, sets, components, action, ties, objective)
-    return replace(found, policy=to_jax(_quickest(model, graph, good, decided, action)))
+    traced = is_sharded(model) or is_traced((model, target, stay, policy, tolerance))
+    if is_sparse(model) or stay is not None:
+        if traced:
+            raise ValueError(
+                "reachability of a sparse model, or with stay, needs concrete arrays; inside jit "
+                "use prepare(model, target), or the product with the formula's automaton."
+            )
+        return _on_host(model, target, stay, policy, objective, tolerance)
+    iterative = method == "iterative" and policy is not None
+    if traced or not is_table(model) or iterative or max_steps is not None or start is not None:
+        question = target, tolerance, 1_000_000 if max_steps is None else max_steps
+        if policy is not None:
+            return optimum.policy_reachability(model, policy, *question, method=method)
+        return optimum.optimal_reachability(model, *question, start, objective=objective)
+    found = None
+    if policy is None:
+        found = _by_layers(model, target, tolerance, objective)
+    return _on_host(model, target, None, policy, objective, tolerance) if found is None else found
 
 
-@partial(jax.jit, static_argnames=("objective",))
-def _inside_jit(model, target, tolerance, max_steps, start, *, objective) -> Solution:
-    sets, components = in_turn(partial(_decided, objective=objective), model, target)
-    return _optimize(model, sets, components, tolerance, max_steps, start, objective=objective)
-
-
-def _decided(model: Any, target: Any, *, objective: str) -> tuple[Sets, EndComponents | None]:
-    """What the graph decides of an optimum, and the end components in what is left."""
-    graph = graph_of(model, target)
-    target = take(graph, target)
-    if objective == "min":
-        return min_sets(graph, target), None
-    sets = max_sets(graph, target)
-    return sets, components_within(graph, ~(sets.one | sets.zero))
-
-
-# --- small concrete models: the host ---------------------------------------------------------
-
-
-def action_matrices(model: Any) -> list[Any]:
-    """The transitions of a concrete model, a matrix for each action."""
-    model = model.mdp if isinstance(model, Game) else model
-    world: Any = model.mdp if isinstance(model, Product) else model
-    dense = isinstance(world, DenseMDP)
-    weight = np.where(
-        support(world), np.asarray(world.transition if dense else world.probability), 0
-    )
-    memory = np.zeros((world.num_states, 1), np.int32)
-    if world is not model:
-        memory = np.asarray(model.next_memory)
-    on_entry = getattr(model, "label_on", "entry") == "entry"
-    return host.transition_rows(
-        None if dense else np.asarray(world.successor), weight, memory, on_entry
+def _on_host(
+    model: Model,
+    target: Booleans,
+    stay: Booleans | None,
+    policy: Floats | Integers | None,
+    objective: str,
+    tolerance: float | None,
+) -> Solution:
+    """The probabilities by the sparse engine."""
+    sparse = rows_of_model(model)
+    question = Question.of(target, stay, objective)
+    asked, fine = _tolerances(model, tolerance, exact=stay is None and not is_sparse(model))
+    host, depth = sparse.host, 0
+    if policy is not None:
+        host, _, depth = induced_chain(model, sparse, policy)
+    found = question.solve(host, fine, depth)
+    if policy is None and stay is None and not is_sparse(model):
+        found = replace(found, row=_fastest(host, question, found))
+    return with_given_policy(
+        solution_from_enclosure(model, sparse, found, asked, relative=False), policy
     )
 
 
-def _unit(model: Any) -> float:
-    """Rounding of a backup in double precision."""
-    terms = model.num_successors + model.num_actions + 4
-    return terms * float(np.finfo(np.float64).eps)
+def _tolerances(model: Model, tolerance: float | None, *, exact: bool) -> tuple[float, float]:
+    """The width of the enclosure that counts as converged, and the width to aim for."""
+    eps = float(np.finfo(np.dtype(model.dtype)).eps)
+    asked = default_tolerance(model) if tolerance is None else float(tolerance)
+    if exact and tolerance is None:
+        asked = 2 * eps**0.5
+    small = model.num_states <= _FINE_LIMIT
+    if exact and (tolerance is None or small):
+        return asked, min(asked, max(4 * eps, 1e-12 if small else 1e-11))
+    return asked, asked
 
 
-def _host_solution(model: Any, found: host.Bounds, policy: Any, tolerance: Any) -> Solution | None:
-    """The bounds in the model's precision, rounded outwards; None if wider than asked."""
-    dtype, shape = np.dtype(model.dtype), model.state_shape
-    exact = found.lower == found.upper
-    low, high = (
-        np.where(exact, x, np.nextafter(x.astype(dtype), end)).clip(0, 1).astype(dtype)
-        for x, end in ((found.lower, dtype.type(-1)), (found.upper, dtype.type(2)))
-    )
-    goal = np.sqrt(np.finfo(dtype).eps) if tolerance is None else float(tolerance)
-    if not (high - low <= 2 * goal).all():
-        return None
-    value = found.value.astype(dtype).clip(low, high)
-    arrays = (
-        value.reshape(shape),
-        policy,
-        low.reshape(shape),
-        high.reshape(shape),
-        np.asarray(found.residual, dtype),
-        np.int32(found.rounds),
-        np.int32(Status.CONVERGED),
-    )
-    return Solution(*to_jax(arrays))
+def rows_of_model(model: Model) -> SparseMDP:
+    """The sparse rows of a concrete model or game; a float32 model means its normalised rows."""
+    return to_sparse(model.mdp if isinstance(model, Game) else model)
 
 
-def _by_layers(model: Any, target: Any, tolerance: Any, objective: str) -> Solution | None:
-    """Of a large product, one part of the automaton after the other; None where that is no help."""
+def on_rows(sparse: SparseMDP, quantity: Array) -> Array:
+    """A quantity on actions ``[S, A]`` as one on rows ``[R]``."""
+    flat = np.asarray(quantity).reshape(sparse.num_states, -1)
+    return flat[sparse.host.state, np.asarray(sparse.action)]
+
+
+def on_actions(sparse: SparseMDP, quantity: Array, model: ActionModel) -> Array:
+    """A quantity on rows ``[R]`` as one on actions ``[S, A]``, 0 at unavailable ones."""
+    found = np.zeros((sparse.num_states, model.num_actions), quantity.dtype)
+    found[sparse.host.state, np.asarray(sparse.action)] = quantity
+    return found.reshape(*model.state_shape, -1)
+
+
+def row_of_action(sparse: SparseMDP, action: Array) -> Integers:
+    """The rows ``int[S]`` of a policy of actions ``int[S]``."""
+    chosen = np.asarray(action).ravel()[sparse.host.state] == np.asarray(sparse.action)
+    return sparse.host.first_choice(chosen)[1]
+
+
+class Question(NamedTuple):
+    """A reachability question about sparse rows."""
+
+    target: Booleans
+    stay: Booleans | None
+    objective: str
+
+    @classmethod
+    def of(cls, target: Booleans, stay: Booleans | None, objective: str) -> Question:
+        """The question with flat arrays."""
+        stay = None if stay is None else np.asarray(stay, bool).ravel()
+        return cls(np.asarray(target, bool).ravel(), stay, objective)
+
+    def solve(self, mdp: HostMDP, tolerance: float, depth: int = 0) -> Enclosure:
+        """The enclosure on sparse rows."""
+        return solver.reachability(
+            mdp,
+            self.target,
+            maximize=self.objective == "max",
+            stay=self.stay,
+            tolerance=tolerance,
+            depth=depth,
+        )
+
+
+# --- ties -----------------------------------------------------------------------------------------
+
+
+def conserving_rows(mdp: HostMDP, objective: str, found: Enclosure) -> Booleans:
+    """Rows in undecided states by which every policy that decides almost surely attains the bound.
+
+    ``P l >= l`` for the lower bound l of a maximum makes l a submartingale, and bounds the value
+    of a policy of such rows from below by its limit, which is 0 or 1; likewise ``P u <= u`` for
+    the upper bound of a minimum.
+    """
+    undecided = found.lower != found.upper
+    unit = (int(np.diff(mdp.entry_start).max(initial=1)) + 8) * float(np.finfo(np.float64).eps)
+    if objective == "max":
+        keeps = mdp.expectation(found.lower) * (1 - unit) >= found.lower[mdp.state]
+        keeps |= end_components(mdp, undecided).inside
+    else:
+        keeps = mdp.expectation(found.upper) * (1 + unit) <= found.upper[mdp.state]
+    return keeps & undecided[mdp.state]
+
+
+def _fastest(mdp: HostMDP, question: Question, found: Enclosure) -> Integers:
+    """The rows of the policy with the least expected time to decide, among those that attain."""
+    if mdp.num_states > QUICK_LIMIT:
+        return found.row
+    good = conserving_rows(mdp, question.objective, found)
+    undecided = found.lower != found.upper
+    good[found.row[undecided]] = True
+    decided = ~undecided
+    if question.objective == "max":
+        one = found.lower == 1
+        good |= one[mdp.state] & ~mdp.support.some_successor_in(~one)
+        decided &= ~one | question.target
+    return fastest_rows(mdp, good, decided, found.row)
+
+
+# --- large products -------------------------------------------------------------------------------
+
+
+def _by_layers(
+    model: ActionModel, target: Booleans, tolerance: float | None, objective: str
+) -> Solution | None:
+    """A large product by the automaton's components; None where that does not help."""
     world = model.mdp if isinstance(model, Product) else None
     if not isinstance(world, MDP) or model.label_on != "entry" or model.num_states <= QUICK_LIMIT:
         return None
+    asked, fine = _tolerances(model, tolerance, exact=True)
     eps = float(np.finfo(np.dtype(model.dtype)).eps)
-    width = max(4 * eps, 1e-11) if tolerance is None else 2 * float(tolerance) - 4 * eps
-    beside = PaddedProduct(
+    width = fine if tolerance is None else asked - 4 * eps  # bounds are rounded outwards
+    if not width > 0:
+        return None
+    used = support(world)
+    layers = PaddedProduct(
         np.asarray(world.successor),
-        support(world),
-        np.asarray(world.probability),
+        used,
+        _normalised(np.where(used, np.asarray(world.probability), 0)),
         np.asarray(world.available),
         np.asarray(model.automaton.delta),
         np.asarray(model.letter),
         None if model.allowed is None else np.asarray(model.allowed),
     )
-    if not width > 0:
-        return None
     found = layered_reachability(
-        beside, np.asarray(target), maximize=objective == "max", tolerance=width
+        layers, np.asarray(target), maximize=objective == "max", tolerance=width
     )
     if found is None:
         return None
     half = (found.upper - found.lower) / 2
-    # The operator carries the bounds towards each other, so the value by half of what is between.
-    bounds = host.Bounds(
-        found.lower + half,
-        found.lower,
-        found.upper,
-        float(half.max()),
-        found.sweeps,
-        found.action,
-        half > 0,
+    # The operator contracts the bounds towards each other, so the residual is at most half of the
+    # width.
+    bounds = Enclosure(
+        value=found.lower + half,
+        lower=found.lower,
+        upper=found.upper,
+        row=found.action,
+        rounds=found.sweeps,
+        residual=float(half.max()),
+        method="sweeps in place",
     )
-    return _host_solution(model, bounds, found.action, tolerance)
+    return solution_from_enclosure(model, None, bounds, asked, relative=False)
 
 
-def _policy_on_host(model: Any, target: Any, policy: Any, tolerance: Any) -> Solution | None:
-    table = np.asarray(policy)
-    if is_deterministic(table):
-        table = np.eye(model.num_actions, dtype=model.dtype)[table]
-    graph = graph_of(model)
-    sets = policy_sets(graph, np.asarray(target), table)
-    one, zero = sets.one.ravel(), sets.zero.ravel()
-    undecided = ~(one | zero)
-    if undecided.sum() > _FILLED:
-        return None
-    chain = host.policy_row(action_matrices(model), table.reshape(len(one), -1).astype(float))
-    found = host.of_policy(chain, one, undecided, _unit(model))
-    return None if found is None else _host_solution(model, found, table, tolerance)
-
-
-def _optimum_on_host(
-    model: Any,
-    graph: Graph,
-    sets: Sets,
-    components: EndComponents | None,
-    tolerance: Any,
-    objective: str,
-) -> tuple[Solution | None, Any]:
-    """The optimum, if it could be found, and the actions that tie: ``bool[S, A]``."""
-    allowed, group = graph.available, np.arange(sets.one.size, dtype=np.int32)
-    if components is not None:
-        allowed, group = allowed & ~components.inside, np.asarray(components.component).ravel()
-    undecided = ~(sets.one | sets.zero)
-    if undecided.sum() > _FILLED:
-        return None, False
-    rows = action_matrices(model)
-    found = host.optimum(
-        rows,
-        allowed.reshape(len(group), -1),
-        group,
-        sets.one.ravel(),
-        undecided.ravel(),
-        1 if objective == "max" else -1,
-        _unit(model),
-    )
-    if found is None:
-        return None, False
-    exits, action = (x.reshape(sets.one.shape) for x in (found.exits, found.action))
-    if components is not None:
-        towards = attract(graph, exits, components.inside).action
-        action = np.where(exits, action, towards)
-    policy = np.where(undecided, action, sets.action).astype(np.int32)
-    ties = _ties(model, rows, found, objective).reshape(graph.available.shape)
-    return _host_solution(model, found, policy, tolerance), ties
-
-
-def _ties(model: Any, rows: list[Any], found: host.Bounds, objective: str) -> Any:
-    """The actions that do not lead away from the bound that is attained: ``bool[S, A]``.
-
-    It is then a bound of whatever policy decides almost surely by them.
-    """
-    unit = _unit(model)
-    bound = found.lower if objective == "max" else found.upper
-    ahead = np.stack([row @ bound for row in rows], -1)
-    if objective == "max":
-        keeps = ahead * (1 - unit) >= bound[:, None]
-    else:
-        keeps = ahead * (1 + unit) <= bound[:, None]
-    return keeps & ((bound > 0) & (bound < 1))[:, None]
-
-
-def _attaining(
-    graph: Graph,
-    sets: Sets,
-    components: EndComponents | None,
-    policy: Any,
-    ties: Any,
-    objective: str,
-) -> Any:
-    """Actions by which any policy that decides almost surely attains the bound: ``bool[S, A]``."""
-    undecided = ~(sets.one | sets.zero)[..., None]
-    good = undecided & ((policy[..., None] == np.arange(graph.num_actions)) | ties)
-    if objective == "max":
-        good |= sets.one[..., None] & graph.forall(sets.one)
-    if components is not None:
-        good |= components.inside
-    return good & graph.available
-
-
-def attaining_actions(model: Any, target: Any, *, objective: str) -> tuple[Any, Solution] | None:
-    """Actions by which every policy that takes them all now and then attains a bound.
-
-    Where the probability is strictly between 0 and 1: those in end components, and those that do
-    not lead away from the bound. By them a policy decides almost surely, if it can.
-
-    Args:
-      model: a concrete model.
-      target: ``bool[S]``.
-      objective: ``"max"`` or ``"min"``.
-
-    Returns:
-      ``bool[S, A]``, False elsewhere, and the bounds, `lower` of a maximum, `upper` of a minimum;
-      None if that could not be shown on the host.
-    """
-    if not is_table(model) or math.prod(model.state_shape) > _HOST_LIMIT:
-        return None
-    graph = graph_of(model)
-    sets, components = _decided(model, np.asarray(target), objective=objective)
-    found, ties = _optimum_on_host(model, graph, sets, components, np.inf, objective)
-    if found is None:
-        return None
-    if components is not None:
-        ties = ties | components.inside
-    decided = sets.one | sets.zero
-    good = ties & ~decided[..., None] & graph.available
-    return (good, found) if attract(graph, decided, good).region.all() else None
-
-
-def _quickest(model: Any, graph: Graph, good: Any, decided: Any, policy: Any) -> Any:
-    """The policy of some actions that decides in the least expected time.
-
-    Where it is decided, or if that is too hard to find, it is the policy that is given.
-    """
-    if decided.size > QUICK_LIMIT or decided.all():
-        return policy
-    start = surely(graph, decided, good)
-    if not start.region.all():
-        return policy
-    action = np.where(decided, policy, start.action)
-    found = quickest(
-        action_matrices(model), good.reshape(decided.size, -1), ~decided.ravel(), action.ravel()
-    )
-    return policy if found is None else found.reshape(decided.shape).astype(np.int32)
-
-
-# --- a fixed policy: a linear system with a certificate -----------------------------------
-
-
-@partial(jax.jit, static_argnames=("method",))
-def _evaluate(model, target, policy, tolerance, max_steps, *, method) -> Solution:
-    """Solves ``y = 1_one + (P_pi y) on the undecided states`` and encloses the answer."""
-    target = jnp.asarray(target, bool)
-    checked = valid_policy(model, policy)
-    policy = checked.distribution
-    sets = policy_sets(TracedGraph(model), target, policy)
-    undecided = ~(sets.one | sets.zero)
-    one = sets.one.astype(model.dtype)
-    weight = action_columns(model.num_actions, policy)
-    system = lax.stop_gradient(
-        System(sweep_operator(model), weight, undecided.ravel().astype(model.dtype))
-    )
-    linear = solver(system, method, max_steps=max_steps)
-
-    def onward(y: jax.Array) -> jax.Array:
-        return jnp.where(undecided, action_mean(policy, expectation(model, y)), 0)
-
-    still = lax.stop_gradient(policy)
-    value, n = lax.stop_gradient(linear.counted(one))
-    value = jnp.where(undecided, value, one)
-    # Elimination can break down where rounding closes what leaves a set hardly ever.
-    value = jnp.clip(jnp.where(jnp.isfinite(value), value, 0), 0, 1)
-    error, residual, _ = lax.stop_gradient(
-        m_matrix_error(model, linear.solve, onward, value, undecided)
-    )
-    goal = jnp.sqrt(jnp.finfo(model.dtype).eps) if tolerance is None else tolerance
-    solution = Solution(
-        value=value,
-        policy=still,
-        lower=jnp.maximum(value - error, 0),
-        upper=jnp.minimum(value + error, 1),
-        residual=residual,
-        num_steps=n,
-        # What elimination leaves is rounding.
-        status=status_code(
-            jnp.max(error) <= goal, jnp.isfinite(residual), isinstance(linear, Inverse)
-        ),
-    )
-    found = implicit(
-        lambda y: one + onward(y),
-        lax.stop_gradient(value),
-        solve=linear.solve,
-        transpose_solve=linear.transpose_solve,
-    )
-    solution = replace(lax.stop_gradient(solution), value=found, policy=policy)
-    return refuse(solution, checked.given, checked.valid)
-
-
-# --- optima: interval iteration -------------------------------------------------------------
-
-
-class _Search(NamedTuple):
-    """A problem of finding an optimum; `sign` times probabilities are maximised.
-
-    Where `cheap`, sweeps under a fixed policy go through its chain over single states; a product
-    gathers whole rows, which such a chain cannot.
-    """
-
-    model: Any
-    undecided: jax.Array
-    one: jax.Array
-    components: EndComponents | None
-    goal: jax.Array
-
-    @property
-    def cheap(self) -> bool:
-        return self.components is None and not isinstance(self.model, Product)
-
-    @property
-    def slack(self) -> float:
-        """Sums of nonnegative terms err by a relative amount, so rounded outwards bounds stay."""
-        return rounding_unit(self.model)
-
-    @property
-    def leaving(self) -> jax.Array:
-        available = self.model.available
-        return available if self.components is None else available & ~self.components.inside
-
-    def best(self, sign: int, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-        value, action = action_argmax(sign * expectation(self.model, y), self.leaving)
-        return jnp.where(self.undecided, _collapse(self.components, sign * value), self.one), action
-
-    def nearer(self, sign: int, near: jax.Array, image: jax.Array) -> jax.Array:
-        return sign * jnp.maximum(sign * near, sign * image * (1 - sign * self.slack))
-
-    def closer(self, sign: int, far: jax.Array, image: jax.Array) -> jax.Array:
-        return sign * jnp.minimum(sign * far, sign * image * (1 + sign * self.slack))
-
-
-class _Bounds(NamedTuple):
-    near: jax.Array
-    far: jax.Array
-    failed: jax.Array  # whether the last guess was no bound
-    moved: jax.Array
-    rests: jax.Array  # whether a round gained less than rounding takes
-
-    @property
-    def half(self) -> jax.Array:
-        return jnp.max(jnp.abs(self.far - self.near)) / 2
-
-
-def _tighter(sign: int, finest: bool, table: None, carry: _Bounds, search: _Search) -> _Bounds:
-    """One round: a sweep and some under the greedy policy for `near`, a guess or sweeps for `far`.
-
-    A value that the operator does not carry away from the optimum is a bound, because the fixed
-    point is unique where end components are collapsed; so `far` is guessed, and where the guess
-    fails, plain interval iteration goes on. Where the bounds are to be the finest, this goes on
-    beyond the goal: a guess is then a bound of the same shape that is `_FINER` times as near.
-    """
-    near, far, failed, *_ = carry
-    image, action = search.best(sign, near)
-    close = jnp.bool_(finest) & (carry.half <= search.goal)
-    aim = jnp.where(close, carry.half / _FINER, search.goal)
-    settled = jnp.max(jnp.abs(image - near)) <= aim / 32
-    new_near = search.nearer(sign, near, image)
-    if search.cheap:
-        new_near = _followed(sign, search, new_near, action)
-
-    def guess() -> tuple[jax.Array, jax.Array]:
-        # `near` moved by almost the tolerance; some sweeps give it its shape.
-        beyond = jnp.where(close, (far - new_near) / _FINER, sign * 1.8 * search.goal)
-        offered = jnp.clip(new_near + beyond, 0, 1)
-        offered = jnp.where(search.undecided, offered, search.one)
-
-        def sweep(_, pair: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-            return pair[1], search.best(sign, pair[1])[0] * (1 + sign * search.slack)
-
-        before, after = lax.fori_loop(0, _FAR_SWEEPS, sweep, (offered, offered))
-        proven = jnp.all(sign * after <= sign * before)
-        return jnp.where(proven, search.closer(sign, far, after), far), ~proven
-
-    def sweeps() -> tuple[jax.Array, jax.Array]:
-        step = lax.fori_loop(
-            0, _FAR_SWEEPS, lambda _, y: search.closer(sign, y, search.best(sign, y)[0]), far
-        )
-        return step, jnp.bool_(False)
-
-    gain = jnp.max(jnp.abs(new_near - near))
-    rests = close & (gain <= search.slack / 8)
-    new_far, failed = lax.cond(
-        settled | rests, lambda: lax.cond(failed | ~settled, sweeps, guess), lambda: (far, failed)
-    )
-    far_gain = jnp.max(jnp.abs(new_far - far))
-    rests &= ~failed & (far_gain <= search.slack / 8)
-    return _Bounds(new_near, new_far, failed, (gain > 0) | (far_gain > 0) | failed, rests)
-
-
-def _followed(sign: int, search: _Search, near: jax.Array, action: jax.Array) -> jax.Array:
-    onward = policy_operator(search.model, action)
-
-    def sweep(_, y: jax.Array) -> jax.Array:
-        image = onward(y.ravel()).reshape(y.shape)
-        return search.nearer(sign, y, jnp.where(search.undecided, image, search.one))
-
-    return lax.fori_loop(0, _POLICY_SWEEPS, sweep, near)
-
-
-def _ended(finest: bool, carry: _Bounds, search: _Search) -> jax.Array:
-    return (carry.rests if finest else carry.half <= search.goal) | ~carry.moved
-
-
-@partial(jax.jit, static_argnames=("objective",))
-def _optimize(model, sets: Sets, components, tolerance, max_steps, start, *, objective) -> Solution:
-    """Encloses an optimum between a bound that a policy attains and one that is proven.
-
-    The attained bound ("near") is the lower one of a maximum and the upper one of a
-    minimum. Sweeps under its own greedy policy move it soundly and cheaply.
-    """
-    sign = 1 if objective == "max" else -1
-    undecided = ~(sets.one | sets.zero)
-    one = sets.one.astype(model.dtype)
-    eps = jnp.finfo(model.dtype).eps
-    goal = jnp.asarray(jnp.sqrt(eps) if tolerance is None else tolerance, model.dtype)
-    search = _Search(model, undecided, one, components, goal)
-    top = jnp.where(undecided, 1, one)
-    low, high = (
-        (one, top)
-        if start is None
-        else (jnp.where(undecided, jnp.clip(x, 0, 1), one) for x in start)
-    )
-    near, far = (low, high) if objective == "max" else (high, low)
-    finest, no = tolerance is None, jnp.bool_(False)
-    bounds, n = iterate(
-        partial(_tighter, sign, finest),
-        partial(_ended, finest),
-        None,
-        _Bounds(near, far, no, ~no, no),
-        search,
-        max_steps=max_steps,
-    )
-    near, far = bounds.near, bounds.far
-    still = lax.stop_gradient(search)
-    action = still.best(sign, near)[1]
-    if components is not None:
-        own = action_argmax(expectation(still.model, near), still.leaving)[0]
-        exits = undecided & (own >= _collapse(components, own))
-        towards = attract(TracedGraph(model), exits, components.inside).action
-        action = jnp.where(exits, action, towards)
-    lower, upper = (near, far) if objective == "max" else (far, near)
-    value = (lower + upper) / 2
-    residual = jnp.max(jnp.abs(still.best(sign, value)[0] - value))
-    policy = jnp.where(undecided, action, sets.action)
-    solution = Solution(
-        value=value,
-        policy=policy,
-        lower=lower,
-        upper=upper,
-        residual=residual,
-        num_steps=n,
-        status=status_code(bounds.half <= goal, jnp.isfinite(residual)),
-    )
-    solution = jax.tree.map(lax.stop_gradient, solution)
-
-    def follow(y: jax.Array) -> jax.Array:
-        return jnp.where(undecided, action_mean(policy, expectation(model, y)), one)
-
-    # The optimum's derivative is that of the policy that attains it (Danskin).
-    return replace(solution, value=implicit(follow, solution.value))
-
-
-def _collapse(components: EndComponents | None, value: jax.Array) -> jax.Array:
-    """The largest value in each state's end component."""
-    if components is None:
-        return value
-    label = components.component.ravel()
-    best = jax.ops.segment_max(value.ravel(), label, num_segments=label.size)
-    return best[label].reshape(value.shape)
+def _normalised(weight: Floats) -> Floats:
+    """Rows that sum to 1 in double precision."""
+    weight = weight.astype(np.float64)
+    total = weight.sum(-1, keepdims=True)
+    return np.divide(weight, total, out=weight, where=total > 0)

@@ -22,7 +22,8 @@ from jaxltl.core.models.ops.array_namespace import is_traced, namespace, to_jax
 from jaxltl.core.models.ops.operators import is_deterministic, require_policy
 from jaxltl.core.models.product import Product
 from jaxltl.core.pretty_print import brief
-from jaxltl.core.sparse.solvers.shortest_path import quickest, until_read
+from jaxltl.core.sparse.mdp import HostMDP
+from jaxltl.core.sparse.solvers.shortest_path import fastest_rows, with_exits
 from jaxltl.core.types import Solution
 from jaxltl.core.values.engine.host_solution import is_sparse
 from jaxltl.core.values.interval.robust import refuse_nature
@@ -30,8 +31,10 @@ from jaxltl.core.values.interval.satisfaction import robust_product_satisfaction
 from jaxltl.core.values.undiscounted.complement import opposite_event
 from jaxltl.core.values.undiscounted.reachability import (
     QUICK_LIMIT,
-    action_matrices,
+    on_rows,
     reachability_probability,
+    row_of_action,
+    rows_of_model,
 )
 from jaxltl.core.values.undiscounted.sparse_satisfaction import product_satisfaction
 
@@ -109,7 +112,7 @@ def optimal_satisfaction(
     objective: str = "max",
     nature: str | None = None,
     tolerance: jax.Array | float | None = None,
-    max_steps: jax.Array | int = 1_000_000,
+    max_steps: jax.Array | int | None = None,
     start: tuple[jax.Array, jax.Array] | None = None,
 ) -> Solution:
     """Largest or smallest probability of satisfying the product's task, with its policy.
@@ -141,10 +144,7 @@ def optimal_satisfaction(
       objective: ``"max"`` or ``"min"``.
       nature: of products of interval models only, see
         :func:`~jaxltl.core.values.interval.satisfaction.robust_satisfaction`.
-      tolerance: half the width of the enclosure asked for; default as in
-        :func:`reachability_probability`, as closely as the dtype allows.
-      max_steps: sweeps at most.
-      start: bounds to go on from, as for :func:`reachability_probability`.
+      tolerance, max_steps, start: as for :func:`reachability_probability`.
 
     Returns:
       :class:`Solution`; `value` is ``float[S, Q]``, `policy` ``int32[S, Q]``, memoryless in
@@ -254,19 +254,24 @@ def _visiting(problem: Reaching, found: Solution) -> Any:
     assert accepting is not None
     if is_traced((model, found)) or model.num_states > QUICK_LIMIT:
         return accepting.action
-    rows = until_read(action_matrices(model), *visiting(problem))
-    inside = np.asarray(accepting.inside).reshape(model.num_states, -1)
-    action = np.asarray(accepting.action)
-    quick = quickest(rows, inside, np.asarray(accepting.region).ravel(), action.ravel())
-    return action if quick is None else quick.reshape(action.shape)
+    sparse = rows_of_model(model)
+    visits = until_visit(problem, sparse.host)
+    inside = on_rows(sparse, accepting.inside)
+    inner = ~np.asarray(accepting.region).ravel()
+    row = row_of_action(sparse, accepting.action)
+    found = fastest_rows(
+        visits,
+        np.append(inside, True),
+        np.append(inner, True),
+        np.append(row, sparse.num_rows),
+    )
+    return np.asarray(sparse.action)[found[:-1]].reshape(model.state_shape)
 
 
-def visiting(problem: Reaching) -> tuple[Any, Any]:
-    """The reads that an accepting end component is visited for, as `until_read` takes them.
+def until_visit(problem: Reaching, mdp: HostMDP) -> HostMDP:
+    """The product's rows, in which accepting visits lead to a further, absorbing state.
 
-    Returns:
-      ``bool[N, L]``, whether reading a letter in a state is a visit, and ``int[N]``, the letter
-      that is read when a state is entered; on the host.
+    An accepting visit reads the least priority of the accepting end component.
     """
     model, accepting = problem.model, problem.accepting
     assert accepting is not None
@@ -278,7 +283,8 @@ def visiting(problem: Reaching) -> tuple[Any, Any]:
     else:
         marked = least == automaton.priority[:, letter].T
         read = np.zeros(model.num_states, np.int32)
-    return marked.reshape(model.num_states, -1), read
+    marked = marked.reshape(model.num_states, -1)
+    return with_exits(mdp, marked[mdp.state[mdp.row], read[mdp.successor]])
 
 
 def _shifted(automaton: Automaton) -> Automaton:

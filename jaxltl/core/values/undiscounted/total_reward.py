@@ -8,6 +8,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import NDArray
 
 from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.models.construct.convert import to_sparse
@@ -16,6 +17,7 @@ from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.mesh.sharded import ShardedMDP, is_sharded
 from jaxltl.core.models.ops.array_namespace import is_traced
 from jaxltl.core.models.product import Product
+from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.models.sparse import Rewards, SparseMDP, choice_reward
 from jaxltl.core.sparse.solvers import reachability as optimal
 from jaxltl.core.types import Solution, require_shape
@@ -28,6 +30,8 @@ from jaxltl.core.values.engine.host_solution import (
 )
 from jaxltl.core.values.interval.robust import refuse_nature, robust_total_reward
 from jaxltl.core.values.undiscounted.traced_total_reward import total_reward_by_sweeps
+
+_SIX_DIGITS = 1e-6
 
 
 @validated()
@@ -132,6 +136,51 @@ def total_reward(
     return with_given_policy(
         solution_from_enclosure(model, sparse, found, asked, relative=True), policy
     )
+
+
+def hitting_time(model: Model, policy: Array, target: Array) -> NDArray[np.float64]:
+    """Expected number of steps of a policy until a set is reached, on the host.
+
+    The total reward ``h = 1 + P_pi h`` where the set is reached almost surely, which the graph
+    decides; infinite elsewhere, 0 in the set.
+
+    Args:
+      model: a concrete model.
+      policy: as for :func:`total_reward`.
+      target: ``bool[S]`` (``[S, Q]``).
+
+    Returns:
+      ``float64[S]``; NaN where six digits could not be certified, as the policy takes longer than
+      double precision can represent.
+
+    Raises:
+      ValueError: something is traced, or the policy is invalid.
+
+    Concrete arrays only, on the host; not differentiable.
+
+    Example:
+      >>> from jaxltl import from_dense
+      >>> mdp = from_dense([[[0.5, 0.5]], [[0.0, 1.0]]])
+      >>> hitting_time(mdp, np.array([0, 0]), np.array([False, True])).tolist()
+      [2.0, 0.0]
+    """
+    if is_traced((model, policy, target)):
+        raise ValueError("hitting_time works on the host; call it outside jit and vmap.")
+    require_shape("target", target, model.state_shape)
+    chain = induced_chain(model, to_sparse(model), policy)
+    goal = np.asarray(target, bool).ravel()
+    found = optimal.total_reward(
+        chain.mdp,
+        np.ones(chain.mdp.num_rows),
+        goal,
+        maximize=False,
+        tolerance=_SIX_DIGITS / 100,
+        depth=chain.depth,
+    )
+    with np.errstate(invalid="ignore"):
+        narrow = found.upper - found.lower <= _SIX_DIGITS * found.upper
+    time = np.where(narrow | np.isinf(found.value), found.value, np.nan)
+    return time.reshape(model.state_shape)
 
 
 def _earned(model: Any, sparse: SparseMDP, reward: Any) -> np.ndarray:

@@ -32,6 +32,7 @@ from jax import lax
 from jaxltl.core.graphs.attractor import attract, avoid, surely
 from jaxltl.core.graphs.end_components import EndComponents, components_within
 from jaxltl.core.graphs.graph import TracedGraph
+from jaxltl.core.graphs.reaching import policy_sets
 from jaxltl.core.models.ops.operators import (
     action_argmax,
     action_mean,
@@ -42,24 +43,14 @@ from jaxltl.core.models.ops.operators import (
 from jaxltl.core.models.ops.successor_tables import action_columns, sweep_operator
 from jaxltl.core.models.product import Product
 from jaxltl.core.types import Solution, status_code
-from jaxltl.core.values.engine.certificates import refuse, rounding_unit
+from jaxltl.core.values.engine.certificates import refuse, rounding_unit, underflow
+from jaxltl.core.values.engine.chain_systems import ChainSystem
 from jaxltl.core.values.engine.implicit_diff import implicit
 from jaxltl.core.values.engine.iterate import in_turn
-from jaxltl.core.values.engine.linear import (
-    Bicgstab,
-    System,
-    dot,
-    inverse,
-    is_small,
-    norm,
-    start_bicgstab,
-)
-from jaxltl.core.values.undiscounted.reachability import policy_sets
+from jaxltl.core.values.engine.linear import System, bicgstab, inverse, is_small, norm
 
 _FORCING = 1e-2  # relative residual asked of a linear system
 _POOR = 0.5  # of one that was solved too badly to be of use
-_MOST_INNER = 20_000  # applications of P for one
-_REFINEMENTS = 16  # systems for a derivative
 _SWEEPS = 128  # under the greedy policy, where it cannot be solved
 _ATTEMPTS = 8  # shares e that are tried
 _ROUNDINGS = 3  # of a backup, that the smallest e is
@@ -174,7 +165,8 @@ def total_reward_by_sweeps(
         return jnp.where(found.open, ahead.ravel()[found.leaves], 0)
 
     finite = found.finite & earns
-    value = implicit(follow, found.value, linear=_refined)
+    system = ChainSystem(model, chosen, found.open, found.leaves)
+    value = implicit(follow, found.value, system=lax.stop_gradient(system))
     value, lower, upper = (
         jnp.where(finite, x, jnp.where(earns, jnp.inf, bad))
         for x, bad in ((value, jnp.nan), (found.lower, -jnp.inf), (found.upper, jnp.inf))
@@ -365,7 +357,7 @@ def _improved(problem: _Problem, factor: jax.Array, at: _Point) -> tuple[jax.Arr
         x = (inverse(eye - moves) @ change.ravel()).reshape(change.shape) / scale
         n = jnp.int32(0)
     else:
-        x, n = _bicgstab(matvec, wanted)
+        x, n = bicgstab(matvec, wanted, tolerance=_FORCING)
     left = norm((wanted - matvec(x)).ravel())
     solved = left <= _POOR * norm(wanted.ravel())  # false for NaN
     x = lax.cond(
@@ -374,54 +366,6 @@ def _improved(problem: _Problem, factor: jax.Array, at: _Point) -> tuple[jax.Arr
         lambda: lax.fori_loop(1, _SWEEPS, lambda _, x: x + (wanted - matvec(x)), wanted),
     )
     return at.value + scale * x, n + jnp.where(solved, 1, _SWEEPS)
-
-
-def _bicgstab(
-    matvec: Callable[[jax.Array], jax.Array], b: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """x with ``matvec(x) = b``, nearly, and how often that was applied."""
-
-    def flat(x: jax.Array) -> jax.Array:
-        return matvec(x.reshape(b.shape)).ravel()
-
-    right = b.ravel()
-    # Where states lead on to others and seldom back, which is what progress looks like, residuals
-    # are soon orthogonal to the first one, from which the method then learns nothing.
-    shadow = jax.random.normal(jax.random.key(0), right.shape, right.dtype)
-    start = start_bicgstab(jnp.zeros_like(right), right)._replace(
-        shadow=shadow, rho=dot(shadow, right)
-    )
-    goal, most = _FORCING * norm(right), min(_MOST_INNER, 8 * right.size + 64)
-
-    def body(carry: tuple[Bicgstab, jax.Array]) -> tuple[Bicgstab, jax.Array]:
-        k, n = carry
-        k = k.first(flat(k.p))
-        return k.second(flat(k.r)), n + 2
-
-    def goes_on(carry: tuple[Bicgstab, jax.Array]) -> jax.Array:
-        k, n = carry
-        return (k.size > goal) & jnp.isfinite(k.size) & (n < most)
-
-    k, n = lax.while_loop(goes_on, body, (start, jnp.int32(0)))
-    return k.x.reshape(b.shape), n
-
-
-def _refined(matvec: Callable[[jax.Array], jax.Array], b: jax.Array) -> jax.Array:
-    """x with ``matvec(x) = b``, as nearly as the dtype allows."""
-    goal = float(jnp.finfo(b.dtype).eps) ** 0.8 * norm(b.ravel())
-
-    def body(carry: Any) -> Any:
-        x, left, _, n = carry
-        better = x + _bicgstab(matvec, left)[0]
-        left = b - matvec(better)
-        return better, left, norm(left.ravel()), n + 1
-
-    def goes_on(carry: Any) -> jax.Array:
-        _, _, size, n = carry
-        return (size > goal) & (n < _REFINEMENTS)
-
-    start = jnp.zeros_like(b), b, norm(b.ravel()), jnp.int32(0)
-    return lax.while_loop(goes_on, body, start)[0]
 
 
 def _solved(
@@ -501,7 +445,7 @@ def _tried(problem: _Problem, unit: jax.Array, tolerance: jax.Array, k: _Search)
     offered = jnp.where(problem.open, jnp.maximum(factor * at.image, 0), 0)
     at = _backup(problem, offered)
     # Sums of terms that are not negative err by a share of them, and by what underflows.
-    least = unit / jnp.finfo(unit.dtype).eps * jnp.finfo(unit.dtype).tiny
+    least = underflow(problem.model)
     most, fewest = at.image * (1 + unit) + least, at.image * (1 - unit) - least
     holds = jnp.where(above, most <= offered, fewest >= offered)
     proven = jnp.all(jnp.where(problem.open, holds & jnp.isfinite(offered), True))

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from jaxltl.core.models.construct.restrict import with_allowed
+from jaxltl.core.models.ops.operators import transition_matrix
 from jaxltl.core.sparse.solvers import layered_reachability as layers
-from jaxltl.core.sparse.solvers.dense_reachability import policy_row
 from jaxltl.core.values.undiscounted import reachability
-from jaxltl.core.values.undiscounted.reachability import action_matrices, reachability_probability
+from jaxltl.core.values.undiscounted.reachability import reachability_probability
 from tests.support import random_product
 
 
@@ -42,8 +42,8 @@ def cases(count, seed, num_memory=4):
 
 def attained(model, target, policy):
     """The probability of a policy, by squaring its chain."""
-    chain = policy_row(action_matrices(model), np.eye(3)[np.asarray(policy).ravel()])
-    chain = np.asarray(chain if isinstance(chain, np.ndarray) else chain.toarray())
+    weights = np.eye(3)[np.asarray(policy)]
+    chain = np.asarray(transition_matrix(model, weights), float).reshape(target.size, -1)
     goal = target.ravel()
     chain = np.where(goal[:, None], np.eye(goal.size), chain)
     for _ in range(34):

@@ -3,10 +3,9 @@
 import jax
 import numpy as np
 import pytest
-from scipy import sparse
 
 import jaxltl as jl
-from jaxltl.core.sparse.solvers import shortest_path as way_out
+from jaxltl.core.sparse.solvers.shortest_path import fastest_rows
 from jaxltl.core.values.undiscounted.satisfaction import as_reachability
 from tests.core.values.undiscounted.test_optimal_actions import (
     CASES,
@@ -106,30 +105,23 @@ def test_a_corridor_is_walked_straight():
     assert successor[probability.argmax()] == 1
 
 
-@pytest.mark.parametrize("dense", [True, False])
-@pytest.mark.parametrize("sweeps", [0, 20_000])
-def test_ways_out_by_sweeps_and_by_systems(dense, sweeps, monkeypatch):
-    """A slow walk on a line of 60 states, in which one action is a little less slow."""
-    monkeypatch.setattr(way_out, "_MAX_SWEEPS", sweeps)
-    size, rng = 60, np.random.default_rng(0)
+@pytest.mark.parametrize("size", [60, 800])
+def test_the_fastest_policy_of_a_slow_walk(size):
+    """A walk on a line in which one action of two is a little less slow."""
+    rng = np.random.default_rng(0)
     quick = rng.integers(2, size=size)
-    rows = np.zeros((2, size, size))
-    states = np.arange(size - 1)
-    for a in range(2):
-        ahead = np.where(quick[:-1] == a, 0.5, 0.49)
-        rows[a, states, states + 1] = ahead
-        rows[a, states, np.maximum(states - 1, 0)] += 1 - ahead
-    if not dense:
-        monkeypatch.setattr(way_out, "DENSE_LIMIT", 0)
-        rows = [sparse.csr_array(row) for row in rows]
-    open_ = np.arange(size) < size - 1
-    found = way_out.quickest(list(rows), np.ones((size, 2), bool), open_, np.zeros(size, np.int32))
-    np.testing.assert_array_equal(found[:-1], quick[:-1])
-    monkeypatch.setattr(way_out, "_MOST", 10)
-    assert (
-        way_out.quickest(list(rows), np.ones((size, 2), bool), open_, np.zeros(size, np.int32))
-        is None
-    )
+    ahead = np.where(quick[:, None] == np.arange(2), 0.5, 0.49)
+    states = np.arange(size)
+    around = np.stack([np.maximum(states - 1, 0), np.minimum(states + 1, size - 1)], -1)
+    model = jl.make_mdp(np.repeat(around[:, None], 2, 1), np.stack([1 - ahead, ahead], -1))
+    host = jl.to_sparse(model).host
+    goal = states == size - 1
+    rows = np.ones(host.num_rows, bool)
+    found = fastest_rows(host, rows, goal, host.row_start[:-1])
+    np.testing.assert_array_equal(found[:-1] - host.row_start[:-2], quick[:-1])
+    rows[host.row_start[5] : host.row_start[6]] = False
+    given = np.asarray(host.row_start[:-1])
+    np.testing.assert_array_equal(fastest_rows(host, rows, goal, given), given)
 
 
 TASKS = ("F g", "G !r", "G F g & G F y", "F G g & F y")

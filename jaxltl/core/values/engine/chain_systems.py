@@ -1,0 +1,117 @@
+"""Linear systems ``(I - P_pi) x = b`` of absorbing chains, for the derivatives of their values.
+
+Their condition grows with the expected number of steps, so a Krylov method alone stagnates. Small
+ones are inverted; large ones are eliminated on the host, where sparse elimination loses no more
+digits than the number of steps costs; those over a mesh are solved by refined BiCGSTAB.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jaxltl.core.models.construct.convert import to_sparse
+from jaxltl.core.models.mesh.sharded import is_sharded
+from jaxltl.core.models.protocols import ActionModel
+from jaxltl.core.sparse.linear.elimination import factorize
+from jaxltl.core.sparse.linear.topological_order import Edges, ordered_components
+from jaxltl.core.values.engine.iterate import in_turn
+from jaxltl.core.values.engine.linear import DENSE_LIMIT, inverse, krylov_refined
+
+Operator = Callable[[jax.Array], jax.Array]
+
+
+class ChainSystem(NamedTuple):
+    """The system ``x - mask * (P_pi x)[row_of]``.
+
+    Attributes:
+      model: a padded model or a product of one.
+      policy: ``float[S, A]`` or ``int32[S]``.
+      mask: ``bool[S]``, the transient states.
+      row_of: ``int32[S]``, the flat state whose row a state takes; None for its own.
+    """
+
+    model: ActionModel
+    policy: jax.Array
+    mask: jax.Array
+    row_of: jax.Array | None = None
+
+    def solve(self, matvec: Operator, b: jax.Array) -> jax.Array:
+        """The solution of ``matvec(x) = b`` for the system itself."""
+        return self._solve(matvec, b, False)
+
+    def transpose_solve(self, matvec: Operator, b: jax.Array) -> jax.Array:
+        """The solution for the transpose."""
+        return self._solve(matvec, b, True)
+
+    def _solve(self, matvec: Operator, b: jax.Array, transposed: bool) -> jax.Array:
+        if is_sharded(self.model):
+            return krylov_refined(matvec, b)
+        if b.size <= DENSE_LIMIT:
+            eye = jnp.eye(b.size, dtype=b.dtype).reshape(b.size, *b.shape)
+            matrix = lax.map(matvec, eye, batch_size=min(b.size, 32)).reshape(b.size, b.size).T
+            inverted, right = in_turn(inverse, matrix), b.ravel()
+            x = inverted @ right
+            return (x + inverted @ (right - matrix @ x)).reshape(b.shape)
+        x = jax.pure_callback(
+            _eliminated(transposed),
+            jax.ShapeDtypeStruct(b.shape, b.dtype),
+            self,
+            b,
+            vmap_method="sequential",
+        )
+        return lax.cond(jnp.all(jnp.isfinite(x)), lambda: x, lambda: krylov_refined(matvec, b))
+
+
+def _eliminated(transposed: bool) -> Callable[..., np.ndarray]:
+    def solve(system: ChainSystem, b: jax.Array) -> np.ndarray:
+        system, right = jax.tree.map(np.asarray, (system, b))
+        x = _solution(_transitions(system), np.asarray(right, np.float64).ravel(), transposed)
+        return x.reshape(right.shape).astype(right.dtype)
+
+    return solve
+
+
+def _transitions(system: ChainSystem) -> Any:
+    """``float64[N, N]``, the chain on transient states, SciPy's; None if rows are invalid."""
+    from scipy.sparse import csr_array, diags_array
+
+    try:
+        sparse = to_sparse(system.model)
+    except ValueError:
+        return None
+    host, policy = sparse.host, system.policy
+    if policy.ndim == system.mask.ndim:
+        weight = policy.ravel()[host.state] == np.asarray(sparse.action)
+    else:
+        weight = policy.reshape(host.num_states, -1)[host.state, np.asarray(sparse.action)]
+    rows = np.arange(host.num_rows)
+    mix = csr_array(
+        (weight.astype(np.float64), rows, host.row_start), shape=(host.num_states, host.num_rows)
+    )
+    chain = (mix @ host.matrix).tocsr()
+    if system.row_of is not None:
+        chain = chain[system.row_of.ravel()]
+    found = (diags_array(system.mask.ravel().astype(np.float64)) @ chain).tocsr()
+    found.eliminate_zeros()
+    return found
+
+
+def _solution(chain: Any, b: np.ndarray, transposed: bool) -> np.ndarray:
+    """The solution by sparse elimination, refined once; NaN where that failed."""
+    failed = np.full(b.size, np.nan)
+    if chain is None:
+        return failed
+    matrix = chain.T.tocsr() if transposed else chain
+    matrix.sort_indices()
+    label = ordered_components(Edges(matrix.indptr, matrix.indices))
+    solver = factorize(matrix, label, np.arange(b.size))
+    if solver is None:
+        return failed
+    x = solver.solve(b)
+    return x + solver.solve(b + matrix @ x - x)
