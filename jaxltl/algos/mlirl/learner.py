@@ -1,16 +1,16 @@
-"""Maximum-likelihood inverse RL with side information in temporal logic (chapter 2).
+"""Maximum-likelihood inverse RL with temporal-logic side information (dissertation, chapter 2).
 
-From demonstrations, learn a reward whose softmax policy makes them likely (2.4), in the
-world or in its product with a task, and trade the likelihood against the probability
-that the policy does the task (2.6).
+Given demonstrations, find a reward whose softmax policy maximises their likelihood (2.4), in the
+world or in its product with a task, plus ``mu`` times the probability that the policy satisfies the
+task (2.6). The model with side information is a product, ``jl.product(world, "!r U g")``; its
+features have shape ``[S, Q, A, F]``, such as those of :func:`task_features`.
 
-Example: learning from two runs that reach the goal, of which one tries again, by two features.
+Example: two demonstrations that reach the goal, and two features.
 
   >>> import jax, numpy as np
   >>> import jaxltl as jl
   >>> from jaxltl.algos import mlirl
-  >>> from jaxltl.algos.common import learner
-  >>> world = jl.make_mdp(  # a start, from where one gets to a goal or into a trap
+  >>> world = jl.make_mdp(  # an initial state, a goal and a trap
   ...     [[[1, 2], [0, 1]], [[1, 0], [0, 0]], [[2, 0], [0, 0]]],
   ...     [[[0.8, 0.2], [0.5, 0.5]], [[1, 0], [0, 0]], [[1, 0], [0, 0]]],
   ...     available=[[True, True], [True, False], [True, False]], initial=[1, 0, 0],
@@ -20,34 +20,22 @@ Example: learning from two runs that reach the goal, of which one tries again, b
   >>> problem = mlirl.make_problem(world, features, shown)
   >>> hparams = mlirl.Hparams(discount=0.5, optimizer="adam")
   >>> state, metrics = mlirl.train(jax.random.key(0), problem, hparams, num_steps=2)
-  >>> metrics.loss.shape, bool(metrics.loss[1] < metrics.loss[0])  # a row for each step
+  >>> metrics.loss.shape, bool(metrics.loss[1] < metrics.loss[0])
   ((2,), True)
   >>> mlirl.policy(state, problem, hparams).shape  # [S, A]
   (3, 2)
-
-A run is made of steps, goes on from a state, and may end early:
-
-  >>> state = mlirl.init(jax.random.key(0), problem, hparams)  # train is init and run
-  >>> state, metrics = mlirl.run(state, problem, hparams, num_steps=2)  # step after step
-  >>> until = learner.gradient_vanishes(1e-6)  # for run_until and train_until
-  >>> state.step.item()
-  2
-  >>> solution = jax.eval_shape(mlirl.solve, state.parameters, problem, hparams)
-  >>> solution.value.shape  # mlirl.objective judges its policy
+  >>> jax.eval_shape(mlirl.solve, state.parameters, problem, hparams).value.shape
   (3,)
-
-With side information the model is a product, ``jl.product(world, "!r U g")``, features are
-``[S, Q, A, F]``, such as :func:`task_features` makes them, and ``Hparams(mu=...)`` weighs the task.
-Many seeds are ``jax.vmap(lambda key: train(key, problem, hparams, num_steps=...))(keys)``; so are
-many settings, by ``vmap`` over the numbers of ``Hparams``. Resume by
-``run(state, problem, hparams, num_steps=...)``; end early by ``train_until``.
+  >>> loss, parts = mlirl.objective(state.parameters, problem, hparams)
+  >>> parts.neg_log_likelihood.shape
+  ()
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import chex
 import jax
@@ -69,6 +57,7 @@ from jaxltl.core.models.construct.restrict import with_allowed
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.models.product import Product
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.pretty_print import brief, history
 from jaxltl.core.types import Solution, Status, require_shape, worst
@@ -105,14 +94,7 @@ Reward = Callable[[Any, jax.Array], jax.Array]
 
 
 def linear_reward(weights: jax.Array, features: jax.Array) -> jax.Array:
-    """``R(s, a) = sum_f theta_f F_f(s, a)``, the class of rewards of section 2.2.
-
-    Args:
-      weights: ``float[F]``, theta.
-      features: ``float[S, A, F]`` (``[S, Q, A, F]``).
-
-    Returns:
-      ``float[S, A]`` (``[S, Q, A]``); differentiable in both.
+    """``R(s, a) = sum_f theta_f F_f(s, a)`` (section 2.2) for `weights` theta and `features` F.
 
     Example:
       >>> linear_reward(jnp.array([1.0, 2.0]), jnp.array([[[3.0, 4.0]]])).tolist()
@@ -124,21 +106,21 @@ def linear_reward(weights: jax.Array, features: jax.Array) -> jax.Array:
 @brief
 @struct.dataclass
 class Problem:
-    """What is given: a model, features, demonstrations, and a class of rewards.
+    """A model, features, demonstrations, and a class of rewards.
 
     Attributes:
       model: the world, or its product with the task.
       features: ``float[S, A, F]`` (``[S, Q, A, F]``).
-      counts: ``float[S, A]`` (``[S, Q, A]``), how often each pair was demonstrated.
-      start: parameters around which learning starts, any pytree; ``float[F]`` if linear.
-      satisfaction_weight: ``float[S]``, of the states over which g sums the satisfaction.
+      counts: ``float[S, A]`` (``[S, Q, A]``), demonstrated state-action counts.
+      start: center of the initial parameters, any pytree; ``float[F]`` if linear.
+      satisfaction_weight: ``float[S]``, weights of the states in g of (2.6).
       reward: ``(parameters, features) -> float[S, A]``; static.
     """
 
-    model: Any
+    model: MDP | DenseMDP | Product
     features: jax.Array
     counts: jax.Array
-    start: Any
+    start: PyTree
     satisfaction_weight: jax.Array
     reward: Reward = struct.field(pytree_node=False, default=linear_reward)
 
@@ -146,18 +128,19 @@ class Problem:
 @brief
 @struct.dataclass
 class Hparams:
-    """How to learn. Numbers are traced, so new values do not recompile.
+    """Settings; numbers are traced.
 
     Attributes:
       discount: in [0, 1).
-      mu: weight of the satisfaction term (2.6); None leaves it out (cases 1 and 2); default None.
-      l2: precision of the Gaussian prior on the parameters; default 1e-3.
-      learning_rate: for ``adam`` and ``sgd``; default 0.1.
+      mu: at least 0; weight of the satisfaction term (2.6); None: none (cases 1 and 2);
+        default None.
+      l2: at least 0; precision of the Gaussian prior on the parameters; default 1e-3.
+      learning_rate: of ``adam``, ``rmsprop`` and ``sgd``; default 0.1.
       start_scale: standard deviation of the noise added to ``Problem.start``; default 1.0.
-      policy: ``"boltzmann"`` (2.3) or ``"soft"``; static; default ``"boltzmann"``.
-      adjoint: ``"exact"``, or ``"approximate"`` for (2.7); static; default ``"exact"``.
-      optimizer: ``"lbfgs"``, ``"adam"``, ``"rmsprop"`` or ``"sgd"``, all optax's; static;
-        default ``"lbfgs"``.
+      policy: ``"boltzmann"`` (2.3) or ``"soft"`` (maximum entropy); static;
+        default ``"boltzmann"``.
+      adjoint: ``"exact"``, or ``"approximate"`` as in (2.7); static; default ``"exact"``.
+      optimizer: ``"lbfgs"``, ``"adam"``, ``"rmsprop"`` or ``"sgd"``; static; default ``"lbfgs"``.
     """
 
     discount: jax.Array | float
@@ -173,12 +156,12 @@ class Hparams:
 @brief
 @struct.dataclass
 class State:
-    """Parameters on their way, with the value that the next solve starts from.
+    """Parameters, and the initial value of the next solve.
 
     Attributes:
-      key, step: the root key and the number of steps made, ``int32[]``.
+      key, step: root key, and steps made, ``int32[]``.
       parameters: of the reward, as ``Problem.start``; ``float[F]`` if linear.
-      value: ``float[S]`` (``[S, Q]``), of the reward at parameters that are near.
+      value: ``float[S]`` (``[S, Q]``), the value at the last evaluated parameters.
       optimizer: optax's state, or that of the line search.
     """
 
@@ -197,7 +180,7 @@ class Metrics:
     Attributes:
       loss: the objective, with prior and satisfaction term.
       neg_log_likelihood: (2.4), in nats, over all demonstrated pairs.
-      satisfaction: weighted mean of the satisfaction probability, in [0, 1]; NaN without the term.
+      satisfaction: weighted mean of the satisfaction probability; NaN without the term.
       gradient_norm: Euclidean.
       status: of the solvers of value and satisfaction; see :class:`~jaxltl.core.types.Status`.
     """
@@ -210,8 +193,9 @@ class Metrics:
 
 
 @brief(codes={"status": Status})
-class Objective(NamedTuple):
-    """What the loss at some parameters was made of.
+@struct.dataclass
+class Objective:
+    """Terms of the loss.
 
     Attributes:
       neg_log_likelihood: ``float[]``, (2.4), in nats, over all demonstrated pairs.
@@ -231,7 +215,7 @@ def make_problem(
     features: jax.Array,
     demonstrations: Trajectories,
     *,
-    start: Any = None,
+    start: PyTree | None = None,
     reward: Reward = linear_reward,
     satisfaction_over: str | jax.Array = "initial",
     allowed: jax.Array | None = None,
@@ -242,23 +226,22 @@ def make_problem(
       model: the world (case 1) or a product (cases 2 and 3).
       features: ``float[S, A, F]`` or ``float[S, Q, A, F]``.
       demonstrations: in the world; lifted here if the model is a product.
-      start: initial parameters; default zero weights, one per feature.
+      start: center of the initial parameters; default zero weights, one per feature.
       reward: any differentiable reward of parameters and features, such as a flax
         network's ``apply``.
-      satisfaction_over: the states over which g sums (2.6): ``"initial"`` (where the model
-        starts; the dissertation's prose), ``"all"`` (its formula), or weights ``float[S]``.
-      allowed: ``bool[S, A]`` (``[S, Q, A]``), the actions that policies choose from, such as those
-        that lose nothing of the task (:func:`~jaxltl.core.values.undiscounted.optimal_actions.optimal_actions`);
-        default all. Demonstrated steps that take others are left out:
-        :func:`~jaxltl.core.models.construct.lifting.allowed_steps` tells which.
+      satisfaction_over: the states of g in (2.6): ``"initial"`` (the dissertation's prose),
+        ``"all"`` (its formula), or weights ``float[S]``.
+      allowed: ``bool[S, A]`` (``[S, Q, A]``), action mask of the policies, such as
+        :func:`~jaxltl.core.values.undiscounted.optimal_actions.optimal_actions`; default all.
+        Demonstrated steps outside of it
+        (:func:`~jaxltl.core.models.construct.lifting.allowed_steps`) do not count.
 
     Returns:
       :class:`Problem`.
 
     Raises:
-      ValueError: features, weights or mask of the wrong shape, features that are not finite,
-        an unknown `satisfaction_over`, a reward of the wrong shape, demonstrations that are not the
-        world's, or one of which no step is allowed.
+      ValueError: features, weights, mask or reward of a wrong shape, features that are not finite,
+        an unknown `satisfaction_over`, demonstrations that do not fit the world, or no allowed step.
     """
     model = model if allowed is None else with_allowed(model, allowed)
     actions = (*model.state_shape, model.num_actions)
@@ -298,15 +281,13 @@ def make_problem(
 def solve(
     parameters: Any, problem: Problem, hparams: Hparams, initial: jax.Array | None = None
 ) -> Solution:
-    """Value and policy of the reward at some parameters (2.3).
+    """The softmax value and policy (2.3) at `parameters` of the reward of a `problem`.
 
-    Args:
-      parameters: as ``Problem.start``.
-      problem, hparams: what and how.
-      initial: ``float[S]`` (``[S, Q]``), a value to start the Boltzmann iteration from.
+    By ``policy`` and ``adjoint`` of `hparams`; the Boltzmann iteration starts from `initial`,
+    ``float[S]`` (``[S, Q]``).
 
     Returns:
-      :class:`Solution`, `policy` ``float[S, A]`` (``[S, Q, A]``); both differentiable in the
+      :class:`Solution`, with `policy` ``float[S, A]`` (``[S, Q, A]``); differentiable in the
       parameters.
 
     Raises:
@@ -334,8 +315,7 @@ def objective(
 ) -> tuple[jax.Array, Objective]:
     """``J = -sum log pi(s, a) - mu g(y) + l2 / 2 |theta|^2``: (2.4), (2.6) and the prior.
 
-    Args:
-      parameters, problem, hparams, initial: as in :func:`solve`.
+    For `parameters`, `problem`, `hparams` and `initial` as in :func:`solve`.
 
     Returns:
       The loss ``float[]``, and :class:`Objective`. Differentiable in the parameters: exactly, or as
@@ -344,7 +324,7 @@ def objective(
     Raises:
       ValueError: unknown kind of policy or adjoint, or a satisfaction term without a task.
     """
-    # Once, so that the derivative goes back through it once.
+    # Evaluated once, so that the backward pass runs through it once.
     reward = problem.reward(parameters, problem.features)
     solution = _solve(reward, problem, hparams, initial)
     logits = policy_logits(problem.model, reward, hparams.discount, solution.value)
@@ -357,15 +337,21 @@ def objective(
     if hparams.mu is not None:
         if not isinstance(problem.model, Product):
             raise ValueError("mu weighs the satisfaction of a task: make the problem in a product.")
-        done = satisfaction_probability(problem.model, jax.nn.softmax(logits, axis=-1))
-        total = jnp.sum(problem.satisfaction_weight * done.value)
+        attained = satisfaction_probability(problem.model, jax.nn.softmax(logits, axis=-1))
+        total = jnp.sum(problem.satisfaction_weight * attained.value)
         loss -= hparams.mu * total
         satisfaction = total / jnp.sum(problem.satisfaction_weight)
-        # A policy that hardly ever leaves some states may have no certificate; what counts in
-        # learning is that its equation is solved.
-        solved = done.residual <= jnp.sqrt(jnp.finfo(loss.dtype).eps)
-        status = worst(status, jnp.where(solved, Status.CONVERGED, done.status))
-    return loss, Objective(-log_likelihood, satisfaction, solution.value, status)
+        # A policy that hardly ever leaves some states may have no certificate; for learning it is
+        # enough that its equation is solved.
+        solved = attained.residual <= jnp.sqrt(jnp.finfo(loss.dtype).eps)
+        status = worst(status, jnp.where(solved, Status.CONVERGED, attained.status))
+    parts = Objective(
+        neg_log_likelihood=-log_likelihood,
+        satisfaction=satisfaction,
+        value=solution.value,
+        status=status,
+    )
+    return loss, parts
 
 
 def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
@@ -384,9 +370,11 @@ def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     parameters = unravel(flat + hparams.start_scale * noise)
     value = jnp.zeros(problem.model.state_shape, problem.model.dtype)
     if hparams.optimizer == "lbfgs":
-        # Nothing is known yet; only the shapes are read.
+        # A placeholder, of which only the shapes are read.
         zero = jnp.zeros((), value.dtype)
-        parts = Objective(zero, zero, value, jnp.int32(0))
+        parts = Objective(
+            neg_log_likelihood=zero, satisfaction=zero, value=value, status=jnp.int32(0)
+        )
         optimizer = line_search.start(
             parameters, line_search.Point(parameters, zero + jnp.inf, parameters, parts)
         )
@@ -395,7 +383,7 @@ def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     return State(key, jnp.int32(0), parameters, value, optimizer)
 
 
-@jax.jit  # so that it is traced once, wherever it stands
+@jax.jit  # traced once for all its uses
 def _evaluate(
     parameters: Any, problem: Problem, hparams: Hparams, initial: jax.Array
 ) -> line_search.Point:
@@ -448,7 +436,7 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
 
 
 def _usable(parts: Objective) -> jax.Array:
-    """The value, or zero where a solve failed, which would poison the next one's start."""
+    """The value, or zero if its solve failed, as the initial value of the next solve."""
     return jnp.where(parts.status < Status.NONFINITE, parts.value, 0)
 
 
@@ -456,7 +444,7 @@ def _optimizer(hparams: Hparams) -> optax.GradientTransformationExtraArgs:
     return learner.optimizer(hparams.optimizer, hparams.learning_rate)
 
 
-# The metrics, and so their gradient, are of the state before a step.
+# Metrics, and so their gradient, describe the state before a step.
 run, train, run_until, train_until = learner.bind(init, step, keep="before")
 
 
