@@ -1,16 +1,14 @@
-"""Behavioral cloning with the task's memory (dissertation, section 3.5).
+"""Behavioral cloning with automaton states (dissertation, section 3.5).
 
-A network that sees what is near and the memory of the task's automaton classifies which
-action was demonstrated there. There is no world model: nothing is planned, so what was
-learned holds where things look as they did in the demonstrations.
+A network classifies the demonstrated action by a local observation and the state of the task's
+automaton. It uses no model of the world.
 
-Example: a policy of what is seen, here of which state it is, and of the task's memory.
+Example: a policy of the state and the automaton state.
 
   >>> import jax, jax.numpy as jnp
   >>> import jaxltl as jl
   >>> from jaxltl.algos import behavioral_cloning as cloning
-  >>> from jaxltl.algos.common import learner
-  >>> world = jl.make_mdp(  # a start, from where one gets to a goal or into a trap
+  >>> world = jl.make_mdp(  # an initial state, a goal and a trap
   ...     [[[1, 2], [0, 1]], [[1, 0], [0, 0]], [[2, 0], [0, 0]]],
   ...     [[[0.8, 0.2], [0.5, 0.5]], [[1, 0], [0, 0]], [[1, 0], [0, 0]]],
   ...     available=[[True, True], [True, False], [True, False]], initial=[1, 0, 0],
@@ -21,28 +19,13 @@ Example: a policy of what is seen, here of which state it is, and of the task's 
   >>> problem = cloning.make_problem(model, jnp.eye(3), shown, network=network, held_out=0.5)
   >>> hparams = cloning.Hparams(batch=5)
   >>> state, metrics = cloning.train(jax.random.key(0), problem, hparams, num_steps=2)
-  >>> metrics.loss.shape
-  (2,)
-  >>> jax.eval_shape(cloning.policy, state, problem, hparams).shape  # [W, S, Q, A]
-  (1, 3, 3, 2)
-
-A run is made of steps, goes on from a state, and may end early:
-
-  >>> state = cloning.init(jax.random.key(0), problem, hparams)  # train is init and run
-  >>> state, metrics = cloning.run(state, problem, hparams, num_steps=2)  # step after step
-  >>> until = learner.has_stopped  # for run_until and train_until
-  >>> state.step.item()
-  2
-  >>> jax.eval_shape(  # in any world that is seen the same way
-  ...     lambda other: cloning.policy_in_world(
-  ...         network, state.best.parameters, other, jnp.eye(3)), model).shape
+  >>> metrics.loss.shape, jax.eval_shape(cloning.policy, state, problem, hparams).shape
+  ((2,), (1, 3, 3, 2))
+  >>> jax.eval_shape(lambda other: cloning.policy_in_world(
+  ...     network, state.best.parameters, other, jnp.eye(3)), model).shape
   (3, 3, 2)
   >>> jax.eval_shape(cloning.neg_log_likelihood, state.parameters, problem, problem.counts).shape
   ()
-
-Many seeds are ``jax.vmap(lambda key: train(key, problem, hparams, num_steps=...))(keys)``; so are
-many settings, by ``vmap`` over the numbers of ``Hparams``. Stop
-when patience has run out by ``train_until(..., until=learner.has_stopped)``.
 """
 
 from __future__ import annotations
@@ -71,19 +54,16 @@ from jaxltl.core.types import Status, status_code
 
 
 class ConvolutionalPolicy(nn.Module):
-    """The network of section 3.5: two convolutions, two dense layers, ReLU between them.
+    """The network of section 3.5: two convolutions and two dense layers with ReLU.
 
-    The convolutions see the patch as an image. The memory, which has no place in it, joins
-    what they found at the first dense layer.
+    Maps an observation ``float[..., O]``, an image, and a memory ``float[..., Q]``, which enters at
+    the first dense layer, to scores ``float[..., A]``.
 
     Attributes:
       observation_shape: height, width and channels; section 3.5 has (3, 3, 5).
-      num_actions: how many scores to give.
-      kernels: of each convolution, 2 x 2 with stride 1 and no padding.
+      num_actions: number of scores.
+      kernels: number of kernels of each convolution, 2 x 2 with stride 1 and no padding.
       hidden: widths of the dense layers.
-
-    Called with ``float[..., O]``, O the product of that shape, and ``float[..., Q]`` it returns
-    scores ``float[..., A]``.
 
     Example:
       >>> shape, _ = jax.eval_shape(
@@ -108,13 +88,11 @@ class ConvolutionalPolicy(nn.Module):
 
 
 class DensePolicy(nn.Module):
-    """A multilayer perceptron on (observation, memory), ReLU between its layers.
+    """A multilayer perceptron with ReLU: ``float[..., O]`` and ``float[..., Q]`` to scores.
 
     Attributes:
-      num_actions: how many scores to give.
+      num_actions: number of scores.
       hidden: widths of the hidden layers.
-
-    Called with ``float[..., O]`` and ``float[..., Q]`` it returns scores ``float[..., A]``.
     """
 
     num_actions: int = 4
@@ -126,7 +104,7 @@ class DensePolicy(nn.Module):
 
 
 def _dense_layers(module: Any, seen: jax.Array, memory: jax.Array) -> jax.Array:
-    """Scores of (what is seen, memory) side by side; each part goes in only once."""
+    """Scores by (observation, memory); the first layer is a sum of one for each."""
     widths = (*module.hidden, module.num_actions)
     inputs = seen.shape[-1] + memory.shape[-1]
     kernel = module.param("kernel", nn.initializers.lecun_normal(), (inputs, widths[0]))
@@ -144,13 +122,13 @@ def _dense_layers(module: Any, seen: jax.Array, memory: jax.Array) -> jax.Array:
 @brief
 @struct.dataclass
 class Problem:
-    """What is given: what is seen in worlds, and which actions were demonstrated.
+    """Observations in worlds, and demonstrations.
 
     Attributes:
-      observation: ``float[W, S, O]``, what is seen in each world state.
-      available: ``bool[W, S, A]``, others have no probability.
-      counts: ``float[W, S, Q, A]``, how often each pair was demonstrated.
-      held_out: counts of the demonstrations by which learning is stopped; may be zero.
+      observation: ``float[W, S, O]``, of each world state.
+      available: ``bool[W, S, A]``.
+      counts: ``float[W, S, Q, A]``, demonstrated state-action counts.
+      held_out: counts of the held-out demonstrations for early stopping; may be zero.
       network: called as ``network(observation [..., O], memory [..., Q]) -> float[..., A]``,
         memory one-hot, scores (logits) of the actions; static.
     """
@@ -165,11 +143,11 @@ class Problem:
 @brief
 @struct.dataclass
 class Hparams:
-    """How to learn. Numbers are traced, so new values do not recompile.
+    """Settings; numbers are traced.
 
     Attributes:
       learning_rate: of Adam; default 3e-3.
-      l2: precision of the Gaussian prior on the parameters, shared by all pairs; default 0.0.
+      l2: at least 0; precision of the Gaussian prior, divided by the number of pairs; default 0.0.
       patience: steps without a better held-out likelihood after which learning stops; default 500.
       batch: pairs in a minibatch; static; default 128.
     """
@@ -183,15 +161,14 @@ class Hparams:
 @brief
 @struct.dataclass
 class State:
-    """Parameters on their way; once `stopped`, only the step counter goes on.
+    """Parameters; once `stopped`, only the step counter changes.
 
     Attributes:
-      key, step: the root key and the number of steps made, ``int32[]``.
+      key, step: root key, and steps made, ``int32[]``.
       parameters: of the network, a pytree.
       optimizer: optax's state.
-      best: what was learned, :class:`~jaxltl.algos.common.early_stopping.Best`:
-        ``state.best.parameters``.
-      stopped: ``bool[]``, whether patience has run out.
+      best: the best held-out parameters, :class:`~jaxltl.algos.common.early_stopping.Best`.
+      stopped: ``bool[]``, whether patience is exhausted.
     """
 
     key: jax.Array
@@ -234,8 +211,8 @@ def make_problem(
       models: a product, several, or products stacked along a first axis of W worlds.
       observation: ``float[S, O]`` or ``float[W, S, O]``, or one for each world.
       demonstrations: in the world (not in the product), or one for each world.
-      held_out: the share of each world's trajectories, its last ones, by which learning is
-        stopped early; or such trajectories; None or 0: no early stopping.
+      held_out: share of each world's trajectories, the last ones, or other trajectories, for early
+        stopping; None or 0: no early stopping.
       network: the policy; default :class:`ConvolutionalPolicy` with the models' number of
         actions.
 
@@ -243,8 +220,8 @@ def make_problem(
       :class:`Problem`, its arrays stacked over W worlds.
 
     Raises:
-      ValueError: worlds that differ, observations or scores of the wrong shape, or
-        demonstrations that do not fit their world, or of which none is left.
+      ValueError: worlds of different shapes, observations or scores of a wrong shape, or
+        demonstrations that do not fit their world, or no counted pair.
     """
     models = stack_models(models)
     observation = stack_observations(models, observation)
@@ -265,7 +242,7 @@ def _require_scores(problem: Problem) -> None:
     size = problem.observation.shape[-1]
     if height_width_channels is not None and int(np.prod(height_width_channels)) != size:
         raise ValueError(
-            f"an observation has {size} numbers, which are none of shape "
+            f"an observation has {size} numbers, which do not fit the shape "
             f"{tuple(height_width_channels)}; set ConvolutionalPolicy(observation_shape=...)."
         )
     found = jax.eval_shape(
@@ -289,16 +266,11 @@ def _inputs(problem: Problem) -> tuple[jax.Array, jax.Array]:
 def policy_in_world(
     network: nn.Module, parameters: Any, model: Product, observation: jax.Array
 ) -> jax.Array:
-    """The policy in a world, which may be a new one: ``float[S, Q, A]``.
+    """The policy ``float[S, Q, A]`` in any world, zero at unavailable actions.
 
-    Args:
-      network: as ``Problem.network``.
-      parameters: what was learned, ``state.best.parameters``.
-      model: the product of that world and the task; batches of worlds by ``vmap``.
-      observation: ``float[S, O]``.
-
-    Returns:
-      ``float[S, Q, A]``, zero at actions that are not available; differentiable in the parameters.
+    Of a `network` with `parameters`, such as ``state.best.parameters``, in a `model`, the product
+    of the world and the task, by the `observation` ``float[S, O]``. Differentiable in the
+    parameters.
     """
     memory = jnp.eye(model.num_memory, dtype=observation.dtype)[None]
     scores: Any = network.apply(parameters, observation[:, None], memory)
@@ -329,15 +301,9 @@ def _scores(parameters: Any, problem: Problem) -> jax.Array:
 
 
 def neg_log_likelihood(parameters: Any, problem: Problem, counts: jax.Array) -> jax.Array:
-    """Negative log-likelihood (3.10) of the average counted pair; NaN if there is none.
+    """The negative log-likelihood (3.10) of the average pair in `counts`, in nats; NaN without any.
 
-    Args:
-      parameters: of the network.
-      problem: the worlds.
-      counts: ``float[W, S, Q, A]``.
-
-    Returns:
-      ``float[]``, in nats; differentiable in the parameters.
+    Differentiable in the `parameters` of the network of the `problem`.
     """
     log_policy = _log_policy(_scores(parameters, problem), problem.available[:, :, None])
     return -jnp.sum(counts * log_policy) / jnp.sum(counts)
@@ -427,7 +393,7 @@ def _draw(key: chex.PRNGKey, counts: jax.Array, num: int) -> tuple[jax.Array, ..
     """Indices ``int32[num]`` on each axis of `counts`, with probabilities proportional to them."""
     total = jnp.cumsum(counts.ravel())
     point = jax.random.uniform(key, (num,), total.dtype) * total[-1]
-    # Rounding must not lead beyond the last pair that counts.
+    # Rounding must not lead beyond the last counted pair.
     last = jnp.searchsorted(total, total[-1])
     index = jnp.minimum(jnp.searchsorted(total, point, side="right"), last)
     return jnp.unravel_index(index, counts.shape)

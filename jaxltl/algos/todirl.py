@@ -1,24 +1,23 @@
 """Task-oriented deep inverse RL (dissertation, chapter 3).
 
-From demonstrations, learn a reward network that sees what is near, the memory of the
-task's automaton and the action, such that the soft (maximum-entropy) policy of the product
-makes the demonstrations likely (3.3). What was learned is local, so it plans in worlds that
-were never seen: :func:`plan`.
+Maximum-entropy inverse RL with a reward network whose inputs are a local observation, the state of
+the task's automaton, and the action: find parameters for which the soft policy of the product makes
+the demonstrations likely (3.3). Such a reward is local, so :func:`plan` computes policies in unseen
+worlds.
 
-Example: a reward of what is seen, here of which state it is, that plans in another world.
+Example: a reward of the state, and the policy that it gives in another world.
 
   >>> import jax, jax.numpy as jnp
   >>> import jaxltl as jl
   >>> from jaxltl.algos import todirl
-  >>> from jaxltl.algos.common import learner
-  >>> world = jl.make_mdp(  # a start, from where one gets to a goal or into a trap
+  >>> world = jl.make_mdp(  # an initial state, a goal and a trap
   ...     [[[1, 2], [0, 1]], [[1, 0], [0, 0]], [[2, 0], [0, 0]]],
   ...     [[[0.8, 0.2], [0.5, 0.5]], [[1, 0], [0, 0]], [[1, 0], [0, 0]]],
   ...     available=[[True, True], [True, False], [True, False]], initial=[1, 0, 0],
   ...     label=[[0, 0], [1, 0], [0, 1]], propositions=["g", "r"])
   >>> shown = jl.make_trajectories(world, [[(0, 1), (0, 0), (1, 0)], [(0, 0), (1, 0)]])
   >>> model = jl.product(world, "!r U g", label_on="exit")
-  >>> problem = todirl.make_problem(  # the second demonstration tells when to stop
+  >>> problem = todirl.make_problem(  # the second demonstration is held out
   ...     model, jnp.eye(3), shown, network=todirl.RewardNetwork((3,)), held_out=0.5)
   >>> hparams = todirl.Hparams(discount=0.9, patience=3, optimizer="sgd")
   >>> state, metrics = todirl.train(jax.random.key(0), problem, hparams, num_steps=2)
@@ -27,33 +26,20 @@ Example: a reward of what is seen, here of which state it is, that plans in anot
   >>> jax.eval_shape(todirl.policy, state, problem, hparams).shape  # [W, S, Q, A]
   (1, 3, 3, 2)
   >>> parameters = state.best.parameters
-  >>> shape = jax.eval_shape(  # in any world that is seen the same way
-  ...     lambda other: todirl.plan(problem.network, parameters, other, jnp.eye(3), hparams), model)
-  >>> shape.policy.shape
+  >>> jax.eval_shape(lambda other: todirl.plan(
+  ...     problem.network, parameters, other, jnp.eye(3), hparams).policy, model).shape
   (3, 3, 2)
-
-A run is made of steps, goes on from a state, and may end early:
-
-  >>> state = todirl.init(jax.random.key(0), problem, hparams)  # train is init and run
-  >>> state, metrics = todirl.run(state, problem, hparams, num_steps=2)  # step after step
-  >>> until = learner.has_stopped  # for run_until and train_until
-  >>> state.step.item()
-  2
-  >>> solution = jax.eval_shape(todirl.solve, state.parameters, problem, hparams)
-  >>> solution.value.shape  # todirl.objective judges its policy
-  (1, 3, 3)
-
-Many seeds are ``jax.vmap(lambda key: train(key, problem, hparams, num_steps=...))(keys)``; so are
-many settings, by ``vmap`` over the numbers of ``Hparams``. Stop
-when patience has run out by ``train_until(..., until=learner.has_stopped)``.
+  >>> loss, parts = jax.eval_shape(todirl.objective, parameters, problem, hparams)
+  >>> parts.value.shape, jax.eval_shape(todirl.solve, parameters, problem, hparams).value.shape
+  ((1, 3, 3), (1, 3, 3))
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import chex
 import jax
@@ -76,26 +62,27 @@ from jaxltl.core.models.construct.batch import unstack_product as lane
 from jaxltl.core.models.construct.restrict import with_allowed
 from jaxltl.core.models.ops.successor_tables import PredecessorTable, predecessor_table
 from jaxltl.core.models.product import Product
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.pretty_print import brief, history
 from jaxltl.core.types import Solution, Status, status_code
 from jaxltl.core.values.discounted.soft import policy_logits, soft_policy_adjoint, soft_value
 from jaxltl.core.values.undiscounted.satisfaction import satisfaction_probability
 
+ResultT = TypeVar("ResultT")
+
 # --- reward networks ---------------------------------------------------------------------------
 
 
 class RewardNetwork(nn.Module):
-    """A multilayer perceptron on (observation, memory, action), ReLU between its layers.
+    """A multilayer perceptron with ReLU on (observation, memory, action).
 
-    The first layer is a dense layer on the three inputs side by side, computed as the sum
-    of its three parts: each part sees its own input only once, not once per combination.
+    Maps ``float[..., O]``, ``float[..., Q]`` and ``float[..., A]``, which broadcast, to
+    ``float[...]``. The first layer is a sum of three, so that no input is repeated for each
+    combination with the others.
 
     Attributes:
       hidden: widths of the hidden layers; section 3.5 has two of 80. Empty: a linear reward.
-
-    Called with ``float[..., O]``, ``float[..., Q]`` and ``float[..., A]``, which broadcast, it
-    returns ``float[...]``.
     """
 
     hidden: Sequence[int] = (80, 80)
@@ -111,14 +98,14 @@ class RewardNetwork(nn.Module):
         terms = [x @ part for x, part in zip(inputs, parts, strict=True)]
         x = terms[0] + (terms[1] + terms[2] + bias)
         rows = x.shape[:-1]
-        x = x.reshape(-1, widths[0])  # as a matrix the products are a little faster
+        x = x.reshape(-1, widths[0])  # matrix products are faster than batched ones
         for width in widths[1:]:
             x = nn.Dense(width)(nn.relu(x))
         return x.reshape(rows)
 
 
 class Concatenated(nn.Module):
-    """A network that reads one vector, ``[..., O + Q + A] -> [...]`` or ``[..., 1]``, as a reward.
+    """A reward network from one of concatenated inputs, ``[..., O + Q + A] -> [...]`` or ``[..., 1]``.
 
     Attributes:
       network: the flax module, of vectors ``float[N, O + Q + A]``, or of any leading axes.
@@ -149,17 +136,16 @@ class Concatenated(nn.Module):
 @brief
 @struct.dataclass
 class Problem:
-    """What is given: worlds beside the task, what is seen in them, and demonstrations.
+    """Products of worlds with the task, observations, and demonstrations.
 
     Attributes:
       model: products stacked along a first axis of W worlds.
-      observation: ``float[W, S, O]``, what is seen in each world state.
-      counts: ``float[W, S, Q, A]``, how often each pair was demonstrated; with a horizon
+      observation: ``float[W, S, O]``, of each world state.
+      counts: ``float[W, S, Q, A]``, demonstrated state-action counts; with a horizon
         ``float[W, T, S, Q, A]``.
-      held_out: counts of the demonstrations by which learning is stopped; may be zero.
+      held_out: counts of the held-out demonstrations for early stopping; may be zero.
       weight: ``float[W]``, factors of the worlds' likelihoods.
-      predecessors: of the product states, with a first axis of W, or None; they make the
-        gradient faster.
+      predecessors: of the product states, with a first axis of W, for a faster gradient; or None.
       network: called as ``network(observation [S, 1, 1, O], memory [1, Q, 1, Q],
         action [1, 1, A, A]) -> float[S, Q, A]``, memory and action one-hot; static.
     """
@@ -174,30 +160,29 @@ class Problem:
 
     @property
     def horizon(self) -> int | None:
-        """Steps that the counts tell apart, or None."""
+        """The number T of time steps of the counts, or None."""
         return self.counts.shape[1] if self.counts.ndim == 5 else None
 
 
 @brief
 @struct.dataclass
 class Hparams:
-    """How to learn. Numbers are traced, so new values do not recompile.
+    """Settings; numbers are traced.
 
     Attributes:
-      discount: in [0, 1); with a horizon 1 is allowed.
-      l2: precision of the Gaussian prior on the parameters; default 1e-3.
-      learning_rate: for every optimiser but ``lbfgs``; default 3e-3.
-      patience: steps without a better held-out likelihood after which learning stops; with `mu`,
-        without a better sum of it and of the weighed probability of an average pair; default 50.
-      mu: weight of the probability of the task (2.6) from the worlds' starts; None leaves it out;
+      discount: in [0, 1); with a horizon also 1.
+      l2: at least 0; precision of the Gaussian prior on the parameters; default 1e-3.
+      learning_rate: of all optimizers but ``lbfgs``; default 3e-3.
+      patience: steps without a better held-out likelihood (with `mu`, plus the weighted satisfaction
+        probability) after which learning stops; default 50.
+      mu: at least 0; weight of the satisfaction probability (2.6) from the initial states; None:
+        none; default None.
+      tolerance: certified error of the soft values; None: the precision of the dtype;
         default None.
-      tolerance: certified error asked of the soft values; None: what the dtype allows;
-        default None.
-      optimizer: ``"adam"``, ``"sgd"``, ``"rmsprop"`` or ``"lbfgs"``, all optax's; static;
-        default ``"adam"``.
-      method: of the soft solver, see :func:`~jaxltl.core.values.discounted.soft.soft_value`; static;
+      optimizer: ``"adam"``, ``"sgd"``, ``"rmsprop"`` or ``"lbfgs"``; static; default ``"adam"``.
+      method: of :func:`~jaxltl.core.values.discounted.soft.soft_value`; static;
         default ``"value_iteration"``.
-      horizon: None, or the number of steps of a run, for a policy of the time left; static;
+      horizon: number of steps of a run, for a time-dependent policy, or None; static;
         default None.
     """
 
@@ -215,16 +200,15 @@ class Hparams:
 @brief
 @struct.dataclass
 class State:
-    """Parameters on their way; once `stopped`, only the step counter goes on.
+    """Parameters; once `stopped`, only the step counter changes.
 
     Attributes:
-      key, step: the root key and the number of steps made, ``int32[]``.
+      key, step: root key, and steps made, ``int32[]``.
       parameters: of the network, a pytree.
       value: ``float[W, S, Q]``, the soft value that the next solve starts from.
       optimizer: optax's state.
-      best: what was learned, :class:`~jaxltl.algos.common.early_stopping.Best`:
-        ``state.best.parameters``.
-      stopped: ``bool[]``, whether patience has run out.
+      best: the best held-out parameters, :class:`~jaxltl.algos.common.early_stopping.Best`.
+      stopped: ``bool[]``, whether patience is exhausted.
     """
 
     key: jax.Array
@@ -246,7 +230,7 @@ class Metrics:
       neg_log_likelihood: minus (3.3), in nats, over all pairs, weighted by world.
       per_pair: the same for the average pair.
       held_out: negative log-likelihood of the average held-out pair; NaN without any.
-      satisfaction: mean probability of the task over the worlds and their starts; NaN without mu.
+      satisfaction: mean satisfaction probability over worlds and initial states; NaN without mu.
       gradient_norm: Euclidean.
       error: certified error of the soft values, in units of the reward, largest over the worlds.
       status: of the soft solver, the worst over the worlds.
@@ -278,25 +262,23 @@ def make_problem(
     Args:
       worlds: a product, several, or products stacked along a first axis of W worlds.
       observation: ``float[S, O]``, or one for each world.
-      demonstrations: in the world (not in the product), or one for each world; empty
-        trajectories are left out.
-      held_out: the share of each world's trajectories, its last ones, by which learning is
-        stopped early; or such trajectories; None or 0: no early stopping.
+      demonstrations: in the world (not in the product), or one for each world.
+      held_out: share of each world's trajectories, the last ones, or other trajectories, for early
+        stopping; None or 0: no early stopping.
       network: the reward; default :class:`RewardNetwork`.
       weight: ``float[W]``, factors of the worlds' likelihoods; default 1.
       horizon: count pairs by time, for ``Hparams.horizon``.
-      allowed: ``bool[S, Q, A]``, or one for each world: the actions that policies choose from, such
-        as those that lose nothing of the task
-        (:func:`~jaxltl.core.values.undiscounted.optimal_actions.optimal_actions`); default all. Demonstrated
-        steps that take others are left out.
+      allowed: ``bool[S, Q, A]``, or one for each world: action mask of the policies, such as
+        :func:`~jaxltl.core.values.undiscounted.optimal_actions.optimal_actions`; default all.
+        Demonstrated steps outside of it do not count.
 
     Returns:
       :class:`Problem`, its arrays stacked over W worlds.
 
     Raises:
-      ValueError: worlds of different shapes or propositions, observations, weights or
-        rewards of the wrong shape, masks that do not fit, demonstrations that do not fit their
-        world or exceed the horizon, or no pair left to learn from.
+      ValueError: worlds of different shapes or propositions, observations, weights, rewards or
+        masks of a wrong shape, demonstrations that do not fit their world or exceed the horizon, or
+        no counted pair.
     """
     model = stack_models(worlds)
     if allowed is not None:
@@ -346,28 +328,21 @@ def _inputs(model: Product, observation: jax.Array) -> tuple[jax.Array, jax.Arra
 def reward(
     network: nn.Module, parameters: Any, model: Product, observation: jax.Array
 ) -> jax.Array:
-    """The network's reward in a product.
+    """The reward ``float[S, Q, A]`` of a `network` with `parameters` in a `model`, a product.
 
-    Args:
-      network, parameters: what was learned.
-      model: the product, of S states, Q memories and A actions.
-      observation: ``float[S, O]``.
-
-    Returns:
-      ``float[S, Q, A]``; differentiable in the parameters and the observation.
+    By the `observation` ``float[S, O]``; differentiable in it and in the parameters.
 
     Example:
       >>> from jaxltl import from_dense, product
       >>> world = from_dense([[[0, 1.0]], [[0, 1.0]]], label=[[0], [1]], propositions=["g"])
       >>> model = product(world, "F g")
-      >>> class Late(nn.Module):  # one for what is done with the task done
+      >>> class Late(nn.Module):  # a reward of 1 in the final automaton state
       ...     def __call__(self, observation, memory, action):
       ...         return 0 * observation[..., 0] + memory[..., 1] + 0 * action[..., 0]
       >>> jax.eval_shape(lambda seen: reward(Late(), {}, model, seen), jnp.eye(2)).shape
       (2, 2, 1)
     """
-    found: Any = network.apply(parameters, *_inputs(model, observation))
-    return found
+    return jnp.asarray(network.apply(parameters, *_inputs(model, observation)))
 
 
 def plan(
@@ -380,17 +355,16 @@ def plan(
     initial: jax.Array | None = None,
     allowed: jax.Array | None = None,
 ) -> Solution:
-    """Soft value and policy (3.4), (3.5) of a learned reward in any world.
+    """The soft value and policy (3.4), (3.5) of a learned reward in any world.
 
     Args:
-      network, parameters: what was learned.
-      model: the product; its automaton has as many states as the one learned with.
+      network, parameters: the reward.
+      model: the product; its automaton has as many states as that of the training worlds.
       observation: ``float[S, O]``.
       hparams: discount, tolerance, method and horizon are read.
-      initial: ``float[S, Q]``, a value to start from.
-      allowed: ``bool[S, Q, A]``, the actions to choose from in this world; default all. Inside
-        those that lose nothing of its task the plan does it as well as it can be done, and what
-        was learned decides how.
+      initial: ``float[S, Q]``, initial value of the solver.
+      allowed: ``bool[S, Q, A]``, action mask in this world; default all. Inside the optimal actions
+        of its task the policy attains the optimal satisfaction probability.
 
     Returns:
       :class:`~jaxltl.core.types.Solution`, differentiable in the parameters; with a
@@ -419,7 +393,7 @@ def _plan(
 
 
 def _backward_induction(rewards: jax.Array, model: Product, hparams: Hparams) -> Solution:
-    """Soft values with 0, ..., T - 1 steps behind, ``V_T = 0``; exact but for rounding."""
+    """Soft values of a finite horizon, ``V_T = 0``, by backward induction; exact up to rounding."""
     rewards = jnp.asarray(rewards, model.dtype)
     discount = jnp.asarray(hparams.discount, model.dtype)
 
@@ -450,26 +424,23 @@ def _backward_induction(rewards: jax.Array, model: Product, hparams: Hparams) ->
 def solve(
     parameters: Any, problem: Problem, hparams: Hparams, initial: jax.Array | None = None
 ) -> Solution:
-    """Soft values and policies of a reward in the problem's worlds, with a first axis of W.
+    """The soft values and policies of `parameters` in all worlds of a `problem`.
 
-    Args:
-      parameters: of the network.
-      problem, hparams: what and how.
-      initial: ``float[W, S, Q]``, values to start from.
+    By `hparams`, with initial values `initial`, ``float[W, S, Q]``.
 
     Returns:
       :class:`~jaxltl.core.types.Solution`, `value` ``float[W, S, Q]`` and `policy`
       ``float[W, S, Q, A]``, with a horizon ``[W, T, ...]``; differentiable in the parameters.
     """
 
-    def world(model, observation, initial):
+    def world(model: Product, observation: jax.Array, initial: jax.Array) -> Solution:
         return plan(problem.network, parameters, model, observation, hparams, initial=initial)
 
     return _each_world(world, problem.model, problem.observation, _initial(problem, initial))
 
 
-def _each_world(function, *arguments):
-    """``vmap`` over worlds; one world is not batched, which would keep seeds from being so."""
+def _each_world(function: Callable[..., ResultT], *arguments: PyTree) -> ResultT:
+    """``vmap`` over worlds, but for a single one, so that a vmap over seeds stays fast."""
     if jax.tree.leaves(arguments)[0].shape[0] == 1:
         one = function(*(jax.tree.map(lambda x: x[0], y) for y in arguments))
         return jax.tree.map(lambda x: x[None], one)
@@ -488,11 +459,11 @@ def _initial(problem: Problem, initial: jax.Array | None) -> jax.Array:
 @brief(codes={"status": Status})
 @struct.dataclass
 class Objective:
-    """What the loss was made of, and the soft values with their evidence.
+    """Terms of the loss, and the soft values.
 
     Attributes:
-      neg_log_likelihood, per_pair, held_out, satisfaction, error, status: as of :class:`Metrics`.
-      score: ``float[]``, by which learning is stopped early, the less the better.
+      neg_log_likelihood, per_pair, held_out, satisfaction, error, status: of :class:`Metrics`.
+      score: ``float[]``, criterion of early stopping, to be minimised.
       value: ``float[W, S, Q]``, from which the next solve may start.
     """
 
@@ -511,19 +482,17 @@ def objective(
 ) -> tuple[jax.Array, Objective]:
     """``-sum log pi(a | s, q) + l2 / 2 |theta|^2``: minus (3.2), over all pairs of all worlds.
 
-    With ``hparams.mu`` less mu times the probability of the task in each world, as in (2.6).
-    Its gradient costs one linear solve with the transposed transition matrix of the policy
-    (implicit function theorem), instead of one system (3.6) for each parameter.
-
-    Args:
-      parameters, problem, hparams, initial: as in :func:`solve`.
+    For `parameters`, `problem`, `hparams` and `initial` as in :func:`solve`; with ``hparams.mu``
+    minus mu times the satisfaction probability in each world, as in (2.6). The gradient costs one
+    linear solve with the transposed transition matrix of the policy (implicit function theorem),
+    instead of one system (3.6) for each parameter.
 
     Returns:
       The loss ``float[]``, in nats, and :class:`Objective`; differentiable in the parameters.
 
     Raises:
-      ValueError: the problem does not count pairs by time up to ``hparams.horizon``, or there is
-        a weight ``mu`` with a horizon.
+      ValueError: the problem does not count pairs by time up to ``hparams.horizon``, or `mu` is
+        combined with a horizon.
     """
     if hparams.horizon is not None and hparams.mu is not None:
         raise ValueError("mu weighs the probability of a task at any time; leave horizon out.")
@@ -536,81 +505,123 @@ def objective(
     if hparams.horizon is None and problem.horizon is not None:
         counts, held_out = counts.sum(axis=1), held_out.sum(axis=1)
 
-    def world(model, observation, counts, held_out, initial, before):
-        rewards = jnp.asarray(reward(problem.network, parameters, model, observation), model.dtype)
-        find = _by_time if hparams.horizon is not None else partial(_stationary, before=before)
-        return find(rewards, model, hparams, counts, held_out, initial)
+    def likelihood(data: _World) -> _Likelihood:
+        found = reward(problem.network, parameters, data.model, data.observation)
+        rewards = jnp.asarray(found, data.model.dtype)
+        by_time = hparams.horizon is not None
+        return (_time_dependent if by_time else _stationary)(rewards, data, hparams)
 
-    seen, other, done, value, error, status = _each_world(
-        world,
-        problem.model,
-        problem.observation,
-        counts,
-        held_out,
-        _initial(problem, initial),
-        problem.predecessors,
+    found = _each_world(
+        likelihood,
+        _World(
+            model=problem.model,
+            observation=problem.observation,
+            counts=counts,
+            held_out=held_out,
+            initial=_initial(problem, initial),
+            predecessors=problem.predecessors,
+        ),
     )
     weight = problem.weight
     pairs, other_pairs = (weight @ jnp.sum(x, axis=(1, 2, 3)) for x in _flat(counts, held_out))
-    neg = -weight @ seen
+    neg = -weight @ found.demonstrated
     squares = sum(jnp.sum(x * x) for x in jax.tree.leaves(parameters))
     loss = neg + hparams.l2 / 2 * squares
-    score = lax.stop_gradient(-(weight @ other) / other_pairs)
-    found = Objective(
+    score = lax.stop_gradient(-(weight @ found.held_out) / other_pairs)
+    parts = Objective(
         neg_log_likelihood=neg,
         per_pair=neg / pairs,
         held_out=score,
         score=score,
-        satisfaction=jnp.mean(done),
-        value=value,
-        error=jnp.max(error),
-        status=jnp.max(status),
+        satisfaction=jnp.mean(found.satisfaction),
+        value=found.value,
+        error=jnp.max(found.error),
+        status=jnp.max(found.status),
     )
     if hparams.mu is None:
-        return loss, found
-    # Its derivative is in that of the likelihood, since one linear system serves both.
-    gain = lax.stop_gradient(hparams.mu * (weight @ done))
-    return loss - gain, replace(found, score=score - gain / pairs)
+        return loss, parts
+    # Its derivative is part of the likelihood's, since one linear system serves both.
+    gain = lax.stop_gradient(hparams.mu * (weight @ found.satisfaction))
+    return loss - gain, replace(parts, score=score - gain / pairs)
 
 
-def _stationary(rewards, model, hparams, counts, held_out, initial, *, before):
-    """Log-likelihoods of the stationary soft policy, with the gradient of the first."""
+@struct.dataclass
+class _World:
+    """Data of one world, or of all with a first axis."""
+
+    model: Product
+    observation: jax.Array
+    counts: jax.Array
+    held_out: jax.Array
+    initial: jax.Array
+    predecessors: PredecessorTable | None
+
+
+@struct.dataclass
+class _Likelihood:
+    """Log-likelihoods of demonstrated and held-out pairs in a world, and the solver's results."""
+
+    demonstrated: jax.Array
+    held_out: jax.Array
+    satisfaction: jax.Array
+    value: jax.Array
+    error: jax.Array
+    status: jax.Array
+
+
+def _stationary(rewards: jax.Array, data: _World, hparams: Hparams) -> _Likelihood:
+    """Likelihoods of the stationary soft policy; the demonstrated one is differentiable."""
+    model, counts = data.model, data.counts
     constant = lax.stop_gradient(rewards)
-    solution = lax.stop_gradient(_plan(constant, model, hparams, initial))
+    solution = lax.stop_gradient(_plan(constant, model, hparams, data.initial))
     log_policy = _log_policy(model, constant, hparams.discount, solution.value)
     policy = jnp.where(model.available, jnp.exp(log_policy), 0)
-    done, cotangent = jnp.full((), jnp.nan, model.dtype), counts
+    satisfaction, cotangent = jnp.full((), jnp.nan, model.dtype), counts
     if hparams.mu is not None:
-        done, gain = jax.value_and_grad(partial(_satisfaction, model))(policy)
+        satisfaction, gain = jax.value_and_grad(partial(_satisfaction, model))(policy)
         cotangent = counts + hparams.mu * policy * gain
     slope = lax.stop_gradient(
-        soft_policy_adjoint(model, policy, hparams.discount, cotangent, predecessors=before)
+        soft_policy_adjoint(
+            model, policy, hparams.discount, cotangent, predecessors=data.predecessors
+        )
     )
-    # The likelihood, and as its derivative the adjoint's, which differentiating the solver's
-    # own equations would find by scatters, slow on a CPU.
-    seen = jnp.sum(counts * log_policy) + jnp.sum(slope * (rewards - constant))
-    error = jnp.max(solution.upper - solution.lower) / 2
-    other = jnp.sum(held_out * log_policy)
-    return seen, other, lax.stop_gradient(done), solution.value, error, solution.status
+    # The adjoint is the derivative of the likelihood; differentiating the solver's equations gives
+    # the same by scatters, which are slow on CPUs.
+    return _Likelihood(
+        demonstrated=jnp.sum(counts * log_policy) + jnp.sum(slope * (rewards - constant)),
+        held_out=jnp.sum(data.held_out * log_policy),
+        satisfaction=lax.stop_gradient(satisfaction),
+        value=solution.value,
+        error=jnp.max(solution.upper - solution.lower) / 2,
+        status=solution.status,
+    )
 
 
-def _satisfaction(model, policy) -> jax.Array:
-    """The mean probability of the task over the starts."""
+def _satisfaction(model: Product, policy: jax.Array) -> jax.Array:
+    """The mean satisfaction probability over initial states."""
     return jnp.sum(model.initial * satisfaction_probability(model, policy).value)
 
 
-def _by_time(rewards, model, hparams, counts, held_out, initial):
-    """Log-likelihoods of the policy of the time left, differentiable as they stand."""
+def _time_dependent(rewards: jax.Array, data: _World, hparams: Hparams) -> _Likelihood:
+    """Likelihoods of the time-dependent soft policy, differentiable by backward induction."""
+    model = data.model
     solution = _backward_induction(rewards, model, hparams)
     after = jnp.concatenate([solution.value[1:], jnp.zeros_like(solution.value[:1])])
     log_policy = jax.vmap(lambda v: _log_policy(model, rewards, hparams.discount, v))(after)
-    seen, other = (jnp.sum(x * log_policy) for x in (counts, held_out))
-    error = lax.stop_gradient(jnp.max(solution.upper - solution.lower) / 2)
-    return seen, other, jnp.full((), jnp.nan, model.dtype), initial, error, solution.status
+    return _Likelihood(
+        demonstrated=jnp.sum(data.counts * log_policy),
+        held_out=jnp.sum(data.held_out * log_policy),
+        satisfaction=jnp.full((), jnp.nan, model.dtype),
+        value=data.initial,
+        error=lax.stop_gradient(jnp.max(solution.upper - solution.lower) / 2),
+        status=solution.status,
+    )
 
 
-def _log_policy(model, rewards, discount, value) -> jax.Array:
-    """Zero at unavailable actions, which have no counts."""
+def _log_policy(
+    model: Product, rewards: jax.Array, discount: jax.Array | float, value: jax.Array
+) -> jax.Array:
+    """The logarithm of the soft policy; zero at unavailable actions, which have no counts."""
     logits = policy_logits(model, rewards, discount, value)
     return jnp.where(model.available, jax.nn.log_softmax(logits, axis=-1), 0)
 
@@ -687,7 +698,7 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
     best, stopped = stop_early(
         state, parameters, parts.score, jnp.any(problem.held_out > 0), hparams.patience
     )
-    # A solve that failed would poison the next one's start.
+    # The value of a failed solve is no initial value.
     value = jnp.where(parts.status != Status.NONFINITE, parts.value, 0)
     after = replace(
         state, parameters=parameters, value=value, optimizer=optimizer, best=best, stopped=stopped

@@ -202,7 +202,7 @@ make = partial(bc.make_problem, held_out=None, network=SMALL)
             lambda: make(
                 two_worlds(), [np.eye(6)] * 2, demonstrations(), network=bc.ConvolutionalPolicy()
             ),
-            "6 numbers, which are none of shape",
+            "6 numbers, which do not fit the shape",
         ),
     ],
 )
