@@ -299,7 +299,8 @@ def lacking(path):
     elif not of_protocol:
         lacks += lacking_in_function(inspect.unwrap(thing), text, PUBLIC.get(name) is not thing)
     examples = examples_in(text)
-    if not examples and not of_protocol and not shown_in_module(path):
+    is_protocol = getattr(thing, "_is_protocol", False)
+    if not examples and not of_protocol and not is_protocol and not shown_in_module(path):
         lacks.append("an example")
     if any(x.want.count("\n") > 8 or len(max(x.want.split("\n"), key=len)) > 99 for x in examples):
         lacks.append("an example that shows no more than is read")

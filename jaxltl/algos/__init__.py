@@ -14,45 +14,6 @@ reports and resumption), ``checkpoint`` (files), ``early_stopping``, ``schedules
 ``actor_critic`` (networks) and ``pac`` (constants and bounds of ``rmax``).
 """
 
-import importlib
-from typing import TYPE_CHECKING, Any
+import lazy_loader
 
-__all__ = [
-    "behavioral_cloning",
-    "cce",
-    "common",
-    "feasible",
-    "interval_learning",
-    "many_tasks",
-    "maximin_q",
-    "mlirl",
-    "ppo",
-    "regions",
-    "rmax",
-    "todirl",
-    "trust_region",
-]
-
-if TYPE_CHECKING:
-    from jaxltl.algos import behavioral_cloning as behavioral_cloning
-    from jaxltl.algos import cce as cce
-    from jaxltl.algos import common as common
-    from jaxltl.algos import feasible as feasible
-    from jaxltl.algos import interval_learning as interval_learning
-    from jaxltl.algos import many_tasks as many_tasks
-    from jaxltl.algos import maximin_q as maximin_q
-    from jaxltl.algos import mlirl as mlirl
-    from jaxltl.algos import ppo as ppo
-    from jaxltl.algos import regions as regions
-    from jaxltl.algos import rmax as rmax
-    from jaxltl.algos import todirl as todirl
-    from jaxltl.algos import trust_region as trust_region
-else:
-
-    def __getattr__(name: str) -> Any:
-        if name not in __all__:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        return importlib.import_module(f"{__name__}.{name}")
-
-    def __dir__() -> list[str]:
-        return sorted({*globals(), *__all__})
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -42,13 +42,17 @@ import optax
 from flax import linen as nn
 from flax import struct
 
+from jaxltl.algos.common.settings import COUNT, Number, static, traced
+from jaxltl.core.validation import Range
 from jaxltl.algos.common import learner
+
+from jaxltl.algos.common import trees
 from jaxltl.algos.common.early_stopping import Best, stop_early
 from jaxltl.core.models.construct.batch import stack_models, stack_observations, training_counts
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.pretty_print import brief, history
-from jaxltl.core.types import Status, status_code
+from jaxltl.core.types import Status
 
 # --- policy networks -----------------------------------------------------------------------------
 
@@ -152,10 +156,10 @@ class Hparams:
       batch: pairs in a minibatch; static; default 128.
     """
 
-    learning_rate: jax.Array | float = 3e-3
-    l2: jax.Array | float = 0.0
-    patience: jax.Array | int = 500
-    batch: int = struct.field(pytree_node=False, default=128)
+    learning_rate: Number = traced(Range(0, open_above=True), default=3e-3)
+    l2: Number = traced(Range(0, open_above=True), default=0.0)
+    patience: Number = traced(Range(1), default=500)
+    batch: int = static(COUNT, default=128)
 
 
 @brief
@@ -188,7 +192,7 @@ class Metrics:
       loss: of the minibatch, in nats a pair, with the prior.
       held_out: negative log-likelihood of the average held-out pair; NaN without any.
       gradient_norm: Euclidean.
-      status: NONFINITE if the loss or its gradient is no number, else CONVERGED.
+      status: NONFINITE if the loss or its gradient is no number, else COMPLETED.
     """
 
     loss: jax.Array
@@ -314,17 +318,8 @@ def _log_policy(scores: jax.Array, available: jax.Array) -> jax.Array:
     return jnp.where(available, log_policy, 0)
 
 
-def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
-    """A state at the network's own random start; the key is kept.
-
-    Args:
-      key: a PRNG key, which the state keeps; ``vmap`` over keys for many seeds.
-      problem: of :func:`make_problem`.
-      hparams: :class:`Hparams`.
-
-    Returns:
-      :class:`State`, no step made.
-    """
+def _init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
+    """A state at the network's own random start; the key is kept."""
     dtype = problem.observation.dtype
     drawn = problem.network.init(learner.init_key(key), *_inputs(problem))
     parameters = jax.tree.map(lambda x: jnp.asarray(x, dtype), drawn)
@@ -340,19 +335,8 @@ def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     )
 
 
-def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
-    """One step of Adam on a minibatch, drawn with replacement from the demonstrated pairs.
-
-    The loss is (3.10) with the network's outputs read as logits; softmax twice, as the
-    formula has it where they are probabilities, does not train.
-
-    Args:
-      state: of :func:`init` or of an earlier step; unchanged.
-      problem, hparams: as of :func:`init`.
-
-    Returns:
-      The next :class:`State`, and :class:`Metrics`, figures of the parameters before the step.
-    """
+def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
+    """One step of Adam on a minibatch, drawn with replacement from the demonstrated pairs."""
     pairs = _draw(learner.step_key(state), problem.counts, hparams.batch)
 
     def loss_of(parameters: Any) -> jax.Array:
@@ -371,13 +355,16 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
     best, stopped = stop_early(
         state, parameters, held_out, jnp.any(problem.held_out > 0), hparams.patience
     )
-    parameters, optimizer = learner.choose(
+    parameters, optimizer = trees.choose(
         stopped, (state.parameters, state.optimizer), (parameters, optimizer)
     )
     norm = optax.tree.norm(gradient)
     finite = jnp.isfinite(loss) & jnp.isfinite(norm)
     metrics = Metrics(
-        loss=loss, held_out=held_out, gradient_norm=norm, status=status_code(finite, finite)
+        loss=loss,
+        held_out=held_out,
+        gradient_norm=norm,
+        status=learner.completion_status(finite, finite),
     )
     return State(
         key=state.key,
@@ -404,4 +391,4 @@ def _optimizer(hparams: Hparams) -> optax.GradientTransformation:
     return optax.chain(optax.scale_by_adam(), rate)
 
 
-run, train, run_until, train_until = learner.bind(init, step)
+init, step, run, train, run_until, train_until = learner.bind(_init, _step)

@@ -54,7 +54,12 @@ from jax import lax
 from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 
+from jaxltl.algos.common.settings import Number, static, traced
+from jaxltl.core.validation import Range
 from jaxltl.algos.common import learner
+from jaxltl.algos.common import trees
+from jaxltl.algos.common import optimizers
+from jaxltl.algos.common import loops
 from jaxltl.algos.common.schedules import Schedule, at
 from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.models.parametric.parametric import Ends, ParametricMDP
@@ -124,9 +129,9 @@ class Hparams:
         :func:`~jaxltl.core.values.prepared.prepared.solve_prepared`; default None.
     """
 
-    learning_rate: Schedule = 0.1
-    optimizer: str = struct.field(pytree_node=False, default="adam")
-    tolerance: jax.Array | float | None = None
+    learning_rate: Schedule = traced(Range(0, open_above=True), default=0.1, schedule=True)
+    optimizer: str = static(("adam", "rmsprop", "sgd", "sign"), default="adam")
+    tolerance: Number | None = traced(Range(0, open_above=True), default=None)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,10 +150,10 @@ class Budget:
 
     def __post_init__(self) -> None:
         """Raises ValueError if a number is out of range."""
-        validation.integer("num_steps", self.num_steps, least=1, most=learner.MOST)
+        validation.integer("num_steps", self.num_steps, least=1, most=loops.MAX_STEPS)
         if self.num_proofs is not None:
             validation.integer("num_proofs", self.num_proofs, least=1)
-        width_asked(self.tolerance)
+        validation.require_in_range("tolerance", self.tolerance)
 
 
 @brief
@@ -360,7 +365,7 @@ def _has_variable_cost(prepared: Prepared) -> bool:
     return not is_direct(prepared) if _is_chain(prepared) else prepared.cyclic
 
 
-def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
+def _init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     """A point drawn uniformly from the box."""
     share = jax.random.uniform(learner.init_key(key), problem.low.shape, problem.low.dtype)
     return start_at(problem.low + share * (problem.high - problem.low), key, problem, hparams)
@@ -378,7 +383,7 @@ def start_at(parameters: jax.Array, key: chex.PRNGKey, problem: Problem, hparams
         parameters=point,
         inside=problem.inside,
         best=Best(jnp.full_like(point, jnp.nan), jnp.full((), jnp.nan, point.dtype)),
-        optimizer=learner.strong(_optimizer(hparams, jnp.int32(0)).init(point)),
+        optimizer=trees.strong(_optimizer(hparams, jnp.int32(0)).init(point)),
     )
 
 
@@ -388,16 +393,11 @@ def _optimizer(hparams: Hparams, step: jax.Array) -> optax.GradientTransformatio
         return optax.with_extra_args_support(
             optax.chain(optax.scale_by_sign(), optax.scale_by_learning_rate(rate))
         )
-    if hparams.optimizer == "lbfgs":
-        raise ValueError('optimizer="lbfgs" leaves the box; choose adam, rmsprop, sgd or sign.')
-    return learner.optimizer(hparams.optimizer, rate)
+    return optimizers.optimizer(hparams.optimizer, rate)
 
 
-def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
-    """A projected gradient step; from a point without a model, half way back to the last one with.
-
-    Points at which the solve failed count as points without a model.
-    """
+def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
+    """A projected gradient step; from a point without a model, half way back to the last one with."""
     x = state.parameters
     size = problem.high - problem.low
 
@@ -414,14 +414,14 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
     moved = jnp.clip(x + updates * size, problem.low, problem.high)
     gain = problem.sign * (value - state.best.value)
     better = good & ~(gain <= 0)  # also if the best is NaN
-    best = learner.choose(better, Best(x, value), state.best)
+    best = trees.choose(better, Best(x, value), state.best)
     after = State(
         key=state.key,
         step=state.step + 1,
         parameters=jnp.where(good, moved, x + (state.inside - x) / 2),
         inside=jnp.where(good, x, state.inside),
         best=best,
-        optimizer=learner.choose(good, optimizer, state.optimizer),
+        optimizer=trees.choose(good, optimizer, state.optimizer),
     )
     status = jnp.where(good | (status >= Status.NONFINITE), status, Status.NONFINITE)
     return after, Metrics(
@@ -444,7 +444,7 @@ def _unit(problem: Problem, value: jax.Array) -> jax.Array:
     return jnp.maximum(unit, limits.tiny)
 
 
-run, train, run_until, train_until = learner.bind(init, step)
+init, step, run, train, run_until, train_until = learner.bind(_init, _step)
 
 
 def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
@@ -542,7 +542,7 @@ def feasible(
     points = None
     if np.ndim(starts) == 0:
         keys = jax.random.split(
-            key, validation.integer("starts", starts, least=1, most=learner.MOST)
+            key, validation.integer("starts", starts, least=1, most=loops.MAX_STEPS)
         )
     else:
         points = problem.model.inside_of("start", starts).astype(problem.low.dtype)
@@ -561,11 +561,11 @@ def _search(
     hparams: Hparams,
     goal: jax.Array,
     most: jax.Array,
-) -> learner.Learned:
+) -> loops.Learned:
     """Searches from all starts: in parallel, or sequentially if their costs differ."""
     until = Partial(_met, problem.sign * goal, problem.sign)
 
-    def one(key: jax.Array, point: jax.Array | None) -> learner.Learned:
+    def one(key: jax.Array, point: jax.Array | None) -> loops.Learned:
         state = init(key, problem, hparams)
         if point is not None:
             state = start_at(point, key, problem, hparams)
@@ -582,9 +582,7 @@ def _met(
     return sign * metrics.best_value >= goal
 
 
-def _prove(
-    problem: Problem, threshold: float, learned: learner.Learned, budget: Budget
-) -> Feasible:
+def _prove(problem: Problem, threshold: float, learned: loops.Learned, budget: Budget) -> Feasible:
     """Certified bounds at the points that seem to meet the threshold, best values first."""
     best = learned.state.best
     value = np.asarray(best.value, np.float64)

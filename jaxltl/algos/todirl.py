@@ -50,7 +50,13 @@ from flax import linen as nn
 from flax import struct
 from jax import lax
 
+from jaxltl.algos.common.settings import COUNT, Number, static, traced
+from jaxltl.core.validation import Range
 from jaxltl.algos.common import learner
+
+from jaxltl.algos.common import trees
+
+from jaxltl.algos.common import optimizers
 from jaxltl.algos.common.early_stopping import Best, stop_early
 from jaxltl.core.models.construct.batch import (
     restrict_stacked_actions,
@@ -186,15 +192,15 @@ class Hparams:
         default None.
     """
 
-    discount: jax.Array | float
-    l2: jax.Array | float = 1e-3
-    learning_rate: jax.Array | float = 3e-3
-    patience: jax.Array | int = 50
-    mu: jax.Array | float | None = None
-    tolerance: jax.Array | float | None = None
-    optimizer: str = struct.field(pytree_node=False, default="adam")
-    method: str = struct.field(pytree_node=False, default="value_iteration")
-    horizon: int | None = struct.field(pytree_node=False, default=None)
+    discount: Number = traced(Range(0, 1))
+    l2: Number = traced(Range(0, open_above=True), default=1e-3)
+    learning_rate: Number = traced(Range(0, open_above=True), default=3e-3)
+    patience: Number = traced(Range(1), default=50)
+    mu: Number | None = traced(Range(0, open_above=True), default=None)
+    tolerance: Number | None = traced(Range(0, open_above=True), default=None)
+    optimizer: str = static(("adam", "sgd", "rmsprop", "lbfgs"), default="adam")
+    method: str = static(("newton", "value_iteration"), default="value_iteration")
+    horizon: int | None = static(COUNT, default=None)
 
 
 @brief
@@ -630,17 +636,8 @@ def _flat(*counts: jax.Array) -> list[jax.Array]:
     return [x.reshape(x.shape[0], -1, *x.shape[-2:]) for x in counts]
 
 
-def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
-    """A state at the network's own random start; the key is kept.
-
-    Args:
-      key: a PRNG key, which the state keeps; ``vmap`` over keys for many seeds.
-      problem: of :func:`make_problem`.
-      hparams: :class:`Hparams`.
-
-    Returns:
-      :class:`State`, no step made.
-    """
+def _init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
+    """A state at the network's own random start; the key is kept."""
     dtype = problem.model.dtype
     inputs = _inputs(problem.model, problem.observation[0])
     drawn = _draw(problem.network, learner.init_key(key), inputs)
@@ -664,16 +661,8 @@ def _draw(network: nn.Module, key: chex.PRNGKey, inputs: tuple[jax.Array, ...]) 
     return network.init(key, *inputs)
 
 
-def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
-    """One full-batch step of the optimiser on :func:`objective`; deterministic given the state.
-
-    Args:
-      state: of :func:`init` or of an earlier step; unchanged.
-      problem, hparams: as of :func:`init`.
-
-    Returns:
-      The next :class:`State`, and :class:`Metrics`, figures of the parameters before it.
-    """
+def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
+    """One full-batch step of the optimiser on :func:`objective`; deterministic given the state."""
 
     def loss_of(parameters: Any) -> jax.Array:
         return objective(parameters, problem, hparams, state.value)[0]
@@ -703,15 +692,15 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
     after = replace(
         state, parameters=parameters, value=value, optimizer=optimizer, best=best, stopped=stopped
     )
-    after = learner.choose(stopped, replace(state, best=best, stopped=stopped), after)
+    after = trees.choose(stopped, replace(state, best=best, stopped=stopped), after)
     return replace(after, step=state.step + 1), metrics
 
 
 def _optimizer(hparams: Hparams) -> optax.GradientTransformationExtraArgs:
-    return learner.optimizer(hparams.optimizer, hparams.learning_rate)
+    return optimizers.optimizer(hparams.optimizer, hparams.learning_rate)
 
 
-run, train, run_until, train_until = learner.bind(init, step)
+init, step, run, train, run_until, train_until = learner.bind(_init, _step)
 
 
 def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:

@@ -38,6 +38,7 @@ from jaxltl.app.job import (
 )
 from jaxltl.app.job import fingerprint as fingerprint
 from jaxltl.app.wording import many
+from jaxltl.core.types import Status
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.environments.environment import Environment, Finite, require_environment
@@ -290,7 +291,7 @@ def summary(outcome: Outcome) -> dict[str, Any]:
             "training": {
                 "steps": task.learner.steps,
                 "transitions": _transitions(outcome),
-                "troubled_rows": int((status != 0).sum()),
+                "troubled_rows": int((status > Status.COMPLETED).sum()),
                 "last": last,
                 "hyperparameters": task.given,
             },

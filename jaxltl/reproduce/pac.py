@@ -13,7 +13,8 @@ import numpy as np
 from jax.tree_util import Partial
 
 from jaxltl.algos import rmax
-from jaxltl.algos.common import learner, pac
+from jaxltl.algos.common import pac
+from jaxltl.algos.common import loops
 from jaxltl.app.job import plain
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.games.winning import almost_sure_buchi
@@ -164,14 +165,14 @@ def _summary(model: Patrol, value: jax.Array) -> Figures:
 
 
 @jax.jit
-def _learn_all(keys: jax.Array, problem: rmax.Problem, hparams: rmax.Hparams) -> learner.Learned:
-    return jax.vmap(lambda key: _learn(key, problem, hparams, jnp.int32(learner.MOST)))(keys)
+def _learn_all(keys: jax.Array, problem: rmax.Problem, hparams: rmax.Hparams) -> loops.Learned:
+    return jax.vmap(lambda key: _learn(key, problem, hparams, jnp.int32(loops.MAX_STEPS)))(keys)
 
 
 @jax.jit
 def _learn(
     key: jax.Array, problem: rmax.Problem, hparams: rmax.Hparams, most: jax.Array
-) -> learner.Learned:
+) -> loops.Learned:
     """Learning until the strategy is stable, or a number of moves was made."""
     return rmax.train_until(key, problem, hparams, until=Partial(_is_stable, most), num_steps=10**6)
 
@@ -183,10 +184,10 @@ def _is_stable(
 
 
 def _single_run_seconds(
-    keys: jax.Array, problem: rmax.Problem, hparams: rmax.Hparams, found: learner.Learned
+    keys: jax.Array, problem: rmax.Problem, hparams: rmax.Hparams, found: loops.Learned
 ) -> tuple[float, float]:
     """Median seconds of single runs, until they end and until their last update."""
-    most = jnp.full_like(found.state.last_update, learner.MOST)
+    most = jnp.full_like(found.state.last_update, loops.MAX_STEPS)
     medians = []
     for limits in (most, found.state.last_update):
         runs = [
@@ -198,7 +199,7 @@ def _single_run_seconds(
 
 
 def _evaluated(
-    found: learner.Learned, problem: rmax.Problem, hparams: rmax.Hparams
+    found: loops.Learned, problem: rmax.Problem, hparams: rmax.Hparams
 ) -> tuple[list[Figures], rmax.Evidence]:
     """A row for each seed, and the evidence of the first one.
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from jaxltl.algos import feasible as search
-from jaxltl.algos.common import learner
+from jaxltl.algos.common import loops
 from jaxltl.algos.feasible import Budget, Hparams, certify, evaluate, feasible, make_problem, within
 from jaxltl.core.models.parametric.parametric import make_parametric
 from jaxltl.core.models.sparse import Rewards, make_sparse
@@ -365,7 +365,7 @@ def forged(problem, points, values):
     size = len(values)
     code = jnp.zeros(size, jnp.int32)
     metrics = search.Metrics(values, values, values, code)
-    return learner.Learned(replace(states, best=best), metrics, code + 3, code)
+    return loops.Learned(replace(states, best=best), metrics, code + 3, code)
 
 
 def test_a_search_that_is_wrong_claims_nothing(tmp_path):
@@ -472,7 +472,7 @@ def test_questions_that_are_none(tmp_path, changed, message):
             r"start 1 has p = 0.95; its interval is \[0.1",
         ),
         (0.2, {"starts": np.array([[np.nan]])}, "start 0 has p = nan"),
-        (0.2, {"hparams": Hparams(optimizer="lbfgs")}, "leaves the box"),
+        (0.2, {"hparams": Hparams(optimizer="lbfgs")}, "choose one of adam, rmsprop, sgd, sign"),
         (0.2, {"hparams": Hparams(optimizer="newton")}, "optimizer='newton'; choose one of"),
     ],
 )

@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import connected_components
 
 import jaxltl as jl
 from jaxltl.algos import interval_learning as learning
-from jaxltl.algos.common import learner
+from jaxltl.algos.common import loops
 from jaxltl.algos.interval_learning import _intervals
 from jaxltl.core.models.game import make_game
 from jaxltl.core.models.interval import make_interval
@@ -206,10 +206,10 @@ def test_samples_are_of_the_world():
 
 def test_counters_end_before_they_are_full():
     problem, hparams, (states, _) = on_the_way(TASKS[0], "linear", 0)
-    last = lane(states, 39).replace(samples=np.int32(learner.MOST - 70))
+    last = lane(states, 39).replace(samples=np.int32(loops.MAX_STEPS - 70))
     step = jax.jit(learning.step)
     state, metrics = step(last, problem, hparams)
-    assert state.samples == learner.MOST - 6 and metrics.status == Status.MAX_STEPS
+    assert state.samples == loops.MAX_STEPS - 6 and metrics.status == Status.MAX_STEPS
     after, metrics = step(state, problem, hparams)
     assert after.samples == state.samples and metrics.status == Status.MAX_STEPS
     np.testing.assert_array_equal(after.counts, state.counts)
@@ -280,7 +280,7 @@ def test_settled_values_are_the_robust_values_of_the_intervals(task):
     for i in range(3):
         problem, _, (states, metrics) = on_the_way(task, "linear", i, sweeps=1000)
         model = problem.model
-        assert np.asarray(metrics.status)[39] == Status.CONVERGED
+        assert np.asarray(metrics.status)[39] == Status.COMPLETED
         for number in (0, 39):
             state = lane(states, number)
             intervals = make_interval(model.mdp, state.lower, state.upper)

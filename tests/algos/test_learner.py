@@ -33,7 +33,7 @@ from jaxltl.algos import (
     trust_region,
 )
 from jaxltl.algos.cce.exponential_family import diagonal_gaussian
-from jaxltl.algos.common import checkpoint, learner
+from jaxltl.algos.common import checkpoint, learner, loops
 from jaxltl.algos.common.chunks import run_in_chunks
 from jaxltl.core.environments.environment import Timestep, make_box, make_environment
 from jaxltl.core.models.game import make_game
@@ -79,8 +79,6 @@ def toy_step(state, problem, hparams):
 
 
 TOY = SimpleNamespace(
-    init=toy_init,
-    step=toy_step,
     policy=lambda state, problem, hparams: state.position,
     **learner.bind(toy_init, toy_step)._asdict(),
 )
@@ -532,6 +530,21 @@ def test_every_learner_is_called_alike(name):
     assert set(np.asarray(metrics.status).tolist()) <= set(Status)
 
 
+@each(["mlirl-product", "rmax", "q-maximin", "cce", "ppo"])
+def test_a_traced_hyperparameter_out_of_range_is_invalid(name):
+    module, problem, hparams, _ = case(name)
+    field = "temperature" if name == "cce" else "discount"
+
+    @jax.jit
+    def trained(value):
+        changed = hparams.replace(**{field: value})
+        _, metrics = module.train(jax.random.key(0), problem, changed, num_steps=2, max_rows=2)
+        return metrics.status
+
+    assert (trained(-0.5) == Status.INVALID).all() and (trained(jnp.nan) == Status.INVALID).all()
+    assert (trained(getattr(hparams, field)) < Status.INVALID).all()
+
+
 # --- what does not exist does not matter ------------------------------------------------------
 
 
@@ -607,7 +620,7 @@ def test_runs_have_at_least_one_step_and_row(limits):
 def test_counters_stay_where_they_end():
     most = np.iinfo(np.int32).max
     total = jnp.asarray(np.array([0, most - 3, most - 2, most], np.int32))
-    assert learner.count(total, 3).tolist() == [3, most, most, most]
+    assert learner.saturating_add(total, 3).tolist() == [3, most, most, most]
 
 
 def reaches(number, before, after, metrics):
@@ -648,7 +661,7 @@ def test_lanes_end_each_for_itself():
         )
     )(starts("toy"), most)
     assert found.num_steps.tolist() == [4, 20, 8]
-    assert found.status.tolist() == [0, Status.MAX_STEPS, 0]
+    assert found.status.tolist() == [Status.COMPLETED, Status.MAX_STEPS, Status.COMPLETED]
     for i, number in enumerate([4, 20, 8]):
         alone, _ = module.run(start("toy", i), problem, hparams, num_steps=number, max_rows=1)
         np.testing.assert_allclose(found.state.position[i], alone.position, rtol=1e-12)
@@ -660,13 +673,13 @@ def test_lanes_end_each_for_itself():
         ({"keep": "both"}, "keep='both'; choose"),
         ({"check_every": 0}, "check_every=0; it must be at least 1"),
         ({"num_steps": 0}, "num_steps=0; it must be at least 1"),
-        ({"idle": True, "keep": "before"}, "idle=True goes with"),
+        ({"idle": True, "keep": "before"}, "idle=True requires"),
     ],
 )
 def test_runs_that_make_no_sense_are_refused(options, message):
     module, problem, hparams, _ = case("toy")
     with pytest.raises(ValueError, match=message):
-        learner.run_until(
+        loops.run_until(
             module.step,
             start("toy"),
             problem,
@@ -687,7 +700,7 @@ def test_a_loop_of_lanes_is_a_while_loop():
 
     def loop(n, most, step):
         carry = {"n": n, "sum": jnp.zeros(2)}
-        return learner.while_active(active, body, carry, {"most": most, "step": step})
+        return loops.while_active(active, body, carry, {"most": most, "step": step})
 
     most = jnp.array([[3, 0, 7], [1, 5, 2]])
     step = jnp.array([1.0, 10.0])

@@ -416,7 +416,7 @@ def test_a_run_ends_when_the_value_is_stable():
         )
 
     done = check(stop(1e-5, 2000))
-    assert done.status == Status.CONVERGED
+    assert done.status == Status.COMPLETED
     assert done.num_steps < 1000
     assert done.num_steps % 20 == 0
     assert done.residual <= 1e-5
@@ -436,7 +436,7 @@ def test_a_run_ends_when_the_value_is_stable():
         num_steps=2000,
         check_every=20,
     )
-    assert again.status == Status.CONVERGED
+    assert again.status == Status.COMPLETED
     assert again.state.step == again.num_steps + 30
 
 
@@ -451,7 +451,7 @@ def test_a_rest_before_all_is_seen_does_not_end_the_run():
     done = maximin_q.train_until(
         jax.random.key(0), problem, hparams, until=maximin_q.value_is_stable(1e-6), num_steps=100
     )
-    assert done.status == Status.CONVERGED
+    assert done.status == Status.COMPLETED
     assert done.num_steps >= length // 4
     assert done.state.value[-1] > 1.9
 

@@ -270,7 +270,7 @@ def test_bad_problems_are_refused(arguments, message):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"policy": "greedy"}, "policy='greedy'; choose boltzmann or soft"),
+        ({"policy": "greedy"}, "policy='greedy'; choose one of boltzmann, soft"),
         ({"policy": "soft", "adjoint": "approximate"}, "belongs to the Boltzmann policy"),
         ({"adjoint": "none"}, "adjoint='none'; choose one of exact, approximate"),
         ({"mu": 1.0}, "make the problem in a product"),

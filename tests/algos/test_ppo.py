@@ -589,10 +589,10 @@ def test_problems_that_cannot_be_are_named(make, message):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"num_envs": 0}, "num_envs=0; it must be at least 1"),
+        ({"num_envs": 0}, "num_envs=0; it must be an integer of at least 1"),
         ({"num_minibatches": 7}, "num_minibatches=7 does not divide 1024, the number of num_envs"),
-        ({"discount": 1.5}, r"discount=1.5; it must lie in \[0, 1\]"),
-        ({"clip": float("nan")}, "clip=nan; it must lie"),
+        ({"discount": 1.5}, r"discount=1.5; it must be at least 0 and at most 1"),
+        ({"clip": float("nan")}, "clip=nan; it must be at least 0"),
         ({"squash": "cut"}, "squash='cut'; choose one of clip, tanh"),
     ],
 )

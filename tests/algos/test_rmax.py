@@ -418,7 +418,7 @@ def test_single_precision():
 
 def test_how_a_run_ends():
     done = learn(jax.random.key(0), example(), settings(), 500)
-    assert done.status == Status.CONVERGED
+    assert done.status == Status.COMPLETED
     rested = done.state.moves - done.state.last_update
     assert 500 <= rested < 500 + settings().moves_per_step
     short = learn(jax.random.key(0), example(), settings(), 500, num_steps=3)
@@ -433,7 +433,7 @@ def test_a_run_is_over_when_no_more_moves_can_be_counted():
         state.replace(moves=jnp.int32(most - 5)), problem, hparams, num_steps=9, max_rows=9
     )
     assert (np.diff(np.asarray(metrics.moves)) >= 0).all() and metrics.moves[-1] == most
-    assert metrics.status[-1] == Status.MAX_STEPS and metrics.status[0] == Status.CONVERGED
+    assert metrics.status[-1] == Status.MAX_STEPS and metrics.status[0] == Status.COMPLETED
     again, _ = rmax.run(state, problem, hparams, num_steps=9, max_rows=9)
     assert again.moves == most and (again.counts == state.counts).all()
     assert (state.known_at <= most).all() and (state.known_at >= -1).all()

@@ -920,7 +920,7 @@ def test_new_worlds_limits_and_settings_do_not_retrace():
     [
         ({"method": "ppo"}, r"method='ppo'; choose"),
         ({"penalty": 1.0}, "CPO finds its own multiplier"),
-        ({"cg_steps": 0}, "cg_steps=0; it must be at least 1"),
+        ({"cg_steps": 0}, "cg_steps=0; it must be an integer of at least 1"),
         ({"value_batches": 1000}, "value_batches=1000 of 200 samples"),
     ],
 )

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from jaxltl.algos import mlirl
-from jaxltl.algos.common import learner
 from jaxltl.algos.mlirl import features
 from jaxltl.app import learn
 from jaxltl.app.files.task_mlirl import read_task
@@ -34,7 +33,7 @@ def test_the_policy_is_that_of_the_weights(write, optimizer):  # noqa: F811
         by_hand = -np.sum(counts[seen] * np.log(np.asarray(expected.policy)[seen]))
         np.testing.assert_allclose(loss, by_hand, rtol=1e-9)
         assert status == expected.status
-        state, _ = learner.run(mlirl.step, state, problem, hparams, num_steps=3)
+        state, _ = mlirl.run(state, problem, hparams, num_steps=3)
 
 
 def test_a_feature_that_is_left_out_is_named(write, monkeypatch):  # noqa: F811

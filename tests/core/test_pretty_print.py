@@ -20,7 +20,7 @@ from jax.sharding import NamedSharding, PartitionSpec
 import jaxltl as jl
 from jaxltl import algos, envs
 from jaxltl.algos import behavioral_cloning, cce, mlirl, ppo
-from jaxltl.algos.common import learner
+from jaxltl.algos.common import loops
 from jaxltl.algos.common.schedules import Linear
 from jaxltl.core import pretty_print as show
 from tests.support import replaced
@@ -420,7 +420,7 @@ def test_rows_of_figures_are_told_by_the_last():
     )
     seeds = jax.tree.map(lambda x: np.stack([x, 2 * x]), rows)
     assert "the last of 2 x 3 rows, loss=[0.25, 0.5]" in told(seeds)
-    learned = learner.Learned(seeds, rows, np.array([3, 2]), np.array([0, 4]))
+    learned = loops.Learned(seeds, rows, np.array([3, 2]), np.array([0, 4]))
     assert "num_steps=[3, 2], status=1 CONVERGED, 1 MAX_STEPS" in told(learned)
 
 

@@ -64,6 +64,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from jaxltl.algos.common.settings import COUNT, Number, static, traced
+from jaxltl.core.validation import Range
 from jaxltl.algos.cce import exponential_family as families
 from jaxltl.algos.cce._elites import (
     Pool,
@@ -78,7 +80,6 @@ from jaxltl.algos.cce._evaluation import evaluate_all, per_cost, scores, split
 from jaxltl.algos.common import learner
 from jaxltl.algos.common.schedules import SLACK, Schedule, at, is_schedule
 from jaxltl.algos.common.schedules import Polynomial as Polynomial
-from jaxltl.algos.common.settings import UNBOUNDED, require_numbers
 from jaxltl.core import validation
 from jaxltl.core.environments.environment import as_partial, require_key
 from jaxltl.core.pretty_print import brief, history
@@ -166,19 +167,19 @@ class Hparams:
         default None.
     """
 
-    rate: Schedule = 0.1
-    sample_share: Schedule = None
-    num_samples: Schedule = None
-    temperature: jax.Array | float = 1.0
+    rate: Schedule = traced(Range(0, 1, open_below=True), default=0.1, schedule=True)
+    sample_share: Schedule = traced(Range(0, 1), default=None, schedule=True)
+    num_samples: Schedule = traced(Range(0), default=None, schedule=True)
+    temperature: Number = traced(Range(0, open_below=True, open_above=True), default=1.0)
     margin: jax.Array | float = 0.0
-    population: int = struct.field(pytree_node=False, default=100)
-    rho: float = struct.field(pytree_node=False, default=0.2)
-    weighting: str = struct.field(pytree_node=False, default="until_feasible")
-    elite_reuse: bool = struct.field(pytree_node=False, default=False)
-    antithetic: bool = struct.field(pytree_node=False, default=False)
-    variance_floor: jax.Array | float | None = None
+    population: int = static(COUNT, default=100)
+    rho: float = static(Range(0, 1, open_below=True, open_above=True), default=0.2)
+    weighting: str = static(WEIGHTINGS, default="until_feasible")
+    elite_reuse: bool = static(bool, default=False)
+    antithetic: bool = static(bool, default=False)
+    variance_floor: Number | None = traced(Range(0), default=None)
     noise: Schedule = None
-    restart_below: jax.Array | float | None = None
+    restart_below: Number | None = traced(Range(0), default=None)
     sharding: Any = struct.field(pytree_node=False, default=None)
 
 
@@ -199,8 +200,7 @@ class State:
         objective that is NaN or plus infinity, or a cost that is NaN. At most 2^31 - 1 are counted.
       num_restarts: ``int32[]``, so far.
       status: ``int32[]``, NONFINITE if no sample of the last step could be used (the distribution
-        then stays as it was), else CONVERGED, which says nothing of the search: it has no end of
-        its own.
+        then stays as it was), else COMPLETED.
     """
 
     key: jax.Array
@@ -321,20 +321,8 @@ def make_problem(
 # --- the learner ----------------------------------------------------------------------------
 
 
-def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
-    """The first distribution, before any sample.
-
-    Args:
-      key: a PRNG key, which the state keeps; ``vmap`` over keys for many seeds.
-      problem: of :func:`make_problem`.
-      hparams: :class:`Hparams`.
-
-    Returns:
-      :class:`State`, no step made.
-
-    Raises:
-      ValueError: settings that leave no elite or that are out of range.
-    """
+def _init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
+    """The first distribution, before any sample."""
     _check(problem, hparams)
     require_key(key)
     point = families.center(problem.family)
@@ -369,20 +357,12 @@ def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
         num_evaluated=zero,
         num_invalid=zero,
         num_restarts=zero,
-        status=jnp.int32(Status.CONVERGED),
+        status=jnp.int32(Status.COMPLETED),
     )
 
 
-def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
-    """One population: drawn, evaluated, ranked, and the distribution moved.
-
-    Args:
-      state: of :func:`init` or of an earlier step; unchanged.
-      problem, hparams: as of :func:`init`.
-
-    Returns:
-      The next :class:`State`, and :class:`Metrics`, figures of the step.
-    """
+def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
+    """One population: drawn, evaluated, ranked, and the distribution moved."""
     _check(problem, hparams)
     _require_state(state, problem)
     draw_key, evaluate_key = jax.random.split(learner.step_key(state))
@@ -423,10 +403,10 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
         best=better(state.best, fresh, excess, feasible, objective, state.best.objective),
         least=better(state.least, fresh, excess, usable, -excess, -state.least.excess),
         elites=elites if hparams.elite_reuse else None,
-        num_evaluated=learner.count(state.num_evaluated, num_samples),
-        num_invalid=learner.count(state.num_invalid, invalid),
+        num_evaluated=learner.saturating_add(state.num_evaluated, num_samples),
+        num_invalid=learner.saturating_add(state.num_invalid, invalid),
         num_restarts=state.num_restarts + restarted.astype(jnp.int32),
-        status=jnp.where(fine, Status.CONVERGED, Status.NONFINITE).astype(jnp.int32),
+        status=jnp.where(fine, Status.COMPLETED, Status.NONFINITE).astype(jnp.int32),
     )
     num_usable = jnp.sum(usable)
     return new, Metrics(
@@ -445,7 +425,7 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
     )
 
 
-run, train, run_until, train_until = learner.bind(init, step)
+init, step, run, train, run_until, train_until = learner.bind(_init, _step)
 
 
 def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
@@ -711,18 +691,6 @@ def _nan_last(x: float) -> float:
 # --- checks ---------------------------------------------------------------------------------
 
 
-_RANGES = {
-    "rate": (0, 1),
-    "sample_share": (0, 1),
-    "num_samples": (0, np.inf),
-    "temperature": (0, np.inf),
-    "variance_floor": (0, np.inf),
-    "restart_below": (0, np.inf),
-}
-_SCHEDULES = ("rate", "sample_share", "num_samples")
-_OPTIONAL = ("sample_share", "num_samples", "variance_floor", "restart_below")
-
-
 def _require_ours(problem: Problem, hparams: Hparams) -> None:
     validation.instance("problem", problem, Problem, "one of cce.make_problem")
     validation.instance("hparams", hparams, Hparams, "cce.Hparams")
@@ -740,17 +708,11 @@ def _require_state(state: State, problem: Problem) -> None:
 
 def _check(problem: Problem, hparams: Hparams) -> None:
     _require_ours(problem, hparams)
-    for name in ("elite_reuse", "antithetic"):
-        validation.boolean(name, getattr(hparams, name))
-    validation.choice("weighting", hparams.weighting, WEIGHTINGS)
-    rho = validation.finite_number("rho", hparams.rho)
-    population = validation.integer("population", hparams.population, least=1, most=2**31 - 1)
-    if isinstance(hparams.rho, str) or not 0 < rho < 1 or rho * population < 1 - SLACK:
+    if hparams.rho * hparams.population < 1 - SLACK:
         raise ValueError(
-            f"rho={hparams.rho} of population={hparams.population} leaves no elite, or all; give "
-            "rho in (0, 1) with rho * population at least 1."
+            f"rho={hparams.rho} of population={hparams.population} leaves no elite; "
+            "rho * population must be at least 1."
         )
-    require_numbers(hparams, _RANGES, optional=_OPTIONAL, schedules=_SCHEDULES)
     several = {"margin": problem.limit.shape}
     if hparams.noise is not None and not is_schedule(hparams.noise):
         several["noise"] = families.center(problem.family).shape
@@ -759,13 +721,9 @@ def _check(problem: Problem, hparams: Hparams) -> None:
         if np.ndim(number):
             require_shape(name, number, shape)
         else:
-            require_numbers(hparams, {name: UNBOUNDED})
+            validation.require_in_range(name, number, Range())
     sharding = hparams.sharding
     if sharding is not None and not isinstance(sharding, jax.sharding.NamedSharding):
         raise ValueError(
             f"sharding is a {type(sharding).__name__}; give a jax.sharding.NamedSharding."
         )
-    for name in ("rate", "temperature"):
-        number = getattr(hparams, name)
-        if not is_schedule(number) and not isinstance(number, jax.core.Tracer) and not number > 0:
-            raise ValueError(f"{name}={number}; it must be positive.")

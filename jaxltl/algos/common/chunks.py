@@ -35,15 +35,9 @@ from jax.tree_util import Partial
 
 from jaxltl.algos.common import checkpoint as files
 from jaxltl.algos.common._run_over_mesh import run_over_mesh
-from jaxltl.algos.common.learner import (
-    Progress,
-    Step,
-    Until,
-    block_lengths,
-    either,
-    run_blocks,
-    strong,
-)
+from jaxltl.algos.common.loops import Progress, Step, Until, block_lengths, run_blocks
+from jaxltl.algos.common.settings import require_hparams
+from jaxltl.algos.common.trees import either, strong
 from jaxltl.core.models.mesh.lanes import on_host
 from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core import validation
@@ -111,6 +105,7 @@ def run_in_chunks(
     lanes = validation.boolean("lanes", lanes)
     chunk = chunk or max(max_rows, -(-num_steps // 100))
     num_lanes = len(state.step) if lanes else None
+    require_hparams(hparams, batched=lanes)
     hparams = _spread(hparams, state) if lanes else hparams
     until = until if until is None or isinstance(until, Partial) else Partial(until)
     now = _begin(step, state, problem, hparams, num_lanes)

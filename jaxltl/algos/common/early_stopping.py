@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxltl.algos.common.learner import choose
+from jaxltl.algos.common.trees import choose
 from jaxltl.core.pretty_print import brief
 
 

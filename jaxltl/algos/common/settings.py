@@ -1,63 +1,173 @@
-"""What learners are given: numbers within their ranges, arrays, and parameters of their network."""
+"""Hyperparameters: ranges declared with the fields, and their validation for all learners.
+
+A learner's ``Hparams`` declares each field with its valid values::
+
+    @struct.dataclass
+    class Hparams:
+        discount: Number = traced(Range(0, 1, open_above=True))
+        learning_rate: Schedule = traced(Range(0, open_above=True), default=1e-3, schedule=True)
+        method: str = static(("trpo", "cpo"), default="cpo")
+        num_envs: int = static(Range(1, integer=True), default=8)
+
+A field whose default is None may be None. The functions made by
+:func:`~jaxltl.algos.common.learner.bind` call :func:`require_hparams` and :func:`flag_invalid`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from typing import Any
+import dataclasses
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple, Protocol, TypeVar, cast
 
 import flax.errors
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import struct
 
-from jaxltl.algos.common.schedules import is_schedule
+from jaxltl.algos.common.schedules import at, is_schedule
 from jaxltl.core import validation
+from jaxltl.core.types import Status, worst
+from jaxltl.core.validation import Range
 
-UNBOUNDED = (-np.inf, np.inf)
+Number = jax.Array | float  # traced
+MAX_INT = 2**31 - 1
+COUNT = Range(1, MAX_INT, integer=True)
 
 
-def require_numbers(
-    hparams: Any,
-    ranges: Mapping[str, tuple[float, float]],
-    *,
-    optional: Collection[str] = (),
-    schedules: Collection[str] = (),
-) -> None:
-    """Refuses settings that are not one number each, or lie outside of their ranges.
+class HasStatus(Protocol):
+    """A learner's metrics."""
+
+    @property
+    def status(self) -> jax.Array:
+        """``int32[]``, a :class:`~jaxltl.Status`."""
+
+
+MetricsT = TypeVar("MetricsT", bound=HasStatus)
+
+
+class _Valid(NamedTuple):
+    """Valid values of a field: a range, words, or the type bool."""
+
+    values: Range | tuple[str, ...] | type[bool]
+    is_static: bool
+    may_be_schedule: bool
+
+
+def traced(valid: Range, *, default: Any = dataclasses.MISSING, schedule: bool = False) -> Any:
+    """A dataclass field with a traced number in a range.
 
     Args:
-      hparams: whose attributes they are.
-      ranges: least and most of each, both allowed; of what is traced they are not looked at.
-      optional: names of those that may be None.
-      schedules: names of those that may be a schedule of the step.
+      valid: the range.
+      default: of the field; a field whose default is None may be None.
+      schedule: whether it may be a schedule of such numbers.
 
-    Raises:
-      ValueError: naming the setting, what it is and what to give.
+    Returns:
+      The field.
+    """
+    metadata = {"valid": _Valid(valid, False, schedule)}
+    return struct.field(default=default, metadata=metadata)
+
+
+def static(valid: Range | tuple[str, ...] | type[bool], *, default: Any) -> Any:
+    """A dataclass field with a static integer (or a tuple of them), word or truth value.
+
+    Args:
+      valid: the range, the words, or bool.
+      default: of the field; a field whose default is None may be None.
+
+    Returns:
+      The field.
 
     Example:
-      >>> from types import SimpleNamespace
-      >>> require_numbers(SimpleNamespace(discount=1.5), {"discount": (0, 1)})
+      >>> @struct.dataclass
+      ... class Hparams:
+      ...     method: str = static(("trpo", "cpo"), default="cpo")
+      >>> require_hparams(Hparams(method="ppo"))
       Traceback (most recent call last):
-      ValueError: discount=1.5; it must lie in [0, 1].
+      ValueError: method='ppo'; choose one of trpo, cpo.
     """
-    for name, (low, high) in ranges.items():
-        number = getattr(hparams, name)
-        if (number is None and name in optional) or (name in schedules and is_schedule(number)):
+    metadata = {"valid": _Valid(valid, True, False)}
+    return struct.field(pytree_node=False, default=default, metadata=metadata)
+
+
+def _declared(hparams: object) -> Iterator[tuple[str, Any, _Valid]]:
+    """Name, value and valid values of all fields but those that are None by their default."""
+    if not dataclasses.is_dataclass(hparams):
+        return
+    for field in dataclasses.fields(hparams):
+        value = getattr(hparams, field.name)
+        is_absent = value is None and field.default is None
+        if "valid" in field.metadata and not is_absent:
+            yield field.name, value, field.metadata["valid"]
+
+
+def require_hparams(hparams: object, *, batched: bool = False) -> None:
+    """Raises ValueError if a concrete hyperparameter is outside its declared range.
+
+    Args:
+      hparams: an instance of a learner's ``Hparams``; anything else has no declared ranges.
+      batched: whether numbers may have a leading axis of lanes.
+
+    Example:
+      >>> @struct.dataclass
+      ... class Hparams:
+      ...     discount: Number = traced(Range(0, 1))
+      >>> require_hparams(Hparams(discount=1.5))
+      Traceback (most recent call last):
+      ValueError: discount=1.5; it must be at least 0 and at most 1.
+    """
+    for name, value, (valid, is_static, may_be_schedule) in _declared(hparams):
+        if valid is bool:
+            validation.boolean(name, value)
+        elif isinstance(valid, tuple):
+            validation.choice(name, value, valid)
+        elif is_static:
+            for one in value if isinstance(value, tuple | list) else [value]:
+                validation.require_in_range(name, one, valid)
+        elif may_be_schedule and is_schedule(value):
+            continue  # its values are checked step by step
+        else:
+            lanes = np.ravel(value) if batched and np.ndim(value) else [value]
+            for one in lanes:
+                validation.require_in_range(name, one, valid)
+
+
+def flag_invalid(metrics: MetricsT, hparams: object, step: jax.Array) -> MetricsT:
+    """A learner's metrics, with status INVALID if a traced hyperparameter is out of range.
+
+    Args:
+      metrics: a dataclass with a ``status``.
+      hparams: an instance of the learner's ``Hparams``.
+      step: ``int32[]``, number of steps made, at which schedules are evaluated.
+
+    Returns:
+      The metrics, with `status` replaced.
+
+    Example:
+      >>> @struct.dataclass
+      ... class Metrics:
+      ...     status: jax.Array
+      >>> @struct.dataclass
+      ... class Hparams:
+      ...     discount: Number = traced(Range(0, 1))
+      >>> check = jax.jit(lambda x: flag_invalid(Metrics(jnp.int32(0)), Hparams(x), jnp.int32(0)))
+      >>> check(1.5).status.item() == Status.INVALID
+      True
+    """
+    flags = []
+    for _, value, (valid, is_static, may_be_schedule) in _declared(hparams):
+        if is_static or not isinstance(valid, Range):
             continue
-        kind = getattr(number, "dtype", None)
-        kind = np.asarray(number).dtype if kind is None and not isinstance(number, dict) else kind
-        real = kind is not None and any(
-            jnp.issubdtype(kind, x) for x in (jnp.integer, jnp.floating)
-        )
-        if np.ndim(number) or not real:  # a whole number that is too large is an object
-            raise ValueError(
-                f"{name}={validation.shorten(number)}; give one number"
-                f"{', or a Partial(function) of the step' if name in schedules else ''}. Many "
-                "settings are a vmap."
-            )
-        if not isinstance(number, jax.core.Tracer) and not low <= number <= high:
-            raise ValueError(f"{name}={number}; it must lie in [{low}, {high}].")
+        number = at(value, step) if may_be_schedule else value
+        if isinstance(number, jax.core.Tracer):
+            flags.append(valid.contains(number))
+    if not flags:
+        return metrics
+    status = jnp.where(jnp.stack(flags).all(), Status.CONVERGED, Status.INVALID)
+    status = worst(metrics.status, status.astype(jnp.int32))
+    return dataclasses.replace(cast(Any, metrics), status=status)
 
 
 def require_arrays(**trees: Any) -> None:

@@ -53,6 +53,8 @@ from jax import lax
 from jax.tree_util import Partial
 
 from jaxltl.algos.common import learner, pac
+
+from jaxltl.algos.common import loops
 from jaxltl.algos.common.play import take
 from jaxltl.algos.interval_learning._intervals import (
     confidence_intervals,
@@ -61,20 +63,19 @@ from jaxltl.algos.interval_learning._intervals import (
 )
 from jaxltl.algos.interval_learning._sampling import sampled_counts
 from jaxltl.algos.interval_learning.problem import Problem
-from jaxltl.algos.interval_learning.state import INTERVALS, Hparams, Metrics, State
+from jaxltl.algos.interval_learning.state import Hparams, Metrics, State
 from jaxltl.core.graphs.acceptance import accepting_bottom_components
 from jaxltl.core.graphs.end_components import bottom_components
 from jaxltl.core.models.mdp import support
 from jaxltl.core.models.ops.operators import forall_successor
-from jaxltl.core.types import Status, status_code
+from jaxltl.core.types import Status
 from jaxltl.core.values.evaluation.data_guarantee import DataGuarantee, learn_guarantee
 from jaxltl.core.values.interval.contest import chances
 
 
 @jax.jit
-def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
+def _init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     """No samples: every transition may have nearly all of its action's probability."""
-    _check(hparams)
     world = problem.model.mdp
     used = world.successor_probability > 0
     single = used.sum(-1, keepdims=True) == 1
@@ -96,11 +97,10 @@ def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     )
 
 
-def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
+def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
     """Episodes, the update of the intervals, and value iteration from the last values."""
-    _check(hparams)
     size = hparams.num_runs * hparams.length
-    more = state.samples <= learner.MOST - size
+    more = state.samples <= loops.MAX_STEPS - size
     new = sampled_counts(state, problem, hparams) * more
     state = replace(
         state,
@@ -119,30 +119,30 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
     return state, measure(state, problem, hparams)
 
 
-run, train, run_until, train_until = learner.bind(init, step)
+init, step, run, train, run_until, train_until = learner.bind(_init, _step)
 
 
 def measure(state: State, problem: Problem, hparams: Hparams) -> Metrics:
     """The :class:`Metrics` of a state."""
     model = problem.model
-    more = state.samples <= learner.MOST - hparams.num_runs * hparams.length
+    more = state.samples <= loops.MAX_STEPS - hparams.num_runs * hparams.length
     settled = (state.residual <= hparams.tolerance) & more
     return Metrics(
         samples=state.samples,
         lower=jnp.sum(model.initial * state.pessimistic),
         upper=jnp.sum(model.initial * state.optimistic),
         residual=state.residual,
-        status=status_code(settled, jnp.isfinite(state.residual)),
+        status=learner.completion_status(settled, jnp.isfinite(state.residual)),
     )
 
 
-def bounds_within(width: chex.Numeric) -> learner.Until:
+def bounds_within(width: chex.Numeric) -> loops.Until:
     """A condition for ``run_until``: optimistic minus pessimistic value at most `width`, converged."""
     return Partial(_bounds_within, width)
 
 
 def _bounds_within(width: jax.Array, before: State, after: State, metrics: Metrics) -> jax.Array:
-    return (metrics.upper - metrics.lower <= width) & (metrics.status == Status.CONVERGED)
+    return (metrics.upper - metrics.lower <= width) & (metrics.status == Status.COMPLETED)
 
 
 @jax.jit
@@ -297,12 +297,3 @@ def _soonest(
     best = jnp.where(problem.winning[..., None], problem.allowed, best)
     speed = jnp.asarray(hparams.discount, moves.dtype) * jnp.maximum(most, 0)
     return _with_decided(problem, speed), best
-
-
-def _check(hparams: Hparams) -> None:
-    """Raises ValueError for static settings out of range."""
-    if hparams.intervals not in INTERVALS:
-        raise ValueError(f'intervals={hparams.intervals!r}; choose "linear" or "confidence".')
-    for name in ("num_runs", "length"):
-        if getattr(hparams, name) < 1:
-            raise ValueError(f"{name}={getattr(hparams, name)}; it must be at least 1.")

@@ -7,6 +7,8 @@ from functools import partial
 import jax
 from flax import struct
 
+from jaxltl.algos.common.settings import COUNT, Number, static, traced
+from jaxltl.core.validation import Range
 from jaxltl.core.pretty_print import brief, history
 from jaxltl.core.types import Status
 
@@ -37,18 +39,18 @@ class Hparams:
       length: moves of an episode; static; default 64.
     """
 
-    intervals: str = struct.field(pytree_node=False, default="linear")
-    confidence: jax.Array | float = 0.9
-    least: jax.Array | float = 1e-4
-    strength: jax.Array | float = 5.0
-    most_strength: jax.Array | float = 10.0
-    exploration: jax.Array | float = 0.1
-    restart: jax.Array | float = 0.05
-    discount: jax.Array | float = 0.99
-    sweeps: jax.Array | int = 40
-    tolerance: jax.Array | float = 1e-4
-    num_runs: int = struct.field(pytree_node=False, default=4)
-    length: int = struct.field(pytree_node=False, default=64)
+    intervals: str = static(INTERVALS, default="linear")
+    confidence: Number = traced(Range(0, 1, open_below=True, open_above=True), default=0.9)
+    least: Number = traced(Range(0, 1, open_below=True), default=1e-4)
+    strength: Number = traced(Range(0, open_below=True, open_above=True), default=5.0)
+    most_strength: Number = traced(Range(0, open_below=True, open_above=True), default=10.0)
+    exploration: Number = traced(Range(0, 1, open_below=True), default=0.1)
+    restart: Number = traced(Range(0, 1), default=0.05)
+    discount: Number = traced(Range(0, 1, open_below=True, open_above=True), default=0.99)
+    sweeps: Number = traced(Range(1), default=40)
+    tolerance: Number = traced(Range(0, open_above=True), default=1e-4)
+    num_runs: int = static(COUNT, default=4)
+    length: int = static(COUNT, default=64)
 
 
 @brief
@@ -89,7 +91,7 @@ class Metrics:
       samples: observed transitions.
       lower, upper: pessimistic and optimistic value, mean over the initial distribution.
       residual: of :class:`State`.
-      status: CONVERGED if the residual is at most the tolerance; MAX_STEPS if not, or if all
+      status: COMPLETED if the residual is at most the tolerance; MAX_STEPS if not, or if all
         samples that can be counted were observed.
     """
 

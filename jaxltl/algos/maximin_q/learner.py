@@ -51,7 +51,10 @@ from flax import struct
 from jax import lax
 from jax.tree_util import Partial
 
+from jaxltl.algos.common.settings import COUNT, Number, static, traced
+from jaxltl.core.validation import Range
 from jaxltl.algos.common import learner, splitmix
+from jaxltl.algos.common import loops
 from jaxltl.algos.maximin_q._alias import draw_alias
 from jaxltl.algos.maximin_q.problem import Problem
 from jaxltl.algos.common.play import (
@@ -62,7 +65,7 @@ from jaxltl.algos.common.play import (
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.ops.operators import action_argmax, sample_successor
 from jaxltl.core.pretty_print import brief, history
-from jaxltl.core.types import Status, status_code
+from jaxltl.core.types import Status
 
 MOST_VISITS = 2**30  # counted; a step adds at most as many again
 _UNROLLED = 16  # actions up to which a maximum over them is unrolled, several times faster
@@ -91,18 +94,18 @@ class Hparams:
       moves_per_step: moves of each chain in a step; static. Default 64.
     """
 
-    discount: jax.Array | float
-    step_size: jax.Array | float | None = None
-    step_power: jax.Array | float | None = None
-    epsilon: jax.Array | float | None = None
-    environment_epsilon: jax.Array | float | None = None
-    epsilon_decay: jax.Array | float = 1.0
-    epsilon_min: jax.Array | float = 0.0
-    restart: jax.Array | float = 0.0
-    initial_value: jax.Array | float = 0.0
-    per: str = struct.field(pytree_node=False, default="system_move")
-    num_chains: int = struct.field(pytree_node=False, default=1024)
-    moves_per_step: int = struct.field(pytree_node=False, default=64)
+    discount: Number = traced(Range(0, 1, open_above=True))
+    step_size: Number | None = traced(Range(0, 1, open_below=True), default=None)
+    step_power: Number | None = traced(Range(0.5, 1, open_below=True), default=None)
+    epsilon: Number | None = traced(Range(0, 1), default=None)
+    environment_epsilon: Number | None = traced(Range(0, 1), default=None)
+    epsilon_decay: Number = traced(Range(0, 1), default=1.0)
+    epsilon_min: Number = traced(Range(0, 1), default=0.0)
+    restart: Number = traced(Range(0, 1), default=0.0)
+    initial_value: Number = traced(Range(open_below=True, open_above=True), default=0.0)
+    per: str = static(("system_move", "move"), default="system_move")
+    num_chains: int = static(COUNT, default=1024)
+    moves_per_step: int = static(COUNT, default=64)
 
 
 @brief
@@ -149,7 +152,7 @@ class Metrics:
       visited: distinct entries of the table that were updated.
       violations: actions outside of the mask that were taken.
       error: largest error over the measured states; NaN if the value is unknown.
-      status: NONFINITE if a value is not finite, else CONVERGED, which does not certify the value;
+      status: NONFINITE if a value is not finite, else COMPLETED, which does not certify the value;
         see :func:`value_is_stable`.
     """
 
@@ -165,7 +168,7 @@ class Metrics:
 
 
 @jax.jit
-def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
+def _init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     """A table of ``hparams.initial_value``, and chains at initial states."""
     _check(problem, hparams)
     dtype, is_system, num_chains = problem.game.dtype, problem.game.system, hparams.num_chains
@@ -189,14 +192,8 @@ def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     )
 
 
-def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
-    """``moves_per_step`` moves of every chain, each followed by an update of the table.
-
-    All chains read the table, then all write. If m of them update one entry, they share the step
-    size a of its next visit, which equals m updates in sequence with the mean of their targets::
-
-        Q <- (1 - a)^m Q + (1 - (1 - a)^m) mean.
-    """
+def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
+    """``moves_per_step`` moves of every chain, each followed by an update of the table."""
     _check(problem, hparams)
     restart_key, action_key, successor_key = (
         jax.random.fold_in(learner.step_key(state), i) for i in range(3)
@@ -228,7 +225,7 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
     return after, measure(after, problem, hparams)
 
 
-run, train, run_until, train_until = learner.bind(init, step)
+init, step, run, train, run_until, train_until = learner.bind(_init, _step)
 
 
 def measure(state: State, problem: Problem, hparams: Hparams) -> Metrics:
@@ -243,11 +240,11 @@ def measure(state: State, problem: Problem, hparams: Hparams) -> Metrics:
         visited=jnp.sum(state.visits > 0, dtype=jnp.int32),
         violations=state.violations,
         error=error,
-        status=status_code(finite, finite),
+        status=learner.completion_status(finite, finite),
     )
 
 
-def value_is_stable(tolerance: chex.Numeric) -> learner.Until:
+def value_is_stable(tolerance: chex.Numeric) -> loops.Until:
     """A condition for ``run_until``: no value changed by more than `tolerance`, no entry is new.
 
     Evidence of convergence, not a proof; a longer window ``check_every`` gives better evidence.
@@ -467,11 +464,7 @@ def _answers(problem: Problem) -> jax.Array:
 
 def _check(problem: Problem, hparams: Hparams) -> None:
     """Raises ValueError for static settings that are out of range or do not fit the game."""
-    if hparams.per not in ("move", "system_move"):
-        raise ValueError(f'per={hparams.per!r}; choose "move" or "system_move".')
     chains, moves = hparams.num_chains, hparams.moves_per_step
-    if chains < 1 or moves < 1:
-        raise ValueError(f"num_chains={chains}, moves_per_step={moves}; both must be at least 1.")
     if chains * moves > MOST_VISITS:
         raise ValueError(
             f"num_chains={chains} times moves_per_step={moves} is more than {MOST_VISITS} moves; "

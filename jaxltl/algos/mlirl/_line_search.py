@@ -11,7 +11,8 @@ import optax
 from flax import struct
 from jax import lax
 
-from jaxltl.algos.common import learner
+
+from jaxltl.algos.common import trees
 
 _MOST = 16  # evaluations for one step
 _DECREASE, _CURVATURE = 1e-4, 0.9  # Wolfe's constants
@@ -66,7 +67,7 @@ def start(parameters: Any, point: Point) -> Search:
     """Before anything was evaluated; `point` gives the shapes."""
     zero = optax.tree.zeros_like(parameters)
     # optax starts from weakly typed zeros, which a second run would compile anew for.
-    memory = learner.strong(_directions().init(parameters))
+    memory = trees.strong(_directions().init(parameters))
     return Search(point, zero, memory, jnp.bool_(False))
 
 
@@ -100,7 +101,7 @@ def step(evaluate: Callable[[Any, Point], Point], search: Search) -> tuple[Searc
         size = jnp.where(jnp.isfinite(high), (low + high) / 2, 2 * low)
         better = good | (new.loss < k.best.loss)
         later = k._replace(
-            best=learner.either(better, new, k.best),
+            best=trees.either(better, new, k.best),
             moved=k.moved | better,
             size=size,
             low=low,
@@ -117,7 +118,7 @@ def step(evaluate: Callable[[Any, Point], Point], search: Search) -> tuple[Searc
             direction=optax.tree.scale(scale, new.gradient),
             size=jnp.ones_like(size),
         )
-        return learner.either(k.known, later, first)
+        return trees.either(k.known, later, first)
 
     one = jnp.ones((), search.point.loss.dtype)
     begin = _Trial(
@@ -138,9 +139,9 @@ def step(evaluate: Callable[[Any, Point], Point], search: Search) -> tuple[Searc
     # A direction that does not descend, or a step that led nowhere, starts afresh.
     fresh = ~(optax.tree.vdot(moved, new.gradient) > 0) | ~found.moved
     scale = jnp.minimum(1, 1 / optax.tree.norm(new.gradient))
-    moved = learner.either(fresh, optax.tree.scale(scale, new.gradient), moved)
-    memory = learner.either(
-        fresh & ~jnp.isnan(new.loss), learner.strong(_directions().init(new.parameters)), memory
+    moved = trees.either(fresh, optax.tree.scale(scale, new.gradient), moved)
+    memory = trees.either(
+        fresh & ~jnp.isnan(new.loss), trees.strong(_directions().init(new.parameters)), memory
     )
     return Search(new, optax.tree.scale(-1, moved), memory, jnp.bool_(True)), found.base
 

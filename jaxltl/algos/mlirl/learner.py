@@ -45,7 +45,11 @@ import optax
 from flax import struct
 from jax.flatten_util import ravel_pytree
 
+from jaxltl.algos.common.settings import Number, static, traced
+from jaxltl.core.validation import Range
 from jaxltl.algos.common import learner
+from jaxltl.algos.common import trees
+from jaxltl.algos.common import optimizers
 from jaxltl.algos.mlirl import _line_search as line_search
 from jaxltl.algos.mlirl.features import Features as Features
 from jaxltl.algos.mlirl.features import pair_counts
@@ -143,14 +147,14 @@ class Hparams:
       optimizer: ``"lbfgs"``, ``"adam"``, ``"rmsprop"`` or ``"sgd"``; static; default ``"lbfgs"``.
     """
 
-    discount: jax.Array | float
-    mu: jax.Array | float | None = None
-    l2: jax.Array | float = 1e-3
-    learning_rate: jax.Array | float = 0.1
-    start_scale: jax.Array | float = 1.0
-    policy: str = struct.field(pytree_node=False, default="boltzmann")
-    adjoint: str = struct.field(pytree_node=False, default="exact")
-    optimizer: str = struct.field(pytree_node=False, default="lbfgs")
+    discount: Number = traced(Range(0, 1, open_above=True))
+    mu: Number | None = traced(Range(0, open_above=True), default=None)
+    l2: Number = traced(Range(0, open_above=True), default=1e-3)
+    learning_rate: Number = traced(Range(0, open_above=True), default=0.1)
+    start_scale: Number = traced(Range(0, open_above=True), default=1.0)
+    policy: str = static(("boltzmann", "soft"), default="boltzmann")
+    adjoint: str = static(("exact", "approximate"), default="exact")
+    optimizer: str = static(("lbfgs", "adam", "rmsprop", "sgd"), default="lbfgs")
 
 
 @brief
@@ -303,8 +307,6 @@ def _solve(
         if hparams.adjoint != "exact":
             raise ValueError('adjoint="approximate" (2.7) belongs to the Boltzmann policy.')
         return soft_value(problem.model, reward, hparams.discount)
-    if hparams.policy != "boltzmann":
-        raise ValueError(f"policy={hparams.policy!r}; choose boltzmann or soft.")
     return boltzmann_value(
         problem.model, reward, hparams.discount, initial=initial, adjoint=hparams.adjoint
     )
@@ -354,17 +356,8 @@ def objective(
     return loss, parts
 
 
-def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
-    """Parameters at ``problem.start`` plus noise of ``hparams.start_scale``; the key is kept.
-
-    Args:
-      key: a PRNG key, which the state keeps; ``vmap`` over keys for many seeds.
-      problem: of :func:`make_problem`.
-      hparams: :class:`Hparams`.
-
-    Returns:
-      :class:`State`, no step made.
-    """
+def _init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
+    """Parameters at ``problem.start`` plus noise of ``hparams.start_scale``; the key is kept."""
     flat, unravel = ravel_pytree(problem.start)
     noise = jax.random.normal(learner.init_key(key), flat.shape, flat.dtype)
     parameters = unravel(flat + hparams.start_scale * noise)
@@ -379,7 +372,7 @@ def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
             parameters, line_search.Point(parameters, zero + jnp.inf, parameters, parts)
         )
     else:
-        optimizer = learner.strong(_optimizer(hparams).init(parameters))
+        optimizer = trees.strong(_optimizer(hparams).init(parameters))
     return State(key, jnp.int32(0), parameters, value, optimizer)
 
 
@@ -393,24 +386,13 @@ def _evaluate(
     return line_search.Point(parameters, loss, gradient, parts)
 
 
-def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
-    """One step of the optimiser on :func:`objective`; deterministic given the state.
-
-    Under ``vmap`` runs make their steps in turn: each takes as many evaluations as it needs.
-    A step is not differentiated through: :func:`objective` is what has derivatives.
-
-    Args:
-      state: of :func:`init` or of an earlier step; unchanged.
-      problem, hparams: as of :func:`init`.
-
-    Returns:
-      The next :class:`State`, and :class:`Metrics`, figures of the parameters before the step.
-    """
-    return in_turn(_step, state, problem, hparams)
+def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
+    """One step of the optimiser on :func:`objective`; deterministic given the state."""
+    return in_turn(_update, state, problem, hparams)
 
 
 @jax.jit
-def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
+def _update(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
     if hparams.optimizer == "lbfgs":
 
         def evaluate(parameters: Any, before: line_search.Point) -> line_search.Point:
@@ -441,11 +423,11 @@ def _usable(parts: Objective) -> jax.Array:
 
 
 def _optimizer(hparams: Hparams) -> optax.GradientTransformationExtraArgs:
-    return learner.optimizer(hparams.optimizer, hparams.learning_rate)
+    return optimizers.optimizer(hparams.optimizer, hparams.learning_rate)
 
 
 # Metrics, and so their gradient, describe the state before a step.
-run, train, run_until, train_until = learner.bind(init, step, keep="before")
+init, step, run, train, run_until, train_until = learner.bind(_init, _step, keep="before")
 
 
 def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:

@@ -13,7 +13,10 @@ from flax import struct
 from jax import lax
 
 from jaxltl.algos.common import action_distributions as actions_of
-from jaxltl.algos.common import learner
+
+from jaxltl.algos.common import trees
+
+from jaxltl.algos.common import loops
 from jaxltl.algos.common.actor_critic import Output, evaluated
 from jaxltl.algos.common.advantages import generalized_advantages
 from jaxltl.algos.common.moments import Moments, normalized, scale_of, updated_moments
@@ -80,7 +83,7 @@ def _unless_nonfinite(moments: Moments, numbers: jax.Array) -> Moments:
     """With a batch taken in, unless a number in it is not finite."""
     new = updated_moments(moments, numbers)
     fine = jnp.all(jnp.isfinite(new.mean)) & jnp.all(jnp.isfinite(new.squares))
-    return learner.choose(fine, new, moments)
+    return trees.choose(fine, new, moments)
 
 
 class _Path(NamedTuple):
@@ -182,7 +185,7 @@ def _walked(key: chex.PRNGKey, state: Any, problem: Any, hparams: Any) -> tuple[
     walkers, path = walk(
         lanes.device_ranks(hparams.sharding), state.walkers, begin, noise, keys, step
     )
-    return learner.strong(walkers), path
+    return trees.strong(walkers), path
 
 
 def _walk(
@@ -304,5 +307,5 @@ def _at_ends(cut: jax.Array, following: jax.Array, ends: Any, judge: Any) -> jax
         return turn + active(carry, given), values
 
     given = cut.sum(), place, flat, moments, parameters
-    _, values = learner.while_active(active, body, (jnp.int32(0), following.ravel()), given)
+    _, values = loops.while_active(active, body, (jnp.int32(0), following.ravel()), given)
     return values.reshape(following.shape)

@@ -12,7 +12,8 @@ import optax
 from jax import lax
 
 from jaxltl.algos.common import action_distributions as actions_of
-from jaxltl.algos.common import learner
+
+from jaxltl.algos.common import trees
 from jaxltl.algos.common.actor_critic import Output, evaluated, has_memory
 from jaxltl.algos.common.schedules import at
 from jaxltl.algos.ppo._collect import Rows
@@ -96,7 +97,7 @@ def _said(parameters: Any, rows: Rows, begun: Any, problem: Any) -> Output:
 
     def on(memory: Any, row: Any) -> tuple[Any, Output]:
         start, observation = row
-        memory = jax.vmap(lambda s, m: learner.choose(s, problem.memory, m))(start, memory)
+        memory = jax.vmap(lambda s, m: trees.choose(s, problem.memory, m))(start, memory)
         said = say(memory, observation)
         return said.memory, said._replace(memory=())
 
@@ -152,7 +153,7 @@ def improved(
             lambda x, u: x - (rate * u).astype(x.dtype), going.parameters, change
         )
         made = finite & ~stopped
-        new = learner.choose(made, (parameters, optimizer), (going.parameters, going.optimizer))
+        new = trees.choose(made, (parameters, optimizer), (going.parameters, going.optimizer))
         return _Going(new[0], new[1], stopped), (told, made, ~finite & ~stopped)
 
     def epoch(going: _Going, key: chex.PRNGKey) -> tuple[_Going, Any]:

@@ -60,11 +60,14 @@ import chex
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 from jax.tree_util import Partial
 
+from jaxltl.algos.common.settings import COUNT, MAX_INT, Number, static, traced
+from jaxltl.core.validation import Range
 from jaxltl.algos.common import action_distributions as actions_of
+
+from jaxltl.algos.common import trees
 from jaxltl.algos.common import learner
 from jaxltl.algos.common.actor_critic import ActorCritic as ActorCritic
 from jaxltl.algos.common.actor_critic import RecurrentActorCritic as RecurrentActorCritic
@@ -79,7 +82,6 @@ from jaxltl.algos.common.actor_critic import (
 from jaxltl.algos.common.moments import Moments, no_moments, normalized
 from jaxltl.algos.common.schedules import Schedule
 from jaxltl.algos.common.schedules import at as _at
-from jaxltl.algos.common.settings import require_numbers
 from jaxltl.algos.ppo._collect import Walkers, collected
 from jaxltl.algos.ppo._update import descent, improved
 from jaxltl.core import validation
@@ -179,25 +181,25 @@ class Hparams:
         all devices once, for a minibatch is drawn from all of it. Default None.
     """
 
-    discount: jax.Array | float
-    gae_lambda: jax.Array | float = 0.95
-    learning_rate: Schedule = 2.5e-4
-    clip: Schedule = 0.2
-    value_clip: Schedule | None = None
-    value_weight: jax.Array | float = 0.5
-    entropy_weight: jax.Array | float = 0.01
-    max_gradient_norm: jax.Array | float | None = 0.5
-    target_kl: jax.Array | float | None = None
-    adam_epsilon: jax.Array | float = 1e-5
-    num_envs: int = struct.field(pytree_node=False, default=8)
-    num_steps: int = struct.field(pytree_node=False, default=128)
-    num_epochs: int = struct.field(pytree_node=False, default=4)
-    num_minibatches: int = struct.field(pytree_node=False, default=4)
-    normalize_advantage: bool = struct.field(pytree_node=False, default=True)
-    normalize_observation: bool = struct.field(pytree_node=False, default=False)
-    normalize_reward: bool = struct.field(pytree_node=False, default=False)
-    squash: str = struct.field(pytree_node=False, default="clip")
-    num_resets: int | None = struct.field(pytree_node=False, default=None)
+    discount: Number = traced(Range(0, 1))
+    gae_lambda: Number = traced(Range(0, 1), default=0.95)
+    learning_rate: Schedule = traced(Range(0, open_above=True), default=2.5e-4, schedule=True)
+    clip: Schedule = traced(Range(0), default=0.2, schedule=True)
+    value_clip: Schedule | None = traced(Range(0), default=None, schedule=True)
+    value_weight: Number = traced(Range(0, open_above=True), default=0.5)
+    entropy_weight: Number = traced(Range(0, open_above=True), default=0.01)
+    max_gradient_norm: Number | None = traced(Range(0), default=0.5)
+    target_kl: Number | None = traced(Range(0), default=None)
+    adam_epsilon: Number = traced(Range(0, open_above=True), default=1e-5)
+    num_envs: int = static(COUNT, default=8)
+    num_steps: int = static(COUNT, default=128)
+    num_epochs: int = static(COUNT, default=4)
+    num_minibatches: int = static(COUNT, default=4)
+    normalize_advantage: bool = static(bool, default=True)
+    normalize_observation: bool = static(bool, default=False)
+    normalize_reward: bool = static(bool, default=False)
+    squash: str = static(actions_of.SQUASHES, default="clip")
+    num_resets: int | None = static(Range(0, MAX_INT, integer=True), default=None)
     sharding: Any = struct.field(pytree_node=False, default=None)
 
 
@@ -246,7 +248,7 @@ class Metrics:
       learning_rate: of this step.
       updates: minibatches that changed the parameters.
       nonfinite: minibatches left out because a number of theirs was not finite.
-      status: CONVERGED; NONFINITE if `nonfinite` is positive or an advantage was not finite;
+      status: COMPLETED; NONFINITE if `nonfinite` is positive or an advantage was not finite;
         INVALID if somewhere no action was allowed (the first is taken there, and parameters stay).
     """
 
@@ -313,7 +315,7 @@ def make_problem(
         )
     network = default_network(actions) if network is None else network
     validation.instance("network", network, nn.Module, "a flax.linen.Module")
-    memory = learner.strong(initial_memory(network, memory))
+    memory = trees.strong(initial_memory(network, memory))
     seen = jax.eval_shape(
         lambda key: environment.observe(environment.reset(key)), jax.random.key(0)
     )
@@ -326,24 +328,6 @@ def make_problem(
     return Problem(environment=environment, memory=memory, network=network)
 
 
-_RANGES = {
-    "discount": (0, 1),
-    "gae_lambda": (0, 1),
-    "value_weight": (0, np.inf),
-    "entropy_weight": (0, np.inf),
-    "max_gradient_norm": (0, np.inf),
-    "target_kl": (0, np.inf),
-    "adam_epsilon": (0, np.inf),
-    "learning_rate": (0, np.inf),
-    "clip": (0, np.inf),
-    "value_clip": (0, np.inf),
-}
-
-
-_OPTIONAL = ("max_gradient_norm", "target_kl", "value_clip")
-_SCHEDULES = ("learning_rate", "clip", "value_clip")
-
-
 def _require_ours(problem: Problem, hparams: Hparams) -> None:
     validation.instance("problem", problem, Problem, "one of ppo.make_problem")
     validation.instance("hparams", hparams, Hparams, "ppo.Hparams")
@@ -351,13 +335,6 @@ def _require_ours(problem: Problem, hparams: Hparams) -> None:
 
 def _check(problem: Problem, hparams: Hparams) -> None:
     _require_ours(problem, hparams)
-    for name in ("num_envs", "num_steps", "num_epochs", "num_minibatches"):
-        validation.integer(name, getattr(hparams, name), least=1, most=2**31 - 1)
-    if hparams.num_resets is not None:
-        validation.integer("num_resets", hparams.num_resets, most=2**31 - 1)
-    validation.choice("squash", hparams.squash, actions_of.SQUASHES)
-    for name in ("normalize_advantage", "normalize_observation", "normalize_reward"):
-        validation.boolean(name, getattr(hparams, name))
     validation.integer(
         "num_envs times num_steps", hparams.num_envs * hparams.num_steps, most=2**31 - 1
     )
@@ -375,7 +352,6 @@ def _check(problem: Problem, hparams: Hparams) -> None:
         num_envs=hparams.num_envs,
         **{"the number of rows of a minibatch": size // hparams.num_minibatches},
     )
-    require_numbers(hparams, _RANGES, optional=_OPTIONAL, schedules=_SCHEDULES)
 
 
 # --- what was learned -----------------------------------------------------------------------------
@@ -448,17 +424,8 @@ def _act(
 # --- learning -------------------------------------------------------------------------------------
 
 
-def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
-    """The network at its own random start, and N environments at theirs.
-
-    Args:
-      key: a PRNG key, which the state keeps; ``vmap`` over keys for many seeds.
-      problem: of :func:`make_problem`.
-      hparams: :class:`Hparams`.
-
-    Returns:
-      :class:`State`, no step made.
-    """
+def _init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
+    """The network at its own random start, and N environments at theirs."""
     _check(problem, hparams)
     return _begun(require_key(key), problem, hparams)
 
@@ -483,7 +450,7 @@ def _begun(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     moments = None
     if hparams.normalize_observation:
         moments = jax.tree.map(lambda x: no_moments(x.shape), first)
-    return learner.strong(
+    return trees.strong(
         State(
             key=key,
             step=jnp.int32(0),
@@ -497,16 +464,8 @@ def _begun(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     )
 
 
-def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
-    """T steps of N environments, and some epochs of minibatches of what they tell.
-
-    Args:
-      state: of :func:`init` or of an earlier step; unchanged.
-      problem, hparams: as of :func:`init`.
-
-    Returns:
-      The next :class:`State`, and :class:`Metrics`, figures of the step.
-    """
+def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
+    """T steps of N environments, and some epochs of minibatches of what they tell."""
     _check(problem, hparams)
     validation.instance("state", state, State, "one of ppo.init or ppo.train")
     collect_key, update_key = jax.random.split(learner.step_key(state))
@@ -514,17 +473,17 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
     parameters, optimizer, figures, updates, nonfinite = improved(
         update_key, state, rows, begun, problem, hparams
     )
-    parameters, optimizer = learner.choose(
+    parameters, optimizer = trees.choose(
         told.permitted, (parameters, optimizer), (state.parameters, state.optimizer)
     )
-    status = jnp.where((nonfinite > 0) | ~told.finite, Status.NONFINITE, Status.CONVERGED)
+    status = jnp.where((nonfinite > 0) | ~told.finite, Status.NONFINITE, Status.COMPLETED)
     status = jnp.where(told.permitted, status, Status.INVALID).astype(jnp.int32)
     new = replace(
         after,
         step=state.step + 1,
         parameters=parameters,
         optimizer=optimizer,
-        transitions=learner.count(state.transitions, hparams.num_envs * hparams.num_steps),
+        transitions=learner.saturating_add(state.transitions, hparams.num_envs * hparams.num_steps),
     )
     return new, Metrics(
         transitions=new.transitions,
@@ -547,4 +506,4 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
     )
 
 
-run, train, run_until, train_until = learner.bind(init, step)
+init, step, run, train, run_until, train_until = learner.bind(_init, _step)

@@ -7,7 +7,9 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 
-from jaxltl.algos.common import learner, pac
+from jaxltl.algos.common import pac
+
+from jaxltl.algos.common import loops
 from jaxltl.algos.common.play import take
 from jaxltl.algos.rmax._rollout import Rollout
 from jaxltl.algos.rmax.problem import Problem
@@ -44,7 +46,7 @@ def update_model(state: State, rollout: Rollout, problem: Problem, hparams: Hpar
         num_updates=state.num_updates + changed,
     )
     # A loop of one iteration, which is skipped if no lane has changed.
-    value, error, best, _ = learner.while_active(
+    value, error, best, _ = loops.while_active(
         lambda carry, _: carry[-1],
         _solve,
         (state.value, state.error, state.best, changed),

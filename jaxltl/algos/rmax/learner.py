@@ -53,6 +53,8 @@ import numpy as np
 from jax.tree_util import Partial
 
 from jaxltl.algos.common import learner, pac, splitmix
+
+from jaxltl.algos.common import loops
 from jaxltl.algos.common.play import draw
 from jaxltl.algos.rmax._optimistic_model import (
     exploration,
@@ -71,14 +73,12 @@ from jaxltl.algos.rmax._rollout import (
     start_rollout,
 )
 from jaxltl.algos.rmax.problem import Problem
-from jaxltl.algos.rmax.state import UPDATES, Hparams, Metrics, State, reward_error
-from jaxltl.core.types import status_code
+from jaxltl.algos.rmax.state import Hparams, Metrics, State, reward_error
 
 
 @jax.jit
-def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
+def _init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     """No pair known: each is assumed to pay ``R_max / (1 - discount)`` for ever."""
-    _check(hparams)
     game, shape = problem.game, problem.game.mdp.probability.shape
     listed = game.mdp.probability > 0
     bound = jnp.asarray(unknown_reward(hparams), game.dtype)
@@ -105,11 +105,8 @@ def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     )
 
 
-def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
-    """At most ``moves_per_step`` moves, until the model changes, and the new strategy.
-
-    Under ``vmap`` every lane proceeds to its next update, and then one solve serves all lanes.
-    """
+def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
+    """At most ``moves_per_step`` moves, until the model changes, and the new strategy."""
     return _step_if(state, problem, hparams, jnp.bool_(True))
 
 
@@ -117,10 +114,9 @@ def _step_if(
     state: State, problem: Problem, hparams: Hparams, active: jax.Array
 ) -> tuple[State, Metrics]:
     """A step, or the same state without copying its arrays."""
-    _check(hparams)
     moves = jnp.where(active, hparams.moves_per_step, 0)
-    moves = jnp.minimum(moves, learner.MOST - state.moves).astype(jnp.int32)
-    rollout = learner.while_active(
+    moves = jnp.minimum(moves, loops.MAX_STEPS - state.moves).astype(jnp.int32)
+    rollout = loops.while_active(
         lambda r, _: r.remaining > 0,
         move,
         start_rollout(state, moves),
@@ -131,7 +127,7 @@ def _step_if(
     return state, measure(state, problem, hparams)
 
 
-run, train, run_until, train_until = learner.bind(init, step, step_if=_step_if)
+init, step, run, train, run_until, train_until = learner.bind(_init, _step, step_if=_step_if)
 
 
 def measure(state: State, problem: Problem, hparams: Hparams) -> Metrics:
@@ -146,11 +142,13 @@ def measure(state: State, problem: Problem, hparams: Hparams) -> Metrics:
         always_almost_sure=state.always_almost_sure,
         fault=state.fault,
         residual=state.error,
-        status=status_code(solved & (state.moves < learner.MOST), jnp.isfinite(state.error)),
+        status=learner.completion_status(
+            solved & (state.moves < loops.MAX_STEPS), jnp.isfinite(state.error)
+        ),
     )
 
 
-def strategy_is_stable(moves: chex.Numeric) -> learner.Until:
+def strategy_is_stable(moves: chex.Numeric) -> loops.Until:
     """A condition for ``run_until``: the strategy has not changed for a number of `moves`."""
     return Partial(_strategy_is_stable, moves)
 
@@ -229,11 +227,3 @@ def _rules(state: State, problem: Problem, hparams: Hparams) -> Rules:
         restart=jnp.asarray(hparams.restart, dtype),
         every=jnp.bool_(hparams.update == "every"),
     )
-
-
-def _check(hparams: Hparams) -> None:
-    """Raises ValueError for static settings out of range."""
-    if hparams.update not in UPDATES:
-        raise ValueError(f'update={hparams.update!r}; choose "every" or "printed".')
-    if hparams.moves_per_step < 1:
-        raise ValueError(f"moves_per_step={hparams.moves_per_step}; it must be at least 1.")

@@ -7,6 +7,8 @@ from functools import partial
 import jax
 from flax import struct
 
+from jaxltl.algos.common.settings import COUNT, Number, static, traced
+from jaxltl.core.validation import Range
 from jaxltl.core.pretty_print import brief, history
 from jaxltl.core.types import Status
 
@@ -34,14 +36,14 @@ class Hparams:
         default 128.
     """
 
-    discount: jax.Array | float
-    reward_bound: jax.Array | float
-    epsilon: jax.Array | float
-    failure: jax.Array | float = 0.1
-    known_after: jax.Array | int | None = None
-    restart: jax.Array | float = 0.0
-    update: str = struct.field(pytree_node=False, default="every")
-    moves_per_step: int = struct.field(pytree_node=False, default=128)
+    discount: Number = traced(Range(0, 1, open_below=True, open_above=True))
+    reward_bound: Number = traced(Range(0, open_below=True, open_above=True))
+    epsilon: Number = traced(Range(0, open_below=True, open_above=True))
+    failure: Number = traced(Range(0, 1, open_below=True, open_above=True), default=0.1)
+    known_after: Number | None = traced(Range(1), default=None)
+    restart: Number = traced(Range(0, 1), default=0.0)
+    update: str = static(UPDATES, default="every")
+    moves_per_step: int = static(COUNT, default=128)
 
 
 @brief

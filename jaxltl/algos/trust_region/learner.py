@@ -63,16 +63,16 @@ from typing import Any, NamedTuple
 import chex
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 from flax import struct
 from jax import lax
 from jax.flatten_util import ravel_pytree
 from jax.tree_util import Partial
 
+from jaxltl.algos.common.settings import COUNT, MAX_INT, Number, static, traced
+from jaxltl.core.validation import Range
 from jaxltl.algos.common import learner
 from jaxltl.algos.common.moments import Moments, no_moments, updated_moments
-from jaxltl.algos.common.settings import UNBOUNDED, require_numbers
 from jaxltl.algos.trust_region._policy_networks import (
     gaussian,
     inputs_at,
@@ -105,7 +105,7 @@ from jaxltl.core.environments.environment import (
 )
 from jaxltl.core.environments.episodes import Agent
 from jaxltl.core.pretty_print import brief, history
-from jaxltl.core.types import Status, require_shape, status_code
+from jaxltl.core.types import Status, require_shape
 
 __all__ = [
     "METHODS",
@@ -177,26 +177,26 @@ class Hparams:
         default 5 and 8.
     """
 
-    discount: jax.Array | float
-    cost_discount: jax.Array | float = 1.0
-    gae_lambda: jax.Array | float = 0.97
-    cost_gae_lambda: jax.Array | float = 0.97
-    delta: jax.Array | float = 0.01
-    damping: jax.Array | float = 1e-3
-    penalty: jax.Array | float | None = None
-    initial_deviation: jax.Array | float = 1.0
-    backtrack: jax.Array | float = 0.8
-    value_rate: jax.Array | float = 3e-3
-    method: str = struct.field(pytree_node=False, default="cpo")
-    num_trajectories: int = struct.field(pytree_node=False, default=200)
-    hidden: tuple[int, ...] = struct.field(pytree_node=False, default=(32, 32))
-    value_hidden: tuple[int, ...] = struct.field(pytree_node=False, default=(32, 32))
-    normalize: bool = struct.field(pytree_node=False, default=True)
-    cg_steps: int = struct.field(pytree_node=False, default=10)
-    search_steps: int = struct.field(pytree_node=False, default=15)
-    fisher_stride: int = struct.field(pytree_node=False, default=1)
-    value_epochs: int = struct.field(pytree_node=False, default=5)
-    value_batches: int = struct.field(pytree_node=False, default=8)
+    discount: Number = traced(Range(0, 1))
+    cost_discount: Number = traced(Range(0, 1), default=1.0)
+    gae_lambda: Number = traced(Range(0, 1), default=0.97)
+    cost_gae_lambda: Number = traced(Range(0, 1), default=0.97)
+    delta: Number = traced(Range(0, open_above=True), default=0.01)
+    damping: Number = traced(Range(0, open_above=True), default=1e-3)
+    penalty: Number | None = traced(Range(open_below=True, open_above=True), default=None)
+    initial_deviation: Number = traced(Range(0, open_above=True), default=1.0)
+    backtrack: Number = traced(Range(0, 1), default=0.8)
+    value_rate: Number = traced(Range(0, open_above=True), default=3e-3)
+    method: str = static(METHODS, default="cpo")
+    num_trajectories: int = static(COUNT, default=200)
+    hidden: tuple[int, ...] = static(COUNT, default=(32, 32))
+    value_hidden: tuple[int, ...] = static(COUNT, default=(32, 32))
+    normalize: bool = static(bool, default=True)
+    cg_steps: int = static(COUNT, default=10)
+    search_steps: int = static(COUNT, default=15)
+    fisher_stride: int = static(COUNT, default=1)
+    value_epochs: int = static(Range(0, MAX_INT, integer=True), default=5)
+    value_batches: int = static(COUNT, default=8)
 
 
 @brief
@@ -249,7 +249,7 @@ class Metrics:
         networks that were used did not explain.
       nonfinite: trajectories with a number that is not finite; they are left out, so that
         all other figures leave them out too.
-      status: CONVERGED; MAX_STEPS if no length of the step would do, so that the policy stays;
+      status: COMPLETED; MAX_STEPS if no length of the step would do, so that the policy stays;
         NONFINITE if `nonfinite` is positive or the step was not finite (the policy then stays).
     """
 
@@ -372,20 +372,6 @@ def _as_action(problem: Problem, action: jax.Array) -> jax.Array:
     return clipped_action(actions, action.reshape(actions.shape).astype(actions.dtype))
 
 
-_RANGES = {
-    "discount": (0, 1),
-    "cost_discount": (0, 1),
-    "gae_lambda": (0, 1),
-    "cost_gae_lambda": (0, 1),
-    "delta": (0, np.inf),
-    "damping": (0, np.inf),
-    "penalty": UNBOUNDED,
-    "initial_deviation": (0, np.inf),
-    "backtrack": (0, 1),
-    "value_rate": (0, np.inf),
-}
-
-
 def _require_ours(problem: Problem, hparams: Hparams) -> None:
     validation.instance("problem", problem, Problem, "one of trust_region.make_problem")
     validation.instance("hparams", hparams, Hparams, "trust_region.Hparams")
@@ -407,19 +393,10 @@ def _require_observed(state: State, observation: jax.Array) -> None:
 
 def _check(problem: Problem, hparams: Hparams) -> None:
     _require_ours(problem, hparams)
-    require_numbers(hparams, _RANGES, optional=["penalty"])
-    validation.integer("value_epochs", hparams.value_epochs, most=2**31 - 1)
-    validation.boolean("normalize", hparams.normalize)
-    validation.choice("method", hparams.method, METHODS)
     if hparams.method == "cpo" and problem.limit is None:
         raise ValueError('method="cpo" needs a limit: pass one to make_problem, or use "trpo".')
     if hparams.method == "cpo" and hparams.penalty is not None:
         raise ValueError('penalty is for method="trpo": CPO finds its own multiplier.')
-    for name in ("num_trajectories", "cg_steps", "search_steps", "fisher_stride", "value_batches"):
-        validation.integer(name, getattr(hparams, name), least=1, most=2**31 - 1)
-    for name in ("hidden", "value_hidden"):
-        for width in validation.sequence(name, getattr(hparams, name)):
-            validation.integer(f"{name}: a width", width, least=1, most=2**31 - 1)
     samples = hparams.num_trajectories * problem.horizon
     if hparams.value_batches > samples:
         raise ValueError(f"value_batches={hparams.value_batches} of {samples} samples; use fewer.")
@@ -600,21 +577,9 @@ def _rollout(
     )
 
 
-def init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
+def _init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     """Random networks. If observations are normalised, a first batch of trajectories is drawn
-    for their moments, and counted.
-
-    Args:
-      key: a PRNG key, which the state keeps; ``vmap`` over keys for many seeds.
-      problem: of :func:`make_problem`.
-      hparams: :class:`Hparams`.
-
-    Returns:
-      :class:`State`, no step made.
-
-    Raises:
-      ValueError: a method that does not fit the problem, or a number out of its range.
-    """
+    for their moments, and counted."""
     _check(problem, hparams)
     return _begun(require_key(key), problem, hparams)
 
@@ -655,16 +620,8 @@ def _begun(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     )
 
 
-def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
-    """N trajectories, one step of the policy, and the value networks fitted to the same ones.
-
-    Args:
-      state: of :func:`init` or of an earlier step; unchanged.
-      problem, hparams: as of :func:`init`.
-
-    Returns:
-      The next :class:`State`, and :class:`Metrics`, figures of the step.
-    """
+def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
+    """N trajectories, one step of the policy, and the value networks fitted to the same ones."""
     _check(problem, hparams)
     _require_state(state)
     draw_key, fit_key = jax.random.split(learner.step_key(state))
@@ -690,7 +647,7 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
         value_moments=value_moments,
         optimizer=optimizer,
         moments=moments,
-        trajectories=learner.count(state.trajectories, hparams.num_trajectories),
+        trajectories=learner.saturating_add(state.trajectories, hparams.num_trajectories),
     )
     left_out = weighted_variance(found, batch.valid)
     return state, replace(
@@ -700,7 +657,7 @@ def step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metri
     )
 
 
-run, train, run_until, train_until = learner.bind(init, step)
+init, step, run, train, run_until, train_until = learner.bind(_init, _step)
 
 
 def _estimated(
@@ -798,5 +755,5 @@ def _improved(
         cost_multiplier=dual.cost,
         unexplained=jnp.zeros(len(found), dtype),
         nonfinite=nonfinite,
-        status=status_code(accepted, usable),
+        status=learner.completion_status(accepted, usable),
     )

@@ -1,0 +1,15 @@
+from . import (
+    behavioral_cloning as behavioral_cloning,
+    cce as cce,
+    common as common,
+    feasible as feasible,
+    interval_learning as interval_learning,
+    many_tasks as many_tasks,
+    maximin_q as maximin_q,
+    mlirl as mlirl,
+    ppo as ppo,
+    regions as regions,
+    rmax as rmax,
+    todirl as todirl,
+    trust_region as trust_region,
+)

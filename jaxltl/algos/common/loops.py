@@ -1,0 +1,248 @@
+"""Training loops: a fixed number of steps, or until a condition holds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any, TypeVar
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import lax
+from jax.tree_util import Partial
+
+from jaxltl.algos.common.settings import require_arrays, require_hparams
+from jaxltl.algos.common.trees import choose
+from jaxltl.core.pretty_print import brief
+from jaxltl.core.types import Status, worst
+from jaxltl.core import validation
+
+ProblemT = TypeVar("ProblemT")
+HparamsT = TypeVar("HparamsT")
+StateT = TypeVar("StateT")
+MetricsT = TypeVar("MetricsT")
+CarryT = TypeVar("CarryT")
+GivenT = TypeVar("GivenT")
+
+Step = Callable[[StateT, ProblemT, HparamsT], tuple[StateT, MetricsT]]
+Until = Callable[[StateT, StateT, MetricsT], chex.Numeric]
+
+MAX_STEPS = np.iinfo(np.int32).max  # counters of steps are int32
+
+
+def run(
+    step: Step[StateT, ProblemT, HparamsT, MetricsT],
+    state: StateT,
+    problem: ProblemT,
+    hparams: HparamsT,
+    *,
+    num_steps: int,
+    max_rows: int = 1000,
+) -> tuple[StateT, MetricsT]:
+    """:meth:`~jaxltl.algos.common.learner.Learner.run` of a learner with this `step`."""
+    num_steps, max_rows = (
+        x if isinstance(x, int) else validation.integer(name, x, least=1)
+        for name, x in (("num_steps", num_steps), ("max_rows", max_rows))
+    )
+    if num_steps < 1 or max_rows < 1:
+        raise ValueError(f"num_steps={num_steps}, max_rows={max_rows}; both must be at least 1.")
+    if num_steps > MAX_STEPS:
+        raise ValueError(f"num_steps={num_steps}; it must be at most {MAX_STEPS}.")
+    require_arrays(state=state, problem=problem, hparams=hparams)
+    require_hparams(hparams)
+    return run_blocks(step, state, problem, hparams, block_lengths(num_steps, max_rows))
+
+
+def block_lengths(num_steps: int, max_rows: int) -> np.ndarray:
+    """Lengths ``int32[rows]`` of at most `max_rows` blocks of `num_steps` steps in total.
+
+    All blocks but the first have equal lengths.
+
+    >>> block_lengths(7, 3).tolist()
+    [1, 3, 3]
+    """
+    stride = -(-num_steps // max_rows)
+    lengths = np.full(-(-num_steps // stride), stride, np.int32)
+    lengths[0] = num_steps - (num_steps - 1) // stride * stride
+    return lengths
+
+
+@partial(jax.jit, static_argnames="step")
+def run_blocks(
+    step: Step[StateT, ProblemT, HparamsT, MetricsT],
+    state: StateT,
+    problem: ProblemT,
+    hparams: HparamsT,
+    lengths: chex.Array,
+) -> tuple[StateT, MetricsT]:
+    """Blocks of steps as one program; returns the metrics of each block's last step."""
+    empty = _zero_metrics(step, state, problem, hparams)
+
+    def block(state: StateT, length: jax.Array) -> tuple[StateT, MetricsT]:
+        return lax.fori_loop(
+            0, length, lambda _, carry: step(carry[0], problem, hparams), (state, empty)
+        )
+
+    return lax.scan(block, state, lengths)
+
+
+def _zero_metrics(step: Callable[..., tuple[Any, MetricsT]], *arguments: Any) -> MetricsT:
+    # One trace of the step serves all: two could be compiled to different roundings.
+    _, shape = jax.eval_shape(step, *arguments)
+    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shape)
+
+
+@brief(codes={"status": Status})
+@struct.dataclass
+class Learned:
+    """Result of a run with a stopping condition; ``check`` accepts it.
+
+    Attributes:
+      state: the last state.
+      metrics: of the last step.
+      num_steps: ``int32[]``, steps of this run.
+      status: ``int32[]``, COMPLETED if the condition was met, else MAX_STEPS; or worse, the status
+        of the last step's metrics.
+    """
+
+    state: Any
+    metrics: Any
+    num_steps: jax.Array
+    status: jax.Array
+
+    @property
+    def residual(self) -> jax.Array:
+        """The last step's ``residual`` or ``gradient_norm``; NaN if the metrics have neither."""
+        norm = getattr(self.metrics, "gradient_norm", jnp.full(self.status.shape, jnp.nan))
+        return getattr(self.metrics, "residual", norm)
+
+
+def run_until(
+    step: Callable[..., tuple[StateT, MetricsT]],
+    state: StateT,
+    problem: ProblemT,
+    hparams: HparamsT,
+    *,
+    until: Until[StateT, MetricsT],
+    num_steps: chex.Numeric,
+    check_every: int = 1,
+    keep: str = "after",
+    idle: bool = False,
+) -> Learned:
+    """:meth:`~jaxltl.algos.common.learner.Learner.run_until` of a learner with this `step`.
+
+    With `idle`, the step takes a fourth argument ``bool[]`` and returns the state unchanged where
+    it is False; otherwise finished lanes are masked array by array.
+    """
+    if keep not in ("after", "before"):
+        raise ValueError(f'keep={keep!r}; choose "after" or "before".')
+    if idle and (check_every, keep) != (1, "after"):
+        raise ValueError('idle=True requires check_every=1 and keep="after".')
+    for name, number in {"num_steps": num_steps, "check_every": check_every}.items():
+        if not isinstance(number, jax.Array):
+            validation.integer(name, number, least=1, most=MAX_STEPS)
+    until = until if isinstance(until, Partial) else Partial(validation.function("until", until))
+    require_arrays(state=state, problem=problem, hparams=hparams, until=until)
+    require_hparams(hparams)
+    given = (problem, hparams, until, jnp.asarray(num_steps, jnp.int32))
+    return _run_until(step, state, given, check_every, keep, idle)
+
+
+@struct.dataclass
+class Progress:
+    """A run in progress.
+
+    Attributes:
+      state, metrics: of the last step.
+      count: ``int32[]``, number of steps.
+      done: ``bool[]``, whether the condition was met.
+    """
+
+    state: Any
+    metrics: Any
+    count: jax.Array
+    done: jax.Array
+
+
+@partial(jax.jit, static_argnames=("step", "check_every", "keep", "idle"))
+def _run_until(
+    step: Callable[..., tuple[Any, Any]],
+    state: Any,
+    given: tuple[Any, ...],
+    check_every: int,
+    keep: str,
+    idle: bool,
+) -> Learned:
+    def active(carry: tuple[Progress, Any], given: tuple[Any, ...]) -> jax.Array:
+        return ~carry[0].done & (carry[0].count < given[-1])
+
+    def body(carry: tuple[Progress, Any], given: tuple[Any, ...]) -> tuple[Progress, Any]:
+        going, (problem, hparams, until, _) = active(carry, given), given
+        now, window = carry
+        before = now.state if window is None else window
+        after, metrics = step(now.state, problem, hparams, *([going] if idle else []))
+        number = now.count + 1
+        due = number % check_every == 0
+        done = due & jnp.asarray(until(before, after, metrics))
+        last = choose(done, before, after) if keep == "before" else after
+        new = Progress(last, metrics, jnp.where(going, number, now.count), done & going)
+        if idle:  # the step left the state of a finished lane unchanged
+            metrics = choose(going, metrics, now.metrics)
+            new = replace(new, metrics=metrics, done=new.done | now.done)
+        else:
+            new = choose(going, new, now)
+        return new, None if window is None else choose(due, new.state, window)
+
+    problem, hparams, *_ = given
+    empty = _zero_metrics(step, state, problem, hparams, *([jnp.bool_(True)] if idle else []))
+    begin = Progress(state, empty, jnp.int32(0), jnp.bool_(False))
+    end, _ = while_active(active, body, (begin, None if check_every == 1 else state), given)
+    status = jnp.where(end.done, Status.COMPLETED, Status.MAX_STEPS).astype(jnp.int32)
+    return Learned(
+        end.state, end.metrics, end.count, worst(status, getattr(end.metrics, "status", status))
+    )
+
+
+def while_active(
+    active: Callable[[CarryT, GivenT], jax.Array],
+    body: Callable[[CarryT, GivenT], CarryT],
+    carry: CarryT,
+    given: GivenT,
+) -> CarryT:
+    """``while active(carry, given): carry = body(carry, given)`` without masking under ``vmap``.
+
+    A vmapped ``lax.while_loop`` copies all arrays of finished lanes in every iteration. Here `body`
+    must return the carry of an inactive lane unchanged, so that only written entries are touched.
+
+    Example:
+      >>> def half(x, bound):  # small numbers are unchanged
+      ...     return jnp.where(x > bound, x / 2, x)
+      >>> run = jax.vmap(lambda x: while_active(lambda x, bound: x > bound, half, x, 1.0))
+      >>> run(jnp.array([0.5, 4.0])).tolist()
+      [0.5, 1.0]
+    """
+    carry, given = jax.tree.map(jnp.asarray, (carry, given))
+
+    @jax.custom_batching.custom_vmap
+    def loop(carry: CarryT, given: GivenT) -> CarryT:
+        return lax.while_loop(lambda c: active(c, given), lambda c: body(c, given), carry)
+
+    @loop.def_vmap
+    def _(size: int, batched: Any, carry: CarryT, given: GivenT) -> tuple[CarryT, Any]:
+        lanes, shared = batched
+        carry = jax.tree.map(
+            lambda x, b: x if b else jnp.broadcast_to(x, (size, *x.shape)), carry, lanes
+        )
+        axes = (0, jax.tree.map(lambda b: 0 if b else None, shared))
+        last = lax.while_loop(
+            lambda c: jnp.any(jax.vmap(active, axes)(c, given)),
+            lambda c: jax.vmap(body, axes)(c, given),
+            carry,
+        )
+        return last, jax.tree.map(lambda _: True, lanes)
+
+    return loop(carry, given)
