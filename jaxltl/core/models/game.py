@@ -1,4 +1,4 @@
-"""Turn-based games: a model, and whose turn it is in each state."""
+"""Turn-based stochastic games."""
 
 from __future__ import annotations
 
@@ -31,10 +31,8 @@ class Game:
     """A turn-based game of the system against the environment, stochastic or deterministic.
 
     Attributes:
-      mdp: the model: an MDP, a DenseMDP, a SparseMDP or a Product, in which each state's player
-        chooses.
-      system: ``bool[S]`` (``[S, Q]`` in a product): True where the system moves, who
-        maximises; False where the environment does.
+      mdp: the model: an MDP, a DenseMDP, a SparseMDP, an IntervalMDP or a Product.
+      system: ``bool[S]`` (``[S, Q]`` in a product), True in the states of the system, the maximiser.
 
     Example:
       >>> import jaxltl as jl
@@ -53,12 +51,12 @@ class Game:
 
     @property
     def num_actions(self) -> int:
-        """A; of a sparse model there is none."""
+        """A; ValueError for a sparse model."""
         return self.mdp.num_actions
 
     @property
     def num_successors(self) -> int:
-        """K, as of the model."""
+        """K."""
         return self.mdp.num_successors
 
     @property
@@ -68,12 +66,12 @@ class Game:
 
     @property
     def successor_probability(self) -> jax.Array:
-        """As of the model."""
+        """``float[S, A, K]``."""
         return self.mdp.successor_probability
 
     @property
     def available(self) -> jax.Array:
-        """``bool[S, A]``: the moves of each state's player."""
+        """``bool[S, A]``."""
         return self.mdp.available
 
     @property
@@ -83,7 +81,7 @@ class Game:
 
     @property
     def label(self) -> jax.Array:
-        """``bool[S, P]``, which propositions hold in a state."""
+        """``bool[S, P]``, the propositions that hold in each state."""
         return self.mdp.label
 
     @property
@@ -93,22 +91,22 @@ class Game:
 
     @property
     def dtype(self) -> jnp.dtype:
-        """Of the probabilities."""
+        """The dtype of the probabilities."""
         return self.mdp.dtype
 
 
 def make_game(model: Model, system: Sequence[bool] | chex.Array) -> Game:
-    """A checked :class:`Game`, on the host.
+    """A checked :class:`Game`.
 
     Args:
       model: an MDP, a DenseMDP, a SparseMDP, an IntervalMDP or a Product.
-      system: whose turn it is in each state: True the system's, False the environment's.
+      system: the player of each state: True for the system, False for the environment.
 
     Returns:
       :class:`Game`.
 
     Raises:
-      ValueError: a state has no owner, or no move.
+      ValueError: a state without a player or an action, or a subnormal probability.
 
     Example:
       >>> from jaxltl import from_dense
@@ -123,7 +121,7 @@ def make_game(model: Model, system: Sequence[bool] | chex.Array) -> Game:
 
 
 def check_moves(available: np.ndarray, system: np.ndarray) -> None:
-    """Raises a ValueError that names the first state whose player has no move."""
+    """Raises ValueError, naming the state, if a player has no action."""
     stuck = np.argwhere(~available.any(-1))
     if stuck.size:
         state = tuple(int(i) for i in stuck[0])
@@ -144,8 +142,7 @@ def _owners(system: Any, shape: tuple[int, ...]) -> np.ndarray:
         least = min(owner.shape[0] if owner.ndim else 0, shape[0])
         missing = f" State {least} has no owner." if owner.ndim == 1 and least < shape[0] else ""
         raise ValueError(
-            f"system has shape {owner.shape}; expected {shape}, whose turn it is in each "
-            f"state.{missing}"
+            f"system has shape {owner.shape}; expected {shape}, the player of each state.{missing}"
         )
     if owner.dtype == bool:
         return owner
@@ -161,7 +158,7 @@ def _owners(system: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def as_game(model: Model) -> Game:
-    """A game as solvers take it; any other model as the game in which the system always moves."""
+    """The game itself, or a model as the game in which all states are the system's."""
     if not isinstance(model, Game):
         if not hasattr(model, "state_shape"):
             raise ValueError(validation.unsupported_model(model))
@@ -170,7 +167,7 @@ def as_game(model: Model) -> Game:
 
 
 def as_padded_game(model: Model) -> Game:
-    """The same, where sparse models are padded (:func:`~jaxltl.core.models.construct.padded.to_padded`)."""
+    """The game of :func:`as_game`, with a sparse model padded."""
     game = as_game(model)
     if isinstance(game.mdp, SparseMDP):
         game = replace(game, mdp=to_padded(game.mdp))
@@ -178,12 +175,12 @@ def as_padded_game(model: Model) -> Game:
 
 
 def is_deterministic(model: Model) -> bool:
-    """Whether every move has one successor, so that chance plays no part; on the host."""
+    """True if every choice has one successor."""
     return not bool((support(base_model(model)).sum(-1) > 1).any())
 
 
 def swap_players(game: Game) -> Game:
-    """The same game with the players' names exchanged."""
+    """The game with the players exchanged."""
     xp, system = namespace(game.system)
     return replace(game, system=to_jax(xp.logical_not(system)))
 
@@ -191,7 +188,7 @@ def swap_players(game: Game) -> Game:
 # --- the primitives: those of the model -----------------------------------------------------
 
 
-def _that_of_the_model(primitive: Any) -> None:
+def _register_on_base(primitive: Any) -> None:
     primitive.register(Game, lambda game, *given, **named: primitive(game.mdp, *given, **named))
 
 
@@ -206,4 +203,4 @@ for _primitive in (
     operators.induced_chain,
     operators.transition_matrix,
 ):
-    _that_of_the_model(_primitive)
+    _register_on_base(_primitive)

@@ -1,7 +1,7 @@
-"""A world run beside an automaton: the lazy product.
+"""Lazy products of a model and an automaton.
 
-Nothing is copied. A value on the product has shape ``[S, Q]``, and the automaton only
-decides at which memory state the value of a successor is read.
+Nothing is copied: a value on the product has the shape ``[S, Q]``, and the automaton determines the
+memory state at which the value of a successor is read.
 """
 
 from __future__ import annotations
@@ -42,19 +42,18 @@ register_annotated_pytree(
 @brief(facts=facts.product, drawn=True)
 @struct.dataclass
 class Product:
-    """A world beside an automaton that remembers the task's progress.
+    """The product of a model and an automaton that tracks the progress of a task.
 
-    With ``label_on="entry"``, ``(s, q) -> (t, delta(q, L(t)))``, starting in
-    ``delta(q_I, L(s0))``: the label of the state that is entered is read. With
-    ``label_on="exit"``, ``(s, q) -> (t, delta(q, L(s)))``, starting in ``q_I``: the
-    label of the state that is left.
+    With ``label_on="entry"``, ``(s, q) -> (t, delta(q, L(t)))``, starting in ``delta(q_I, L(s0))``: the
+    automaton reads the label of the successor. With ``label_on="exit"``,
+    ``(s, q) -> (t, delta(q, L(s)))``, starting in ``q_I``: it reads the label of the current state.
 
     Attributes:
-      mdp: the world, an MDP or a DenseMDP.
-      automaton: the task.
-      letter: ``int32[S]``, the automaton's letter that each world state shows.
-      label_on: which label a step reads; static.
-      allowed: ``bool[S, Q, A]``, the actions to which the world's are narrowed, or None; see
+      mdp: the base model.
+      automaton: the automaton of the task.
+      letter: ``int32[S]``, the letter of each state of the base model.
+      label_on: ``"entry"`` or ``"exit"``; static.
+      allowed: ``bool[S, Q, A]``, a restriction of the actions, or None; see
         :func:`~jaxltl.core.models.construct.restrict.with_allowed`.
 
     Example:
@@ -74,17 +73,17 @@ class Product:
 
     @property
     def num_states(self) -> int:
-        """Product states: S times Q."""
+        """S times Q."""
         return self.mdp.num_states * self.num_memory
 
     @property
     def num_memory(self) -> int:
-        """Q, the states of the automaton."""
+        """Q, the number of automaton states."""
         return self.automaton.delta.shape[-2]
 
     @property
     def num_actions(self) -> int:
-        """A, as of the world."""
+        """A."""
         return self.mdp.num_actions
 
     @property
@@ -94,7 +93,7 @@ class Product:
 
     @property
     def num_successors(self) -> int:
-        """K, as of the world."""
+        """K."""
         return self.mdp.num_successors
 
     @property
@@ -104,7 +103,7 @@ class Product:
 
     @property
     def dtype(self) -> jnp.dtype:
-        """Of the probabilities."""
+        """The dtype of the probabilities."""
         return self.mdp.dtype
 
     @property
@@ -117,13 +116,13 @@ class Product:
 
     @property
     def next_memory(self) -> jax.Array:
-        """``int32[S, Q]``: the memory after reading the label of a world state in memory q."""
+        """``int32[S, Q]``: the memory state after reading the label of s in memory state q."""
         _, delta, letter = namespace(self.automaton.delta, self.letter)
         return to_jax(delta[:, letter].T)
 
     @property
     def initial_memory(self) -> jax.Array:
-        """``int32[S]``: the memory in which a run starts at each world state."""
+        """``int32[S]``: the initial memory state at each initial state."""
         automaton = self.automaton
         xp, start, delta, letter = namespace(automaton.initial, automaton.delta, self.letter)
         if self.label_on == "exit":
@@ -139,7 +138,7 @@ class Product:
 
     @property
     def final(self) -> jax.Array:
-        """``bool[S, Q]``: the automaton is in a final state."""
+        """``bool[S, Q]``: the final automaton states."""
         xp, automaton = namespace(self.automaton)
         final = automaton.final
         return to_jax(xp.broadcast_to(final, self.state_shape))
@@ -148,14 +147,14 @@ class Product:
 def occurring_letters(
     world: LabelledModel, propositions: Collection[str] | None = None
 ) -> list[frozenset]:
-    """The sets of propositions that occur at some state of a world, for ``to_automaton``.
+    """The letters that occur in a model, each once, for ``to_automaton``.
 
     Args:
       world: the model.
-      propositions: keep only these; default all.
+      propositions: the propositions of the letters; default: all.
 
     Returns:
-      The letters, each once.
+      Sets of propositions.
 
     Example:
       >>> from jaxltl import from_dense
@@ -184,22 +183,20 @@ def product(
 def product(
     world: LabelledModel, task: Automaton | Formula | str, *, label_on: str = "entry"
 ) -> Product | Game:
-    """The lazy product of a world and a task.
+    """The lazy product of a model and a task.
 
-    A formula is translated over the letters that occur in the world.
+    A formula is translated over the letters that occur in the model.
 
     Args:
-      world: the model, an MDP, a DenseMDP or a Game; its labels are read on the host.
-      task: an automaton, a formula, or a formula's text.
+      world: an MDP, a DenseMDP, a SparseMDP, a ShardedMDP or a Game, with concrete labels.
+      task: an automaton, a formula, or its text.
       label_on: ``"entry"`` or ``"exit"``, see :class:`Product`.
 
     Returns:
-      A :class:`Product`; of a game, the :class:`~jaxltl.core.models.game.Game` on the product, in
-      which the same player moves in every memory state.
+      A :class:`Product`; of a game, the :class:`~jaxltl.core.models.game.Game` on the product.
 
     Raises:
-      ValueError: the task mentions a proposition that the world lacks, or the world
-        shows a letter that the automaton was not built for.
+      ValueError: an unknown proposition in the task, or a letter that the automaton does not have.
 
     Example:
       >>> from jaxltl import from_dense
@@ -233,13 +230,13 @@ def product(
 
 @singledispatch
 def distinct_labels(world: LabelledModel) -> np.ndarray:
-    """The labels of a world on the host, ``bool[S, P]``; of one on a mesh those that occur."""
+    """``bool[S, P]``, the labels of a model; of one on a mesh the distinct ones."""
     return np.asarray(world.label)
 
 
 @singledispatch
 def letters_by_state(world: LabelledModel, letter: np.ndarray) -> jax.Array:
-    """``int32[S]``, what each state shows, from a number for each of the :func:`distinct_labels`."""
+    """``int32[S]``, the letter of each state, from that of each of the :func:`distinct_labels`."""
     return to_jax(letter)
 
 
@@ -261,10 +258,10 @@ _SELECT = 16  # memory states up to which reading at a memory is a selection
 
 
 def _through(model: Product, operator, value: jax.Array, term, combine, empty=0) -> jax.Array:
-    """Applies a primitive of the world at every memory state: ``[S, Q, A]`` from ``[S, Q]``.
+    """Applies an operator of the base model at every memory state: ``[S, Q, A]`` from ``[S, Q]``.
 
-    On entry the value of t is read at delta(q, L(t)), before the world's operator; on
-    exit at delta(q, L(s)), after it. Where an action is not allowed the result is `empty`.
+    On entry the value of t is read at delta(q, L(t)), before the base operator; on exit at
+    delta(q, L(s)), after it. Disallowed actions have the result `empty`.
     """
     if model.label_on == "entry":
         value = _read_at(value, model.next_memory)
@@ -278,22 +275,14 @@ def _through(model: Product, operator, value: jax.Array, term, combine, empty=0)
 
 
 def _each_memory(world: MDP | DenseMDP, operator, value, term, combine) -> jax.Array:
-    """A world's primitive on each column of ``[S, Q]``: ``[S, Q, A]``.
-
-    The primitive combines a term of weight and value over the successors of a pair.
-    """
+    """An operator of the base model on each column of ``[S, Q]``: ``[S, Q, A]``."""
     if isinstance(world, DenseMDP):
         return jax.vmap(lambda v: operator(world, v), in_axes=1, out_axes=1)(value)
     return operators.combined(world, value, term, combine)
 
 
 def reads(model: Product, marked: jax.Array) -> jax.Array:
-    """Whether an action can make the automaton read a marked transition: ``bool[S, Q, A]``.
-
-    Args:
-      model: the product.
-      marked: ``bool[Q, L]``, transitions of the automaton.
-    """
+    """``bool[S, Q, A]``: choices that may make a marked transition ``bool[Q, L]`` of the automaton."""
     here = jnp.asarray(marked)[:, model.letter].T
     if model.label_on == "exit":
         return here[:, :, None] & model.available
@@ -304,15 +293,9 @@ def reads(model: Product, marked: jax.Array) -> jax.Array:
 
 
 def read_probability(model: Product, marked: jax.Array) -> jax.Array:
-    """The probability that an action makes the automaton read a marked transition.
+    """The probability ``float[S, Q, A]`` that a choice makes a marked transition of the automaton.
 
-    Args:
-      model: the product.
-      marked: ``bool[Q, L]``, transitions of the automaton; or numbers on them, for what a step
-        reads of them in expectation.
-
-    Returns:
-      ``float[S, Q, A]``, zero at unavailable actions.
+    `marked` is ``bool[Q, L]``, or numbers on transitions, for their expectation.
     """
     here = jnp.asarray(marked)[:, model.letter].T.astype(model.dtype)
     if model.label_on == "exit":
@@ -322,9 +305,9 @@ def read_probability(model: Product, marked: jax.Array) -> jax.Array:
 
 
 def _read_at(value: jax.Array, memory: jax.Array) -> jax.Array:
-    """``value[s, memory[s, q]]``, as a selection for few memory states.
+    """``value[s, memory[s, q]]``, by selection for few memory states.
 
-    Its transpose is then a sum, where that of a gather is a scatter, which is slow.
+    The transpose is then a sum, which is faster than the scatter that transposes a gather.
     """
     num_memory = value.shape[1]
     if num_memory > _SELECT:

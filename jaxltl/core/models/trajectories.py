@@ -1,4 +1,4 @@
-"""Trajectories, checked and padded, and their simulation."""
+"""Trajectories of a model: validation, padding and simulation."""
 
 from __future__ import annotations
 
@@ -102,11 +102,7 @@ def make_trajectories(
 
 
 def require_states(trajectories: Trajectories, model: Model) -> None:
-    """Refuses trajectories that number the states of another model.
-
-    Raises:
-      ValueError: they belong to a model of another shape, or hold a state that does not exist.
-    """
+    """Raises ValueError for trajectories of a model with other states."""
     expected, found = model.state_shape, trajectories.state_shape
     if found is not None and found != expected:
         hint = ""

@@ -1,4 +1,4 @@
-"""What compiled programs read of a sparse model, and answers in the shape of what was asked."""
+"""Models as compiled solvers read them, and solutions in the original shape."""
 
 from __future__ import annotations
 
@@ -22,23 +22,17 @@ from jaxltl.core.types import Solution
 
 
 def is_sparse(model: Model) -> bool:
-    """Whether a model's choices are rows: a SparseMDP, or a product of one."""
+    """True for a SparseMDP and a product of one."""
     return isinstance(model.mdp if isinstance(model, Product) else model, SparseMDP)
 
 
 def compiled_form(model: Model, reward: Any = None) -> tuple[Any, Any]:
-    """A model and a reward for solvers that are compiled; all but sparse ones as they are.
+    """A model and a reward for compiled solvers; only sparse models change.
 
-    A product of a sparse model is written out: its states are numbered ``s * Q + q``, and its rows
-    are those of :func:`~jaxltl.core.models.construct.convert.to_sparse`, inside ``jit`` too.
-
-    Args:
-      model: a model or a game.
-      reward: as of :func:`~jaxltl.core.models.sparse.choice_reward`, or None.
-
-    Returns:
-      A sparse model without names, rewards and variables, which programs would only be compiled
-      anew for, or a game on one; and the reward, of a sparse model a structure.
+    A product of a sparse model becomes a sparse model with states ``s * Q + q`` and the rows of
+    :func:`~jaxltl.core.models.construct.convert.to_sparse`, inside ``jit`` too. A sparse model loses its
+    names, rewards and variables, for which programs would be recompiled, and its reward becomes a
+    structure (see :func:`~jaxltl.core.models.sparse.choice_reward`).
     """
     if isinstance(model, Game):
         form, reward = compiled_form(model.mdp, reward)
@@ -71,7 +65,7 @@ def _named_reward(model: Model, reward: Any) -> tuple[Any, Any]:
 
 
 def reshape_solution(model: Model, solution: Solution) -> Solution:
-    """A solution of a model's compiled form, with the model's states."""
+    """A solution of a model's compiled form, with the model's shape of states."""
     lazy = model.mdp if isinstance(model, Game) else model
     if not (is_sparse(lazy) and isinstance(lazy, Product)):
         return solution
@@ -146,7 +140,7 @@ def _written_out(model: Product) -> SparseMDP:
 
 
 def _repeated(start: jax.Array, times: int) -> jax.Array:
-    """The starts of spans, of which each is repeated so often: ``[S * times + 1]``."""
+    """The starts ``[S * times + 1]`` of segments, each of which is repeated `times` times."""
     width = jnp.diff(start)
     begins = start[:-1, None] * times + jnp.arange(times, dtype=start.dtype) * width[:, None]
     return jnp.append(begins.ravel(), start[-1] * times)

@@ -1,4 +1,4 @@
-"""One model written in several ways: sparse, padded, and products written out."""
+"""Conversions between sparse, padded and product models."""
 
 from __future__ import annotations
 
@@ -16,20 +16,19 @@ from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
 
 
 def to_sparse(model: Model) -> SparseMDP:
-    """Any concrete MDP, DenseMDP, product of one, or sparse model, as a :class:`SparseMDP`.
+    """Any concrete MDP, DenseMDP, product or sparse model as a :class:`SparseMDP`.
 
-    Unavailable actions and padding are left out. Row i of a state takes the i-th of its available
-    actions, whose number is ``action[i]``. A product's states are numbered ``s * Q + q``, and
-    labels are the world's.
+    Row i of a state is the i-th of its available actions, whose number is ``action[i]``. A product's
+    states are numbered ``s * Q + q``, with the labels of the base model.
 
     Args:
       model: the model.
 
     Returns:
-      :class:`SparseMDP`; what is sparse already comes back as it is.
+      :class:`SparseMDP`; a sparse model is returned unchanged.
 
     Raises:
-      ValueError: the model is none of these.
+      ValueError: a model of another kind.
 
     Example:
       >>> from jaxltl import make_mdp

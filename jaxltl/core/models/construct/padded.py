@@ -1,4 +1,4 @@
-"""A sparse model with padded successor lists."""
+"""Padding of sparse models to successor lists of equal length."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _LARGEST = 8 * 2**30  # bytes of the largest model that is padded
 
 
 def row_actions(model: SparseMDP) -> np.ndarray:
-    """The action that each row of a sparse model becomes when it is padded, ``int[R]``."""
+    """The action of each row in the padded model, ``int[R]``."""
     if not isinstance(model, SparseMDP):
         raise ValueError(validation.unsupported_model(model))
     host = model.host
@@ -22,10 +22,10 @@ def row_actions(model: SparseMDP) -> np.ndarray:
 
 
 def to_padded(model: SparseMDP) -> MDP:
-    """The same process with padded successor lists, for batches and the compiled solvers.
+    """A sparse model with padded successor lists, for batches and the compiled solvers.
 
-    An action of the padded model is the number of a choice's action where actions have numbers
-    without names, as :func:`to_sparse` gives them, else its rank among the choices of its state.
+    The action of a row is its number where actions have numbers and no names, as :func:`to_sparse` gives
+    them, else its rank among the choices of its state.
 
     Args:
       model: the sparse model.
@@ -34,8 +34,8 @@ def to_padded(model: SparseMDP) -> MDP:
       :class:`MDP`, with A the largest number of choices and K that of successors.
 
     Raises:
-      ValueError: padding would take more than 8 GB, with the size; or two choices of a state have
-        one number.
+      ValueError: more than 8 GB, with the size; two choices of a state with one number; or a
+        probability that is zero or subnormal in JAX's default precision.
 
     Example:
       >>> import jaxltl as jl
@@ -71,7 +71,7 @@ def to_padded(model: SparseMDP) -> MDP:
 
 
 def pad_rows(model: SparseMDP, quantity: np.ndarray) -> np.ndarray:
-    """A quantity on rows ``[R]`` as one of the padded model, ``[S, A]``; zero where unavailable."""
+    """A quantity ``[R]`` on rows as one of the padded model, ``[S, A]``; zero where unavailable."""
     action = row_actions(model)
     found = np.zeros((model.num_states, int(action.max()) + 1), quantity.dtype)
     found[model.host.state, action] = quantity

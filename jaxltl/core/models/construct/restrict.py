@@ -1,4 +1,4 @@
-"""Parts of a model: fewer actions, or the reachable states as an ordinary model."""
+"""Restrictions of models: fewer actions, or the reachable states as a model."""
 
 from __future__ import annotations
 
@@ -15,28 +15,29 @@ from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.mdp import MDP, DenseMDP, make_mdp, support
-from jaxltl.core.models.construct.part import submodel, reachable_states
 from jaxltl.core.models.product import Product, flat_successor
 from jaxltl.core import validation
 from jaxltl.core.models.protocols import ActionModel, Model, ModelT
-from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.models.sparse import Rewards, SparseMDP
+from jaxltl.core.sparse.graph.components import forward_reachable
+from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
 from jaxltl.core.pretty_print import brief
 
 
 def with_allowed(model: ModelT, allowed: chex.Array) -> ModelT:
-    """The same model in which only some of the actions are left.
+    """The model with its actions restricted to a mask.
 
     Args:
       model: an MDP, a DenseMDP, a SparseMDP, an IntervalMDP, a Product or a Game.
-      allowed: ``bool[S, A]``, in a product ``bool[S, Q, A]``, of a sparse model ``bool[R]``,
-        such as the actions that lose nothing or a permissive strategy's mask.
+      allowed: ``bool[S, A]``, in a product ``bool[S, Q, A]``, of a sparse model ``bool[R]``, such as a
+        permissive strategy.
 
     Returns:
-      A model of the same kind and states, whose `available` is the mask.
+      A model of the same kind and states, whose available actions are the mask.
 
     Raises:
-      ValueError: the mask has another shape or dtype, holds an action that is not available, or
-        leaves a state without any (the latter two unless something is traced).
+      ValueError: a mask of another shape or dtype; unless something is traced, an action that is not
+        available, or a state without any.
 
     Example:
       >>> from jaxltl import from_dense
@@ -91,17 +92,17 @@ def _named(state: list[int]) -> str:
 
 @brief
 class Restriction(NamedTuple):
-    """The reachable part of a model as an ordinary one.
+    """The reachable part of a model.
 
     Attributes:
-      model: S' states, with labels and propositions of the world.
-      base_state: ``int32[S']``, the state of the world that each is.
-      memory: ``int32[S']``, in a product its memory, zero otherwise.
+      model: S' states, with the labels and propositions of the original.
+      base_state: ``int32[S']``, the original state, without the automaton state.
+      memory: ``int32[S']``, the automaton state in a product, else zero.
 
     Example:
       >>> import jaxltl as jl
       >>> path = jl.make_sparse(None, [0, 1, 2, 3], [1, 1, 0], [1, 1, 1], initial=[1, 0, 0])
-      >>> part = jl.restrict(path)
+      >>> part = jl.models.restrict(path)
       >>> part.model.num_states, part.base_state.tolist()
       (2, [0, 1])
     """
@@ -114,20 +115,18 @@ class Restriction(NamedTuple):
 def restrict(
     model: ActionModel, initial: chex.Array | None = None, *, allowed: chex.Array | None = None
 ) -> Restriction:
-    """The states that are reachable from initial ones by allowed actions, on the host.
+    """The states reachable from the initial ones by allowed actions, as a model.
 
     Args:
-      model: an MDP, a SparseMDP, a Product over one, a Game on either, or an IntervalMDP.
-      initial: ``float[S]`` or ``[S, Q]``, a distribution to start from; default the model's.
-      allowed: ``bool[S, A]`` or ``[S, Q, A]``, the actions to keep, such as a permissive
-        strategy's mask; default the available ones. Of a sparse model ``bool[R]``.
+      model: an MDP, a SparseMDP, a Product of one, a Game on them, or an IntervalMDP.
+      initial: ``float[S]`` or ``[S, Q]``, an initial distribution; default: the model's.
+      allowed: ``bool[S, A]`` or ``[S, Q, A]``, of a sparse model ``bool[R]``; default: all actions.
 
     Returns:
-      A :class:`Restriction` to an MDP or SparseMDP, or to a Game on one; labels and propositions
-      are the world's.
+      A :class:`Restriction` to an MDP or SparseMDP, or to a Game on one.
 
     Raises:
-      ValueError: the world has no successor lists, or a reachable state keeps no action.
+      ValueError: a model without successor lists, or a reachable state without an allowed action.
 
     Example:
       >>> import jaxltl as jl
@@ -192,7 +191,7 @@ def _start(model: Model, initial: chex.Array | None) -> np.ndarray:
 def _reached(
     seen: np.ndarray, targets: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 ) -> np.ndarray:
-    """The numbers of the states that are seen at first, or reached from those, ascending."""
+    """The states reachable from the initial mask `seen`, ascending."""
     number = np.empty(seen.size, int)
     frontier = np.flatnonzero(seen)
     while frontier.size:
@@ -207,7 +206,7 @@ def _reached(
 
 
 def _restriction(model: Model, part: Model, states: np.ndarray, num_memory: int) -> Restriction:
-    """A model of some of the states, and what these are in the model."""
+    """A model of some of the states, with their original numbers."""
     base, memory = to_jax(tuple(x.astype(np.int32) for x in np.divmod(states, num_memory)))
     if isinstance(model, Game):
         part = Game(part, to_jax(np.asarray(model.system).ravel()[states]))
@@ -217,7 +216,7 @@ def _restriction(model: Model, part: Model, states: np.ndarray, num_memory: int)
 def _restrict_sparse(
     model: Model, lazy: Model, initial: chex.Array | None, allowed: chex.Array | None
 ) -> Restriction:
-    """The same of a sparse model, or of a product of one, which is written out for it."""
+    """The restriction of a sparse model, or of a product of one as a sparse model."""
     sparse = to_sparse(lazy)
     start = _start(model, initial)
     rows = np.ones(sparse.num_rows, bool)
@@ -236,3 +235,48 @@ def _restrict_sparse(
 
 def _columns(s: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return s[:, None, None], q[:, None, None]
+
+
+# --- sparse models --------------------------------------------------------------------------------
+
+
+def submodel(model: SparseMDP, states: np.ndarray, rows: np.ndarray) -> SparseMDP:
+    """The sparse model of some states ``bool[S]`` and rows ``bool[R]``; ValueError for a state without rows."""
+    host = model.host
+    row = np.flatnonzero(rows & states[host.state])
+    kept = np.flatnonzero(states)
+    number = np.full(host.num_states, -1, np.int32)
+    number[kept] = np.arange(kept.size)
+    choices = np.bincount(number[host.state[row]], minlength=kept.size)
+    if (choices == 0).any():
+        raise ValueError(f"no choice is left in state {kept[int(np.argmin(choices))]}; allow one.")
+    width = np.diff(host.entry_start)[row]
+    entry = concatenated_ranges(host.entry_start[row], width)
+
+    def taken(x: Any, index: np.ndarray) -> Any:
+        return None if x is None else np.asarray(x)[index]
+
+    rewards = {
+        name: Rewards(taken(x.state, kept), taken(x.choice, row), taken(x.transition, entry))
+        for name, x in model.rewards.items()
+    }
+    initial = np.asarray(model.initial)[kept]
+    return replace(
+        model,
+        row_start=offsets_from_counts(choices),
+        entry_start=offsets_from_counts(width),
+        successor=number[host.successor[entry]],
+        probability=host.probability[entry],
+        initial=initial / initial.sum() if initial.sum() else initial,
+        label=np.asarray(model.label)[kept],
+        rewards=rewards,
+        action=taken(model.action, row),
+        valuation={name: taken(x, kept) for name, x in model.valuation.items()},
+    )
+
+
+def reachable_states(model: SparseMDP, start: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """``bool[S]``, the states reachable from `start` by some rows."""
+    host = model.host
+    used = rows[host.row]
+    return forward_reachable(host.state[host.row[used]], host.successor[used], start)

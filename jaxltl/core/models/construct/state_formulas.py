@@ -1,4 +1,4 @@
-"""Where labels and Boolean formulas of them hold in a sparse model."""
+"""Label and Boolean state formulas on sparse models."""
 
 from __future__ import annotations
 
@@ -14,14 +14,13 @@ BUILT_IN = ("init", "deadlock")  # what every model of PRISM and Storm has
 
 
 def label_columns(model: SparseMDP, names: Collection[str], place: str) -> np.ndarray:
-    """Where some labels hold, ``bool[S, len(names)]``.
+    """The states in which labels hold, ``bool[S, len(names)]``.
 
-    A model without the label ``init`` has it in its initial states, and one without ``deadlock``
-    where the only choice is a loop to itself with probability 1, as which readers keep a state
-    without choices.
+    The built-in label ``init`` holds in initial states, and ``deadlock`` where the only choice is a
+    self-loop with probability 1, as which readers keep states without choices.
 
     Raises:
-      ValueError: there is no such label, with those that there are.
+      ValueError: an unknown label.
     """
     known = (*model.propositions, *(x for x in BUILT_IN if x not in model.propositions))
     require_known(names, known, place)
@@ -32,11 +31,11 @@ def label_columns(model: SparseMDP, names: Collection[str], place: str) -> np.nd
         elif name == "init":
             found[:, i] = np.asarray(model.initial) > 0
         else:
-            found[:, i] = _standing_still(model)
+            found[:, i] = _deadlocks(model)
     return found
 
 
-def _standing_still(model: SparseMDP) -> np.ndarray:
+def _deadlocks(model: SparseMDP) -> np.ndarray:
     host = model.host
     row = host.row_start[:-1]
     entry = host.entry_start[row]
@@ -47,7 +46,7 @@ def _standing_still(model: SparseMDP) -> np.ndarray:
 def states_satisfying(
     model: SparseMDP, condition: Formula | str, place: str = "the condition"
 ) -> np.ndarray:
-    """Where a Boolean formula of labels holds, ``bool[S]``.
+    """The states that satisfy a Boolean formula of labels, ``bool[S]``.
 
     Raises:
       ValueError: an unknown label or a temporal operator.
@@ -71,11 +70,7 @@ def states_satisfying(
 def state_letters(
     model: SparseMDP, names: Collection[str], place: str = "the formula"
 ) -> tuple[list[frozenset[str]], np.ndarray]:
-    """The sets of labels that occur, of those named, and the number of each state's: ``int[S]``.
-
-    Raises:
-      ValueError: there is no such label.
-    """
+    """The letters over some labels that occur, and the letter number of each state, ``int[S]``."""
     rows, number = distinct_rows(label_columns(model, names, place))
     return [
         frozenset(n for n, holds in zip(names, row, strict=True) if holds) for row in rows

@@ -1,7 +1,6 @@
-"""Arrays that the host can read, and NumPy in JAX's place for them.
+"""NumPy or jax.numpy, by the kind of the arrays.
 
-An operation of ``jax.numpy`` outside of ``jit`` compiles a program for every shape. What is done
-to concrete arrays once, NumPy does without compiling anything.
+Operations of ``jax.numpy`` outside of ``jit`` compile a program for each shape; NumPy does not.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ import numpy as np
 
 
 def is_traced(tree: Any) -> bool:
-    """Whether the host does not read a tree: an array is abstract, or lies on several devices."""
+    """True if the host cannot read a tree: an array is a tracer, or lies on several devices."""
     return any(
         isinstance(x, jax.core.Tracer) or (isinstance(x, jax.Array) and not x.is_fully_replicated)
         for x in jax.tree.leaves(tree)
@@ -34,7 +33,7 @@ def namespace(*trees: Any) -> tuple[Any, ...]:
 
 
 def to_jax(tree: Any) -> Any:
-    """A tree with JAX arrays; of NumPy's this compiles nothing, where ``jnp.asarray`` may."""
+    """A tree with JAX arrays, without compilation."""
 
     def one(x: Any) -> jax.Array:
         # What is put on a device may share its memory with what it was made of.

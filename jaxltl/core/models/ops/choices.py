@@ -1,7 +1,7 @@
-"""A state's choices, and the reductions over them, by which algorithms see any kind of model.
+"""Choices of a model's states, and reductions over them.
 
-Quantities on choices are ``[S, A]`` where models are padded (``[S, Q, A]`` in a product), and
-``[R]``, a number for each row, where they are sparse. What is asked of them is the same.
+Quantities on choices have the shape ``[S, A]`` for padded models (``[S, Q, A]`` for products) and
+``[R]`` for sparse models. :class:`Actions` and :class:`Rows` have the same methods.
 """
 
 from __future__ import annotations
@@ -22,22 +22,14 @@ from jaxltl.core import validation
 
 
 def action_mean(policy: jax.Array, quantity: jax.Array) -> jax.Array:
-    """Mean over a policy's actions, ``sum_a pi(s, a) x(s, a)``.
-
-    Args:
-      policy: ``float[S, A]``, or ``int32[S]`` for a deterministic policy.
-      quantity: ``[S, A]``, finite.
-
-    Returns:
-      ``[S]``.
-    """
+    """Mean over a policy's actions, ``sum_a pi(s, a) x(s, a)``; the policy is ``float[S, A]`` or ``int32[S]``."""
     if is_deterministic(policy):
         return jnp.take_along_axis(quantity, policy[..., None], axis=-1)[..., 0]
     return jnp.sum(policy * quantity, axis=-1)
 
 
 def action_max(quantity: jax.Array, available: jax.Array) -> jax.Array:
-    """Maximum over available actions, ``[S]`` from ``[S, A]``; written out for few actions."""
+    """Maximum over available actions, ``[S]`` from ``[S, A]``; unrolled for few actions."""
     quantity = jnp.where(available, quantity, -jnp.inf)
     if quantity.shape[-1] > kernels.UNROLL:
         return quantity.max(axis=-1)
@@ -48,7 +40,7 @@ def action_max(quantity: jax.Array, available: jax.Array) -> jax.Array:
 
 
 def action_argmax(quantity: jax.Array, available: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Maximum over available actions and the first action that attains it, ``[S]`` each."""
+    """Maximum over available actions and the first maximiser, ``[S]`` each."""
     quantity = jnp.where(available, quantity, -jnp.inf)
     if quantity.shape[-1] > kernels.UNROLL:
         return quantity.max(axis=-1), quantity.argmax(axis=-1).astype(jnp.int32)
@@ -61,7 +53,7 @@ def action_argmax(quantity: jax.Array, available: jax.Array) -> tuple[jax.Array,
 
 
 def first_action(condition: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Whether a condition ``bool[S, A]`` holds for some action, and the first one (or 0)."""
+    """True where a condition ``bool[S, A]`` holds for some action, and the first such action or 0."""
     if condition.shape[-1] > kernels.UNROLL:
         return condition.any(axis=-1), condition.argmax(axis=-1).astype(jnp.int32)
     some = jnp.zeros(condition.shape[:-1], bool)
@@ -73,7 +65,7 @@ def first_action(condition: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def is_deterministic(policy: chex.Array) -> bool:
-    """Whether a policy is given as one action per state (integers) rather than a distribution."""
+    """True for a deterministic policy, given as integers; ValueError for anything but an array."""
     try:
         kind = jnp.result_type(policy)
     except TypeError:
@@ -86,50 +78,50 @@ def is_deterministic(policy: chex.Array) -> bool:
 
 @brief
 class Actions(NamedTuple):
-    """Choices that are padded to as many actions in every state.
+    """Choices padded to the same number of actions in each state.
 
     Attributes:
-      available: ``bool[S, A]``, which of them exist.
+      available: ``bool[S, A]``, the choices that exist.
     """
 
     available: jax.Array
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of a quantity on choices."""
+        """The shape of a quantity on choices."""
         return self.available.shape
 
     @property
     def layout(self) -> Columns:
-        """What reduces quantities in columns."""
+        """The reductions of quantities in column layout."""
         return Columns()
 
     def spread(self, x: jax.Array) -> jax.Array:
-        """What holds of states, of their choices: something that combines with ``[S, A]``."""
+        """Broadcasts a quantity on states to choices."""
         return x[..., None]
 
     def sum(self, quantity: jax.Array) -> jax.Array:
-        """``[S]``, of a quantity that is zero where there is no choice."""
+        """``[S]``, of a quantity that is zero at unavailable actions."""
         return jnp.sum(quantity, axis=-1)
 
     def max(self, quantity: jax.Array, where: jax.Array | None = None) -> jax.Array:
-        """``[S]``; of some of the choices, minus infinity where there is none."""
+        """``[S]``; minus infinity where the mask `where` is empty."""
         return action_max(quantity, self.available if where is None else where)
 
     def argmax(self, quantity: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """The maximum and the first choice that attains it, ``[S]`` each."""
+        """The maximum and the first maximiser, ``[S]`` each."""
         return action_argmax(quantity, self.available)
 
     def first(self, condition: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Whether a condition holds for some choice, and the first one (or the first of all)."""
+        """True where a condition holds for some choice, and the first one, or choice 0."""
         return first_action(condition)
 
     def all(self, condition: jax.Array) -> jax.Array:
-        """Whether a condition holds for all entries of a state, ``bool[S]``."""
+        """``bool[S]``, True where a condition holds for all entries of a state."""
         return jnp.all(condition, axis=-1)
 
     def logits(self, quantity: jax.Array) -> jax.Array:
-        """The quantity, minus infinity where there is no choice."""
+        """The quantity, minus infinity at unavailable actions."""
         return jnp.where(self.available, quantity, -jnp.inf)
 
     def top(self, logits: jax.Array) -> jax.Array:
@@ -145,49 +137,49 @@ class Actions(NamedTuple):
         return jax.nn.softmax(logits, axis=-1)
 
     def mean(self, policy: jax.Array, quantity: jax.Array) -> jax.Array:
-        """``sum_a pi(s, a) x(s, a)`` for weights, or integers that name a choice of each state."""
+        """``sum_a pi(s, a) x(s, a)`` for weights, or integers that choose an action in each state."""
         return action_mean(policy, quantity)
 
     def one_hot(self, choice: jax.Array, dtype: Any) -> jax.Array:
-        """Weight one on a choice of each state; none on what is no choice of it."""
+        """Weight one on the chosen action of each state."""
         return jax.nn.one_hot(choice, self.shape[-1], dtype=dtype)
 
     def columns(self, quantity: jax.Array) -> list[jax.Array]:
-        """A arrays ``[N]``, which lie side by side in memory."""
+        """A arrays ``[N]``, contiguous in memory."""
         return action_columns(self.shape[-1], quantity)
 
     def whole(self, columns: list[jax.Array]) -> jax.Array:
-        """The quantity with these columns."""
+        """The inverse of `columns`."""
         return jnp.stack(columns, axis=-1).reshape(self.shape)
 
 
 @brief
 class Columns(NamedTuple):
-    """Padded choices whose quantities are an array ``[N, ...]`` for each action.
+    """Padded choices in column layout: an array ``[N, ...]`` for each action.
 
-    Unavailable ones have weight zero and, in maxima, minus infinity.
+    Unavailable actions have weight zero, and minus infinity in maxima.
     """
 
     def spread(self, x: jax.Array, like: list[jax.Array]) -> list[jax.Array]:
-        """What holds of states, or of all of them, of each of their choices."""
+        """Broadcasts a quantity on states to choices."""
         return [x] * len(like)
 
     def sum(self, quantity: list[jax.Array]) -> jax.Array:
-        """As of :class:`Actions`."""
+        """See :class:`Actions`."""
         total = quantity[0]
         for x in quantity[1:]:
             total = jnp.add(total, x)
         return total
 
     def max(self, quantity: list[jax.Array]) -> jax.Array:
-        """As of :class:`Actions`."""
+        """See :class:`Actions`."""
         best = quantity[0]
         for x in quantity[1:]:
             best = jnp.maximum(best, x)
         return best
 
     def best(self, quantity: list[jax.Array]) -> tuple[jax.Array, list[jax.Array]]:
-        """The maximum, and weight one on the first choice that attains it."""
+        """The maximum, and weight one on the first maximiser."""
         best = self.max(quantity)
         weight, free = [], jnp.ones(best.shape, bool)
         for x in quantity:
@@ -197,7 +189,7 @@ class Columns(NamedTuple):
         return best, weight
 
     def mean(self, weight: list[jax.Array], quantity: list[jax.Array]) -> jax.Array:
-        """As of :class:`Actions`; weights may lack the lanes."""
+        """See :class:`Actions`; weights may lack the batch axis."""
         return self.sum([_beside(w, x) * x for w, x in zip(weight, quantity, strict=True)])
 
     def size(self, quantity: list[jax.Array]) -> int:
@@ -205,23 +197,21 @@ class Columns(NamedTuple):
         return quantity[0].shape[0]
 
     def packed(self, quantity: list[jax.Array]) -> jax.Array:
-        """One array of all."""
+        """All columns as one array."""
         return jnp.stack(quantity)
 
     def unpacked(self, packed: jax.Array) -> list[jax.Array]:
-        """What was packed."""
+        """The inverse of `packed`."""
         return list(packed)
 
 
 @brief
 class Rows(NamedTuple):
-    """Choices without padding; those of a state stand together.
-
-    Quantities on them are ``[R, ...]``, in every layout.
+    """Choices without padding, grouped by state; quantities have the shape ``[R, ...]`` in every layout.
 
     Attributes:
-      state: ``int32[R]``, whose they are; ascending.
-      start: ``int32[S + 1]``, where each state's begin.
+      state: ``int32[R]``, the state of each row, ascending.
+      start: ``int32[S + 1]``, the first row of each state.
     """
 
     state: jax.Array
@@ -229,7 +219,7 @@ class Rows(NamedTuple):
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of a quantity on choices."""
+        """The shape of a quantity on choices."""
         return self.state.shape
 
     @property
@@ -243,7 +233,7 @@ class Rows(NamedTuple):
 
     @property
     def available(self) -> jax.Array:
-        """All exist."""
+        """All rows exist."""
         return jnp.ones(self.shape, bool)
 
     def size(self, quantity: jax.Array) -> int:
@@ -251,34 +241,34 @@ class Rows(NamedTuple):
         return self.num_states
 
     def spread(self, x: jax.Array, like: jax.Array | None = None) -> jax.Array:
-        """As of :class:`Actions`; with `like`, a quantity, what has no axis of states stays."""
+        """See :class:`Actions`; with `like`, a quantity without an axis of states is unchanged."""
         x = jnp.asarray(x)
         if like is not None and x.ndim < like.ndim:
             return x
         return kernels.gather(x, self.state)
 
     def sum(self, quantity: jax.Array) -> jax.Array:
-        """As of :class:`Actions`."""
+        """See :class:`Actions`."""
         if quantity.dtype == bool:
             quantity = quantity.astype(jnp.int32)
         return kernels.segment_reduce(jax.ops.segment_sum, quantity, self.state, self.num_states)
 
     def max(self, quantity: jax.Array, where: jax.Array | None = None) -> jax.Array:
-        """As of :class:`Actions`, with the derivative of the choice that attains it."""
+        """See :class:`Actions`; the derivative is that of the maximiser."""
         if where is not None:
             quantity = jnp.where(where, quantity, -jnp.inf)
         best, row = self.argmax(quantity)
         return jnp.where(jnp.isnan(best), jnp.nan, kernels.gather(quantity, row))
 
     def argmax(self, quantity: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """As of :class:`Actions`."""
+        """See :class:`Actions`."""
         fixed = lax.stop_gradient(quantity)
         best = kernels.segment_reduce(jax.ops.segment_max, fixed, self.state, self.num_states)
         some, row = self.first(fixed >= kernels.gather(best, self.state))
         return jnp.where(some, best, jnp.nan), row
 
     def first(self, condition: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """As of :class:`Actions`."""
+        """See :class:`Actions`."""
         last = self.shape[0]
         number = jnp.arange(last, dtype=jnp.int32)
         found = kernels.segment_reduce(
@@ -288,42 +278,42 @@ class Rows(NamedTuple):
         return some, jnp.where(some, found, self.start[:-1]).astype(jnp.int32)
 
     def all(self, condition: jax.Array) -> jax.Array:
-        """As of :class:`Actions`."""
+        """See :class:`Actions`."""
         return ~self.first(~condition)[0]
 
     def logits(self, quantity: jax.Array) -> jax.Array:
-        """As of :class:`Actions`."""
+        """See :class:`Actions`."""
         return quantity
 
     def top(self, logits: jax.Array) -> jax.Array:
-        """As of :class:`Actions`; without derivative."""
+        """See :class:`Actions`; without derivative."""
         fixed = lax.stop_gradient(logits)
         return kernels.segment_reduce(jax.ops.segment_max, fixed, self.state, self.num_states)
 
     def logsumexp(self, logits: jax.Array) -> jax.Array:
-        """As of :class:`Actions`."""
+        """See :class:`Actions`."""
         top = lax.stop_gradient(self.top(logits))
         return jnp.log(self.sum(jnp.exp(logits - self.spread(top)))) + top
 
     def softmax(self, logits: jax.Array) -> jax.Array:
-        """As of :class:`Actions`."""
+        """See :class:`Actions`."""
         raised = jnp.exp(logits - self.spread(lax.stop_gradient(self.top(logits))))
         return raised / self.spread(self.sum(raised))
 
     def mean(self, policy: jax.Array, quantity: jax.Array) -> jax.Array:
-        """As of :class:`Actions`; weights may lack the lanes."""
+        """See :class:`Actions`; weights may lack the batch axis."""
         if is_deterministic(policy):
             return kernels.gather(quantity, policy)
         return self.sum(_beside(policy, quantity) * quantity)
 
     def one_hot(self, choice: jax.Array, dtype: Any) -> jax.Array:
-        """As of :class:`Actions`."""
+        """See :class:`Actions`."""
         number = jnp.arange(self.shape[0], dtype=jnp.int32)
         mine = kernels.gather(jnp.asarray(choice), self.state)
         return (number == mine).astype(jax.dtypes.canonicalize_dtype(dtype))
 
     def best(self, quantity: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """As of :class:`Columns`."""
+        """See :class:`Columns`."""
         best, row = self.argmax(quantity)
         return best, self.one_hot(row, best.dtype)
 
@@ -346,7 +336,7 @@ class Rows(NamedTuple):
 
 @singledispatch
 def choices(model: Model) -> Actions | Rows:
-    """The choices of a model's states; of a representation of one's own, its `available`."""
+    """The choices of a model; a new representation has `available`."""
     if not hasattr(model, "available"):
         raise ValueError(validation.unsupported_model(model))
     return Actions(model.available)
@@ -354,13 +344,56 @@ def choices(model: Model) -> Actions | Rows:
 
 @choices.register(SparseMDP)
 def row_choices(model: SparseMDP) -> Rows:
-    """Of a sparse model."""
+    """The choices of a sparse model."""
     return Rows(kernels.segment_ids(model.row_start, model.num_rows), jnp.asarray(model.row_start))
+
+
+class RowEntries(NamedTuple):
+    """The transitions of a sparse model for compiled sweeps.
+
+    Attributes:
+      choices: the rows.
+      row: ``int32[T]``, the row of each entry.
+      successor: ``int32[T]``.
+      probability: ``float[T]``.
+    """
+
+    choices: Rows
+    row: jax.Array
+    successor: jax.Array
+    probability: jax.Array
+
+    def over_entries(self, operation: Any, quantity: jax.Array) -> jax.Array:
+        """A reduction over the entries of each row: ``[R, ...]`` from ``[T, ...]``."""
+        return kernels.segment_reduce(operation, quantity, self.row, self.choices.shape[0])
+
+    def expectation(self, value: jax.Array) -> jax.Array:
+        """Expected value of the next state, ``[R, ...]`` from ``[S, ...]``."""
+        reached = kernels.gather(value, self.successor)
+        weight = self.probability.reshape(-1, *(1,) * (reached.ndim - 1))
+        return self.over_entries(jax.ops.segment_sum, weight * reached)
+
+    def matrix(self, weight: jax.Array) -> jax.Array:
+        """``float[S, S]`` under weights ``[R]`` of the rows."""
+        size = self.choices.num_states
+        entry = kernels.gather(weight, self.row) * self.probability
+        state = kernels.gather(self.choices.state, self.row)
+        return jnp.zeros((size, size), entry.dtype).at[state, self.successor].add(entry)
+
+
+def row_entries(model: SparseMDP) -> RowEntries:
+    """A sparse model's transitions, with the row of each entry and the state of each row."""
+    return RowEntries(
+        row_choices(model),
+        kernels.segment_ids(model.entry_start, model.num_transitions),
+        jnp.asarray(model.successor),
+        jnp.asarray(model.probability),
+    )
 
 
 @singledispatch
 def choice_shape(model: Model) -> tuple[int, ...]:
-    """The shape of a quantity on choices: ``(S, A)``, in a product ``(S, Q, A)``, or ``(R,)``."""
+    """The shape of a quantity on choices: ``(S, A)``, ``(S, Q, A)`` for a product, or ``(R,)``."""
     if not hasattr(model, "num_actions"):
         raise ValueError(validation.unsupported_model(model))
     return (*model.state_shape, model.num_actions)
@@ -372,7 +405,7 @@ def _(model: SparseMDP) -> tuple[int, ...]:
 
 
 def action_columns(num_actions: int, quantity: jax.Array) -> list[jax.Array]:
-    """``[S, A]`` as A arrays ``[N]``, which lie side by side in memory."""
+    """``[S, A]`` as A arrays ``[N]``, contiguous in memory."""
     rows = quantity.reshape(-1, num_actions)
     return [rows[:, a] for a in range(num_actions)]
 

@@ -1,4 +1,4 @@
-"""The one gather-and-sum over successors, behind every primitive of every model."""
+"""Gather-and-reduce kernels over successors, the basis of the operators of all models."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ import numpy as np
 
 from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
 
-# Transitions of a state up to which what is summed over them is written out, so that XLA fuses
-# it into one pass and with what reads single actions; beyond, programs would grow too large.
+# Transitions of a state up to which sums over them are unrolled, so that XLA fuses them into one
+# pass; beyond, programs would grow too large.
 WRITTEN_OUT = 64
-# Transitions in all up to which they are gathered in one go: one pass over so few is as fast as
-# many, and every pass that is written out takes the compiler some ten milliseconds.
+# Transitions in all up to which one gather is as fast as an unrolled loop, whose passes take the
+# compiler some ten milliseconds each.
 FEW = 2**15
-# Entries of a short last axis up to which a reduction over it is written out.
+# Length of the last axis up to which a reduction over it is unrolled.
 UNROLL = 16
 
 Term = Callable[[jax.Array, jax.Array], jax.Array]
 
 
 def gather(value: Any, index: Any) -> jax.Array:
-    """Rows ``value[index]`` at places that are known to exist, without checks of bounds."""
+    """Rows ``value[index]`` without bounds checks."""
     return jnp.asarray(value).at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
@@ -36,16 +36,9 @@ def fold(
     term: Term = jnp.multiply,
     combine: Term = jnp.add,
 ) -> jax.Array:
-    """Combines, over the successors of one action, terms of a weight and the value there.
+    """Reduces, over the K successors of an action, terms of a weight and the value there: ``[N, ...]``.
 
-    Args:
-      successor: K arrays ``int32[N]``.
-      weight: K arrays ``float[N]``.
-      value: ``[N, ...]``; what stands behind the states is carried along.
-      term, combine: for an expectation, the product and the sum.
-
-    Returns:
-      ``[N, ...]``.
+    `successor` and `weight` are K arrays ``[N]``; trailing axes of `value` are a batch.
     """
     terms = []
     for target, w in zip(successor, weight, strict=True):
@@ -61,10 +54,7 @@ def by_action(
     term: Term = jnp.multiply,
     combine: Term = jnp.add,
 ) -> list[jax.Array]:
-    """:func:`fold` for each action, from tables ``[N, A, K]``: A arrays ``[N, ...]``.
-
-    Where there are few transitions, or many in a state, all actions are combined at once.
-    """
+    """The reduction :func:`fold` of each action, from tables ``[N, A, K]``: A arrays ``[N, ...]``."""
     num_actions, width = successor.shape[1:]
     if successor.size <= FEW:
         found = folded(successor, weight, value, term, combine, axis=2)
@@ -102,7 +92,7 @@ def folded(
     *,
     axis: int,
 ) -> jax.Array:
-    """:func:`fold` along the axis of the successors of whole tables, in one pass."""
+    """The reduction :func:`fold` along the successor axis of whole tables, in one pass."""
     rows = gather(value, successor)
     terms = term(weight.reshape(weight.shape + (1,) * (rows.ndim - weight.ndim)), rows)
     wholes: dict[Any, Any] = {jnp.add: jnp.sum, jnp.logical_or: jnp.any, jnp.minimum: jnp.min}
@@ -110,17 +100,17 @@ def folded(
 
 
 def stacked(columns: Sequence[jax.Array]) -> jax.Array:
-    """Arrays of the actions side by side, as the last axis."""
+    """Columns of actions as the last axis."""
     return jnp.stack(columns, axis=-1)
 
 
 def positive_hits(weight: jax.Array, inside: jax.Array) -> jax.Array:
-    """Whether a successor of positive weight lies in a region."""
+    """True where a successor of positive weight lies in a region."""
     return (weight > 0) & inside
 
 
 def where_positive(weight: jax.Array, value: jax.Array) -> jax.Array:
-    """The value where a successor has positive weight, else the largest of its dtype."""
+    """The value where the weight is positive, else the largest number of its dtype."""
     return jnp.where(weight > 0, value, dtype_max(value.dtype))
 
 
@@ -130,15 +120,15 @@ def dtype_max(dtype: Any) -> Any:
     return jnp.inf if is_float else jnp.iinfo(dtype).max
 
 
-# --- spans that stand one after another ------------------------------------------------------
+# --- segments ------------------------------------------------------------------------------------
 
 
 def segment_ids(start: Any, total: int) -> jax.Array:
-    """Whose span each of a number of things lies in, ``int32[total]``, from the spans' starts."""
+    """The segment of each position, ``int32[total]``, from the starts of nonempty segments."""
     count = start.shape[-1] - 1
     if not is_traced(start):
         return to_jax(np.repeat(np.arange(count, dtype=np.int32), np.diff(np.asarray(start))))
-    # Spans are not empty, so each begins one.
+    # Segments are nonempty, so that each start begins one.
     begins = (
         jnp.zeros(total, jnp.int32)
         .at[start[1:-1]]
@@ -148,5 +138,5 @@ def segment_ids(start: Any, total: int) -> jax.Array:
 
 
 def segment_reduce(operation: Any, quantity: jax.Array, owner: jax.Array, count: int) -> jax.Array:
-    """A reduction such as ``jax.ops.segment_sum`` of what each of so many owners has."""
+    """A segment reduction such as ``jax.ops.segment_sum`` with sorted ids."""
     return operation(quantity, owner, count, indices_are_sorted=True, mode="promise_in_bounds")

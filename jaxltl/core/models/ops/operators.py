@@ -1,13 +1,11 @@
-"""The primitives through which every algorithm sees a model.
+"""Operators of a model: expectation, predecessors, sampling and induced chains.
 
-A model is an :class:`~jaxltl.core.models.mdp.MDP`, a :class:`~jaxltl.core.models.mdp.DenseMDP`, a
-:class:`~jaxltl.core.models.sparse.SparseMDP` or a
-:class:`~jaxltl.core.models.product.Product`. Values have the shape of the model's states,
-``[S]`` or ``[S, Q]``, and quantities on actions have one more axis, A; of a sparse model they are
-``[R]``, and an action is a row. Reductions over a state's choices are those of
-:func:`~jaxltl.core.models.ops.choices.choices`. The functions are open (``functools.singledispatch``):
-a representation of one's own needs ``expectation``, ``exists_successor``, ``forall_successor`` and
-``sample_successor``, and ``least_successor`` where ranks are compared.
+Algorithms see a model through these functions and through the reductions of
+:func:`~jaxltl.core.models.ops.choices.choices`. Values have the shape of the model's states, ``[S]``
+or ``[S, Q]``; quantities on choices have one more axis, A, and for a sparse model the shape ``[R]``.
+The functions are open (``functools.singledispatch``): a new representation registers
+``expectation``, ``exists_successor``, ``forall_successor`` and ``sample_successor``, and
+``least_successor`` for ranks.
 """
 
 from __future__ import annotations
@@ -32,7 +30,7 @@ from jaxltl.core.models.ops.choices import action_mean as action_mean
 from jaxltl.core.models.ops.choices import choice_shape, choices
 from jaxltl.core.models.ops.choices import first_action as first_action
 from jaxltl.core.models.ops.choices import is_deterministic as is_deterministic
-from jaxltl.core.models.ops.entries import row_entries
+from jaxltl.core.models.ops.choices import row_entries
 from jaxltl.core.models.ops.kernels import where_positive
 from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import SparseMDP
@@ -49,11 +47,11 @@ def expectation(model: Model, value: jax.Array) -> jax.Array:
       value: ``float[S]``.
 
     Returns:
-      ``float[S, A]``, zero at unavailable actions. Linear in `value` and in the
-      transition probabilities, and differentiable in both.
+      ``float[S, A]``, zero at unavailable actions. Linear and differentiable in `value` and in the
+      transition probabilities.
 
     Raises:
-      TypeError: the model is none.
+      TypeError: `model` is not a model.
 
     Example:
       >>> from jaxltl import from_dense
@@ -66,19 +64,19 @@ def expectation(model: Model, value: jax.Array) -> jax.Array:
 
 @singledispatch
 def exists_successor(model: Model, region: jax.Array) -> jax.Array:
-    """Whether some successor lies in a region: ``bool[S, A]`` from ``bool[S]``.
+    """Existential predecessors: choices with a successor in a region, ``bool[S, A]`` from ``bool[S]``.
 
-    Decided on the support of the transition function. False at unavailable actions.
+    A successor has positive probability; unavailable actions are False.
 
     Args:
       model: the model.
       region: ``bool[S]``.
 
     Returns:
-      ``bool[S, A]``, of a sparse model ``bool[R]``. Boolean: there is no derivative.
+      ``bool[S, A]``, of a sparse model ``bool[R]``. There is no derivative.
 
     Raises:
-      TypeError: the model is none.
+      TypeError: `model` is not a model.
 
     Example:
       >>> import jaxltl as jl
@@ -91,19 +89,19 @@ def exists_successor(model: Model, region: jax.Array) -> jax.Array:
 
 @singledispatch
 def forall_successor(model: Model, region: jax.Array) -> jax.Array:
-    """Whether all successors lie in a region: ``bool[S, A]`` from ``bool[S]``.
+    """Universal predecessors: choices with all successors in a region, ``bool[S, A]`` from ``bool[S]``.
 
-    Decided on the support; padding counts as true, so unavailable actions are True.
+    A successor has positive probability; unavailable actions are True.
 
     Args:
       model: the model.
       region: ``bool[S]``.
 
     Returns:
-      ``bool[S, A]``, of a sparse model ``bool[R]``. Boolean: there is no derivative.
+      ``bool[S, A]``, of a sparse model ``bool[R]``. There is no derivative.
 
     Raises:
-      TypeError: the model is none.
+      TypeError: `model` is not a model.
 
     Example:
       >>> import jaxltl as jl
@@ -116,10 +114,7 @@ def forall_successor(model: Model, region: jax.Array) -> jax.Array:
 
 @singledispatch
 def least_successor(model: Model, value: jax.Array) -> jax.Array:
-    """Smallest value among the successors: ``[S, A]`` from ``[S]``.
-
-    Decided on the support; the largest value of the dtype at unavailable actions.
-    """
+    """Least value among the successors, ``[S, A]`` from ``[S]``; the dtype's largest at unavailable actions."""
     raise TypeError(_unknown(model))
 
 
@@ -127,20 +122,20 @@ def least_successor(model: Model, value: jax.Array) -> jax.Array:
 def sample_successor(
     model: Model, key: chex.PRNGKey, state: jax.Array, action: jax.Array
 ) -> jax.Array:
-    """One draw from ``P(. | state, action)``; the key is consumed.
+    """A random successor, drawn from ``P(. | state, action)``.
 
-    A product's states are numbered ``s * Q + q``, the order of a flattened value.
+    The states of a product are numbered ``s * Q + q``, the order of a flattened value.
 
     Args:
       model: the model.
-      key: a PRNG key.
+      key: the random key.
       state, action: ``int32[]``.
 
     Returns:
-      ``int32[]``, the successor. Drawn: there is no derivative.
+      ``int32[]``. There is no derivative.
 
     Raises:
-      TypeError: the model is none.
+      TypeError: `model` is not a model.
 
     Example:
       >>> import jaxltl as jl
@@ -153,59 +148,46 @@ def sample_successor(
 
 @singledispatch
 def induced_chain(model: Model, policy: jax.Array) -> MDP | DenseMDP:
-    """The Markov chain of a deterministic policy, as a model with one action.
+    """The Markov chain that a deterministic policy ``int32[S]`` induces, as a model with one action.
 
-    Args:
-      model: the model.
-      policy: ``int32[S]``.
-
-    Returns:
-      A model without labels. Of a product it has ``S * Q`` states, numbered
-      ``s * Q + q``. Differentiable in the transition probabilities.
+    It has no labels; that of a product has ``S * Q`` states, numbered ``s * Q + q``. Differentiable in
+    the transition probabilities.
     """
     raise TypeError(_unknown(model))
 
 
 @singledispatch
 def transition_matrix(model: Model, policy: jax.Array) -> jax.Array:
-    """``P_pi(s, t) = sum_a pi(s, a) P(t | s, a)`` as a full matrix, for small models.
+    """``P_pi(s, t) = sum_a pi(s, a) P(t | s, a)`` as a dense matrix ``float[S, S]``, for small models.
 
-    Args:
-      model: the model.
-      policy: ``float[S, A]``.
-
-    Returns:
-      ``float[S, S]``; of a product, over states numbered ``s * Q + q``.
+    The states of a product are numbered ``s * Q + q``.
     """
     raise TypeError(_unknown(model))
 
 
 @singledispatch
 def policy_operator(model: Model, policy: jax.Array) -> Callable[[jax.Array], jax.Array]:
-    """``v -> P_pi v`` of a deterministic policy, ``float[N]`` from ``float[N]``, for sweeps."""
+    """The operator ``v -> P_pi v`` of a deterministic policy on flat values ``float[N]``."""
     return chain_operator(induced_chain(model, policy))
 
 
 def chain_operator(chain: Model) -> Callable[[jax.Array], jax.Array]:
-    """``v -> P v`` of a model with one action."""
+    """The operator ``v -> P v`` of a model with one action."""
     return lambda value: expectation(chain, value)[:, 0]
 
 
 def pushforward(model: Model, mass: jax.Array) -> jax.Array:
-    """Mass that flows into each state, ``(P' x)(t) = sum_{s, a} P(t | s, a) x(s, a)``.
-
-    The transpose of :func:`expectation`, for every representation.
+    """Mass flow into each state, ``(P' x)(t) = sum_{s, a} P(t | s, a) x(s, a)``: the transposed expectation.
 
     Args:
       model: the model.
       mass: ``float[S, A]``.
 
     Returns:
-      ``float[S]``. Linear in `mass` and in the transition probabilities, and differentiable
-      in both.
+      ``float[S]``. Linear and differentiable in `mass` and in the transition probabilities.
 
     Raises:
-      TypeError: the model is none.
+      TypeError: `model` is not a model.
 
     Example:
       >>> from jaxltl import from_dense
@@ -231,37 +213,26 @@ def _unknown(model: Model) -> str:
 def combined(
     model: Model, value: jax.Array, term: kernels.Term, combine: kernels.Term
 ) -> jax.Array:
-    """Terms of a weight and the value there, combined over the successors of each choice.
+    """A reduction over the successors of each choice, ``[S, ..., A]`` from values ``[S, ...]``.
 
-    What :func:`expectation`, :func:`exists_successor` and :func:`least_successor` are made of where
-    a model is written down as successors.
-
-    Args:
-      model: the model.
-      value: ``[S, ...]``.
-      term, combine: as of :func:`~jaxltl.core.models.ops.kernels.fold`.
-
-    Returns:
-      ``[S, ..., A]``.
+    `term` maps a weight and a value, and `combine` reduces the terms, as in
+    :func:`~jaxltl.core.models.ops.kernels.fold`; :func:`expectation`, :func:`exists_successor` and
+    :func:`least_successor` are its instances.
     """
     raise TypeError(_unknown(model))
 
 
 @singledispatch
 def unpadded_states(model: Model) -> jax.Array | bool:
-    """The states that are the model's own: all, but of one on a mesh ``bool[N]``."""
+    """The states of the original model: True for all, or ``bool[N]`` for a model on a mesh."""
     return True
 
 
 @singledispatch
 def greatest_predecessor(model: Model, quantity: jax.Array) -> jax.Array:
-    """Largest quantity among the choices that may lead to a state: ``[S, ...]``, ``[S, ..., A]``.
+    """Largest quantity among the choices that lead to a state, ``[S, ...]`` from ``[S, ..., A]``.
 
-    Decided on the support; 0 where no choice leads.
-
-    Args:
-      model: the model.
-      quantity: integers, at least 0; of a product ``[S, Q, A]``.
+    Integers of at least 0, and 0 for states without predecessors; of a product ``[S, Q, A]``.
     """
     raise TypeError(_unknown(model))
 
@@ -322,14 +293,14 @@ def _(model: MDP, policy: jax.Array) -> jax.Array:
 
 
 def scatter_matrix(successor: jax.Array, weight: jax.Array) -> jax.Array:
-    """``float[S, S]`` that adds weights ``[S, A, K]`` at (s, successor)."""
+    """``float[S, S]`` with weights ``[S, A, K]`` added at (s, successor)."""
     num_states = successor.shape[0]
     row = jnp.arange(num_states)[:, None, None]
     return jnp.zeros((num_states, num_states), weight.dtype).at[row, successor].add(weight)
 
 
 def make_chain(successor: jax.Array, probability: jax.Array, initial: jax.Array) -> MDP:
-    """An MDP with one action from ``int32[S, K]`` successors and their probabilities."""
+    """A Markov chain, an MDP with one action, from successors ``int32[S, K]``."""
     num_states = successor.shape[0]
     return MDP(
         successor=successor[:, None, :],
@@ -445,11 +416,7 @@ def _(model: SparseMDP, policy: jax.Array) -> Callable[[jax.Array], jax.Array]:
 
 
 def policy_distribution(model: Model, policy: Any) -> jax.Array:
-    """Any policy as ``float[S, A]``, of a sparse model ``float[R]``, its shape checked.
-
-    Raises:
-      ValueError: the policy has neither the shape of states nor of state-action pairs.
-    """
+    """A policy as a distribution ``float[S, A]`` or ``float[R]``; ValueError for a wrong shape."""
     states, pairs = model.state_shape, choice_shape(model)
     if is_deterministic(policy):
         if jnp.shape(policy) != states:
@@ -469,12 +436,12 @@ def policy_distribution(model: Model, policy: Any) -> jax.Array:
 
 
 class Policy(NamedTuple):
-    """A policy as a solver uses it.
+    """A validated policy.
 
     Attributes:
-      distribution: ``float[S, A]``; the policy, made uniform where its row is none.
-      given: the same with the rows as they were, NaN at unavailable actions that they take.
-      valid: ``bool[]``, whether every row was a distribution over available actions.
+      distribution: ``float[S, A]``, uniform where the given row is not a distribution.
+      given: the given rows, NaN where an unavailable action has weight.
+      valid: ``bool[]``, True if all rows are distributions over available actions.
     """
 
     distribution: jax.Array
@@ -483,12 +450,10 @@ class Policy(NamedTuple):
 
 
 def valid_policy(model: Model, policy: jax.Array, where: jax.Array | bool = True) -> Policy:
-    """A policy and whether it is one: rows at least 0, summing to 1, on available actions.
+    """A policy with its validity: rows are distributions over available actions.
 
-    Args:
-      model: the model.
-      policy: ``float[S, A]`` or ``int32[S]``; differentiable in the former.
-      where: ``bool[S]``, the states whose rows count.
+    The model and the policy must not hold subnormal numbers. Only the rows of the states `where` count.
+    Differentiable in a stochastic policy.
     """
     policy, over = policy_distribution(model, policy), choices(model)
     available = over.available
@@ -504,11 +469,7 @@ def valid_policy(model: Model, policy: jax.Array, where: jax.Array | bool = True
 
 
 def require_policy(model: Model, policy: Any, where: Any = True) -> None:
-    """Raises on the host unless a policy is one; passes over traced arrays.
-
-    Raises:
-      ValueError: a row is no distribution over available actions, with its state; or a shape.
-    """
+    """Raises ValueError, naming the state, for a concrete policy that is not valid."""
     if is_traced((model, policy, where)) or unpadded_states(model) is not True:
         return
     world = getattr(model, "mdp", model)
@@ -541,17 +502,7 @@ def require_policy(model: Model, policy: Any, where: Any = True) -> None:
 
 
 def row_weights(model: SparseMDP, policy: Any, where: Any = True) -> np.ndarray:
-    """A policy of a sparse model as weights of its rows, ``float64[R]``, on the host.
-
-    Args:
-      model: a concrete sparse model.
-      policy: rows ``int32[S]``, or their weights ``float[R]``.
-      where: ``bool[S]``, the states whose rows count.
-
-    Raises:
-      ValueError: a shape is wrong, or a state's row is not one of its own, or its weights are no
-        distribution.
-    """
+    """A concrete policy of a sparse model as checked row weights ``float64[R]``; `where` as in :func:`valid_policy`."""
     host, policy = model.host, np.asarray(policy)
     if is_deterministic(policy):
         if policy.shape != (host.num_states,):
@@ -580,7 +531,7 @@ def row_weights(model: SparseMDP, policy: Any, where: Any = True) -> np.ndarray:
 
 
 def require_weights(host: Any, weight: np.ndarray, tolerance: float, where: Any = True) -> None:
-    """Raises a ValueError unless weights ``float[R]`` are a distribution in each state."""
+    """Raises ValueError unless row weights are a distribution in each state."""
     total = host.over_choices(np.add, weight)
     off = ~((np.abs(total - 1) <= tolerance) & (host.over_choices(np.minimum, weight) >= 0))
     off &= where

@@ -1,9 +1,8 @@
-"""Successors and predecessors of numbered states, for sweeps whose speed matters.
+"""Successor and predecessor tables of models, for sweeps.
 
-A model's states are numbered in order of their arrays (``s * Q + q`` in a product), and what
-is swept has the states first and, behind them, lanes that are solved side by side: one gather
-then moves whole rows of lanes. The transposed sweep gathers from lists of predecessors: XLA
-runs a scatter on a CPU one entry at a time.
+States are numbered in the order of their arrays (``s * Q + q`` for a product). Swept values have
+the states first and a batch axis last, so that one gather moves whole rows of the batch. The
+transposed sweep gathers from predecessor lists, since XLA on a CPU runs scatters sequentially.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from jaxltl.core.models.ops import kernels, operators
 from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.models.ops.choices import Columns
 from jaxltl.core.models.ops.choices import action_columns as action_columns
-from jaxltl.core.models.ops.entries import RowEntries, row_entries
+from jaxltl.core.models.ops.choices import RowEntries, row_entries
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import SparseMDP
@@ -35,11 +34,10 @@ _WIDEST = 6  # predecessor lists are at most this many times wider than successo
 
 @brief
 class SuccessorTable(NamedTuple):
-    """Where the pairs of a model lead, ``[A, K, N]``: an array ``[N]`` for each transition.
+    """Successors of all state-action pairs, ``[A, K, N]``: an array ``[N]`` for each action and successor.
 
-    Separate arrays lie side by side in memory whatever layout XLA chooses, without which
-    its loops over states are not vectorised. Where there are few transitions in all, they are
-    one array: programs are smaller.
+    Separate arrays are contiguous whatever layout XLA chooses, which lets it vectorise the loops over
+    states. Small tables are one array, for smaller programs.
 
     Attributes:
       successor: ``int32[N]``, by action and number of the successor.
@@ -51,7 +49,7 @@ class SuccessorTable(NamedTuple):
 
     @property
     def choices(self) -> Columns:
-        """How quantities on actions are laid out."""
+        """The layout of quantities on actions."""
         return Columns()
 
     def expectation(self, value: jax.Array) -> list[jax.Array]:
@@ -65,7 +63,7 @@ class SuccessorTable(NamedTuple):
 @brief
 @struct.dataclass
 class ModelOperator:
-    """The same by a model's own primitive, for models that are too wide or too large to write down.
+    """The operator of a model without a table: too wide, too large or of another representation.
 
     Attributes:
       model: any model.
@@ -94,11 +92,11 @@ class ModelOperator:
 @brief
 @struct.dataclass
 class ShardedSuccessorTable:
-    """As :class:`SuccessorTable` of a model over a mesh, one table of all choices.
+    """The :class:`SuccessorTable` of a model on a mesh, in one table.
 
     Attributes:
       model: the model.
-      successor, probability: ``[N]`` by action and number of the successor; places, not states.
+      successor, probability: ``[N]`` by action and number of the successor, local places.
     """
 
     model: ShardedMDP
@@ -125,7 +123,7 @@ class ShardedSuccessorTable:
 
 @brief
 class PredecessorTable(NamedTuple):
-    """The pairs that lead to each state, ``a * N + i``, padded with probability zero.
+    """State-action pairs ``a * N + i`` that lead to each state, padded with probability zero.
 
     Attributes:
       pair: ``int32[P, N]``.
@@ -143,10 +141,7 @@ class PredecessorTable(NamedTuple):
 def sweep_operator(
     model: Model,
 ) -> SuccessorTable | ShardedSuccessorTable | ModelOperator | RowEntries:
-    """What sweeps a model: its successors where they can be written down, else its primitives.
-
-    Of a sparse model, or a game on one, its entries.
-    """
+    """The fastest operator for sweeps over a model: a table where it fits, else :class:`ModelOperator`."""
     world = model.mdp if isinstance(model, Game) else model
     if isinstance(world, SparseMDP):
         return row_entries(world)
@@ -170,7 +165,7 @@ def _spread_out(model: ShardedMDP) -> ShardedSuccessorTable | None:
 
 
 def successor_table(model: Model) -> SuccessorTable | None:
-    """The successor table of an MDP, of a product of one or of a game; None where it is too large."""
+    """The successor table of an MDP, a product of one, or a game on them; None if too large."""
     model = model.mdp if isinstance(model, Game) else model
     world = model.mdp if isinstance(model, Product) else model
     if not isinstance(world, MDP) or not isinstance(model, MDP | Product):
@@ -205,15 +200,7 @@ def _columns(entries: jax.Array) -> list[list[jax.Array]] | jax.Array:
 
 
 def predecessor_table(models: Sequence[Any]) -> PredecessorTable | None:
-    """The predecessor lists of models of one shape, with a leading axis, on the host.
-
-    Args:
-      models: W models.
-
-    Returns:
-      Lists padded to the longest, ``[W, P, N]``; None if there is no successor table, or if
-      some state has too many predecessors for that to pay.
-    """
+    """Predecessor tables of models of one shape, ``[W, P, N]``; None where padding would waste too much."""
     table_of = jax.jit(successor_table)
     tables = [table_of(model) for model in models]
     lists = []

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxltl.core.models.mesh.sharded import is_sharded
-from jaxltl.core.models.ops.entries import RowEntries
+from jaxltl.core.models.ops.choices import RowEntries
 from jaxltl.core.models.ops.operators import transition_matrix
 from jaxltl.core.models.ops.successor_tables import (
     ModelOperator,
