@@ -589,9 +589,13 @@ def solve(
 @click.option(
     "--graph",
     type=click.Choice(["seen", "complete"]),
-    default="seen",
-    show_default=True,
-    help="Assumption on possible transitions: those in the log, or all.",
+    help="Assumption on possible transitions: those in the log, or all (the default).",
+)
+@click.option(
+    "--least-probability",
+    type=float,
+    metavar="P",
+    help="Assume that no possible transition is less likely than P.",
 )
 @click.option(
     "--method",

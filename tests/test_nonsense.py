@@ -210,8 +210,11 @@ def things(folder):
                 "columns": ("state", "label"),
             },
         ),
-        (jl.learn_guarantee, {**told, "rows": None, "num_claims": None, "tolerance": 1e-6}),
-        (jl.values.guarantee_curve, {**told, "sizes": [1, 2], "seed": 0}),
+        (
+            jl.learn_guarantee,
+            {**told, "graph": "given", "rows": None, "num_claims": None, "tolerance": 1e-6},
+        ),
+        (jl.values.guarantee_curve, {**told, "graph": "given", "sizes": [1, 2], "seed": 0}),
         (jl.solve_property, {"model": model, "prop": 'Pmaxmin=? [F "a"]', "states": None}),
         (
             jl.make_parametric,
@@ -795,7 +798,7 @@ def test_a_log_of_a_world_whose_slips_repeat_a_successor(tmp_path):
     path.write_text("state,action,next\n0,0,0\n0,0,1\n0,0,0\n")
     counts = jl.read_log(path, world)
     assert counts.count.tolist() == [2, 1]
-    assert jl.learn_guarantee(world, counts, "true", 0.9).bound == 1
+    assert jl.learn_guarantee(world, counts, "true", 0.9, graph="given").bound == 1
     with pytest.raises(ValueError, match="convert a model whose rows repeat a successor by to_sp"):
         jl.models.align_counts(world, counts)
     path.write_text("state,action,next\n1,0,0\n")

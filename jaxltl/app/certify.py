@@ -13,6 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from jaxltl.core import validation
+from jaxltl.core.statistics.graph_assumption import Graph, LeastProbability
+from jaxltl.core.validation import Range
 from jaxltl.core.models.construct.counts import TransitionCounts, model_from_counts, align_counts
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.statistics.confidence_sets import check_confidence
@@ -26,6 +29,10 @@ from jaxltl.core.values.evaluation.data_guarantee import (
 SHOWN = 5  # choices for which more samples are recommended
 DIGITS = 5  # of printed bounds, which solvers compute to 1e-6
 POINTS = 13  # of a curve
+_HINT = (
+    "each choice may lead to each of them; --least-probability P or --graph seen assume more, and "
+    "guarantee more"
+)
 PICTURES = (".svg", ".png", ".pdf")
 
 
@@ -37,12 +44,14 @@ class Evidence:
       model: its probabilities are frequencies, or those of a given model.
       counts: ``int64[T]``, of the model's entries.
       states, actions: names of states, and of each choice's action.
+      graph: assumption on transitions that the log does not contain.
     """
 
     model: SparseMDP
     counts: np.ndarray
     states: tuple[str, ...]
     actions: tuple[str, ...]
+    graph: Graph
 
 
 @dataclass(frozen=True)
@@ -68,7 +77,7 @@ def read_evidence(
     model: Path | None = None,
     initial: Sequence[str] = (),
     terminal: Sequence[str] = (),
-    graph: str = "seen",
+    graph: Graph | None = None,
     option: str = "--{} ",
 ) -> Evidence:
     """The transition counts of a log, with a given model or one of the log's frequencies.
@@ -76,7 +85,8 @@ def read_evidence(
     Args:
       log, labels, model: files.
       initial, terminal: names of states.
-      graph: assumption on successors; see :func:`~jaxltl.core.models.construct.counts.model_from_counts`.
+      graph: see :func:`~jaxltl.core.models.construct.counts.model_from_counts`; default
+        ``"complete"``, or ``"given"`` with a model.
       option: format of an option's name in errors.
 
     Returns:
@@ -98,7 +108,9 @@ def read_evidence(
                 "a model has its labels and initial states; leave --labels, --initial "
                 "and --terminal out."
             )
-        return _named(given, align_counts(given, read_log(log, given)))
+        if graph is not None:
+            raise ValueError("a model has its graph; leave --graph and --least-probability out.")
+        return _named(given, align_counts(given, read_log(log, given)), "given")
     if not initial:
         raise ValueError(f"name the initial state: {option.format('initial')}STATE.")
     counts = read_log(log)
@@ -110,14 +122,33 @@ def read_evidence(
                 f"has {_some(counts)}."
             )
     known = None if labels is None else read_labels(labels, counts.states)
+    graph = "complete" if graph is None else graph
     sparse, count = model_from_counts(
         counts,
         initial=list(initial),
         labels=known,
         terminal=terminal,
-        graph="complete" if graph == "complete" else "seen",
+        graph=graph,  # type: ignore[arg-type]
     )
-    return _named(sparse, count)
+    return _named(sparse, count, graph)
+
+
+def graph_of_options(
+    graph: str | None, least_probability: float | None, confidence: float
+) -> Graph | None:
+    """The assumption that two options name; a least probability takes a tenth of the failures.
+
+    Raises:
+      ValueError: both options are given, or the probability is out of range.
+    """
+    if least_probability is None:
+        return graph  # type: ignore[return-value]
+    if graph is not None:
+        raise ValueError("graph and least probability are two assumptions; give one of them.")
+    validation.require_in_range(
+        "least probability", least_probability, Range(0, 1, open_below=True)
+    )
+    return LeastProbability(least_probability, failure=(1 - confidence) / 10)
 
 
 def _some(counts: TransitionCounts) -> str:
@@ -126,13 +157,13 @@ def _some(counts: TransitionCounts) -> str:
     return shown + (f" and {more} more" if more > 0 else "")
 
 
-def _named(model: SparseMDP, counts: np.ndarray) -> Evidence:
+def _named(model: SparseMDP, counts: np.ndarray, graph: Graph) -> Evidence:
     states = model.valuation.get("state")
     names = range(model.num_states) if states is None else states
     rank = np.arange(model.num_rows) - model.host.row_start[model.host.state]
     number = rank if model.action is None else np.asarray(model.action)
     actions = [model.action_names[a] if model.action_names else str(a) for a in number]
-    return Evidence(model, counts, tuple(map(str, names)), tuple(actions))
+    return Evidence(model, counts, tuple(map(str, names)), tuple(actions), graph)
 
 
 def certify(evidence: Evidence, asked: Asked) -> DataGuarantee:
@@ -154,7 +185,8 @@ def certify(evidence: Evidence, asked: Asked) -> DataGuarantee:
       >>> _ = path.write_text("state,action,next,count\\ndock,go,bay,900\\ndock,go,pit,100\\n")
       >>> labels = path.with_name("labels.csv")
       >>> _ = labels.write_text("state,label\\nbay,bay\\n")
-      >>> seen = read_evidence(path, labels=labels, initial=["dock"], terminal=["bay", "pit"])
+      >>> seen = read_evidence(path, labels=labels, initial=["dock"], terminal=["bay", "pit"],
+      ...                      graph="seen")
       >>> found = certify(seen, Asked("F bay", 0.95, "anytime", "max"))
       >>> 0.85 < found.bound < 0.9
       True
@@ -164,6 +196,7 @@ def certify(evidence: Evidence, asked: Asked) -> DataGuarantee:
         evidence.counts,
         asked.formula,
         asked.confidence,
+        graph=evidence.graph,
         method=asked.method,
         objective=asked.objective,
     )  # type: ignore[arg-type]
@@ -179,6 +212,9 @@ def text(evidence: Evidence, asked: Asked, found: DataGuarantee, seconds: float)
         f"  {int(evidence.counts.sum())} transitions of {evidence.model.num_rows} choices in "
         f"{evidence.model.num_states} states, {found.sets.num_claims} claims of {asked.method}",
     ]
+    lines.append(f"  assuming that {found.assumption}")
+    if evidence.graph == "complete":
+        lines.append(f"  {_HINT}")
     status = Status(int(found.satisfaction.solution.status))
     if status != Status.CONVERGED:
         lines.append(f"  the solver's bounds did not converge ({status.name})")
@@ -214,6 +250,7 @@ def entry(evidence: Evidence, asked: Asked, found: DataGuarantee, seconds: float
         "bound": found.bound,
         "optimistic": found.optimistic,
         "confidence": found.confidence,
+        "assumption": found.assumption,
         "method": asked.method,
         "status": Status(int(found.satisfaction.solution.status)).name,
         "samples": int(evidence.counts.sum()),
@@ -283,6 +320,7 @@ def curve(evidence: Evidence, asked: Asked) -> tuple[list[int], list[float]]:
         asked.formula,
         asked.confidence,
         sizes.tolist(),
+        graph=evidence.graph,
         method=asked.method,
         objective=asked.objective,
     )  # type: ignore[arg-type]
@@ -318,7 +356,11 @@ def certify_and_write(
         nothing if policy is None else atomic_write(policy) as file,
         nothing if picture is None else atomic_write(picture) as drawing,
     ):
-        evidence = read_evidence(log, **world)
+        options = dict(world)
+        graph = graph_of_options(
+            options.pop("graph", None), options.pop("least_probability", None), asked.confidence
+        )
+        evidence = read_evidence(log, graph=graph, **options)
         found, seconds = timed(evidence, asked)
         say(text(evidence, asked, found, seconds))
         result = entry(evidence, asked, found, seconds)

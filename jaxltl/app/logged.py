@@ -8,7 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from jaxltl.app.certify import Asked, Evidence, certify, read_evidence, sample_next
+from jaxltl.app.certify import (
+    Asked,
+    Evidence,
+    certify,
+    graph_of_options,
+    read_evidence,
+    sample_next,
+)
 from jaxltl.app.files.models import padded
 from jaxltl.app.files.task_mlirl import WorldTable
 from jaxltl.core.models.mdp import MDP
@@ -61,7 +68,7 @@ def load_logged(folder: Path, table: WorldTable) -> tuple[MDP, tuple[str, ...], 
         labels=None if table.labels is None else folder / table.labels,
         initial=[initial] if isinstance(initial, str) else initial,
         terminal=table.terminal or (),
-        graph=table.graph or "seen",
+        graph=graph_of_options(table.graph, table.least_probability, confidence),
         option="{} = ",
     )
     mdp, actions, column = padded(evidence.model)
@@ -87,7 +94,7 @@ def guaranteed(logged: Logged, model: Product, formula: str, policy: Any) -> dic
     Returns:
       For ``result.json``: ``guaranteed``, a lower bound of the policy's satisfaction probability,
       ``best_guaranteed``, the greatest such bound of any policy, and ``optimistic``, an upper
-      bound for all policies; all with one ``confidence``.
+      bound for all policies; all with one ``confidence``, under the ``assumption``.
     """
     evidence = logged.evidence
     best = certify(evidence, Asked(formula, logged.confidence, logged.method, "max"))
@@ -103,6 +110,7 @@ def guaranteed(logged: Logged, model: Product, formula: str, policy: Any) -> dic
         "guaranteed": safe_mean(share[share > 0], lower, up=False),
         "best_guaranteed": best.bound,
         "optimistic": best.optimistic,
+        "assumption": best.assumption,
         "samples": logged.num_samples,
         "method": logged.method,
         "status": Status(status).name,

@@ -50,6 +50,10 @@ def certified(log, *more):
     )
 
 
+def certified_as_seen(log, *more):
+    return certified(log, "--graph", "seen", *more)
+
+
 def told(printed):
     """The two bounds, as people read them."""
     found = re.match(r"P [<>]= (\S+) with .*\n.* than (\S+)\n", printed)
@@ -58,21 +62,24 @@ def told(printed):
 
 def test_what_is_guaranteed_is_printed_and_written(log):
     out = log.parent / "policy.json"
-    found = certified(log, "--json", "--policy", out)
+    found = certified_as_seen(log, "--json", "--policy", out)
     assert found.exit_code == 0, found.output
     model, counts = model_from_counts(
-        read_log(log), initial="hall", labels=read_labels(log.parent / "labels.csv")
+        read_log(log), initial="hall", graph="seen", labels=read_labels(log.parent / "labels.csv")
     )
-    expected = learn_guarantee(model, counts, "F safe", 0.95)
+    expected = learn_guarantee(model, counts, "F safe", 0.95, graph="seen")
     result = json.loads(found.stdout.splitlines()[-1])
     assert result["bound"] == expected.bound
     assert 0.8 < result["bound"] < 0.9 < result["optimistic"]
     assert result["samples"] == int(counts.sum())
     assert result["sample_next"][0]["action"] == "left"
+    assert "\n  assuming that only transitions that the log contains are possible\n" in found.stdout
+    assert result["assumption"] == expected.assumption
     printed, limit = told(found.stdout)
     assert expected.bound - 1e-5 < printed <= expected.bound
     assert expected.optimistic <= limit < expected.optimistic + 1e-5
     table = json.loads(out.read_text())
+    assert table["assumption"] == expected.assumption
     moves = {(x["state"], x["memory"]): x["action"] for x in table["policy"]}
     assert moves["hall", table["initial_memory"]] == "left"
     assert table["letter"]["kitchen"] == ["safe"]
@@ -80,7 +87,7 @@ def test_what_is_guaranteed_is_printed_and_written(log):
 
 def test_the_other_direction_and_methods(log):
     for method in ("clopper-pearson", "hoeffding", "weissman"):
-        found = certified(log, "--method", method, "--json", "--min")
+        found = certified_as_seen(log, "--method", method, "--json", "--min")
         result = json.loads(found.stdout.splitlines()[-1])
         assert result["optimistic"] <= 0.8 <= result["bound"]
         assert "P <= " in found.stdout
@@ -90,7 +97,7 @@ def test_the_other_direction_and_methods(log):
 
 def test_a_curve_is_drawn(log):
     picture = log.parent / "curve.svg"
-    found = certified(log, "--curve", picture, "--json")
+    found = certified_as_seen(log, "--curve", picture, "--json")
     result = json.loads(found.stdout.splitlines()[-1])
     assert picture.read_bytes().startswith(b"<?xml")
     assert (np.diff(result["curve"]["samples"]) > 0).all()
@@ -121,7 +128,7 @@ def test_a_model_file_has_the_graph(log, tmp_path):
     ],
 )
 def test_mistakes(log, more, message):
-    found = certified(log, *more)
+    found = certified_as_seen(log, *more)
     assert found.exit_code == 2
     assert message in found.stderr
     assert found.stderr.count("\n") == 2  # the first line, and the mistake
@@ -130,9 +137,34 @@ def test_mistakes(log, more, message):
 def test_mistakes_in_files(log):
     place = log.parent / "labels.csv"
     place.write_text("state,label\nkitchen,safe\nattic,safe\n")
-    assert "line 3" in certified(log).stderr
+    assert "line 3" in certified_as_seen(log).stderr
     place.write_text("state,label\nkitchen,sure\n")
-    assert "safe" in certified(log).stderr
+    assert "safe" in certified_as_seen(log).stderr
     log.write_text("state,action\nhall,left\n")
-    assert "next" in certified(log).stderr
+    assert "next" in certified_as_seen(log).stderr
     assert "--initial STATE" in run(log, "F safe", "--confidence", 0.9).stderr
+
+
+def test_nothing_is_assumed_of_the_graph_unless_it_is_said(log):
+    """A choice may lead where the log does not show it to lead."""
+    found = certified(log, "--json")
+    free = json.loads(found.stdout.splitlines()[-1])
+    assert "assuming that there are no states but those that the log names" in found.stdout
+    assert "--least-probability P or --graph seen assume more" in found.stdout
+    least = json.loads(
+        certified(log, "--json", "--least-probability", 0.02).stdout.splitlines()[-1]
+    )
+    assert least["assumption"].startswith("no possible transition is less likely than 0.02")
+    seen = json.loads(certified_as_seen(log, "--json").stdout.splitlines()[-1])
+    assert 0 < free["bound"] < least["bound"] < seen["bound"]
+    assert {x["confidence"] for x in (free, least, seen)} == {0.95}
+    for more, message in (
+        (["--least-probability", 0.02], "give one of them"),
+        (["--model", "world.tra"], "world.tra"),
+    ):
+        wrong = certified_as_seen(log, *more)
+        assert wrong.exit_code == 2 and message in wrong.stderr
+    assert (
+        "least probability=1.5; it must be above 0"
+        in certified(log, "--least-probability", 1.5).stderr
+    )

@@ -34,6 +34,7 @@ confidence = 0.9
 initial = "dock"
 labels = "labels.csv"
 terminal = ["pit"]
+graph = "seen"
 
 [task]
 formula = "!pit U goal"
@@ -114,14 +115,16 @@ def test_what_is_guaranteed_of_a_policy(write, label_on, method):
         counts,
         initial="dock",
         terminal=["pit"],
+        graph="seen",
         labels=read_labels(task.path.parent / "labels.csv"),
     )
-    expected = learn_guarantee(model, count, task.formula, 0.9, method=method)
+    expected = learn_guarantee(model, count, task.formula, 0.9, graph="seen", method=method)
     assert found["best_guaranteed"] == expected.bound
     assert found["optimistic"] == expected.optimistic
     np.testing.assert_allclose(found["guaranteed"], expected.bound, atol=2e-6)
     frequency = float(np.asarray(best.value)[0, int(prod.initial_memory[0])])
     assert found["guaranteed"] < frequency < found["optimistic"]
+    assert found["assumption"] == "only transitions that the log contains are possible"
     assert found["samples"] == 1103 and found["status"] == "CONVERGED"
     assert found["sample_next"][0]["state"] == "dock"
     # By hand: the pit takes all that it may of both ways, the wait of none.
@@ -162,6 +165,9 @@ def test_what_is_guaranteed_of_a_policy(write, label_on, method):
         ),
         (('"dock"', "[]"), "initial = []; it must be"),
         (('["pit"]', '["cellar"]'), "[world] terminal = cellar: the log has no such state"),
+        (('graph = "seen"', ""), "[world] must have either graph ="),
+        (('graph = "seen"', 'graph = "seen"\nleast_probability = 0.1'), "must have either graph ="),
+        (('graph = "seen"', "least_probability = 0"), "least_probability = 0; it must be"),
         (('["pit"]', '["dock"]'), "terminal state 'dock' was left to 'goal'"),
         (('"labels.csv"', '"gone.csv"'), "gone.csv"),
         (('"log.csv"', '"log.csv"\nslip = 0.1'), "slip belongs to a map"),
@@ -239,7 +245,7 @@ def test_what_the_log_never_showed_is_taken_for_impossible_or_not(write):
     for graph, low, high in (("seen", 1 - 1e-6, 1), ("complete", 0.9, 0.999)):
         task = read_task(
             write(
-                ("[task]", f'graph = "{graph}"\n[task]'),
+                ('graph = "seen"', f'graph = "{graph}"'),
                 log=LOG.replace("ramp,pit,100", "ramp,goal,1"),
             )
         )

@@ -199,7 +199,13 @@ def guarantee(state: State, problem: Problem, confidence: float, **options: Any)
     world = problem.model.mdp
     counts = np.asarray(state.counts)[support(world)]
     return learn_guarantee(
-        world, counts, problem.model.automaton, confidence, method="anytime", **options
+        world,
+        counts,
+        problem.model.automaton,
+        confidence,
+        graph="given",
+        method="anytime",
+        **options,
     )
 
 

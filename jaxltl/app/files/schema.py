@@ -56,6 +56,7 @@ NonNegative = Annotated[float, Meta("a finite number of at least 0", _in(0))]
 Unit = Annotated[float, Meta("a finite number in [0, 1]", _in(0, 1))]
 Discount = Annotated[float, Meta("a finite number in [0, 1)", lambda v: 0 <= v < 1)]
 Confidence = Annotated[float, Meta("a number between 0 and 1, such as 0.95", lambda v: 0 < v < 1)]
+LeastProbability = Annotated[float, Meta("a number above 0 and at most 1", lambda v: 0 < v <= 1)]
 Text = Annotated[str, Meta("a text", lambda v: bool(v.strip()))]
 Name = Annotated[
     str,

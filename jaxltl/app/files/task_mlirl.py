@@ -17,6 +17,7 @@ from jaxltl.app.files.schema import (
     Confidence,
     Count,
     Discount,
+    LeastProbability,
     Map,
     NonNegative,
     Number,
@@ -61,7 +62,10 @@ class WorldTable(GridTable):
     terminal: Key[StateNames | None, "States of a log where episodes end."] = None
     graph: Key[
         Literal["seen", "complete"] | None,
-        "Possible successors of a log: those seen, or all states.",
+        "Assumption on the possible transitions of a log: those in the log, or all.",
+    ] = None
+    least_probability: Key[
+        LeastProbability | None, "Assume that no possible transition of a log is less likely."
     ] = None
     method: Key[
         Literal["anytime", "clopper-pearson", "hoeffding", "weissman"] | None,
@@ -73,7 +77,7 @@ class WorldTable(GridTable):
         self.require_one(sources, "a map, a model (a file) or transitions (a log)")
         of_map = ("legend", "wall", "slip", "absorbing")
         if self.transitions is None:
-            of_log = ("confidence", "labels", "terminal", "graph", "method")
+            of_log = ("confidence", "labels", "terminal", "graph", "least_probability", "method")
             self.refuse(of_log, "transitions, a log")
             if isinstance(self.initial, list):
                 raise ValueError(
@@ -87,6 +91,11 @@ class WorldTable(GridTable):
             raise ValueError("lacks confidence of the guarantee from the log, such as 0.95.")
         if self.initial is None:
             raise ValueError("lacks initial, the name of the initial state, or a list of names.")
+        self.require_one(
+            ("graph", "least_probability"),
+            'graph = "seen" (only transitions that the log contains are possible), '
+            'graph = "complete" (all are), or least_probability, of the possible ones',
+        )
 
 
 @table

@@ -131,7 +131,7 @@ def _tiles(result: Result) -> list[tuple[str, str]]:
     if data is not None:
         text = (
             f"guaranteed with confidence {data['confidence']:g}, from "
-            f"{many(data['samples'], 'logged transition')}"
+            f"{many(data['samples'], 'logged transition')}, assuming that {data['assumption']}"
         )
         tiles.insert(0, (rounded_down(data["guaranteed"]), text))
     return tiles
@@ -201,7 +201,7 @@ def _log_remarks(data: Result) -> list[Remark]:
 def _guaranteed(data: Result) -> str:
     return (
         f"P >= {rounded_down(data['guaranteed'])} with confidence {data['confidence']:g}, from "
-        f"{many(data['samples'], 'logged transition')}"
+        f"{many(data['samples'], 'logged transition')}, assuming that {data['assumption']}"
     )
 
 

@@ -269,7 +269,12 @@ def test_the_ball_guarantees_more_than_its_box():
     for i in range(20):
         model, task = spreading(rng), TASKS[i % len(TASKS)]
         found = learn_guarantee(
-            model, drawn(rng, model, int(rng.integers(20, 500))), task, 0.9, method="weissman"
+            model,
+            drawn(rng, model, int(rng.integers(20, 500))),
+            task,
+            0.9,
+            graph="given",
+            method="weissman",
         )
         assert found.model.radius is not None
         box = robust_satisfaction(found.model.box, task, nature="min").solution

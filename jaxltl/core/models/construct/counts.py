@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxltl.core.statistics.graph_assumption import LeastProbability, require_graph
 from jaxltl.core import validation
 from jaxltl.core.sparse.rows import offsets_from_counts
 from jaxltl.core.array_types import Integers
@@ -384,19 +385,17 @@ def model_from_counts(
     counts: TransitionCounts,
     *,
     initial: str | int | Mapping[Any, float] | Sequence[Any],
+    graph: Literal["seen", "complete"] | LeastProbability,
     labels: Mapping[str, Iterable[Any]] | None = None,
     terminal: Iterable[Any] = (),
-    graph: Literal["seen", "complete"] = "seen",
 ) -> tuple[SparseMDP, NDArray[np.int64]]:
-    """A model whose choices are those that were counted, and the counts of its entries.
+    """A model of the choices that were counted, and the counts of its transitions.
 
-    With ``graph="seen"`` it is taken for granted that a choice leads to no state but those that it
-    was counted to lead to (with a count of 0, perhaps); with ``"complete"`` it may lead to every
-    state there is. A state in which nothing was tried and that is not terminal has one choice,
-    `any`, of which nothing is known: it may lead to every state. The model's probabilities are the
-    frequencies, or, of rows with counts of zero, those after one more of each; what is known of
-    them is what :func:`~jaxltl.core.statistics.confidence_sets.intervals_from_counts` makes of the counts with
-    the model's `entry_start`.
+    Its probabilities are the frequencies, or, in rows with a count of 0, those after one more
+    sample of each transition. Confidence sets of the true ones are those of
+    :func:`~jaxltl.core.statistics.confidence_sets.intervals_from_counts` for the returned counts
+    and the model's `entry_start`. A state without samples that is not terminal has one choice,
+    `any`, which may lead to every state.
 
     Args:
       counts: what was counted.
@@ -404,7 +403,11 @@ def model_from_counts(
         of some, by name.
       labels: the states where each proposition holds, by name.
       terminal: states in which runs stay.
-      graph: what is known of the successors.
+      graph: the assumption on transitions that were not observed: ``"seen"``, they are impossible
+        (except those with a count of 0); ``"complete"``, each choice may lead to every state; or
+        :class:`~jaxltl.core.statistics.graph_assumption.LeastProbability`, they are impossible for
+        choices with sufficiently many samples. Pass it to
+        :func:`~jaxltl.core.values.evaluation.data_guarantee.learn_guarantee`, too.
 
     Returns:
       The model, which keeps the names of states as its variable `state`, and ``int64[T]``.
@@ -415,12 +418,13 @@ def model_from_counts(
 
     Example:
       >>> counts = make_counts([0, 0, 1], [0, 0, 0], [0, 1, 1], [7, 3, 9], states=["a", "b"])
-      >>> model, count = model_from_counts(counts, initial="a", labels={"done": ["b"]})
+      >>> model, count = model_from_counts(
+      ...     counts, initial="a", graph="seen", labels={"done": ["b"]})
       >>> model.probability.tolist(), count.tolist(), model.states_with_label("done").tolist()
       ([0.7, 0.3, 1.0], [7, 3, 9], [False, True])
     """
     _require_counts(counts)
-    validation.choice("graph", graph, ("seen", "complete"))
+    require_graph(graph, ("seen", "complete"))
     if labels is not None and not isinstance(labels, Mapping):
         raise ValueError(
             f"labels is {validation.shorten(labels)}; give the states of each label, in a dict."
@@ -440,7 +444,8 @@ def model_from_counts(
     lone = untried * len(names) + (names.index(_ANY) if untried.size else 0)
     choice = np.unique(np.concatenate([tried, lone]))
     state, action = np.divmod(choice, len(names))
-    is_open = ~stays[state] & ((graph == "complete") | np.isin(choice, lone))
+    samples = np.bincount(np.searchsorted(choice, tried), counts.count, choice.size)
+    is_open = ~stays[state] & (_may_miss(graph, samples) | np.isin(choice, lone))
     entries = _entries(counts, np.searchsorted(choice, tried), state, is_open)
     start, successor, count = entries
     labels = {
@@ -458,6 +463,13 @@ def model_from_counts(
         valuation={"state": _variable(counts.states)},
     )
     return model, count
+
+
+def _may_miss(graph: str | LeastProbability, samples: NDArray[Any]) -> NDArray[np.bool_]:
+    """Choices with possible transitions that may not have been observed."""
+    if isinstance(graph, LeastProbability):
+        return samples < graph.sufficient_samples(samples.size)
+    return np.full(samples.shape, graph == "complete")
 
 
 def _entries(

@@ -1,4 +1,4 @@
-"""From counted transitions to a policy and what is guaranteed of it."""
+"""Policies and guarantees for temporal-logic tasks from counted transitions."""
 
 from __future__ import annotations
 
@@ -8,6 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from jaxltl.core.statistics.graph_assumption import (
+    Graph,
+    LeastProbability,
+    describe_graph,
+    require_graph,
+)
 from jaxltl.core.automata.translate import Task
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.construct.counts import TransitionCounts, align_counts
@@ -25,26 +31,27 @@ from jaxltl.core.values.undiscounted.mixture import safe_mean
 @brief(facts=facts.guarantee)
 @dataclass(frozen=True)
 class DataGuarantee:
-    """What data guarantee of a task.
+    """A policy for a task, and bounds on its satisfaction probability with a confidence.
 
     Attributes:
-      bound: a probability, of the initial distribution; with the confidence that was asked for, the
-        task has at least this probability under the policy (at most, where it was to be made
-        small).
-      confidence: the chance, in (0, 1), that data are drawn of which all this is true.
-      optimistic: a probability that no policy exceeds, with the same confidence, of the same data:
-        how much more data can gain at most.
-      satisfaction: the policy, the automaton that is its memory, and nature's worst case.
-      model: the model with its intervals.
-      sets: the sets from which these come.
-      gain: ``float64[R]``, where more samples help: by how much the bound would rise, to first
-        order, if a choice were known to be what its frequencies say.
+      bound: lower bound on the satisfaction probability of the policy from the initial
+        distribution (upper bound if it was minimised).
+      confidence: probability, over the data, that all statements here are true, if the assumption
+        on the graph holds.
+      optimistic: bound that no policy exceeds, with the same confidence and data.
+      satisfaction: the policy, its automaton, and nature's worst case.
+      model: the interval model.
+      sets: the confidence sets of its rows.
+      gain: ``float64[R]``, first-order increase of the bound if a row's probabilities were known
+        to be its frequencies: where more samples help.
+      graph: the assumption on the graph.
 
     Example:
       >>> from jaxltl import make_sparse
       >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [.5, .5, 1, 1], initial=[1, 0, 0],
       ...                    label=[[0], [1], [0]], propositions=["a"])
-      >>> found = learn_guarantee(coin, np.array([900, 100, 0, 0]), "F a", confidence=0.95)
+      >>> found = learn_guarantee(coin, np.array([900, 100, 0, 0]), "F a", confidence=0.95,
+      ...                         graph="given")
       >>> 0.85 < found.bound < 0.9 < found.optimistic < 0.95, found.confidence
       (True, 0.95)
       >>> found.gain.argmax().item(), found.gain.shape  # sample choice 0
@@ -58,6 +65,12 @@ class DataGuarantee:
     model: IntervalMDP
     sets: ConfidenceSets
     gain: np.ndarray
+    graph: Graph
+
+    @property
+    def assumption(self) -> str:
+        """The assumption on the graph, in words."""
+        return describe_graph(self.graph)
 
 
 def learn_guarantee(
@@ -66,37 +79,41 @@ def learn_guarantee(
     task: Task,
     confidence: float,
     *,
+    graph: Graph,
     method: Method = "anytime",
     objective: str = "max",
     rows: Any = None,
     num_claims: int | None = None,
     tolerance: float | None = None,
 ) -> DataGuarantee:
-    """A policy for a formula, and the probability that it has with a confidence.
+    """A policy for a temporal-logic task, with a guarantee from counted transitions.
 
-    Sets that hold all probabilities at once with the confidence
-    (:func:`~jaxltl.core.statistics.confidence_sets.intervals_from_counts`) make an interval model; its worst
-    case over nature is at most (for ``"min"`` at least) the truth for every policy, so it may be
-    optimised over the same data. A ball is taken as it is.
+    Confidence sets that contain all rows of the true model at once
+    (:func:`~jaxltl.core.statistics.confidence_sets.intervals_from_counts`) are an interval model.
+    Its worst case over nature bounds the truth for every policy, so that the policy may be
+    optimised on the same data.
 
     Args:
-      model: its graph, labels and initial distribution count; its probabilities do not. See
-        :func:`~jaxltl.core.models.construct.counts.model_from_counts` for one that is made of a log.
-      counts: of its transitions, matched by name; or ``int[T]``, beside its entries.
-      task: a formula, its text or an automaton.
-      confidence: in (0, 1), of everything that is returned at once.
-      method: ``"anytime"`` holds however data were gathered, ``"clopper-pearson"``,
-        ``"hoeffding"`` and ``"weissman"`` where the number of samples of each choice does not
-        depend on what they were.
+      model: its graph, labels and initial distribution are used, its probabilities are not. See
+        :func:`~jaxltl.core.models.construct.counts.model_from_counts` for a model of a log.
+      counts: of its transitions, matched by name; or ``int[T]``, one for each of its entries.
+      task: a formula, its text, or an automaton.
+      confidence: in (0, 1), of all returned statements at once.
+      graph: the assumption on the model's graph: ``"given"``, it is known; ``"seen"``,
+        ``"complete"`` or :class:`~jaxltl.core.statistics.graph_assumption.LeastProbability`, as it
+        was given to `model_from_counts`. There is no default: the guarantee holds under it only.
+      method: ``"anytime"`` holds for any way of gathering data; ``"clopper-pearson"``,
+        ``"hoeffding"`` and ``"weissman"`` need numbers of samples that do not depend on outcomes.
       objective: ``"max"`` or ``"min"``.
-      rows, num_claims: as of :func:`~jaxltl.core.statistics.confidence_sets.intervals_from_counts`.
-      tolerance: of :func:`~jaxltl.core.values.interval.satisfaction.robust_satisfaction`.
+      rows, num_claims: see :func:`~jaxltl.core.statistics.confidence_sets.intervals_from_counts`.
+      tolerance: width of the enclosures of the interval model's values.
 
     Returns:
       :class:`DataGuarantee`.
 
     Raises:
-      ValueError: the counts do not fit the model, the confidence, a label or a direction.
+      ValueError: the counts do not fit the model; an invalid confidence, label, direction or graph;
+        the model is not complete as `graph` states, or `graph.failure` leaves no confidence.
 
     Concrete arrays only, on the host; not differentiable.
 
@@ -104,7 +121,7 @@ def learn_guarantee(
       >>> from jaxltl import make_sparse
       >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [.5, .5, 1, 1], initial=[1, 0, 0],
       ...                    label=[[0], [1], [0]], propositions=["a"])
-      >>> found = learn_guarantee(coin, np.array([900, 100, 0, 0]), "F a", 0.95,
+      >>> found = learn_guarantee(coin, np.array([900, 100, 0, 0]), "F a", 0.95, graph="given",
       ...                         method="clopper-pearson")
       >>> round(found.bound, 3), round(found.optimistic, 3)
       (0.88, 0.918)
@@ -114,7 +131,7 @@ def learn_guarantee(
     count = align_counts(sparse, counts) if isinstance(counts, TransitionCounts) else counts
     sets = intervals_from_counts(
         count,
-        confidence,
+        _confidence_of_sets(sparse, graph, confidence),
         method=method,
         entry_start=sparse.entry_start,
         rows=rows,
@@ -141,7 +158,30 @@ def learn_guarantee(
         model=interval,
         sets=sets,
         gain=sign * _gain(interval, found, center, share),
+        graph=graph,
     )
+
+
+def _confidence_of_sets(model: SparseMDP, graph: Graph, confidence: float) -> float:
+    """Confidence left for probabilities, after the graph's share of the failures."""
+    require_graph(graph)
+    if isinstance(graph, LeastProbability):
+        if not graph.failure < 1 - confidence:
+            raise ValueError(
+                f"graph.failure={graph.failure:g}; it must be below 1 - confidence, "
+                f"{1 - confidence:g}."
+            )
+        return confidence + graph.failure
+    host = model.host
+    width = np.diff(host.entry_start)
+    loops = np.bincount(host.row, host.successor == host.state[host.row], host.num_rows) == width
+    if graph == "complete" and ((width < host.num_states) & ~loops).any():
+        row = int(np.argmax((width < host.num_states) & ~loops))
+        raise ValueError(
+            f"graph='complete', but choice {row} has {width[row]} of {host.num_states} successors; "
+            "give the assumption by which the model was made."
+        )
+    return confidence
 
 
 def _with_sets(model: SparseMDP, sets: ConfidenceSets) -> tuple[IntervalMDP, np.ndarray]:
@@ -200,18 +240,19 @@ def guarantee_curve(
     confidence: float,
     sizes: Sequence[int],
     *,
+    graph: Graph,
     seed: int = 0,
     method: Method = "anytime",
     objective: str = "max",
 ) -> np.ndarray:
-    """The bound over the number of samples, of random parts of the data.
+    """Guaranteed bounds for random subsets of the data of given sizes.
 
-    Each part is drawn from the one before without replacement, so the curve is that of one order
-    in which the data might have come.
+    Each subset is drawn from the next larger one without replacement: the curve is that of one
+    random order of the data.
 
     Args:
-      model, counts, task, confidence, method, objective: as of :func:`learn_guarantee`; each point
-        has the confidence by itself.
+      model, counts, task, confidence, graph, method, objective: see :func:`learn_guarantee`; each
+        point has the confidence by itself.
       sizes: how many transitions to take, each at most as many as there are.
       seed: of the order.
 
@@ -227,7 +268,8 @@ def guarantee_curve(
       >>> from jaxltl import make_sparse
       >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [.5, .5, 1, 1], initial=[1, 0, 0],
       ...                    label=[[0], [1], [0]], propositions=["a"])
-      >>> curve = guarantee_curve(coin, np.array([900, 100, 0, 0]), "F a", 0.95, [10, 100, 1000])
+      >>> curve = guarantee_curve(coin, np.array([900, 100, 0, 0]), "F a", 0.95, [10, 100, 1000],
+      ...                         graph="given")
       >>> curve.shape, bool((np.diff(curve) > 0).all())
       ((3,), True)
     """
@@ -251,6 +293,6 @@ def guarantee_curve(
     for i in np.argsort(-wanted, kind="stable"):
         every = rng.multivariate_hypergeometric(every, int(wanted[i]), method="marginals")
         bound[i] = learn_guarantee(
-            sparse, every, task, confidence, method=method, objective=objective
+            sparse, every, task, confidence, graph=graph, method=method, objective=objective
         ).bound
     return bound

@@ -207,7 +207,9 @@ def test_from_counts_to_an_interval_model():
 
 def test_integers_as_names():
     counts = make_counts([0, 1], [0, 0], [1, 1], states=["3", "-12"])
-    model, _ = model_from_counts(counts, initial={3: 0.25, "-12": 0.75}, terminal=[-12])
+    model, _ = model_from_counts(
+        counts, initial={3: 0.25, "-12": 0.75}, graph="seen", terminal=[-12]
+    )
     assert model.valuation["state"].tolist() == [3, -12] and model.initial.tolist() == [0.25, 0.75]
     assert in_order({"b", "a"}) == ("a", "b") and in_order(["2", "10", "-3"]) == ("-3", "2", "10")
 
@@ -227,7 +229,7 @@ def test_integers_as_names():
 def test_models_that_are_refused(arguments, message):
     counts = make_counts([0, 1], [0, 0], [1, 1])
     with pytest.raises(ValueError, match=message):
-        model_from_counts(counts, **{"initial": "0"} | arguments)
+        model_from_counts(counts, **{"initial": "0", "graph": "seen"} | arguments)
 
 
 @pytest.mark.parametrize(

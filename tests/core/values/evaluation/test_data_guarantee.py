@@ -5,9 +5,10 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from jaxltl.core.models.construct.counts import make_counts
+from jaxltl.core.models.construct.counts import make_counts, model_from_counts
 from jaxltl.core.models.interval import make_interval
 from jaxltl.core.models.sparse import make_sparse
+from jaxltl.core.statistics.graph_assumption import LeastProbability, describe_graph
 from jaxltl.core.values.evaluation.data_guarantee import guarantee_curve, learn_guarantee, safe_mean
 from jaxltl.core.values.interval.satisfaction import robust_satisfaction
 from jaxltl.core.values.undiscounted.sparse_satisfaction import sparse_satisfaction
@@ -50,7 +51,12 @@ def test_guarantees_hold(method, count):
     for i in range(count):
         model, task = labelled(rng), TASKS[i % len(TASKS)]
         found = learn_guarantee(
-            model, drawn(rng, model, int(rng.integers(1, 300))), task, 0.9, method=method
+            model,
+            drawn(rng, model, int(rng.integers(1, 300))),
+            task,
+            0.9,
+            graph="given",
+            method=method,
         )
         true = sparse_satisfaction(model, task).solution.value[0]
         own = under(model, found)
@@ -113,9 +119,9 @@ def test_more_data_guarantee_more():
     true = sparse_satisfaction(model, "!b U a").solution.value[0]
     counts = drawn(rng, model, 10**6)
     for method in METHODS:
-        found = learn_guarantee(model, counts, "!b U a", 0.99, method=method)
+        found = learn_guarantee(model, counts, "!b U a", 0.99, graph="given", method=method)
         assert true - 0.02 < found.bound <= true <= found.optimistic < true + 0.02
-    worst = learn_guarantee(model, counts, "!b U a", 0.99, objective="min")
+    worst = learn_guarantee(model, counts, "!b U a", 0.99, graph="given", objective="min")
     least = sparse_satisfaction(model, "!b U a", objective="min").solution.value[0]
     assert worst.optimistic <= least + 1e-9
     assert least <= worst.bound < least + 0.02
@@ -138,7 +144,7 @@ def test_where_more_samples_help():
     """The gain is the change of the bound if a choice becomes known, while it is small."""
     model = coins()
     counts = np.array([900_000, 100_000, 8_000, 2_000, 0, 0])
-    found = learn_guarantee(model, counts, "F a", 0.9)
+    found = learn_guarantee(model, counts, "F a", 0.9, graph="given")
     assert found.gain.argmax() == 1
     assert (found.gain >= 0).all()
     sets = found.sets
@@ -151,15 +157,17 @@ def test_where_more_samples_help():
 
 def test_the_curve_of_a_log():
     counts = np.array([9000, 1000, 8000, 2000, 0, 0])
-    curve = guarantee_curve(coins(), counts, "F a", 0.9, [0, 100, 5000, 20_000], seed=1)
+    curve = guarantee_curve(
+        coins(), counts, "F a", 0.9, [0, 100, 5000, 20_000], graph="given", seed=1
+    )
     assert curve[0] == 0
     assert (np.diff(curve) > 0).all()
-    whole = learn_guarantee(coins(), counts, "F a", 0.9).bound
+    whole = learn_guarantee(coins(), counts, "F a", 0.9, graph="given").bound
     assert curve[-1] == whole
-    again = guarantee_curve(coins(), counts, "F a", 0.9, [20_000, 100], seed=1)
+    again = guarantee_curve(coins(), counts, "F a", 0.9, [20_000, 100], graph="given", seed=1)
     assert again[0] == whole
     with pytest.raises(ValueError, match=r"sizes\[1\] is 20001; there are 20000 transitions"):
-        guarantee_curve(coins(), counts, "F a", 0.9, [5, 20_001])
+        guarantee_curve(coins(), counts, "F a", 0.9, [5, 20_001], graph="given")
     for numbers, sizes, message in (
         (counts, [0.5], "sizes is float64"),
         (counts, 5, "sizes is int64"),
@@ -167,16 +175,16 @@ def test_the_curve_of_a_log():
         (-counts, [5], "none is negative"),
     ):
         with pytest.raises(ValueError, match=message):
-            guarantee_curve(coins(), numbers, "F a", 0.9, sizes)
+            guarantee_curve(coins(), numbers, "F a", 0.9, sizes, graph="given")
 
 
 def test_counts_by_name():
     counts = make_counts([0, 0, 1, 1], [0] * 4, [1, 3, 2, 3], [90, 10, 80, 20])
-    found = learn_guarantee(coins(), counts, "F a", 0.9)
-    same = learn_guarantee(coins(), np.array([90, 10, 80, 20, 0, 0]), "F a", 0.9)
+    found = learn_guarantee(coins(), counts, "F a", 0.9, graph="given")
+    same = learn_guarantee(coins(), np.array([90, 10, 80, 20, 0, 0]), "F a", 0.9, graph="given")
     assert found.bound == same.bound > 0.4
     with pytest.raises(ValueError, match="confidence"):
-        learn_guarantee(coins(), counts, "F a", 1.0)
+        learn_guarantee(coins(), counts, "F a", 1.0, graph="given")
 
 
 def test_means_are_rounded_to_the_safe_side():
@@ -188,3 +196,64 @@ def test_means_are_rounded_to_the_safe_side():
         low, high = (safe_mean(share, value, up=up) for up in (False, True))
         assert Fraction(low) <= mean / sum(weights) <= Fraction(high) <= low + Fraction(1, 10**14)
     assert safe_mean(share, np.ones(4), up=False) == 1
+
+
+def test_a_transition_that_was_not_observed_is_not_taken_for_impossible():
+    """A rare fall into the pit: half of the logs do not contain it, so no bound may exclude it."""
+    rng, num_logs, size, rare = np.random.default_rng(0), 60, 1500, 0.0005
+    graphs = {
+        "seen": "seen",
+        "complete": "complete",
+        "least": LeastProbability(rare, failure=0.01),
+        "too large": LeastProbability(0.05, failure=0.01),
+    }
+    wrong = dict.fromkeys(graphs, 0)
+    for _ in range(num_logs):
+        fall = int(rng.binomial(size, rare))
+        counts = make_counts(
+            [0, 0], [0, 0], [1, 2], [size - fall, fall], states=["dock", "bay", "pit"]
+        )
+        counts = counts if fall else make_counts([0], [0], [1], [size], states=counts.states)
+        for name, graph in graphs.items():
+            model, count = model_from_counts(
+                counts,
+                initial="dock",
+                labels={"bay": ["bay"]},
+                terminal=["bay", "pit"],
+                graph=graph,
+            )
+            found = learn_guarantee(model, count, "F bay", 0.95, graph=graph)
+            assert found.confidence == 0.95 and found.optimistic > 1 - rare
+            assert found.assumption == describe_graph(graph)
+            wrong[name] += found.bound > 1 - rare
+    assert wrong["complete"] <= 0.05 * num_logs and wrong["least"] <= 0.05 * num_logs
+    # Assumptions that do not hold.
+    assert wrong["seen"] > 0.3 * num_logs and wrong["too large"] > 0.3 * num_logs
+
+
+@pytest.mark.parametrize(("value", "num_choices"), [(0.3, 1), (0.05, 7), (0.6, 3)])
+def test_sufficient_samples_show_all_transitions(value, num_choices):
+    graph = LeastProbability(value, failure=0.02)
+    samples = graph.sufficient_samples(num_choices)
+    width = int(1 / value)  # the most transitions that a choice can have
+    if width > 1:
+        assert num_choices * width * (1 - value) ** samples <= graph.failure
+        assert num_choices / value * (1 - value) ** (samples - 3) > graph.failure
+    rng = np.random.default_rng(1)
+    drawn = rng.multinomial(samples, [value] * width + [1 - value * width], size=10_000)
+    missed = (drawn[:, :width] == 0).any(1).mean() if width > 1 else 0
+    assert missed * num_choices <= graph.failure * 1.5
+
+
+def test_assumptions_that_are_refused():
+    counts = np.array([90, 10, 80, 20, 0, 0])
+    with pytest.raises(TypeError, match="graph"):
+        learn_guarantee(coins(), counts, "F a", 0.9)
+    with pytest.raises(ValueError, match="graph='all'; choose one of given, seen, complete"):
+        learn_guarantee(coins(), counts, "F a", 0.9, graph="all")
+    with pytest.raises(ValueError, match="graph='complete', but choice 0 has 2 of"):
+        learn_guarantee(coins(), counts, "F a", 0.9, graph="complete")
+    with pytest.raises(ValueError, match=r"graph.failure=0.1; it must be below 1 - confidence"):
+        learn_guarantee(coins(), counts, "F a", 0.95, graph=LeastProbability(0.1, failure=0.1))
+    with pytest.raises(ValueError, match=r"value=0; it must be above 0"):
+        LeastProbability(0)
