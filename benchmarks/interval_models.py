@@ -181,14 +181,14 @@ def measure(name: str, size: int, folder: Path, objectives: tuple[str, ...] = ("
     peer = stormpy.build_model_from_drn[stormpy.Interval](str(path))
     target = model.states_with_label("goal")
     for objective in objectives:
-        for nature in ("min", "max"):
+        for nature in ("adversarial", "cooperative"):
             ours, theirs = [], []
             for _ in range(REPEATS):
                 fresh = model.replace(lower=model.lower)  # nothing is remembered
                 begin = time.process_time()
                 found = robust_reachability(fresh, target, objective=objective, nature=nature)
                 ours.append(time.process_time() - begin)
-                value, seconds = storm(peer, f'P{objective}=? [F "goal"]', objective == nature)
+                value, seconds = storm(peer, f'P{objective}=? [F "goal"]', nature == "cooperative")
                 theirs.append(seconds)
             yield {
                 "model": name,
@@ -211,10 +211,7 @@ def prepared() -> None:
     """Prints the seconds of 1,000 models of 100 states, solved in three ways."""
     import jax
 
-    from jaxltl.core.values.prepared.prepared_interval import (
-        prepare_interval,
-        solve_prepared_interval,
-    )
+    from jaxltl.core.values import prepare, solve_prepared
 
     jax.config.update("jax_enable_x64", True)
     rng = np.random.default_rng(0)
@@ -225,9 +222,9 @@ def prepared() -> None:
         for x in zip(*(_intervals(rng, chance, start, 0.3) for _ in range(LANES)), strict=True)
     )
     target = model.states_with_label("goal")
-    for nature in ("min", "max"):
-        question = prepare_interval(model, target, nature=nature)
-        one = jax.jit(lambda q, a, b: solve_prepared_interval(q, lower=a, upper=b))
+    for nature in ("adversarial", "cooperative"):
+        question = prepare(model, target, nature=nature)
+        one = jax.jit(lambda q, a, b: solve_prepared(q, lower=a, upper=b))
         many = jax.jit(jax.vmap(one, in_axes=(None, 0, 0)))
 
         jax.block_until_ready((one(question, lower[0], upper[0]), many(question, lower, upper)))
@@ -259,7 +256,7 @@ def main() -> None:
         prepared()
         return
     print(
-        f"{'model':<14}{'states':>8}{'policy':>7}{'nature':>7}{'ours s':>9}{'storm s':>9}"
+        f"{'model':<14}{'states':>8}{'policy':>7}{'nature':>12}{'ours s':>9}{'storm s':>9}"
         f"{'ratio':>7}  status [lower, upper] storm"
     )
     with TemporaryDirectory() as folder:
@@ -270,7 +267,7 @@ def main() -> None:
                 for row in measure(name, size, Path(folder), tuple(chosen.objectives)):
                     print(
                         f"{row['model']:<14}{row['states']:>8}{row['policy']:>7}"
-                        f"{row['nature']:>7}{row['ours']:9.3f}{row['storm']:9.3f}"
+                        f"{row['nature']:>12}{row['ours']:9.3f}{row['storm']:9.3f}"
                         f"{row['ours'] / row['storm']:7.2f}  {row['status']} "
                         f"[{row['lower']:.7g}, {row['upper']:.7g}] {row['peer']:.7g} "
                         f"{row['rounds']} {row['method']}",

@@ -201,3 +201,8 @@ def mass_preserving(rng: np.random.Generator, probability: np.ndarray) -> np.nda
     noise = np.where(used, rng.normal(size=used.shape), 0)
     count = np.maximum(used.sum(axis=-1, keepdims=True), 1)
     return np.where(used, noise - noise.sum(axis=-1, keepdims=True) / count, 0)
+
+
+def nature_word(objective, direction):
+    """The word for a nature that maximises (``"max"``) or minimises under an objective."""
+    return "cooperative" if objective == direction else "adversarial"

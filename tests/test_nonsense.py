@@ -91,7 +91,7 @@ def things(folder):
     box = read.over(0.1, 0.9)
     problem = feasible.make_problem(box, "goal", bound=">=")
     asked = {"model": model, "target": "a", "objective": "max", "nature": "min"}
-    solved = robust_reachability(model, "a", nature="min")
+    solved = robust_reachability(model, "a", nature="adversarial")
     ends = {"lower": [0.4, 0.3, 1, 1], "upper": [0.7, 0.6, 1, 1]}
     ball = {"center": [0.5, 0.5, 1, 1], "radius": [0.1, 0, 0]}
     told = {
@@ -142,7 +142,7 @@ def things(folder):
                 "initial": [1, 0, 0],
             },
         ),
-        (jl.values.prepare_interval, {**asked, "stay": None, "reward": None, "policy": None}),
+        (jl.values.prepare, {**asked, "stay": None, "reward": None, "policy": None}),
         (
             jl.statistics.intervals_from_counts,
             {

@@ -100,7 +100,7 @@ def guaranteed(logged: Logged, model: Product, formula: str, policy: Any) -> dic
     best = certify(evidence, Asked(formula, logged.confidence, logged.method, "max"))
     against = product(best.model, model.automaton, label_on=model.label_on)
     weights: Any = np.asarray(policy)[evidence.model.host.state, :, logged.column]
-    found = satisfaction_probability(against, weights, nature="min")
+    found = satisfaction_probability(against, weights, nature="adversarial")
     share = np.asarray(evidence.model.initial)
     lower = from_starts(against, found.lower)[share > 0]
     codes = int(found.status), int(best.satisfaction.solution.status)

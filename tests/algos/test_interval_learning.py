@@ -21,7 +21,7 @@ from jaxltl.core.values.undiscounted.satisfaction import (
     satisfaction_probability,
 )
 from tests import reference
-from tests.support import as_mdp, counted_traces, lane
+from tests.support import as_mdp, counted_traces, lane, nature_word
 
 S, A, K = 6, 2, 3
 TASKS = ("F a & G !b", "G F a & G F b", "F G a | G F b")
@@ -286,7 +286,10 @@ def test_settled_values_are_the_robust_values_of_the_intervals(task):
             intervals = make_interval(model.mdp, state.lower, state.upper)
             for nature, value in (("min", state.pessimistic), ("max", state.optimistic)):
                 exact = robust_satisfaction(
-                    intervals, model.automaton, nature=nature, states=np.arange(S)
+                    intervals,
+                    model.automaton,
+                    nature=nature_word("max", nature),
+                    states=np.arange(S),
                 )
                 np.testing.assert_allclose(
                     np.asarray(value)[:, int(model.automaton.initial)],

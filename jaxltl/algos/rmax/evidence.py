@@ -188,8 +188,10 @@ def data_evidence(
     )
     within = Game(model, np.asarray(problem.game.system)[state])
     weight = np.asarray(strategy, np.float64)[s, a]
-    secured = robust_discounted_value(within, "reward", discount, policy=weight, nature="min")
-    optimal = robust_discounted_value(within, "reward", discount, nature="max")
+    secured = robust_discounted_value(
+        within, "reward", discount, policy=weight, nature="adversarial"
+    )
+    optimal = robust_discounted_value(within, "reward", discount, nature="cooperative")
     bounds = np.full((2, region.size), np.nan)
     bounds[0, state], bounds[1, state] = secured.lower, optimal.upper
     return DataEvidence(bounds[0], bounds[1], float(confidence), int(count.sum()))

@@ -41,9 +41,9 @@ class IntervalMDP:
     """A labelled decision process with an interval for each probability.
 
     A row stands for all distributions p with ``lower <= p <= upper`` and, where there is a radius,
-    ``sum_t |p_t - center_t| <= radius``. Each time that it is taken, nature picks one of them, to
-    make a value small or large (`nature="min"`, `"max"`). Build one with :func:`make_interval` or
-    :func:`interval_rows`, which check it.
+    ``sum_t |p_t - center_t| <= radius``. Each time that it is taken, nature picks one of them,
+    against the policy (`nature="adversarial"`) or with it (`"cooperative"`). Build one with
+    :func:`make_interval` or :func:`interval_rows`, which check it.
 
     Attributes:
       nominal: the graph, labels, rewards and names; its probabilities are one distribution of
@@ -60,7 +60,7 @@ class IntervalMDP:
       >>> rough = jl.make_interval(coin, [0.4, 0.3, 1, 1], [0.7, 0.6, 1, 1])
       >>> rough.num_transitions, rough.lower.tolist(), rough.is_chain
       (4, [0.4, 0.3, 1.0, 1.0], True)
-      >>> round(float(jl.reachability_probability(rough, rough.states_with_label("heads"), nature="min")
+      >>> round(float(jl.reachability_probability(rough, rough.states_with_label("heads"), nature="adversarial")
       ...             .value[0]), 6)
       0.4
     """

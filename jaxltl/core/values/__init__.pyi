@@ -66,8 +66,6 @@ from .prepared.prepared import (
 )
 from .prepared.prepared_interval import (
     PreparedInterval as PreparedInterval,
-    prepare_interval as prepare_interval,
-    solve_prepared_interval as solve_prepared_interval,
 )
 from .properties.solve_property import (
     Answer as Answer,

@@ -28,6 +28,7 @@ from jaxltl.core.values.undiscounted.satisfaction import (
 from jaxltl.io.model_files import read_model, write_model
 from tests.core.sparse.interval.test_balls import within_ball
 from tests.core.values.evaluation.test_data_guarantee import drawn, labelled
+from tests.support import nature_word
 
 TASKS = ["F a", "!b U a", "G F a", "F G a | F b", "G !b"]
 DIRECTIONS = list(itertools.product(("max", "min"), repeat=2))
@@ -62,13 +63,13 @@ def test_half_of_the_radius_moves():
     for radius, least, most in ((0.0, 0.5, 0.5), (0.2, 0.4, 0.6), (1.2, 0.0, 1.0), (2.0, 0, 1)):
         model = around(three(), radius)
         for nature, value in (("min", least), ("max", most)):
-            found = robust_reachability(model, "a", nature=nature)
+            found = robust_reachability(model, "a", nature=nature_word("max", nature))
             assert found.value[0] == pytest.approx(value, abs=1e-15)
             assert found.lower[0] <= value <= found.upper[0]
             within_ball(model.host, found.nature)
     ahead = np.array([0.0, 1.0, 0.9, 0.0])
     model = around(three(), 0.4)
-    assert robust_expectation(model, ahead, nature="min")[0][0] == pytest.approx(0.86 - 0.2)
+    assert robust_expectation(model, ahead, nature="adversarial")[0][0] == pytest.approx(0.86 - 0.2)
     model = make_interval(  # an end that may gain little leaves the rest to the next
         three(),
         np.zeros(6),
@@ -77,7 +78,7 @@ def test_half_of_the_radius_moves():
         radius=[0.4, 0, 0, 0],
     )
     least = 0.86 - 0.05 * 1 - 0.15 * 0.1
-    assert robust_expectation(model, ahead, nature="min")[0][0] == pytest.approx(least)
+    assert robust_expectation(model, ahead, nature="adversarial")[0][0] == pytest.approx(least)
 
 
 def test_in_its_box_more_is_possible():
@@ -92,15 +93,15 @@ def test_in_its_box_more_is_possible():
         radius=[0.2, 0, 0, 0],
     )
     ahead = np.array([1.0, 1.0, 0.0, 0.0])
-    assert robust_expectation(model, ahead, nature="max")[0][0] == pytest.approx(0.6)
-    assert robust_expectation(model.box, ahead, nature="max")[0][0] == pytest.approx(0.7)
+    assert robust_expectation(model, ahead, nature="cooperative")[0][0] == pytest.approx(0.6)
+    assert robust_expectation(model.box, ahead, nature="cooperative")[0][0] == pytest.approx(0.7)
 
 
 def test_what_a_radius_removes():
     """An end may go only if the ball reaches so far."""
     for radius, zero in ((0.19, False), (0.2, True), (0.21, True)):
         model = around(three(), radius)
-        found = robust_reachability(model, "b", nature="min")
+        found = robust_reachability(model, "b", nature="adversarial")
         assert (found.upper[0] == 0) == zero
         # Who is not known to be left out is entered sooner or later.
         again = interval_rows(
@@ -112,7 +113,7 @@ def test_what_a_radius_removes():
             center=[0.5, 0.4, 0.1, 1, 1],
             radius=[radius + 0.8, 0, 0],
         )
-        least = robust_reachability(again, [False, True, True], nature="min")
+        least = robust_reachability(again, [False, True, True], nature="adversarial")
         assert least.lower[0] == (0 if zero else 1)
     never = around(three().replace(probability=np.array([0.5, 0.5, 0, 1, 1, 1])), 0.0)
     assert never.num_transitions == 5  # what can get nothing is left out
@@ -128,7 +129,9 @@ def test_a_full_radius_is_a_box():
         ball = make_interval(model, low, high, center=p, radius=np.full(model.num_rows, 2.0))
         for objective, nature in DIRECTIONS:
             one, other = (
-                robust_satisfaction(x, task, objective=objective, nature=nature)
+                robust_satisfaction(
+                    x, task, objective=objective, nature=nature_word(objective, nature)
+                )
                 for x in (box, ball)
             )
             np.testing.assert_allclose(one.value, other.value, atol=1e-9)
@@ -144,23 +147,23 @@ def test_products_policies_and_games():
         )
         world = make_interval(model, ball.lower, ball.upper, center=ball.center, radius=ball.radius)
         for nature in ("min", "max"):
-            found = robust_satisfaction(world, task, nature=nature)
+            found = robust_satisfaction(world, task, nature=nature_word("max", nature))
             assert found.solution.status == 0
             both = product(world, found.automaton)
-            whole = optimal_satisfaction(both, nature=nature)
+            whole = optimal_satisfaction(both, nature=nature_word("max", nature))
             start = found.product.start[0]
             place = found.product.base_state[start], found.product.memory[start]
             assert whole.value[place] == pytest.approx(found.value[start], abs=2e-6)
             assert whole.nature.shape == (world.num_transitions * both.num_memory,)
-            own = satisfaction_probability(both, whole.policy, nature=nature)
+            own = satisfaction_probability(both, whole.policy, nature=nature_word("max", nature))
             np.testing.assert_allclose(own.value, whole.value, atol=3e-6)
             per = np.diff(world.nominal.row_start)[world.nominal.host.state]
             share = np.tile(1 / per[:, None], both.num_memory)
-            mixed = satisfaction_probability(both, share, nature=nature)
+            mixed = satisfaction_probability(both, share, nature=nature_word("max", nature))
             assert (mixed.lower <= whole.upper).all()
         system = rng.random(world.num_states) < 0.5
         game = robust_reachability(make_game(world, system), "a")
-        free = robust_reachability(world, "a", nature="min")
+        free = robust_reachability(world, "a", nature="adversarial")
         assert (game.lower <= free.upper).all()
         within_ball(world.host, game.nature)
 
@@ -183,16 +186,16 @@ def test_restricted_and_written(tmp_path):
     few = with_allowed(world, first)
     np.testing.assert_array_equal(few.radius, world.radius[first])
     policy = np.flatnonzero(first).astype(np.int32)
-    alone = robust_reachability(world, "a", policy=policy, nature="min")
-    kept = robust_reachability(few, "a", nature="min")
+    alone = robust_reachability(world, "a", policy=policy, nature="adversarial")
+    kept = robust_reachability(few, "a", nature="adversarial")
     np.testing.assert_allclose(kept.value, alone.value, atol=1e-9)
     part = restrict(world)
-    near = robust_reachability(part.model, "a", nature="min").value
-    far = robust_reachability(world, "a", nature="min").value
+    near = robust_reachability(part.model, "a", nature="adversarial").value
+    far = robust_reachability(world, "a", nature="adversarial").value
     np.testing.assert_allclose(near, far[np.asarray(part.base_state)], atol=1e-9)
     for solve in (
         lambda: prepare_interval(world, "a"),
-        lambda: robust_sensitivity(world, kept, "a", nature="min"),
+        lambda: robust_sensitivity(world, kept, "a", nature="adversarial"),
     ):
         with pytest.raises(ValueError, match=r"the model has a radius, .* model.box"):
             solve()
@@ -209,7 +212,7 @@ def test_padded_models_and_successors_that_repeat():
         radius=[[0.2], [0], [0]],
     )
     goal = [False, True, False]
-    assert robust_reachability(model, goal, nature="min").value[0] == pytest.approx(0.5)
+    assert robust_reachability(model, goal, nature="adversarial").value[0] == pytest.approx(0.5)
     twice = interval_rows(
         None,
         [0, 3, 4, 5],
@@ -220,7 +223,7 @@ def test_padded_models_and_successors_that_repeat():
         radius=[0.2, 0, 0],
     )
     assert twice.num_transitions == 4
-    assert robust_reachability(twice, goal, nature="min").value[0] == pytest.approx(0.5)
+    assert robust_reachability(twice, goal, nature="adversarial").value[0] == pytest.approx(0.5)
     gain = robust_discounted_value(twice, [0.0, 1.0, 0.0], 0.5)
     assert gain.value[0] == pytest.approx(0.5 * 0.5 * 2)
 
@@ -277,7 +280,7 @@ def test_the_ball_guarantees_more_than_its_box():
             method="weissman",
         )
         assert found.model.radius is not None
-        box = robust_satisfaction(found.model.box, task, nature="min").solution
+        box = robust_satisfaction(found.model.box, task, nature="adversarial").solution
         assert box.lower[0] <= found.satisfaction.solution.upper[0] + 1e-9
         more += found.bound - box.lower[0]
     assert more > 0.1

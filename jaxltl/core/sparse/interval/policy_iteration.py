@@ -429,10 +429,10 @@ class _Search:
         for _ in range(_ATTEMPTS):
             if best is None:
                 break
-            found = self.evaluate_with_steps(best, self.extra)
-            if found is None:
+            evaluated = self.evaluate_with_steps(best, self.extra)
+            if evaluated is None:
                 break
-            best, self.extra = found
+            best, self.extra = evaluated
             z = best.value - self.extra * best.steps
             if self.operator.proves_attained(z, best):
                 attained = replace(best, bound=z)

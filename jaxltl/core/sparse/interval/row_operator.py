@@ -95,7 +95,7 @@ class Block:
             found -= high[owner]
         else:
             found = two_float_difference(high[target], low[target], high[owner], low[owner])
-        if np.ndim(step_reward):
+        if isinstance(step_reward, np.ndarray):
             step_reward = step_reward[self.owner]
         elif not step_reward:
             return found

@@ -23,7 +23,7 @@ from jaxltl.core.pretty_print import brief
 from jaxltl.core.statistics.confidence_sets import ConfidenceSets, Method, intervals_from_counts
 from jaxltl.core import validation
 from jaxltl.core.values import facts
-from jaxltl.core.values.interval.robust import require_direction
+from jaxltl.core.values.interval.robust import require_objective
 from jaxltl.core.values.interval.satisfaction import RobustSatisfaction, robust_satisfaction
 from jaxltl.core.values.undiscounted.mixture import safe_mean
 
@@ -126,7 +126,7 @@ def learn_guarantee(
       >>> round(found.bound, 3), round(found.optimistic, 3)
       (0.88, 0.918)
     """
-    require_direction(None, objective)
+    require_objective(objective)
     sparse = to_sparse(model)
     count = align_counts(sparse, counts) if isinstance(counts, TransitionCounts) else counts
     sets = intervals_from_counts(
@@ -138,12 +138,11 @@ def learn_guarantee(
         num_claims=num_claims,
     )
     interval, kept = _with_sets(sparse, sets)
-    against, along = ("min", "max") if objective == "max" else ("max", "min")
     found = robust_satisfaction(
-        interval, task, objective=objective, nature=against, tolerance=tolerance
+        interval, task, objective=objective, nature="adversarial", tolerance=tolerance
     )
     best = robust_satisfaction(
-        interval, task, objective=objective, nature=along, tolerance=tolerance
+        interval, task, objective=objective, nature="cooperative", tolerance=tolerance
     )
     share = np.asarray(interval.initial)
     share = share[share > 0]

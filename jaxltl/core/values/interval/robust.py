@@ -25,22 +25,20 @@ from jaxltl.core.values.undiscounted.step_bounded import state_mask
 TOLERANCE = 1e-6
 
 
-def require_direction(nature: str | None, objective: str) -> str:
-    """Nature's direction; against the objective where nothing is said.
+def require_objective(objective: str) -> str:
+    """The objective; ValueError unless it is ``"max"`` or ``"min"``."""
+    return validation.choice("objective", objective, ("max", "min"))
 
-    Raises:
-      ValueError: it, or the objective, is none of ``"min"`` and ``"max"``.
+
+def nature_direction(nature: str | None, objective: str) -> str:
+    """``"max"`` or ``"min"``: what nature optimises under an objective of the policy.
+
+    An ``"adversarial"`` nature (the default) wants the opposite, a ``"cooperative"`` one the same.
     """
-    if not isinstance(objective, str) or objective not in ("max", "min"):
-        raise ValueError(f'objective={validation.shorten(objective)}; it must be "max" or "min".')
-    if nature is None:
-        return "min" if objective == "max" else "max"
-    if not isinstance(nature, str) or nature not in ("max", "min"):
-        raise ValueError(
-            f'nature={validation.shorten(nature)}; it must be "min" (nature makes the value '
-            'small) or "max" (large).'
-        )
-    return nature
+    require_objective(objective)
+    nature = "adversarial" if nature is None else nature
+    validation.choice("nature", nature, ("adversarial", "cooperative"))
+    return objective if nature == "cooperative" else {"max": "min", "min": "max"}[objective]
 
 
 def width_asked(tolerance: Any) -> float:
@@ -49,7 +47,7 @@ def width_asked(tolerance: Any) -> float:
 
 
 def refuse_nature(nature: str | None) -> None:
-    """Raises ValueError if a direction of nature is given where it has nothing to choose."""
+    """Raises ValueError if `nature` is given for a model without uncertainty sets."""
     if nature is not None:
         raise ValueError(
             f"nature={nature!r} is for models with intervals (make_interval); the "
@@ -80,8 +78,7 @@ def robust_reachability(
       policy: ``int32[S]``, rows, or ``float[R]``, their weights, to be evaluated; default:
         optimise. Of a game, the system's, whose environment still chooses.
       objective: ``"max"`` or ``"min"``, what the policy (the system) makes of the probability.
-      nature: ``"min"`` or ``"max"``, what nature makes of it; default: the opposite of
-        `objective` (for a given policy: ``"min"``).
+      nature: ``"adversarial"`` (default), against the objective, or ``"cooperative"``.
       stay: ``bool[S]``, the states that may be passed; default all.
       tolerance: the width of the enclosure asked for, 1e-6.
 
@@ -212,7 +209,7 @@ def robust_discounted_value(
 
 
 def robust_expectation(
-    model: IntervalMDP, value: Any, *, nature: str = "min"
+    model: IntervalMDP, value: Any, *, objective: str = "max", nature: str | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """The expected value of the next state of each choice, as nature makes it.
 
@@ -222,7 +219,7 @@ def robust_expectation(
     Args:
       model: the model.
       value: ``float[S]``, finite.
-      nature: ``"min"`` or ``"max"``.
+      objective, nature: as of :func:`robust_reachability`; the default is the least expectation.
 
     Returns:
       ``float64[R]``, and nature's distributions, ``float64[T]``.
@@ -239,13 +236,13 @@ def robust_expectation(
       >>> robust_expectation(model, [0.0, 4.0])[0].tolist()
       [2.0, 4.0]
     """
-    require_direction(nature, "max")
+    maximize = nature_direction(nature, objective) == "max"
     model, _ = world_of(model)
     require_shape("value", value, model.state_shape)
     ahead = validation.float_array("value", value)[model.host.mdp.successor]
     if not np.isfinite(ahead).all():
         raise ValueError("value is not finite in some successor; give numbers.")
-    p = model.host.extreme_distributions(ahead, maximize=nature == "max")
+    p = model.host.extreme_distributions(ahead, maximize=maximize)
     return model.host.sum_rows(p * ahead), p
 
 
@@ -387,7 +384,7 @@ def sides_of(model: Any, policy: Any, objective: str, nature: str | None) -> Sid
     world, system = world_of(model)
     if policy is None:
         return host_sides(world.host, system, objective, nature)._replace(model=world)
-    helpful = require_direction(nature, objective) == "max"
+    helpful = nature_direction(nature, objective) == "max"
     parted = _under(world, np.asarray(policy), True if system is None else system)
     # What is left to choose is the environment's, against the policy.
     against = helpful if system is None else objective == "min"
@@ -415,7 +412,7 @@ def host_sides(
     host: UncertainMDP, system: np.ndarray | None, objective: str, nature: str | None
 ) -> Sides:
     """:func:`sides_of` on the host, without a policy."""
-    helpful = require_direction(nature, objective) == "max"
+    helpful = nature_direction(nature, objective) == "max"
     maximize = objective == "max"
     if system is None:
         return Sides(None, host, maximize, helpful, None, None)

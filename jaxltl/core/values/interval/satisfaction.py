@@ -84,7 +84,7 @@ def robust_satisfaction(
       model: an IntervalMDP, or a game on one (or on a sparse model).
       task: a formula, its text, or an automaton over the letters that occur in the model.
       objective: ``"max"`` or ``"min"``, what the policy (the system) makes of the probability.
-      nature: ``"min"`` or ``"max"``; default: the opposite of `objective`.
+      nature: ``"adversarial"`` (default), against the objective, or ``"cooperative"``.
       states: ``int[I]``, where runs start; default the initial states.
       tolerance: the width of the enclosure asked for, 1e-6.
 

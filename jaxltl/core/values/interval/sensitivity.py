@@ -14,7 +14,7 @@ from jaxltl.core.sparse.graph.qualitative import backward_reachable
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.types import Solution
 from jaxltl.core import validation
-from jaxltl.core.values.interval.robust import require_direction
+from jaxltl.core.values.interval.robust import nature_direction
 from jaxltl.core.values.undiscounted.step_bounded import state_mask
 
 
@@ -41,7 +41,8 @@ def robust_sensitivity(
     solution: Solution,
     target: Any,
     *,
-    nature: str,
+    objective: str = "max",
+    nature: str | None = None,
     stay: Any = None,
     initial: Any = None,
 ) -> Sensitivity:
@@ -57,7 +58,7 @@ def robust_sensitivity(
       model: the model.
       solution: of it: the probability of reaching a target, or the reward until it is reached.
       target: ``bool[S]``, or the name of a label.
-      nature: ``"min"`` or ``"max"``, what nature made of it.
+      objective, nature: the directions that the solution was asked for.
       stay: ``bool[S]``, the states that may be passed, if the solution was asked so; default all.
       initial: ``float[S]``, weights of the states; default the initial distribution.
 
@@ -77,12 +78,12 @@ def robust_sensitivity(
       >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
       >>> model = make_interval(coin, [0.4, 0.3, 1, 1], [0.7, 0.6, 1, 1])
       >>> goal = [False, True, False]
-      >>> found = robust_reachability(model, goal, nature="min")
-      >>> change = robust_sensitivity(model, found, goal, nature="min", initial=[1, 0, 0])
+      >>> found = robust_reachability(model, goal, nature="adversarial")
+      >>> change = robust_sensitivity(model, found, goal, nature="adversarial", initial=[1, 0, 0])
       >>> change.lower.tolist(), change.upper.tolist()
       ([0.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0])
     """
-    require_direction(nature, "max")
+    maximize = nature_direction(nature, objective) == "max"
     refuse_ball(require_interval(model), "robust_sensitivity is about ends")
     if not isinstance(solution, Solution) or solution.nature is None:
         raise ValueError(
@@ -113,7 +114,7 @@ def robust_sensitivity(
     chain, entry = host.under_policy(policy)
     chance = np.asarray(solution.nature, np.float64)[entry]
     visits = _visits(chain.resolve(chance), goal, passed, weight)
-    change, given = _against_the_rest(host, ahead, nature == "max")
+    change, given = _against_the_rest(host, ahead, maximize)
     taken = np.zeros(host.mdp.num_rows)
     taken[policy] = visits
     change = np.where(taken[host.mdp.row] > 0, change * taken[host.mdp.row], 0)

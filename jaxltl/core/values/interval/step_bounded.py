@@ -14,7 +14,7 @@ from jaxltl.core.sparse.interval.robust_values import Query
 from jaxltl.core.sparse.interval.step_bounded import StepBoundedValues
 from jaxltl.core.types import Solution
 from jaxltl.core import validation
-from jaxltl.core.values.interval.robust import entry_reward, require_direction
+from jaxltl.core.values.interval.robust import entry_reward, nature_direction
 from jaxltl.core.values.undiscounted.step_bounded import (
     solution_from_error,
     state_reward,
@@ -33,7 +33,7 @@ def robust_next_probability(
       model: the model.
       target: ``bool[S]``, or the name of a label.
       objective: ``"max"`` or ``"min"``, what the policy makes of the probability.
-      nature: ``"min"`` or ``"max"``, what nature makes of it; default: the opposite.
+      nature: ``"adversarial"`` (default), against the objective, or ``"cooperative"``.
 
     Returns:
       :class:`~jaxltl.core.types.Solution`, exactly 0 or 1 where supports say so.
@@ -49,10 +49,12 @@ def robust_next_probability(
       >>> robust_next_probability(coin, [False, True]).value.tolist()
       [0.5, 1.0]
     """
-    nature = require_direction(nature, objective)
+    direction = nature_direction(nature, objective)
     chosen = state_mask(require_interval(model).nominal, target, "target")
     return _solution(
-        interval_bounded.next_step(model.host, chosen, Query(objective == "max", nature == "max"))
+        interval_bounded.next_step(
+            model.host, chosen, Query(objective == "max", direction == "max")
+        )
     )
 
 
@@ -89,15 +91,18 @@ def robust_bounded_reachability(
     Example:
       >>> from jaxltl.core.models import interval_rows
       >>> coin = interval_rows(None, [0, 2, 3], [0, 1, 1], [0.25, 0.5, 1], [0.5, 0.75, 1])
-      >>> robust_bounded_reachability(coin, [False, True], 2, nature="max").value.tolist()
+      >>> robust_bounded_reachability(coin, [False, True], 2, nature="cooperative").value.tolist()
       [0.9375, 1.0]
     """
-    nature, steps = require_direction(nature, objective), validation.integer("num_steps", num_steps)
+    direction, steps = (
+        nature_direction(nature, objective),
+        validation.integer("num_steps", num_steps),
+    )
     goal = state_mask(require_interval(model).nominal, target, "target")
     free = np.ones_like(goal) if stay is None else state_mask(model.nominal, stay, "stay")
     return _solution(
         interval_bounded.until(
-            model.host, goal, free, steps, Query(objective == "max", nature == "max")
+            model.host, goal, free, steps, Query(objective == "max", direction == "max")
         )
     )
 
@@ -132,7 +137,7 @@ def robust_cumulative_reward(
     Example:
       >>> from jaxltl.core.models import interval_rows
       >>> coin = interval_rows(None, [0, 2, 3], [0, 1, 1], [0.25, 0.5, 1], [0.5, 0.75, 1])
-      >>> robust_cumulative_reward(coin, [1.0, 0.0], 2, nature="max").value.tolist()
+      >>> robust_cumulative_reward(coin, [1.0, 0.0], 2, nature="cooperative").value.tolist()
       [1.5, 0.0]
     """
     zero = np.zeros(require_interval(model).num_states)
@@ -168,7 +173,7 @@ def robust_instantaneous_reward(
     Example:
       >>> from jaxltl.core.models import interval_rows
       >>> coin = interval_rows(None, [0, 2, 3], [0, 1, 1], [0.25, 0.5, 1], [0.5, 0.75, 1])
-      >>> robust_instantaneous_reward(coin, [1.0, 0.0], 2, nature="max").value.tolist()
+      >>> robust_instantaneous_reward(coin, [1.0, 0.0], 2, nature="cooperative").value.tolist()
       [0.25, 0.0]
     """
     start = state_reward(require_interval(model).nominal, reward)
@@ -184,10 +189,13 @@ def _earned(
     objective: str,
     nature: str | None,
 ) -> Solution:
-    nature, steps = require_direction(nature, objective), validation.integer("num_steps", num_steps)
+    direction, steps = (
+        nature_direction(nature, objective),
+        validation.integer("num_steps", num_steps),
+    )
     return _solution(
         interval_bounded.total(
-            model.host, earned, start, steps, Query(objective == "max", nature == "max")
+            model.host, earned, start, steps, Query(objective == "max", direction == "max")
         ),
         highest=math.inf,
     )

@@ -27,6 +27,13 @@ from jaxltl.core.values import facts
 from jaxltl.core.values.engine.block_sweeps import Blocks, Chosen, chosen_names, meets, sweep
 from jaxltl.core.values.engine.implicit_diff import implicit
 from jaxltl.core.values.engine.iterate import in_turn
+from jaxltl.core.models.interval import IntervalMDP
+from jaxltl.core.values.interval.robust import refuse_nature
+from jaxltl.core.values.prepared.prepared_interval import (
+    PreparedInterval,
+    prepare_interval,
+    solve_prepared_interval,
+)
 from jaxltl.core.values.prepared.interval_iteration import SLACK, Problem, enclose_circles
 
 
@@ -103,8 +110,10 @@ def prepare(
     *,
     stay: chex.Array | None = None,
     reward: str | Rewards | chex.Array | None = None,
+    policy: chex.Array | None = None,
     objective: str = "max",
-) -> Prepared:
+    nature: str | None = None,
+) -> Prepared | PreparedInterval:
     """Puts the states of a model in order, once, for solves with other numbers.
 
     What the graph decides is decided here: chains of single successors, states worth nothing, one
@@ -117,7 +126,10 @@ def prepare(
       stay: ``bool[S]``, the states that may be passed before; default all. Not with a reward.
       reward: asks for the expected total reward until the target and not for the probability of
         reaching it; as of :func:`~jaxltl.core.models.sparse.choice_reward`, finite and at least 0.
+      policy: of an IntervalMDP, rows ``int32[S]`` to be evaluated; default: optimise.
       objective: ``"max"``, ``"min"``, or ``"policy"`` for values of policies that are given later.
+      nature: of an IntervalMDP, ``"adversarial"`` (default) or ``"cooperative"``, see
+        :func:`~jaxltl.core.values.prepared.prepared_interval.prepare_interval`.
 
     Returns:
       A pytree of arrays. Which transitions are possible and which rewards are zero is settled.
@@ -136,6 +148,22 @@ def prepare(
       >>> round(solve(jnp.array([0.25, 0.75, 1, 1])).item(), 3)
       0.25
     """
+    if isinstance(model, IntervalMDP):
+        return prepare_interval(
+            model,
+            target,
+            stay=stay,
+            reward=reward,
+            policy=policy,
+            objective=objective,
+            nature=nature,
+        )
+    refuse_nature(nature)
+    if policy is not None:
+        raise ValueError(
+            'policy is for models with intervals; prepare with objective="policy" and give the '
+            "policy to solve_prepared."
+        )
     if objective not in ("max", "min", "policy"):
         raise ValueError(f'objective={objective!r}; it must be "max", "min" or "policy".')
     refuse_sharded(model)
@@ -219,9 +247,11 @@ def _prepared(host: Any, plan: Plan, cost: Any, objective: str) -> Prepared:
 
 @validated()
 def solve_prepared(
-    prepared: Prepared,
+    prepared: Prepared | PreparedInterval,
     *,
     probability: chex.Array | None = None,
+    lower: chex.Array | None = None,
+    upper: chex.Array | None = None,
     reward: chex.Array | None = None,
     policy: chex.Array | None = None,
     tolerance: chex.Array | float | None = None,
@@ -235,6 +265,8 @@ def solve_prepared(
     Args:
       prepared: the question.
       probability: ``float[T]``, of the same transitions, all positive; rows sum to one.
+      lower, upper: ``float[T]``, of a prepared IntervalMDP in place of probabilities, see
+        :func:`~jaxltl.core.values.prepared.prepared_interval.solve_prepared_interval`.
       reward: ``float[R]``, finite, at least 0, and 0 where it was; also positive where it was, if
         the least is asked for. Only if a reward was prepared.
       policy: rows ``int32[S]`` or weights ``float[R]``, if it was prepared for policies; a chain
@@ -267,6 +299,19 @@ def solve_prepared(
       >>> slope.shape
       (4,)
     """
+    if isinstance(prepared, PreparedInterval):
+        if probability is not None or policy is not None:
+            raise ValueError("a question about intervals takes lower and upper ends and a reward.")
+        return solve_prepared_interval(
+            prepared,
+            lower=lower,
+            upper=upper,
+            reward=reward,
+            tolerance=tolerance,
+            max_steps=max_steps,
+        )
+    if lower is not None or upper is not None:
+        raise ValueError("lower and upper are for a prepared IntervalMDP; give probability.")
     probability, reward = given_numbers(prepared, probability, reward)
     policy = None if policy is None else jnp.asarray(policy)
     chain = prepared.num_rows == prepared.num_states

@@ -39,7 +39,7 @@ from jaxltl.core.values.interval.contest import (
     rounding,
     system,
 )
-from jaxltl.core.values.interval.robust import interval_reward, require_direction, width_asked
+from jaxltl.core.values.interval.robust import interval_reward, nature_direction, width_asked
 from jaxltl.core.values.undiscounted.step_bounded import state_mask
 
 _LOOSE = 1e-6  # how far ends may miss a distribution, as in the models
@@ -68,7 +68,7 @@ class PreparedInterval:
       answers: what must stay so: entries, questions, their rows, answers.
       lower, upper, reward: ``float[T]``, ``float[T]``, ``float[R]``, as they were.
       question: ``"probability"`` or ``"reward"``, static.
-      objective, nature: ``"max"`` or ``"min"``, static.
+      objective, nature_objective: ``"max"`` or ``"min"``, of the policy and of nature, static.
       num_rows: R, static.
       circling: whether who gets out may stay for ever, static.
 
@@ -76,7 +76,7 @@ class PreparedInterval:
       >>> from jaxltl.core.models import interval_rows
       >>> coin = interval_rows(None, [0, 2, 3, 4], [1, 2, 1, 2], [.4, .3, 1, 1], [.7, .6, 1, 1])
       >>> prepared = prepare_interval(coin, [False, True, False])
-      >>> prepared.objective, prepared.nature, prepared.size, prepared.node.tolist()
+      >>> prepared.objective, prepared.nature_objective, prepared.size, prepared.node.tolist()
       ('max', 'min', 1, [0, 2, 1])
     """
 
@@ -96,7 +96,7 @@ class PreparedInterval:
     reward: Any
     question: str = struct.field(pytree_node=False)
     objective: str = struct.field(pytree_node=False)
-    nature: str = struct.field(pytree_node=False)
+    nature_objective: str = struct.field(pytree_node=False)
     num_rows: int = struct.field(pytree_node=False)
     circling: bool = struct.field(pytree_node=False)
 
@@ -131,8 +131,7 @@ def prepare_interval(
         :func:`~jaxltl.core.values.interval.robust.robust_total_reward`.
       policy: ``int32[S]``, rows to be evaluated; default: optimise.
       objective: ``"max"`` or ``"min"``, what the policy makes of the value.
-      nature: ``"min"`` or ``"max"``, what nature makes of it; default: the opposite of
-        `objective` (for a given policy: ``"min"``).
+      nature: ``"adversarial"`` (default), against the objective, or ``"cooperative"``.
 
     Returns:
       A pytree of arrays. Where ends and rewards are positive is settled, and so is which successors
@@ -162,7 +161,7 @@ def prepare_interval(
     refuse_ball(require_interval(model), "prepare_interval has no rule for its derivatives")
     if stay is not None and reward is not None:
         raise ValueError("expected rewards are until the target alone: leave stay out.")
-    nature = require_direction(nature, objective)
+    direction = nature_direction(nature, objective)
     target = state_mask(model.nominal, target, "target")
     stay = None if stay is None else state_mask(model.nominal, stay, "stay")
     host: UncertainMDP = model.host
@@ -176,7 +175,7 @@ def prepare_interval(
             )
         row_weights(model.nominal, policy)  # checks it
         host, entry = host.under_policy(policy)
-    up, large = objective == "max", nature == "max"
+    up, large = objective == "max", direction == "max"
     if policy is not None:
         up = large  # who decides nothing wants what nature wants
     cost = None if reward is None else interval_reward(model, reward)
@@ -185,7 +184,7 @@ def prepare_interval(
     else:
         mine = cost if policy is None else cost[np.asarray(policy)]
         plan = plan_total_reward(host, mine, target, Query(up, large))
-    return _prepared(model, host, entry, plan, cost, policy, (objective, nature, up))
+    return _prepared(model, host, entry, plan, cost, policy, (objective, direction, up))
 
 
 def _prepared(
@@ -228,7 +227,7 @@ def _prepared(
     origin = np.arange(mdp.num_rows) if policy is None else np.asarray(policy)
     inside = np.ones(whole.num_transitions, bool)
     inside[entry] = plan.within
-    objective, nature, _ = directions
+    objective, direction, _ = directions
     answers = plan.queries
     found = PreparedInterval(
         table=table,
@@ -252,7 +251,7 @@ def _prepared(
         reward=None if cost is None else cost.astype(dtype),
         question="probability" if cost is None else "reward",
         objective=objective,
-        nature=nature,
+        nature_objective=direction,
         num_rows=whole.num_rows,
         circling=plan.has_free_cycles,
     )
@@ -407,7 +406,7 @@ def _contest(prepared: PreparedInterval, lower: Any, upper: Any, reward: Any) ->
     cost = -reward[prepared.row] if is_reward else jnp.zeros(prepared.row.shape, low.dtype)
     wanted = "min" if is_reward else "max"
     chain = prepared.choice.shape[1] == 1
-    nature = prepared.nature == wanted
+    nature = prepared.nature_objective == wanted
     return Contest(
         prepared.target,
         prepared.owner,

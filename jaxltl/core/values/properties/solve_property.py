@@ -126,8 +126,11 @@ class _Aim(NamedTuple):
 
     @property
     def directions(self) -> dict[str, Any]:
-        """As solvers take it."""
-        return {"objective": self.policy, "nature": self.nature}
+        """Keyword arguments of the solvers."""
+        if self.nature is None:
+            return {"objective": self.policy, "nature": None}
+        nature = "cooperative" if self.nature == self.policy else "adversarial"
+        return {"objective": self.policy, "nature": nature}
 
 
 @validated()

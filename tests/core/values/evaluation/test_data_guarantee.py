@@ -71,7 +71,7 @@ def under(model, found):
     """The true probability under the policy, whose memory is the automaton's state."""
     product = found.satisfaction.product
     points = make_interval(model, model.probability, model.probability)
-    whole = robust_satisfaction(points, found.satisfaction.automaton, nature="max")
+    whole = robust_satisfaction(points, found.satisfaction.automaton, nature="cooperative")
     np.testing.assert_array_equal(whole.product.base_state, product.base_state)
     host = whole.product.host
     taken = whole.product.base_row == np.asarray(found.satisfaction.solution.policy)[host.state]

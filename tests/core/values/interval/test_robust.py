@@ -27,7 +27,7 @@ from jaxltl.core.values.undiscounted.satisfaction import (
 from jaxltl.core.values.undiscounted.sparse_satisfaction import sparse_satisfaction
 from jaxltl.core.values.undiscounted.total_reward import total_reward
 from tests.reference_intervals import chains, parity, random_model, reach, reward
-from tests.support import counts
+from tests.support import counts, nature_word
 
 DIRECTIONS = [("max", "max"), ("max", "min"), ("min", "max"), ("min", "min")]
 TASKS = [
@@ -73,7 +73,9 @@ def test_points_are_the_exact_model():
         task = TASKS[i % len(TASKS)]
         for objective, nature in DIRECTIONS:
             exact = sparse_satisfaction(given, task, objective=objective).solution
-            found = robust_satisfaction(model, task, objective=objective, nature=nature).solution
+            found = robust_satisfaction(
+                model, task, objective=objective, nature=nature_word(objective, nature)
+            ).solution
             assert int(found.status) == Status.CONVERGED
             np.testing.assert_allclose(found.value, exact.value, atol=2e-6)
 
@@ -91,7 +93,9 @@ def test_wider_intervals_give_nature_more():
             for width in (0.05, 0.2, 1.0):
                 model = around(given, width)
                 least, most = (
-                    robust_satisfaction(model, task, objective=objective, nature=nature).solution
+                    robust_satisfaction(
+                        model, task, objective=objective, nature=nature_word(objective, nature)
+                    ).solution
                     for nature in ("min", "max")
                 )
                 assert int(least.status) == int(most.status) == Status.CONVERGED
@@ -112,9 +116,15 @@ def test_products(label_on):
         if label_on == "entry":
             start = np.asarray(pairs.automaton.delta)[start, np.asarray(pairs.letter)]
         for objective, nature in DIRECTIONS:
-            found = optimal_satisfaction(pairs, objective=objective, nature=nature)
+            found = optimal_satisfaction(
+                pairs, objective=objective, nature=nature_word(objective, nature)
+            )
             alone = robust_satisfaction(
-                model, task, objective=objective, nature=nature, states=np.arange(4)
+                model,
+                task,
+                objective=objective,
+                nature=nature_word(objective, nature),
+                states=np.arange(4),
             ).solution
             assert int(found.status) == Status.CONVERGED
             np.testing.assert_allclose(found.value[np.arange(4), start], alone.value, atol=2e-6)
@@ -138,11 +148,13 @@ def test_policies_of_products(label_on):
         alone = satisfaction_probability(exact, weight).value
         np.testing.assert_allclose(satisfaction_probability(points, weight).value, alone, atol=2e-6)
         for nature in ("min", "max"):
-            best = optimal_satisfaction(pairs, nature=nature)
+            best = optimal_satisfaction(pairs, nature=nature_word("max", nature))
             if nature == "min":  # else nature, too, has to keep to what attains it
-                own = satisfaction_probability(pairs, best.policy, nature=nature)
+                own = satisfaction_probability(
+                    pairs, best.policy, nature=nature_word("max", nature)
+                )
                 np.testing.assert_allclose(own.value, best.value, atol=2e-6)
-            found = satisfaction_probability(pairs, weight, nature=nature)
+            found = satisfaction_probability(pairs, weight, nature=nature_word("max", nature))
             assert int(found.status) == Status.CONVERGED
             side = 1 if nature == "max" else -1
             assert (side * (found.value - alone) >= -2e-6).all()
@@ -162,8 +174,12 @@ def test_parts_of_interval_models():
     part = restrict(model, np.eye(6)[0], allowed=first)
     target = model.states_with_label("a")
     for nature in ("min", "max"):
-        whole = robust_reachability(model, target, policy=host.row_start[:-1], nature=nature)
-        found = robust_reachability(part.model, target[np.asarray(part.base_state)], nature=nature)
+        whole = robust_reachability(
+            model, target, policy=host.row_start[:-1], nature=nature_word("max", nature)
+        )
+        found = robust_reachability(
+            part.model, target[np.asarray(part.base_state)], nature=nature_word("max", nature)
+        )
         np.testing.assert_allclose(found.value, whole.value[np.asarray(part.base_state)], atol=1e-6)
 
 
@@ -173,12 +189,17 @@ def test_policies_are_evaluated():
         model = labelled(rng)
         target = model.states_with_label("a")
         for nature in ("min", "max"):
-            best = robust_reachability(model, target, nature=nature)
-            own = robust_reachability(model, target, policy=best.policy, nature=nature)
+            best = robust_reachability(model, target, nature=nature_word("max", nature))
+            own = robust_reachability(
+                model, target, policy=best.policy, nature=nature_word("max", nature)
+            )
             np.testing.assert_allclose(own.value, best.value, atol=1e-6)
             np.testing.assert_array_equal(own.policy, best.policy)
             other = robust_reachability(
-                model, target, policy=model.nominal.host.row_start[:-1], nature=nature
+                model,
+                target,
+                policy=model.nominal.host.row_start[:-1],
+                nature=nature_word("max", nature),
             )
             assert (other.lower <= best.upper + 1e-12).all()
 
@@ -188,17 +209,31 @@ def test_one_function_takes_both_kinds():
     target = model.states_with_label("a")
     for objective, nature in DIRECTIONS:
         np.testing.assert_array_equal(
-            reachability_probability(model, target, objective=objective, nature=nature).value,
-            robust_reachability(model, target, objective=objective, nature=nature).value,
-        )
-        np.testing.assert_array_equal(
-            total_reward(model, np.ones(4), target, objective=objective, nature=nature).value,
-            robust_total_reward(
-                model, np.ones(4), target, objective=objective, nature=nature
+            reachability_probability(
+                model, target, objective=objective, nature=nature_word(objective, nature)
+            ).value,
+            robust_reachability(
+                model, target, objective=objective, nature=nature_word(objective, nature)
             ).value,
         )
-    with pytest.raises(ValueError, match=r"nature='max'.*intervals"):
-        reachability_probability(model.nominal, target, nature="max")
+        np.testing.assert_array_equal(
+            total_reward(
+                model,
+                np.ones(4),
+                target,
+                objective=objective,
+                nature=nature_word(objective, nature),
+            ).value,
+            robust_total_reward(
+                model,
+                np.ones(4),
+                target,
+                objective=objective,
+                nature=nature_word(objective, nature),
+            ).value,
+        )
+    with pytest.raises(ValueError, match=r"nature='cooperative'.*intervals"):
+        reachability_probability(model.nominal, target, nature="cooperative")
 
 
 def test_mixed_policies():
@@ -216,7 +251,7 @@ def test_mixed_policies():
             robust_reachability(points, target, policy=weight).value, alone.value, atol=1e-6
         )
         low, high = (
-            robust_reachability(model, target, policy=weight, nature=nature)
+            robust_reachability(model, target, policy=weight, nature=nature_word("max", nature))
             for nature in ("min", "max")
         )
         assert (low.lower <= alone.upper).all()
@@ -245,18 +280,22 @@ def test_games(count):
         for nature in ("min", "max"):
             for objective in ("max", "min"):
                 of = {"objective": objective, "nature": nature}
+                ask = {"objective": objective, "nature": nature_word(objective, nature)}
                 held(
-                    robust_reachability(game, goal, **of),
+                    robust_reachability(game, goal, **ask),
                     played(host, goal, system, worth[0], **of),
                 )
                 held(
-                    robust_total_reward(game, cost, goal, **of),
+                    robust_total_reward(game, cost, goal, **ask),
                     played(host, goal, system, worth[1], **of),
                 )
             yes = np.zeros(4, bool)
-            sides = host_sides(host, system, "max", nature)
+            sides = host_sides(host, system, "max", nature_word("max", nature))
             found = _solved(sides, host, yes, yes, priority, False, 1e-6)
-            held(found, played(host, yes, system, worth[2], objective="max", nature=nature))
+            held(
+                found,
+                played(host, yes, system, worth[2], objective="max", nature=nature),
+            )
 
 
 def _reach(goal, rows, p):
@@ -325,7 +364,9 @@ def test_discounted_values():
                 p = model.host.extreme_distributions(ahead, maximize=nature == "max")
                 image = model.host.sum_rows(p * ahead)
                 value = getattr(np, objective + "imum").reduceat(image, host.row_start[:-1])
-            found = robust_discounted_value(model, earned, 0.9, objective=objective, nature=nature)
+            found = robust_discounted_value(
+                model, earned, 0.9, objective=objective, nature=nature_word(objective, nature)
+            )
             assert int(found.status) == Status.CONVERGED
             np.testing.assert_allclose(found.value, value, atol=1e-8)
             assert (found.lower <= value + 1e-12).all()
@@ -333,7 +374,7 @@ def test_discounted_values():
             game = Game(model, np.ones(4, bool))
             np.testing.assert_allclose(
                 robust_discounted_value(
-                    game, earned, 0.9, objective=objective, nature=nature
+                    game, earned, 0.9, objective=objective, nature=nature_word(objective, nature)
                 ).value,
                 value,
                 atol=1e-7,
@@ -383,7 +424,7 @@ def test_bad_questions():
     with pytest.raises(ValueError, match=r"IntervalMDP takes no intervals; .*its nominal one"):
         make_interval(model, [0.1, 0.2, 1, 1], [0.8, 0.9, 1, 1])
     target = [False, True, False]
-    with pytest.raises(ValueError, match=r'nature=.adverse.; it must be "min"'):
+    with pytest.raises(ValueError, match="nature='adverse'; choose one of adversarial"):
         robust_reachability(model, target, nature="adverse")
     for tolerance in (float("nan"), -1.0, "fine"):
         with pytest.raises(ValueError, match=r"tolerance=.*at least 0"):

@@ -14,6 +14,7 @@ from jaxltl.core.values.interval.robust import robust_reachability, robust_total
 from jaxltl.core.values.interval.sensitivity import robust_sensitivity
 from jaxltl.core.values.prepared.prepared_interval import prepare_interval, solve_prepared_interval
 from tests.reference_intervals import vertices
+from tests.support import nature_word
 
 DIRECTIONS = list(itertools.product(("max", "min"), repeat=2))
 GOAL = np.array([True, False, False, False, False])
@@ -100,7 +101,9 @@ def test_all_ends_of_a_batch_are_enclosed_as_by_brute_force(seed, objective, nat
     successor, lower, upper, cost = _cases(seed, 12)
     model = _model(successor, lower[0], upper[0])
     for reward in (None, cost):
-        prepared = prepare_interval(model, GOAL, reward=reward, objective=objective, nature=nature)
+        prepared = prepare_interval(
+            model, GOAL, reward=reward, objective=objective, nature=nature_word(objective, nature)
+        )
         solve = jax.jit(
             jax.vmap(lambda a, b, p=prepared: solve_prepared_interval(p, lower=a, upper=b))
         )
@@ -126,16 +129,20 @@ def test_policy_and_nature_attain_what_they_are_shown_for(objective, nature):
     successor, lower, upper, _ = _cases(3, 1)
     model = _model(successor, lower[0], upper[0])
     found = solve_prepared_interval(
-        prepare_interval(model, GOAL, stay=STAY, objective=objective, nature=nature)
+        prepare_interval(
+            model, GOAL, stay=STAY, objective=objective, nature=nature_word(objective, nature)
+        )
     )
-    host = robust_reachability(model, GOAL, stay=STAY, objective=objective, nature=nature)
+    host = robust_reachability(
+        model, GOAL, stay=STAY, objective=objective, nature=nature_word(objective, nature)
+    )
     p = np.asarray(found.nature)
     assert (p >= model.lower - 1e-15).all() and (p <= model.upper + 1e-15).all()
     np.testing.assert_allclose(np.add.reduceat(p, ENTRY_START[:-1]), 1, rtol=1e-14)
     fixed = _model(successor, p, np.maximum(p, 1e-300))  # what is left out has no room
     side = robust_reachability(fixed, GOAL, stay=STAY, objective=objective)
     mine = robust_reachability(
-        model, GOAL, stay=STAY, policy=np.asarray(found.policy), nature=nature
+        model, GOAL, stay=STAY, policy=np.asarray(found.policy), nature=nature_word("max", nature)
     )
     np.testing.assert_allclose(mine.value, host.value, atol=2e-6)
     np.testing.assert_allclose(side.value, host.value, atol=2e-6)
@@ -175,7 +182,7 @@ def test_derivatives_in_the_ends_are_differences(objective, nature, question):
     model = _model(successor, p * (1 - wide), np.minimum(p * (1 + wide), 1))
     way = rng.normal(size=(2, 20)) * (wide > 0)
     cost, weight = np.append([0, 0], rng.random(6)), rng.random(5)
-    ask = {"objective": objective, "nature": nature}
+    ask = {"objective": objective, "nature": nature_word(objective, nature)}
     reward = cost if question == "reward" else None
     # The reward is earned until either end is met, where it is finite.
     goal = GOAL if reward is None else ~np.array([False, False, True, True, True])
@@ -208,7 +215,7 @@ def test_derivatives_in_the_ends_are_differences(objective, nature, question):
         model,
         host(model),
         goal,
-        nature=nature,
+        **ask,
         initial=weight,
         stay=STAY if reward is None else None,
     )
@@ -221,7 +228,7 @@ def test_derivatives_in_the_ends_are_differences(objective, nature, question):
 def test_other_graphs_are_refused_inside_jit():
     successor, lower, upper, _ = _cases(6, 1)
     model = _model(successor, lower[0], upper[0])
-    prepared = prepare_interval(model, GOAL, objective="max", nature="min")
+    prepared = prepare_interval(model, GOAL, objective="max", nature="adversarial")
 
     def status(lower, upper):
         return int(solve_prepared_interval(prepared, lower=lower, upper=upper).status)
@@ -243,12 +250,12 @@ def test_nature_that_may_drop_other_successors_is_refused():
         return interval_rows(None, [0, 1, 3], [0, 0, 1], [1, 0, 0], [1, 0.75, room])
 
     goal = np.array([True, False])
-    prepared = prepare_interval(model(0.5), goal, objective="min", nature="min")
+    prepared = prepare_interval(model(0.5), goal, objective="min", nature="cooperative")
     ends = [(m.lower, m.upper) for m in map(model, (0.5, 0.75, 1.0))]
     found = [solve_prepared_interval(prepared, lower=a, upper=b) for a, b in ends]
     assert [int(x.status) for x in found] == [Status.CONVERGED] * 2 + [Status.INVALID]
     assert float(found[0].value[1]) == 1
-    again = prepare_interval(model(1.0), goal, objective="min", nature="min")
+    again = prepare_interval(model(1.0), goal, objective="min", nature="cooperative")
     assert float(solve_prepared_interval(again).value[1]) == 0
 
 
