@@ -90,7 +90,7 @@ def things(folder):
     read = jl.io.read_parametric(folder / "coin.drn")
     box = read.over(0.1, 0.9)
     problem = feasible.make_problem(box, "goal", bound=">=")
-    asked = {"model": model, "target": "a", "objective": "max", "nature": "min"}
+    asked = {"model": model, "target": "a", "objective": "max", "nature": "adversarial"}
     solved = robust_reachability(model, "a", nature="adversarial")
     ends = {"lower": [0.4, 0.3, 1, 1], "upper": [0.7, 0.6, 1, 1]}
     ball = {"center": [0.5, 0.5, 1, 1], "radius": [0.1, 0, 0]}
@@ -125,7 +125,10 @@ def things(folder):
             jl.values.robust_discounted_value,
             {"model": model, "reward": "r", "discount": 0.9, "policy": None, "tolerance": 1e-6},
         ),
-        (jl.values.robust_expectation, {"model": model, "value": [0.0, 1, 2], "nature": "min"}),
+        (
+            jl.values.robust_expectation,
+            {"model": model, "value": [0.0, 1, 2], "nature": "adversarial"},
+        ),
         (jl.values.robust_satisfaction, {"model": model, "task": "F a", "states": [0]}),
         (jl.values.robust_next_probability, asked),
         (jl.values.robust_bounded_reachability, {**asked, "num_steps": 2, "stay": None}),
@@ -137,7 +140,7 @@ def things(folder):
                 "model": model,
                 "solution": solved,
                 "target": "a",
-                "nature": "min",
+                "nature": "adversarial",
                 "stay": None,
                 "initial": [1, 0, 0],
             },

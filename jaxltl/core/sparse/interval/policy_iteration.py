@@ -352,8 +352,8 @@ class _Search:
             z = pair.value - self.extra * pair.steps
             if operator.proves_attained(z, pair):
                 return replace(pair, bound=z)
-            if not pair.steps.all() and (found := self.proportional_bound(pair)) is not None:
-                return found
+            if not pair.steps.all() and (bounded := self.proportional_bound(pair)) is not None:
+                return bounded
             if operator.adversarial:
                 pair = operator.improve(pair, z, -self.extra)[0]
             found = self.evaluate_with_steps(pair, self.extra)
