@@ -7,7 +7,7 @@ A learner has ``Problem``, ``Hparams``, ``State`` and ``Metrics``; ``make_proble
 ``vmap``; they are not differentiable unless their documentation says so.
 
 From demonstrations: ``mlirl``, ``todirl``, ``behavioral_cloning``. From interaction with a model:
-``maximin_q``, ``rmax``, ``interval_learning``. From interaction with a simulator: ``ppo``,
+``expected_sarsa``, ``maximin_q``, ``rmax``, ``interval_learning``. From interaction with a simulator: ``ppo``,
 ``many_tasks``, ``cce``, ``trust_region``. Parameters of a parametric model: ``feasible``,
 ``regions``. Shared parts are in ``common``: ``learner`` (training loops), ``chunks`` (progress
 reports and resumption), ``checkpoint`` (files), ``early_stopping``, ``schedules``,

@@ -2,6 +2,7 @@ from . import (
     behavioral_cloning as behavioral_cloning,
     cce as cce,
     common as common,
+    expected_sarsa as expected_sarsa,
     feasible as feasible,
     interval_learning as interval_learning,
     many_tasks as many_tasks,

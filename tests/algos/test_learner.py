@@ -23,6 +23,7 @@ import jaxltl as jl
 from jaxltl.algos import (
     behavioral_cloning,
     cce,
+    expected_sarsa,
     feasible,
     interval_learning,
     maximin_q,
@@ -324,6 +325,14 @@ def intervals():
     return Case(interval_learning, problem, setting(), setting(strength=1.0, exploration=0.5))
 
 
+def temporal_difference():
+    problem = expected_sarsa.make_problem(world()[0], numbers(3, 2))
+    setting = partial(expected_sarsa.Hparams, num_transitions=7, restart=0.3)
+    return Case(
+        expected_sarsa, problem, setting(discount=0.9), setting(discount=0.8, step_size=0.3)
+    )
+
+
 LEARNERS = {
     "toy": lambda: Case(TOY, jnp.arange(3.0), 0.1, 0.2),
     "mlirl-world": mlirl_world,
@@ -340,6 +349,7 @@ LEARNERS = {
     "cloning": cloning,
     "feasible": parameters,
     "intervals": intervals,
+    "sarsa": temporal_difference,
 }
 
 # Two ways to write a problem of one learner down, and a network that remembers, which takes
@@ -568,6 +578,7 @@ REWARDS = {
     "mlirl-world": "features",
     "mlirl-product": "features",
     "rmax": "reward",
+    "sarsa": "reward",
     "q-generalized": "reward",
     "q-maximin": "reward",
 }
