@@ -303,6 +303,22 @@ window.addEventListener("load", () => {
 </script></body>"""
 
 
+FRAME = """<!doctype html><body style="margin:0">
+<iframe id="page" width="{width}" height="900" style="border:0" srcdoc="{page}"></iframe>
+<script>
+const wait = setInterval(() => {{
+  const inner = document.getElementById("page").contentDocument.getElementById("verdict");
+  if (!inner) return;
+  clearInterval(wait);
+  const verdict = document.createElement("pre");
+  verdict.id = "verdict";
+  verdict.textContent = inner.textContent;
+  document.getElementById("page").remove();
+  document.body.append(verdict);
+}}, 50);
+</script></body>"""
+
+
 @pytest.fixture(scope="module")
 def browser():
     found = next(filter(None, map(shutil.which, BROWSERS)), None)
@@ -310,6 +326,9 @@ def browser():
         pytest.skip(f"there is no browser among {', '.join(BROWSERS)}")
 
     def visit(path, width, *options):
+        # In a frame: windows of some browsers are never narrower than 485 pixels.
+        framed = path.with_name(f"frame-{width}-{path.name}")
+        framed.write_text(FRAME.format(width=width, page=html.escape(path.read_text())))
         done = subprocess.run(
             [
                 found,
@@ -318,11 +337,11 @@ def browser():
                 "--disable-gpu",
                 "--enable-logging=stderr",
                 f"--user-data-dir={path.parent / 'profile'}",
-                f"--window-size={width},900",
+                "--window-size=1400,1000",
                 "--virtual-time-budget=20000",
                 "--dump-dom",
                 *options,
-                path.as_uri(),
+                framed.as_uri(),
             ],
             capture_output=True,
             text=True,

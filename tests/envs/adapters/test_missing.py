@@ -1,4 +1,4 @@
-"""A package that is not installed is told with the command that installs it."""
+"""Errors for packages that are not installed name the command that installs them."""
 
 import sys
 
@@ -15,4 +15,4 @@ def test_a_missing_package_is_named(name, monkeypatch):
         if module == name or module.startswith(f"{name}."):
             monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(ImportError, match=rf'from_{name} needs .*pip install "jaxltl\[{name}\]"'):
-        getattr(jaxltl, f"from_{name}")(object())
+        getattr(jaxltl.envs, f"from_{name}")(object())
