@@ -1,4 +1,4 @@
-"""Markov decision processes as arrays, and the host-side checks that let them in."""
+"""Markov decision processes with padded or dense arrays, and their validation."""
 
 from __future__ import annotations
 
@@ -23,17 +23,16 @@ from jaxltl.core import validation
 class MDP:
     """A labelled Markov decision process with padded successor lists.
 
-    Taking action ``a`` in state ``s`` leads to ``successor[s, a, k]`` with
-    ``probability[s, a, k]``. Padding has successor 0 and probability 0, and so has
-    every unavailable action. Build one with :func:`make_mdp`, which checks it.
+    Action ``a`` in state ``s`` leads to ``successor[s, a, k]`` with ``probability[s, a, k]``. Padding and
+    unavailable actions have successor 0 and probability 0. :func:`make_mdp` builds a checked model.
 
     Attributes:
       successor: ``int32[S, A, K]``.
       probability: ``float[S, A, K]``; rows of available actions sum to one.
       available: ``bool[S, A]``; every state has an available action.
       initial: ``float[S]``, the initial distribution.
-      label: ``bool[S, P]``, which propositions hold in a state.
-      propositions: the P names, static.
+      label: ``bool[S, P]``, the propositions that hold in each state.
+      propositions: the P names; static.
 
     Example:
       >>> import jaxltl as jl
@@ -41,7 +40,7 @@ class MDP:
       ...                     label={"goal": [1]})
       >>> chain.num_states, chain.num_actions, chain.label.tolist()
       (2, 1, [[False], [True]])
-      >>> chain.replace(initial=np.array([1.0, 0.0])).initial.tolist()  # a changed copy
+      >>> chain.replace(initial=np.array([1.0, 0.0])).initial.tolist()  # a modified copy
       [1.0, 0.0]
     """
 
@@ -69,17 +68,17 @@ class MDP:
 
     @property
     def num_successors(self) -> int:
-        """K, the longest list of successors."""
+        """K."""
         return self.probability.shape[-1]
 
     @property
     def successor_probability(self) -> jax.Array:
-        """Weights of the successors, ``float[S, A, K]``; zero at unavailable actions."""
+        """``float[S, A, K]``, zero at unavailable actions."""
         return jnp.where(self.available[..., None], self.probability, 0)
 
     @property
     def dtype(self) -> jnp.dtype:
-        """Of the probabilities."""
+        """The dtype of the probabilities."""
         return self.probability.dtype
 
 
@@ -117,7 +116,7 @@ class DenseMDP:
 
     @property
     def num_successors(self) -> int:
-        """S: every state counts as a successor."""
+        """S: all states are listed as successors."""
         return self.num_states
 
     @property
@@ -127,17 +126,17 @@ class DenseMDP:
 
     @property
     def successor_probability(self) -> jax.Array:
-        """``float[S, A, S]``: every state counts as a successor; zero at unavailable actions."""
+        """``float[S, A, S]``, zero at unavailable actions."""
         return jnp.where(self.available[..., None], self.transition, 0)
 
     @property
     def dtype(self) -> jnp.dtype:
-        """Of the probabilities."""
+        """The dtype of the probabilities."""
         return self.transition.dtype
 
 
 def support(world: Model) -> np.ndarray:
-    """Which successors are possible, ``bool[S, A, K]``, on the host; none where unavailable."""
+    """``bool[S, A, K]``, successors of positive probability; ValueError if one is subnormal."""
     if not isinstance(world, MDP | DenseMDP):
         raise ValueError(validation.unsupported_model(world))
     weight = world.transition if isinstance(world, DenseMDP) else world.probability
@@ -349,13 +348,6 @@ def _checked_available(available: chex.Array, shape: tuple[int, int]) -> np.ndar
 def checked_initial(initial: chex.Array | None, num_states: int) -> np.ndarray:
     """An initial distribution, checked, on the host.
 
-    Args:
-      initial: ``float[S]``, a distribution within 1e-6; None for the uniform one.
-      num_states: S.
-
-    Returns:
-      ``float64[S]``, which sums to one.
-
     Raises:
       ValueError: a wrong shape, a probability that is negative or NaN, with its state, or a sum
         that is not 1.
@@ -372,7 +364,7 @@ def checked_initial(initial: chex.Array | None, num_states: int) -> np.ndarray:
 
 
 def refuse_negative(initial: np.ndarray, *, first: int = 0) -> None:
-    """Raises a ValueError of a probability that is none; `first` is the first state's number."""
+    """Raises ValueError for a negative probability; `first` is the number of the first state."""
     bad = ~(initial >= 0)
     if bad.any():
         s = np.flatnonzero(bad)[0]
@@ -387,21 +379,7 @@ def checked_label(
     propositions: Sequence[str],
     num_states: int,
 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Where propositions hold, and their names, checked, on the host.
-
-    Args:
-      label: ``bool[S, P]``, or the states where each proposition holds, by its name; None for no
-        propositions.
-      propositions: P distinct names; of a label by names, default its own, in their order.
-      num_states: S.
-
-    Returns:
-      ``bool[S, P]`` and the P names.
-
-    Raises:
-      ValueError: names that are not distinct or not those of the label, names without a label, a
-        wrong shape, or a state that does not exist.
-    """
+    """Validated labels ``bool[S, P]`` with their names, from a matrix, a mapping or None."""
     names = tuple(validation.sequence("propositions", propositions))
     if not all(isinstance(x, str) for x in names) or len(set(names)) != len(names):
         raise ValueError(f"propositions {validation.shorten(names)} are not distinct.")

@@ -1,8 +1,8 @@
-"""Lanes of one function over the devices of a mesh: seeds, settings, instances, whole populations.
+"""Batches of independent computations over the devices of a mesh.
 
-What ``vmap`` does side by side on one device is done by several, each with a share of the lanes.
-No lane reads another, so that nothing goes from device to device, and a loop whose length depends
-on the data goes on for as long as the device's own lanes need.
+``vmap`` runs a batch (seeds, hyperparameters, instances, populations) on one device; here each
+device runs its share. No element reads another, so that nothing is communicated, and a loop with a
+data-dependent length runs as long as the device's own elements need.
 """
 
 from __future__ import annotations
@@ -28,36 +28,28 @@ def vmap_over_mesh(
     *,
     in_axes: Any = 0,
 ) -> Callable[..., Any]:
-    """``jax.vmap(function, in_axes)`` with its lanes over the devices of a mesh.
+    """``jax.vmap(function, in_axes)`` with the batch distributed over the devices of a mesh.
 
-    Lane i lies on the device that holds it by ``PartitionSpec(axis)``: of N lanes over D devices
-    each makes N / D in a row, under ``vmap``. What comes out are arrays of all N lanes that stay
-    where they were made, and that go in again without being moved: seeds are trained with
-    ``train``, and go on with ``run``. It works under ``jit``, and over the devices of several
-    processes (``jax.distributed``), each of which makes the same call; :func:`on_host` then brings
-    results to each.
-
-    Where D does not divide N, lanes are repeated up to the next multiple, and cut off again; the
-    results are then on every device, for JAX splits arrays evenly.
-
-    Arithmetic is that of ``vmap`` of N / D lanes: another number of devices may round differently
-    where the compiler makes other instructions for another number of lanes.
+    Device d of D runs the d-th N / D elements, under ``vmap``, as ``PartitionSpec(axis)`` places them.
+    Results stay on their devices and can be passed on without being moved, from ``train`` to ``run``.
+    Works under ``jit``, and over several processes (``jax.distributed``) that make the same call;
+    :func:`on_host` then collects the results. If D does not divide N, elements are repeated up to the
+    next multiple and dropped again, and the results are replicated. Rounding is that of ``vmap`` of
+    N / D elements and may depend on D where the compiler chooses other instructions.
 
     Args:
-      function: of one lane, such as a learner's ``train`` or ``run``; compiled once for it, the
-        mesh and the shapes.
-      mesh: of devices, such as ``jax.make_mesh((jax.device_count(),), ("lanes",))``.
-      axis: the mesh axis, or several, over which the lanes lie; the devices along others do the
-        same, or share in a lane's work where `function` says so. Default: all.
-      in_axes: as of ``vmap``, each 0 or None: which arguments, or parts of them, have lanes along
-        their first axis; others are the same for all, and on every device.
+      function: of one element, such as a learner's ``train`` or ``run``; compiled once for each
+        function, mesh and shapes.
+      mesh: devices, such as ``jax.make_mesh((jax.device_count(),), ("lanes",))``.
+      axis: the mesh axis or axes of the batch; devices along others do the same, or share the work of
+        an element where `function` says so. Default: all.
+      in_axes: as of ``vmap``, 0 or None for each argument or part.
 
     Returns:
-      A function of the arguments, with lanes. Keywords are static, and given to `function` as they
-      are.
+      A function of batched arguments; keywords are static and passed to `function`.
 
     Raises:
-      ValueError: no such axis, other `in_axes`, or arguments whose numbers of lanes differ.
+      ValueError: an unknown axis, other `in_axes`, or batches of different size.
 
     Example:
       >>> import jax.numpy as jnp
@@ -84,15 +76,15 @@ def vmap_over_mesh(
 
 
 def on_host(tree: Any) -> Any:
-    """NumPy arrays of a tree's arrays, the same in every process; keys stay keys.
+    """NumPy copies of a tree's arrays, in every process; random keys stay keys.
 
-    Arrays that lie on the devices of several processes are sent to all, so that each is to call.
+    Collects arrays that are distributed over several processes, so that all processes call it.
 
     Args:
-      tree: of arrays, NumPy's or JAX's, and of numbers.
+      tree: arrays and numbers.
 
     Returns:
-      The same tree of NumPy arrays.
+      The tree of NumPy arrays.
 
     Example:
       >>> on_host({"a": jnp.arange(3), "b": 2.5})["a"].tolist()
@@ -114,11 +106,7 @@ def on_host(tree: Any) -> Any:
 
 
 def axes_of(mesh: Mesh, axis: str | Sequence[str] | None) -> tuple[str, ...]:
-    """Names of mesh axes: the one given, those given, or all.
-
-    Raises:
-      ValueError: a name that the mesh does not have, or one twice.
-    """
+    """Names of mesh axes: one, several, or all for None; ValueError for an unknown or repeated name."""
     names = mesh.axis_names if axis is None else (axis,) if isinstance(axis, str) else tuple(axis)
     if not names or len(set(names)) < len(names) or not set(names) <= set(mesh.axis_names):
         raise ValueError(
@@ -129,18 +117,18 @@ def axes_of(mesh: Mesh, axis: str | Sequence[str] | None) -> tuple[str, ...]:
 
 
 def automatic(mesh: Mesh) -> Mesh:
-    """The mesh whose arrays JAX splits by itself: the types of others say where each must lie."""
+    """The mesh with automatic axes, whose arrays JAX partitions by itself."""
     return Mesh(mesh.devices, mesh.axis_names, axis_types=(AxisType.Auto,) * len(mesh.axis_names))
 
 
 def _first_axes(sharding: NamedSharding) -> tuple[str, ...]:
-    """Names of the mesh axes that the first entry of a spec splits over."""
+    """The mesh axes over which a sharding splits the first axis."""
     first = (*sharding.spec, None)[0]
     return () if first is None else (first,) if isinstance(first, str) else tuple(first)
 
 
 def _here(mesh: Any) -> Any:
-    """The mesh that holds where this is traced: of a mesh that was set, or of a lane on it."""
+    """The ambient mesh of a trace, else the given one."""
     ambient = jax.sharding.get_abstract_mesh()
     return automatic(mesh) if ambient.empty else ambient
 
@@ -153,11 +141,7 @@ def _count(mesh: Any, axes: Sequence[str]) -> int:
 
 
 def require_split(name: str, sharding: Any, **sizes: int) -> None:
-    """Raises unless a sharding is None, or one that splits axes of these lengths evenly.
-
-    Raises:
-      ValueError: it is something else, or does not.
-    """
+    """Raises ValueError unless a sharding is None or splits axes of the given sizes evenly."""
     if sharding is None:
         return
     validation.instance(name, sharding, NamedSharding, "a jax.sharding.NamedSharding")
@@ -178,10 +162,7 @@ def require_split(name: str, sharding: Any, **sizes: int) -> None:
 
 
 def split_axis(tree: Any, sharding: NamedSharding | None, axis: int = 0) -> Any:
-    """A tree whose arrays have one axis split over the devices that a sharding's spec names.
-
-    Within a lane, under ``jit``; None: as it is.
-    """
+    """A tree whose arrays have one axis split over the devices of a sharding; None: unchanged. Under ``jit``."""
     if sharding is None:
         return tree
     spec = PartitionSpec(*[None] * axis, _first_axes(sharding))
@@ -189,7 +170,7 @@ def split_axis(tree: Any, sharding: NamedSharding | None, axis: int = 0) -> Any:
 
 
 def replicate(tree: Any, sharding: NamedSharding | None) -> Any:
-    """A tree whose arrays are on all devices of a sharding; None: as it is."""
+    """A tree with arrays replicated over the devices of a sharding; None: unchanged."""
     if sharding is None:
         return tree
     mesh = _here(sharding.mesh)
@@ -202,13 +183,10 @@ def shard_function(
     axes: Sequence[int | None],
     out_axes: Any,
 ) -> Callable[..., Any]:
-    """A function that each device calls with its own part of the arguments; under ``jit``.
+    """A function that each device applies to its share of the arguments, under ``jit``; None: unchanged.
 
-    Args:
-      function: of parts; it may say what goes from device to device.
-      sharding: whose spec names the devices; None: the function itself.
-      axes: of each argument the axis that is split, or None: each device has all of it.
-      out_axes: the same of what it returns, a tree prefix.
+    `axes` are the split axes of the arguments, None for replicated ones, and `out_axes` those of the
+    result, a tree prefix. The function may communicate between devices.
     """
     if sharding is None:
         return function
@@ -228,7 +206,7 @@ def shard_function(
 
 
 def vmap_split(function: Callable[..., Any], sharding: NamedSharding | None, in_axes: Any) -> Any:
-    """:func:`vmap_over_mesh` over the devices that a sharding's spec names; None: ``vmap``."""
+    """:func:`vmap_over_mesh` over the devices of a sharding; ``vmap`` for None."""
     if sharding is None:
         return jax.vmap(function, in_axes)
     mesh: Any = sharding.mesh
@@ -236,7 +214,7 @@ def vmap_split(function: Callable[..., Any], sharding: NamedSharding | None, in_
 
 
 def device_ranks(sharding: NamedSharding | None) -> jax.Array:
-    """``int32[D]``, the numbers of a sharding's devices, each of which :func:`shard_function` gives one."""
+    """``int32[D]``, device numbers, one for each call by :func:`shard_function`."""
     devices = 1 if sharding is None else _count(sharding.mesh, _first_axes(sharding))
     return jnp.arange(devices, dtype=jnp.int32)
 
@@ -244,9 +222,9 @@ def device_ranks(sharding: NamedSharding | None) -> jax.Array:
 def running_sum(
     counted: jax.Array, rank: jax.Array, sharding: NamedSharding | None
 ) -> tuple[jax.Array, jax.Array]:
-    """How many of all devices' ``bool[N]`` are True up to each of one's own, ``int32``; and in all.
+    """Cumulative counts over all devices, ``int32[N]`` from a device's ``bool[N]``, and the total.
 
-    In a function that :func:`shard_function` calls, with its part of :func:`device_ranks`.
+    For functions under :func:`shard_function`, with the device's entry of :func:`device_ranks`.
     """
     number = jnp.cumsum(counted, dtype=jnp.int32)
     if sharding is None:
@@ -260,7 +238,7 @@ def running_sum(
 
 
 def _spread(in_axes: Any, arguments: tuple[Any, ...]) -> list[bool]:
-    """For each array of the arguments whether it has lanes."""
+    """``bool`` for each array of the arguments: True if it is batched."""
 
     def is_none(x: Any) -> bool:
         return x is None
@@ -289,7 +267,7 @@ def _spread(in_axes: Any, arguments: tuple[Any, ...]) -> list[bool]:
 
 
 def _number(lanes: tuple[bool, ...], arguments: Any) -> int:
-    """How many lanes there are."""
+    """The batch size."""
     shapes = [np.shape(x) for x, has in zip(jax.tree.leaves(arguments), lanes, strict=True) if has]
     numbers = sorted({shape[:1] for shape in shapes})
     if len(numbers) != 1 or not numbers[0] or numbers[0][0] < 1:
@@ -304,7 +282,7 @@ def _number(lanes: tuple[bool, ...], arguments: Any) -> int:
 def _placed(
     arguments: Any, lanes: tuple[bool, ...], number: int, mesh: Mesh, axes: tuple[str, ...]
 ) -> Any:
-    """Arguments where they are needed, so that none lies on a device outside of the mesh."""
+    """Arguments on the devices of the mesh."""
     if jax.sharding.get_abstract_mesh().empty:
         mesh = automatic(mesh)
     even = number % _count(mesh, axes) == 0
@@ -327,7 +305,7 @@ def _placed(
 
 
 def _from_each(x: Any, sharding: NamedSharding) -> jax.Array:
-    """An array over the devices of several processes, of which each gives its part."""
+    """An array over the devices of several processes, from each process's part."""
     if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
         return jax.random.wrap_key_data(
             _from_each(jax.random.key_data(x), sharding), impl=jax.random.key_impl(x)

@@ -1,7 +1,7 @@
-"""Putting a model onto the devices of a mesh, whole or part by part, and quantities there and back.
+"""Distribution of models and of quantities over the devices of a mesh.
 
-Each process makes the parts of its own devices. What the parts have to know of one another (how
-many rows there are of each width, which states are asked for) is exchanged once.
+Each process builds the parts of its own devices. Counts of rows by width and lists of halo states
+are exchanged once.
 """
 
 from __future__ import annotations
@@ -12,13 +12,14 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.sharding import Mesh
 
 from jaxltl.core import validation
 from jaxltl.core.models import facts
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.construct.padded import row_actions
-from jaxltl.core.models.mesh.lanes import automatic, axes_of, on_host
+from jaxltl.core.models.mesh.lanes import on_host
+from jaxltl.core.models.mesh.layout import StateLayout, state_layout
 from jaxltl.core.models.mesh.sharded import RowTable, ShardedMDP
 from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import (
@@ -32,29 +33,29 @@ from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
 
 _WIDTHS = np.array(sorted({int(m * 2**e) for e in range(26) for m in (1, 1.5)} | {3}))
-_PADDED = 1.25  # times the transitions that one table of all rows may hold
-_HALO = 0.6  # share of the others' values from which on all of them are sent
+_PADDED = 1.25  # size of a single table of all rows, relative to the transitions, at most
+_HALO = 0.6  # fraction of the other devices' values from which on all of them are sent
 
 
 @brief(facts=facts.part)
 @dataclass(frozen=True)
 class ModelPart:
-    """The states of a range, with their choices and where those lead.
+    """A range of states of a model, with their choices.
 
     Attributes:
       entry_start: ``int[r + 1]``.
-      successor: ``int[t]``, numbers among all states.
+      successor: ``int[t]``, state numbers of the whole model.
       probability: ``float[t]``; rows sum to one.
-      row_start: ``int[n + 1]``; None: one row a state.
-      action: ``int[r]``, the numbers of the rows' actions; default their rank in the state.
-      initial: ``float[n]``; default: runs start anywhere with the same probability.
+      row_start: ``int[n + 1]``; None: one row in each state.
+      action: ``int[r]``, action numbers; default: the rank in the state.
+      initial: ``float[n]``; default: uniform over all states.
       label: ``bool[n, P]``.
       rewards: expected rewards of rows by name, ``float[r]``.
-      row: ``int[r]``, the numbers of the rows among all rows of the model, so that quantities on
-        them can be put onto the mesh; default: none are.
+      row: ``int[r]``, row numbers of the whole model, so that :func:`to_mesh` accepts quantities on
+        rows; default: none.
 
     Example:
-      >>> part = ModelPart(np.arange(3), np.array([1, 0]), np.ones(2))  # of two states in a circle
+      >>> part = ModelPart(np.arange(3), np.array([1, 0]), np.ones(2))  # a cycle of two states
       >>> part.successor.tolist(), part.row_start is None
       ([1, 0], True)
     """
@@ -73,26 +74,26 @@ class ModelPart:
 def shard(
     model: Model, mesh: Mesh, *, axis: str | None = None, order: str | np.ndarray = "given"
 ) -> ShardedMDP:
-    """A model whose states lie on the devices of a mesh.
+    """A model distributed over the devices of a mesh axis.
 
-    Solvers take it like any other: discounted, soft, reachability, satisfaction, total rewards,
-    their gradients and the graph's fixpoints, inside ``jit`` too. Every process gives the same
-    model; if it is too large for one, see :func:`model_from_parts`.
+    Solvers accept it like any other model, inside ``jit`` too: discounted and soft values,
+    reachability, satisfaction, total rewards, their gradients and graph fixed points. All processes
+    give the same model; :func:`model_from_parts` builds one that is too large for a process.
 
     Args:
       model: a concrete MDP, DenseMDP or SparseMDP.
       mesh: the devices, such as ``jax.make_mesh((4,), ("states",))``.
-      axis: over which axis of the mesh; default its only one.
-      order: ``"given"``: neighbouring devices get neighbouring numbers; ``"near"``: states are put
-        into an order in which most successors are near (Cuthill and McKee 1969, reversed), so that
-        less is exchanged; or ``int[S]``, the states in the order that is wanted.
+      axis: the mesh axis of the states; default: the only one.
+      order: ``"given"``: contiguous ranges of state numbers; ``"near"``: reverse Cuthill-McKee order
+        (1969), which reduces communication; or a permutation ``int[S]``.
 
     Returns:
-      :class:`~jaxltl.core.models.mesh.sharded.ShardedMDP`. An action of it is an action of the model,
-      of a sparse one what it is in :func:`~jaxltl.core.models.construct.padded.to_padded`.
+      :class:`~jaxltl.core.models.mesh.sharded.ShardedMDP`. Its actions are those of the model, of a
+      sparse one as in :func:`~jaxltl.core.models.construct.padded.to_padded`.
 
     Raises:
-      ValueError: the model, the axis or the order is none.
+      ValueError: an invalid model, axis or order, or a probability that is zero or subnormal in JAX's
+        default precision.
 
     Example:
       >>> from jaxltl import from_dense
@@ -138,20 +139,20 @@ def model_from_parts(
     axis: str | None = None,
     propositions: tuple[str, ...] = (),
 ) -> ShardedMDP:
-    """A model on a mesh that is too large for one process, made where its parts are to be.
+    """A distributed model from parts, for models that are too large for one process.
 
     Args:
-      part: from the range of states of a device, ``(start, stop)``, its :class:`ModelPart`. Called
-        in each process for the devices of that process only.
+      part: the :class:`ModelPart` of a range of states ``(start, stop)``; each process calls it for the
+        ranges of its own devices.
       num_states: S.
       mesh, axis: as for :func:`shard`.
-      propositions: the names of the labels.
+      propositions: names of the labels.
 
     Returns:
       :class:`~jaxltl.core.models.mesh.sharded.ShardedMDP`.
 
     Raises:
-      ValueError: naming the state and the value: what is wrong with a part.
+      ValueError: an invalid part, naming the state and the value.
 
     Example:
       >>> def cycle(start, stop):  # from each state to the next
@@ -169,30 +170,26 @@ def model_from_parts(
 
 
 def ranges_of(num_states: int, mesh: Mesh, axis: str | None = None) -> list[tuple[int, int]]:
-    """The ranges of states, ``(start, stop)``, that this process is asked for parts of.
-
-    Raises:
-      ValueError: the axis is none, or there are fewer states than devices.
-    """
-    layout = _layout(num_states, mesh, axis)
+    """The ranges of states ``(start, stop)`` of this process's devices."""
+    layout = state_layout(num_states, mesh, axis)
     return [layout.span(d) for d in layout.mine]
 
 
 def to_mesh(model: ShardedMDP, quantity: Any, fill: Any = 0) -> jax.Array:
-    """A quantity of the given model in the places of the sharded one.
+    """A quantity of the original model on the mesh.
 
     Args:
-      model: the model.
-      quantity: ``[S, ...]`` of states, or of pairs of a state and an action, or of the rows of a
-        sparse model ``[R]``; on the host, the same in every process.
-      fill: where there is no such state or choice.
+      model: the distributed model.
+      quantity: ``[S, ...]`` on states or state-action pairs, or ``[R]`` on rows of a sparse model;
+        concrete, and the same in every process.
+      fill: the value at padded states and choices.
 
     Returns:
-      ``[N, ...]``, of rows ``[N, A]``. Put there from the host: derivatives begin with what is on
-      the mesh.
+      ``[N, ...]``, of rows ``[N, A]``. Derivatives start at the result.
 
     Raises:
-      ValueError: the shape is wrong.
+      ValueError: a wrong shape, or a weight of a choice that is zero or subnormal in the model's
+        precision.
 
     Example:
       >>> import jaxltl as jl
@@ -233,12 +230,12 @@ def _num_rows(model: ShardedMDP) -> int:
 
 
 def from_mesh(model: ShardedMDP, quantity: jax.Array) -> np.ndarray:
-    """A quantity ``[N, ...]`` as one of the given model, ``[S, ...]``, on the host.
+    """A quantity ``[N, ...]`` on the mesh as one of the original model, a NumPy array ``[S, ...]``.
 
-    In several processes all of them call it, and each gets all of it.
+    With several processes, all call it and each gets the whole array.
 
     Args:
-      model: the model on the mesh.
+      model: the distributed model.
       quantity: ``[N, ...]``, such as a solution's value.
 
     Returns:
@@ -257,113 +254,7 @@ def from_mesh(model: ShardedMDP, quantity: jax.Array) -> np.ndarray:
     return result
 
 
-# --- what stands where ----------------------------------------------------------------------------
-
-
-class _Layout(NamedTuple):
-    """Who holds which states."""
-
-    mesh: Mesh
-    axis: str
-    num_given: int
-
-    @property
-    def starts(self) -> np.ndarray:
-        """Where the ranges begin, and where the last one ends."""
-        return np.arange(self.parts + 1) * self.num_given // self.parts
-
-    @property
-    def size(self) -> int:
-        """The places on a device."""
-        return -(-self.num_given // self.parts)
-
-    def place(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Which range a state is in, and where."""
-        range_ = np.searchsorted(self.starts, state, "right") - 1
-        return range_, state - self.starts[range_]
-
-    @property
-    def parts(self) -> int:
-        return self.mesh.shape[self.axis]
-
-    @property
-    def sharding(self) -> NamedSharding:
-        return NamedSharding(self.mesh, PartitionSpec(self.axis))
-
-    def devices(self, d: int) -> list[Any]:
-        """The devices with the d-th range, more than one where the mesh has other axes."""
-        along = self.mesh.axis_names.index(self.axis)
-        return list(np.moveaxis(self.mesh.devices, along, 0)[d : d + 1].ravel())
-
-    def owner(self, d: int) -> int:
-        """The process that speaks for a range."""
-        return min(device.process_index for device in self.devices(d))
-
-    @property
-    def mine(self) -> list[int]:
-        """The ranges of which this process holds a copy."""
-        here = jax.process_index()
-        return [
-            d
-            for d in range(self.parts)
-            if any(device.process_index == here for device in self.devices(d))
-        ]
-
-    def span(self, d: int) -> tuple[int, int]:
-        return int(self.starts[d]), int(self.starts[d + 1])
-
-    def array(self, pieces: Mapping[int, np.ndarray]) -> jax.Array:
-        """The global array of which each device has a piece, all of one shape."""
-        here, found = jax.process_index(), []
-        for d, piece in pieces.items():
-            found += [
-                jax.device_put(piece, device)
-                for device in self.devices(d)
-                if device.process_index == here
-            ]
-        some = next(iter(pieces.values()))
-        shape = (some.shape[0] * self.parts, *some.shape[1:])
-        return jax.make_array_from_single_device_arrays(shape, self.sharding, found)
-
-    def replicated(self, x: np.ndarray) -> jax.Array:
-        """The same on all devices."""
-        return jax.make_array_from_callback(
-            x.shape, NamedSharding(self.mesh, PartitionSpec()), lambda index: x[index]
-        )
-
-    def exchanged(self, pieces: Mapping[int, np.ndarray]) -> list[np.ndarray]:
-        """What every range has, in every process; pieces differ in their first axis alone."""
-        if jax.process_count() == 1:
-            return [pieces[d] for d in range(self.parts)]
-        from jax.experimental import multihost_utils
-
-        length = np.zeros(self.parts, np.int64)
-        for d, piece in pieces.items():
-            length[d] = len(piece)
-        length = np.asarray(multihost_utils.process_allgather(length)).max(0)
-        some = next(iter(pieces.values()))
-        padded = np.zeros((self.parts, int(length.max()), *some.shape[1:]), some.dtype)
-        for d, piece in pieces.items():
-            padded[d, : len(piece)] = piece
-        # Bytes, since JAX may hold no wider numbers than single precision.
-        every = np.asarray(multihost_utils.process_allgather(padded.view(np.uint8)))
-        return [
-            np.ascontiguousarray(every[self.owner(d), d]).view(some.dtype)[: length[d]]
-            for d in range(self.parts)
-        ]
-
-
-def _layout(num_states: int, mesh: Mesh, axis: str | None) -> _Layout:
-    validation.instance("mesh", mesh, Mesh, "a jax.sharding.Mesh, such as jax.make_mesh makes")
-    names = axes_of(mesh, axis)
-    if len(names) != 1:
-        raise ValueError(f"the mesh has axes {mesh.axis_names}; name one of them as axis.")
-    axis = names[0]
-    if num_states < mesh.shape[axis]:
-        raise ValueError(
-            f"{num_states} states cannot lie on {mesh.shape[axis]} devices; give a mesh of fewer."
-        )
-    return _Layout(automatic(mesh), axis, num_states)
+# --- parts ----------------------------------------------------------------------------------------
 
 
 def _order(model: SparseMDP, order: Any) -> np.ndarray:
@@ -391,7 +282,7 @@ def _order(model: SparseMDP, order: Any) -> np.ndarray:
 
 
 class _Piece(NamedTuple):
-    """What a device has of the arrays of a ShardedMDP."""
+    """A device's share of the arrays of a ShardedMDP."""
 
     tables: tuple[RowTable, ...]
     place: np.ndarray | None
@@ -406,7 +297,7 @@ class _Piece(NamedTuple):
 def _assembled(
     part: Any, ordered: Any, num_states: int, mesh: Mesh, axis: str | None, propositions: Any
 ) -> ShardedMDP:
-    layout = _layout(num_states, mesh, axis)
+    layout = state_layout(num_states, mesh, axis)._replace(order=ordered)
     parts = {d: _checked(part, layout, d, len(propositions)) for d in layout.mine}
     facts = np.concatenate(layout.exchanged({d: _facts(x) for d, x in parts.items()}))
     halo = _halo(layout, parts)
@@ -419,8 +310,8 @@ def _assembled(
     )
     pieces = {}
     for d, x in parts.items():
-        tables, place = _tables(layout, halo, facts, d, x)
-        pieces[d] = _of_states(layout, facts, d, x, tables, place, labels, ordered)
+        rows = _tables(layout, halo, facts, d, x)
+        pieces[d] = _of_states(layout, facts, d, x, rows, labels)
     whole: _Piece = jax.tree.map(
         lambda *each: layout.array(dict(zip(pieces, each, strict=True))), *pieces.values()
     )
@@ -437,7 +328,7 @@ def _assembled(
 
 
 class _Range(NamedTuple):
-    """A part with all that it may leave out."""
+    """A validated part with its defaults."""
 
     entry_start: np.ndarray
     successor: np.ndarray
@@ -450,7 +341,7 @@ class _Range(NamedTuple):
     row: np.ndarray | None
 
 
-def _checked(part: Any, layout: _Layout, d: int, num_labels: int) -> _Range:
+def _checked(part: Any, layout: StateLayout, d: int, num_labels: int) -> _Range:
     start, stop = layout.span(d)
     found = part(start, stop)
     if not isinstance(found, ModelPart):
@@ -502,7 +393,7 @@ _ACTIONS, _WIDEST, _TRANSITIONS, _INITIAL, _COUNTS = range(5)
 
 
 def _facts(part: _Range) -> np.ndarray:
-    """Of a range: actions, widest row, transitions, initial mass, and the rows of each width."""
+    """Actions, widest row, transitions, initial mass, and the number of rows of each width."""
     width = np.diff(part.entry_start)
     rows = np.bincount(np.searchsorted(_WIDTHS, width), minlength=_WIDTHS.size)
     return np.concatenate(
@@ -519,20 +410,20 @@ def _facts(part: _Range) -> np.ndarray:
 
 
 class _Halo(NamedTuple):
-    """What is exchanged before a sweep."""
+    """The communication before a sweep."""
 
-    layout: _Layout
+    layout: StateLayout
     rounds: Any
     sent: list[dict[int, np.ndarray]]
     asked: list[np.ndarray] | None  # the states that each range asks for, in order
     first: dict[tuple[int, int], int]  # where what comes from another range begins
 
     def own(self, d: int) -> int:
-        """Where a device sees its own states."""
+        """The place of a device's first own state."""
         return d * self.layout.size if self.asked is None else 0
 
     def places(self, d: int, successor: np.ndarray) -> np.ndarray:
-        """Numbers of states as places among what a device sees."""
+        """State numbers as local places."""
         owner, found = self.layout.place(successor)
         if self.asked is None:
             return (owner * self.layout.size + found).astype(np.int32)
@@ -547,7 +438,7 @@ def _within(ascending: np.ndarray, start: int, stop: int) -> np.ndarray:
     return ascending[slice(*np.searchsorted(ascending, (start, stop)))]
 
 
-def _halo(layout: _Layout, parts: Mapping[int, _Range]) -> _Halo:
+def _halo(layout: StateLayout, parts: Mapping[int, _Range]) -> _Halo:
     count, size = layout.parts, layout.size
     asked = {}
     for d, part in parts.items():
@@ -578,9 +469,9 @@ def _halo(layout: _Layout, parts: Mapping[int, _Range]) -> _Halo:
 
 
 def _tables(
-    layout: _Layout, halo: _Halo, facts: np.ndarray, d: int, part: _Range
+    layout: StateLayout, halo: _Halo, facts: np.ndarray, d: int, part: _Range
 ) -> tuple[tuple[RowTable, ...], np.ndarray | None]:
-    """A range's rows by width, and which row each choice is; filled states lead to themselves."""
+    """Rows by width, and the row of each choice; padded states have self-loops."""
     num_actions, widest = (int(x) for x in facts[:, [_ACTIONS, _WIDEST]].max(0))
     here, size, own = part.initial.size, layout.size, halo.own(d)
     successor = halo.places(d, part.successor)
@@ -597,7 +488,7 @@ def _tables(
         target[filled * num_actions, 0], weight[filled * num_actions, 0] = own + filled, 1
         return (RowTable(target, weight),), None
     most, kind = facts[:, _COUNTS:].max(0).astype(np.int64), np.searchsorted(_WIDTHS, width)
-    # The last two rows are that of filled states and that of what is no choice.
+    # The first two rows are those of padded states and of missing choices.
     tables = [RowTable(np.zeros((2, 1), np.int32), np.zeros((2, 1)))]
     tables[0].successor[0, 0], tables[0].probability[0, 0] = own + min(here, size - 1), 1
     place, begins = np.ones((size, num_actions), np.int32), 2
@@ -618,15 +509,14 @@ def _tables(
 
 
 def _of_states(
-    layout: _Layout,
+    layout: StateLayout,
     facts: np.ndarray,
     d: int,
     part: _Range,
-    tables: Any,
-    place: Any,
+    rows: tuple[tuple[RowTable, ...], np.ndarray | None],
     labels: np.ndarray,
-    ordered: Any,
 ) -> _Piece:
+    tables, place = rows
     num_actions, here = int(facts[:, _ACTIONS].max()), part.initial.size
     state = np.repeat(np.arange(here), np.diff(part.row_start))
     pair = state, part.action
@@ -643,13 +533,14 @@ def _of_states(
             "number them apart."
         )
     available[here:, 0] = True
-    kind = np.zeros(layout.size, np.int32)  # filled states show what another shows
+    kind = np.zeros(layout.size, np.int32)  # padded states have some label that occurs
     different, of = np.unique(part.label, axis=0, return_inverse=True)
     place_of = {shown.tobytes(): i for i, shown in enumerate(labels)}
     kind[:here] = np.array([place_of[x.tobytes()] for x in different], np.int32)[of.ravel()]
     start, stop = layout.span(d)
     number = np.full(layout.size, -1, np.int32)
-    number[:here] = np.arange(start, stop) if ordered is None else ordered[start:stop]
+    order = layout.order
+    number[:here] = np.arange(start, stop) if order is None else order[start:stop]
     row = None if part.row is None else on_choices(part.row, -1, np.int32)
     initial = np.zeros(layout.size)
     initial[:here] = part.initial

@@ -1,10 +1,9 @@
-"""Models whose states lie on the devices of a mesh, and how values get from one to another.
+"""Models distributed over the devices of a mesh, and their operators.
 
-A device holds a range of the states with the rows of their choices. What a row leads to is numbered
-as the device sees it: its own states first, then those of others that it is sent before a sweep. So
-every sweep is the one of any other model, on what a device holds, after one exchange: of a halo
-where most successors are near, of all values where they are not. All that solvers do besides is
-elementwise or a reduction, which JAX splits over the mesh by itself.
+A device holds a range of the states with the rows of their choices. Rows refer to local places: the
+device's own states first, then the states that it receives before a sweep. A sweep is one exchange,
+of a halo or of all values, followed by the local sweep; all other operations of solvers are
+elementwise or reductions, which JAX partitions.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ class RowTable(NamedTuple):
     """Rows of one width.
 
     Attributes:
-      successor: ``int32[M, W]``, places among what the row's device sees.
+      successor: ``int32[M, W]``, local places.
       probability: ``float[M, W]``, zero in padding.
     """
 
@@ -41,36 +40,36 @@ class RowTable(NamedTuple):
 @brief(facts=facts.sharded)
 @struct.dataclass
 class ShardedMDP:
-    """A labelled decision process whose states lie on the devices of a mesh axis.
+    """A labelled MDP distributed over the devices of a mesh axis.
 
-    Of N places for states, a device has the same number in a row. Those that are left over are
-    filled with absorbing states, where nothing is earned and no run starts. Quantities on choices
-    are ``[N, A]``. Make one with :func:`~jaxltl.core.models.mesh.shard.shard` or
-    :func:`~jaxltl.core.models.mesh.shard.model_from_parts`, which also put quantities of the given model
-    in its places and bring them back.
+    All devices have the same number of the N places for states; padded places hold absorbing states
+    without reward and initial probability. Quantities on choices are ``[N, A]``.
+    :func:`~jaxltl.core.models.mesh.shard.shard` and
+    :func:`~jaxltl.core.models.mesh.shard.model_from_parts` build one, and
+    :func:`~jaxltl.core.models.mesh.shard.to_mesh` and
+    :func:`~jaxltl.core.models.mesh.shard.from_mesh` convert quantities.
 
     Attributes:
-      tables: the rows by their width; those of a device stand together.
-      place: ``int32[N, A]``, which of its device's rows a choice is, over all tables; None: one
-        table, in the order of states and actions.
+      tables: the rows by width; those of a device are contiguous.
+      place: ``int32[N, A]``, the local row of each choice, over all tables; None: one table, in the order
+        of states and actions.
       available: ``bool[N, A]``.
-      sent: for each round of an exchange ``int32[D * H]``, which of its own states a device sends.
+      sent: for each round of an exchange ``int32[D * H]``, the local states that a device sends.
       initial: ``float[N]``, the initial distribution.
-      kind: ``int32[N]``, which of the rows of `shown` a state's label is.
+      kind: ``int32[N]``, the row of `shown` that is the label of each state.
       shown: ``bool[U, P]``, the labels that occur.
-      rewards: named expected rewards of choices, ``float[N, A]``.
-      number: ``int32[N]``, of the state in the given model; -1 where there is none.
-      row: ``int32[N, A]``, of the choice in the given sparse model; -1 where there is none. None
-        if there was no such model.
-      propositions: the P names, static.
-      num_given: S, the states of the given model; static.
-      mesh, axis: the devices, and over which of the mesh's axes the states lie; static.
-      rounds: for each round the pairs (from, to) of devices; None: all values go to all; static.
+      rewards: expected rewards of choices by name, ``float[N, A]``.
+      number: ``int32[N]``, the state of the original model, or -1.
+      row: ``int32[N, A]``, the row of the original sparse model, or -1; None without such a model.
+      propositions: the P names; static.
+      num_given: S, the states of the original model; static.
+      mesh, axis: the devices, and the mesh axis of the states; static.
+      rounds: for each round the pairs (source, target) of devices; None: all-gather; static.
 
     Example:
       >>> import jaxltl as jl
       >>> path = jl.make_sparse(None, [0, 1, 2], [1, 1], [1, 1])
-      >>> model = jl.shard(path, jax.make_mesh((1,), ("states",)))
+      >>> model = jl.models.shard(path, jax.make_mesh((1,), ("states",)))
       >>> model.num_given, model.num_devices, model.num_exchanged
       (2, 1, 0)
     """
@@ -93,12 +92,12 @@ class ShardedMDP:
 
     @property
     def num_states(self) -> int:
-        """Places for states, filled ones among them."""
+        """N, padded states included."""
         return self.available.shape[0]
 
     @property
     def num_actions(self) -> int:
-        """A, the most choices of a state."""
+        """A, the largest number of choices of a state."""
         return self.available.shape[1]
 
     @property
@@ -108,32 +107,32 @@ class ShardedMDP:
 
     @property
     def num_successors(self) -> int:
-        """The most successors of a choice."""
+        """The largest number of successors of a choice."""
         return max(table.successor.shape[1] for table in self.tables)
 
     @property
     def dtype(self) -> Any:
-        """Of the probabilities."""
+        """The dtype of the probabilities."""
         return self.tables[0].probability.dtype
 
     @property
     def label(self) -> jax.Array:
-        """``bool[N, P]``, which propositions hold in a state."""
+        """``bool[N, P]``, the propositions that hold in each state."""
         return kernels.gather(self.shown, self.kind)
 
     @property
     def num_devices(self) -> int:
-        """Over which the states lie."""
+        """D."""
         return self.mesh.shape[self.axis]
 
     @property
     def sharding(self) -> NamedSharding:
-        """Of arrays ``[N, ...]``."""
+        """The sharding of arrays ``[N, ...]``."""
         return NamedSharding(self.mesh, PartitionSpec(self.axis))
 
     @property
     def num_exchanged(self) -> int:
-        """How many values go from device to device before a sweep, in all."""
+        """The number of values communicated before a sweep."""
         if self.rounds is None:
             return self.num_states * (self.num_devices - 1)
         each = (x.shape[0] // self.num_devices for x in self.sent)
@@ -141,18 +140,14 @@ class ShardedMDP:
 
 
 def is_sharded(model: Model) -> bool:
-    """Whether a model, or the world of a product or a game, lies on a mesh."""
+    """True if a model, or the base model of a product or a game, is distributed."""
     while not isinstance(model, ShardedMDP) and hasattr(model, "mdp"):
         model = model.mdp
     return isinstance(model, ShardedMDP)
 
 
 def refuse_sharded(model: Model) -> None:
-    """Raises where something reads a model on the host, and it lies on a mesh.
-
-    Raises:
-      ValueError: it does, with what there is over a mesh.
-    """
+    """Raises ValueError for a distributed model, naming the supported functions."""
     while hasattr(model, "mdp"):
         model = model.mdp
     if isinstance(model, ShardedMDP):
@@ -160,13 +155,13 @@ def refuse_sharded(model: Model) -> None:
 
 
 def over_devices(model: ShardedMDP, function: Any, *arguments: Any) -> Any:
-    """``function(*arguments)`` on what each device has of them, side by side."""
+    """``function(*arguments)`` on each device's share of the arguments."""
     spec = PartitionSpec(model.axis)
     return jax.shard_map(function, mesh=model.mesh, in_specs=spec, out_specs=spec)(*arguments)
 
 
 def seen_by(model: ShardedMDP, sent: tuple[jax.Array, ...], value: jax.Array) -> jax.Array:
-    """On a device: its values and those that it is sent, in the order of its tables' places."""
+    """On a device: its own values and the received ones, by local place."""
     if model.rounds is None:
         return lax.all_gather(value, model.axis, tiled=True)
     parts = [value]
@@ -249,7 +244,7 @@ def _(model: ShardedMDP, quantity: jax.Array) -> jax.Array:
 
 
 def _across(available: jax.Array, quantity: jax.Array) -> jax.Array:
-    """``[N, A]`` beside quantities ``[N, ..., A]``."""
+    """``[N, A]`` broadcast to quantities ``[N, ..., A]``."""
     missing = quantity.ndim - available.ndim
     return available.reshape(available.shape[0], *(1,) * missing, available.shape[1])
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import jaxltl as jl
+from jaxltl.core.graphs.attractor import almost_surely_reaching, attractor
 from jaxltl.core.models.ops.operators import least_successor
 from tests.support import REPRESENTATIONS, random_representation
 
@@ -30,7 +31,6 @@ def questions(model, region, value, reward, policy, *, compiled=True):
 
     Those that are compiled in any case need not be asked twice.
     """
-    attractor = jl.core.graphs.attractor
     components = jl.graphs.end_components(model, jnp.ones(model.state_shape, bool))
     solved = (
         {
@@ -50,8 +50,8 @@ def questions(model, region, value, reward, policy, *, compiled=True):
     )
     return {
         "available": model.available,
-        "surely": attractor.almost_surely_reaching(model, region).region,
-        "forced": attractor.attractor(model, region, rule="forall").region,
+        "surely": almost_surely_reaching(model, region).region,
+        "forced": attractor(model, region, rule="forall").region,
         "components": components.inside,
         "most": jl.reachability_probability(model, region).value,
         "least probability": jl.reachability_probability(model, region, objective="min").value,
