@@ -74,12 +74,11 @@ def with_exits(mdp: HostMDP, leaving: Booleans) -> HostMDP:
     target, weight = target[order], weight[order]
     same = np.zeros(target.size, bool)
     same[1:] = (target[1:] == size) & (target[:-1] == size) & (mdp.row[1:] == mdp.row[:-1])
-    group = np.cumsum(~same) - 1
-    weight = np.bincount(group, weight)
+    merged = np.add.reduceat(weight, np.flatnonzero(~same))
     width = np.bincount(mdp.row[~same], minlength=mdp.num_rows)
     return HostMDP(
         offsets_from_counts(np.append(np.diff(mdp.row_start), 1)),
         offsets_from_counts(np.append(width, 1)),
         np.append(target[~same], size).astype(np.int32),
-        np.append(weight, 1.0),
+        np.append(merged, 1.0),
     )

@@ -1,4 +1,4 @@
-"""What certifies a value: MacQueen's bounds, the M-matrix bound, and the rounding in both."""
+"""Certificates of values: MacQueen's bounds, the M-matrix bound, and rounding errors."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from jaxltl.core.types import Solution, Status
 
 
 def rounding_unit(model: Any) -> Any:
-    """Rounding errors of one backup, relative to the magnitude of what it sums.
+    """Rounding error of one backup, relative to the magnitude of its terms.
 
-    A backup sums at most as many products as a state has successors, over which rows may
-    also miss one by a rounding each, and takes a maximum or a mean over the actions.
+    A backup adds at most K products and takes a maximum or a mean over A actions. The sum of a row
+    may miss 1 by a rounding for each entry, since a model means its normalised rows.
     """
     terms = widest_row(model) + most_choices(model) + 4
     return terms * float(jnp.finfo(model.dtype).eps)
@@ -29,7 +29,7 @@ def underflow(model: Any) -> Any:
 
 
 def most_choices(model: Any) -> Any:
-    """The most choices that a state has: static, but of a sparse model ``int32[]``."""
+    """Maximal number of choices of a state: static, for a sparse model ``int32[]``."""
     world = getattr(model, "mdp", model)
     if isinstance(world, SparseMDP):
         return jnp.max(jnp.diff(jnp.asarray(world.row_start)))
@@ -37,7 +37,7 @@ def most_choices(model: Any) -> Any:
 
 
 def widest_row(model: Any) -> Any:
-    """The most successors that a choice has: static, but of a sparse model ``int32[]``."""
+    """Maximal number of successors of a choice: static, for a sparse model ``int32[]``."""
     world = getattr(model, "mdp", model)
     if isinstance(world, SparseMDP):
         return jnp.max(jnp.diff(jnp.asarray(world.entry_start)))
@@ -56,13 +56,13 @@ def backup_error(unit: Any, *sizes: Any) -> jax.Array:
 
 
 class Enclosure(NamedTuple):
-    """An enclosure seen from an image, and what it shows; a field may have lanes.
+    """An enclosure relative to an image; a field may have a last axis of lanes.
 
     Attributes:
-      shift: from the image to the middle.
+      shift: the middle of the enclosure minus the image.
       half: half of the width; infinite without a certificate.
       converged: whether the width is at most the tolerance.
-      exhausted: whether it is mostly rounding, so that further sweeps would not help.
+      exhausted: whether the width is mostly rounding, so that further sweeps would not help.
       finite: whether there is a certificate.
     """
 
@@ -74,7 +74,7 @@ class Enclosure(NamedTuple):
 
     @property
     def ended(self) -> jax.Array:
-        """Whether there is nothing left to gain."""
+        """Whether further sweeps would not help."""
         return self.converged | self.exhausted | ~self.finite
 
 
@@ -91,8 +91,8 @@ def enclose(
 
     Args:
       value, image: ``[N, ...]``, v and ``T v``.
-      discount: g; there are no bounds from 1 on.
-      rounding: what one backup can err by.
+      discount: g < 1; else there are no bounds.
+      rounding: error of one backup.
       tolerance: width of the enclosure; None: what the dtype allows.
     """
     change = image - value
@@ -128,22 +128,22 @@ def m_matrix_error(
     value: jax.Array,
     undecided: jax.Array,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """A certified error of an approximate solution of ``y = P y`` where it is undecided.
+    """Certified error of an approximate solution of ``y = P y`` on the undecided states.
 
-    If e >= 0 satisfies ``e - P e >= |r|`` there, where r is the residual of y and P leads nowhere
-    from elsewhere, then ``|y - y*| <= e``, because ``I - P`` is an M-matrix. So a second solve
-    certifies the first, and a check of that inequality, rounding included, is the proof.
+    If e >= 0 satisfies ``e - P e >= |r|`` there, where r is the residual of y and decided states
+    are absorbing, then ``|y - y*| <= e``, because ``I - P`` is an M-matrix. A second solve gives e,
+    and a check of the inequality, rounding included, proves it.
 
     Args:
-      model: what P belongs to.
+      model: the model of P.
       solve: approximately ``(I - P) x = b``.
       onward: ``x -> P x``, zero where decided.
       value: ``float[S]`` in [0, 1], exact where decided.
       undecided: ``bool[S]``.
 
     Returns:
-      The error ``float[S]``, zero where decided and one elsewhere if nothing is proven; the
-      largest residual; and whether it was proven.
+      The error ``float[S]``, zero where decided, and 1 elsewhere if the check fails; the largest
+      residual; and whether the check holds.
     """
     unit = rounding_unit(model)
     residual = jnp.where(undecided, jnp.abs(onward(value) - value), 0)
@@ -156,12 +156,9 @@ def m_matrix_error(
 
 
 def refuse(solution: Solution, policy: jax.Array, valid: jax.Array) -> Solution:
-    """The solution, or one that says that the policy it was asked for is none.
+    """The solution, or INVALID_POLICY without value and bounds unless the policy is valid.
 
-    Args:
-      solution: of whatever the policy was taken for.
-      policy: as it was given, NaN at unavailable actions.
-      valid: whether it is a policy.
+    `policy` is the argument of the solver, NaN at unavailable actions.
     """
 
     def where(good: jax.Array, bad: float) -> jax.Array:

@@ -28,7 +28,13 @@ class LinearSystem(Protocol):
 class Krylov(NamedTuple):
     """The solvers of :func:`~jaxltl.core.values.engine.linear.solve_linear`."""
 
-    solve = transpose_solve = staticmethod(solve_linear)
+    def solve(self, matvec: Operator, b: jax.Array) -> jax.Array:
+        """The solution of the system."""
+        return solve_linear(matvec, b)
+
+    def transpose_solve(self, matvec: Operator, b: jax.Array) -> jax.Array:
+        """The solution of the transposed system."""
+        return solve_linear(matvec, b)
 
 
 def implicit(

@@ -1,9 +1,8 @@
-"""The one loop of every solver, in which each lane goes at its own pace.
+"""The loop of all solvers, and its batching under ``vmap``.
 
-Under ``vmap``, loops that look at their data in every step are run lane after lane: each makes its
-own steps and no others, bit for bit those that it makes alone. Sweeps, in which all lanes do the
-same, run side by side, the lanes as the last axis of every array: a gather then moves whole rows of
-lanes, and what is computed of them is vectorised.
+Loops with data-dependent branches are batched sequentially: each lane makes the same steps, bit for
+bit, as alone. Sweeps are batched with the lanes as the last axis of every array, so that a gather
+moves whole rows of lanes and arithmetic on them is vectorised.
 """
 
 from __future__ import annotations
@@ -32,31 +31,30 @@ def iterate(
     lanes: str = "in turn",
     every: int = 1,
 ) -> tuple[Any, jax.Array]:
-    """``carry = step(table, carry, given)`` until ``finished(carry, given)``, at least once.
+    """Repeats ``carry = step(table, carry, given)`` until ``finished(carry, given)``, at least once.
 
-    Nothing is differentiated through it: solvers attach implicit derivatives to what it finds.
+    Not differentiable: solvers attach implicit derivatives to the result.
 
     Args:
-      step: one unit of work; it closes over nothing that differs from lane to lane, unless
-        `lanes` is ``"mapped"``.
+      step: one step; unless `lanes` is ``"mapped"``, it closes over no batched array.
       finished: ``bool[]``, or ``bool[lanes]``.
-      table: what lanes can share, such as a model's successors.
-      carry: what changes.
-      given: what does not, and may differ from lane to lane.
-      max_steps: steps at most.
-      lanes: what ``vmap`` makes of it: ``"in turn"``, lane after lane; ``"side by side"``, where
-        arrays have an axis of lanes behind their own; or ``"mapped"`` as any other loop.
-      every: steps between two looks at whether a lane is finished.
+      table: arrays that lanes can share, such as a model's successors.
+      carry: the loop variables.
+      given: constants, maybe batched.
+      max_steps: maximal number of steps.
+      lanes: the batching: ``"in turn"`` (sequential), ``"side by side"`` (a last axis of lanes), or
+        ``"mapped"`` as any other loop.
+      every: number of steps between two tests of `finished`.
 
     Returns:
-      The last carry, and how many steps were made, ``int32[]``.
+      The last carry, and the number of steps, ``int32[]``.
     """
 
     def loop(table: Any, carry: Any, given: Any, most: jax.Array) -> tuple[Any, jax.Array]:
         def one(carry: Any, n: jax.Array, active: jax.Array) -> tuple[Any, jax.Array]:
             new = step(table, carry, given)
             if every == 1 and most.ndim == 0:
-                return new, n + 1  # the loop itself has looked
+                return new, n + 1  # the loop condition has tested it
             goes = active & (n < most)
             return jax.tree.map(partial(jnp.where, goes), new, carry), n + goes
 
@@ -82,14 +80,10 @@ def _mapped(function: Callable[..., Any], *arguments: Any) -> Any:
 
 
 def in_turn(function: Callable[..., Any], *arguments: Any) -> Any:
-    """``function(*arguments)``, which ``vmap`` runs lane after lane.
+    """``function(*arguments)``, batched sequentially under ``vmap``; not differentiable.
 
-    For work whose amount depends on the data, and for what is slower in a batch than alone: a
-    lane's work is its own. It is not differentiated through.
-
-    Args:
-      function: of trees of arrays; it closes over nothing that differs from lane to lane.
-      arguments: its arguments.
+    For work whose amount depends on the data, or that is slower in a batch. The function takes
+    trees of arrays and closes over no batched array.
     """
 
     @jax.custom_batching.sequential_vmap
@@ -100,12 +94,10 @@ def in_turn(function: Callable[..., Any], *arguments: Any) -> Any:
 
 
 def side_by_side(function: Callable[..., Any], table: Any, *arguments: Any) -> Any:
-    """``function(table, *arguments)``, whose lanes under ``vmap`` become a last axis.
+    """``function(table, *arguments)``, batched under ``vmap`` with a last axis of lanes.
 
-    Args:
-      function: of arrays with or without that axis; it closes over nothing that is traced.
-      table: shared by the lanes; if it is batched too, they are mapped as usual.
-      arguments: trees of arrays.
+    The function takes arrays with and without that axis, and closes over no traced array. A batched
+    `table` is mapped as usual.
     """
 
     @jax.custom_batching.custom_vmap
@@ -133,10 +125,10 @@ def side_by_side(function: Callable[..., Any], table: Any, *arguments: Any) -> A
 
 
 def fill_row(x: jax.Array) -> jax.Array:
-    """Lanes on the last axis, of which the last is repeated until they fill vector units.
+    """Pads the last axis to a multiple of the vector width by repeating the last lane.
 
-    XLA vectorises rows of any other length badly or not at all: 16 exponentials in a row take a
-    quarter of the time of 10. Few lanes stay as they are.
+    XLA vectorises rows of other lengths badly: 16 exponentials in a row take a quarter of the time
+    of 10. Fewer than half a vector is not padded.
     """
     size = x.shape[-1]
     room = size if size < _ROW / 2 else -(-size // _ROW) * _ROW

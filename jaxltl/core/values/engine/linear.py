@@ -1,8 +1,8 @@
-"""Linear systems ``(I - c P_w) x = b`` and their transposes, small and large.
+"""Linear systems ``(I - c P_w) x = b`` and their transposes, inside ``jit``.
 
-Small systems are inverted by elimination: it does not matter how slowly a policy makes progress.
-The library's own, since LAPACK's threads make batches of small systems wait for one another.
-Large ones are solved by BiCGSTAB.
+Small systems are inverted by elimination, so that the number of expected steps does not matter; not
+by LAPACK, whose threads make batches of small systems wait for one another. Large systems are
+solved by Richardson iteration and BiCGSTAB (van der Vorst 1992).
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class System(NamedTuple):
         return y - back
 
     def matrix(self) -> jax.Array:
-        """``float[N, N]``, written out."""
+        """The system as ``float[N, N]``."""
         n = self.num_states
         eye = jnp.eye(n, dtype=jax.tree.leaves(self.weight)[0].dtype)
         if not isinstance(self.table, SuccessorTable):
@@ -90,18 +90,13 @@ class System(NamedTuple):
 
 
 class Inverse(NamedTuple):
-    """An inverse, with the system to refine by.
-
-    Attributes:
-      system: what was inverted.
-      inverse: ``float[N, N]``.
-    """
+    """A system and its inverse ``float[N, N]``, by which it is solved with refinement."""
 
     system: System
     inverse: jax.Array
 
     def counted(self, b: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """As :meth:`solve`, and the products with the system that it took."""
+        """The result of :meth:`solve`, and the number of products with the system."""
         x = _refined(self.inverse, self.system.matvec, b.ravel())
         return x.reshape(b.shape), jnp.int32(_REFINEMENTS)
 
@@ -110,22 +105,22 @@ class Inverse(NamedTuple):
         return self.counted(b)[0]
 
     def transpose_counted(self, b: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """As :meth:`transpose_solve`, and the products that it took."""
+        """The result of :meth:`transpose_solve`, and the number of products."""
         # Without refinement: the transposed product would be a scatter.
         return (b.ravel() @ self.inverse).reshape(b.shape), jnp.int32(0)
 
     def transpose_solve(self, b: jax.Array) -> jax.Array:
-        """The same of the transpose."""
+        """The solution of the transposed system."""
         return self.transpose_counted(b)[0]
 
 
 class Krylov(NamedTuple):
-    """The same without a matrix.
+    """A system solved by :func:`solve_linear`, with the interface of :class:`Inverse`.
 
     Attributes:
-      system: what is to be solved.
+      system: the system.
       tolerance: relative residual; default as of :func:`solve_linear`.
-      max_steps: products with the system at most.
+      max_steps: maximal number of products with the system.
     """
 
     system: System
@@ -133,11 +128,11 @@ class Krylov(NamedTuple):
     max_steps: jax.Array | int = 100_000
 
     def solve(self, b: jax.Array) -> jax.Array:
-        """As :meth:`Inverse.solve`."""
+        """The solution of the system."""
         return self.counted(b)[0]
 
     def counted(self, b: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """As of an Inverse."""
+        """The solution of the system, and the number of products."""
         x, n = _krylov(
             lambda table, given, x: System(table, *given).matvec(x),
             self.system.table,
@@ -149,11 +144,11 @@ class Krylov(NamedTuple):
         return x.reshape(b.shape), n
 
     def transpose_solve(self, b: jax.Array) -> jax.Array:
-        """As of an Inverse."""
+        """The solution of the transposed system."""
         return self.transpose_counted(b)[0]
 
     def transpose_counted(self, b: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """As of an Inverse."""
+        """The solution of the transposed system, and the number of products."""
         x, n = _krylov(
             lambda table, given, x: System(table, *given).vecmat(x),
             self.system.table,
@@ -168,16 +163,9 @@ class Krylov(NamedTuple):
 def solver(
     system: System, method: str = "auto", *, max_steps: jax.Array | int = 100_000
 ) -> Inverse | Krylov:
-    """What solves a system; its derivatives are not taken.
+    """The solver of a system by method: direct (inversion), iterative, or auto by size.
 
-    Args:
-      system: the system.
-      method: ``"direct"`` (inversion), ``"iterative"`` (BiCGSTAB), or ``"auto"``, direct up to
-        512 states.
-      max_steps: products with the system at most, if it is not inverted.
-
-    Raises:
-      ValueError: unknown method.
+    Not differentiable. `max_steps` is the maximal number of products of an iterative solver.
     """
     if method not in ("auto", "direct", "iterative"):
         raise ValueError(f"method={method!r}; choose auto, direct or iterative.")
@@ -189,7 +177,7 @@ def solver(
 
 
 def is_small(table: Any, num_states: int) -> bool:
-    """Whether systems of so many states are inverted; those on several devices never are."""
+    """Whether systems of `num_states` are inverted; sharded ones are not."""
     spread = isinstance(table, ModelOperator | ShardedSuccessorTable) and is_sharded(table.model)
     return num_states <= DENSE_LIMIT and not spread
 
@@ -203,14 +191,11 @@ def _refined(inverse_: jax.Array, matvec: Any, b: jax.Array) -> jax.Array:
 
 
 def inverse(matrix: jax.Array) -> jax.Array:
-    """The inverse of a matrix by Gauss-Jordan elimination without pivoting, in blocks.
+    """The inverse of ``float[N, N]`` by Gauss-Jordan elimination without pivoting, in blocks.
 
     Stable for ``I - c P`` with a stochastic P and ``c <= 1``: elimination without pivoting does not
     let the entries of a diagonally dominant matrix grow (Higham 2002, section 9.5). A singular
     matrix gives NaN or infinity.
-
-    Args:
-      matrix: ``float[N, N]``.
 
     Example:
       >>> inverse(jnp.array([[1.0, -0.5], [-0.5, 0.75]])).tolist()
@@ -231,7 +216,7 @@ def inverse(matrix: jax.Array) -> jax.Array:
         pivot = _small_inverse(lax.dynamic_slice(rows, (0, start), (block, block)))
         rows = pivot @ jnp.where(inside, 0, rows)
         a = jnp.where(inside, 0, a) - columns @ rows
-        # Products of numbers this small would be denormal, which are slow, and weigh nothing.
+        # Products of numbers this small are subnormal, which is slow, and do not matter.
         a = jnp.where(jnp.abs(a) < smallest, 0, a)
         a = lax.dynamic_update_slice(a, -columns @ pivot, (0, start))
         rows = lax.dynamic_update_slice(rows, pivot, (0, start))
@@ -254,9 +239,9 @@ def _small_inverse(matrix: jax.Array) -> jax.Array:
 
 
 class Bicgstab(NamedTuple):
-    """BiCGSTAB in the names of van der Vorst (1992): two products with the system a step.
+    """State of BiCGSTAB in the notation of van der Vorst (1992), arrays ``[N]``.
 
-    Arrays ``[N]``; `r` is the residual of x by recurrence.
+    One iteration has two products with the system. `r` is the residual of x by recurrence.
     """
 
     x: jax.Array
@@ -273,14 +258,14 @@ class Bicgstab(NamedTuple):
         return norm(self.r)
 
     def first(self, image: jax.Array) -> Bicgstab:
-        """With the system applied to `p`; it is to be applied to `r` next."""
+        """First half of an iteration, from the product with `p`; the next one is with `r`."""
         alpha = _ratio(self.rho, dot(self.shadow, image))
         return self._replace(
             x=self.x + alpha * self.p, r=self.r - alpha * image, v=image, alpha=alpha
         )
 
     def second(self, image: jax.Array) -> Bicgstab:
-        """With the system applied to `r`; it is to be applied to `p` next."""
+        """Second half of an iteration, from the product with `r`; the next one is with `p`."""
         omega = _ratio(dot(image, self.r), dot(image, image))
         x, r = self.x + omega * self.r, self.r - omega * image
         rho = dot(self.shadow, r)
@@ -289,22 +274,22 @@ class Bicgstab(NamedTuple):
 
 
 def start_bicgstab(x: jax.Array, r: jax.Array) -> Bicgstab:
-    """From an x and its residual."""
+    """The state for an x with residual r."""
     rho = dot(r, r)
     return Bicgstab(x, r, r, r, jnp.zeros_like(r), rho, jnp.ones_like(rho))
 
 
 class _Search(NamedTuple):
-    """The state of :func:`solve_linear`."""
+    """State of :func:`solve_linear`."""
 
     phase: jax.Array
-    z: jax.Array  # what the operator is applied to next
+    z: jax.Array  # argument of the next product
     krylov: Bicgstab
-    error: jax.Array  # the norm of the residual
+    error: jax.Array  # norm of the residual
     steps: jax.Array  # in this phase
-    forced: jax.Array  # whether the last stretch was forced Richardson steps
-    returning: jax.Array  # whether this look only fetches the residual of the best x
-    best: jax.Array  # the best x whose true residual was looked at
+    forced: jax.Array  # whether the last phase was Richardson steps after a failure of BiCGSTAB
+    returning: jax.Array  # whether this product only gives the residual of the best x
+    best: jax.Array  # the x with the least true residual
     best_error: jax.Array
     num_steps: jax.Array
 
@@ -312,8 +297,8 @@ class _Search(NamedTuple):
 _RICHARDSON, _FIRST, _SECOND, _LOOK, _DONE = range(5)
 
 
-class _Wanted(NamedTuple):
-    """What is to be solved: the right-hand side, the residual to reach, the steps at most."""
+class _Goal(NamedTuple):
+    """Right-hand side, residual to reach, and maximal number of steps."""
 
     b: jax.Array
     target: jax.Array
@@ -329,21 +314,19 @@ def solve_linear(
 ) -> jax.Array:
     """Solves ``matvec(x) = b`` where matvec is the identity minus an operator.
 
-    Richardson steps ``x + (b - matvec(x))`` for as long as they contract well, then
-    BiCGSTAB (van der Vorst 1992), with regular looks at the true residual. Where
-    BiCGSTAB did not halve it, Richardson steps follow all the same, which converge
-    whenever the operator is a contraction in some norm; they end as soon as their pace
-    shows that max_steps would not be enough. Each step applies `matvec` once; what it is applied
-    to depends on the phase.
+    Richardson steps ``x + (b - matvec(x))`` while they contract well, then BiCGSTAB (van der Vorst
+    1992), restarted from the true residual at regular intervals. If BiCGSTAB does not halve it,
+    Richardson steps follow, which converge whenever the operator is a contraction in some norm;
+    they end when their rate shows that `max_steps` would not be enough.
 
     Args:
-      matvec: a linear map on arrays of the shape of `b`.
+      matvec: a linear map on arrays of the shape of `b`; applied once in each step.
       b: the right-hand side.
       tolerance: relative residual in the Euclidean norm; default ``eps ** 0.8``.
-      max_steps: applications of `matvec` at most.
+      max_steps: maximal number of steps.
 
     Returns:
-      x. Judge it by its residual: the best iterate is returned however it ended.
+      The iterate with the least residual, which may be above the tolerance.
     """
 
     def flat(table: None, given: tuple[()], x: jax.Array) -> jax.Array:
@@ -358,12 +341,12 @@ def _krylov(matvec, table, given, b, tolerance, max_steps, *, lanes: str = "in t
     if tolerance is None:
         tolerance = float(jnp.finfo(b.dtype).eps) ** 0.8
     size = norm(b)
-    wanted = _Wanted(b, tolerance * size, jnp.asarray(max_steps, jnp.int32))
+    goal = _Goal(b, tolerance * size, jnp.asarray(max_steps, jnp.int32))
 
     def step(table: Any, k: _Search, given: Any) -> _Search:
-        given, wanted = given
+        given, goal = given
         image = matvec(table, given, k.z)
-        branches = [partial(f, wanted) for f in (_richardson, _first, _second, _look)]
+        branches = [partial(f, goal) for f in (_richardson, _first, _second, _look)]
         k = lax.switch(k.phase, branches, k, image)
         return k._replace(num_steps=k.num_steps + 1)
 
@@ -385,18 +368,18 @@ def _krylov(matvec, table, given, b, tolerance, max_steps, *, lanes: str = "in t
         lambda k, _: k.phase == _DONE,
         table,
         start,
-        (given, wanted),
+        (given, goal),
         max_steps=max_steps,
         lanes=lanes,
     )
     return last.best, n
 
 
-def _richardson(wanted: _Wanted, k: _Search, image: jax.Array) -> _Search:
+def _richardson(goal: _Goal, k: _Search, image: jax.Array) -> _Search:
     x, r = k.krylov.x + k.krylov.r, k.krylov.r - image
     error = norm(r)
-    small = (error <= wanted.target) | ~jnp.isfinite(error) | (k.forced & (k.steps >= _STRETCH))
-    # At first for as long as it goes well; then BiCGSTAB from where it got to.
+    small = (error <= goal.target) | ~jnp.isfinite(error) | (k.forced & (k.steps >= _STRETCH))
+    # Richardson steps while they contract well, then BiCGSTAB from their iterate.
     slow = ~k.forced & (error > _GOOD_RATE * k.error)
     look = small & ~slow
     after = jnp.where(look, _LOOK, jnp.where(slow, _FIRST, _RICHARDSON)).astype(jnp.int32)
@@ -409,15 +392,15 @@ def _richardson(wanted: _Wanted, k: _Search, image: jax.Array) -> _Search:
     )
 
 
-def _first(wanted: _Wanted, k: _Search, image: jax.Array) -> _Search:
+def _first(goal: _Goal, k: _Search, image: jax.Array) -> _Search:
     krylov = k.krylov.first(image)
     return k._replace(krylov=krylov, phase=jnp.full_like(k.phase, _SECOND), z=krylov.r)
 
 
-def _second(wanted: _Wanted, k: _Search, image: jax.Array) -> _Search:
+def _second(goal: _Goal, k: _Search, image: jax.Array) -> _Search:
     krylov = k.krylov.second(image)
     error = krylov.size
-    ended = (error <= wanted.target / 2) | (k.steps >= _STRETCH) | ~jnp.isfinite(error)
+    ended = (error <= goal.target / 2) | (k.steps >= _STRETCH) | ~jnp.isfinite(error)
     return k._replace(
         krylov=krylov,
         error=error,
@@ -427,22 +410,22 @@ def _second(wanted: _Wanted, k: _Search, image: jax.Array) -> _Search:
     )
 
 
-def _look(wanted: _Wanted, k: _Search, image: jax.Array) -> _Search:
-    """Judges x by its true residual; what failed is left for the best x so far."""
-    r = wanted.b - image
+def _look(goal: _Goal, k: _Search, image: jax.Array) -> _Search:
+    """Computes the true residual of x, and returns to the best x after a failure."""
+    r = goal.b - image
     error = norm(r)
     better = error < k.best_error  # false for NaN
     halved = error <= k.best_error / 2
     best = jnp.where(better, k.krylov.x, k.best)
     best_error = jnp.where(better, error, k.best_error)
-    # How many stretches more at this pace, if it was forced.
+    # The number of further phases at this rate, if they are forced.
     tiny = float(jnp.finfo(r.dtype).tiny)
     pace = jnp.log(k.best_error / best_error)
-    stretches = jnp.log(best_error / jnp.maximum(wanted.target, tiny)) / jnp.maximum(pace, tiny)
-    # It says nothing before news can have come through from every state.
-    told = k.num_steps > 4 * r.shape[0]
-    hopeless = told & (stretches * _STRETCH > wanted.most - k.num_steps)
-    stop = (best_error <= wanted.target) | (k.forced & ~k.returning & (~better | hopeless))
+    stretches = jnp.log(best_error / jnp.maximum(goal.target, tiny)) / jnp.maximum(pace, tiny)
+    # The rate means nothing before information has passed from every state.
+    settled = k.num_steps > 4 * r.shape[0]
+    hopeless = settled & (stretches * _STRETCH > goal.most - k.num_steps)
+    stop = (best_error <= goal.target) | (k.forced & ~k.returning & (~better | hopeless))
     returning = ~(better | k.returning | stop)
     after = jnp.where(halved, _FIRST, jnp.where(returning, _LOOK, _RICHARDSON))
     return k._replace(
@@ -505,16 +488,16 @@ def krylov_refined(matvec: Operator, b: jax.Array) -> jax.Array:
 
 
 def dot(x: jax.Array, y: jax.Array) -> jax.Array:
-    """Inner products along the states, one for each lane."""
+    """Inner product over the states."""
     return jnp.sum(x * y, axis=0)
 
 
 def norm(x: jax.Array) -> jax.Array:
-    """Euclidean norms along the states."""
+    """Euclidean norm over the states."""
     return jnp.sqrt(dot(x, x))
 
 
 def _ratio(x: jax.Array, y: jax.Array) -> jax.Array:
-    """x / y, and zero where y has vanished, which restarts the recurrence."""
+    """x / y, and 0 where y vanishes, which restarts the recurrence."""
     safe = jnp.abs(y) > float(jnp.finfo(y.dtype).tiny)
     return jnp.where(safe, x / jnp.where(safe, y, 1), 0)

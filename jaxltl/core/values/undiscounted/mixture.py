@@ -1,7 +1,6 @@
-"""Policies mixed until the probability of a task is as large as asked.
+"""Mixtures of two policies with a certified satisfaction probability, on the host.
 
-Of two policies one state at a time: ``(1 - share) policy + share sure``, which is again a policy
-without memory of its own. Everything here is on the host.
+A mixture is ``(1 - share) policy + share other`` in each product state, again a memoryless policy.
 """
 
 from __future__ import annotations
@@ -17,19 +16,19 @@ from jaxltl.core.pretty_print import brief
 from jaxltl.core.types import Solution
 from jaxltl.core.values.undiscounted.satisfaction import satisfaction_probability
 
-WINDOW = 0.02  # how far above an asked probability the certified one may be
-_AIM = WINDOW / 4  # and is aimed to be
+WINDOW = 0.02  # maximal excess of the certified probability over the required one
+_AIM = WINDOW / 4  # excess at which the bisection ends
 _HALVINGS = 30
 
 
 @brief
 class Mixture(NamedTuple):
-    """A policy, how much of a surer one is in it, and what it is certified to attain.
+    """A mixture with its certified satisfaction probability.
 
     Attributes:
       policy: ``float[S, Q, A]``.
-      share: of the surer policy, in [0, 1].
-      attained: its certified probability, of the mean or the worst initial state.
+      share: of the second policy, in [0, 1].
+      attained: lower bound of the probability, of the mean or the worst initial state.
     """
 
     policy: np.ndarray
@@ -38,26 +37,26 @@ class Mixture(NamedTuple):
 
 
 def at_starts(model: Product, value: Any, over: str) -> tuple[float, int]:
-    """The mean or the least of a product's value over its initial states, and where it is least."""
+    """The mean or minimum of a value over the initial states, and the state of the minimum."""
     weight = np.asarray(model.mdp.initial, float)
     starts = np.flatnonzero(weight > 0)
     known = from_starts(model, value)[starts].astype(float)
     least, place = known.min(), int(starts[known.argmin()])
     if over == "worst":
         return float(least), place
-    # Rounding does not take a mean out of what it is a mean of.
+    # Rounding must not move the mean out of the range.
     mean = known @ (weight[starts] / weight[starts].sum())
     return float(np.clip(mean, least, known.max())), place
 
 
 def from_starts(model: Product, value: Any) -> np.ndarray:
-    """A product's value at the memory in which a run starts: ``[S]`` from ``[S, Q]``."""
+    """The value ``[S]`` at the initial memory of each world state, from ``[S, Q]``."""
     memory = np.asarray(model.initial_memory)
     return np.asarray(value)[np.arange(len(memory)), memory]
 
 
 def attained(model: Product, policy: Any, over: str) -> float:
-    """What a policy ``[S, Q, A]`` is certified to attain, on average or from the worst start."""
+    """Lower bound of a policy's probability, for the mean or the worst initial state."""
     found = satisfaction_probability(model, to_jax(np.asarray(policy, model.dtype)))
     return at_starts(model, found.lower, over)[0]
 
@@ -65,17 +64,9 @@ def attained(model: Product, policy: Any, over: str) -> float:
 def require_attainable(
     model: Product, best: Solution, probability: float, over: str, place: Callable[[int], str]
 ) -> None:
-    """Refuses a probability that no policy has.
+    """Raises a ValueError if the required probability exceeds the optimal one.
 
-    Args:
-      model: the product.
-      best: the best probability of its task.
-      probability: asked for.
-      over: ``"mean"`` of the initial states, or the ``"worst"``.
-      place: the name of a world state.
-
-    Raises:
-      ValueError: with what is possible, and from where least.
+    `place` gives the name of a world state for the message.
     """
     possible, where = at_starts(model, best.lower, over)
     if possible < probability:
@@ -95,16 +86,9 @@ def require_attainable(
 def least_mixture(
     model: Product, policy: Any, sure: Any, probability: float, *, over: str = "mean"
 ) -> Mixture:
-    """The least share of a surer policy by which a probability is reached.
+    """The mixture with the least share of `sure` that has a certified probability, by bisection.
 
-    Never all of it if less is enough: what it does not do would then be impossible.
-
-    Args:
-      model: the product.
-      policy: ``float[S, Q, A]``.
-      sure: ``float[S, Q, A]``, which is to have that probability.
-      probability: asked for, certified.
-      over: ``"mean"`` of the initial states, or the ``"worst"``.
+    The share is below 1 if possible, so that no action of `policy` gets probability 0.
     """
     policy, sure = np.asarray(policy), np.asarray(sure)
     found = Mixture(policy, 0.0, attained(model, policy, over))
@@ -135,17 +119,18 @@ def reaching(
     *,
     over: str = "mean",
 ) -> Mixture:
-    """A policy with the least share of moves that lose nothing by which a probability is reached.
+    """The mixture with the least share of an optimal policy that has a required probability.
 
-    Where a policy of such moves takes its time, so that any share of steps that lose is too much,
-    it is the quickest of the best policies that is mixed in.
+    If the mixture with `inside` exceeds the required probability by more than a window (because
+    `inside` takes long, so that the smallest share of suboptimal actions matters), the mixture with
+    the fastest optimal policy is tried too.
 
     Args:
       model: the product.
-      policy: ``float[S, Q, A]``, what is wanted but for the probability.
-      inside: ``float[S, Q, A]``, what is wanted of the actions that lose nothing.
+      policy: ``float[S, Q, A]``, the preferred policy.
+      inside: ``float[S, Q, A]``, the preferred policy among those of optimal actions.
       best: of :func:`~jaxltl.core.values.undiscounted.satisfaction.optimal_satisfaction`.
-      probability: asked for, certified, and attainable.
+      probability: the required probability, at most the optimal one.
       over: ``"mean"`` of the initial states, or the ``"worst"``.
 
     Example:
@@ -167,13 +152,13 @@ def reaching(
 
 
 def safe_mean(share: np.ndarray, bound: np.ndarray, *, up: bool, highest: float = np.inf) -> float:
-    """The mean of bounds of at least 0, rounded up or down.
+    """The weighted mean of nonnegative bounds, rounded up or down.
 
     Args:
       share: ``float64[I]``, positive weights of any sum.
       bound: ``float64[I]``, maybe infinite.
-      up: whether upper bounds are given, else lower ones.
-      highest: what no value exceeds.
+      up: whether they are upper bounds.
+      highest: an upper bound of all values.
 
     Example:
       >>> safe_mean(np.array([0.5, 0.5]), np.array([1.0, 1.0]), up=False)
@@ -188,7 +173,7 @@ def safe_mean(share: np.ndarray, bound: np.ndarray, *, up: bool, highest: float 
 
 
 def safe_ends(model: Any, found: Any, *, highest: float = np.inf) -> tuple[float, float]:
-    """What encloses the mean over the initial distribution of what `lower` and `upper` enclose."""
+    """Enclosure of the mean over the initial distribution, from `lower` and `upper`."""
     share = np.asarray(model.initial, np.float64)
     start = np.flatnonzero(share)
     low, high = (

@@ -1,8 +1,8 @@
-"""The actions that lose nothing of the best probability of a task.
+"""Action masks inside which every policy of full support attains the optimal probability.
 
-Where the best probability is 0 or 1, and in end components, that is decided on the graph; in
-between by certified bounds, and what these leave open is certified afterwards by the policy that
-takes all of the actions alike. docs/optimal-actions.md has the proofs.
+Qualitative analysis decides which actions are optimal where the probability is 0 or 1, and in end
+components; certified bounds decide elsewhere, and the uniform policy over the mask certifies the
+rest. docs/optimal-actions.md has the proofs.
 """
 
 from __future__ import annotations
@@ -49,15 +49,15 @@ Booleans = NDArray[np.bool_]
 @brief(facts=facts.optimal_actions)
 @struct.dataclass
 class OptimalActions:
-    """A mask of actions inside which a task is done as well as it can be.
+    """A mask of optimal actions of a product.
 
     Attributes:
-      allowed: ``bool[S, Q, A]``, the mask; it allows an action in every state.
-      policy: ``float[S, Q, A]``, all allowed actions alike.
-      best: the best probability, of
+      allowed: ``bool[S, Q, A]``, the mask, with an action in every state.
+      policy: ``float[S, Q, A]``, uniform over the allowed actions.
+      best: the optimal probability, of
         :func:`~jaxltl.core.values.undiscounted.satisfaction.optimal_satisfaction`.
-      attained: the probability that `policy` attains.
-      loss: ``float[]``, a certified bound on what `policy` loses in any state.
+      attained: the probability of `policy`.
+      loss: ``float[]``, a certified bound on the loss of `policy` in any state.
       status: CONVERGED if the loss is within the tolerance, else PRECISION.
 
     Example:
@@ -85,34 +85,28 @@ def optimal_actions(
     objective: str = "max",
     tolerance: float | None = None,
 ) -> OptimalActions:
-    """The actions that preserve the best probability of a product's task, as a mask.
+    """The actions that conserve the optimal satisfaction probability of a product, as a mask.
 
-    With V the best probability, the conserving actions: ``(P V)(s, a) = V(s)``. **Every policy
-    that gives positive probability to exactly the actions of the mask attains V from every
-    state.** V of its run is a martingale, and its run ends in a set of states that it goes on
-    visiting and that no action of the mask leaves. There V is constant, and if it is not 0, the
-    set holds an accepting end component, since best policies do not leave it either. So the mask
-    has to leave out, of the conserving actions, only those by which a run might return to the
-    accepting end component that it is in, having met a lesser, odd priority: of the actions that
-    stay for ever in an end component of conserving actions around it, it keeps those of the
-    accepting component alone. For co-safe and safety tasks, and the most of a Buchi task, there
-    are none, and the mask holds every action of every best policy; so it does outside of
-    accepting end components for any task.
+    With V the optimal probability, the conserving actions satisfy ``(P V)(s, a) = V(s)``. **Every
+    policy that gives positive probability to exactly the actions of the mask attains V from every
+    state.** V along its trajectory is a martingale, and the trajectory ends in an end component of
+    the mask, in which V is constant; if V > 0, that component contains an accepting one. The mask
+    therefore excludes only those conserving actions by which a trajectory could leave an accepting
+    end component, meet a smaller odd priority and return. For co-safe and safety tasks, and for
+    maxima of Buchi tasks, it excludes none; nor outside of accepting end components.
 
     Args:
       model: the product, concrete.
-      solution: of :func:`~jaxltl.core.values.undiscounted.satisfaction.optimal_satisfaction` for the same
-        objective; default, it is computed.
-      objective: ``"max"``, or ``"min"`` for the least probability.
-      tolerance: what the policy may lose at most; default the square root of the dtype's precision.
+      solution: of :func:`~jaxltl.core.values.undiscounted.satisfaction.optimal_satisfaction` for
+        the same objective; default: it is computed.
+      objective: ``"max"`` or ``"min"``.
+      tolerance: maximal loss of the policy; default the square root of the dtype's precision.
 
     Returns:
-      :class:`OptimalActions`. An action is kept if by the bounds, and the rounding of the model's
-      numbers, it can be conserving; so none is missing, and some may be kept that lose less than
-      that. `loss` bounds what the uniform policy loses by them. If it is above the tolerance,
-      other actions are kept where the probability is between 0 and 1: those that are proven not
-      to lead away from a lower bound, which then every policy that takes all of them attains; or,
-      where that cannot be proven, the best policy's action.
+      :class:`OptimalActions`. The mask contains every action that can be conserving within the
+      bounds and the rounding of the model's numbers. If the loss of its uniform policy is above the
+      tolerance, the mask contains, where the probability is between 0 and 1, the actions that are
+      proven to conserve a lower bound, or else the action of the optimal policy.
 
     Raises:
       ValueError: the model is traced, or the objective is unknown.
@@ -141,10 +135,9 @@ def optimal_actions(
     )
     if int(found.status) == Status.CONVERGED:
         return found
-    # What is left of it attains bounds whatever the shares of its actions.
-    sure = _attaining(problem)
-    if sure is not None:
-        keeps, bounds = sure
+    attaining = _attaining(problem)
+    if attaining is not None:
+        keeps, bounds = attaining
         bounds = opposite_event(bounds) if problem.opposite else bounds
         narrower = _bounded(problem, keeps, bounds, objective, goal)
         if int(narrower.status) == Status.CONVERGED:
@@ -155,19 +148,19 @@ def optimal_actions(
 
 
 def _conserving(problem: Reaching, solution: Solution, objective: str) -> Booleans:
-    """The actions that may be conserving, and all that are: ``bool[S, Q, A]``."""
-    decided, keeps, open_ = _on_graph(problem)
+    """A superset of the conserving actions: ``bool[S, Q, A]``."""
+    decided, keeps, undecided = _on_graph(problem)
     graph = graph_of(problem.model)
     if problem.objective == "max":
-        # Inside an end component the best probability is everywhere the same.
-        keeps = keeps | components_within(graph, open_).inside
+        # The optimal probability is constant in an end component.
+        keeps = keeps | components_within(graph, undecided).inside
     return graph.available & (
         keeps | (~decided[..., None] & _by_bounds(problem.model, solution, objective))
     )
 
 
 def _on_graph(problem: Reaching) -> tuple[Booleans, Booleans, Booleans]:
-    """Where the probability is 0 or 1, the actions that lose nothing there, and the rest."""
+    """The prob0 and prob1 states, the optimal actions in them, and the other states."""
     graph = graph_of(problem.model)
     largest = problem.objective == "max"
     sets = (max_sets if largest else min_sets)(graph, np.asarray(problem.target))
@@ -177,14 +170,14 @@ def _on_graph(problem: Reaching) -> tuple[Booleans, Booleans, Booleans]:
 
 
 def _by_bounds(model: Product, solution: Solution, objective: str) -> Booleans:
-    """The actions whose bound on the safe side reaches that of their state."""
+    """The actions whose optimistic bound is not worse than their state's pessimistic bound."""
     near, far = np.asarray(solution.lower, float), np.asarray(solution.upper, float)
     sign = 1
     if objective == "min":
         near, far, sign = far, near, -1
     sparse = rows_of_model(model)
     ahead = on_actions(sparse, sparse.host.expectation(far.ravel()), model)
-    # A model's probabilities are rounded, and so may be what it is a model of.
+    # The model's probabilities may be rounded ones.
     slack = rounding_unit(model) * np.maximum(ahead, near[..., None])
     return sign * ahead + slack >= sign * near[..., None]
 
@@ -210,11 +203,11 @@ def _attaining(problem: Reaching) -> tuple[Booleans, Solution] | None:
 def _bounded(
     problem: Reaching, keeps: Booleans, bounds: Solution, objective: str, goal: float
 ) -> OptimalActions:
-    """The mask of what the graph decides, and elsewhere of actions that attain the bounds."""
-    decided, sure, _ = _on_graph(problem)
+    """The mask of qualitatively optimal actions, and elsewhere of actions attaining the bounds."""
+    decided, optimal, _ = _on_graph(problem)
     graph = graph_of(problem.model)
     allowed, policy = _staying(
-        problem, graph.available & (sure | (~decided[..., None] & keeps)), problem.model.dtype
+        problem, graph.available & (optimal | (~decided[..., None] & keeps)), problem.model.dtype
     )
     return _judged(allowed, policy, bounds, replace(bounds, policy=policy), objective, goal)
 
@@ -227,7 +220,7 @@ def _certified(
     objective: str,
     goal: float,
 ) -> OptimalActions:
-    """The mask of conserving actions, and what its uniform policy attains."""
+    """The mask of conserving actions, and the probability of its uniform policy."""
     allowed, policy = _staying(problem, keeps, model.dtype)
     attained = satisfaction_probability(model, policy, tolerance=goal / 8)
     return _judged(allowed, policy, solution, attained, objective, goal)
@@ -250,11 +243,7 @@ def _judged(
 
 
 def _staying(problem: Reaching, keeps: Booleans, dtype: Any) -> tuple[jax.Array, jax.Array]:
-    """Leaves out the actions by which a run may return to its accepting end component.
-
-    Returns:
-      The mask and its uniform policy.
-    """
+    """The mask without actions that return to an accepting end component, and its uniform policy."""
     accepting: Any = problem.accepting
     if accepting is not None:
         graph = graph_of(problem.model)

@@ -1,9 +1,8 @@
-"""How well a policy does a task in a world it may never have seen, with certified bounds.
+"""Satisfaction probabilities of policies over sets of worlds, with certified bounds.
 
-The probability of the task from each start (3.8), its mean over the starts (3.9) and its
-least value. One product's evaluation is written so that ``vmap`` over stacked worlds and
-policies is one fast program: the linear system falls into one block for each memory
-state, each is inverted once, and a second solve certifies the first.
+The probability from each initial state (3.8), its mean (3.9) and its minimum. Under ``vmap`` over
+stacked worlds and policies this is one program: the linear system has one block for each memory
+state, which is inverted once, and a second solve certifies the first.
 """
 
 from __future__ import annotations
@@ -48,16 +47,16 @@ _EXACT_LIMIT = 4096  # product states up to which a stiff chain is eliminated on
 @brief(codes={"status": Status})
 @struct.dataclass
 class Performance:
-    """How well a policy does the task of a product; fields have a leading axis under ``vmap``.
+    """Satisfaction probabilities of a policy; fields have a leading axis under ``vmap``.
 
     Attributes:
-      mean: L_phi (3.9), the mean over the starts of the probability of the task.
+      mean: L_phi (3.9), the mean over the initial states of the satisfaction probability.
       lower, upper: a certified enclosure of the mean.
-      worst: the least probability over the starts.
-      worst_lower, worst_upper: a certified enclosure of that.
-      worst_state: ``int32[]``, the start where it is attained.
-      value: ``float[S]``, the probability from each world state, started there.
-      status: whether the bounds at all starts are as narrow as asked.
+      worst: the minimum over the initial states.
+      worst_lower, worst_upper: a certified enclosure of the minimum.
+      worst_state: ``int32[]``, the initial state of the minimum.
+      value: ``float[S]``, the probability from each world state with the initial memory.
+      status: whether the enclosures at all initial states are as narrow as the tolerance.
 
     Example:
       >>> from jaxltl import from_dense, product
@@ -86,7 +85,7 @@ def task_performance(
     method: str = "auto",
     tolerance: jax.Array | float | None = None,
 ) -> Performance:
-    """Probability that a policy does the product's task: mean and least over the starts (3.9).
+    """Satisfaction probability of a policy: mean and minimum over the initial states (3.9).
 
     Args:
       model: one product; ``vmap`` over stacked ones, or :func:`task_performances`.
@@ -94,18 +93,17 @@ def task_performance(
       method: ``"blocks"`` (one inverse for each memory state, of co-safe and safety
         tasks), ``"general"`` (:func:`~jaxltl.core.values.undiscounted.satisfaction.satisfaction_probability`,
         for any task), or ``"auto"``, blocks up to 1024 world states.
-      tolerance: half the width of the bounds asked for; default the square root of the
-        dtype's precision.
+      tolerance: width of the enclosures; default twice the square root of the dtype's precision.
 
     Returns:
-      :class:`Performance`. Where a policy hardly ever leaves a set, rounding may leave
-      nothing certain: the bounds are then 0 and 1, the status is PRECISION, and
-      :func:`task_performances` has an answer.
+      :class:`Performance`. If a policy hardly ever leaves a set, rounding may prevent a
+      certificate: the bounds are then 0 and 1 and the status is PRECISION; use
+      :func:`task_performances`.
 
     Raises:
-      ValueError: the policy has the wrong shape or a row that is no distribution over available
-        actions (under ``jit`` the status is then INVALID), blocks are asked for another kind of
-        task, or an unknown method.
+      ValueError: the policy has the wrong shape or a row that is not a distribution over available
+        actions (INVALID_POLICY under ``jit``), the method is unknown, or it is ``"blocks"`` for
+        a Buchi or parity task.
 
     Differentiable in the policy and in the world's probabilities, with the support held fixed: in
     forward mode, and with ``method="general"`` in reverse mode too.
@@ -176,13 +174,13 @@ def _summarize(model: Product, value, lower, upper, tolerance) -> Performance:
     starts = weight > 0
     eps = jnp.finfo(model.dtype).eps
     slack = 4 * eps * jnp.sqrt(1.0 * weight.size)  # rounding of a sum of at most one
-    goal = jnp.sqrt(eps) if tolerance is None else tolerance
+    goal = 2 * jnp.sqrt(eps) if tolerance is None else tolerance
     worst_state = jnp.argmin(jnp.where(starts, value, jnp.inf)).astype(jnp.int32)
-    narrow = jnp.max(jnp.where(starts, upper - lower, 0)) <= 2 * goal
+    narrow = jnp.max(jnp.where(starts, upper - lower, 0)) <= goal
     finite = jnp.all(jnp.isfinite(value))
 
     def mean(x: jax.Array, slack: jax.Array) -> jax.Array:
-        # Rounding takes no mean out of the range of what it is of.
+        # Rounding must not move the mean out of the range.
         least, most = (
             f(jnp.where(starts, x, out)) for f, out in ((jnp.min, jnp.inf), (jnp.max, -jnp.inf))
         )
@@ -202,11 +200,11 @@ def _summarize(model: Product, value, lower, upper, tolerance) -> Performance:
 
 
 def _reach(model: Product, target: jax.Array, policy: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Probability ``float[S, Q]`` of reaching a set, and a certified bound on its error.
+    """Reachability probabilities ``float[S, Q]``, and a certified bound on the error.
 
-    ``(I - P) y = b`` on the undecided states is solved block by block: between memory
-    states by sweeps, which end exactly when the automaton's only cycles are loops, and
-    within each by its inverse; :func:`~jaxltl.core.values.engine.certificates.m_matrix_error` certifies it.
+    ``(I - P) y = b`` on the undecided states is solved by block Jacobi over memory states, exactly
+    if the automaton's only cycles are self-loops, and certified by
+    :func:`~jaxltl.core.values.engine.certificates.m_matrix_error`.
     """
     sets = policy_sets(TracedGraph(model), target, policy)
     undecided = ~(sets.one | sets.zero)
@@ -217,7 +215,7 @@ def _reach(model: Product, target: jax.Array, policy: jax.Array) -> tuple[jax.Ar
         return jnp.where(undecided, action_mean(policy, expectation(model, y)), 0)
 
     value = jnp.where(undecided, solve(one), one)
-    # Elimination can break down where rounding closes what leaves a set hardly ever.
+    # Elimination can break down where rounding closes a set that is hardly ever left.
     value = jnp.clip(jnp.where(jnp.isfinite(value), value, 0), 0, 1)
     return value, m_matrix_error(model, solve, onward, value, undecided)[0]
 
@@ -225,8 +223,8 @@ def _reach(model: Product, target: jax.Array, policy: jax.Array) -> tuple[jax.Ar
 def _block_solver(model: Product, policy: jax.Array, undecided: jax.Array):
     """Solves ``x - P x = b`` on the undecided states, ``x = b`` elsewhere, for ``[S, Q]``.
 
-    Block Jacobi with a block for each memory state. Where the automaton's only cycles are
-    loops, it ends exactly after as many sweeps as its longest path has states.
+    Block Jacobi with a block for each memory state. If the automaton's only cycles are self-loops,
+    it ends after as many sweeps as its longest path has states.
     """
     stays = model.next_memory == jnp.arange(model.num_memory)  # [S, Q]
     inside = jnp.where(undecided.T[:, :, None], _within(model, policy, stays), 0)
@@ -257,7 +255,7 @@ def _block_solver(model: Product, policy: jax.Array, undecided: jax.Array):
 
 
 def _within(model: Product, policy: jax.Array, stays: jax.Array) -> jax.Array:
-    """``float[Q, S, S]``, the policy's transitions that leave the memory as it is."""
+    """``float[Q, S, S]``, the policy's transitions that do not change the memory."""
     steps = jax.vmap(partial(transition_matrix, model.mdp), in_axes=1)(policy)
     kept = stays.T[:, :, None] if model.label_on == "exit" else stays.T[:, None, :]
     return jnp.where(kept, steps, 0)
@@ -275,17 +273,17 @@ def task_performances(
 ) -> Performance:
     """:func:`task_performance` in each of several worlds, on the host.
 
-    Co-safe and safety tasks by one compiled program for all; other tasks one world after the
-    other, on the graph and by a system in what it leaves open. What that cannot certify in the
-    models' precision, because the policy hardly ever leaves some set, is done again in double
-    precision by an elimination without subtractions (Grassmann, Taksar and Heyman 1985), whose
-    relative error is bounded whatever the chain (O'Cinneide 1993).
+    Co-safe and safety tasks are evaluated by one compiled program, other tasks one world after the
+    other. Worlds that this does not certify in the models' precision, because the policy hardly
+    ever leaves some set, are evaluated again in double precision by an elimination without
+    subtractions (Grassmann, Taksar and Heyman 1985), whose relative error is bounded for every
+    chain (O'Cinneide 1993).
 
     Args:
       models: stacked products, see :func:`~jaxltl.core.models.construct.batch.stack_products`.
       policies: ``float[W, S, Q, A]`` or ``int32[W, S, Q]``; without W the same in every world.
       tolerance: as in :func:`task_performance`.
-      batch: worlds that are in memory at once.
+      batch: number of worlds in memory at once.
 
     Returns:
       :class:`Performance` with a leading axis W.
@@ -335,12 +333,12 @@ def task_performances(
 
 
 def _batched(models: Product, policies: jax.Array, tolerance, *, batch: int) -> Performance:
-    """Batch after batch, so that memory does not grow with the number of worlds."""
+    """Evaluation in batches, so that memory does not grow with the number of worlds."""
     count = len(policies)
     size = min(batch, count)
     parts = []
     for first in range(0, count, size):
-        # The last batch is filled up from before, so that one program serves all.
+        # The last batch overlaps with the one before, so that all have one shape.
         begin = min(first, count - size)
         lanes = jax.tree.map(lambda x, i=begin: x[i : i + size], (models, policies))
         found = jax.block_until_ready(_together(*lanes, tolerance))
@@ -349,7 +347,7 @@ def _batched(models: Product, policies: jax.Array, tolerance, *, batch: int) -> 
 
 
 def _one_by_one(models: Product, policies: jax.Array, tolerance) -> Performance:
-    """World after world on the host, where the components of a chain are found quickest."""
+    """Evaluation of one world after the other, on the host."""
     parts = []
     for w in range(num_worlds(models)):
         model, policy = jax.tree.map(lambda x, w=w: np.asarray(x)[w], (models, policies))
@@ -367,10 +365,9 @@ def _together(models: Product, policies: jax.Array, tolerance) -> Performance:
 
 
 def _by_elimination(model: Product, policy: jax.Array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Probability of the task and bounds on it, ``float64[S, Q]``, on the host.
+    """Satisfaction probabilities and their bounds, ``float64[S, Q]``, by GTH elimination.
 
-    States are eliminated one by one. Each weight stays a sum of products of weights, so
-    its relative error is small however rare a transition is.
+    Weights stay sums of products of weights, so that their relative errors are small.
     """
     kind = model.automaton.acceptance
     safety = kind == "safety"
@@ -402,7 +399,7 @@ def _by_elimination(model: Product, policy: jax.Array) -> tuple[np.ndarray, np.n
     for k in range(len(rest)):
         solved[k] = (hit[k] + inner[k, :k] @ solved[:k]) / total[k]
     value[rest] = np.minimum(solved, 1)
-    # To first order 2 n^3 roundings; the rest of the factor is for what is of higher order.
+    # To first order 2 n^3 roundings; the rest of the factor bounds terms of higher order.
     error = np.zeros_like(value)
     n = len(rest) + 8
     # Rounding to the model's precision comes on top.
@@ -445,20 +442,13 @@ def _reaching(weight: np.ndarray, goal: np.ndarray) -> np.ndarray:
     return inside
 
 
-# --- what the worlds have in common -----------------------------------------------------------
+# --- summaries over worlds ------------------------------------------------------------------------
 
 
 def infeasible_starts(model: Product) -> jax.Array:
-    """Starts from which no policy can do the task, ``bool[S]``; decided on the graph.
+    """Initial states ``bool[S]`` with maximal satisfaction probability 0, decided on the graph.
 
-    From there the best probability is zero: no final state of a co-safe task can be reached, those
-    of a safety task cannot but be left, or no accepting end component can be reached.
-
-    Args:
-      model: one product; on the host if it is concrete, else under ``jit`` and ``vmap``.
-
-    Returns:
-      ``bool[S]``; not differentiable.
+    Works on concrete and on traced products; not differentiable.
 
     Example:
       >>> from jaxltl import from_dense, product
@@ -483,16 +473,15 @@ class Summary(NamedTuple):
     """Performance over worlds.
 
     Attributes:
-      mean, std: of L_phi over the worlds (std of the sample; 0 for one world).
+      mean, std: of L_phi over the worlds (sample standard deviation; 0 for one world).
       lower, upper: certified bounds on the mean.
-      worst_world: the name of the world with the least L_phi, and that value.
-      worst: likewise.
-      worst_start: the least probability from any start of any world.
-      num_worlds: how many worlds these figures are of.
-      infeasible: names of the worlds with starts from which no policy does the task. They
-        count in the figures unless they are left out.
-      left_out: names of the worlds that the figures leave out.
-      uncertain: names of the worlds whose bounds are wider than was asked.
+      worst_world, worst: the name of the world with the least L_phi, and its value.
+      worst_start: the least probability from any initial state of any world.
+      num_worlds: number of worlds in these figures.
+      infeasible: names of the worlds with initial states from which no policy satisfies the task;
+        they count in the figures unless they are excluded.
+      left_out: names of the excluded worlds.
+      uncertain: names of the worlds whose enclosures are wider than the tolerance.
     """
 
     mean: float
@@ -515,19 +504,19 @@ def summarize(
     names: Sequence[str] | None = None,
     leave_out: Collection[str] = (),
 ) -> Summary:
-    """Mean, spread and worst case over worlds, on the host.
+    """Mean, standard deviation and worst case over worlds, on the host.
 
     Args:
       models: stacked products.
       performance: of :func:`task_performances`.
       names: W names of the worlds; default ``"world 0"`` and so on.
-      leave_out: names of worlds that do not count. Nothing is left out otherwise.
+      leave_out: names of worlds to exclude.
 
     Returns:
-      :class:`Summary`, numbers of Python.
+      :class:`Summary` of Python numbers.
 
     Raises:
-      ValueError: names are missing, double or unknown, or no world is left.
+      ValueError: names are missing, repeated or unknown, or all worlds are excluded.
 
     Example:
       >>> from jaxltl import from_dense, stack_products

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import jax
 import numpy as np
@@ -133,10 +133,11 @@ def reachability_probability(
         return _on_host(model, target, stay, policy, objective, tolerance)
     iterative = method == "iterative" and policy is not None
     if traced or not is_table(model) or iterative or max_steps is not None or start is not None:
+        padded = cast(ActionModel, model)
         question = target, tolerance, 1_000_000 if max_steps is None else max_steps
         if policy is not None:
-            return optimum.policy_reachability(model, policy, *question, method=method)
-        return optimum.optimal_reachability(model, *question, start, objective=objective)
+            return optimum.policy_reachability(padded, policy, *question, method=method)
+        return optimum.optimal_reachability(padded, *question, start, objective=objective)
     found = None
     if policy is None:
         found = _by_layers(model, target, tolerance, objective)
@@ -145,11 +146,11 @@ def reachability_probability(
 
 def _on_host(
     model: Model,
-    target: Booleans,
-    stay: Booleans | None,
-    policy: Floats | Integers | None,
+    target: Array,
+    stay: Array | None,
+    policy: Array | None,
     objective: str,
-    tolerance: float | None,
+    tolerance: Array | None,
 ) -> Solution:
     """The probabilities by the sparse engine."""
     sparse = rows_of_model(model)
@@ -166,7 +167,7 @@ def _on_host(
     )
 
 
-def _tolerances(model: Model, tolerance: float | None, *, exact: bool) -> tuple[float, float]:
+def _tolerances(model: Model, tolerance: Array | None, *, exact: bool) -> tuple[float, float]:
     """The width of the enclosure that counts as converged, and the width to aim for."""
     eps = float(np.finfo(np.dtype(model.dtype)).eps)
     asked = default_tolerance(model) if tolerance is None else float(tolerance)
@@ -266,10 +267,12 @@ def _fastest(mdp: HostMDP, question: Question, found: Enclosure) -> Integers:
 
 
 def _by_layers(
-    model: ActionModel, target: Booleans, tolerance: float | None, objective: str
+    model: Model, target: Array, tolerance: Array | None, objective: str
 ) -> Solution | None:
     """A large product by the automaton's components; None where that does not help."""
-    world = model.mdp if isinstance(model, Product) else None
+    if not isinstance(model, Product):
+        return None
+    world = model.mdp
     if not isinstance(world, MDP) or model.label_on != "entry" or model.num_states <= QUICK_LIMIT:
         return None
     asked, fine = _tolerances(model, tolerance, exact=True)

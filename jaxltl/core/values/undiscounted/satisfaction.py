@@ -1,4 +1,4 @@
-"""Probabilities of satisfying a formula: of a policy, largest and smallest."""
+"""Satisfaction probabilities of formulas: of a policy, maximal and minimal."""
 
 from __future__ import annotations
 
@@ -48,32 +48,30 @@ def satisfaction_probability(
     method: str = "auto",
     tolerance: jax.Array | float | None = None,
 ) -> Solution:
-    """Probability that a policy satisfies the product's task, from every product state.
+    """Satisfaction probability of a policy, from every product state.
 
-    For a co-safe task, of reaching a final state (2.5); for a safety task, of never
-    leaving the final states; for Buchi and parity, of reaching a closed component of the
-    policy's chain whose least priority is even.
+    For a co-safe task, the probability of reaching a final state (2.5); for a safety task, of never
+    leaving the final states; for Buchi and parity, of reaching a bottom strongly connected
+    component whose least priority is even.
 
     Args:
       model: the product.
-      policy: ``float[S, Q, A]`` or ``int32[S, Q]``; where the world is sparse ``float[R, Q]``, or
-        its rows ``int32[S, Q]``.
-      nature: of products of interval models only, ``"min"`` (the default) or ``"max"``.
+      policy: ``float[S, Q, A]`` or ``int32[S, Q]``; for a sparse world ``float[R, Q]``, or its rows
+        ``int32[S, Q]``.
+      nature: for products of interval models only, ``"min"`` (the default) or ``"max"``.
       method, tolerance: as in :func:`reachability_probability`.
 
     Returns:
-      :class:`Solution`; `value` is ``float[S, Q]``. The probability from the start is
-      ``jnp.sum(model.initial * solution.value)``.
+      :class:`Solution`; `value` is ``float[S, Q]``. The probability from the initial distribution
+      is ``jnp.sum(model.initial * solution.value)``.
 
     Raises:
-      ValueError: the model is no product, the policy has the wrong shape or a row that is no
-        distribution over available actions (under ``jit`` the status is then INVALID), nature is
-        named where probabilities are no intervals, or an unknown method.
+      ValueError: the model is not a product, the policy has the wrong shape or a row that is not a
+        distribution over available actions (INVALID_POLICY under ``jit``), `nature` is given for a
+        model without intervals, or the method is unknown.
 
-    Differentiable in the policy and in the world's transition probabilities, with the
-    support held fixed.
-
-    Not so of products of sparse and of interval models, which are solved on the host.
+    Differentiable in the policy and in the world's transition probabilities, with the support held
+    fixed; not for products of sparse and of interval models, which are solved on the host.
 
     Example:
       >>> from jaxltl import from_dense, product
@@ -115,48 +113,45 @@ def optimal_satisfaction(
     max_steps: jax.Array | int | None = None,
     start: tuple[jax.Array, jax.Array] | None = None,
 ) -> Solution:
-    """Largest or smallest probability of satisfying the product's task, with its policy.
+    """Maximal or minimal satisfaction probability of a product, with an optimal policy.
 
-    For a co-safe task, of reaching a final state; for a safety task, of never leaving
-    them; for Buchi and parity, of reaching an accepting end component, where the policy
-    goes on so that acceptance is almost sure (Baier and Katoen 2008, section 10.6.4).
-    The least probability of a task is one minus the largest of its negation.
+    For a co-safe task, the probability of reaching a final state; for a safety task, of never
+    leaving them; for Buchi and parity, of reaching an accepting end component, in which the policy
+    is accepted almost surely (Baier and Katoen 2008, section 10.6.4). The minimal probability of a
+    Buchi or parity task is one minus the maximal one of its negation.
 
-    The policy is also the **quickest of the best**: of all policies that attain the optimum, it
-    has the least expected number of steps from every state until nothing is open any more. That is
+    Of all optimal policies of a concrete padded model, the result is the **fastest**: it has the
+    least expected number of steps, from every state,
 
-    - for what is to be reached (a final state of a co-safe task, by ``"min"`` a state off those of
-      a safety task): until it is reached, or out of reach;
-    - for what is to be avoided (the same with the other objective): until it is out of reach, or
-      sure;
-    - for Buchi and parity: until the accepting end component is reached, or none can be; and in it,
-      by its own actions, from any state until its least priority is read again.
+    - if a set is to be reached (the final states of a co-safe task, or the other states of a safety
+      task with ``"min"``): until it is reached or cannot be reached;
+    - if a set is to be avoided (with the other objective): until it cannot be reached or is reached
+      almost surely;
+    - for Buchi and parity: until an accepting end component is reached or cannot be; and inside,
+      by its actions, until its least priority is read next.
 
-    Every best policy decides almost surely, so these times are finite: a stochastic shortest path
-    (Bertsekas and Tsitsiklis 1991) over the conserving actions. Of equally quick actions it takes
-    the first. On a concrete model whose bounds are not found on the host, as of more than some
-    thousand states, actions are known to tie where the graph shows it: where the best
-    probability is 1, and in end components. Under ``jit`` and ``vmap`` the policy attains the same
-    optimum but may take longer.
+    Optimal policies decide almost surely, so that this is a stochastic shortest path (Bertsekas and
+    Tsitsiklis 1991) over the conserving actions. Of equally fast actions it takes the first. Under
+    ``jit`` and ``vmap``, and beyond 10^5 states, the policy attains the same optimum but may take
+    longer.
 
     Args:
       model: the product.
       objective: ``"max"`` or ``"min"``.
-      nature: of products of interval models only, see
+      nature: for products of interval models only, see
         :func:`~jaxltl.core.values.interval.satisfaction.robust_satisfaction`.
       tolerance, max_steps, start: as for :func:`reachability_probability`.
 
     Returns:
-      :class:`Solution`; `value` is ``float[S, Q]``, `policy` ``int32[S, Q]``, memoryless in
-      the product: its memory is the automaton's state. Where the world is sparse, it is one of the
-      best policies, of the world's rows.
+      :class:`Solution`; `value` is ``float[S, Q]``, `policy` ``int32[S, Q]``, memoryless in the
+      product: its memory is the automaton's state. For a sparse world it consists of rows.
 
     Raises:
-      ValueError: the model is no product, the objective is unknown, nature is named where
-        probabilities are no intervals, or the world is sparse and its actions are restricted.
+      ValueError: the model is not a product, the objective is unknown, `nature` is given for a
+        model without intervals, or the world is sparse and its actions are restricted.
 
-    Differentiable in the world's transition probabilities, with the support and the best policy
-    held fixed; not so of products of sparse and of interval models, which are solved on the host.
+    Differentiable in the world's transition probabilities, with the support and the optimal policy
+    held fixed; not for products of sparse and of interval models, which are solved on the host.
 
     Example:
       >>> from jaxltl import from_dense, product
@@ -203,20 +198,20 @@ def _optimal(
     return opposite_event(found) if problem.opposite else found
 
 
-# What no host reads is one program, not one an operation.
+# One program for a model over a mesh, instead of one for each operation.
 _over_mesh = jax.jit(_optimal, static_argnames=("objective",))
 
 
 @brief
 class Reaching(NamedTuple):
-    """The optimal reachability problem that a task's optimum is.
+    """An optimal satisfaction problem as an optimal reachability problem.
 
     Attributes:
       model: the product, or that of the task's negation.
       target: ``bool[S, Q]``.
       objective: ``"max"`` or ``"min"``.
-      opposite: whether the task's probability is one minus that of the target.
-      accepting: for Buchi and parity, what the target is made of.
+      opposite: whether the satisfaction probability is one minus that of the target.
+      accepting: for Buchi and parity, the accepting end components of the target.
     """
 
     model: Product
@@ -227,11 +222,7 @@ class Reaching(NamedTuple):
 
 
 def as_reachability(model: Product, objective: str) -> Reaching:
-    """What is to be reached, and whether often or seldom, for the best probability of a task.
-
-    Raises:
-      ValueError: the objective is unknown.
-    """
+    """The reachability problem whose optimum is the optimal satisfaction probability."""
     if objective not in ("max", "min"):
         raise ValueError(f'objective={objective!r}; it must be "max" or "min".')
     kind = model.automaton.acceptance
@@ -246,9 +237,9 @@ def as_reachability(model: Product, objective: str) -> Reaching:
 
 
 def _visiting(problem: Reaching, found: Solution) -> Any:
-    """In accepting end components, a policy that meets their least priority again and again.
+    """A policy that reads the least priority of accepting end components infinitely often.
 
-    On a concrete model, the one by which the next time is soonest.
+    On a concrete model, the fastest one.
     """
     model, accepting = problem.model, problem.accepting
     assert accepting is not None
@@ -257,15 +248,15 @@ def _visiting(problem: Reaching, found: Solution) -> Any:
     sparse = rows_of_model(model)
     visits = until_visit(problem, sparse.host)
     inside = on_rows(sparse, accepting.inside)
-    inner = ~np.asarray(accepting.region).ravel()
+    outer = ~np.asarray(accepting.region).ravel()
     row = row_of_action(sparse, accepting.action)
-    found = fastest_rows(
+    rows = fastest_rows(
         visits,
         np.append(inside, True),
-        np.append(inner, True),
+        np.append(outer, True),
         np.append(row, sparse.num_rows),
     )
-    return np.asarray(sparse.action)[found[:-1]].reshape(model.state_shape)
+    return np.asarray(sparse.action)[rows[:-1]].reshape(model.state_shape)
 
 
 def until_visit(problem: Reaching, mdp: HostMDP) -> HostMDP:

@@ -45,17 +45,16 @@ def total_reward(
     nature: str | None = None,
     tolerance: float | None = None,
 ) -> Solution:
-    """Expected reward until a target is reached; without a target, for ever.
+    """Total expected reward until a target is reached, or for ever.
 
     The least solution of ``x = 0`` on the target, ``x = opt_a (r(s, a) + (P x)(s, a))`` elsewhere
-    (Puterman 1994, chapter 7; Baier and Katoen 2008, section 10.5.1). What comes after the target
-    does not count. It is infinite where the target is not reached almost surely: for ``"max"``
-    under some policy, for ``"min"`` under every policy; without a target where reward is earned
-    for ever. That is decided on the graph; where going round earns nothing, states are one.
+    (Puterman 1994, chapter 7; Baier and Katoen 2008, section 10.5.1). It is infinite where the
+    target is not reached almost surely: for ``"max"`` under some policy, for ``"min"`` under every
+    policy; without a target, where reward is earned for ever. The graph decides this, and end
+    components of zero reward are collapsed.
 
-    Inside ``jit``, and of a :class:`~jaxltl.core.models.mesh.sharded.ShardedMDP`, inexact policy
-    iteration and two sweeps that prove the bounds answer, see
-    :mod:`~jaxltl.core.values.undiscounted.traced_total_reward`.
+    Concrete models are solved on sparse rows. Inside ``jit``, and over a mesh, inexact policy
+    iteration is used, see :mod:`~jaxltl.core.values.undiscounted.traced_total_reward`.
 
     Args:
       model: an MDP, DenseMDP, SparseMDP or product of one, or an IntervalMDP; inside ``jit`` an
@@ -67,13 +66,12 @@ def total_reward(
       target: ``bool[S]``; inside ``jit`` and over a mesh there has to be one.
       policy: evaluate this policy; default: optimise.
       objective: ``"max"`` or ``"min"``; ignored when a policy is given.
-      nature: of interval models only, see
-        :func:`~jaxltl.core.values.interval.robust.robust_total_reward`, which answers then.
-      tolerance: the width of the enclosure asked for, as a share of the value; default 1e-6 in
-        double precision, 1e-3 in single.
+      nature: for interval models only, see
+        :func:`~jaxltl.core.values.interval.robust.robust_total_reward`.
+      tolerance: relative width of the enclosure; default 1e-6 in double precision, 1e-3 in single.
 
     Returns:
-      :class:`Solution`; `value` is ``float[S]``, infinite or 0 exactly where the graph says so. An
+      :class:`Solution`; `value` is ``float[S]``, infinite or 0 exactly where the graph decides. An
       optimum's `policy` attains its bound on the safe side: ``int32[S]``, rows of a sparse model,
       else actions. Inside ``jit`` bad rewards give the status ``NONFINITE``, a bad policy
       ``INVALID``.
@@ -197,7 +195,7 @@ def _earned(model: Any, sparse: SparseMDP, reward: Any) -> np.ndarray:
     return flat[sparse.host.state, np.asarray(sparse.action)]
 
 
-# --- what no host reads -------------------------------------------------------------------------
+# --- inside jit and over a mesh -------------------------------------------------------------------
 
 
 def _by_sweeps(
@@ -222,7 +220,7 @@ def _by_sweeps(
 
 
 def _on_choices(model: Any, world: Any, reward: Any) -> Any:
-    """A reward as it was given, on choices: ``float[S, A]``."""
+    """A reward as one on actions: ``float[S, A]``."""
     actions = (*model.state_shape, model.num_actions)
     if reward is None or isinstance(reward, str | Rewards):
         named = world.rewards if isinstance(world, ShardedMDP) else {}
@@ -241,7 +239,7 @@ def _on_choices(model: Any, world: Any, reward: Any) -> Any:
 
 def _require_rewards(model: Any, world: Any, reward: Any) -> None:
     least, state = _least_reward(model, world, reward)
-    # Inside jit the status says it.
+    # Inside jit the status is NONFINITE.
     if not isinstance(least, jax.core.Tracer) and not least >= 0:
         raise ValueError(
             f"the reward of a choice of state {state} is {least:.6g}; expected total rewards need "
@@ -251,7 +249,7 @@ def _require_rewards(model: Any, world: Any, reward: Any) -> None:
 
 @jax.jit
 def _least_reward(model: Any, world: Any, reward: Any) -> Any:
-    """The least reward of a choice, NaN if one is, and its state."""
+    """The least reward of an available action, and its state; NaN if one is NaN."""
     least = jnp.min(jnp.where(model.available, reward, jnp.inf), axis=-1)
     least = least.reshape(world.num_states, -1).min(-1)
     if isinstance(world, ShardedMDP):

@@ -1,22 +1,21 @@
-"""Expected total rewards inside ``jit``, and of models over the devices of a mesh.
+"""Expected total rewards inside ``jit`` and over a mesh.
 
-Where the value is infinite or 0 is decided on the graph. In between it is the fixed point of
-``T x = opt_a (r(s, a) + (P x)(s, a))``, and enclosed by two sweeps that prove a bound each: of the
-solutions of ``l = (1 - e) T l`` and ``u = (1 + e) T u``, for a small e, one is below its image and
-the other above, by more than rounding. The share e of the value that is lost or gained in a step
-is small enough once all that are lost on the way are: it is found by trying.
+The graph decides where the value is infinite or 0. Elsewhere it is the fixed point of
+``T x = opt_a (r(s, a) + (P x)(s, a))``, enclosed between the solutions of ``l = (1 - e) T l`` and
+``u = (1 + e) T u`` for a small e, which is found by trial: one application of T proves
+``l <= T l`` and ``u >= T u``, because e exceeds the rounding of a backup.
 
-- ``u >= T u`` and ``u >= 0`` bound a maximum, which is the least such u. Of a minimum
-  ``u >= T_pi u`` bounds the value of pi, where the graph says that pi reaches the target.
-- ``l <= T l`` bounds the value of every policy that reaches the target almost surely: repeated,
-  T leaves nothing of l (Bertsekas and Tsitsiklis 1991). A maximum is finite only where all do.
-- A minimum whose end components earn nothing has many fixed points. There the states of each are
-  one: they take the best choice that leads out of any of them.
+- ``u >= T u`` and ``u >= 0`` bound a maximum, which is the least such u. For a minimum
+  ``u >= T_pi u`` bounds the value of pi if pi reaches the target almost surely, by its graph.
+- ``l <= T l`` bounds the value of every policy that reaches the target almost surely, since
+  ``P^n l -> 0`` (Bertsekas and Tsitsiklis 1991). A maximum is finite only where all policies do.
+- A minimum with end components of zero reward has several fixed points. Their states are collapsed:
+  they share the best choice that leaves the end component.
 
-The equations are solved by inexact policy iteration (Newton's method): in every step the linear
-system of the greedy policy is solved to a hundredth of its right-hand side, the forcing term, by
-BiCGSTAB, on small models that lie on one device by elimination. It is scaled by the value, so that
-small values get as many digits as large ones.
+The equations are solved by inexact policy iteration (Newton's method): in each step the linear
+system of the greedy policy is solved to the relative residual 1e-2 (the forcing term) by BiCGSTAB,
+and by elimination for small models on one device. The system is scaled by the value, so that small
+values get as many digits as large ones.
 """
 
 from __future__ import annotations
@@ -49,32 +48,32 @@ from jaxltl.core.values.engine.implicit_diff import implicit
 from jaxltl.core.values.engine.iterate import in_turn
 from jaxltl.core.values.engine.linear import System, bicgstab, inverse, is_small, norm
 
-_FORCING = 1e-2  # relative residual asked of a linear system
-_POOR = 0.5  # of one that was solved too badly to be of use
-_SWEEPS = 128  # under the greedy policy, where it cannot be solved
-_ATTEMPTS = 8  # shares e that are tried
-_ROUNDINGS = 3  # of a backup, that the smallest e is
-_REST = 400  # steps of policy iteration that may pass without the error being halved
-_SAME = 80  # of these that one counts for in which the policy stays as it was
-_LARGEST = 0.1  # share e
+_FORCING = 1e-2  # relative residual of a linear system
+_POOR = 0.5  # relative residual from which a solution is not used
+_SWEEPS = 128  # under the greedy policy, if its system is not solved
+_ATTEMPTS = 8  # number of shares e
+_ROUNDINGS = 3  # the smallest e, in rounding errors of a backup
+_REST = 400  # steps of policy iteration in which the error must halve
+_SAME = 80  # steps for which one counts that does not change the policy
+_LARGEST = 0.1  # the largest share e
 _MOST_STEPS = 1_000_000
 
 
 class _Problem(NamedTuple):
-    """What is left when the graph has decided what it can.
+    """Residual problem after qualitative preprocessing.
 
     Attributes:
       model: the model.
-      sign: 1 or -1 times values are maximised; static.
+      sign: 1 for a maximum, -1 for a minimum; static.
       reward: ``float[S, A]``.
-      policy: ``float[S, A]``, the weights of a given policy, or None.
-      open: ``bool[S]``, where the value is finite and not 0; policies that matter stay there until
-        it is decided.
+      policy: ``float[S, A]``, the policy to evaluate, or None.
+      open: ``bool[S]``, where the value is finite and not 0.
       finite: ``bool[S]``.
-      allowed: ``bool[S, A]``, the actions that may be best; in end components those that leave.
-      start: ``int32[S]``, actions that decide almost surely.
+      allowed: ``bool[S, A]``, the actions to choose from; in collapsed end components those that
+        leave.
+      start: ``int32[S]``, actions that leave the open states almost surely.
       decided: ``int32[S]``, actions for the states that are not open.
-      circles: of a minimum, the end components in which nothing is earned.
+      circles: for a minimum, the end components of zero reward.
     """
 
     model: Any
@@ -90,8 +89,7 @@ class _Problem(NamedTuple):
 
 
 class _Point(NamedTuple):
-    """A value, its image, and what attains that: an action, and in an end component the state whose
-    action it is."""
+    """A value, its image under T, the action, and in an end component the state that takes it."""
 
     value: jax.Array
     image: jax.Array
@@ -100,14 +98,14 @@ class _Point(NamedTuple):
 
 
 class Found(NamedTuple):
-    """What :func:`total_reward_by_sweeps` knows before derivatives.
+    """Result of :func:`total_reward_by_sweeps` without derivatives.
 
     Attributes:
       value, lower, upper: ``float[S]``, 0 where it is infinite.
       policy: ``int32[S]``, attains the bound on the safe side.
-      leaves: ``int32[S]``, the number of the state whose action a state's value comes from.
-      open, finite: as of the problem.
-      residual, num_steps, status: as of a Solution.
+      leaves: ``int32[S]``, the state whose action gives a state's value.
+      open, finite: as in the problem.
+      residual, num_steps, status: as in a Solution.
     """
 
     value: jax.Array
@@ -132,22 +130,10 @@ def total_reward_by_sweeps(
     *,
     objective: str,
 ) -> Solution:
-    """Expected reward until a target is reached, of models that no host reads.
+    """Traced :func:`~jaxltl.core.values.undiscounted.total_reward.total_reward`, with its arguments.
 
-    Args:
-      model: an MDP, a DenseMDP, a ShardedMDP or a product of one.
-      reward: ``float[S, A]``, at least 0 and finite.
-      target: ``bool[S]``.
-      policy: ``float[S, A]`` or ``int32[S]``; None: optimise.
-      tolerance: the width of the enclosure asked for, as a share of the value.
-      objective: ``"max"`` or ``"min"``.
-
-    Returns:
-      :class:`Solution` as of :func:`~jaxltl.core.values.undiscounted.total_reward.total_reward`. Bounds are 0
-      and infinity as far as nothing is proven, and the status says so. Where a reward is none, the
-      value is NaN and the status ``NONFINITE``.
-
-    Differentiable in the reward, the probabilities and the policy, with the support held fixed.
+    Bounds are 0 and infinity where nothing is proven. If a reward is negative or not finite, the
+    value is NaN and the status ``NONFINITE``.
     """
     target, reward = jnp.asarray(target, bool), jnp.asarray(reward, model.dtype)
     earns = jnp.all(jnp.where(model.available, (reward >= 0) & jnp.isfinite(reward), True))
@@ -223,13 +209,13 @@ def _of_policy(graph: TracedGraph, reward: jax.Array, target: jax.Array, policy:
 
 
 def _earning(graph: TracedGraph, reward: jax.Array, target: jax.Array, taken: Any) -> jax.Array:
-    """From where something may be earned before the target."""
+    """The states from which a positive reward may be earned before the target."""
     some = graph.first(taken & _positive(reward))[0] & ~target
     return attract(graph, some, taken, among=~target).region & ~target
 
 
 def _positive(reward: jax.Array) -> jax.Array:
-    """Whether it is more than 0, also where it is so small that arithmetic takes it for 0."""
+    """Whether a reward is positive, also if it is subnormal, which arithmetic flushes to 0."""
     kind = jnp.int64 if reward.dtype.itemsize == 8 else jnp.int32
     return lax.bitcast_convert_type(reward, kind) > 0
 
@@ -251,7 +237,7 @@ def _smallest(graph: TracedGraph, reward: jax.Array, target: jax.Array) -> _Prob
     sure = surely(graph, target)
     finite = sure.region
     allowed = graph.available & graph.forall(finite) & graph.on_choices(finite & ~target)
-    # What can surely be done for nothing is worth nothing.
+    # The value is 0 where the target is reached almost surely without reward.
     free = allowed & ~_positive(reward)
     nothing = surely(graph, target, free)
     open_ = finite & ~nothing.region
@@ -281,7 +267,7 @@ def _numbers(shape: tuple[int, ...]) -> jax.Array:
 
 
 def _backup(problem: _Problem, value: jax.Array) -> _Point:
-    """A value's image under T, 0 where it is not open."""
+    """A value's image under T, 0 outside of the open states."""
     ahead = problem.reward + expectation(problem.model, value)
     leaves = _numbers(value.shape)
     if problem.policy is not None:
@@ -300,7 +286,7 @@ def _backup(problem: _Problem, value: jax.Array) -> _Point:
 
 
 def _least(component: jax.Array, image: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The least in each state's end component, and the first state that has it."""
+    """The minimum over each state's end component, and the first state that attains it."""
     label, flat, last = component.ravel(), image.ravel(), image.size - 1
     best = jax.ops.segment_min(flat, label, num_segments=flat.size)[label]
     mine = jnp.where(flat <= best, _numbers(flat.shape), last)
@@ -315,7 +301,7 @@ def _where_it_leaves(problem: _Problem, at: _Point, x: jax.Array) -> jax.Array:
 
 
 def _onward(problem: _Problem, at: _Point) -> Callable[[jax.Array], jax.Array]:
-    """``x -> P_pi x`` of the policy that attains an image, 0 where it is not open."""
+    """``x -> P_pi x`` for the policy that attains an image, 0 outside of the open states."""
     model = problem.model
     if problem.policy is None and not isinstance(model, Product):
         along = policy_operator(model, at.action)
@@ -329,9 +315,9 @@ def _onward(problem: _Problem, at: _Point) -> Callable[[jax.Array], jax.Array]:
 
 
 def _improved(problem: _Problem, factor: jax.Array, at: _Point) -> tuple[jax.Array, jax.Array]:
-    """A step of policy iteration for ``v = factor * T v``, and the applications of P it took.
+    """A step of policy iteration for ``v = factor * T v``, and its number of applications of P.
 
-    Where the linear system cannot be solved, sweeps under its policy.
+    If the linear system is not solved, sweeps under its policy.
     """
     model, onward = problem.model, _onward(problem, at)
     swept = factor * at.image
@@ -371,7 +357,7 @@ def _improved(problem: _Problem, factor: jax.Array, at: _Point) -> tuple[jax.Arr
 def _solved(
     problem: _Problem, factor: jax.Array, goal: jax.Array, at: _Point, num_steps: jax.Array
 ) -> tuple[_Point, jax.Array]:
-    """A point near ``v = factor * T v``, by policy iteration from one; nothing is proven here."""
+    """An approximate solution of ``v = factor * T v`` by policy iteration."""
     tiny = jnp.finfo(at.value.dtype).tiny
 
     def error(at: _Point) -> jax.Array:
@@ -407,15 +393,15 @@ def _solved(
 
 
 class _Search(NamedTuple):
-    """What is proven, and where the search is; pairs are below and above.
+    """State of the search for bounds; pairs are lower and upper.
 
     Attributes:
-      at: where it is.
+      at: the current point.
       share: e.
-      bounds: two values.
-      shares: the e by which each was proven, infinite if it was not.
+      bounds: the proven bounds.
+      shares: the e of each proven bound, else infinity.
       safe: the point whose policy attains the bound on the safe side.
-      tries, num_steps: how many bounds were looked for, and the applications of P.
+      tries, num_steps: numbers of trials, and of applications of P.
       ended: whether other shares would not help.
     """
 
@@ -430,21 +416,21 @@ class _Search(NamedTuple):
 
 
 def _width(problem: _Problem, bounds: tuple[jax.Array, jax.Array]) -> jax.Array:
-    """The largest width, as a share of the value."""
+    """The largest relative width."""
     lower, upper = bounds
     each = jnp.where(jnp.isfinite(upper), (upper - lower) / upper, jnp.inf)
     return jnp.max(jnp.where(problem.open, each, 0))
 
 
 def _tried(problem: _Problem, unit: jax.Array, tolerance: jax.Array, k: _Search) -> _Search:
-    """Looks for one of the bounds, proves it if it is one, and says how to go on."""
+    """One trial: solves for one of the bounds, checks it, and updates the share."""
     above = k.tries % 2 == 1
     factor = 1 + jnp.where(above, k.share, -k.share)
     at, n = _solved(problem, factor, k.share / 4, k.at, k.num_steps)
-    # Images are the same all over an end component.
+    # Images are constant in a collapsed end component.
     offered = jnp.where(problem.open, jnp.maximum(factor * at.image, 0), 0)
     at = _backup(problem, offered)
-    # Sums of terms that are not negative err by a share of them, and by what underflows.
+    # Sums of nonnegative terms have a relative error, and an absolute one by underflow.
     least = underflow(problem.model)
     most, fewest = at.image * (1 + unit) + least, at.image * (1 - unit) - least
     holds = jnp.where(above, most <= offered, fewest >= offered)
@@ -494,7 +480,7 @@ def _solution(problem: _Problem, tolerance: jax.Array) -> Found:
     policy, decides = _policy(problem, k.safe)
     lower, upper = k.bounds
     if problem.sign < 0:
-        # The bound is that of a policy that stops.
+        # The bound holds for a policy that leaves the open states almost surely.
         upper = jnp.where(problem.open & ~decides, jnp.inf, upper)
     both = jnp.isfinite(upper)
     value = jnp.where(both, (lower + upper) / 2, jnp.maximum(k.at.image, lower))
@@ -517,7 +503,7 @@ def _solution(problem: _Problem, tolerance: jax.Array) -> Found:
 
 
 def _policy(problem: _Problem, safe: _Point) -> tuple[jax.Array, jax.Array]:
-    """A point's policy in all states, and whether it leaves the open ones almost surely."""
+    """A point's policy in all states, and whether it leaves the open states almost surely."""
     graph = TracedGraph(problem.model)
     action, always = safe.action, jnp.bool_(True)
     if problem.circles is not None:

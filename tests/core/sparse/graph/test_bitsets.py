@@ -7,9 +7,9 @@ import pytest
 
 from jaxltl.core.graphs.attractor import avoid
 from jaxltl.core.graphs.graph import host_graph
+from jaxltl.core.graphs.reaching import max_sets, min_sets
 from jaxltl.core.models.mdp import support
 from jaxltl.core.sparse.graph import bitsets as bits
-from jaxltl.core.values.undiscounted.reachability import max_sets, min_sets
 from tests.support import random_product
 
 
