@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +19,7 @@ from jaxltl.core.sparse.rows import (
 )
 
 _FEW = 24  # states of a frontier up to which Python's own loop beats NumPy's overhead
+_READY = 500  # edges from which SciPy's search is faster, once it is imported
 _MANY = 64  # transitions into one of them from which it does not
 
 
@@ -42,7 +44,8 @@ def forward_search(start: Integers, after: Integers, first: Booleans) -> Boolean
     """Nodes that are reachable from some nodes; node i has successors ``after[start[i] : ...]``."""
     seen = first.copy()
     frontier = np.flatnonzero(first)
-    if after.size > SCIPY_SIZE // 4:
+    ready = after.size > _READY and "scipy.sparse.csgraph" in sys.modules
+    if ready or after.size > SCIPY_SIZE // 4:
         from scipy import sparse
         from scipy.sparse import csgraph
 

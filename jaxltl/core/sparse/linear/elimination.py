@@ -248,7 +248,7 @@ def _block(
     )
     try:
         factor = linalg.splu(
-            _minus(inner).T,
+            _transposed_system(inner),
             permc_spec="MMD_AT_PLUS_A" if min_degree or wide else "NATURAL",
             diag_pivot_thresh=0,
             relax=1,
@@ -336,12 +336,18 @@ def _counted(source: Integers, target: Integers, size: int) -> float:
     return total * size / len(sampled)
 
 
-def _minus(matrix: Any) -> Any:
+def _transposed_system(matrix: Any) -> Any:
+    """``(I - P)^T`` in compressed columns, from P in compressed rows."""
     from scipy import sparse
 
-    found = (sparse.eye_array(matrix.shape[0], format="csr") - matrix).tocsr()
-    found.sort_indices()
-    return found
+    size, start = matrix.shape[0], matrix.indptr + np.arange(matrix.indptr.size)
+    diagonal = start[:-1]
+    other = np.ones(matrix.nnz + size, bool)
+    other[diagonal] = False
+    data, indices = np.ones(other.size), np.empty(other.size, matrix.indices.dtype)
+    data[other] = -matrix.data
+    indices[diagonal], indices[other] = np.arange(size), matrix.indices
+    return sparse.csc_array((data, indices, start), shape=matrix.shape)
 
 
 def _swept(matrix: Any, b: Floats) -> Floats:

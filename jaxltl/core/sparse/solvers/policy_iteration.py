@@ -54,7 +54,8 @@ from jaxltl.core.sparse.solvers.total_cost import (
 _EPS = float(np.finfo(np.float64).eps)
 _SHARE = 0.1  # of the tolerance that the extra cost of the steps may take
 _SHARE_CHAIN = 1e-5  # of a chain, where ties between choices do not matter
-_FIRST_SWEEPS = 60  # of value iteration, for a first policy
+# Sweeps of value iteration for a first policy; of small cores, where a policy costs little, half.
+_FIRST_SWEEPS, _SMALL_CORE = 60, 5000
 _SWEEPS = 12  # after each linear system, which propagate improvements
 _SWEPT_ROUNDS = 12  # after which improvements are strict, so that policy iteration ends
 _KEPT = 0.75  # of the extra cost: smaller gains are ignored, and the rest proves the bound
@@ -211,7 +212,8 @@ class _CoreSolver:
     def solve(self) -> _CoreValues:
         """Bounds, by double precision if that suffices."""
         equation = self.equation
-        first = self._made_proper(equation.greedy_policy(np.zeros(equation.size), _FIRST_SWEEPS))
+        num_sweeps = _FIRST_SWEEPS // (2 if equation.size <= _SMALL_CORE else 1)
+        first = self._made_proper(equation.greedy_policy(np.zeros(equation.size), num_sweeps))
         best, rounds, last = self._iterate(first)
         for method in (self._by_refinement, self._by_fractions):
             if best is not None and self._is_narrow(best, self.tolerance):
