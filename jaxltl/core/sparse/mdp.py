@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.pretty_print import brief
-from jaxltl.core.sparse.rows import Rows, concatenated_ranges
+from jaxltl.core.sparse.rows import Rows, concatenated_ranges, offsets_from_counts
 
 
 @brief
@@ -101,6 +101,14 @@ class HostMDP:
         if self.is_chain:
             return quantity
         return operation.reduceat(quantity, self.row_start[:-1])
+
+    def chain(self, row: Integers) -> HostMDP:
+        """The Markov chain of a policy, from the row of each state."""
+        width = np.diff(self.entry_start)[row]
+        entry = concatenated_ranges(self.entry_start[row], width)
+        states = np.arange(self.num_states + 1)
+        start = offsets_from_counts(width)
+        return HostMDP(states, start, self.successor[entry], self.probability[entry])
 
     def first_choice(self, mask: Booleans) -> tuple[Booleans, Integers]:
         """Whether some row of a state is marked, and its first marked row (or its first row)."""

@@ -103,8 +103,8 @@ def policy_iteration(
             rounds, method, node = found.rounds, found.method, solver.node
             bounds[:, node], policy[node] = (found.near, found.far, found.value), found.policy
             # Values are at least 0, as relative errors of the levels above assume.
-            low = 0 if maximize else 1
-            bounds[low, node] = np.maximum(bounds[low, node], 0)
+            lowest = 0 if maximize else 1
+            bounds[lowest, node] = np.maximum(bounds[lowest, node], 0)
         after = Levels(above.node[::-1], [above.start[-1] - x for x in above.start[::-1]])
         solve_levels(rows, after, bounds, policy, sign)
         _widen(bounds, above.node, sign, (len(above.start) - 1) * unit)
@@ -114,12 +114,23 @@ def policy_iteration(
     high = np.where(np.isnan(high), np.inf, high + TINY)
     value = np.clip(value, low, high)
     residual = rows.residual(value, sign)
-    full = [problem.terminal_value.copy() for _ in range(3)]
-    for x, part in zip(full, (value, low, high), strict=True):
-        x[rows.node] = part
     row = problem.mdp.row_start[:-1].astype(np.int64)
     row[rows.node] = rows.row[policy]
-    return Enclosure(*full, row=row, rounds=rounds, residual=residual, method=method)
+
+    def everywhere(x: Floats) -> Floats:
+        full = problem.terminal_value.copy()
+        full[rows.node] = x
+        return full
+
+    return Enclosure(
+        value=everywhere(value),
+        lower=everywhere(low),
+        upper=everywhere(high),
+        row=row,
+        rounds=rounds,
+        residual=residual,
+        method=method,
+    )
 
 
 def _widen(bounds: Floats, node: Integers, sign: int, share: float) -> None:

@@ -18,7 +18,7 @@ from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.sparse.choice_order import Choices, choices_of
 from jaxltl.core.sparse.graph.qualitative import positive_under_all_policies, backward_reachable
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import sorted_unique, concatenated_ranges, offsets_from_counts
+from jaxltl.core.sparse.rows import sorted_unique, concatenated_ranges
 from jaxltl.core.sparse.solvers.total_cost import Enclosure
 from jaxltl.core.sparse.solvers.reachability import reachability, reward_forever, total_reward
 
@@ -294,15 +294,7 @@ class _Limit:
         """``float64[S]``."""
         mdp = self.mdp
         if self.maximize and not mdp.is_chain:
-            row = self.found.row
-            mdp = HostMDP(
-                np.arange(mdp.num_states + 1),
-                offsets_from_counts(np.diff(mdp.entry_start)[row]),
-                *(
-                    x[concatenated_ranges(mdp.entry_start[row], np.diff(mdp.entry_start)[row])]
-                    for x in (mdp.successor, mdp.probability)
-                ),
-            )
+            mdp = mdp.chain(self.found.row)
         ended = ~self.open | ~positive_under_all_policies(mdp, self.target, among=self.open)
         time = total_reward(mdp, np.ones(mdp.num_rows), ended, maximize=True, tolerance=0.1)
         twice = max(2 * float(time.upper.max()), 1)
