@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 import jaxltl
-from jaxltl.app import processes as several
+from jaxltl.app import processes
 from jaxltl.app import compilation, run_job
 from jaxltl.app.reports.drawing import artist
 
@@ -128,10 +128,16 @@ def _over_devices(command: Callable[..., None]) -> Callable[..., None]:
         help="Address of process 0, without such a launcher.",
     )
     @click.option("--process", type=click.IntRange(0), metavar="I", help="Number of this process.")
-    @click.option("--processes", type=click.IntRange(1), metavar="N", help="Number of processes.")
+    @click.option(
+        "--processes",
+        "num_processes",
+        type=click.IntRange(1),
+        metavar="N",
+        help="Number of processes.",
+    )
     @click.option(
         "--wait",
-        default=several.WAIT,
+        default=processes.WAIT,
         show_default=True,
         metavar="SECONDS",
         type=click.FloatRange(1, 86400),
@@ -143,12 +149,12 @@ def _over_devices(command: Callable[..., None]) -> Callable[..., None]:
         mesh: int | None,
         coordinator: str | None,
         process: int | None,
-        processes: int | None,
+        num_processes: int | None,
         wait: float,
         **options: Any,
     ) -> None:
-        asked = several.Asked(mesh, coordinator, process, processes, wait)
-        command(*args, asked=asked, **options)
+        devices = processes.DeviceOptions(mesh, coordinator, process, num_processes, wait)
+        command(*args, devices=devices, **options)
 
     return run
 
@@ -167,7 +173,7 @@ def _first_line(text: str) -> str:
     return f"jaxltl {jaxltl.__version__}: {text}"
 
 
-def _say_once(launch: several.Launch) -> Callable[[str], None]:
+def _say_once(launch: processes.Launch) -> Callable[[str], None]:
     """:func:`_say` in the first of several processes, and nothing in others."""
     return _say if launch.process == 0 else lambda text: None
 
@@ -207,7 +213,7 @@ def learn(
     seeds: int,
     again: bool,
     as_json: bool,
-    asked: several.Asked,
+    devices: processes.DeviceOptions,
 ) -> None:
     """Learn a policy for a formula, and certify its satisfaction probability.
 
@@ -219,21 +225,21 @@ def learn(
     With --mesh the seeds are distributed over devices, also over those of several processes, each
     of which is started with the same arguments; see docs/devices.md.
     """
-    launch = several.launched(asked)
+    launch = processes.launched(devices)
     say = _say_once(launch)
     say(_first_line(f"learning from {task_file}"))
     # No subprocesses of several processes: they could outlive them.
     apart = compilation.is_fresh() and launch.processes == 1
     # First, so that matplotlib is imported in the background.
-    with artist(apart=apart) as begin, several.taking_part(asked, launch, say) as place:
-        job = place.together(lambda: run_job.job_of(task_file))
+    with artist(apart=apart) as begin, processes.process_group(devices, launch, say) as group:
+        job = group.together(lambda: run_job.job_of(task_file))
         from jaxltl.app.job import fingerprint
 
-        task = place.together(lambda: job.read_task(task_file))
+        task = group.together(lambda: job.read_task(task_file))
         out = _place(out, task.name)
         with _precision(job):
             mark = fingerprint(task, seed, seeds)
-            place.agree(
+            group.agree(
                 {
                     "--out": out,
                     "--seed": seed,
@@ -243,12 +249,12 @@ def learn(
                 }
             )
             result = None if again else run_job.finished(out, mark)
-            done = place.sees(f"{out}/result.json", result is not None)
+            done = group.sees(f"{out}/result.json", result is not None)
             request = run_job.Request(out, seed, seeds, mark)
             result = result or run_job.run_job(
-                job, task, request, run_job.Console(begin, say, place)
+                job, task, request, run_job.Console(begin, say, group)
             )
-    if not place.is_first or result is None:
+    if not group.is_first or result is None:
         return
     click.echo(job.report.table(result))
     click.echo(
@@ -508,7 +514,7 @@ def solve(
     tolerance: float,
     as_json: bool,
     checkpoint: Path | None,
-    asked: several.Asked,
+    devices: processes.DeviceOptions,
 ) -> None:
     """Solve properties of a Markov chain or decision process, with certified bounds.
 
@@ -522,29 +528,29 @@ def solve(
     With --mesh the model is distributed over devices, also over those of several processes, each of
     which is started with the same arguments; see docs/devices.md.
     """
-    launch = several.launched(asked)
+    launch = processes.launched(devices)
     say = _say_once(launch)
     say(_first_line(f"solving {model_file}"))
     for option, given, with_mesh in (
         ("--strategy", strategy, False),
         ("--checkpoint", checkpoint, True),
     ):
-        if given is not None and (asked.mesh is not None) != with_mesh:
+        if given is not None and (devices.mesh is not None) != with_mesh:
             raise ValueError(f"{option} goes {'with' if with_mesh else 'without'} --mesh alone.")
-    if asked.mesh is not None:
+    if devices.mesh is not None:
         compilation.use_cache(True)
     from jaxltl.app import solve as solving
 
-    questions = solving.asked_for(properties)
+    questions = solving.parse_queries(properties)
     if all(one.parsed is None for one in questions):
         raise ValueError("\n".join(str(one.error) for one in questions))
     from jaxltl.algos.common.checkpoint import atomic_write
 
     # Before the work, since the directory may not be writable.
     written = contextlib.nullcontext() if strategy is None else atomic_write(strategy)
-    double = contextlib.nullcontext if asked.mesh is None else _float64
-    with written as file, several.taking_part(asked, launch, say) as place, double():
-        if place.mesh is None:
+    double = contextlib.nullcontext if devices.mesh is None else _float64
+    with written as file, processes.process_group(devices, launch, say) as group, double():
+        if group.mesh is None:
             begin = time.perf_counter()
             model = solving.load(model_file)
             entry = solving.model_entry(model, time.perf_counter() - begin)
@@ -552,11 +558,11 @@ def solve(
         else:
             from jaxltl.app import solve_on_mesh
 
-            spread, known, entry = solve_on_mesh.read(model_file, questions, place)
-            found = solve_on_mesh.solve_in(
-                place, spread, known, questions, tolerance, checkpoint, list(properties)
-            )
-        if place.is_first:
+            sharded, fingerprint, entry = solve_on_mesh.read(model_file, questions, group)
+            solver = solve_on_mesh.MeshSolver(group, sharded, fingerprint, tolerance, checkpoint)
+            solver.agree(list(properties))
+            found = solver.solve(questions)
+        if group.is_first:
             click.echo(
                 "{kind} of {states} states, {choices} choices, {transitions} transitions, "
                 "read in {seconds:.3f} s".format(**entry)
@@ -564,11 +570,11 @@ def solve(
         results = []
         for result in found:
             results.append(result)
-            if place.is_first:
+            if group.is_first:
                 click.echo(f"\n{solving.text(result)}")
         if file is not None:
             file.write(solving.strategies(model, results, model_file))
-    if not place.is_first:
+    if not group.is_first:
         as_json = False
     if as_json:
         _print_json({"model": entry, "results": [solving.result_entry(r) for r in results]})
@@ -615,13 +621,10 @@ def solve(
 def certify(
     log: Path,
     formula: str,
-    confidence: float,
-    method: str,
-    smallest: bool,
     policy: Path | None,
     curve: Path | None,
     as_json: bool,
-    **world: Any,
+    **options: Any,
 ) -> None:
     """Learn a policy from logged transitions, with a guaranteed satisfaction probability.
 
@@ -631,8 +634,15 @@ def certify(
     _begin(f"certifying {formula!r} from {log}")
     from jaxltl.app import certify as app
 
-    asked = app.Asked(formula, confidence, method, "min" if smallest else "max")
-    if app.certify_and_write(log, asked, world, policy, curve, as_json, click.echo):
+    objective: Literal["max", "min"] = "min" if options.pop("smallest") else "max"
+    query = app.Query(formula, options.pop("confidence"), options.pop("method"), objective)
+    graph = app.graph_of_options(
+        options.pop("graph"), options.pop("least_probability"), query.confidence
+    )
+    outputs = app.Outputs(policy, curve)
+    if app.certify_and_write(
+        log, query, app.Source(graph=graph, **options), outputs, as_json, click.echo
+    ):
         raise SystemExit(1)
 
 

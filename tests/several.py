@@ -85,10 +85,10 @@ def ended(processes: list[subprocess.Popen], seconds: float) -> list[Ended]:
 
 
 def main(what: str, directory: Path, coordinator: str, process: int, processes: int) -> None:
-    from jaxltl.app.processes import Asked, launched, taking_part
+    from jaxltl.app.processes import DeviceOptions, launched, process_group
 
-    asked = Asked(0, coordinator, process, processes, wait=15)
-    with taking_part(asked, launched(asked, {}), print) as place:
+    asked = DeviceOptions(0, coordinator, process, processes, wait=15)
+    with process_group(asked, launched(asked, {}), print) as place:
         {"learn": run, "solve": solve, "laws": laws}[what](directory, place)
 
 
@@ -166,7 +166,7 @@ def solve(directory: Path, place: Any) -> None:
     import jax
 
     from jaxltl.app import solve_on_mesh
-    from jaxltl.app.solve import asked_for
+    from jaxltl.app.solve import parse_queries
 
     made: list[int] = []
     save = solve_on_mesh.files.save
@@ -179,15 +179,10 @@ def solve(directory: Path, place: Any) -> None:
     solve_on_mesh.files.save = noted  # type: ignore[assignment]
     text = 'Pmax=? [ F "win" ]'
     with jax.enable_x64(True):
-        (found,) = solve_on_mesh.solve_in(
-            place,
-            solve_on_mesh.on_mesh(walk(), place),
-            {},
-            asked_for([text]),
-            1e-6,
-            directory,
-            [text],
-        )
+        model = solve_on_mesh.on_mesh(walk(), place)
+        solver = solve_on_mesh.MeshSolver(place, model, {}, 1e-6, directory)
+        solver.agree([text])
+        (found,) = solver.solve(parse_queries([text]))
     if place.is_first:
         print(f"went on: {bool(made) and made[0] > 16}")
         print(f"saved: {len(made)}")

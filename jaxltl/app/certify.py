@@ -5,11 +5,11 @@ from __future__ import annotations
 import contextlib
 import json
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -55,7 +55,7 @@ class Evidence:
 
 
 @dataclass(frozen=True)
-class Asked:
+class Query:
     """A question: the formula, and the confidence of the answer.
 
     Attributes:
@@ -66,37 +66,46 @@ class Asked:
 
     formula: str
     confidence: float
-    method: str
-    objective: str
+    method: Literal["anytime", "clopper-pearson", "hoeffding", "weissman"]
+    objective: Literal["max", "min"]
 
 
-def read_evidence(
-    log: Path,
-    *,
-    labels: Path | None = None,
-    model: Path | None = None,
-    initial: Sequence[str] = (),
-    terminal: Sequence[str] = (),
-    graph: Graph | None = None,
-    option: str = "--{} ",
-) -> Evidence:
+@dataclass(frozen=True, kw_only=True)
+class Source:
+    """What is known of a log's world.
+
+    Attributes:
+      labels: table of labels, or None.
+      model: model file with the transition graph, or None.
+      initial, terminal: names of states.
+      graph: assumption on possible transitions; default ``"complete"``, or ``"given"`` with a
+        model; see :func:`~jaxltl.core.models.construct.counts.model_from_counts`.
+    """
+
+    labels: Path | None = None
+    model: Path | None = None
+    initial: Sequence[str] = ()
+    terminal: Sequence[str] = ()
+    graph: Graph | None = None
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """Files that the command writes: the policy, and the picture of the curve."""
+
+    policy: Path | None = None
+    curve: Path | None = None
+
+
+def read_evidence(log: Path, source: Source, option: str = "--{} ") -> Evidence:
     """The transition counts of a log, with a given model or one of the log's frequencies.
 
-    Args:
-      log, labels, model: files.
-      initial, terminal: names of states.
-      graph: see :func:`~jaxltl.core.models.construct.counts.model_from_counts`; default
-        ``"complete"``, or ``"given"`` with a model.
-      option: format of an option's name in errors.
-
-    Returns:
-      :class:`Evidence`.
-
-    Raises:
-      ValueError: naming the file and the line, or the option.
+    `option` is the format of an option's name in errors.
     """
     from jaxltl.io.log import read_labels, read_log
 
+    labels, model, initial, terminal = source.labels, source.model, source.initial, source.terminal
+    graph = source.graph
     if model is not None:
         from jaxltl.app.solve import load
 
@@ -166,18 +175,8 @@ def _named(model: SparseMDP, counts: np.ndarray, graph: Graph) -> Evidence:
     return Evidence(model, counts, tuple(map(str, names)), tuple(actions), graph)
 
 
-def certify(evidence: Evidence, asked: Asked) -> DataGuarantee:
+def certify(evidence: Evidence, query: Query) -> DataGuarantee:
     """The guarantee of a log, by :func:`~jaxltl.core.values.evaluation.data_guarantee.learn_guarantee`.
-
-    Args:
-      evidence: of :func:`read_evidence`.
-      asked: the formula and the confidence.
-
-    Returns:
-      :class:`~jaxltl.core.values.evaluation.data_guarantee.DataGuarantee`.
-
-    Raises:
-      ValueError: an unknown label, or an invalid confidence.
 
     Example:
       >>> import tempfile
@@ -185,32 +184,33 @@ def certify(evidence: Evidence, asked: Asked) -> DataGuarantee:
       >>> _ = path.write_text("state,action,next,count\\ndock,go,bay,900\\ndock,go,pit,100\\n")
       >>> labels = path.with_name("labels.csv")
       >>> _ = labels.write_text("state,label\\nbay,bay\\n")
-      >>> seen = read_evidence(path, labels=labels, initial=["dock"], terminal=["bay", "pit"],
-      ...                      graph="seen")
-      >>> found = certify(seen, Asked("F bay", 0.95, "anytime", "max"))
+      >>> source = Source(labels=labels, initial=["dock"], terminal=["bay", "pit"],
+      ...                 graph="seen")
+      >>> seen = read_evidence(path, source)
+      >>> found = certify(seen, Query("F bay", 0.95, "anytime", "max"))
       >>> 0.85 < found.bound < 0.9
       True
     """
     return learn_guarantee(
         evidence.model,
         evidence.counts,
-        asked.formula,
-        asked.confidence,
+        query.formula,
+        query.confidence,
         graph=evidence.graph,
-        method=asked.method,
-        objective=asked.objective,
-    )  # type: ignore[arg-type]
+        method=query.method,
+        objective=query.objective,
+    )
 
 
-def text(evidence: Evidence, asked: Asked, found: DataGuarantee, seconds: float) -> str:
+def text(evidence: Evidence, query: Query, found: DataGuarantee, seconds: float) -> str:
     """The guarantee as text."""
-    side, other = (">=", "more") if asked.objective == "max" else ("<=", "less")
+    side, other = (">=", "more") if query.objective == "max" else ("<=", "less")
     lines = [
         f"P {side} {_outward(found.bound, side == '<=')} with confidence {found.confidence:g}",
-        f"  of {asked.formula!r}, under the policy found; no policy has {other} than "
+        f"  of {query.formula!r}, under the policy found; no policy has {other} than "
         f"{_outward(found.optimistic, side == '>=')}",
         f"  {int(evidence.counts.sum())} transitions of {evidence.model.num_rows} choices in "
-        f"{evidence.model.num_states} states, {found.sets.num_claims} claims of {asked.method}",
+        f"{evidence.model.num_states} states, {found.sets.num_claims} claims of {query.method}",
     ]
     lines.append(f"  assuming that {found.assumption}")
     if evidence.graph == "complete":
@@ -242,16 +242,16 @@ def _state(evidence: Evidence, row: int) -> str:
     return evidence.states[int(evidence.model.host.state[row])]
 
 
-def entry(evidence: Evidence, asked: Asked, found: DataGuarantee, seconds: float) -> dict[str, Any]:
+def entry(evidence: Evidence, query: Query, found: DataGuarantee, seconds: float) -> dict[str, Any]:
     """The guarantee as a JSON object."""
     return {
-        "formula": asked.formula,
-        "objective": asked.objective,
+        "formula": query.formula,
+        "objective": query.objective,
         "bound": found.bound,
         "optimistic": found.optimistic,
         "confidence": found.confidence,
         "assumption": found.assumption,
-        "method": asked.method,
+        "method": query.method,
         "status": Status(int(found.satisfaction.solution.status)).name,
         "samples": int(evidence.counts.sum()),
         "claims": found.sets.num_claims,
@@ -275,7 +275,7 @@ def sample_next(evidence: Evidence, found: DataGuarantee) -> list[dict[str, Any]
     ]
 
 
-def policy_file(evidence: Evidence, asked: Asked, found: DataGuarantee) -> bytes:
+def policy_file(evidence: Evidence, query: Query, found: DataGuarantee) -> bytes:
     """The policy as JSON: an action for each state and memory state, and the memory's update."""
     of = found.satisfaction
     product, automaton = of.product, of.automaton
@@ -296,7 +296,7 @@ def policy_file(evidence: Evidence, asked: Asked, found: DataGuarantee) -> bytes
         if not still
     ]
     table = {
-        **entry(evidence, asked, found, 0.0),
+        **entry(evidence, query, found, 0.0),
         "initial_memory": int(automaton.initial),
         "letters": letters,
         "letter": {
@@ -310,35 +310,34 @@ def policy_file(evidence: Evidence, asked: Asked, found: DataGuarantee) -> bytes
     return (json.dumps(table, allow_nan=False) + "\n").encode()
 
 
-def curve(evidence: Evidence, asked: Asked) -> tuple[list[int], list[float]]:
+def curve(evidence: Evidence, query: Query) -> tuple[list[int], list[float]]:
     """The guarantee by number of samples, for one random order of the log."""
     total = int(evidence.counts.sum())
     sizes = np.unique(np.geomspace(max(total / 10**3, 1), max(total, 1), POINTS).astype(int))
     bound = guarantee_curve(
         evidence.model,
         evidence.counts,
-        asked.formula,
-        asked.confidence,
+        query.formula,
+        query.confidence,
         sizes.tolist(),
         graph=evidence.graph,
-        method=asked.method,
-        objective=asked.objective,
-    )  # type: ignore[arg-type]
+        method=query.method,
+        objective=query.objective,
+    )
     return sizes.tolist(), bound.tolist()
 
 
-def timed(evidence: Evidence, asked: Asked) -> tuple[DataGuarantee, float]:
+def timed(evidence: Evidence, query: Query) -> tuple[DataGuarantee, float]:
     """:func:`certify`, and how long it took."""
     begin = time.perf_counter()
-    return certify(evidence, asked), time.perf_counter() - begin
+    return certify(evidence, query), time.perf_counter() - begin
 
 
 def certify_and_write(
     log: Path,
-    asked: Asked,
-    world: Mapping[str, Any],
-    policy: Path | None,
-    picture: Path | None,
+    query: Query,
+    source: Source,
+    outputs: Outputs,
     as_json: bool,
     say: Callable[[str], None],
 ) -> bool:
@@ -348,7 +347,8 @@ def certify_and_write(
     """
     from jaxltl.algos.common.checkpoint import atomic_write
 
-    check_confidence(asked.confidence)
+    check_confidence(query.confidence)
+    policy, picture = outputs.policy, outputs.curve
     if picture is not None and picture.suffix not in PICTURES:
         raise ValueError(f"--curve {picture}: the name must end in {', '.join(PICTURES)}.")
     nothing: Any = contextlib.nullcontext()
@@ -356,20 +356,16 @@ def certify_and_write(
         nothing if policy is None else atomic_write(policy) as file,
         nothing if picture is None else atomic_write(picture) as drawing,
     ):
-        options = dict(world)
-        graph = graph_of_options(
-            options.pop("graph", None), options.pop("least_probability", None), asked.confidence
-        )
-        evidence = read_evidence(log, graph=graph, **options)
-        found, seconds = timed(evidence, asked)
-        say(text(evidence, asked, found, seconds))
-        result = entry(evidence, asked, found, seconds)
+        evidence = read_evidence(log, source)
+        found, seconds = timed(evidence, query)
+        say(text(evidence, query, found, seconds))
+        result = entry(evidence, query, found, seconds)
         if file is not None:
-            file.write(policy_file(evidence, asked, found))
+            file.write(policy_file(evidence, query, found))
         if drawing is not None:
             from jaxltl import plot
 
-            sizes, bound = curve(evidence, asked)
+            sizes, bound = curve(evidence, query)
             result["curve"] = {"samples": sizes, "bound": bound}
             figure = plot.guarantees(sizes, {"guaranteed": bound}, reference=found.optimistic)
             drawing.write(plot.to_bytes(figure, picture.suffix[1:]))  # type: ignore[union-attr]

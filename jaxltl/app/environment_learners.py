@@ -50,16 +50,7 @@ class Method:
 
 
 def make_method(task: EnvironmentTask, environment: Environment, num_steps: int) -> Method:
-    """The learner of a task file.
-
-    Args:
-      task: the file.
-      environment: with the formula.
-      num_steps: limit of an episode.
-
-    Raises:
-      ValueError: hyperparameters or actions that the learner refuses.
-    """
+    """The learner of a task file."""
     make = {"ppo": _ppo, "cce": _cce, "cpo": _cpo}[task.learner.method]
     found = make(task, environment, num_steps)
     if found.transitions > _LARGEST_COUNT:

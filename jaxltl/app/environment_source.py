@@ -34,16 +34,7 @@ PACKAGES = {
 
 
 def load_environment(task: EnvironmentTask, world: Environment | None = None) -> Environment:
-    """The environment of a task file, with its labels and its horizon.
-
-    Args:
-      task: the file.
-      world: in place of the one that the file names; then nothing is imported.
-
-    Raises:
-      ValueError: a function is missing, fails, or returns no environment; names the file, the
-        table and the key.
-    """
+    """The environment of a task file, with its labels and its horizon."""
     table, folder = task.world, task.path.parent
     if world is None:
         with errors_in(f"{task.path}: [world] labels: "):

@@ -1,7 +1,7 @@
-"""Reads what the runtime of a process writes, and tells in one line why it ended that process.
+"""Reports in one line why the JAX runtime ended a process.
 
-Run as a program of its own, beside the process, since the runtime ends that at once: with the
-process's number as argument, and its lines as standard input. It imports nothing of the package.
+Runs as another program, since the runtime ends its process at once: the process's number is the
+argument, and its error output the standard input. Imports nothing of the package.
 """
 
 from __future__ import annotations
@@ -13,34 +13,30 @@ import sys
 import threading
 
 FATAL = "Terminating process because the JAX distributed service detected"
-END = "jaxltl ends: "  # what the process itself says, which may not live to see it printed
+END = "jaxltl ends: "  # prefix of the process's own last line
 AGAIN = (
-    "what was saved is kept: start all processes again, as many or another number, and the "
-    "run goes on"
+    "Checkpoints are kept: start all processes again, in the same or another number, and the "
+    "run resumes"
 )
 _CHATTER = ("[Gloo] Rank ",)
-_PATIENCE = 1.0  # seconds for the rest of a message
+_WAIT = 1.0  # seconds for the rest of a message
 
 
-def told(text: str, process: int) -> str:
-    """The line for the runtime's last words.
+def explain(text: str, process: int) -> str:
+    """One line for the runtime's last message.
 
     Example:
-      >>> told("Terminating process ...: UNAVAILABLE: The following tasks are unhealthy "
+      >>> explain("Terminating process ...: UNAVAILABLE: The following tasks are unhealthy "
       ...      "(stopped sending heartbeats):\\n1\\nThe tasks have crashed.", 0)[:44]
-      'process 0 stops, for process 1 gives no sign'
+      'process 0 stops: process 1 does not respond.'
     """
     if (own := re.search(f"^{END}(.+)$", text, re.MULTILINE)) is not None:
         return own[1]
     silent = re.search(r"stopped sending heartbeats\):\n([\d,\s]+)", text)
     if silent is not None:
         names = re.findall(r"\d+", silent[1])
-        who = (
-            f"process {names[0]} gives"
-            if len(names) == 1
-            else (f"processes {', '.join(names)} give")
-        )
-        return f"process {process} stops, for {who} no sign of life any more; {AGAIN}."
+        who = f"process {names[0]} does" if len(names) == 1 else f"processes {', '.join(names)} do"
+        return f"process {process} stops: {who} not respond. {AGAIN}."
     if "RegisterTask" in text and "ALREADY_EXISTS" in text:
         return (
             f"process {process}: another process has the same number; give each its own "
@@ -53,14 +49,14 @@ def told(text: str, process: int) -> str:
         )
     if ("PollForError" in text and "Failed to send RPC" in text) or "Socket closed" in text:
         return (
-            f"process {process} stops, for process 0, which the others meet at, has ended; {AGAIN}."
+            f"process {process} stops: process 0, which coordinates the others, has ended. {AGAIN}."
         )
-    return f"process {process} stops, for another process has ended; {AGAIN}."
+    return f"process {process} stops: another process has ended. {AGAIN}."
 
 
 def main() -> None:
-    """Passes lines on until the last words come, or the process has ended; of these one line."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that is read from decides
+    """Copies lines until the last message or the end of the process, and explains that."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the observed process handles it
     process, last = int(sys.argv[1]), list[str]()
     done = threading.Event()
 
@@ -79,9 +75,9 @@ def main() -> None:
     begun = threading.Event()
     threading.Thread(target=read, daemon=True).start()
     begun.wait()
-    done.wait(_PATIENCE)  # what the process has started may hold the other end for longer
+    done.wait(_WAIT)  # subprocesses may hold the pipe open
     if last:
-        sys.stderr.write(f"error: {told(''.join(last), process)}\n")
+        sys.stderr.write(f"error: {explain(''.join(last), process)}\n")
         sys.stderr.flush()
     os._exit(0)  # the thread may still be reading
 

@@ -66,12 +66,7 @@ def ask(
     asked: str | float,
     over: str = "mean",
 ) -> Guarantee:
-    """The guarantee that is asked for a product.
-
-    Raises:
-      ValueError: no policy attains the probability, with the attainable one; or a demonstration
-        has no optimal step.
-    """
+    """The guarantee that is asked for a product."""
     nothing = np.zeros(np.shape(shown.state), bool)
     if asked == "none":
         return Guarantee(asked, over, best, None, nothing, None)
@@ -114,9 +109,6 @@ def _losing(
 
 def check_formula(automaton: Automaton) -> str | None:
     """A remark on a formula that every trajectory satisfies, or None.
-
-    Raises:
-      ValueError: no trajectory satisfies it.
 
     Example:
       >>> from jaxltl import to_automaton
@@ -233,10 +225,6 @@ class Search(Generic[Learned]):
         jumps with the weight, or no weight attains it, policies of both sides are mixed; and the
         likeliest policy is mixed with the likeliest one of optimal actions or, if that gives no
         probability near the asked one, with the quickest of these.
-
-        Args:
-          free: learned without a weight.
-          inside: a policy of optimal actions alone, and what it was learned as.
         """
         asked = float(self.guarantee.asked)
         first = self._attempt(self.policy_of(free), free, 0.0, 0.0)
@@ -303,13 +291,6 @@ def bracket(
 
     Each starts from the result of the next smaller weight: the likelihood has several maxima, and
     those found from too large a weight are lower.
-
-    Args:
-      train: learns with a weight, starting from an earlier result.
-      first: the attempt without a weight, with `learned` and `attained`.
-      judged: the attempt of a result and its weight.
-      asked: the probability to attain.
-      halvings: bisections, at most.
     """
     low, below = 0.0, first
     for high in map(float, _WEIGHTS):

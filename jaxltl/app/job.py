@@ -167,11 +167,7 @@ def memory_arrays(model: Product, size: int | None = None) -> dict[str, Any]:
 
 
 def save_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
-    """Writes arrays as an ``.npz``, atomically.
-
-    Raises:
-      ValueError: the file is not writable.
-    """
+    """Writes arrays as an ``.npz``, atomically."""
     with atomic_write(path) as file:
         np.savez(file, allow_pickle=False, **{k: np.asarray(v) for k, v in arrays.items()})
 

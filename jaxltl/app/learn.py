@@ -95,14 +95,14 @@ class Learned:
 def _features(setup: Setup) -> mlirl.Features:
     """The features of the reward, in the world or in the product (chapter 2)."""
     table, model, shown = setup.task.learner, setup.model, setup.demonstrations
-    avoid, progress = table.avoid or (), table.progress
+    avoid = table.avoid or ()
     if table.in_world:
         return mlirl.world_features(
-            model.mdp, shown, goal=table.goal or (), progress=progress or (), avoid=avoid
+            model.mdp, shown, goal=table.goal or (), progress=table.progress_labels, avoid=avoid
         )
     # Without a guarantee, those of the dissertation's Table 1 alone.
     best = None if setup.guarantee.asked == "none" else setup.guarantee.best
-    return mlirl.task_features(model, shown, avoid=avoid, progress=progress, best=best)
+    return mlirl.task_features(model, shown, avoid=avoid, progress=table.progress_states, best=best)
 
 
 def _problem(setup: Setup, allowed: np.ndarray | None) -> mlirl.Problem:
@@ -308,11 +308,7 @@ class Outcome:
 
 
 def prepare(task: MlirlTask, seed: int) -> Setup:
-    """The world, product and demonstrations of a task.
-
-    Raises:
-      ValueError: the task or one of its files is wrong.
-    """
+    """The world, product and demonstrations of a task."""
     world = load_world(task)
     with errors_in(f"{task.path}: [task] "):
         model = product(world.mdp, task.formula, label_on=task.label_on)
@@ -344,11 +340,7 @@ def describe(setup: Setup) -> str:
 
 
 def learn(setup: Setup, training: Training) -> Outcome:
-    """Learns with N seeds, keeps the one of least loss, and evaluates all.
-
-    Raises:
-      ValueError: the learner cannot work on this task.
-    """
+    """Learns with N seeds, keeps the one of least loss, and evaluates all."""
     model = setup.model
     learned, chosen, attempt = _with_guarantee(setup, training)
     training.stage("checking")
@@ -479,9 +471,6 @@ def save(out: Path, outcome: Outcome) -> None:
     state in the initial state s and after reading the label of s; ``label_on``; ``actions [A]``;
     ``weights [F]`` and ``features [F]``; ``satisfaction``, ``lower`` and ``upper`` ``[S, Q]``; for
     a log, the names ``states [S]``.
-
-    Raises:
-      ValueError: the directory is not writable.
     """
     model, learned, i = outcome.setup.model, outcome.learned, outcome.chosen
     logged = outcome.setup.world.logged

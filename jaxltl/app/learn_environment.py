@@ -105,16 +105,7 @@ class Outcome:
 
 
 def prepare(task: EnvironmentTask, seed: int, world: Environment | None = None) -> Setup:
-    """The environment with the formula, and the learner.
-
-    Args:
-      task: the file.
-      seed: unused.
-      world: in place of the one that the file names.
-
-    Raises:
-      ValueError: the file, or a function that it names, is wrong.
-    """
+    """The environment with the formula, and the learner."""
     del seed
     world = load_environment(task, world)
     with errors_in(f"{task.path}: [task] formula: "):
@@ -396,9 +387,6 @@ def save(out: Path, outcome: Outcome) -> None:
 
     ``policy.npz`` has the arrays of the learner's state that determine the kept policy, and the
     text and path of the task file; :func:`load_policy` reads it.
-
-    Raises:
-      ValueError: the directory is not writable.
     """
     from jaxltl.plot.episodes import play_episode
 

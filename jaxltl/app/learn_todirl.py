@@ -1,8 +1,8 @@
-"""From demonstrations to a reward that carries over: what `jaxltl learn` does for todirl.
+"""Task-oriented deep inverse reinforcement learning: the job of ``method = "todirl"``.
 
-The reward network is learned in the training worlds (dissertation, chapter 3), and the policies
-that are soft-optimal for it are judged there and in test worlds, beside the one of an expert who
-knows the task and one that moves at random.
+A reward network is learned in the training worlds (dissertation, chapter 3). Its soft-optimal
+policies are evaluated there and in test worlds, beside an expert that knows the formula and the
+uniform policy.
 """
 
 from __future__ import annotations
@@ -89,19 +89,14 @@ from jaxltl.io.learned_reward import LearnedReward, save_reward
 DOUBLE = True
 
 
-_BATCH = 64  # worlds that are planned in at once
+_BATCH = 64  # worlds in a batch of planning
 
 
-_EXPERT_DISCOUNT = 0.99  # at most, where the file does not give one
+_EXPERT_DISCOUNT = 0.99  # largest default
 
 
 def prepare(task: TodirlTask, seed: int) -> Setup:
-    """The worlds, products and demonstrations of a task; all of its files checked.
-
-    Raises:
-      ValueError: something in the task or its files is wrong, or the probability that is to be
-        guaranteed is more than any policy has in some world.
-    """
+    """The worlds, products and demonstrations of a task."""
     judge, memory = load_automata(task)
     shown = task.demonstrations
     require_cosafe(task.path, shown, judge)
@@ -116,8 +111,8 @@ def prepare(task: TodirlTask, seed: int) -> Setup:
     if not found:
         key = jax.random.fold_in(jax.random.key(seed), 0)
         for w, scene in enumerate(scenes):
-            # Without padding, and whatever the learner remembers: tasks that differ only in
-            # that, or in their test worlds, have the same demonstrations.
+            # Without padding and the learner's memory: tasks that differ only in these have the
+            # same demonstrations.
             model = product(scene.mdp, judge, label_on=task.label_on)
             own = jax.random.fold_in(key, w)
             if soft:
@@ -134,7 +129,9 @@ def prepare(task: TodirlTask, seed: int) -> Setup:
                 runs, lost = synthetic_demonstrations(task.path, shown, model, own, bests[w])
                 found, dropped = [*found, runs], dropped + lost
     if memory is not judge:
-        expert = np.tile(expert, (1, 1, len(memory.delta), 1))  # the task's state varies fastest
+        expert = np.tile(
+            expert, (1, 1, len(memory.delta), 1)
+        )  # the formula's automaton state varies fastest
     setup = Setup(
         task,
         judge,
@@ -159,7 +156,7 @@ def prepare(task: TodirlTask, seed: int) -> Setup:
 
 
 def _narrowed(setup: Setup) -> Setup:
-    """With the actions alone that lose nothing, and how many demonstrated steps took others."""
+    """Restricts a setup to optimal actions, and counts the demonstrated steps that are not."""
     task, worlds, count = setup.task, setup.worlds, 0
     allowed = [np.asarray(one.allowed) for one in setup.sure or ()]
     for w, trajectories in enumerate(setup.demonstrations):
@@ -175,9 +172,9 @@ def _narrowed(setup: Setup) -> Setup:
 def _experts(
     task: TodirlTask, scenes: list[Scene], judge: Automaton, *, soft: bool
 ) -> tuple[np.ndarray, list[Solution]]:
-    """Policies ``[W, S, Q, A]`` of one who knows the task, and its best probability if not soft.
+    """Policies ``[W, S, Q, A]`` of the expert, and optimal solutions unless it is soft.
 
-    Soft-optimal for a reward, or the quickest of the best.
+    The expert is soft-optimal for a reward of the formula, or the quickest optimal policy.
     """
     if soft:
         shown = task.demonstrations
@@ -188,13 +185,13 @@ def _experts(
         return np.asarray(_expert(models, discount, shown.rewards())), []
     bests = [optimal_satisfaction(product(s.mdp, judge, label_on=task.label_on)) for s in scenes]
     size = max(scene.mdp.num_states for scene in scenes)
-    # In the padding any move does.
+    # Actions in padding states never matter.
     chosen = [np.pad(np.asarray(x.policy), ((0, size - len(x.policy)), (0, 0))) for x in bests]
     return np.eye(len(ACTIONS))[np.stack(chosen)], bests
 
 
 def _stack(task: TodirlTask, scenes: list[Scene], judge: Automaton, memory: Automaton) -> Worlds:
-    """All worlds at once, so that what works in them is compiled once."""
+    """Stacks all worlds, so that one program serves them."""
     mdps = [scene.mdp for scene in scenes]
     both = judge if memory is judge else synchronize(memory, judge)
     with errors_in(f"{task.path}: "):
@@ -216,7 +213,7 @@ def _observations(scenes: list[Scene], model: Product) -> jax.Array:
 
 
 def describe(setup: Setup) -> str:
-    """What a task comes to, in one line."""
+    """Sizes of a setup, in one line."""
     pairs = sum(int(np.sum(shown.length)) for shown in setup.demonstrations)
     number = sum(len(shown.length) for shown in setup.demonstrations)
     tests = len(setup.worlds.scenes) - setup.num_training
@@ -227,15 +224,11 @@ def describe(setup: Setup) -> str:
 
 
 def learn(setup: Setup, training: Training) -> Outcome:
-    """Learns with N seeds, keeps one without looking at test worlds, and evaluates it.
-
-    Raises:
-      ValueError: the learner cannot work on this task.
-    """
+    """Learns with N seeds, keeps one without looking at test worlds, and evaluates it."""
     table = setup.task.learner
     network = todirl.RewardNetwork(tuple(table.hidden))
     scenes = setup.worlds.scenes[: setup.num_training]
-    # Stacked anew, without the padding that larger test worlds ask for.
+    # Stacked again, without the padding of larger test worlds.
     model = stack_products(
         [scene.mdp for scene in scenes], setup.memory, label_on=setup.task.label_on
     )
@@ -251,7 +244,7 @@ def learn(setup: Setup, training: Training) -> Outcome:
     )
     hparams = settings(todirl.Hparams, table.given())
     if setup.is_probability and is_weighable(setup):
-        hparams = replace(hparams, mu=0.0)  # it is one program for all weights
+        hparams = replace(hparams, mu=0.0)  # not None, so that one program serves all weights
     learned = _train(setup, problem, hparams, training)
     chosen = _least_loss(learned)
     if setup.is_probability:
@@ -291,21 +284,21 @@ def _train(
 
 
 def _least_loss(learned: Learned) -> int:
-    """The seed that is kept: the best on held-out demonstrations, or the least loss."""
+    """The seed of greatest held-out likelihood, or of least loss."""
     score = np.where(np.isfinite(learned.held_out), learned.held_out, np.inf)
     loss = np.where(np.isfinite(learned.history["loss"][-1]), learned.history["loss"][-1], np.inf)
     return int(np.argmin(score if np.isfinite(score).any() else loss))
 
 
 def _lane(learned: Learned, i: int) -> Learned:
-    """One of the seeds alone."""
+    """The networks of one seed."""
     return replace(one_seed(learned, i), parameters=part_of(learned.parameters, slice(i, i + 1)))
 
 
 def _weighed(
     setup: Setup, problem: todirl.Problem, hparams: todirl.Hparams, free: Learned, seed: int
 ) -> Learned:
-    """What is kept of what one seed learns with more and more weight of the task."""
+    """The network of one seed with the best weight of the satisfaction probability."""
 
     def train(mu: float, _: Learned) -> Learned:
         return _train(setup, problem, replace(hparams, mu=mu), Training(seed, 1))
@@ -369,9 +362,9 @@ def _plans(
     hparams: todirl.Hparams,
     count: int,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Policies of all moves and of those that lose nothing in the first worlds, and statuses.
+    """Plans of all actions and of optimal ones in the first worlds, and statuses.
 
-    One world after the other, so that one program serves all.
+    Worlds are planned in one at a time, so that one program serves all.
     """
     worlds, masks = setup.worlds, np.stack([x.allowed for x in setup.sure or ()])
     found, codes = [], np.zeros(count, np.int32)
@@ -430,9 +423,9 @@ def _within_each(judged: Product, policy: jax.Array) -> Performance:
 
 
 def _within(model: Product, policy: jax.Array) -> Performance:
-    """The probability of doing the task within the steps of a policy ``[T, S, Q, A]``.
+    """Step-bounded satisfaction probability of a policy ``[T, S, Q, A]``.
 
-    Of a safety task, of not failing it.
+    For a safety formula, the probability of no violation within T steps.
     """
     done = model.final.astype(model.dtype)
     kept = jnp.minimum if model.automaton.acceptance == "safety" else jnp.maximum
@@ -443,7 +436,7 @@ def _within(model: Product, policy: jax.Array) -> Performance:
     value, _ = lax.scan(backup, done, policy, reverse=True)
     value = jnp.take_along_axis(value, model.initial_memory[:, None], axis=1)[:, 0]
     starts = model.mdp.initial > 0
-    # Sums of products of numbers of at most one, which round in each of T steps.
+    # Rounding of T steps of sums of K + A products of numbers in [0, 1], to first order.
     terms = model.num_successors + model.num_actions + 4
     half = len(policy) * terms * jnp.finfo(model.dtype).eps
     worst = jnp.argmin(jnp.where(starts, value, jnp.inf)).astype(jnp.int32)
@@ -464,7 +457,7 @@ def _within(model: Product, policy: jax.Array) -> Performance:
 
 
 def summary(outcome: Outcome) -> dict[str, Any]:
-    """The outcome as numbers, lists and texts, for ``result.json``; NaN becomes None."""
+    """The outcome for ``result.json``; NaN becomes None."""
     setup, learned, i = outcome.setup, outcome.learned, outcome.chosen
     task, history, count = setup.task, learned.history, setup.num_training
     infeasible = np.array(
@@ -530,7 +523,7 @@ def summary(outcome: Outcome) -> dict[str, Any]:
 
 
 def _about_learning(learned: Learned, i: int) -> dict[str, Any]:
-    """How one run of the learner ended."""
+    """The final figures of one seed."""
     history = learned.history
     return {
         "loss": history["loss"][-1][i],
@@ -594,13 +587,10 @@ def _about_world(scene: Scene, judged: Judged, w: int, infeasible: int) -> dict[
 def save(out: Path, outcome: Outcome) -> None:
     """Writes ``network.npz`` and, for each training world, ``policy_1.npz`` and so on.
 
-    The network is read by :func:`jaxltl.io.learned_reward.load_reward`. The arrays of a policy:
+    :func:`jaxltl.io.learned_reward.load_reward` reads the network. The arrays of a policy:
     ``policy [S, Q, A]`` (with a horizon ``[T, S, Q, A]``); ``initial_memory [S]`` and
-    ``next_memory [S, Q]``, the memory at the start in s and after reading the label of s;
-    ``label_on``; ``actions [A]``; and ``satisfaction [S]``, the probability of the task from there.
-
-    Raises:
-      ValueError: a place cannot be written to.
+    ``next_memory [S, Q]``, the memory state in the initial state s and after reading the label of
+    s; ``label_on``; ``actions [A]``; and the satisfaction probabilities ``satisfaction [S]``.
     """
     for pattern in ("policy_*.npz", "training_*.svg", "test_*.svg"):
         for stale in out.glob(pattern):
@@ -621,7 +611,7 @@ def save(out: Path, outcome: Outcome) -> None:
 
 
 def learned_reward(outcome: Outcome) -> LearnedReward:
-    """The kept seed's reward, with all that planning with it needs."""
+    """The kept seed's reward with the parameters of planning."""
     task, i = outcome.setup.task, outcome.chosen
     kinds = COLORS if task.is_colored else (*cell_kinds(task.world), "off the map")
     return LearnedReward(

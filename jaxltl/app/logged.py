@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from jaxltl.app.certify import (
-    Asked,
     Evidence,
+    Query,
+    Source,
     certify,
     graph_of_options,
     read_evidence,
@@ -38,7 +39,7 @@ class Logged:
     evidence: Evidence
     column: np.ndarray
     confidence: float
-    method: str
+    method: Literal["anytime", "clopper-pearson", "hoeffding", "weissman"]
 
     @property
     def states(self) -> tuple[str, ...]:
@@ -52,23 +53,17 @@ class Logged:
 
 
 def load_logged(folder: Path, table: WorldTable) -> tuple[MDP, tuple[str, ...], Logged]:
-    """The world of a log, with frequencies as probabilities, the names of its actions, and the log.
-
-    Args:
-      folder: of the files that are named.
-      table: ``[world]`` of a task file.
-
-    Raises:
-      ValueError: naming the file and the line, or the key.
-    """
+    """The world of a log, with frequencies as probabilities, the names of its actions, and the log."""
     initial, confidence = table.initial or [], table.confidence
     assert table.transitions is not None and confidence is not None
     evidence = read_evidence(
         folder / table.transitions,
-        labels=None if table.labels is None else folder / table.labels,
-        initial=[initial] if isinstance(initial, str) else initial,
-        terminal=table.terminal or (),
-        graph=graph_of_options(table.graph, table.least_probability, confidence),
+        Source(
+            labels=None if table.labels is None else folder / table.labels,
+            initial=[initial] if isinstance(initial, str) else initial,
+            terminal=table.terminal or (),
+            graph=graph_of_options(table.graph, table.least_probability, confidence),
+        ),
         option="{} = ",
     )
     mdp, actions, column = padded(evidence.model)
@@ -85,19 +80,12 @@ def guaranteed(logged: Logged, model: Product, formula: str, policy: Any) -> dic
     The policy may depend on the log: with the given confidence all sets hold the true
     distributions at once, so that the worst case over them bounds every policy.
 
-    Args:
-      logged: the log.
-      model: the product of the padded world.
-      formula: of the product.
-      policy: ``float[S, Q, A]``.
-
-    Returns:
-      For ``result.json``: ``guaranteed``, a lower bound of the policy's satisfaction probability,
-      ``best_guaranteed``, the greatest such bound of any policy, and ``optimistic``, an upper
-      bound for all policies; all with one ``confidence``, under the ``assumption``.
+    Returns, for ``result.json``: ``guaranteed``, a lower bound of the policy's satisfaction
+    probability, ``best_guaranteed``, the greatest such bound of any policy, and ``optimistic``, an
+    upper bound for all policies; all with one ``confidence``, under the ``assumption``.
     """
     evidence = logged.evidence
-    best = certify(evidence, Asked(formula, logged.confidence, logged.method, "max"))
+    best = certify(evidence, Query(formula, logged.confidence, logged.method, "max"))
     against = product(best.model, model.automaton, label_on=model.label_on)
     weights: Any = np.asarray(policy)[evidence.model.host.state, :, logged.column]
     found = satisfaction_probability(against, weights, nature="adversarial")

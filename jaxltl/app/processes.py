@@ -1,9 +1,9 @@
-"""Several devices, and several processes, for the command line.
+"""Devices and distributed processes of the command line.
 
-Processes of one run meet by ``jax.distributed``: from what Slurm or Open MPI say in the
-environment, or from the options ``--coordinator``, ``--process`` and ``--processes``. All do the
-same work, each on its own devices; the first alone writes and prints. When one dies the others end,
-with a line that says so.
+Processes of one run are connected by ``jax.distributed``, configured by the environment of Slurm
+or Open MPI, or by the options ``--coordinator``, ``--process`` and ``--processes``. All execute the
+same program, each on its own devices; only the first writes and prints. When one ends early the
+others end too, with a line that explains it.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ if TYPE_CHECKING:
 
 Found = TypeVar("Found")
 
-LOST = 3  # the exit status where another process has died
+LOST = 3  # exit status if another process has ended
 WAIT = 60.0  # seconds
-_TO_THE_END = 7 * 24 * 3600  # seconds that others wait for the first to write its results
-# By launcher, the variables with the number of processes and of this one, and those that JAX takes
-# the first one's address from.
+_TO_THE_END = 7 * 24 * 3600  # seconds that others wait while the first writes its results
+# By launcher: variables of the number of processes and of this process, and those from which JAX
+# derives the coordinator's address.
 _LAUNCHERS = {
     "Open MPI": ("OMPI_COMM_WORLD_SIZE", "OMPI_COMM_WORLD_RANK", ("OMPI_MCA_orte_hnp_uri",)),
     "Slurm": (
@@ -46,14 +46,14 @@ _LAUNCHERS = {
 
 
 @dataclass(frozen=True)
-class Asked:
-    """What was asked for.
+class DeviceOptions:
+    """Options of devices and processes.
 
     Attributes:
-      mesh: the number of devices; 0: all that there are; None: no mesh.
-      coordinator: ``HOST:PORT`` where process 0 is met, or None.
-      process, processes: which process this is, and of how many, or None.
-      wait: seconds that another process may be silent for, at the start and later.
+      mesh: number of devices; 0 for all of them; None for no mesh.
+      coordinator: ``HOST:PORT`` of process 0, or None.
+      process, processes: number of this process, and of processes, or None.
+      wait: seconds after which a silent process is reported, at the start and later.
     """
 
     mesh: int | None = None
@@ -65,72 +65,69 @@ class Asked:
 
 @dataclass(frozen=True)
 class Launch:
-    """Which process this is, of how many, and where the first is met; None: JAX finds out."""
+    """Number of this process, of processes, and the coordinator; None if JAX detects it."""
 
     process: int = 0
     processes: int = 1
     coordinator: str | None = None
 
 
-def launched(asked: Asked, environment: Mapping[str, str] = os.environ) -> Launch:
-    """Which process this is, from the options, else from what a launcher says.
+def launched(options: DeviceOptions, environment: Mapping[str, str] = os.environ) -> Launch:
+    """The launch of this process by its options, else by a launcher's environment.
 
-    Without a mesh every process is alone.
-
-    Raises:
-      ValueError: naming the option: it contradicts others, or one is missing.
+    Without a mesh there is one process.
 
     Example:
-      >>> launched(Asked(mesh=0, coordinator="10.0.0.1:1234", process=1, processes=2), {})
+      >>> launched(DeviceOptions(mesh=0, coordinator="10.0.0.1:1234", process=1, processes=2), {})
       Launch(process=1, processes=2, coordinator='10.0.0.1:1234')
-      >>> launched(Asked(mesh=0), {"SLURM_NTASKS": "4", "SLURM_PROCID": "3", "SLURM_JOB_ID": "7",
+      >>> launched(DeviceOptions(mesh=0), {"SLURM_NTASKS": "4", "SLURM_PROCID": "3", "SLURM_JOB_ID": "7",
       ...                          "SLURM_STEP_NODELIST": "n[1-4]", "SLURM_LOCALID": "0"})
       Launch(process=3, processes=4, coordinator=None)
     """
-    options = {
-        "--coordinator": asked.coordinator,
-        "--process": asked.process,
-        "--processes": asked.processes,
+    names = {
+        "--coordinator": options.coordinator,
+        "--process": options.process,
+        "--processes": options.processes,
     }
-    given = [name for name, value in options.items() if value is not None]
-    if asked.mesh is None:
+    given = [name for name, value in names.items() if value is not None]
+    if options.mesh is None:
         if given:
-            raise ValueError(f"{given[0]} is of use with --mesh alone; give that too.")
+            raise ValueError(f"{given[0]} needs --mesh; give that too.")
         return Launch()
-    if asked.processes == 1 and not asked.process:
+    if options.processes == 1 and not options.process:
         return Launch()
-    launcher, told = _told(environment)
-    processes, process = asked.processes, asked.process
-    if told is not None:
-        processes = told.processes if processes is None else processes
-        process = told.process if process is None else process
-    address = asked.coordinator or environment.get("JAX_COORDINATOR_ADDRESS")
-    if not given and (told is None or told.processes == 1):
+    launcher, detected = _detect(environment)
+    processes, process = options.processes, options.process
+    if detected is not None:
+        processes = detected.processes if processes is None else processes
+        process = detected.process if process is None else process
+    address = options.coordinator or environment.get("JAX_COORDINATOR_ADDRESS")
+    if not given and (detected is None or detected.processes == 1):
         return Launch()
     if processes is None or process is None:
         missing = "--processes" if processes is None else "--process"
         raise ValueError(
             f"{missing} is missing: give --coordinator HOST:PORT, --process I and "
-            "--processes N, or start with srun or mpirun, which say so themselves."
+            "--processes N, or start with srun or mpirun, which provide them."
         )
     if not 0 <= process < processes:
         raise ValueError(
-            f"--process {process} is none of {processes} processes; number them from "
+            f"--process {process} is out of range for {processes} processes; number them from "
             f"0 to {processes - 1}."
         )
     if address is not None:
         _host_and_port(address)
-    elif told is None or any(name not in environment for name in _LAUNCHERS[launcher][2]):
-        who = f"{launcher} does not say where process 0 is" if told else "nobody else says it"
+    elif detected is None or any(name not in environment for name in _LAUNCHERS[launcher][2]):
+        source = f"{launcher} does not provide it" if detected else "no launcher provides it"
         raise ValueError(
-            f"--coordinator is missing, and {who}: give all processes --coordinator "
+            f"--coordinator is missing, and {source}: give all processes --coordinator "
             "HOST:PORT, the machine of process 0 and a free port of it."
         )
     return Launch(process, processes, address)
 
 
-def _told(environment: Mapping[str, str]) -> tuple[str, Launch | None]:
-    """What a launcher says in the environment."""
+def _detect(environment: Mapping[str, str]) -> tuple[str, Launch | None]:
+    """The launcher and its launch, from the environment."""
     for launcher, (number, this, _) in _LAUNCHERS.items():
         with contextlib.suppress(KeyError, ValueError):
             return launcher, Launch(int(environment[this]), int(environment[number]))
@@ -140,17 +137,17 @@ def _told(environment: Mapping[str, str]) -> tuple[str, Launch | None]:
 def _host_and_port(address: str) -> tuple[str, int]:
     host, _, port = address.rpartition(":")
     if not host or not port.isdigit() or not 0 < int(port) < 65536:
-        raise ValueError(f"--coordinator {address!r} is no HOST:PORT, such as node1:12345.")
+        raise ValueError(f"--coordinator {address!r} must be HOST:PORT, such as node1:12345.")
     return host.strip("[]"), int(port)
 
 
 @dataclass(frozen=True)
-class Place:
-    """Where a run takes place.
+class ProcessGroup:
+    """The processes and devices of a run.
 
     Attributes:
-      process, processes: which process this is, and of how many.
-      mesh: of devices, on one axis; None: what JAX does by default.
+      process, processes: number of this process, and of processes.
+      mesh: of devices, on one axis; None for JAX's default device.
     """
 
     process: int = 0
@@ -167,7 +164,7 @@ class Place:
         return 1 if self.mesh is None else self.mesh.size
 
     def exchanged(self, text: str) -> list[str]:
-        """What every process gives, in each of them."""
+        """All-gather of a text: the texts of all processes."""
         if self.processes == 1:
             return [text]
         import numpy as np
@@ -181,32 +178,23 @@ class Place:
         return [row[:n].tobytes().decode() for row, n in zip(every, sizes.tolist(), strict=True)]
 
     def together(self, work: Callable[[], Found]) -> Found:
-        """What a piece of work yields that is each process's own, or a mistake told once.
-
-        Raises:
-          ValueError: a mistake, in the first of the processes that made it.
-          SystemExit: another process tells of its mistake.
-        """
+        """The result of work that each process does; an error of any of them ends all."""
         if self.processes == 1:
             return work()
-        mistake, found = "", None
+        message, found = "", None
         try:
             found = work()
         except (ValueError, OSError) as error:
-            mistake = str(error) or type(error).__name__
-        every = self.exchanged(mistake)
+            message = str(error) or type(error).__name__
+        every = self.exchanged(message)
         if not any(every):
             return found  # type: ignore[return-value]
-        if any(every[: self.process]) or not mistake:
+        if any(every[: self.process]) or not message:
             raise SystemExit(2)
-        raise ValueError(mistake if len(set(every)) == 1 else f"process {self.process}: {mistake}")
+        raise ValueError(message if len(set(every)) == 1 else f"process {self.process}: {message}")
 
     def agree(self, given: Mapping[str, Any]) -> None:
-        """Checks that all processes have the same of what is given by name.
-
-        Raises:
-          ValueError: naming what differs, in the first process; the others end without a word.
-        """
+        """Checks that all processes have the same values by name."""
         every = [json.loads(x) for x in self.exchanged(json.dumps(dict(given), default=str))]
         for process, other in enumerate(every):
             for name in {**every[0], **other}:
@@ -221,11 +209,7 @@ class Place:
                 )
 
     def sees(self, what: str, here: bool) -> bool:
-        """Whether something of the file system is there, if all processes agree.
-
-        Raises:
-          ValueError: they do not.
-        """
+        """Whether a file is present, which must be the same in all processes."""
         every = self.exchanged(str(here))
         if len(set(every)) > 1:
             without = every.index("False")
@@ -239,82 +223,74 @@ class Place:
 
 
 @contextlib.contextmanager
-def taking_part(asked: Asked, launch: Launch, say: Callable[[str], None]) -> Iterator[Place]:
-    """The run of this process among the others: joined before any device is used, left at the end.
-
-    Args:
-      asked: the options.
-      launch: of :func:`launched`.
-      say: takes the line on what it runs on.
-
-    Raises:
-      ValueError: the others cannot be reached, or there are fewer devices than asked for.
-      SystemExit: another process has died; told in one line, with the status :data:`LOST`.
-    """
-    if asked.mesh is None:
-        yield Place()
+def process_group(
+    options: DeviceOptions, launch: Launch, say: Callable[[str], None]
+) -> Iterator[ProcessGroup]:
+    """Joins the processes of a run before any device is used, and leaves them at the end."""
+    if options.mesh is None:
+        yield ProcessGroup()
         return
-    _choose_devices(asked, launch)
+    _choose_devices(options, launch)
     if launch.processes == 1:
-        place = Place(mesh=_mesh(asked, launch))
-        say(f"on {_devices_of(place)}")
-        yield place
+        group = ProcessGroup(mesh=_mesh(options, launch))
+        say(f"on {_devices_of(group)}")
+        yield group
         return
     if launch.coordinator is not None:
-        _meet(launch, asked.wait)
+        _meet(launch, options.wait)
     _read_apart(launch)
     try:
-        _join(launch, asked.wait)
-        place = Place(launch.process, launch.processes, _same_mesh(asked, launch))
-        say(f"on {_devices_of(place)} of {launch.processes} processes")
-        yield place
+        _join(launch, options.wait)
+        group = ProcessGroup(launch.process, launch.processes, _same_mesh(options, launch))
+        say(f"on {_devices_of(group)} of {launch.processes} processes")
+        yield group
     except Exception as error:
         if not is_loss(error):
             raise
-        line = (
-            f"process {launch.process} stops, for another process has ended; {exit_message.AGAIN}."
-        )
+        line = f"process {launch.process} stops: another process has ended. {exit_message.AGAIN}."
         os.write(2, f"{exit_message.END}{line}\n".encode())
         raise SystemExit(LOST) from None
     _leave()
 
 
-def _choose_devices(asked: Asked, launch: Launch) -> None:
-    """What JAX must know before it makes its devices."""
-    if asked.mesh is not None and asked.mesh % launch.processes:
+def _choose_devices(options: DeviceOptions, launch: Launch) -> None:
+    """JAX's settings that precede the creation of devices."""
+    if options.mesh is not None and options.mesh % launch.processes:
         raise ValueError(
-            f"--mesh {asked.mesh} cannot be split evenly over {launch.processes} "
+            f"--mesh {options.mesh} cannot be split evenly over {launch.processes} "
             "processes; give a multiple of them."
         )
     import jax
 
     if launch.processes > 1:
         jax.config.update("jax_cpu_collectives_implementation", "gloo")
-        # Whose handler of SIGTERM notes that the end is near, and lets the process go on.
+        # Its handler of SIGTERM would keep the process alive.
         with contextlib.suppress(AttributeError):
             jax.config.update("jax_enable_preemption_service", False)
-    if asked.mesh and "xla_force_host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
-        with contextlib.suppress(RuntimeError):  # there are devices already, from which to choose
-            jax.config.update("jax_num_cpu_devices", asked.mesh // launch.processes)
+    if options.mesh and "xla_force_host_platform_device_count" not in os.environ.get(
+        "XLA_FLAGS", ""
+    ):
+        with contextlib.suppress(RuntimeError):  # devices exist already
+            jax.config.update("jax_num_cpu_devices", options.mesh // launch.processes)
 
 
-def _same_mesh(asked: Asked, launch: Launch) -> Mesh:
-    """Of all processes, of which each sees the same devices, so that a mistake is told once."""
+def _same_mesh(options: DeviceOptions, launch: Launch) -> Mesh:
+    """The mesh; all processes find the same error, and only the first reports it."""
     try:
-        return _mesh(asked, launch)
+        return _mesh(options, launch)
     except ValueError:
         if launch.process:
             raise SystemExit(2) from None
         raise
 
 
-def _mesh(asked: Asked, launch: Launch) -> Mesh:
-    """The devices, as many of each process, on one axis."""
+def _mesh(options: DeviceOptions, launch: Launch) -> Mesh:
+    """Mesh of an equal number of devices of each process, on one axis."""
     import jax
     import numpy as np
     from jax.sharding import Mesh
 
-    assert asked.mesh is not None
+    assert options.mesh is not None
     each = [[d for d in jax.devices() if d.process_index == p] for p in range(launch.processes)]
     number = len(each[0])
     other = next((p for p, x in enumerate(each) if len(x) != number), None)
@@ -323,33 +299,30 @@ def _mesh(asked: Asked, launch: Launch) -> Mesh:
             f"process {other} has another number of devices, {len(each[other])}, than "
             f"process 0, {number}; give all processes as many."
         )
-    per = asked.mesh // launch.processes if asked.mesh else number
+    per = options.mesh // launch.processes if options.mesh else number
     if number < per:
         several = launch.processes > 1
         takes = f" takes {per} devices of each process" if several else ""
         raise ValueError(
-            f"--mesh {asked.mesh}{takes}: {'each has' if several else 'there are'} {number} "
+            f"--mesh {options.mesh}{takes}: {'each has' if several else 'there are'} {number} "
             f"({jax.default_backend()}); give fewer, or --mesh alone for all."
         )
     return Mesh(np.array([d for x in each for d in x[:per]]), ("devices",))
 
 
-def _devices_of(place: Place) -> str:
-    mesh = place.mesh
+def _devices_of(group: ProcessGroup) -> str:
+    mesh = group.mesh
     assert mesh is not None
     kind = mesh.devices.flat[0].device_kind
     name = "CPU" if kind == "cpu" else kind
     return f"{mesh.size} {name} device{'s' if mesh.size > 1 else ''}"
 
 
-# --- meeting ----------------------------------------------------------------------------------
+# --- joining ----------------------------------------------------------------------------------
 
 
 def _meet(launch: Launch, wait: float) -> None:
-    """Waits for process 0 to be there, or makes sure that it can be met here.
-
-    JAX ends the process where that fails, without a word that helps.
-    """
+    """Waits for process 0, or checks its port; JAX would end the process without explanation."""
     assert launch.coordinator is not None
     host, port = _host_and_port(launch.coordinator)
     if launch.process == 0:
@@ -389,12 +362,12 @@ def _join(launch: Launch, wait: float) -> None:
     seconds = max(int(wait), 1)
     address, bind = launch.coordinator, None
     if address is not None and _host_and_port(address)[0] in ("127.0.0.1", "localhost"):
-        bind = address  # of no use to other machines, and so not open to them
+        bind = address  # local, so not open to other machines
     later: dict[str, Any] = {
         "heartbeat_timeout_seconds": seconds,
         "shutdown_timeout_seconds": _TO_THE_END,
     }
-    known = inspect.signature(jax.distributed.initialize).parameters  # by the version of JAX
+    known = inspect.signature(jax.distributed.initialize).parameters  # depends on JAX's version
     jax.distributed.initialize(
         address,
         launch.processes,
@@ -406,7 +379,7 @@ def _join(launch: Launch, wait: float) -> None:
 
 
 def _leave() -> None:
-    """When all are done. Whoever is the first to leave would seem dead to the others."""
+    """Leaves when all processes are done; an early one would count as lost."""
     import jax
 
     jax.distributed.shutdown()
@@ -416,10 +389,10 @@ def _leave() -> None:
 
 
 def _read_apart(launch: Launch) -> None:
-    """Has what the runtime writes read by another process, which tells of its end in a line.
+    """Redirects the runtime's output to a process that explains an early end in one line.
 
-    The runtime ends a process at once where another has died, with its own words, on the file
-    descriptors; Python's streams get other ones. Processes but the first print nothing else.
+    The runtime ends a process at once when another has died, and writes to the file descriptors;
+    Python's streams get others. All processes but the first print nothing else.
     """
     out, err = os.dup(1), os.dup(2)
     source, sink = os.pipe()
@@ -448,13 +421,13 @@ def _read_apart(launch: Launch) -> None:
         )
     if launch.process:
         sys.stdout = io.TextIOWrapper(io.BufferedWriter(io.FileIO(os.devnull, "w")))
-    with contextlib.suppress(ImportError, ValueError, OSError):  # no dump of all that it holds
+    with contextlib.suppress(ImportError, ValueError, OSError):  # no core dump
         import resource
 
         resource.setrlimit(resource.RLIMIT_CORE, (0, resource.getrlimit(resource.RLIMIT_CORE)[1]))
 
 
 def is_loss(error: Exception) -> bool:
-    """Whether an error says that a process could not reach another one."""
+    """Whether an error is a lost connection to another process."""
     text = str(error)
     return "Gloo" in text or "coordination" in text.lower() or "NCCL" in text

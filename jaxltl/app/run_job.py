@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import numpy as np
     from tqdm import tqdm
 
-    from jaxltl.app.processes import Place
+    from jaxltl.app.processes import ProcessGroup
     from jaxltl.app.reports.drawing import Artist, Drawing, Picture
 
 Drawn = Callable[[], bytes]  # waits for a picture
@@ -53,7 +53,7 @@ class Console:
 
     artist: Artist
     say: Callable[[str], None]
-    place: Place
+    group: ProcessGroup
 
 
 def job_of(task_file: Path) -> Job[Any, Any, Any]:
@@ -85,11 +85,7 @@ def finished(out: Path, mark: str) -> Result | None:
 
 
 def make_directory(out: Path) -> Path:
-    """Makes a directory for results.
-
-    Raises:
-      ValueError: it cannot be made.
-    """
+    """Makes a directory for results."""
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -100,11 +96,7 @@ def make_directory(out: Path) -> Path:
 
 
 def run_job(job: Job[T, S, O], task: T, request: Request, console: Console) -> Result | None:
-    """Runs a job, and returns the contents of ``result.json``; None in all processes but the first.
-
-    Raises:
-      SystemExit: interrupted, with status 130; the same request resumes from the checkpoint.
-    """
+    """Runs a job, and returns the contents of ``result.json``; None in all processes but the first."""
     try:
         return _run(job, task, request, console)
     except KeyboardInterrupt:
@@ -117,17 +109,17 @@ def _run(job: Job[T, S, O], task: T, request: Request, console: Console) -> Resu
     from jaxltl.algos.common import checkpoint as files
 
     start = time.perf_counter()
-    place, begin, checkpoint = console.place, console.artist, request.checkpoint
-    setup = place.together(lambda: job.prepare(task, request.seed))
+    group, begin, checkpoint = console.group, console.artist, request.checkpoint
+    setup = group.together(lambda: job.prepare(task, request.seed))
     console.say(job.describe(setup))
-    if place.mesh is not None:
-        console.say(spread(request.num_seeds, place.num_devices))
-    place.together(lambda: _claim(request.out, task, place))
-    if place.sees(str(checkpoint), checkpoint.exists()):
+    if group.mesh is not None:
+        console.say(spread(request.num_seeds, group.num_devices))
+    group.together(lambda: _claim(request.out, task, group))
+    if group.sees(str(checkpoint), checkpoint.exists()):
         console.say(f"going on from {checkpoint}")
-    place.sees(str(request.out), (request.out / "task.toml").exists())
-    with _progress_bar(task.learner.steps, shown=place.is_first) as bar:
-        early = job.task_pictures(setup) if place.is_first else []
+    group.sees(str(request.out), (request.out / "task.toml").exists())
+    with _progress_bar(task.learner.steps, shown=group.is_first) as bar:
+        early = job.task_pictures(setup) if group.is_first else []
         pictures = [(p, _begun(begin, p)) for p in early]
 
         def report(step: int, figures: Mapping[str, np.ndarray]) -> None:
@@ -141,10 +133,10 @@ def _run(job: Job[T, S, O], task: T, request: Request, console: Console) -> Resu
             report=report,
             stage=bar.set_description_str,
             checkpoint=checkpoint,
-            mesh=place.mesh,
+            mesh=group.mesh,
         )
         outcome = job.learn(setup, training)
-        if not place.is_first:
+        if not group.is_first:
             return None
         files.remove(checkpoint)
         outcome.seconds = time.perf_counter() - start
@@ -153,11 +145,11 @@ def _run(job: Job[T, S, O], task: T, request: Request, console: Console) -> Resu
         return _write(job, outcome, request, pictures, begin)
 
 
-def _claim(out: Path, task: LearningTask, place: Place) -> None:
+def _claim(out: Path, task: LearningTask, group: ProcessGroup) -> None:
     """Makes the directory of results; before the work, since it may not be writable."""
     from jaxltl.algos.common.checkpoint import atomic_write
 
-    if place.is_first:
+    if group.is_first:
         make_directory(out)
         with atomic_write(out / "task.toml") as file:
             file.write(task.path.read_bytes())

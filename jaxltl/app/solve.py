@@ -37,7 +37,7 @@ SOLVED, NOT_CONVERGED, INVALID = 0, 1, 2  # exit statuses
 
 
 @dataclass(frozen=True)
-class Asked:
+class Query:
     """A property of the command or of a file.
 
     Attributes:
@@ -56,14 +56,14 @@ class Result:
     """The answer to a property.
 
     Attributes:
-      asked: the property.
+      query: the property.
       answer: its answer, or None.
       seconds: wall time.
       error: why there is no answer, or None.
       fault: NOT_CONVERGED for the solver, INVALID for the property.
     """
 
-    asked: Asked
+    query: Query
     answer: Found | None
     seconds: float
     error: str | None = None
@@ -76,14 +76,11 @@ class Result:
         return SOLVED if self.answer.status == Status.CONVERGED else NOT_CONVERGED
 
 
-def asked_for(arguments: Sequence[str]) -> list[Asked]:
+def parse_queries(arguments: Sequence[str]) -> list[Query]:
     """Parses arguments: properties, or names of property files; errors are kept by property.
 
-    Raises:
-      ValueError: a file cannot be read.
-
     Example:
-      >>> [one.parsed is not None for one in asked_for(['P=? [ F "a" ]; P=? [ X "a" ]', 'Q=?'])]
+      >>> [one.parsed is not None for one in parse_queries(['P=? [ F "a" ]; P=? [ X "a" ]', 'Q=?'])]
       [True, True, False]
     """
     found = []
@@ -92,9 +89,9 @@ def asked_for(arguments: Sequence[str]) -> list[Asked]:
         if argument.lower().endswith(PROPERTY_FILES):
             place, text = f"{argument}: ", _text_of(Path(argument))
         try:
-            found += [Asked(p.text, p) for p in parse_properties(text)]
+            found += [Query(p.text, p) for p in parse_properties(text)]
         except ValueError as error:
-            found.append(Asked(argument, error=f"{place}{error}"))
+            found.append(Query(argument, error=f"{place}{error}"))
     return found
 
 
@@ -112,11 +109,7 @@ def _text_of(path: Path) -> str:
 
 
 def load(path: Path) -> SparseMDP | IntervalMDP:
-    """A Markov chain or decision process, or an interval one, from a model file.
-
-    Raises:
-      ValueError: the file is malformed, or holds another kind of model.
-    """
+    """A Markov chain or decision process, or an interval one, from a model file."""
     from jaxltl.io.model_files import read_model
 
     model = read_model(path)
@@ -134,26 +127,21 @@ def load(path: Path) -> SparseMDP | IntervalMDP:
 
 
 def solve(
-    model: SparseMDP | IntervalMDP, asked: Sequence[Asked], tolerance: float
+    model: SparseMDP | IntervalMDP, queries: Sequence[Query], tolerance: float
 ) -> Iterator[Result]:
     """Yields the result of each property in order; errors of one do not end the others.
-
-    Args:
-      model: of :func:`load`.
-      asked: of :func:`asked_for`.
-      tolerance: width of the bounds, absolute for probabilities and relative otherwise.
 
     Example:
       >>> from jaxltl import make_sparse
       >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1],
       ...                    initial=[1, 0, 0], label={"a": [1]})
-      >>> first, second = solve(coin, asked_for(['P=? [ F "a" ]', 'P=? [ F "b" ]']), 1e-6)
+      >>> first, second = solve(coin, parse_queries(['P=? [ F "a" ]', 'P=? [ F "b" ]']), 1e-6)
       >>> first.answer.value.tolist(), first.exit_status, "b" in second.error
       ([0.5], 0, True)
     """
     from scipy.sparse import csgraph, linalg  # noqa: F401 - not in the first property's time
 
-    for one in asked:
+    for one in queries:
         begin = time.perf_counter()
         found: Found | None = None
         error, fault = one.error, INVALID
@@ -197,14 +185,14 @@ def result_entry(result: Result) -> dict[str, Any]:
     """A result as its JSON object."""
     found = result.answer
     entry: dict[str, Any] = {
-        "property": result.asked.text,
+        "property": result.query.text,
         "value": None,
         "lower": None,
         "upper": None,
         "status": "INVALID",
     }
-    if result.asked.parsed is not None and result.asked.parsed.name is not None:
-        entry["name"] = result.asked.parsed.name
+    if result.query.parsed is not None and result.query.parsed.name is not None:
+        entry["name"] = result.query.parsed.name
     if isinstance(found, Answer):
         entry |= {
             "value": _over_states(found.value.tolist() if found.holds is None else found.holds),
@@ -261,8 +249,8 @@ def _number(x: Any) -> Any:
 
 def text(result: Result) -> str:
     """A result as text."""
-    lines = [result.asked.text]
-    parsed, found = result.asked.parsed, result.answer
+    lines = [result.query.text]
+    parsed, found = result.query.parsed, result.answer
     if parsed is not None and parsed.name is not None:
         lines[0] = f'"{parsed.name}": {lines[0]}'
     if result.error is not None:
@@ -319,7 +307,7 @@ def _value_text(found: Answer, i: int) -> str:
 def strategies(model: SparseMDP | IntervalMDP, results: Sequence[Result], source: Path) -> bytes:
     """The optimal strategies as JSON; see docs/solve.md."""
     found = [
-        {"property": r.asked.text, **_strategy(model, r.answer.strategy)}
+        {"property": r.query.text, **_strategy(model, r.answer.strategy)}
         for r in results
         if isinstance(r.answer, Answer)
         and r.answer.strategy is not None

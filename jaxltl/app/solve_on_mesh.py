@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -15,9 +15,9 @@ import numpy as np
 
 import jaxltl
 from jaxltl.algos.common import checkpoint as files
-from jaxltl.app.processes import Place, is_loss
+from jaxltl.app.processes import ProcessGroup, is_loss
 from jaxltl.app.run_job import make_directory
-from jaxltl.app.solve import INVALID, NOT_CONVERGED, Asked, Result, load
+from jaxltl.app.solve import INVALID, NOT_CONVERGED, Query, Result, load
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.logic.properties import Property
 from jaxltl.core.models.construct.state_formulas import BUILT_IN, label_columns
@@ -41,12 +41,8 @@ _ROUND = 24  # approximate sweeps of a step of interval iteration
 MAX_STEPS = 1_000_000
 
 
-def on_mesh(model: SparseMDP | IntervalMDP, place: Place) -> ShardedMDP:
-    """Distributes a model over devices, with the built-in labels.
-
-    Raises:
-      ValueError: it has intervals, or fewer states than there are devices.
-    """
+def on_mesh(model: SparseMDP | IntervalMDP, group: ProcessGroup) -> ShardedMDP:
+    """Distributes a model over devices, with the built-in labels."""
     if isinstance(model, IntervalMDP):
         raise ValueError(
             "models whose probabilities are intervals are not solved over a mesh; leave --mesh out."
@@ -54,33 +50,27 @@ def on_mesh(model: SparseMDP | IntervalMDP, place: Place) -> ShardedMDP:
     missing = tuple(x for x in BUILT_IN if x not in model.propositions)
     label = np.hstack([np.asarray(model.label), label_columns(model, missing, "the model")])
     whole = replace(model, label=label, propositions=(*model.propositions, *missing))
-    assert place.mesh is not None
-    return shard(whole, place.mesh)
+    assert group.mesh is not None
+    return shard(whole, group.mesh)
 
 
 def read(
-    path: Path, asked: Sequence[Asked], place: Place
+    path: Path, queries: Sequence[Query], group: ProcessGroup
 ) -> tuple[ShardedMDP, dict[str, str], dict[str, Any]]:
     """Reads a model file over the devices; of a UMB file each process reads its own states.
 
     If a property has built-in labels, each process reads the whole file.
-
-    Returns:
-      The model, its fingerprint, and its JSON object.
-
-    Raises:
-      ValueError: it is no chain or decision process, or cannot be distributed.
     """
-    begin, mesh = time.perf_counter(), place.mesh
+    begin, mesh = time.perf_counter(), group.mesh
     assert mesh is not None
-    formulas = [one.parsed.path for one in asked if one.parsed is not None]
+    formulas = [one.parsed.path for one in queries if one.parsed is not None]
     named = {name for x in formulas if isinstance(x, Formula) for name in x.propositions}
     if path.suffix == ".umb" and not named & set(BUILT_IN):
-        model = place.together(lambda: read_sharded(path, mesh))
-        given = {"file": place.together(lambda: _digest(path))}
+        model = group.together(lambda: read_sharded(path, mesh))
+        given = {"file": group.together(lambda: _digest(path))}
     else:
-        whole = place.together(lambda: load(path))
-        model = place.together(lambda: on_mesh(whole, place))
+        whole = group.together(lambda: load(path))
+        model = group.together(lambda: on_mesh(whole, group))
         given = files.fingerprint(model=whole)
     return model, given, _entry(model, time.perf_counter() - begin)
 
@@ -108,112 +98,95 @@ def _entry(model: ShardedMDP, seconds: float) -> dict[str, Any]:
     }
 
 
-def solve_in(
-    place: Place,
-    model: ShardedMDP,
-    given: Mapping[str, str],
-    asked: Sequence[Asked],
-    tolerance: float,
-    directory: Path | None,
-    properties: list[str],
-) -> Iterator[Result]:
-    """The result of each property, when the processes have agreed on what is asked.
+@dataclass(frozen=True)
+class MeshSolver:
+    """Solver of properties over the devices of a mesh, with checkpoints.
 
-    Raises:
-      ValueError: they were not asked the same, or the directory is not one of all.
+    Attributes:
+      group: the processes and devices.
+      model: distributed over the devices.
+      fingerprint: of the model.
+      tolerance: width of the bounds, absolute for probabilities and relative otherwise.
+      directory: of checkpoints, or None.
     """
-    place.agree(
-        {
-            "the model": hashlib.sha256(repr(sorted(given.items())).encode()).hexdigest(),
-            "the properties": properties,
-            "--tolerance": tolerance,
-            "--checkpoint": directory,
-            "jax": jax.__version__,
-            "jaxltl": jaxltl.__version__,
-        }
-    )
-    if directory is not None:
-        place.together(lambda: make_directory(directory) if place.is_first else None)
-        place.sees(str(directory), directory.is_dir())
-    yield from solve_on_mesh(model, given, asked, tolerance, place, directory)
 
+    group: ProcessGroup
+    model: ShardedMDP
+    fingerprint: Mapping[str, str]
+    tolerance: float
+    directory: Path | None = None
 
-def solve_on_mesh(
-    model: ShardedMDP,
-    given: Mapping[str, str],
-    asked: Sequence[Asked],
-    tolerance: float,
-    place: Place,
-    directory: Path | None,
-) -> Iterator[Result]:
-    """The result of each property, as soon as it is there.
+    def agree(self, properties: list[str]) -> None:
+        """Checks that all processes have the same arguments, files and versions."""
+        directory = self.directory
+        self.group.agree(
+            {
+                "the model": _digest_text(self.fingerprint),
+                "the properties": properties,
+                "--tolerance": self.tolerance,
+                "--checkpoint": directory,
+                "jax": jax.__version__,
+                "jaxltl": jaxltl.__version__,
+            }
+        )
+        if directory is not None:
+            self.group.together(lambda: make_directory(directory) if self.group.is_first else None)
+            self.group.sees(str(directory), directory.is_dir())
 
-    Args:
-      model: over the devices.
-      given: what tells the model apart from others.
-      asked: the properties.
-      tolerance: the width of the bounds.
-      place: the devices and processes.
-      directory: where bounds are kept until their property is answered; None: nowhere.
-    """
-    for one in asked:
-        begin = time.perf_counter()
-        found: Answer | None = None
-        error, fault = one.error, INVALID
-        if one.parsed is not None:
-            try:
-                found = _answered(model, given, one.parsed, tolerance, place, directory)
-            except ValueError as mistake:
-                if place.processes > 1 and is_loss(mistake):
-                    raise
-                error = str(mistake)
-            except NotConverged as failure:
-                error, fault = str(failure), NOT_CONVERGED
-        yield Result(one, found, time.perf_counter() - begin, error, fault)
+    def solve(self, queries: Sequence[Query]) -> Iterator[Result]:
+        """Yields the result of each property in order; errors of one do not end the others."""
+        for query in queries:
+            begin = time.perf_counter()
+            found: Answer | None = None
+            error, fault = query.error, INVALID
+            if query.parsed is not None:
+                try:
+                    found = self._answer(query.parsed)
+                except ValueError as mistake:
+                    if self.group.processes > 1 and is_loss(mistake):
+                        raise
+                    error = str(mistake)
+                except NotConverged as failure:
+                    error, fault = str(failure), NOT_CONVERGED
+            yield Result(query, found, time.perf_counter() - begin, error, fault)
 
-
-def _answered(
-    model: ShardedMDP,
-    given: Mapping[str, str],
-    prop: Property,
-    tolerance: float,
-    place: Place,
-    directory: Path | None,
-) -> Answer:
-    question = question_on_mesh(model, prop)
-    given = {**given, "property": prop.text, "tolerance": repr(tolerance)}
-    path = None if directory is None else directory / f"{_name(given)}.npz"
-    bounds, part, made = first_bounds(model, question), 0, 0
-    if path is not None and place.sees(str(path), path.exists()):
-        bounds, part, made = _restored(path, given, model, question, bounds)
-    most = steps_between(model)
-    while True:
-        half = question.tolerance(tolerance, FINER[part])
-        found = question.advance(bounds, half, most)
-        bounds, steps = (found.lower, found.upper), int(np.asarray(found.num_steps))
-        made += steps
-        if question.goes_on and steps >= most and made < MAX_STEPS:
-            if path is not None:
-                files.save(path, _state(model, bounds, part, made), given)
-            continue
-        answer = question.answer(found, tolerance)
-        if question.is_answered(answer, FINER[part]):
-            break
-        part += 1
-    if path is not None and place.is_first:
-        files.remove(path)
-    return answer
+    def _answer(self, prop: Property) -> Answer:
+        model, group = self.model, self.group
+        question = question_on_mesh(model, prop)
+        mark = {**self.fingerprint, "property": prop.text, "tolerance": repr(self.tolerance)}
+        path = None
+        if self.directory is not None:
+            path = self.directory / f"solve-{_digest_text(mark)[:12]}.npz"
+        bounds, part, made = first_bounds(model, question), 0, 0
+        if path is not None and group.sees(str(path), path.exists()):
+            bounds, part, made = _restored(path, mark, model, question, bounds)
+        chunk = steps_between(model)
+        while True:
+            width = question.tolerance(self.tolerance, FINER[part])
+            found = question.advance(bounds, width, chunk)
+            bounds, steps = (found.lower, found.upper), int(np.asarray(found.num_steps))
+            made += steps
+            if question.goes_on and steps >= chunk and made < MAX_STEPS:
+                if path is not None:
+                    files.save(path, _state(model, bounds, part, made), mark)
+                continue
+            answer = question.answer(found, self.tolerance)
+            if question.is_answered(answer, FINER[part]):
+                break
+            part += 1
+        if path is not None and group.is_first:
+            files.remove(path)
+        return answer
 
 
 def steps_between(model: ShardedMDP) -> int:
-    """How many steps are made before bounds are saved; always as many, so that runs are alike."""
+    """Steps between checkpoints; a constant of the model, so that resumed runs are identical."""
     size = sum(table.successor.size for table in model.tables)
     return max(16, int(_WORK / (_ROUND * size)))
 
 
-def _name(given: Mapping[str, str]) -> str:
-    text = repr(sorted(given.items())).encode()
-    return f"solve-{hashlib.sha256(text).hexdigest()[:12]}"
+def _digest_text(mark: Mapping[str, str]) -> str:
+    return hashlib.sha256(repr(sorted(mark.items())).encode()).hexdigest()
 
 
 def _state(model: ShardedMDP, bounds: Bounds, part: int, made: int) -> dict[str, Any]:
@@ -228,7 +201,7 @@ def _state(model: ShardedMDP, bounds: Bounds, part: int, made: int) -> dict[str,
 def _restored(
     path: Path, given: Mapping[str, str], model: ShardedMDP, question: Question, bounds: Bounds
 ) -> tuple[Bounds, int, int]:
-    """Bounds that were saved, also from another number of devices."""
+    """Bounds from a checkpoint, which may be of another number of devices."""
     like = _state(model, bounds, 0, 0)
     small = {name: x for name, x in like.items() if name != "bounds"}
     empty = jax.tree.map(lambda x: np.zeros((0, *x.shape[1:]), x.dtype), bounds)

@@ -1,11 +1,9 @@
-"""Synthesis from a game file: who wins from where, all the ways to win, and the evidence."""
+"""Synthesis from a game file: winning region, permissive strategy, checks, counter-play."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
-
 import jax.numpy as jnp
 import numpy as np
 
@@ -25,17 +23,18 @@ Progress = Callable[[str], None]
 STAGES = ("reading", "solving", "checking", "strategy", "writing")
 
 
-class Nodes(NamedTuple):
-    """The game that is solved: the world beside the task's automaton, its states numbered.
+@dataclass(frozen=True)
+class Nodes:
+    """The product game that is solved, with its reachable states numbered.
 
     Attributes:
-      game: ``N`` nodes, all that can follow a start in any state of the world. The initial
-        distribution is the game file's.
-      objective: what the system is to achieve.
+      game: ``N`` nodes, reachable from any state of the world; the initial distribution is that of
+        the game file.
+      objective: of the system.
       world_state, automaton_state: ``int[N]``.
-      by_chance: ``bool[N]``, where the environment decides a random move in chance's place.
-      start: ``int[S]``, the node of each state of the world in which a run may start there.
-      automaton: the task's, or None.
+      by_chance: ``bool[N]``, nodes where the environment resolves a random move.
+      start: ``int[S]``, the initial node of each state of the world.
+      automaton: of the formula, or None.
     """
 
     game: Game
@@ -47,13 +46,14 @@ class Nodes(NamedTuple):
     automaton: Automaton | None
 
 
-class Step(NamedTuple):
-    """One position of a play, and what led there.
+@dataclass(frozen=True)
+class Step:
+    """A position of a play, and the move that leads there.
 
     Attributes:
       node: the position.
-      mover: who moved: ``"system"``, ``"environment"``, ``"chance"`` where the environment
-        decides in its place, or ``"start"``.
+      mover: ``"system"``, ``"environment"``, ``"chance"`` for a random move that the environment
+        resolves, or ``"start"``.
       action: the name of the move.
     """
 
@@ -62,14 +62,15 @@ class Step(NamedTuple):
     action: str
 
 
-class Play(NamedTuple):
+@dataclass(frozen=True)
+class Play:
     """A play that the environment wins.
 
     Attributes:
       steps: its positions in order.
-      repeats_from: the number of the step from which it goes round for ever, or None.
-      failed: whether it ends because the task has failed, whatever follows.
-      by_chance: whether a random move went against the system on the way.
+      repeats_from: the step from which it repeats for ever, or None.
+      failed: whether it ends in a violation that no continuation can undo.
+      by_chance: whether a random move was resolved against the system.
     """
 
     steps: list[Step]
@@ -80,16 +81,16 @@ class Play(NamedTuple):
 
 @dataclass(frozen=True)
 class Synthesis:
-    """What was asked and found out.
+    """The result of a synthesis.
 
     Attributes:
-      file, world, nodes: the parts of the game.
+      file, world, nodes: the game.
       winning: the region and both players' strategies, on the nodes.
-      verdict: of the independent check of these.
+      verdict: of the independent check of both strategies.
       strategy: a permissive strategy, or None if the system wins from no initial state.
-      restricted: the game in which the system follows it.
-      strategy_verdict: of the independent check of that.
-      play: one that the environment wins from an initial state; None if it cannot.
+      restricted: the game under that strategy.
+      strategy_verdict: of the independent check of that game.
+      play: one that the environment wins from an initial state, or None.
     """
 
     file: GameFile
@@ -114,19 +115,7 @@ class Synthesis:
 
 
 def synthesize(file: GameFile, progress: Progress = lambda stage: None) -> Synthesis:
-    """Solves the game of a file, checks the solution, and extracts a permissive strategy.
-
-    Args:
-      file: from :func:`~jaxltl.app.files.game.read_game`.
-      progress: is told each of :data:`STAGES` as it begins.
-
-    Returns:
-      :class:`Synthesis`.
-
-    Raises:
-      ValueError: something in the file is wrong, or the strategy that it asks for does not
-        exist although the system wins.
-    """
+    """Solves the game of a file, checks the solution, and extracts a permissive strategy."""
     progress("reading")
     world = load_game(file)
     nodes = make_nodes(file, world)
@@ -150,7 +139,7 @@ def synthesize(file: GameFile, progress: Progress = lambda stage: None) -> Synth
 
 
 def make_nodes(file: GameFile, world: World) -> Nodes:
-    """The game to be solved, see :class:`Nodes`; of a file's world and task."""
+    """The product game of a file's world and objective."""
     game, objective = load_objective(file, world)
     automaton = automaton_of(game)
     width = 1 if automaton is None else game.state_shape[1]
@@ -185,7 +174,7 @@ def _strategy(file: GameFile, nodes: Nodes) -> Permissive:
 
 
 def check_strategy(nodes: Nodes, strategy: Permissive, restricted: Restriction) -> Verification:
-    """An independent check that the system wins whichever of the allowed moves it makes."""
+    """Independent check that the system wins with any choice of allowed moves."""
     game = restricted.model
     base = strategy.base_state[restricted.base_state]
     nobody = jnp.zeros(game.num_states, bool)
@@ -204,10 +193,10 @@ def check_strategy(nodes: Nodes, strategy: Permissive, restricted: Restriction) 
 
 
 def lost_play(nodes: Nodes, winning: Winning, node: int, actions: tuple[str, ...]) -> Play:
-    """One play from a node outside of the winning region, until it fails or repeats.
+    """A play from a node of the losing region, until a violation or a repetition.
 
-    The environment follows its strategy. The system holds out as long as it can where its
-    defeat is a matter of time, and else makes its first move; chance goes against it.
+    The environment follows its strategy. The system delays a certain violation as long as
+    possible, else takes its first move; random moves are resolved against it.
     """
     game, objective = nodes.game, winning.objective
     failed = _failed(nodes, objective)
@@ -222,7 +211,7 @@ def lost_play(nodes: Nodes, winning: Winning, node: int, actions: tuple[str, ...
         advances = np.asarray(objective.assumptions)
 
     def worst(action: int) -> int:
-        """The successor that is worst for the system."""
+        """The losing successor with the earliest violation."""
         nexts = successor[node, action][used[node, action]]
         nexts = nexts[outside[nexts]]
         return int(nexts[np.argmin(time[nexts])])
@@ -230,7 +219,7 @@ def lost_play(nodes: Nodes, winning: Winning, node: int, actions: tuple[str, ...
     steps, met, memory, by_chance = [Step(node, "start", "")], {(node, 0): 0}, 0, False
     while not failed[node]:
         if system[node]:
-            # Every move has a successor outside of the region, or the node were inside.
+            # A losing node has a losing successor by every move.
             moves = np.flatnonzero(available[node])
             action = int(max(moves, key=lambda a: time[worst(int(a))]))
         else:
@@ -244,14 +233,14 @@ def lost_play(nodes: Nodes, winning: Winning, node: int, actions: tuple[str, ...
         if (node, memory) in met:
             return Play(steps, met[node, memory], False, bool(by_chance))
         met[node, memory] = len(steps) - 1
-    # An automaton reads the label of the state that is left, so the step before decides.
+    # The automaton reads labels on exit, so that the violation is decided one step earlier.
     return Play(
         steps[: max(1, len(steps) - (nodes.automaton is not None))], None, True, bool(by_chance)
     )
 
 
 def _failed(nodes: Nodes, objective: Parity | GR1) -> np.ndarray:
-    """Where the task has failed, whatever follows."""
+    """Nodes with a violation that no continuation can undo."""
     failed = np.asarray(objective.lost)
     if nodes.automaton is not None:
         verdict = np.asarray(make_monitor(nodes.automaton).verdict)
@@ -260,7 +249,7 @@ def _failed(nodes: Nodes, objective: Parity | GR1) -> np.ndarray:
 
 
 def demand(found: Synthesis) -> None:
-    """Raises a ValueError if the file demands a strategy and there is none."""
+    """Raises ValueError if the file demands a strategy and there is none."""
     if found.file.demanded and found.strategy is None:
         where = found.world.describe(int(found.starts[0]))
         raise ValueError(

@@ -117,15 +117,7 @@ def likeliest(
     train: Callable[[float, Learned], Learned] | None,
     plans: Callable[[Learned], tuple[np.ndarray, np.ndarray]],
 ) -> tuple[Learned, float]:
-    """The network of greatest likelihood over some weights, and its weight.
-
-    Args:
-      setup: the job.
-      counts: ``float[W, S, Q, A]``, demonstrations of each pair in a training world.
-      free: learned without a weight.
-      train: learns with a weight; None if weights have no effect.
-      plans: plans in the training worlds, of all actions and of optimal ones.
-    """
+    """The network of greatest likelihood over some weights, and its weight."""
     models = [part_of(setup.worlds.model, w) for w in range(setup.num_training)]
     seen = counts > 0
 

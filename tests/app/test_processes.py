@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from jaxltl.algos.common import checkpoint
-from jaxltl.app.exit_message import told
-from jaxltl.app.processes import Asked, Launch, Place, launched
+from jaxltl.app.exit_message import explain
+from jaxltl.app.processes import DeviceOptions, Launch, ProcessGroup, launched
 from jaxltl.core.values.discounted.discounted import optimal_value
 from jaxltl.core.values.discounted.soft import soft_value
 from jaxltl.core.values.properties.solve_property import solve_property
@@ -53,25 +53,33 @@ HERE = {"coordinator": "node1:77", "process": 1, "processes": 2}
     ],
 )
 def test_which_process_this_is(options, environment, expected):
-    assert launched(Asked(**{"mesh": 0, **options}), environment) == expected
+    assert launched(DeviceOptions(**{"mesh": 0, **options}), environment) == expected
 
 
 @pytest.mark.parametrize(
     ("options", "environment", "message"),
     [
-        ({"mesh": None, "process": 1}, {}, "--process is of use with --mesh alone"),
-        ({"process": 1, "processes": 2}, {}, "--coordinator is missing, and nobody else says it"),
+        ({"mesh": None, "process": 1}, {}, "--process needs --mesh"),
+        (
+            {"process": 1, "processes": 2},
+            {},
+            "--coordinator is missing, and no launcher provides it",
+        ),
         ({"process": 1, "coordinator": "a:1"}, {}, "--processes is missing"),
         ({"processes": 2, "coordinator": "a:1"}, {}, "--process is missing"),
-        ({**HERE, "process": 2}, {}, "--process 2 is none of 2 processes; number them from 0 to 1"),
-        ({**HERE, "coordinator": "node1"}, {}, "'node1' is no HOST:PORT"),
-        ({**HERE, "coordinator": ":70000"}, {}, "':70000' is no HOST:PORT"),
-        ({}, MPI_5, "--coordinator is missing, and Open MPI does not say where process 0 is"),
+        (
+            {**HERE, "process": 2},
+            {},
+            "--process 2 is out of range for 2 processes; number them from 0 to 1",
+        ),
+        ({**HERE, "coordinator": "node1"}, {}, "'node1' must be HOST:PORT"),
+        ({**HERE, "coordinator": ":70000"}, {}, "':70000' must be HOST:PORT"),
+        ({}, MPI_5, "--coordinator is missing, and Open MPI does not provide it"),
     ],
 )
 def test_what_contradicts_itself_or_is_missing_is_named(options, environment, message):
     with pytest.raises(ValueError, match=message):
-        launched(Asked(**{"mesh": 0, **options}), environment)
+        launched(DeviceOptions(**{"mesh": 0, **options}), environment)
 
 
 FATAL = (
@@ -86,11 +94,11 @@ FATAL = (
     [
         (
             "UNAVAILABLE: The following tasks are unhealthy (stopped sending heartbeats):\n1\nThe tasks",
-            "process 0 stops, for process 1 gives no sign of life any more; what was saved is kept",
+            "process 0 stops: process 1 does not respond. Checkpoints are kept",
         ),
         (
             "UNAVAILABLE: The following tasks are unhealthy (stopped sending heartbeats):\n1\n12\nThe",
-            "process 0 stops, for processes 1, 12 give no sign of life any more",
+            "process 0 stops: processes 1, 12 do not respond.",
         ),
         (
             "DEADLINE_EXCEEDED: Deadline Exceeded\n\nRPC: /xla.coordination.CoordinationService/Register"
@@ -106,7 +114,7 @@ FATAL = (
             "UNAVAILABLE: Failed to send RPC to coordination service. Either the leader task was "
             "preempted\n:UNKNOWN:Error received from peer\n\nRPC: /xla.coordination.CoordinationService/"
             "PollForError",
-            "process 0 stops, for process 0, which the others meet at, has ended",
+            "process 0 stops: process 0, which coordinates the others, has ended",
         ),
         (
             "INTERNAL: Barrier failed\njaxltl ends: process 0 stops, for reasons.\n    @ 0x7f22",
@@ -114,17 +122,17 @@ FATAL = (
         ),
         (
             "INTERNAL: Shutdown barrier has failed.",
-            "process 0 stops, for another process has ended",
+            "process 0 stops: another process has ended",
         ),
     ],
 )
 def test_the_last_words_of_the_runtime_in_a_line(text, start):
-    line = told(FATAL + text, 0)
+    line = explain(FATAL + text, 0)
     assert line.startswith(start) and "\n" not in line and line.endswith(".")
 
 
 def test_alone_nothing_is_exchanged():
-    place = Place()
+    place = ProcessGroup()
     assert place.is_first and place.exchanged("a") == ["a"] and place.sees("it", False) is False
     place.agree({"--seed": 3})
     assert place.together(lambda: 7) == 7
@@ -202,8 +210,8 @@ def check_end(others, seconds):
         assert any(
             x in found.err
             for x in (
-                "has ended; what was saved is kept",
-                "no sign of life any more; what was saved is kept",
+                "has ended. Checkpoints are kept",
+                "not respond. Checkpoints are kept",
                 "not all processes have joined",
                 "has not reached process 0",
             )

@@ -9,8 +9,8 @@ from click.testing import CliRunner
 
 from jaxltl.algos.common import checkpoint
 from jaxltl.app import solve_on_mesh
-from jaxltl.app.processes import Place
-from jaxltl.app.solve import asked_for
+from jaxltl.app.processes import ProcessGroup
+from jaxltl.app.solve import parse_queries
 from jaxltl.cli import main
 from jaxltl.core.types import Status
 from jaxltl.io.model_files import write_model
@@ -19,22 +19,17 @@ from tests.several import walk
 PROPERTY = 'Pmax=? [ F "win" ]'
 
 
-def place_of(devices):
+def group_of(devices):
     mesh = jax.make_mesh((devices,), ("devices",), devices=jax.devices()[:devices])
-    return Place(mesh=mesh)
+    return ProcessGroup(mesh=mesh)
 
 
 def solved(devices, directory, text=PROPERTY):
-    place = place_of(devices)
-    (result,) = solve_on_mesh.solve_in(
-        place,
-        solve_on_mesh.on_mesh(walk(16), place),
-        {},
-        asked_for([text]),
-        1e-6,
-        directory,
-        [text],
-    )
+    group = group_of(devices)
+    model = solve_on_mesh.on_mesh(walk(16), group)
+    solver = solve_on_mesh.MeshSolver(group, model, {}, 1e-6, directory)
+    solver.agree([text])
+    (result,) = solver.solve(parse_queries([text]))
     return result
 
 
@@ -102,7 +97,7 @@ def test_from_the_command_line(tmp_path):
         (["--mesh", "--strategy", "x.json"], "--strategy goes without --mesh alone"),
         (bounds, "--checkpoint goes with --mesh alone"),
         (["--mesh", "two"], "--mesh two: give a number of devices, or all"),
-        (["--process", "1"], "--process is of use with --mesh alone"),
+        (["--process", "1"], "--process needs --mesh"),
     ):
         wrong = CliRunner().invoke(main, ["solve", model, PROPERTY, *options])
         assert wrong.exit_code == 2 and f"error: {message}" in wrong.stderr

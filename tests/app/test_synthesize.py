@@ -176,7 +176,7 @@ def test_an_unrealizable_task_is_an_answer(lost):
 def test_the_play_obeys_the_rules_and_ends_in_failure(lost):
     printed, result, _ = lost
     steps = result["play"]["steps"]
-    assert result["play"]["failed"] and f"failed in step {len(steps) - 1}" in printed
+    assert result["play"]["failed"] and f"violated in step {len(steps) - 1}" in printed
     moves = {"up": (-1, 0), "down": (1, 0), "left": (0, -1), "right": (0, 1), "stay": (0, 0)}
     for before, after in itertools.pairwise(steps):
         other = "system" if after["mover"] == "environment" else "environment"
@@ -210,7 +210,7 @@ def test_a_repeating_play_names_the_guarantee_that_is_missed(tmp_path):
     )
     printed, result, out = finished(tmp_path, text)
     assert result["task"] == "G (!collision) & G F (system_a) & G F (system_b)"
-    assert "repeat for ever, and never meet system_a" in printed
+    assert "repeat for ever, and never satisfy system_a" in printed
     play = result["play"]
     first, last = play["steps"][play["repeats_from"]], play["steps"][-1]
     assert [first[k] for k in ("system", "environment")] == [
@@ -267,7 +267,7 @@ def test_chance_may_be_an_adversary(arrays, tmp_path):
     assert result["outcome"] == "unrealizable" and report.is_confirmed(result)
     printed = report.table(result, found)
     assert "wins surely from 0 of 1" in printed and "2     chance" in printed
-    assert "steps 0 to 2 repeat for ever, and the task is not done" in printed
+    assert "steps 0 to 2 repeat for ever, and violate the objective" in printed
 
 
 def test_a_refuted_result_is_never_passed_off(arrays, tmp_path, monkeypatch):

@@ -39,10 +39,6 @@ def read_demonstrations(path: Path, world: World) -> Trajectories:
     counted from 0), and ``"actions"``, names or numbers from 0, one per cell. A final cell
     without an action is where the demonstration ended. In the world of a log, states and actions
     have the names of the log.
-
-    Raises:
-      ValueError: a malformed file, or a demonstration that the world cannot generate; names the
-        demonstration and the step, both counted from 1.
     """
     try:
         data = json.loads(read_bytes(path, "the demonstrations"))
@@ -166,21 +162,6 @@ def synthetic_demonstrations(
     reward of satisfying a co-safe formula. A rollout of a co-safe formula ends where it is
     satisfied, and is dropped if that takes longer than the given length, or no step. Rollouts of
     other formulas have the given length, and are dropped where the formula is violated.
-
-    Args:
-      path: the task file, for errors.
-      table: number, length (default 200) and discount.
-      model: the product of the world and the formula.
-      key: a PRNG key, consumed.
-      best: from :func:`~jaxltl.core.values.undiscounted.satisfaction.optimal_satisfaction`.
-
-    Returns:
-      :class:`~jaxltl.core.models.trajectories.Trajectories` of the world, and the number of
-      dropped rollouts.
-
-    Raises:
-      ValueError: a discount for a formula that is not co-safe, more rollouts than fit into
-        memory, or no rollout that satisfies the formula.
     """
     # Import here: tasks with a file of demonstrations compile no rollout.
     from jaxltl.core.models.trajectories import rollout

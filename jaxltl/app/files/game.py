@@ -194,12 +194,7 @@ class World:
 
 
 def read_game(path: str | Path) -> GameFile:
-    """Reads a game file.
-
-    Raises:
-      ValueError: the file is missing or malformed, or a key is unknown, missing or wrong; names
-        the file, the table, the key and the fix.
-    """
+    """Reads a game file."""
     path = Path(path)
     data, _ = schema.read_toml(path, GameFileSchema.KIND)
     file = schema.convert(path, GameFileSchema, data)
@@ -214,11 +209,7 @@ def read_game(path: str | Path) -> GameFile:
 
 
 def load_game(file: GameFile) -> World:
-    """The game that a game file describes.
-
-    Raises:
-      ValueError: a malformed map or model; names the file and the place.
-    """
+    """The game that a game file describes."""
     table = file.game
     with errors_in(f"{file.path}: [game] "):
         if table.model is not None:
@@ -256,15 +247,7 @@ def _cell(given: tuple[int, int], key: str, cells: np.ndarray, wall: str) -> tup
 
 
 def load_objective(file: GameFile, world: World) -> tuple[Game, Parity | GR1]:
-    """The objective, and the game on whose states it is defined.
-
-    Returns:
-      For a formula, its product game; else the world's own game.
-
-    Raises:
-      ValueError: a formula is malformed or has an unknown proposition, or one that must be
-        Boolean is not.
-    """
+    """The objective, and the game on whose states it is defined."""
     task, game = file.task, world.game
     with errors_in(f"{file.path}: [task] "):
         if task.formula is not None:

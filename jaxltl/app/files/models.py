@@ -45,15 +45,6 @@ def read_padded(path: Path, more: Sequence[str] = ()) -> ReadModel:
 
     Actions have the names of choices if these are distinct in each state and at most 100, else
     the rank of a choice in its state.
-
-    Args:
-      path: the file.
-      more: names of other arrays that an ``.npz`` may hold; without ``"system"`` games are
-        refused.
-
-    Raises:
-      ValueError: the file is malformed or a game, or the padded model is too large, with its
-        size.
     """
     name = str(path)
     raw = read_bytes(path, "the model")
@@ -91,11 +82,7 @@ def read_padded(path: Path, more: Sequence[str] = ()) -> ReadModel:
 
 
 def padded(model: SparseMDP) -> tuple[MDP, tuple[str, ...], np.ndarray]:
-    """A sparse model with padded successor lists, the names of actions, and each choice's action.
-
-    Raises:
-      ValueError: the padded model is too large, with its size.
-    """
+    """A sparse model with padded successor lists, the names of actions, and each choice's action."""
     names = tuple(x or "(no name)" for x in model.action_names)
     if model.action is not None and names:
         state, action = model.host.state, np.asarray(model.action)

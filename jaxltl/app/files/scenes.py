@@ -53,16 +53,7 @@ class Scene:
 
 
 def load_scenes(task: TodirlTask, judge: Automaton) -> tuple[list[Scene], list[Scene]]:
-    """The training worlds and the test worlds.
-
-    Args:
-      task: the task file.
-      judge: the automaton of the formula, which generated worlds can satisfy.
-
-    Raises:
-      ValueError: a malformed map, or worlds that do not fit each other; names the table, the
-        world and the place.
-    """
+    """The training worlds and the test worlds."""
     test_maps = (task.test and task.test.maps) or []
     training = [_read_scene(task, "world", i, x) for i, x in enumerate(task.world.maps)]
     test = [_read_scene(task, "test", i, x) for i, x in enumerate(test_maps)]
@@ -229,10 +220,6 @@ def load_automata(task: TodirlTask) -> tuple[Automaton, Automaton]:
 
     Both are over the labels of all kinds of cells, so that memory states mean the same in every
     world.
-
-    Raises:
-      ValueError: a malformed formula, an unknown proposition, or a horizon for a formula that no
-        finite episode decides.
     """
     alphabet = _alphabet(task)
     judge = _translate(task, "[task] formula", task.formula, alphabet)
@@ -268,11 +255,7 @@ def _translate(
 
 
 def load_demonstrations(task: TodirlTask, scenes: Sequence[Scene]) -> list[Trajectories]:
-    """The demonstrations in each of the training worlds, from their files.
-
-    Raises:
-      ValueError: see :func:`jaxltl.app.files.demonstrations.read_demonstrations`.
-    """
+    """The demonstrations in each of the training worlds, from their files."""
     found = []
     for name, scene in zip(task.demonstrations.files or (), scenes, strict=True):
         cells = np.arange(scene.mdp.num_states).reshape(scene.shape).astype(str)

@@ -70,8 +70,11 @@ Propositions = Annotated[list[str], Meta('a list of propositions, such as ["r"]'
 StateNames = Annotated[list[str], Meta("a list of names of states", bool)]
 Widths = Annotated[list[Count], Meta("a list of the widths of the hidden layers, such as [64, 64]")]
 Map = Annotated[
-    Text | dict[Literal["file"], str],
-    Meta('the rows as a text, or { file = "map.txt" }', bool),
+    Text | dict[str, str],
+    Meta(
+        'the rows as a text, or { file = "map.txt" }',
+        lambda v: isinstance(v, str) or v.keys() == {"file"},
+    ),
 ]
 Legend = Annotated[
     dict[str, list[str]],
@@ -82,6 +85,10 @@ Legend = Annotated[
 def key_name(field: attrs.Attribute[Any]) -> str:
     """The key of a field in a file; that of a Python keyword ends in an underscore in Python."""
     return field.name.rstrip("_")
+
+
+def _fields(schema: Any) -> tuple[attrs.Attribute[Any], ...]:
+    return attrs.fields(schema)
 
 
 def _resolve(kind: type, fields: list[attrs.Attribute[Any]]) -> list[attrs.Attribute[Any]]:
@@ -102,7 +109,7 @@ class Table:
 
     def given(self) -> dict[str, Any]:
         """The keys that have a value."""
-        pairs = ((key_name(x), getattr(self, x.name)) for x in attrs.fields(type(self)))
+        pairs = ((key_name(x), getattr(self, x.name)) for x in _fields(type(self)))
         return {name: value for name, value in pairs if value is not None}
 
     def refuse(self, keys: Iterable[str], owner: str) -> None:
@@ -138,11 +145,7 @@ def errors_in(place: str) -> Iterator[None]:
 
 
 def read_toml(path: Path, kind: str, raw: bytes | None = None) -> tuple[dict[str, Any], bytes]:
-    """The tables of a TOML file, and its bytes, which are read unless `raw` has them.
-
-    Raises:
-      ValueError: the file cannot be read or is malformed.
-    """
+    """The tables of a TOML file, and its bytes, which are read unless `raw` has them."""
     raw = read_bytes(path, kind) if raw is None else raw
     try:
         return tomllib.loads(raw.decode()), raw
@@ -196,7 +199,7 @@ def convert(path: Path, schema: type[_Table], data: Mapping[str, Any], name: str
       ValueError: a key is unknown, with the nearest known one; has a wrong value; or is missing.
     """
     where = f"{path}: [{name}]" if name else f"{path}:"
-    fields = {key_name(field): field for field in attrs.fields(schema)}
+    fields = {key_name(field): field for field in _fields(schema)}
     for key in data:
         if key not in fields:
             guess = difflib.get_close_matches(key, fields, n=1, cutoff=0.5)
@@ -223,11 +226,7 @@ def convert(path: Path, schema: type[_Table], data: Mapping[str, Any], name: str
 
 
 def _converted(value: Any, kind: Any) -> Any:
-    """A value in the type of its key; a table's own keys are converted later.
-
-    Raises:
-      TypeError: it has another type, or a condition of :class:`Meta` does not hold.
-    """
+    """A value in the type of its key; a table's own keys are converted later."""
     origin, parts = get_origin(kind), get_args(kind)
     if origin is Annotated:
         found = _converted(value, parts[0])
@@ -313,13 +312,13 @@ def keys_of(schema: type[Table]) -> list[KeyHelp]:
             key_name(field),
             requirement(field.type),
             _default(field.default),
-            next((x for x in field.type.__metadata__ if isinstance(x, str)), ""),
+            next((x for x in getattr(field.type, "__metadata__", ()) if isinstance(x, str)), ""),
         )
-        for field in attrs.fields(schema)
+        for field in _fields(schema)
     ]
 
 
 def _default(default: Any) -> Any:
     if default is attrs.NOTHING:
         return ...
-    return default.factory() if isinstance(default, attrs.Factory) else default
+    return default.factory() if hasattr(default, "factory") else default

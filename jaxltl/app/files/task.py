@@ -116,14 +116,7 @@ class Task:
 def common_fields(
     path: Path, file: TaskFile, hidden: str | None, digest: str, label_on: str
 ) -> dict[str, Any]:
-    """The fields of :class:`Task`.
-
-    Args:
-      path, file: the file and its contents.
-      hidden: the key by which the learner does not see the formula, which rules out a guarantee.
-      digest: of the file and of those that it names.
-      label_on: default of the key.
-    """
+    """The fields of :class:`Task`."""
     task = file.task
     guarantee = task.guarantee or ("none" if hidden else "best")
     where = f"{path}: [task]"
@@ -146,10 +139,6 @@ def common_fields(
 
 
 def method_of(path: str | Path) -> Any:
-    """``[learner] method`` of a task file, unchecked; None if there is none.
-
-    Raises:
-      ValueError: the file cannot be read or is no TOML.
-    """
+    """``[learner] method`` of a task file, unchecked; None if there is none."""
     learner = read_toml(Path(path), TaskFile.KIND)[0].get("learner")
     return learner.get("method") if isinstance(learner, dict) else None

@@ -251,11 +251,7 @@ class EnvironmentTask:
 
 
 def is_environment_task(path: str | Path) -> bool:
-    """Whether a task file is of a simulated world, by its world or by its method.
-
-    Raises:
-      ValueError: the file cannot be read or is no TOML.
-    """
+    """Whether a task file is of a simulated world, by its world or by its method."""
     data = schema.read_toml(Path(path), EnvironmentFile.KIND)[0]
     world, learner = (data.get(name) for name in ("world", "learner"))
     simulated = isinstance(world, dict) and "environment" in world
@@ -263,16 +259,7 @@ def is_environment_task(path: str | Path) -> bool:
 
 
 def read_task(path: str | Path, raw: bytes | None = None) -> EnvironmentTask:
-    """Reads a task file of a simulated world.
-
-    Args:
-      path: the file.
-      raw: its bytes, if they were kept elsewhere; then no file is read, and there is no digest.
-
-    Raises:
-      ValueError: the file, or one that it names, is missing or malformed, or a key is unknown,
-        missing or wrong. The message names the file, the table, the key and the fix.
-    """
+    """Reads a task file of a simulated world."""
     path = Path(path)
     data, found = schema.read_toml(path, EnvironmentFile.KIND, raw)
     file = schema.convert(path, EnvironmentFile, data)

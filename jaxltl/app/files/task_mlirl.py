@@ -158,6 +158,18 @@ class LearnerTable(OptimizerTable):
             raise ValueError(f"progress = {self.progress!r}; it must be a list of {expected}.")
 
     @property
+    def progress_labels(self) -> list[str]:
+        """The propositions of progress, in the world."""
+        return [x for x in self.progress or () if isinstance(x, str)]
+
+    @property
+    def progress_states(self) -> list[int] | None:
+        """The automaton states of progress, in the product; None for the default."""
+        if self.progress is None:
+            return None
+        return [x for x in self.progress if isinstance(x, int)]
+
+    @property
     def in_world(self) -> bool:
         """Whether the reward is one of world states, without the automaton."""
         return self.in_ == "world"
@@ -182,12 +194,7 @@ class MlirlTask(Task):
 
 
 def read_task(path: str | Path) -> MlirlTask:
-    """Reads a task file.
-
-    Raises:
-      ValueError: the file, or one that it names, is missing or malformed, or a key is
-        unknown, missing or wrong. The message names the file, the table, the key and the fix.
-    """
+    """Reads a task file."""
     path = Path(path)
     data, raw = schema.read_toml(path, MlirlFile.KIND)
     file = schema.convert(path, MlirlFile, data)

@@ -204,12 +204,7 @@ class TodirlTask(Task):
 
 
 def read_task(path: str | Path) -> TodirlTask:
-    """Reads a task file.
-
-    Raises:
-      ValueError: the file, or one that it names, is missing or malformed, or a key is
-        unknown, missing or wrong. The message names the file, the table, the key and the fix.
-    """
+    """Reads a task file."""
     path = Path(path)
     data, raw = schema.read_toml(path, TodirlFile.KIND)
     file = schema.convert(path, TodirlFile, data)

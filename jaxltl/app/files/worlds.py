@@ -56,11 +56,7 @@ def grid_options(table: GridTable) -> dict[str, Any]:
 
 
 def load_world(task: MlirlTask) -> World:
-    """The model that a task file describes.
-
-    Raises:
-      ValueError: a malformed map or model; names the file and the place.
-    """
+    """The model that a task file describes."""
     table, folder = task.world, task.path.parent
     with errors_in(f"{task.path}: [world] "):
         # Imports here: most tasks have a map, and need no reader of logs or models.

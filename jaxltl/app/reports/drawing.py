@@ -1,4 +1,4 @@
-"""Pictures drawn beside the work, so that nobody waits for matplotlib."""
+"""Pictures drawn in other processes, in parallel to the work."""
 
 from __future__ import annotations
 
@@ -11,30 +11,32 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from multiprocessing import get_context, parent_process
 from multiprocessing.util import Finalize
-from typing import Any, NamedTuple
+from typing import Any
 
 from jaxltl.app.compilation import collect_rarely
 
 _PROCESSES = 2
 
 
-class Drawing(NamedTuple):
-    """A picture that is still to be drawn: a function of :mod:`jaxltl.plot` and what it takes."""
+@dataclasses.dataclass(frozen=True)
+class Drawing:
+    """A deferred call of a function of :mod:`jaxltl.plot`."""
 
     function: str
     arguments: tuple[Any, ...]
     options: Mapping[str, Any]
 
 
-class Picture(NamedTuple):
-    """A picture of a report: its file's name, title, caption, and how it is drawn.
+@dataclasses.dataclass(frozen=True)
+class Picture:
+    """A picture of a report: file name, title, drawing, and caption.
 
-    A page leaves it out where it has the live part that says the same.
+    A page leaves it out if it has the interactive part with the name `live`.
     """
 
     name: str
     title: str
-    drawing: Drawing | bytes | None  # as SVG, or None, where it is drawn already
+    drawing: Drawing | bytes | None  # or its SVG; None if it is drawn elsewhere
     caption: str
     live: str = ""
 
@@ -43,12 +45,12 @@ Artist = Callable[[Drawing], Callable[[], bytes]]
 
 
 def drawing(function: str, *arguments: Any, **options: Any) -> Drawing:
-    """The call of a function of :mod:`jaxltl.plot`, to be made later and elsewhere."""
+    """A deferred call of a function of :mod:`jaxltl.plot`, with NumPy arrays."""
     return Drawing(function, tuple(map(_on_the_host, arguments)), options)
 
 
 def _on_the_host(argument: Any) -> Any:
-    """An automaton or a world with NumPy's arrays; to read JAX's, a process has to load JAX."""
+    """A dataclass with NumPy arrays: unpickling JAX arrays would import JAX."""
     if not dataclasses.is_dataclass(argument) or isinstance(argument, type):
         return argument
     import jax
@@ -58,8 +60,8 @@ def _on_the_host(argument: Any) -> Any:
 
 
 def draw(picture: Drawing) -> bytes:
-    """The SVG of a picture: of a figure, or as its function says."""
-    # Deferred: learning alone does not need matplotlib.
+    """The SVG of a drawing."""
+    # Import here: learning alone does not need matplotlib.
     from jaxltl import plot
 
     found = getattr(plot, picture.function)(*picture.arguments, **picture.options)
@@ -68,22 +70,17 @@ def draw(picture: Drawing) -> bytes:
 
 @contextlib.contextmanager
 def artist(apart: bool) -> Iterator[Artist]:
-    """What begins to draw a picture and returns how to get it.
-
-    Args:
-      apart: draw in processes of their own, of which the first loads matplotlib from now on, the
-        others with the first picture; else when the picture is asked for.
-    """
+    """A function that begins a drawing and returns a function that waits for its SVG."""
     if not apart:
         yield lambda picture: lambda: draw(picture)
         return
-    # Spawned, since a process with threads, which JAX has, must not fork.
+    # Spawned: JAX has threads, and a process with threads must not fork.
     pool = ProcessPoolExecutor(_PROCESSES, get_context("spawn"), _prepare)
 
     def begin(picture: Drawing) -> Callable[[], bytes]:
-        with _undisturbed():
+        with _interrupts_blocked():
             drawn = pool.submit(draw, picture)
-            pool.submit(int)  # so that the next process begins to load if this one is busy
+            pool.submit(int)  # starts the next process if this one is busy
 
         def finish() -> bytes:
             try:
@@ -94,19 +91,19 @@ def artist(apart: bool) -> Iterator[Artist]:
         return finish
 
     try:
-        with _undisturbed():
+        with _interrupts_blocked():
             pool.submit(int)
         yield begin
     finally:
-        # Waits, else the end of this process leaves semaphores, of which Python warns.
+        # Waits, since Python warns of semaphores that are left at exit.
         pool.shutdown(cancel_futures=True)
 
 
 @contextlib.contextmanager
-def _undisturbed() -> Iterator[None]:
-    """Interrupts come afterwards, to this process alone: one that is begun here never has them.
+def _interrupts_blocked() -> Iterator[None]:
+    """Blocks interrupts; a process that is started here inherits the block.
 
-    It would tell of them while it loads, and the command itself says what is to be done.
+    Else it would print a traceback, where the command itself prints one line.
     """
     if not hasattr(signal, "pthread_sigmask"):
         yield
@@ -120,15 +117,15 @@ def _undisturbed() -> Iterator[None]:
 
 def _prepare() -> None:
     collect_rarely()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # where it could not be kept from here
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # without pthread_sigmask
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    # Else what was loaded is freed piece by piece, for half a second.
+    # Skips the interpreter's teardown, which takes half a second after matplotlib.
     Finalize(None, os._exit, args=(0,), exitpriority=-1)
     import jaxltl.plot  # noqa: F401
 
 
 def _end_with_parent() -> None:
-    """A process of a pool waits for work for ever, also where its parent was killed."""
+    """Ends with the parent: a pool's process would wait for work for ever."""
     if (parent := parent_process()) is not None:
         parent.join()
         os._exit(1)

@@ -39,16 +39,7 @@ def render_page(
     file_text: str,
     **context: Any,
 ) -> str:
-    """A page that needs no other file and no network.
-
-    Args:
-      template: its name; it extends ``page.html``.
-      result: of ``result.json``; the template reads it as ``result``.
-      parts: interactive parts.
-      pictures: with their SVG; those that an interactive part replaces are left out.
-      file_text: the task or game file.
-      context: other values that the template reads.
-    """
+    """A page that needs no other file and no network."""
     explorers = [(part, drawn) for part, drawn in parts if isinstance(part, Explorer)]
     replaced = {part.name for part, _ in parts if not isinstance(part, TooLarge)}
     known = json.dumps(

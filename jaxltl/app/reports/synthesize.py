@@ -1,4 +1,4 @@
-"""What a synthesis found, for people and for files: summary, tables, arrays and pictures."""
+"""Results of a synthesis: summary, text, strategy files and pictures."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from jaxltl.core.models.game import Game, is_deterministic
 
 
 def summary(found: Synthesis, seconds: float) -> dict[str, Any]:
-    """The findings as numbers, lists and texts, for ``result.json``."""
+    """The results for ``result.json``."""
     file, world = found.file, found.world
     wins, starts = found.wins, found.starts
     won = int(wins[starts].sum())
@@ -87,7 +87,7 @@ def _about_play(found: Synthesis) -> dict[str, Any] | None:
 
 
 def is_confirmed(result: Mapping[str, Any]) -> bool:
-    """Whether the independent check found nothing against a :func:`summary`."""
+    """Whether the independent check confirms a :func:`summary`."""
     strategy = result["strategy"]
     claims = result["verdict"]
     sound = strategy is None or strategy["confirmed"]
@@ -95,7 +95,7 @@ def is_confirmed(result: Mapping[str, Any]) -> bool:
 
 
 def table(result: Mapping[str, Any], found: Synthesis) -> str:
-    """A summary for people."""
+    """A :func:`summary` as text."""
     region, strategy = result["region"], result["strategy"]
     sure = result["deterministic"] or result["chance"] == "adversarial"
     surely = "surely" if sure else "almost surely"
@@ -106,7 +106,7 @@ def table(result: Mapping[str, Any], found: Synthesis) -> str:
         "",
         f"{result['outcome']}: the system wins {surely} from {region['initial_states']} of "
         f"{region['num_initial_states']} initial states",
-        f"  (and from {region['states']} of all {result['num_states']} states, were they initial)",
+        f"  (and from {region['states']} of all {result['num_states']} states)",
     ]
     lost = region["num_initial_states"] - region["initial_states"]
     if lost:
@@ -135,7 +135,7 @@ def table(result: Mapping[str, Any], found: Synthesis) -> str:
 
 
 def verdict(result: Mapping[str, Any]) -> str:
-    """What the independent check says."""
+    """The result of the independent check."""
     if is_confirmed(result):
         what = "both players' strategies" + (
             " and the permissive strategy" if result["strategy"] else ""
@@ -145,11 +145,11 @@ def verdict(result: Mapping[str, Any]) -> str:
     return f"independent check: REFUTED: {' '.join(r for r in reasons if r)}"
 
 
-# --- a play, for people ----------------------------------------------------------------------
+# --- plays -----------------------------------------------------------------------------------
 
 
 def describe_play(found: Synthesis) -> list[str]:
-    """A play that the environment wins, as the lines of a table."""
+    """A play that the environment wins, as lines of a table."""
     play, nodes, world = found.play, found.nodes, found.world
     if play is None:
         return []
@@ -179,16 +179,16 @@ def _cells(world: World, state: int) -> list[str]:
 def _ending(play: Play, found: Synthesis) -> str:
     last = len(play.steps) - 1
     if play.failed:
-        chance = ", after chance went against the system" if play.by_chance else ""
-        return f"the task has failed in step {last}{chance}"
+        chance = ", after random moves against the system" if play.by_chance else ""
+        return f"the objective is violated in step {last}{chance}"
     round_ = f"steps {play.repeats_from} to {last} repeat"
     if play.by_chance:
-        return f"{round_} as long as chance goes against the system"
-    return f"{round_} for ever, and {_missed(play, found) or 'the task is not done'}"
+        return f"{round_} as long as random moves are against the system"
+    return f"{round_} for ever, and {_missed(play, found) or 'violate the objective'}"
 
 
 def _missed(play: Play, found: Synthesis) -> str:
-    """Which guarantee a loop never meets."""
+    """The guarantees that a repeated part of a play never satisfies."""
     objective = found.winning.objective
     guarantees = found.file.task.guarantees or ()
     if not isinstance(objective, GR1):
@@ -196,7 +196,7 @@ def _missed(play: Play, found: Synthesis) -> str:
     loop = [step.node for step in play.steps[play.repeats_from :]]
     met = [bool(np.asarray(row)[loop].any()) for row in objective.guarantees]
     never = [g for g, m in zip(guarantees, met, strict=True) if not m]
-    return f"never meet {' nor '.join(never)}" if never else ""
+    return f"never satisfy {' nor '.join(never)}" if never else ""
 
 
 # --- files ----------------------------------------------------------------------------------
@@ -207,15 +207,15 @@ def save(out: Path, found: Synthesis) -> None:
 
     ``strategy.npz``, if the system wins from some initial state, is its permissive strategy as
     the restricted game of N states: ``successor``, ``probability``, ``initial``, ``system``,
-    ``label``, ``propositions`` and ``actions`` as in a game file's model; ``mask [N, A]``, the
-    moves that are allowed; and ``world_state``, ``automaton_state`` and ``memory [N]``, what each
-    state stands for; ``region [S]``, the states of the world from which the system wins. To
-    follow the strategy keep a state of the restricted game, make an allowed move, and go on to
-    the successor whose ``world_state`` was observed.
+    ``label``, ``propositions`` and ``actions`` as in a game file's model; the allowed moves
+    ``mask [N, A]``; ``world_state``, ``automaton_state`` and ``memory [N]`` of each state; and the
+    winning region of the world, ``region [S]``. To follow the strategy, keep a state of the
+    restricted game, take an allowed move, and move to the successor with the observed
+    ``world_state``.
 
     ``counter_strategy.npz``, if the environment wins from some: ``counter_action [N]``, or for
-    GR(1) ``[N, M]`` with ``assumptions [M, N]``, which move its memory on; and the game of N
-    nodes that it is played on, as above.
+    GR(1) ``[N, M]`` with ``assumptions [M, N]``, which advance its memory; and its game of N
+    nodes, as above.
     """
     region = {"region": found.wins}
     nodes = found.nodes
@@ -264,14 +264,8 @@ MOST_PANELS = 6  # of a strategy's memory
 
 
 def pictures(found: Synthesis, environment: int | None = None) -> list[tuple[str, bytes]]:
-    """Pictures as SVG, by file name: the task's automaton, and maps if the game has one.
-
-    Args:
-      found: the findings.
-      environment: the number of the environment's place in ``moves.svg``; default the one
-        in which the strategy forbids the most.
-    """
-    # Deferred: solving alone does not need matplotlib.
+    """Pictures as SVG by file name: the automaton, and maps if the game has one."""
+    # Import here: solving alone does not need matplotlib.
     from jaxltl import plot
 
     made = []
@@ -293,11 +287,7 @@ def pictures(found: Synthesis, environment: int | None = None) -> list[tuple[str
 
 
 def place_of(found: Synthesis, cell: tuple[int, int] | None) -> int | None:
-    """The number of the place in a cell, given by its row and column from 1.
-
-    Raises:
-      ValueError: the game has no map, or no place there.
-    """
+    """The index of the place in a cell, which has row and column from 1."""
     if cell is None:
         return None
     places = found.world.places
@@ -314,7 +304,7 @@ def place_of(found: Synthesis, cell: tuple[int, int] | None) -> int | None:
 
 
 def _most_lost(found: Synthesis, count: int) -> list[int]:
-    """The environment's places with most cells that the system loses, in order."""
+    """The environment's places with the most losing cells, in order."""
     lost = ~found.wins.reshape(count, count, 2)[:, :, 1]
     return sorted(np.argsort(-lost.sum(axis=1), kind="stable")[:12].tolist())
 
@@ -369,7 +359,7 @@ def _moves_picture(found: Synthesis, environment: int | None) -> Any:
 
 
 def _title(found: Synthesis, q: int, m: int, pairs: np.ndarray) -> str:
-    """What the memory of a panel stands for."""
+    """Title of a panel: its automaton state and memory state."""
     parts = []
     if len(set(pairs[:, 0])) > 1:
         parts.append(f"automaton in {q}")

@@ -34,14 +34,7 @@ def page(
     pictures: Iterable[tuple[str, bytes]],
     file_text: str,
 ) -> str:
-    """The HTML report.
-
-    Args:
-      result: from :func:`~jaxltl.app.reports.synthesize.summary`.
-      found: the synthesis.
-      pictures: names and SVG.
-      file_text: the game file.
-    """
+    """The HTML report."""
     part = play_explorer(found)
     drawn = {key: draw(each).decode() for key, each in part.drawings.items()}
     shown = [

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -96,7 +97,8 @@ def _caption_of_curves(outcome: Outcome) -> str:
     )
 
 
-class _Drawn(NamedTuple):
+@dataclass(frozen=True)
+class _Drawn:
     """A world that is drawn: its index, file stem, title, and demonstrations."""
 
     worlds: Worlds
@@ -126,26 +128,18 @@ class _Drawn(NamedTuple):
 def _drawn_worlds(outcome: Outcome) -> Iterator[_Drawn]:
     setup, training, test = outcome.setup, outcome.setup.training, outcome.setup.test
 
-    def drawn(
-        worlds: Worlds,
-        judged: Judged,
-        w: int,
-        stem: str,
-        title: str,
-        arrows: bool,
-        shown: Trajectories | None = None,
-    ) -> _Drawn:
+    def title(worlds: Worlds, judged: Judged, w: int) -> str:
         mean = float(judged.performance["learned"].mean[w])
-        title = f"{title}: {worlds.scenes[w].name} ({mean:.4f})"
-        return _Drawn(worlds, judged, w, stem, title, arrows, shown)
+        return f"{worlds.scenes[w].name} ({mean:.4f})"
 
+    judged = outcome.training
     for w, shown in enumerate(setup.demonstrations[:_PICTURES]):
-        yield drawn(
-            training, outcome.training, w, f"training_{w + 1}", "Training world", True, shown
-        )
+        text = f"Training world: {title(training, judged, w)}"
+        yield _Drawn(training, judged, w, f"training_{w + 1}", text, True, shown)
     if test is not None and outcome.test is not None:
         for n, (rank, w) in enumerate(_chosen_worlds(setup, outcome.test)):
-            yield drawn(test, outcome.test, w, f"test_{n + 1}", f"Test world, {rank}", n == 0)
+            text = f"Test world, {rank}: {title(test, outcome.test, w)}"
+            yield _Drawn(test, outcome.test, w, f"test_{n + 1}", text, n == 0, None)
 
 
 _CAPTION = (
