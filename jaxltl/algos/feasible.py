@@ -99,8 +99,8 @@ class Problem:
     low: Array
     high: Array
     inside: Array
-    target: Array | None
-    stay: Array | None
+    target: Array
+    stay: Array
     reward: str | None = struct.field(pytree_node=False)
     objective: str = struct.field(pytree_node=False)
     bound: str = struct.field(pytree_node=False)

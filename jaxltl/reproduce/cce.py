@@ -102,13 +102,13 @@ def figures(
     for task, methods in plan.feasible_starts:
         progress(f"the robot, task {task}, from feasible policies: {', '.join(methods)}")
         robot = _robot(task)
-        feasible = _feasible_policies(robot, seeds or SEEDS, plan)
-        pretrained += [(robot, _search(robot, m, seeds or SEEDS, plan, feasible)) for m in methods]
+        initial = _feasible_policies(robot, seeds or SEEDS, plan)
+        pretrained += [(robot, _search(robot, m, seeds or SEEDS, plan, initial)) for m in methods]
     evaluated = []
     for runs in (usual, pretrained):
         progress("the robot: trajectories of the returned policies")
         evaluated.append([_evaluated(robot, run, plan) for robot, run in runs])
-    navigation, curves, maps = zip(*evaluated[0], strict=True) if usual else ((), (), ())
+    navigation, robot_curves, maps = zip(*evaluated[0], strict=True) if usual else ((), (), ())
     from_feasible, feasible_curves, _ = (
         zip(*evaluated[1], strict=True) if pretrained else ((), (), ())
     )
@@ -123,7 +123,7 @@ def figures(
                 "optimum": {"state": optimum.state, "control": optimum.control[:, 0]},
                 "learned": drawn,
             },
-            "figure10": curves,
+            "figure10": robot_curves,
             "figure11": feasible_curves,
             "maps": maps,
         }

@@ -10,12 +10,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxltl.core.models.game import Game, as_padded_game
 from jaxltl.core.models.mdp import MDP
+from jaxltl.core.models.protocols import Model
 from jaxltl.core.types import require_shape
 
 # --- on the host ----------------------------------------------------------------------------
 
 
-def explicit_game(game: object) -> Game:
+def explicit_game(game: Model) -> Game:
     """A game on a padded MDP; raises ValueError if its model is of another kind."""
     game = as_padded_game(game)
     if not isinstance(game.mdp, MDP):

@@ -64,6 +64,7 @@ from jaxltl.algos.common.play import (
 )
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.ops.operators import action_argmax, sample_successor
+from jaxltl.core.models.protocols import Array
 from jaxltl.core.pretty_print import brief, history
 from jaxltl.core.types import Status
 
@@ -137,8 +138,8 @@ class State:
     residual: jax.Array
     violations: jax.Array
     position: jax.Array
-    pending: jax.Array | None
-    pending_reward: jax.Array | None
+    pending: Array
+    pending_reward: Array
 
 
 @brief(facts=partial(history, codes={"status": Status}))
@@ -404,7 +405,7 @@ def _action_values(q: jax.Array) -> jax.Array:
     return _reduce(jnp.minimum, q) if q.ndim == 3 else q
 
 
-def _reduce(function: jnp.ufunc, x: jax.Array) -> jax.Array:
+def _reduce(function: Any, x: jax.Array) -> jax.Array:
     """A reduction over the last axis, unrolled if that is short."""
     if x.shape[-1] > _UNROLLED:
         return function.reduce(x, axis=-1)

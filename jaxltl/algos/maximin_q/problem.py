@@ -23,7 +23,7 @@ from jaxltl.algos.maximin_q._alias import MOST_ACTIONS, alias_table
 from jaxltl.core.graphs.end_components import bottom_components
 from jaxltl.core.models.construct.restrict import restrict
 from jaxltl.core.models.game import Game
-from jaxltl.core.models.protocols import Model
+from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.types import require_shape
 
@@ -51,8 +51,8 @@ class Problem:
     allowed: jax.Array
     behavior: jax.Array
     start: jax.Array
-    exact: jax.Array | None
-    measured: jax.Array | None
+    exact: Array
+    measured: Array
     behavior_table: jax.Array
     start_table: jax.Array
     method: str = struct.field(pytree_node=False, default="generalized")

@@ -18,6 +18,7 @@ from jaxltl.core.graphs.attractor import attractor
 from jaxltl.core.models.construct.restrict import restrict
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import interval_rows
+from jaxltl.core.models.protocols import Array
 from jaxltl.core.models.sparse import Rewards
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.rows import offsets_from_counts
@@ -186,7 +187,8 @@ def data_evidence(
         radius=sets.radius,
         rewards={"reward": Rewards(transition=earned[used])},
     )
-    within = Game(model, np.asarray(problem.game.system)[state])
+    system: Array = np.asarray(problem.game.system)[state]
+    within = Game(model, system)
     weight = np.asarray(strategy, np.float64)[s, a]
     secured = robust_discounted_value(
         within, "reward", discount, policy=weight, nature="adversarial"
