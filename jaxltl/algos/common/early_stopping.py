@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -29,7 +30,7 @@ class Best:
 
 
 def stop_early(
-    state: Any, after: Any, held_out: jax.Array, judged: jax.Array, patience: jax.Array | int
+    state: Any, after: Any, held_out: jax.Array, judged: jax.Array, patience: chex.Numeric
 ) -> tuple[Best, jax.Array]:
     """The best parameters so far, and whether patience has run out.
 
