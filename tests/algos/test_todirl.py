@@ -12,6 +12,7 @@ from jax.flatten_util import ravel_pytree
 
 import jaxltl as jl
 from jaxltl.algos import todirl
+from jaxltl.algos.todirl.problem import network_inputs
 from jaxltl.core.models.ops.operators import expectation, pushforward
 from jaxltl.core.models.ops.successor_tables import predecessor_table, successor_table
 from tests import reference
@@ -226,7 +227,7 @@ class Plain(nn.Module):
 
 def test_the_split_first_layer_is_a_dense_layer_on_everything():
     problem = small()
-    inputs = todirl._inputs(lazy(), problem.observation[0])
+    inputs = network_inputs(lazy(), problem.observation[0])
     found = parameters(problem)
     mine = found["params"]
     names = ("Dense_0", "Dense_1", "Dense_2")
@@ -415,7 +416,7 @@ def test_bad_settings_are_refused():
     problem = small()
     with pytest.raises(ValueError, match=r"horizon=3, but the problem has horizon=None; make_pro"):
         todirl.objective(parameters(problem), problem, todirl.Hparams(discount=0.9, horizon=3))
-    with pytest.raises(ValueError, match="optimizer='best'; choose one of lbfgs, adam"):
+    with pytest.raises(ValueError, match="optimizer='best'; choose one of adam, sgd"):
         todirl.init(jax.random.key(0), problem, todirl.Hparams(discount=0.9, optimizer="best"))
 
 

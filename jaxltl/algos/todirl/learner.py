@@ -36,7 +36,7 @@ Example: a reward of the state, and the policy that it gives in another world.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any, TypeVar
@@ -44,163 +44,29 @@ from typing import Any, TypeVar
 import chex
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 from flax import linen as nn
 from flax import struct
 from jax import lax
 
-from jaxltl.algos.common.settings import COUNT, Number, static, traced
-from jaxltl.core.validation import Range
 from jaxltl.algos.common import learner
 
 from jaxltl.algos.common import trees
 
 from jaxltl.algos.common import optimizers
 from jaxltl.algos.common.early_stopping import Best, stop_early
-from jaxltl.core.models.construct.batch import (
-    restrict_stacked_actions,
-    stack_models,
-    stack_observations,
-    training_counts,
-)
-from jaxltl.core.models.construct.batch import unstack_product as lane
-from jaxltl.core.models.construct.restrict import with_allowed
-from jaxltl.core.models.ops.successor_tables import PredecessorTable, predecessor_table
+from jaxltl.core.models.ops.successor_tables import PredecessorTable
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import PyTree
-from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.pretty_print import brief, history
-from jaxltl.core.types import Solution, Status, status_code
-from jaxltl.core.values.discounted.soft import policy_logits, soft_policy_adjoint, soft_value
+from jaxltl.core.types import Solution, Status
+from jaxltl.core.values.discounted.soft import policy_logits, soft_policy_adjoint
 from jaxltl.core.values.undiscounted.satisfaction import satisfaction_probability
 
+from jaxltl.algos.todirl.planning import backward_induction, plan, reward, soft_plan
+from jaxltl.algos.todirl.problem import Hparams, Problem, network_inputs
+
 ResultT = TypeVar("ResultT")
-
-# --- reward networks ---------------------------------------------------------------------------
-
-
-class RewardNetwork(nn.Module):
-    """A multilayer perceptron with ReLU on (observation, memory, action).
-
-    Maps ``float[..., O]``, ``float[..., Q]`` and ``float[..., A]``, which broadcast, to
-    ``float[...]``. The first layer is a sum of three, so that no input is repeated for each
-    combination with the others.
-
-    Attributes:
-      hidden: widths of the hidden layers; section 3.5 has two of 80. Empty: a linear reward.
-    """
-
-    hidden: Sequence[int] = (80, 80)
-
-    @nn.compact
-    def __call__(self, observation: jax.Array, memory: jax.Array, action: jax.Array) -> jax.Array:
-        widths = (*self.hidden, 1)
-        inputs = (observation, memory, action)
-        sizes = [x.shape[-1] for x in inputs]
-        kernel = self.param("kernel", nn.initializers.lecun_normal(), (sum(sizes), widths[0]))
-        bias = self.param("bias", nn.initializers.zeros_init(), (widths[0],))
-        parts = jnp.split(kernel, np.cumsum(sizes)[:-1])
-        terms = [x @ part for x, part in zip(inputs, parts, strict=True)]
-        x = terms[0] + (terms[1] + terms[2] + bias)
-        rows = x.shape[:-1]
-        x = x.reshape(-1, widths[0])  # matrix products are faster than batched ones
-        for width in widths[1:]:
-            x = nn.Dense(width)(nn.relu(x))
-        return x.reshape(rows)
-
-
-class Concatenated(nn.Module):
-    """A reward network from one of concatenated inputs, ``[..., O + Q + A] -> [...]`` or ``[..., 1]``.
-
-    Attributes:
-      network: the flax module, of vectors ``float[N, O + Q + A]``, or of any leading axes.
-
-    Example:
-      >>> import jax
-      >>> network = Concatenated(nn.Dense(1))
-      >>> read = jnp.zeros((5, 3)), jnp.zeros((5, 2)), jnp.zeros((5, 4))
-      >>> shape, _ = jax.eval_shape(network.init_with_output, jax.random.key(0), *read)
-      >>> shape.shape
-      (5,)
-    """
-
-    network: nn.Module
-
-    @nn.compact
-    def __call__(self, observation: jax.Array, memory: jax.Array, action: jax.Array) -> jax.Array:
-        inputs = (observation, memory, action)
-        rows = jnp.broadcast_shapes(*(x.shape[:-1] for x in inputs))
-        wide = [jnp.broadcast_to(x, (*rows, x.shape[-1])) for x in inputs]
-        result = self.network(jnp.concatenate(wide, axis=-1))
-        return result[..., 0] if result.shape == (*rows, 1) else result
-
-
-# --- the learner's data --------------------------------------------------------------------------
-
-
-@brief
-@struct.dataclass
-class Problem:
-    """Products of worlds with the task, observations, and demonstrations.
-
-    Attributes:
-      model: products stacked along a first axis of W worlds.
-      observation: ``float[W, S, O]``, of each world state.
-      counts: ``float[W, S, Q, A]``, demonstrated state-action counts; with a horizon
-        ``float[W, T, S, Q, A]``.
-      held_out: counts of the held-out demonstrations for early stopping; may be zero.
-      weight: ``float[W]``, factors of the worlds' likelihoods.
-      predecessors: of the product states, with a first axis of W, for a faster gradient; or None.
-      network: called as ``network(observation [S, 1, 1, O], memory [1, Q, 1, Q],
-        action [1, 1, A, A]) -> float[S, Q, A]``, memory and action one-hot; static.
-    """
-
-    model: Product
-    observation: jax.Array
-    counts: jax.Array
-    held_out: jax.Array
-    weight: jax.Array
-    predecessors: PredecessorTable | None = None
-    network: nn.Module = struct.field(pytree_node=False, default=RewardNetwork())
-
-    @property
-    def horizon(self) -> int | None:
-        """The number T of time steps of the counts, or None."""
-        return self.counts.shape[1] if self.counts.ndim == 5 else None
-
-
-@brief
-@struct.dataclass
-class Hparams:
-    """Settings; numbers are traced.
-
-    Attributes:
-      discount: in [0, 1); with a horizon also 1.
-      l2: at least 0; precision of the Gaussian prior on the parameters; default 1e-3.
-      learning_rate: of all optimizers but ``lbfgs``; default 3e-3.
-      patience: steps without a better held-out likelihood (with `mu`, plus the weighted satisfaction
-        probability) after which learning stops; default 50.
-      mu: at least 0; weight of the satisfaction probability (2.6) from the initial states; None:
-        none; default None.
-      tolerance: certified error of the soft values; None: the precision of the dtype;
-        default None.
-      optimizer: ``"adam"``, ``"sgd"``, ``"rmsprop"`` or ``"lbfgs"``; static; default ``"adam"``.
-      method: of :func:`~jaxltl.core.values.discounted.soft.soft_value`; static;
-        default ``"value_iteration"``.
-      horizon: number of steps of a run, for a time-dependent policy, or None; static;
-        default None.
-    """
-
-    discount: Number = traced(Range(0, 1))
-    l2: Number = traced(Range(0, open_above=True), default=1e-3)
-    learning_rate: Number = traced(Range(0, open_above=True), default=3e-3)
-    patience: Number = traced(Range(1), default=50)
-    mu: Number | None = traced(Range(0, open_above=True), default=None)
-    tolerance: Number | None = traced(Range(0, open_above=True), default=None)
-    optimizer: str = static(("adam", "sgd", "rmsprop", "lbfgs"), default="adam")
-    method: str = static(("newton", "value_iteration"), default="value_iteration")
-    horizon: int | None = static(COUNT, default=None)
 
 
 @brief
@@ -250,181 +116,6 @@ class Metrics:
     gradient_norm: jax.Array
     error: jax.Array
     status: jax.Array
-
-
-def make_problem(
-    worlds: Product | Sequence[Product],
-    observation: Any,
-    demonstrations: Trajectories | Sequence[Trajectories],
-    *,
-    held_out: float | Trajectories | Sequence[Trajectories] | None = 0.2,
-    network: nn.Module | None = None,
-    weight: Any = None,
-    horizon: int | None = None,
-    allowed: Any = None,
-) -> Problem:
-    """A checked :class:`Problem`, on the host.
-
-    Args:
-      worlds: a product, several, or products stacked along a first axis of W worlds.
-      observation: ``float[S, O]``, or one for each world.
-      demonstrations: in the world (not in the product), or one for each world.
-      held_out: share of each world's trajectories, the last ones, or other trajectories, for early
-        stopping; None or 0: no early stopping.
-      network: the reward; default :class:`RewardNetwork`.
-      weight: ``float[W]``, factors of the worlds' likelihoods; default 1.
-      horizon: count pairs by time, for ``Hparams.horizon``.
-      allowed: ``bool[S, Q, A]``, or one for each world: action mask of the policies, such as
-        :func:`~jaxltl.core.values.undiscounted.optimal_actions.optimal_actions`; default all.
-        Demonstrated steps outside of it do not count.
-
-    Returns:
-      :class:`Problem`, its arrays stacked over W worlds.
-
-    Raises:
-      ValueError: worlds of different shapes or propositions, observations, weights, rewards or
-        masks of a wrong shape, demonstrations that do not fit their world or exceed the horizon, or
-        no counted pair.
-    """
-    model = stack_models(worlds)
-    if allowed is not None:
-        model = restrict_stacked_actions(model, allowed)
-    num_worlds, dtype = model.letter.shape[0], model.dtype
-    observation = stack_observations(model, observation)
-    counts, other = training_counts(model, demonstrations, held_out, horizon=horizon)
-    weight = jnp.ones(num_worlds, dtype) if weight is None else jnp.asarray(weight, dtype)
-    if weight.shape != (num_worlds,):
-        raise ValueError(f"weight has shape {weight.shape}; expected {(num_worlds,)}.")
-    network = RewardNetwork() if network is None else network
-    _require_reward(network, model, observation)
-    return Problem(
-        model=model,
-        observation=observation,
-        counts=counts,
-        held_out=other,
-        weight=weight,
-        predecessors=predecessor_table([lane(model, w) for w in range(num_worlds)]),
-        network=network,
-    )
-
-
-def _require_reward(network: nn.Module, model: Product, observation: jax.Array) -> None:
-    inputs = _inputs(model, observation[0])
-    found = jax.eval_shape(lambda *x: network.init_with_output(jax.random.key(0), *x)[0], *inputs)
-    expected = (*observation.shape[1:2], *(x.shape[-1] for x in inputs[1:]))
-    if getattr(found, "shape", None) != expected:
-        what = getattr(found, "shape", type(found).__name__)
-        raise ValueError(
-            f"the network's reward has shape {what}; expected {expected}, one number for each "
-            "state, memory and action. A module on one vector is wrapped as Concatenated(module)."
-        )
-
-
-def _inputs(model: Product, observation: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """The network's inputs: observation, memory and action on their own axes."""
-    num_memory, num_actions = model.num_memory, model.mdp.available.shape[-1]
-    memory = jnp.eye(num_memory, dtype=observation.dtype)[None, :, None]
-    action = jnp.eye(num_actions, dtype=observation.dtype)[None, None]
-    return observation[:, None, None], memory, action
-
-
-# --- planning -------------------------------------------------------------------------------------
-
-
-def reward(
-    network: nn.Module, parameters: Any, model: Product, observation: jax.Array
-) -> jax.Array:
-    """The reward ``float[S, Q, A]`` of a `network` with `parameters` in a `model`, a product.
-
-    By the `observation` ``float[S, O]``; differentiable in it and in the parameters.
-
-    Example:
-      >>> from jaxltl import from_dense, product
-      >>> world = from_dense([[[0, 1.0]], [[0, 1.0]]], label=[[0], [1]], propositions=["g"])
-      >>> model = product(world, "F g")
-      >>> class Late(nn.Module):  # a reward of 1 in the final automaton state
-      ...     def __call__(self, observation, memory, action):
-      ...         return 0 * observation[..., 0] + memory[..., 1] + 0 * action[..., 0]
-      >>> jax.eval_shape(lambda seen: reward(Late(), {}, model, seen), jnp.eye(2)).shape
-      (2, 2, 1)
-    """
-    return jnp.asarray(network.apply(parameters, *_inputs(model, observation)))
-
-
-def plan(
-    network: nn.Module,
-    parameters: Any,
-    model: Product,
-    observation: jax.Array,
-    hparams: Hparams,
-    *,
-    initial: jax.Array | None = None,
-    allowed: jax.Array | None = None,
-) -> Solution:
-    """The soft value and policy (3.4), (3.5) of a learned reward in any world.
-
-    Args:
-      network, parameters: the reward.
-      model: the product; its automaton has as many states as that of the training worlds.
-      observation: ``float[S, O]``.
-      hparams: discount, tolerance, method and horizon are read.
-      initial: ``float[S, Q]``, initial value of the solver.
-      allowed: ``bool[S, Q, A]``, action mask in this world; default all. Inside the optimal actions
-        of its task the policy attains the optimal satisfaction probability.
-
-    Returns:
-      :class:`~jaxltl.core.types.Solution`, differentiable in the parameters; with a
-      horizon, value and policy have a first axis of time. Batches of worlds by ``vmap``.
-
-    Raises:
-      ValueError: unknown method, or a mask that does not fit.
-    """
-    model = model if allowed is None else with_allowed(model, allowed)
-    return _plan(reward(network, parameters, model, observation), model, hparams, initial)
-
-
-def _plan(
-    rewards: jax.Array, model: Product, hparams: Hparams, initial: jax.Array | None
-) -> Solution:
-    if hparams.horizon is not None:
-        return _backward_induction(rewards, model, hparams)
-    return soft_value(
-        model,
-        rewards,
-        hparams.discount,
-        initial=initial,
-        method=hparams.method,
-        tolerance=hparams.tolerance,
-    )
-
-
-def _backward_induction(rewards: jax.Array, model: Product, hparams: Hparams) -> Solution:
-    """Soft values of a finite horizon, ``V_T = 0``, by backward induction; exact up to rounding."""
-    rewards = jnp.asarray(rewards, model.dtype)
-    discount = jnp.asarray(hparams.discount, model.dtype)
-
-    def backup(value: jax.Array, _: None) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-        logits = policy_logits(model, rewards, discount, value)
-        value = jax.nn.logsumexp(logits, axis=-1)
-        return value, (value, jax.nn.softmax(logits, axis=-1))
-
-    horizon = int(hparams.horizon or 0)
-    last = jnp.zeros(model.state_shape, model.dtype)
-    _, (value, policy) = lax.scan(backup, last, None, length=horizon, reverse=True)
-    exact = lax.stop_gradient(value)
-    terms = model.num_successors + model.num_actions + 4
-    size = jnp.max(jnp.abs(rewards)) + jnp.max(jnp.abs(exact))
-    half = lax.stop_gradient(horizon * terms * jnp.finfo(model.dtype).eps * size)
-    finite = jnp.all(jnp.isfinite(exact))
-    return Solution(
-        value=value,
-        policy=policy,
-        lower=exact - half,
-        upper=exact + half,
-        residual=jnp.zeros((), model.dtype),
-        num_steps=jnp.int32(horizon),
-        status=status_code(finite, finite),
-    )
 
 
 def solve(
@@ -579,7 +270,7 @@ def _stationary(rewards: jax.Array, data: _World, hparams: Hparams) -> _Likeliho
     """Likelihoods of the stationary soft policy; the demonstrated one is differentiable."""
     model, counts = data.model, data.counts
     constant = lax.stop_gradient(rewards)
-    solution = lax.stop_gradient(_plan(constant, model, hparams, data.initial))
+    solution = lax.stop_gradient(soft_plan(constant, model, hparams, data.initial))
     log_policy = _log_policy(model, constant, hparams.discount, solution.value)
     policy = jnp.where(model.available, jnp.exp(log_policy), 0)
     satisfaction, cotangent = jnp.full((), jnp.nan, model.dtype), counts
@@ -611,7 +302,7 @@ def _satisfaction(model: Product, policy: jax.Array) -> jax.Array:
 def _time_dependent(rewards: jax.Array, data: _World, hparams: Hparams) -> _Likelihood:
     """Likelihoods of the time-dependent soft policy, differentiable by backward induction."""
     model = data.model
-    solution = _backward_induction(rewards, model, hparams)
+    solution = backward_induction(rewards, model, hparams)
     after = jnp.concatenate([solution.value[1:], jnp.zeros_like(solution.value[:1])])
     log_policy = jax.vmap(lambda v: _log_policy(model, rewards, hparams.discount, v))(after)
     return _Likelihood(
@@ -639,7 +330,7 @@ def _flat(*counts: jax.Array) -> list[jax.Array]:
 def _init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     """A state at the network's own random start; the key is kept."""
     dtype = problem.model.dtype
-    inputs = _inputs(problem.model, problem.observation[0])
+    inputs = network_inputs(problem.model, problem.observation[0])
     drawn = _draw(problem.network, learner.init_key(key), inputs)
     parameters = jax.tree.map(lambda x: jnp.asarray(x, dtype), drawn)
     return State(

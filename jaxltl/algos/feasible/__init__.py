@@ -1,0 +1,51 @@
+"""Feasible parameters of parametric Markov models by gradient ascent."""
+
+from jaxltl.algos.feasible.learner import (
+    Best,
+    Budget,
+    Feasible,
+    Hparams,
+    Metrics,
+    State,
+    evaluate,
+    feasible,
+    init,
+    policy,
+    run,
+    run_until,
+    start_at,
+    step,
+    train,
+    train_until,
+)
+from jaxltl.algos.feasible.problem import (
+    Problem,
+    certify,
+    make_problem,
+    require_problem,
+    within,
+)
+
+__all__ = [
+    "Best",
+    "Budget",
+    "Feasible",
+    "Hparams",
+    "Metrics",
+    "Problem",
+    "State",
+    "certify",
+    "evaluate",
+    "feasible",
+    "init",
+    "make_problem",
+    "policy",
+    "require_problem",
+    "run",
+    "run_until",
+    "start_at",
+    "step",
+    "train",
+    "train_until",
+    "within",
+]
