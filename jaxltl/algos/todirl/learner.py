@@ -66,7 +66,7 @@ from jaxltl.core.values.undiscounted.satisfaction import satisfaction_probabilit
 from jaxltl.algos.todirl.planning import backward_induction, plan, reward, soft_plan
 from jaxltl.algos.todirl.problem import Hparams, Problem, network_inputs
 
-ResultT = TypeVar("ResultT")
+_ResultT = TypeVar("_ResultT")
 
 
 @brief
@@ -136,7 +136,7 @@ def solve(
     return _each_world(world, problem.model, problem.observation, _initial(problem, initial))
 
 
-def _each_world(function: Callable[..., ResultT], *arguments: PyTree) -> ResultT:
+def _each_world(function: Callable[..., _ResultT], *arguments: PyTree) -> _ResultT:
     """``vmap`` over worlds, but for a single one, so that a vmap over seeds stays fast."""
     if jax.tree.leaves(arguments)[0].shape[0] == 1:
         one = function(*(jax.tree.map(lambda x: x[0], y) for y in arguments))
