@@ -194,7 +194,12 @@ def _init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
 
 
 def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
-    """``moves_per_step`` moves of every chain, each followed by an update of the table."""
+    """``moves_per_step`` moves of every chain, each followed by an update of the table.
+
+    All chains read the table, then all write. If m of them update one entry, they share the step
+    size a of its next visit, which equals m updates in sequence with the mean of their targets:
+    ``Q <- (1 - a)^m Q + (1 - (1 - a)^m) mean``.
+    """
     _check(problem, hparams)
     restart_key, action_key, successor_key = (
         jax.random.fold_in(learner.step_key(state), i) for i in range(3)

@@ -73,6 +73,7 @@ def plan(
 def soft_plan(
     rewards: jax.Array, model: Product, hparams: Hparams, initial: jax.Array | None
 ) -> Solution:
+    """The soft value and policy of `rewards` in a `model`, by `hparams`, started at `initial`."""
     if hparams.horizon is not None:
         return backward_induction(rewards, model, hparams)
     return soft_value(
