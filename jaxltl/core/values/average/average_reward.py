@@ -10,7 +10,7 @@ from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.sparse.solvers.average_reward import average
 from jaxltl.core.types import Solution
-from jaxltl.core.values.undiscounted.step_bounded import (
+from jaxltl.core.values.engine.state_quantities import (
     solution_from_error,
     finite_reward,
     reduction_for,

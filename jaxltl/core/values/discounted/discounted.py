@@ -20,7 +20,9 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxltl.core.values.engine.validated import validated
+from jaxltl.core.values.interval.robust import refuse_nature, robust_discounted_value
 from jaxltl.core.models.compiled.compiled import compiled_form, flatten_policy, reshape_solution
+from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.ops.array_namespace import is_traced
 from jaxltl.core.models.ops.choices import choices
 from jaxltl.core.models.ops.operators import (
@@ -210,6 +212,7 @@ def policy_value(
     reward: jax.Array,
     discount: jax.Array | float,
     *,
+    nature: str | None = None,
     tolerance: jax.Array | float | None = None,
     max_steps: jax.Array | int | None = None,
 ) -> Solution:
@@ -225,6 +228,7 @@ def policy_value(
       reward: ``float[S, A]`` or ``float[S, A, K]``; of a sparse model a name or as of
         :func:`~jaxltl.core.models.sparse.choice_reward`.
       discount: scalar in [0, 1).
+      nature: of an IntervalMDP, ``"adversarial"`` (default) or ``"cooperative"``.
       tolerance: width of the enclosure; default: what the dtype allows.
       max_steps: sweeps at most; default 100,000. Concrete sparse models are solved on the host,
         without sweeps, unless it is given.
@@ -244,6 +248,15 @@ def policy_value(
       >>> round(policy_value(mdp, jnp.array([0]), jnp.ones((1, 1)), 0.5).value.item(), 4)
       2.0
     """
+    if isinstance(model, IntervalMDP):
+        if max_steps is not None:
+            raise ValueError(
+                "models with intervals are solved by policy iteration; give no method."
+            )
+        return robust_discounted_value(
+            model, reward, discount, policy=policy, nature=nature, tolerance=tolerance
+        )
+    refuse_nature(nature)
     concrete = not is_traced((model, policy, reward, discount, tolerance))
     if is_sparse(model) and concrete and max_steps is None:
         return discounted(model, reward, discount, policy=policy, tolerance=tolerance)
@@ -294,6 +307,7 @@ def optimal_value(
     reward: jax.Array,
     discount: jax.Array | float,
     *,
+    nature: str | None = None,
     method: str = "auto",
     tolerance: jax.Array | float | None = None,
     max_steps: jax.Array | int | None = None,
@@ -308,6 +322,7 @@ def optimal_value(
       reward: ``float[S, A]`` or ``float[S, A, K]``; of a sparse model a name or as of
         :func:`~jaxltl.core.models.sparse.choice_reward`.
       discount: scalar in [0, 1).
+      nature: of an IntervalMDP, ``"adversarial"`` (default) or ``"cooperative"``.
       method: ``"policy_iteration"`` (Howard 1960, its systems solved to a hundredth),
         ``"modified_policy_iteration"`` (Puterman and Shin 1978: after each sweep of the
         optimality operator, `evaluation_sweeps` cheap ones under the greedy policy),
@@ -336,6 +351,13 @@ def optimal_value(
       >>> [round(v, 4) for v in best.value.tolist()], best.policy.tolist()
       ([1.0, 2.0], [1, 0])
     """
+    if isinstance(model, IntervalMDP):
+        if method != "auto" or max_steps is not None or evaluation_sweeps is not None:
+            raise ValueError(
+                "models with intervals are solved by policy iteration; give no method."
+            )
+        return robust_discounted_value(model, reward, discount, nature=nature, tolerance=tolerance)
+    refuse_nature(nature)
     concrete = not is_traced((model, reward, discount, tolerance))
     default = method == "auto" and max_steps is None and evaluation_sweeps is None
     if is_sparse(model) and concrete and default:

@@ -22,7 +22,7 @@ from jaxltl.core.types import (
     Status,
     row_tolerance,
 )
-from jaxltl.core.values.undiscounted.step_bounded import finite_reward
+from jaxltl.core.values.engine.state_quantities import finite_reward
 
 
 def status_between(

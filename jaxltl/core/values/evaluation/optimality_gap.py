@@ -31,7 +31,7 @@ from jaxltl.core.values.undiscounted.sparse_satisfaction import (
     at_states,
     product_satisfaction,
 )
-from jaxltl.core.values.undiscounted.step_bounded import solution_from_error
+from jaxltl.core.values.engine.state_quantities import solution_from_error
 
 _BATCH = 4096  # pairs of a world and a memory that are shown to an agent at once
 _SUM = 1e-4  # by how much a network's distribution may miss one; it is scaled

@@ -20,7 +20,7 @@ from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
 from jaxltl.core.types import Solution, require_shape
 from jaxltl.core import validation
 from jaxltl.core.values.engine.host_solution import status_between
-from jaxltl.core.values.undiscounted.step_bounded import state_mask
+from jaxltl.core.values.engine.state_quantities import state_mask
 
 TOLERANCE = 1e-6
 

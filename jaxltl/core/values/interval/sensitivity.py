@@ -15,7 +15,7 @@ from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.types import Solution
 from jaxltl.core import validation
 from jaxltl.core.values.interval.robust import nature_direction
-from jaxltl.core.values.undiscounted.step_bounded import state_mask
+from jaxltl.core.values.engine.state_quantities import state_mask
 
 
 @brief

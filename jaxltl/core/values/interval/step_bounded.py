@@ -15,11 +15,7 @@ from jaxltl.core.sparse.interval.step_bounded import StepBoundedValues
 from jaxltl.core.types import Solution
 from jaxltl.core import validation
 from jaxltl.core.values.interval.robust import entry_reward, nature_direction
-from jaxltl.core.values.undiscounted.step_bounded import (
-    solution_from_error,
-    state_reward,
-    state_mask,
-)
+from jaxltl.core.values.engine.state_quantities import solution_from_error, state_reward, state_mask
 
 
 def robust_next_probability(

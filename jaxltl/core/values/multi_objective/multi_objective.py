@@ -11,7 +11,7 @@ from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.types import Status
 from jaxltl.core import validation
 from jaxltl.core.values.multi_objective.objectives import Objective
-from jaxltl.core.values.undiscounted.step_bounded import TOLERANCE
+from jaxltl.core.values.engine.state_quantities import TOLERANCE
 
 from jaxltl.core.values.multi_objective.front_search import FrontSearch
 from jaxltl.core.values.multi_objective.results import (

@@ -15,7 +15,7 @@ from jaxltl.core.sparse.multi_objective.weighted_sum import WeightedProblem
 from jaxltl.core.sparse.product import SparseProduct, sparse_product
 from jaxltl.core.values import facts
 from jaxltl.core.values.undiscounted.sparse_satisfaction import automaton_and_letters
-from jaxltl.core.values.undiscounted.step_bounded import finite_reward, state_mask
+from jaxltl.core.values.engine.state_quantities import finite_reward, state_mask
 
 _MOST = 8  # probabilities at once, of which all sets are looked at
 

@@ -40,7 +40,7 @@ from jaxltl.core.values.interval.contest import (
     system,
 )
 from jaxltl.core.values.interval.robust import interval_reward, nature_direction, width_asked
-from jaxltl.core.values.undiscounted.step_bounded import state_mask
+from jaxltl.core.values.engine.state_quantities import state_mask
 
 _LOOSE = 1e-6  # how far ends may miss a distribution, as in the models
 

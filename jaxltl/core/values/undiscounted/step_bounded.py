@@ -11,16 +11,34 @@ from typing import Any
 import numpy as np
 
 from jaxltl.core.models.construct.convert import to_sparse
-from jaxltl.core.models.sparse import Rewards, SparseMDP, reward_structure, choice_reward
+from jaxltl.core.models.interval import IntervalMDP
+from jaxltl.core.models.sparse import SparseMDP, reward_structure
 from jaxltl.core.sparse.solvers import step_bounded as host
 from jaxltl.core.sparse.solvers.reward_bounded import bounded_cost, in_units
-from jaxltl.core.types import Solution, Status
+from jaxltl.core.types import Solution
+from jaxltl.core.values.interval import step_bounded as robust
+from jaxltl.core.values.interval.robust import refuse_nature
+from jaxltl.core.values.engine.state_quantities import (
+    reduction_for,
+    state_mask,
+    state_reward,
+    transition_reward,
+    finite_reward,
+    solution_from_error,
+)
 from jaxltl.core import validation
 
-TOLERANCE = 1e-6  # half the width of an enclosure up to which it counts as narrow, relative
+
+def _refuse_steps(by_step: bool) -> None:
+    if by_step:
+        raise ValueError(
+            "by_step is not for models with intervals; solve for each number of steps."
+        )
 
 
-def next_probability(model: Any, target: Any, *, objective: str = "max") -> Solution:
+def next_probability(
+    model: Any, target: Any, *, objective: str = "max", nature: str | None = None
+) -> Solution:
     """Probability that the next state is in a set: ``opt_a P(target | s, a)``.
 
     (Baier and Katoen 2008, section 10.6.1.)
@@ -29,6 +47,7 @@ def next_probability(model: Any, target: Any, *, objective: str = "max") -> Solu
       model: a SparseMDP, or any concrete model that :func:`to_sparse` takes.
       target: ``bool[S]``, or the name of a label.
       objective: ``"max"`` or ``"min"``; irrelevant for chains.
+      nature: of an IntervalMDP, ``"adversarial"`` (default) or ``"cooperative"``.
 
     Returns:
       :class:`Solution`; `value` is ``float64[S]``, `policy` the row of each state ``int32[S]``.
@@ -45,6 +64,9 @@ def next_probability(model: Any, target: Any, *, objective: str = "max") -> Solu
       >>> found.value.tolist(), found.policy.tolist()
       ([0.25, 1.0], [0, 2])
     """
+    if isinstance(model, IntervalMDP):
+        return robust.robust_next_probability(model, target, objective=objective, nature=nature)
+    refuse_nature(nature)
     model, operation = _problem(model, objective)
     mdp, target = model.host, state_mask(model, target, "target")
     # One step of "until" in which the target counts only once it is entered.
@@ -68,6 +90,7 @@ def bounded_reachability(
     *,
     stay: Any = None,
     objective: str = "max",
+    nature: str | None = None,
     by_step: bool = False,
 ) -> Solution:
     """Probability of reaching a set within n steps through states where one may stay.
@@ -82,6 +105,7 @@ def bounded_reachability(
       num_steps: n.
       stay: ``bool[S]`` or a label that must hold before the target is reached; default everywhere.
       objective: ``"max"`` or ``"min"``; irrelevant for chains.
+      nature: of an IntervalMDP, ``"adversarial"`` (default) or ``"cooperative"``.
       by_step: return the choices of all steps.
 
     Returns:
@@ -100,6 +124,12 @@ def bounded_reachability(
       >>> bounded_reachability(model, [False, True], 3).value.tolist()
       [0.875, 1.0]
     """
+    if isinstance(model, IntervalMDP):
+        _refuse_steps(by_step)
+        return robust.robust_bounded_reachability(
+            model, target, num_steps, stay=stay, objective=objective, nature=nature
+        )
+    refuse_nature(nature)
     model, operation = _problem(model, objective, num_steps)
     target = state_mask(model, target, "target")
     stay = np.ones_like(target) if stay is None else state_mask(model, stay, "stay")
@@ -108,14 +138,20 @@ def bounded_reachability(
 
 
 def cumulative_reward(
-    model: Any, reward: Any, num_steps: int, *, objective: str = "max", by_step: bool = False
+    model: Any,
+    reward: Any,
+    num_steps: int,
+    *,
+    objective: str = "max",
+    nature: str | None = None,
+    by_step: bool = False,
 ) -> Solution:
     """Expected reward of the next n steps.
 
     ``x_{k+1}(s) = opt_a r(s, a) + (P x_k)(s, a)`` from ``x_0 = 0`` (Puterman 1994, section 4.3).
 
     Args:
-      model, num_steps, objective, by_step: as for :func:`bounded_reachability`.
+      model, num_steps, objective, nature, by_step: as for :func:`bounded_reachability`.
       reward: as for :func:`~jaxltl.core.models.sparse.row_reward`; finite.
 
     Returns:
@@ -132,6 +168,12 @@ def cumulative_reward(
       >>> cumulative_reward(model, [1.0, 0.0], 3).value.tolist()
       [1.75, 0.0]
     """
+    if isinstance(model, IntervalMDP):
+        _refuse_steps(by_step)
+        return robust.robust_cumulative_reward(
+            model, reward, num_steps, objective=objective, nature=nature
+        )
+    refuse_nature(nature)
     model, operation = _problem(model, objective, num_steps)
     earned, magnitude = finite_reward(model, reward)
     zero = np.zeros(model.num_states)
@@ -140,14 +182,20 @@ def cumulative_reward(
 
 
 def instantaneous_reward(
-    model: Any, reward: Any, num_step: int, *, objective: str = "max", by_step: bool = False
+    model: Any,
+    reward: Any,
+    num_step: int,
+    *,
+    objective: str = "max",
+    nature: str | None = None,
+    by_step: bool = False,
 ) -> Solution:
     """Expected reward of the state after n steps.
 
     ``x_{k+1}(s) = opt_a (P x_k)(s, a)`` from the rewards of states ``x_0 = r``.
 
     Args:
-      model, objective, by_step: as for :func:`bounded_reachability`.
+      model, objective, nature, by_step: as for :func:`bounded_reachability`.
       reward: the name of a reward, a structure, or an array ``[S]``; of a structure only the rewards of
         states count. None is the only reward of the model.
       num_step: n.
@@ -166,6 +214,12 @@ def instantaneous_reward(
       >>> instantaneous_reward(model, [1.0, 0.0], 3).value.tolist()
       [0.125, 0.0]
     """
+    if isinstance(model, IntervalMDP):
+        _refuse_steps(by_step)
+        return robust.robust_instantaneous_reward(
+            model, reward, num_step, objective=objective, nature=nature
+        )
+    refuse_nature(nature)
     model, operation = _problem(model, objective, num_step)
     start = state_reward(model, reward)
     zero = np.zeros(model.num_rows)
@@ -218,7 +272,7 @@ def reward_bounded_reachability(
     stay = np.ones_like(target) if stay is None else state_mask(model, stay, "stay")
     if not 0 <= bound < math.inf:
         raise ValueError(f"bound={bound}; it must be finite and not negative.")
-    cost = _entry_reward(model, reward_structure(model, reward))
+    cost = transition_reward(model, reward_structure(model, reward))
     if (cost < 0).any():
         e = int(np.flatnonzero(cost < 0)[0])
         raise ValueError(
@@ -237,124 +291,3 @@ def reward_bounded_reachability(
 def _problem(model: Any, objective: str, num_steps: int = 0) -> tuple[SparseMDP, Any]:
     validation.integer("num_steps", num_steps)
     return to_sparse(model), reduction_for(objective)
-
-
-def reduction_for(objective: str) -> Any:
-    """``np.maximum`` or ``np.minimum``; ValueError if the objective is neither "max" nor "min"."""
-    if not isinstance(objective, str) or objective not in ("max", "min"):
-        raise ValueError(f'objective={validation.shorten(objective)}; it must be "max" or "min".')
-    return np.maximum if objective == "max" else np.minimum
-
-
-def state_mask(model: SparseMDP, given: Any, name: str) -> np.ndarray:
-    """A set of states as ``bool[S]``, from one in the model's shape or a label."""
-    if isinstance(given, str):
-        return np.asarray(model.states_with_label(given), bool)
-    given = np.asarray(given).reshape(-1)
-    if given.shape != (model.num_states,) or given.dtype != bool:
-        raise ValueError(
-            f"{name} is {given.dtype}{list(given.shape)}; give one bool for each of "
-            f"the {model.num_states} states, or a label."
-        )
-    return given
-
-
-def state_reward(model: SparseMDP, reward: Any) -> np.ndarray:
-    """The rewards of states, ``float64[S]``; ValueError without any, or if some are not finite."""
-    given = reward_structure(model, reward)
-    if given.state is None:
-        raise ValueError(
-            "the reward of a state after so many steps needs a reward on states, and "
-            "this one has none; give an array of one number a state."
-        )
-    return finite_reward(model, Rewards(state=given.state))[0][model.host.row_start[:-1]]
-
-
-def finite_reward(model: SparseMDP, reward: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Expected rewards of rows, and those of absolute values: ``float64[R]``; ValueError if not finite."""
-    given = reward_structure(model, reward)
-    earned = choice_reward(model, given)
-    if not np.isfinite(earned).all():
-        row = int(np.flatnonzero(~np.isfinite(earned))[0])
-        state = int(model.host.state[row])
-        raise ValueError(
-            f"the reward of state {state}, choice {row - int(model.row_start[state])} "
-            f"is {earned[row]}; make it finite."
-        )
-    if all(
-        x is None or (np.asarray(x) >= 0).all()
-        for x in (given.state, given.choice, given.transition)
-    ):
-        return earned, earned
-    sizes = {
-        name: None if x is None else np.abs(np.asarray(x))
-        for name, x in (
-            ("state", given.state),
-            ("choice", given.choice),
-            ("transition", given.transition),
-        )
-    }
-    return earned, choice_reward(model, Rewards(**sizes))
-
-
-def _entry_reward(model: SparseMDP, given: Rewards) -> np.ndarray:
-    """The reward of each entry, ``float64[T]``."""
-    mdp = model.host
-    found = np.zeros(mdp.num_transitions)
-    if given.transition is not None:
-        found += np.asarray(given.transition, np.float64)
-    if given.choice is not None:
-        found += np.asarray(given.choice, np.float64)[mdp.row]
-    if given.state is not None:
-        found += np.asarray(given.state, np.float64)[mdp.state[mdp.row]]
-    if not np.isfinite(found).all():
-        e = int(np.flatnonzero(~np.isfinite(found))[0])
-        raise ValueError(
-            f"the reward is {found[e]} from state {mdp.state[mdp.row[e]]} to "
-            f"{mdp.successor[e]}; make it finite."
-        )
-    return found
-
-
-def solution_from_error(
-    value: np.ndarray,
-    error: Any,
-    policy: Any,
-    num_steps: int,
-    *,
-    highest: float = math.inf,
-    tolerance: float = TOLERANCE,
-    least: float = 1.0,
-    residual: float = 0.0,
-) -> Solution:
-    """A :class:`Solution` from a value and its error.
-
-    Args:
-      value: ``float64[S]``.
-      error: broadcastable to it.
-      policy: rows.
-      num_steps: steps taken.
-      highest: 1 for probabilities.
-      tolerance: the error up to which it has converged, relative to the value,
-      least: or to this, if that is larger.
-      residual: of the solution.
-    """
-    error = np.broadcast_to(np.asarray(error, np.float64), value.shape)
-    out = error > 0
-    lower = np.where(out, np.nextafter(value - error, -np.inf), value)
-    upper = np.where(out, np.nextafter(value + error, np.inf), value)
-    if highest == 1:
-        lower, upper, value = (np.clip(x, 0, 1) for x in (lower, upper, value))
-    finite = bool(np.isfinite(value).all())
-    narrow = bool((error <= tolerance * np.maximum(np.abs(value), least)).all())
-    status = Status.CONVERGED if narrow else Status.PRECISION if finite else Status.NONFINITE
-    found: Any = {
-        "value": value + 0.0,
-        "policy": policy,
-        "lower": lower,
-        "upper": upper,
-        "residual": np.float64(residual),
-        "num_steps": np.int32(min(num_steps, 2**31 - 1)),
-        "status": np.int32(status),
-    }
-    return Solution(**found)

@@ -11,6 +11,7 @@ from jaxltl.core.models.interval import IntervalMDP, interval_rows, make_interva
 from jaxltl.core.models.product import product
 from jaxltl.core.models.sparse import Rewards, make_sparse
 from jaxltl.core.types import Status
+from jaxltl.core.values.discounted.discounted import optimal_value, policy_value
 from jaxltl.core.values.interval.robust import (
     host_sides,
     robust_discounted_value,
@@ -19,12 +20,24 @@ from jaxltl.core.values.interval.robust import (
     robust_total_reward,
 )
 from jaxltl.core.values.interval.satisfaction import _solved, robust_satisfaction
+from jaxltl.core.values.interval.step_bounded import (
+    robust_bounded_reachability,
+    robust_cumulative_reward,
+    robust_instantaneous_reward,
+    robust_next_probability,
+)
 from jaxltl.core.values.undiscounted.reachability import reachability_probability
 from jaxltl.core.values.undiscounted.satisfaction import (
     optimal_satisfaction,
     satisfaction_probability,
 )
 from jaxltl.core.values.undiscounted.sparse_satisfaction import sparse_satisfaction
+from jaxltl.core.values.undiscounted.step_bounded import (
+    bounded_reachability,
+    cumulative_reward,
+    instantaneous_reward,
+    next_probability,
+)
 from jaxltl.core.values.undiscounted.total_reward import total_reward
 from tests.reference_intervals import chains, parity, random_model, reach, reward
 from tests.support import counts, nature_word
@@ -466,3 +479,28 @@ def test_states_that_are_none(states, message):
     for solve, of in ((robust_satisfaction, model), (sparse_satisfaction, coin)):
         with pytest.raises(ValueError, match=message):
             solve(of, "F a", states=states)
+
+
+def test_general_functions_answer_for_intervals():
+    """One function per question: they return what the robust solvers return."""
+    model = labelled(np.random.default_rng(13))
+    target, reward = model.states_with_label("a"), np.arange(4.0)
+    for nature in ("adversarial", "cooperative"):
+        ask = {"nature": nature}
+        for general, robust, given in (
+            (next_probability, robust_next_probability, (target,)),
+            (bounded_reachability, robust_bounded_reachability, (target, 3)),
+            (cumulative_reward, robust_cumulative_reward, (reward, 3)),
+            (instantaneous_reward, robust_instantaneous_reward, (reward, 3)),
+            (optimal_value, robust_discounted_value, (reward, 0.9)),
+        ):
+            np.testing.assert_array_equal(
+                general(model, *given, **ask).value, robust(model, *given, **ask).value
+            )
+            with pytest.raises(ValueError, match="intervals"):
+                general(model.nominal, *given, **ask)
+        policy = np.asarray(model.nominal.host.row_start[:-1])
+        np.testing.assert_array_equal(
+            policy_value(model, policy, reward, 0.9, **ask).value,
+            robust_discounted_value(model, reward, 0.9, policy=policy, **ask).value,
+        )

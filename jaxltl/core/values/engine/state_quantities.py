@@ -1,0 +1,135 @@
+"""Checked sets and rewards of states, and solutions from values with an error."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from jaxltl.core import validation
+from jaxltl.core.models.sparse import Rewards, SparseMDP, choice_reward, reward_structure
+from jaxltl.core.types import Solution, Status
+
+TOLERANCE = 1e-6  # half the width of an enclosure up to which it counts as narrow, relative
+
+
+def reduction_for(objective: str) -> Any:
+    """``np.maximum`` or ``np.minimum``; ValueError if the objective is neither "max" nor "min"."""
+    if not isinstance(objective, str) or objective not in ("max", "min"):
+        raise ValueError(f'objective={validation.shorten(objective)}; it must be "max" or "min".')
+    return np.maximum if objective == "max" else np.minimum
+
+
+def state_mask(model: SparseMDP, given: Any, name: str) -> np.ndarray:
+    """A set of states as ``bool[S]``, from one in the model's shape or a label."""
+    if isinstance(given, str):
+        return np.asarray(model.states_with_label(given), bool)
+    given = np.asarray(given).reshape(-1)
+    if given.shape != (model.num_states,) or given.dtype != bool:
+        raise ValueError(
+            f"{name} is {given.dtype}{list(given.shape)}; give one bool for each of "
+            f"the {model.num_states} states, or a label."
+        )
+    return given
+
+
+def state_reward(model: SparseMDP, reward: Any) -> np.ndarray:
+    """The rewards of states, ``float64[S]``; ValueError without any, or if some are not finite."""
+    given = reward_structure(model, reward)
+    if given.state is None:
+        raise ValueError(
+            "the reward of a state after so many steps needs a reward on states, and "
+            "this one has none; give an array of one number a state."
+        )
+    return finite_reward(model, Rewards(state=given.state))[0][model.host.row_start[:-1]]
+
+
+def finite_reward(model: SparseMDP, reward: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Expected rewards of rows, and those of absolute values: ``float64[R]``; ValueError if not finite."""
+    given = reward_structure(model, reward)
+    earned = choice_reward(model, given)
+    if not np.isfinite(earned).all():
+        row = int(np.flatnonzero(~np.isfinite(earned))[0])
+        state = int(model.host.state[row])
+        raise ValueError(
+            f"the reward of state {state}, choice {row - int(model.row_start[state])} "
+            f"is {earned[row]}; make it finite."
+        )
+    if all(
+        x is None or (np.asarray(x) >= 0).all()
+        for x in (given.state, given.choice, given.transition)
+    ):
+        return earned, earned
+    sizes = {
+        name: None if x is None else np.abs(np.asarray(x))
+        for name, x in (
+            ("state", given.state),
+            ("choice", given.choice),
+            ("transition", given.transition),
+        )
+    }
+    return earned, choice_reward(model, Rewards(**sizes))
+
+
+def transition_reward(model: SparseMDP, given: Rewards) -> np.ndarray:
+    """The reward of each entry, ``float64[T]``."""
+    mdp = model.host
+    found = np.zeros(mdp.num_transitions)
+    if given.transition is not None:
+        found += np.asarray(given.transition, np.float64)
+    if given.choice is not None:
+        found += np.asarray(given.choice, np.float64)[mdp.row]
+    if given.state is not None:
+        found += np.asarray(given.state, np.float64)[mdp.state[mdp.row]]
+    if not np.isfinite(found).all():
+        e = int(np.flatnonzero(~np.isfinite(found))[0])
+        raise ValueError(
+            f"the reward is {found[e]} from state {mdp.state[mdp.row[e]]} to "
+            f"{mdp.successor[e]}; make it finite."
+        )
+    return found
+
+
+def solution_from_error(
+    value: np.ndarray,
+    error: Any,
+    policy: Any,
+    num_steps: int,
+    *,
+    highest: float = math.inf,
+    tolerance: float = TOLERANCE,
+    least: float = 1.0,
+    residual: float = 0.0,
+) -> Solution:
+    """A :class:`Solution` from a value and its error.
+
+    Args:
+      value: ``float64[S]``.
+      error: broadcastable to it.
+      policy: rows.
+      num_steps: steps taken.
+      highest: 1 for probabilities.
+      tolerance: the error up to which it has converged, relative to the value,
+      least: or to this, if that is larger.
+      residual: of the solution.
+    """
+    error = np.broadcast_to(np.asarray(error, np.float64), value.shape)
+    out = error > 0
+    lower = np.where(out, np.nextafter(value - error, -np.inf), value)
+    upper = np.where(out, np.nextafter(value + error, np.inf), value)
+    if highest == 1:
+        lower, upper, value = (np.clip(x, 0, 1) for x in (lower, upper, value))
+    finite = bool(np.isfinite(value).all())
+    narrow = bool((error <= tolerance * np.maximum(np.abs(value), least)).all())
+    status = Status.CONVERGED if narrow else Status.PRECISION if finite else Status.NONFINITE
+    found: Any = {
+        "value": value + 0.0,
+        "policy": policy,
+        "lower": lower,
+        "upper": upper,
+        "residual": np.float64(residual),
+        "num_steps": np.int32(min(num_steps, 2**31 - 1)),
+        "status": np.int32(status),
+    }
+    return Solution(**found)
