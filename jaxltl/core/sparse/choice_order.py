@@ -38,7 +38,7 @@ class Choices(NamedTuple):
 
     @property
     def is_chain(self) -> bool:
-        """Whether each state has one choice."""
+        """True if each state has one choice."""
         return self.order.size == self.states.size
 
     def best(self, quantity: Floats, operation: Any) -> Floats:

@@ -48,7 +48,7 @@ class HostMDP:
 
     @property
     def is_chain(self) -> bool:
-        """Whether every state has one choice."""
+        """True if every state has one choice."""
         return self.num_rows == self.num_states
 
     @cached_property
@@ -65,7 +65,7 @@ class HostMDP:
 
     @cached_property
     def is_self_loop(self) -> NDArray[np.bool_]:
-        """Whether the own state is the only successor of a row, ``bool[R]``."""
+        """Rows whose only successor is their own state, ``bool[R]``."""
         found: NDArray[np.bool_] = self.successor[self.entry_start[:-1]] == self.state
         count = np.diff(self.entry_start)
         several = np.flatnonzero(found & (count > 1))
@@ -111,7 +111,7 @@ class HostMDP:
         return HostMDP(states, start, self.successor[entry], self.probability[entry])
 
     def first_choice(self, mask: Booleans) -> tuple[Booleans, Integers]:
-        """Whether some row of a state is marked, and its first marked row (or its first row)."""
+        """States with a marked row, and the first marked row of each (or its first row)."""
         row = np.flatnonzero(mask)
         first = self.row_start[:-1].astype(np.int32)
         some = np.zeros(self.num_states, bool)

@@ -52,7 +52,7 @@ class Rows:
         return sparse.csr_array((data, self.successor, self.entry_start), shape=shape)
 
     def some_successor_in(self, region: Booleans) -> Booleans:
-        """Whether some successor lies in a region: ``bool[R, ...]`` from ``bool[S, ...]``."""
+        """Marks rows with a successor in a region: ``bool[R, ...]`` from ``bool[S, ...]``."""
         if not region.any():
             return np.zeros((self.num_rows, *region.shape[1:]), bool)
         if region.all():
@@ -137,7 +137,7 @@ def sorted_unique(number: Integers, size: int) -> Integers:
 
 
 def group_starts(number: Integers) -> Booleans:
-    """Whether each number differs from the number before it: ``bool[N]``.
+    """Marks the numbers that differ from the number before them: ``bool[N]``.
 
     >>> group_starts(np.array([1, 1, 3])).tolist()
     [True, False, True]
@@ -183,7 +183,7 @@ def rows_from_dense(used: Booleans) -> Rows:
 
 
 def some_action(mask: Booleans) -> Booleans:
-    """Whether a mask ``bool[..., A]`` holds for some action."""
+    """Marks where a mask ``bool[..., A]`` holds for some action."""
     if mask.shape[-1] > _FEW:
         return np.any(mask, -1, keepdims=True)[..., 0]
     some: Booleans = mask[..., 0].copy()
@@ -193,7 +193,7 @@ def some_action(mask: Booleans) -> Booleans:
 
 
 def first_action(mask: Booleans) -> tuple[Booleans, Integers]:
-    """Whether a mask ``bool[..., A]`` holds for some action, and the first one (or 0)."""
+    """Marks where a mask ``bool[..., A]`` holds for some action, and gives the first one (or 0)."""
     if mask.shape[-1] > _FEW:
         return np.any(mask, -1, keepdims=True)[..., 0], mask.argmax(-1).astype(np.int32)
     # Counting the actions before the first one is ten times faster than writing where it is.

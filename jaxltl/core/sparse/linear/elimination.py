@@ -277,7 +277,7 @@ def _first_entries(source: Integers, target: Integers, size: int) -> tuple[Integ
 
 
 def _too_much(matrix: Any, label: Integers) -> bool:
-    """Whether elimination in the order of the states fills more than the limit.
+    """True if elimination in the order of the states fills more than the limit.
 
     Factors fill nothing before the first entry of a row and of a column (George and Liu 1981). In
     components where that bound is too large, rows are counted along the elimination tree.

@@ -139,7 +139,7 @@ def _largest_share(gap: Floats, scale: Floats) -> float:
 
 
 def _leaves(equation: OptimalityEquation, policy: Integers) -> bool:
-    """Whether a policy leaves from everywhere."""
+    """True if a policy leaves from everywhere."""
     own = equation.matrix[policy]
     back = Edges(own.indptr, own.indices).reverse()
     return bool(forward_search(back.start, back.target, equation.leaving[policy] > 0).all())

@@ -114,7 +114,7 @@ class BlockProblem:
 
 @dataclass(frozen=True)
 class SweepSettings:
-    """What is asked of sweeps.
+    """Settings of sweeps.
 
     Attributes:
       sign: 1 to maximise, -1 to minimise.
@@ -159,7 +159,7 @@ def solve_by_sweeps(
 
     Args:
       problem: of a minimum, staying forever must cost infinitely much.
-      settings: what is asked.
+      settings: sign, accuracy and limits.
       start: ``float[N]``, a first guess of the values.
       time: a first guess of how long a policy stays, for an absolute tolerance.
     """
@@ -309,7 +309,7 @@ class _Search:
             before = change
 
     def is_hopeless(self, changes: list[float], goal: float) -> bool:
-        """Whether there would be too many sweeps at the rate of the last ones."""
+        """True if there would be too many sweeps at the rate of the last ones."""
         most = self.settings.max_sweeps
         if self.sweeps >= most:
             return True

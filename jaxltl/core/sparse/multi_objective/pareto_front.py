@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from jaxltl.core.array_types import Floats
 
 _EPS = float(np.finfo(np.float64).eps)
-_NEAR = 1e-6  # of the size of a program: what it may not tell from what is farthest out
+_NEAR = 1e-6  # of the size of a program: differences that it does not resolve
 _ZOOMS = 12
 _EXACT = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
 
@@ -99,7 +99,7 @@ def mixture(lower: Floats, share: Floats) -> Floats:
 
 
 def meets(lower: Floats, share: Floats, wanted: Floats) -> bool:
-    """Whether a mixture certainly attains a vector, in exact arithmetic.
+    """True if a mixture certainly attains a vector, in exact arithmetic.
 
     Args:
       lower: ``float64[N, n]``.
@@ -134,7 +134,7 @@ def plain(share: Floats) -> Floats:
 
 
 def exceeds(normal: Floats, bound: float, vector: Floats) -> bool:
-    """Whether a vector is certainly outside of a half-space ``normal @ y <= bound``."""
+    """True if a vector is certainly outside of a half-space ``normal @ y <= bound``."""
     slack = 4 * _EPS * (vector.size + 2) * (normal @ np.abs(vector) + abs(bound))
     return bool(normal @ vector - slack > bound)
 
@@ -212,7 +212,7 @@ def _largest_mixtures(
         return [inner]
     best = np.maximum(found.x, 0)
     best /= best.sum()
-    # A program's answer is rounded: what it misses, a little of what is well inside makes up for.
+    # A program is rounded: a small share of an inner point makes up for what it misses.
     misses = (least - mixture(points, best))[asked] + 4 * _EPS * np.abs(least[asked])
     misses = np.maximum(misses, 0)
     spare = (mixture(points, inner) - least)[asked]
@@ -238,7 +238,7 @@ def _outer(
     if found.status != 0:
         return np.inf, None
     weight = np.maximum(-np.asarray(found.ineqlin.marginals), 0)
-    # Any combination of half-spaces is one, and the others are at least what is asked of them.
+    # Any nonnegative combination of half-spaces is one; the others meet their thresholds.
     normal, bound = weight @ normals, float(weight @ bounds)
     if not normal[index] > 0:
         return np.inf, found.x * scale

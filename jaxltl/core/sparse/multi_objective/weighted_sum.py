@@ -67,7 +67,7 @@ class FinalComponents(NamedTuple):
 
 
 def final_components(sums: WeightedProblem) -> FinalComponents | None:
-    """Where runs may end; None if some initial state does not reach that almost surely."""
+    """Final components; None if some initial state does not reach them almost surely."""
     mdp = sums.mdp
     free = (sums.cost == 0).all(0) & sums.ended[mdp.state]
     homes = end_components(mdp, rows=free)
@@ -149,7 +149,7 @@ def weighted_optimum(
     first = np.flatnonzero(sums.start)
     share, high = sums.start[first], bound[quotient.node[first]]
     total = float(share @ high)
-    # What ends are worth may cancel what is spent, and its rounding stays.
+    # Final values and costs may cancel; their rounding stays.
     size = float(share @ np.abs(high)) + float(np.abs(worth).max(initial=0))
     total += 4 * _EPS * size * (1 + first.size)
     weight, home = _policy(mdp, where, free, best, quotient, row)

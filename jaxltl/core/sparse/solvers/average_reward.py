@@ -50,7 +50,7 @@ _LINGERS = 1e12  # range of biases, relative to rewards, that shows states that 
 _IDLE = 6  # policies that improve the gain by no more than
 _IDLE_SHARE = 1e-12  # this share, after which policy iteration ends
 _NEAR = 1e-3  # of the range of biases: the best states
-_TINY = 1e-13  # gains beside which a relative tolerance is not reachable
+_TINY = 1e-13  # relative size of gains that have no relative tolerance
 _LOOSEST = 1e-3  # share up to which second-order terms are negligible
 _FLOOR = 1e-6  # relative to the largest reward: gains near zero are not resolved further
 
@@ -91,7 +91,7 @@ def average(
       magnitude: ``float64[R]``, the sum of absolute values behind each reward.
       tolerance: the width, relative to the value.
       max_steps: sweeps at most.
-      sign: -1 if the rewards are negated ones, of which the smallest average is asked for.
+      sign: -1 if the rewards are negated ones, for a smallest average.
     """
     found = end_components(mdp)
     states = np.flatnonzero(found.region(mdp))
@@ -116,7 +116,7 @@ def average(
     if half <= width:
         (low, high, taken, rounds), slack = stopping.solve(middle, tolerance, width, sign), half
     else:
-        # Beside small gains the error of large ones would be too much: both sides separately.
+        # The error of large gains would be too much for small ones: both sides separately.
         low, _, taken, rounds = stopping.solve(gains.lower, tolerance, width, sign)
         high, slack = stopping.solve(gains.upper, tolerance, width, sign)[1], 0.0
     return AverageReward(
@@ -167,7 +167,7 @@ class _Stopping:
         mdp = self.mdp
         size, worth = mdp.num_states - gain.size, sign * gain
         shift = min(float(worth.min()), 0.0)
-        # Beside large gains, a share of almost zero cannot be resolved.
+        # Gains that are almost zero compared with others are not resolved relatively.
         relative = shift == 0 and bool((worth[worth > 0] > _TINY * worth.max()).all())
         known = np.concatenate([np.zeros(size), worth - shift])
         interior = np.arange(mdp.num_states) < size

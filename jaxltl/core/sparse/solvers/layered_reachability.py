@@ -35,7 +35,7 @@ from jaxltl.core.sparse.solvers.reachability import expands_fast, quotient_polic
 _EPS = float(np.finfo(np.float64).eps)
 _TINY = 1e-290
 _STARTS = 8  # states from one of which few steps
-_MET = 4096  # lead to so many, where the graph is shallow and sweeps end soon
+_MET = 4096  # lead to that many, so that the graph is shallow and sweeps end soon
 _MOST = 2**27  # transitions of a component that is written out, at most
 
 
@@ -138,7 +138,7 @@ def layered_reachability(
 
 
 def _mixes(world: PaddedProduct) -> bool:
-    """Whether few steps from some state lead to many others."""
+    """True if few steps from some state lead to many others."""
     size = world.letter.size
 
     def follow(states: Any) -> Any:

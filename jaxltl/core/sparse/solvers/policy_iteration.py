@@ -72,7 +72,7 @@ def policy_iteration(
       problem: the problem.
       maximize: for a maximum every policy must leave the interior almost surely; for a minimum
         those that do not must have infinite cost.
-      tolerance: the width of the enclosure asked for.
+      tolerance: the width of the enclosure.
       relative: whether that is a share of the value.
     """
     rows, sign = interior_rows(problem), 1 if maximize else -1
@@ -207,7 +207,7 @@ class _CoreSolver:
       label: ``int[M]``, strongly connected components in topological order.
       proper: ``int[M]``, a policy that leaves almost surely, if some do not.
       unit: the relative rounding of a backup; outer_error: of the known values.
-      tolerance, relative: the width asked for.
+      tolerance, relative: the accuracy.
     """
 
     equation: OptimalityEquation
@@ -277,7 +277,7 @@ class _CoreSolver:
             else:
                 time = solver.solve(ones)
             other = self._extra_cost(time, value)
-            # A better policy may be worth so much more that its rounding needs a larger extra.
+            # A better policy may have a value whose rounding needs a larger extra.
             if extra / 2 <= other <= (2 * extra if found is None else np.inf):
                 break
             extra = other

@@ -51,10 +51,10 @@ class ReducedProblem:
       problem: on the nodes of `quotient`, or else of `contraction`; None if nothing is left.
       quotient: of `contraction.mdp`, the model whose end components are states; None without any.
       components: these end components.
-      fixed, fixed_row: nodes of `contraction` whose rows are known whatever the solution is.
+      fixed, fixed_row: nodes of `contraction` whose rows are known in advance.
       mdp: the model; contraction: the model without chains.
       highest: a bound on all values.
-      maximize: whether the largest value is asked for.
+      maximize: whether to maximise.
     """
 
     known_value: Floats
@@ -396,7 +396,7 @@ def solve_shortest_path(
 
 
 def mixes(problem: ShortestPathProblem, size: int) -> bool:
-    """Whether few steps from a state lead to many others."""
+    """True if few steps from a state lead to many others."""
     mdp, interior = problem.mdp, problem.interior
     first = mdp.entry_start[mdp.row_start]
 
@@ -417,7 +417,7 @@ def expands_fast(
     met: int | None = None,
     steps: int = _STEPS,
 ) -> bool:
-    """Whether few steps from a state lead to many others.
+    """True if few steps from a state lead to many others.
 
     Args:
       follow: the successors of some states ``int[M]``, maybe repeated.
@@ -493,7 +493,7 @@ def _stochastic_loops(problem: ShortestPathProblem) -> tuple[Floats, Booleans | 
 
 
 def worst_width(found: Enclosure, *, relative: bool) -> float:
-    """The width of the widest enclosure, relative to the value if asked for."""
+    """The width of the widest enclosure, relative to the value if `relative`."""
     low, high = found.lower, found.upper
     finite = np.isfinite(high)
     width: Any = np.where(finite, high - np.where(finite, low, 0), np.where(low == high, 0, np.inf))

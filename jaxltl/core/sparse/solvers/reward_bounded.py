@@ -169,7 +169,7 @@ def _shape(
     found = end_components(mdp, member if maximal else open_, free)
     inside = found.inside
     if not maximal:
-        # Who may go round without cost for ever need not get there.
+        # A policy that stays in an end component without cost avoids the target.
         member &= ~found.region(mdp)
         inside = np.zeros_like(inside)
     leader = np.where(member & maximal, found.component, np.arange(mdp.num_states))

@@ -28,9 +28,7 @@ _LARGEST = 8.0 * 2**30  # bytes of the choices of all steps
 _LONG = 4096  # backups after which the effect of all further ones is bounded, then at each doubling
 _CLOSE = 1e-9  # effect of all further backups, relative, at which the iteration stops
 _POWER_STATES = 200  # states up to which long horizons of a chain are solved by matrix powers
-_WORK = (
-    2.0**38
-)  # multiplications of one iteration; beyond these, bounds of what is left are returned
+_WORK = 2.0**38  # multiplications of one iteration; beyond these, the rest is bounded
 _OVERHEAD = 10_000  # multiplications in the time that NumPy's calls of one backup take
 _MANY = 32  # steps from which states that cannot reach the target in time are left out
 
@@ -84,7 +82,7 @@ class Backup(NamedTuple):
 
     @property
     def small_chain(self) -> bool:
-        """Whether matrix powers are cheaper than many backups."""
+        """True if matrix powers are cheaper than many backups."""
         return self.choices.is_chain and self.places.size <= _POWER_STATES
 
     def best(self, quantity: Floats) -> Floats:
@@ -343,7 +341,7 @@ def _within(
     surely: bool,
     choose_some: bool,
 ) -> Booleans:
-    """Whether a target is reached in n steps possibly, or surely, by some choices or by all."""
+    """True if a target is reached in n steps possibly, or surely, by some choices or by all."""
     region = target
     choose = np.logical_or if choose_some else np.logical_and
     for _ in range(num_steps):

@@ -45,7 +45,7 @@ def solution_from_enclosure(
       model: the model of the question.
       sparse: the same as sparse rows; None if the policy is one of actions already.
       found: the enclosure.
-      tolerance: the width that was asked for.
+      tolerance: the requested width.
       relative: whether that is a share of the value.
     """
     low, high = found.lower, found.upper
@@ -137,7 +137,7 @@ def induced_chain(model: Any, sparse: SparseMDP, policy: Any) -> Chain:
     chain = (mix @ host.matrix).tocsr()
     chain.sort_indices()
     most = int(count.max())
-    depth = 2 * most + 4 if most > 1 else 0  # two sums of so many terms, one to divide by
+    depth = 2 * most + 4 if most > 1 else 0  # two sums of that many terms, one to divide by
     states = np.arange(host.num_states + 1)
     return Chain(HostMDP(states, chain.indptr, chain.indices, chain.data), weight, depth)
 

@@ -199,7 +199,7 @@ class FrontSearch:
     def decide(
         self, wanted: np.ndarray, max_points: int
     ) -> tuple[bool | None, np.ndarray | None, int | None]:
-        """Whether a vector is attained, by which mixture, or which half-space excludes it."""
+        """Decides whether a vector is attained, with a mixture or a half-space as evidence."""
         looked = 0
         while True:
             for k in range(looked, len(self.normals)):
@@ -226,7 +226,7 @@ class FrontSearch:
         return True
 
     def _known(self, normal: np.ndarray) -> bool:
-        """Whether a weighted sum was solved as accurately already, up to rounding."""
+        """True if a weighted sum was solved as accurately already, up to rounding."""
         size = normal * self.scale
         return any(
             np.abs(size / size.sum() - x * self.scale / (x * self.scale).sum()).max() < 1e-12

@@ -44,7 +44,7 @@ def achievable(
     tolerance: float = TOLERANCE,
     max_points: int = 200,
 ) -> Achievable:
-    """Whether one policy, with memory and randomisation, meets thresholds on several objectives.
+    """Achievability: does one policy, with memory and randomisation, meet all thresholds?
 
     Weighted sums are solved one after the other: each adds a point that its policy attains and a
     half-space that no policy leaves (Forejt, Kwiatkowska and Parker 2012). Thresholds are met if a

@@ -71,7 +71,7 @@ class NearestMixture(NamedTuple):
 
 @brief
 class Achievable(NamedTuple):
-    """Whether thresholds can be met together.
+    """Answer to an achievability query.
 
     Attributes:
       holds: True, False, or None if unknown.

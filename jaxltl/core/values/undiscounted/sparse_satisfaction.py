@@ -34,14 +34,14 @@ from jaxltl.core.values.undiscounted.complement import opposite_event
 
 @brief(facts=facts.satisfaction)
 class Satisfaction(NamedTuple):
-    """The best probability of a task, with a policy that has a memory.
+    """Optimal satisfaction probability, with a finite-memory policy.
 
     Attributes:
-      solution: value, lower and upper are ``float64[I]``, one for each state that was asked for.
-      automaton: the task, over the letters that occur.
-      letter: ``int[S]``, the letter that each state shows.
-      product: what is reached of the model beside the automaton, N states.
-      row: ``int32[N]``, the row of the model that the policy takes in each of them.
+      solution: value, lower and upper are ``float64[I]``, one for each requested state.
+      automaton: of the formula, over the letters that occur.
+      letter: ``int[S]``, the letter of each state.
+      product: the reachable product of the model and the automaton, N states.
+      row: ``int32[N]``, the policy's row of the model in each of them.
 
     Example:
       >>> from jaxltl import make_sparse
@@ -69,30 +69,27 @@ def sparse_satisfaction(
     label_on: str = "entry",
     tolerance: float | None = None,
 ) -> Satisfaction:
-    """Largest or smallest probability of satisfying a formula, from some states.
+    """Optimal probability of satisfying an LTL formula from some states of a sparse model.
 
-    Only what is reached of the product of the model and the formula's automaton is written out (an
-    automaton of one state has the model itself for a product), and that only until the verdict is
-    known. In it the task is to reach states whose verdict is yes, among them, for Buchi and parity
-    acceptance, the accepting end components (Baier and Katoen 2008, section 10.6.4); for a safety
-    formula, not to reach those whose verdict is no. The least probability of Buchi and parity is
-    one minus the largest of the negation.
+    Computed on the reachable product with the formula's automaton, up to states whose verdict is known.
+    It is the probability of reaching accepting states and, under Buchi and parity acceptance, accepting
+    end components (Baier and Katoen 2008, section 10.6.4); for a safety formula, of avoiding rejecting
+    states. Minima under Buchi and parity acceptance are one minus maxima for the negation.
 
     Args:
       model: the model.
       task: a formula, its text, or an automaton over the letters that occur in the model.
       objective: ``"max"`` or ``"min"``.
       states: ``int[I]``, where runs start; default the initial states.
-      label_on: ``"entry"``: the label of the first state is read at once; ``"exit"``: as it is
-        left. The probabilities are the same, for the run shows the same word.
+      label_on: ``"entry"``, reads the label of the first state at once; ``"exit"``, as it is left. The
+        probabilities are equal, as the run has the same word.
       tolerance: of :func:`~jaxltl.core.values.undiscounted.reachability.reachability_probability`.
 
     Returns:
       :class:`Satisfaction`.
 
     Raises:
-      ValueError: an unknown label, state, objective or reading, or a product beyond 2^31
-        states.
+      ValueError: an unknown label, state, objective or reading, or a product beyond 2^31 states.
 
     Concrete arrays only, on the host; not differentiable.
 
@@ -171,7 +168,7 @@ def _best(
         entry_letter = product.entry_letter(reader.letter, reader.on_entry)
         source = product.host.state[product.host.row]
         priority = automaton.priority[product.memory[source], entry_letter] + opposite
-        # Absorbing states have their verdict, and no end component beside it.
+        # Absorbing states have their verdict, and no other end component.
         priority[product.still[source]] = 1
         visiting = accepting_region(product.host, priority)
         goal = goal | visiting.region
