@@ -1,4 +1,4 @@
-"""What is said of a release is the same in all places, and no more is promised than is there."""
+"""Version, metadata and contents of the distribution agree."""
 
 import re
 import tomllib
