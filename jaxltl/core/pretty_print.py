@@ -1,9 +1,8 @@
-"""How objects show themselves: some facts of each in a few lines, never pages of arrays.
+"""Short ``repr`` of objects: a few lines of facts, never pages of arrays.
 
-``brief`` gives a class its ``repr``. What an array holds is read where the host has it and it is
-small; of an abstract one, inside ``jit`` or of ``eval_shape``, and of one that lies elsewhere, the
-type and the shape are told. JAX is not imported here: only where somebody else has loaded it can
-an array be one of its.
+The decorator ``brief`` defines the ``repr`` of a class. Small arrays on the host are read; of traced,
+abstract and distributed arrays only the dtype and the shape appear. This module does not import JAX,
+and looks it up only where it is already loaded.
 """
 
 from __future__ import annotations
@@ -51,13 +50,13 @@ def brief(
     drawn: bool = False,
     codes: Mapping[str, Any] | None = None,
 ) -> Any:
-    """A class whose ``repr`` is short, whatever its fields hold.
+    """A class decorator for a short ``repr``.
 
     Args:
       cls: a dataclass or a named tuple.
-      facts: what is told of an object, text by text, the most telling first; default its fields.
-      drawn: whether notebooks show the picture that :func:`picture` has of it, over the text.
-      codes: by the name of a field the ``enum`` whose numbers it holds.
+      facts: texts about an object, the most important first; default: its fields.
+      drawn: True if notebooks show :func:`picture` of the object above the text.
+      codes: the ``enum`` of the codes in a field, by field name.
 
     Example:
       >>> @brief
@@ -87,7 +86,7 @@ def _repr(self: Any) -> str:
 
 
 def _safe(facts: Facts, plain: Facts, value: Any) -> list[str]:
-    """Trees hold all kinds of things for a while, such as axes and shardings."""
+    """The facts of an object; JAX temporarily stores axes and shardings in the fields of trees."""
     for told in (facts, plain):
         try:
             return [text for text in told(value) if isinstance(text, str) and text]
@@ -100,7 +99,7 @@ def _safe(facts: Facts, plain: Facts, value: Any) -> list[str]:
 
 
 def laid_out(name: str, facts: Sequence[str]) -> str:
-    """Facts in brackets after a name, in one line or several, cut off where they are too many."""
+    """A name with facts in parentheses, in at most `LINES` lines."""
     line = f"{name}({', '.join(facts)})"
     if len(line) <= WIDTH and "\n" not in line:
         return line
@@ -117,7 +116,7 @@ def laid_out(name: str, facts: Sequence[str]) -> str:
 
 
 def nested_repr(value: Any, width: int = _HEAD) -> str:
-    """An object inside of another: its name and as many facts as there is room for."""
+    """The ``repr`` of an object inside another: its name and as many facts as fit."""
     facts = getattr(type(value), "_brief_facts", None)
     if facts is None:
         return truncate(repr(value), width)
@@ -131,13 +130,13 @@ def nested_repr(value: Any, width: int = _HEAD) -> str:
 
 
 def truncate(text: str, width: int = _HEAD) -> str:
-    """A text in one line, of at most so many characters."""
+    """A text in one line of at most `width` characters."""
     text = " ".join(text.split())
     return text if len(text) <= width else f"{text[: width - 3]}..."
 
 
 def count(number: Any, noun: str, nouns: str = "") -> str:
-    """How many there are of something, in words.
+    """A number with a noun.
 
     >>> count(1, "state"), count(1_000_000, "state"), count(2, "entry", "entries")
     ('1 state', '1,000,000 states', '2 entries')
@@ -146,7 +145,7 @@ def count(number: Any, noun: str, nouns: str = "") -> str:
 
 
 def names_text(words: Iterable[Any], width: int = _HEAD) -> str:
-    """Names one after the other; of many, the first and how many there are in all.
+    """A list of names, truncated with the total number.
 
     >>> names_text(f"a{i}" for i in range(1000))
     'a0, a1, a2, a3, a4, a5, a6, a7, a8, a9, a10, a11, a12, a13, ... (1000 in all)'
@@ -162,12 +161,12 @@ def names_text(words: Iterable[Any], width: int = _HEAD) -> str:
 
 
 def propositions_text(propositions: Sequence[str]) -> str:
-    """What labels speak of."""
+    """The propositions of labels."""
     return f"over {names_text(propositions) or 'no propositions'}"
 
 
 def batch_text(shape: Sequence[int]) -> str:
-    """How many there are side by side; nothing where there is one."""
+    """The batch shape; empty for no batch."""
     return (
         count(shape[0], "lane")
         if len(shape) == 1
@@ -179,12 +178,12 @@ def batch_text(shape: Sequence[int]) -> str:
 
 
 def is_array(value: Any) -> bool:
-    """Whether something has a shape and a type, also without numbers."""
+    """True for objects with a shape and a dtype, abstract ones included."""
     return hasattr(value, "shape") and hasattr(value, "dtype")
 
 
 def readable(value: Any, most: int = READ) -> NDArray[Any] | None:
-    """The numbers of an array that the host can read at once; else None."""
+    """The NumPy array of an array that the host can read at once, else None."""
     if isinstance(value, bool | int | float):
         return np.asarray(value)
     if not is_array(value) or not isinstance(value.dtype, np.dtype) or value.size > most:
@@ -203,7 +202,7 @@ def readable(value: Any, most: int = READ) -> NDArray[Any] | None:
 
 
 def array_text(value: Any) -> str:
-    """The type and the shape of an array, and where it is if that is not here.
+    """The dtype and the shape of an array, and its devices if there are several.
 
     >>> array_text(np.zeros((2, 3), np.float32))
     'float32[2, 3]'
@@ -221,15 +220,15 @@ def array_text(value: Any) -> str:
 
 
 def number(value: Any) -> str:
-    """A number; of one that is not whole, six digits."""
+    """A number, with six digits unless it is an integer."""
     whole = isinstance(value, bool | np.bool_ | int | np.integer)
     return str(value) if whole else f"{value:.6g}"
 
 
 def value_range(value: Any) -> str:
-    """What an array holds: a few numbers one by one, of more the least and the greatest.
+    """The values of an array: all of a few, the range of many.
 
-    >>> value_range(np.array([0.25, np.nan])), span(np.arange(9)), span(np.zeros(9, bool))
+    >>> value_range(np.array([0.25, np.nan])), value_range(np.arange(9)), value_range(np.zeros(9, bool))
     ('[0.25, nan]', '0 to 8', '0 of 9 true')
     """
     read = readable(value)
@@ -255,9 +254,9 @@ def value_range(value: Any) -> str:
 
 
 def bounds_text(lower: Any, upper: Any) -> str:
-    """How far certified bounds are apart at most, and where there are none.
+    """The largest width of certified bounds, and the number of states without.
 
-    >>> bounds_text(np.zeros(3), np.array([0, 1e-6, np.inf])), apart(-np.inf, np.inf)
+    >>> bounds_text(np.zeros(3), np.array([0, 1e-6, np.inf])), bounds_text(-np.inf, np.inf)
     ('bounds at most 1e-06 apart, none for 1 of 3', 'no bounds')
     """
     low, high = readable(lower), readable(upper)
@@ -276,7 +275,7 @@ def bounds_text(lower: Any, upper: Any) -> str:
 
 
 def enum_counts(value: Any, codes: Iterable[enum.IntEnum]) -> str:
-    """The names of codes; of several, how many of each there are, the first code first."""
+    """The name of a code; for an array the number of each code."""
     read = readable(value)
     if read is None or read.dtype.kind not in "iu":
         return array_text(value) if is_array(value) else truncate(str(value))
@@ -292,7 +291,7 @@ def enum_counts(value: Any, codes: Iterable[enum.IntEnum]) -> str:
 
 
 def fields(value: Any, codes: Mapping[str, Any] | None = None) -> Iterator[str]:
-    """All fields of an object, each with what is in it; of lanes of a learner how many they are."""
+    """All fields of an object with their values, and the batch shape of a learner's state."""
     step = getattr(value, "step", None)
     if step is not None and is_array(step):
         yield batch_text(step.shape)
@@ -306,14 +305,14 @@ def fields(value: Any, codes: Mapping[str, Any] | None = None) -> Iterator[str]:
 
 
 def field(name: str, value: Any, codes: Iterable[enum.IntEnum] | None = None) -> str:
-    """A name and what it stands for."""
+    """A field with its value."""
     if codes is not None and is_array(value):
         return f"{name}={enum_counts(value, codes)}"
     return f"{name}={describe(value)}"
 
 
 def describe(value: Any) -> str:
-    """Any value in a few words."""
+    """A short description of any value."""
     if is_array(value):
         text = value_range(value)
         if text.startswith("[") or np.ndim(value) == 0 or text == array_text(value):
@@ -332,7 +331,7 @@ def describe(value: Any) -> str:
 
 
 def _tree(value: Any) -> str:
-    """What is no single array: the name of its type or function, and how many arrays are in it."""
+    """A description of a tree or function: its type or name, and the number of arrays."""
     leaves = [x for x in _leaves(value) if is_array(x)]
     inner = value
     while hasattr(inner, "func"):  # of partial functions
@@ -349,7 +348,7 @@ def _tree(value: Any) -> str:
 
 
 def _leaves(value: Any) -> list[Any]:
-    """Of any tree, if JAX is there to say what one is."""
+    """The leaves of a tree."""
     jax = sys.modules.get("jax")
     if jax is not None:
         return list(jax.tree.leaves(value))
@@ -360,9 +359,9 @@ def _leaves(value: Any) -> list[Any]:
 
 
 def history(value: Any, codes: Mapping[str, Any] | None = None) -> Iterator[str]:
-    """Fields that are rows of figures: the last of them, and how all statuses are.
+    """Fields of histories: the last row of each, and the counts of all statuses.
 
-    Of ``status [...]`` the axes say how many rows there are; before the last axis they are lanes.
+    The axes of ``status [...]`` are the rows, with batch axes before the last one.
     """
     shape = tuple(value.status.shape)
     if not shape or readable(value.status) is None:
@@ -384,22 +383,22 @@ def history(value: Any, codes: Mapping[str, Any] | None = None) -> Iterator[str]
 
 @functools.singledispatch
 def picture(value: object) -> str | None:
-    """A value as SVG, by whoever draws its type; None where nobody does, or it would crowd."""
+    """The SVG of a value, by singledispatch; None for unknown or crowded ones."""
     return None
 
 
 def _svg(self: Any) -> str | None:
-    """The picture that notebooks show; None, so that they show text, where there is none."""
+    """The SVG for notebooks; None for text."""
     try:
         importlib.import_module(_DRAWING)  # on first use, since matplotlib is slow to import
         found = picture(self)
-    except Exception:  # nobody who looks at an object wants to hear of its picture
+    except Exception:  # a failed picture must not hide the object
         return None
     return None if found is None or len(found) > _DRAWN else found
 
 
 def _html(self: Any) -> str | None:
-    """The picture over the text, whose colour is the page's own; None without a picture."""
+    """The SVG above the text; None without a picture."""
     found = _svg(self)
     if found is None:
         return None

@@ -175,7 +175,7 @@ def made():
             (0.9, 0.95),
             "keyless",
         ),
-        jl.values.DataGuarantee(0.9, 0.95, 0.99, satisfaction, rough, sure, np.zeros(4)),
+        jl.values.DataGuarantee(0.9, 0.95, 0.99, satisfaction, rough, sure, np.zeros(4), "given"),
         jl.environments.Table(
             coin, np.arange(3), np.zeros(1, int), np.zeros(3, bool), np.ones(3, bool), 9
         ),

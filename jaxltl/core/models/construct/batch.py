@@ -1,8 +1,7 @@
-"""Several worlds as one batch, and a task judged beside another automaton's memory.
+"""Batches of products with one task, and demonstrations in them.
 
-Worlds of one kind become one product whose arrays have a leading axis W, so that one
-``vmap`` plans, learns or evaluates in all of them. All share the task's automaton over
-one alphabet: the letters that occur in any of the worlds.
+Models of one kind become one product whose arrays have a leading axis W, for one ``vmap`` that plans,
+learns or evaluates in all of them. They share the automaton, over the letters of all models.
 """
 
 from __future__ import annotations
@@ -29,23 +28,22 @@ from jaxltl.core.models.trajectories import Trajectories, make_trajectories, req
 
 
 def stack_products(worlds: Sequence[MDP], task: Task, *, label_on: str = "exit") -> Product:
-    """The products of several worlds with one task, as one with a leading axis of worlds.
+    """The products of several models with one task, stacked along a leading axis.
 
-    Smaller worlds are padded (:func:`pad_states`), and so are the successor lists. A
-    formula is translated over all letters that occur in some world.
+    Smaller models are padded (:func:`pad_states`), and so are successor lists. A formula is translated
+    over the letters of all models.
 
     Args:
       worlds: W models with the same actions and the same propositions, in any order.
-      task: an automaton, a formula, or a formula's text.
+      task: an automaton, a formula, or its text.
       label_on: ``"exit"`` or ``"entry"``, see :class:`~jaxltl.core.models.product.Product`.
 
     Returns:
-      A :class:`Product` each of whose arrays has the leading axis ``[W]``, for ``vmap``.
+      A :class:`Product` whose arrays have the leading axis ``[W]``.
 
     Raises:
-      ValueError: there is no world, or one is no MDP, has other actions or propositions
-        than the first, or shows a letter that the automaton was not built for. The
-        message names the world, counted from 0.
+      ValueError: no model, or one that is not an MDP, has other actions or propositions than the first,
+        or a letter that the automaton does not have; models are counted from 0.
 
     Example:
       >>> from jaxltl import from_dense
@@ -82,7 +80,7 @@ def stack_products(worlds: Sequence[MDP], task: Task, *, label_on: str = "exit")
 
 
 def _like_first(world: Model, number: int, first: MDP) -> MDP:
-    """The world with its labels in the order of the first one's propositions."""
+    """The model with labels in the order of the first model's propositions."""
     if not isinstance(world, MDP):
         raise ValueError(
             f"world {number} is a {type(world).__name__}; give MDPs, for example by from_dense."
@@ -108,19 +106,10 @@ def _like_first(world: Model, number: int, first: MDP) -> MDP:
 
 
 def pad_states(mdp: MDP, num_states: int) -> MDP:
-    """The world with unreachable states at the end, which never leave themselves.
-
-    They are no starts, offer every action, and are labelled as state 0 is.
-
-    Args:
-      mdp: S states.
-      num_states: how many there shall be.
-
-    Returns:
-      A model whose first S states are those of `mdp`.
+    """The model with unreachable absorbing states appended, labelled like state 0.
 
     Raises:
-      ValueError: there are more states already.
+      ValueError: more than `num_states` states.
 
     Example:
       >>> from jaxltl import from_dense
@@ -165,12 +154,12 @@ def _pad_successors(mdp: MDP, width: int) -> MDP:
 
 
 def is_stacked(model: Product) -> bool:
-    """Whether a product's arrays have a leading axis of worlds."""
+    """True if a product's arrays have a leading batch axis."""
     return jnp.ndim(model.letter) == 2
 
 
 def as_stacked(model: Product) -> Product:
-    """The product with a leading axis of worlds: itself, or a single one as W = 1."""
+    """The product with a leading batch axis: itself, or W = 1."""
     return model if is_stacked(model) else _stacked([model])
 
 
@@ -180,12 +169,12 @@ def _stacked(models: Sequence[Product]) -> Product:
 
 
 def num_worlds(model: Product) -> int:
-    """W, how many worlds are stacked; 1 for a single one."""
+    """W, the batch size; 1 for a single product."""
     return model.letter.shape[0] if is_stacked(model) else 1
 
 
 def unstack_product(model: Product, number: int) -> Product:
-    """The product of one of the stacked worlds, padding included.
+    """One product of a batch, padding included.
 
     Example:
       >>> from jaxltl import from_dense
@@ -199,15 +188,7 @@ def unstack_product(model: Product, number: int) -> Product:
 
 
 def restrict_stacked_actions(models: Product, allowed: Any) -> Product:
-    """Stacked products in each of which only some of the actions are left.
-
-    Args:
-      models: W stacked products.
-      allowed: ``bool[S, Q, A]`` for a single one, ``bool[W, S, Q, A]``, or a mask for each.
-
-    Raises:
-      ValueError: a mask that does not fit, or another number; the message names the world.
-    """
+    """Stacked products restricted to masks ``bool[W, S, Q, A]``; ValueError names the product."""
     masks = allowed if isinstance(allowed, list | tuple) or np.ndim(allowed) > 3 else [allowed]
     if len(masks) != num_worlds(models):
         raise ValueError(f"there are {len(masks)} masks for {num_worlds(models)} worlds.")
@@ -220,15 +201,14 @@ def restrict_stacked_actions(models: Product, allowed: Any) -> Product:
 
 
 def lift_memory_policy(policy: jax.Array, task: Automaton | int) -> jax.Array:
-    """A policy with the memory of one automaton, in the product with a synchronized one.
+    """A policy with the memory of one automaton in the product with a synchronised second automaton.
 
     Args:
       policy: ``[S, Q1, ...]``, or with leading axes before S if it is ``float[..., S, Q1, A]``.
       task: the second automaton of :func:`synchronize`, or its number Q2 of states.
 
     Returns:
-      ``[S, Q1 * Q2, ...]``: the policy does not see the task's state. Differentiable in
-      the policy.
+      ``[S, Q1 * Q2, ...]``: the policy ignores the second automaton. Differentiable in the policy.
 
     Example:
       >>> lift_memory_policy(jnp.array([[[0.0, 1.0], [1.0, 0.0]]]), 2)[0, :, 1].tolist()
@@ -243,14 +223,10 @@ def lift_memory_policy(policy: jax.Array, task: Automaton | int) -> jax.Array:
 
 
 def stack_models(models: Product | Sequence[Product]) -> Product:
-    """Products of equal shapes with one automaton along a leading axis of worlds.
-
-    Args:
-      models: one product, several, or stacked ones, which are returned as they are.
+    """Products of equal shapes with one automaton, stacked; stacked ones are returned unchanged.
 
     Raises:
-      ValueError: there is none, or one has other propositions, shapes or another automaton
-        than the first. The message names the world.
+      ValueError: no product, or other propositions, shapes or another automaton than the first.
     """
     if isinstance(models, Product):
         return as_stacked(models)
@@ -290,7 +266,7 @@ Demonstrations = Trajectories | Sequence[Trajectories]
 
 
 def _of_each_world(trajectories: Demonstrations) -> list[Trajectories]:
-    """Those of one world, of several, or with a first axis of worlds, without empty ones."""
+    """The nonempty trajectories of each model."""
     if isinstance(trajectories, Trajectories):
         stacked = np.ndim(trajectories.length) == 2
         lanes = range(len(trajectories.length)) if stacked else ()
@@ -306,11 +282,7 @@ def _of_each_world(trajectories: Demonstrations) -> list[Trajectories]:
 def split_trajectories(
     trajectories: Demonstrations, share: float
 ) -> tuple[list[Trajectories], list[Trajectories]]:
-    """Each world's trajectories in two: the last `share` of them is held out.
-
-    Raises:
-      ValueError: the share is not in [0, 1).
-    """
+    """A split of each model's trajectories: the last fraction `share` is held out."""
     if not 0 <= share < 1:
         raise ValueError(f"held_out={share}; it must be a share in [0, 1).")
     given = _of_each_world(trajectories)
@@ -326,21 +298,14 @@ def demonstration_counts(
     *,
     horizon: int | None = None,
 ) -> jax.Array:
-    """How often each allowed pair of the products occurs in trajectories of their worlds.
+    """State-action counts of demonstrations in each product, ``float[W, S, Q, A]``.
 
-    Args:
-      models: stacked products.
-      trajectories: of the world (not of the product), or one for each of the W worlds, in a
-        list or along a first axis; empty ones do not count.
-      horizon: count by time up to so many steps.
-
-    Returns:
-      ``float[W, S, Q, A]``; with a horizon ``float[W, T, S, Q, A]``.
+    With a horizon they are counted by time step, ``float[W, T, S, Q, A]``. Trajectories are those of the
+    base models, in a list or along a leading axis; disallowed pairs do not count.
 
     Raises:
-      ValueError: another number of worlds, a trajectory that its world cannot make, that exceeds
-        the horizon, or of which no step takes an allowed action. The message names the world, the
-        trajectory and the step.
+      ValueError: another number of models, or a trajectory that its model cannot produce, that exceeds
+        the horizon, or that has no allowed action; the message names the model, trajectory and step.
     """
     given, count = _of_each_world(trajectories), num_worlds(models)
     if len(given) != count:
@@ -382,15 +347,7 @@ def demonstration_counts(
 
 
 def stack_observations(models: Product, observation: Any) -> jax.Array:
-    """What is seen in each state of each of the W worlds, checked: ``float[W, S, O]``.
-
-    Args:
-      models: stacked products.
-      observation: ``float[S, O]``, ``float[W, S, O]``, or a list with one for each world.
-
-    Raises:
-      ValueError: another shape, or a number that is not finite.
-    """
+    """Checked observations of the states of each model, ``float[W, S, O]``."""
     if isinstance(observation, list | tuple):
         observation = np.stack([np.asarray(x) for x in observation])
     observation = jnp.asarray(observation, models.dtype)
@@ -412,17 +369,12 @@ def training_counts(
     *,
     horizon: int | None = None,
 ) -> tuple[jax.Array, jax.Array]:
-    """:func:`demonstration_counts` of what is learned from and of what is held out.
+    """The :func:`demonstration_counts` of training and of held-out trajectories.
 
-    Args:
-      models: stacked products.
-      demonstrations: of the worlds.
-      held_out: the share of each world's trajectories, its last ones; or such trajectories;
-        None or 0: none.
-      horizon: count by time up to so many steps.
+    `held_out` is the fraction of each model's trajectories, its last ones, or held-out trajectories.
 
     Raises:
-      ValueError: demonstrations that do not fit their world, or of which none is left.
+      ValueError: trajectories that do not fit their model, or no training data.
     """
     test: Any = held_out
     if held_out is None or isinstance(held_out, int | float):

@@ -1,4 +1,4 @@
-"""Counted transitions by name: beside the entries of a model, or as a model of their own."""
+"""Transition counts from logs: aligned with the entries of a model, or as a model of their own."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ from jaxltl.core.models.sparse import SparseMDP, make_sparse
 from jaxltl.core.pretty_print import brief
 
 _INTEGER = re.compile(r"-?[1-9][0-9]{0,17}|0")
-MOST_SAMPLES = 2**53  # up to which doubles count
+MOST_SAMPLES = 2**53  # the largest range of exact integers in double precision
 _MOST_ENTRIES = 10**8
-_ANY = "any"  # the only action of a state in which nothing was tried
+_ANY = "any"  # the only action of an unvisited state
 
 
 @brief(facts=facts.counts)
 @dataclass(frozen=True)
 class TransitionCounts:
-    """How often an action in a state led to a successor.
+    """Counts of observed transitions by state, action and successor.
 
-    Transitions stand once each, in the order of state, action and successor.
+    Each transition occurs once, in lexicographic order.
 
     Attributes:
-      state, action, successor: ``int32[N]``, numbers of names.
-      count: ``int64[N]``, from 0; with 0, a transition that is possible and never came.
+      state, action, successor: ``int32[N]``, indices of names.
+      count: ``int64[N]``; 0 for a transition that is possible and was not observed.
       states, actions: the names.
 
     Example:
@@ -53,7 +53,7 @@ class TransitionCounts:
 
     @property
     def num_samples(self) -> int:
-        """How many transitions were counted in all."""
+        """The number of observed transitions."""
         return int(self.count.sum())
 
 
@@ -66,19 +66,19 @@ def make_counts(
     states: Sequence[str] | None = None,
     actions: Sequence[str] | None = None,
 ) -> TransitionCounts:
-    """Counts from arrays of transitions, in any order and as often as they came.
+    """Checked :class:`TransitionCounts` from arrays of transitions, in any order and with repetitions.
 
     Args:
       state, action, successor: ``int[N]``.
-      count: ``int[N]``, how often each line came; default: once.
+      count: ``int[N]``, the multiplicity of each transition; default: one.
       states, actions: the names; default: the numbers from 0 to the largest.
 
     Returns:
       :class:`TransitionCounts`.
 
     Raises:
-      ValueError: naming the entry: shapes differ, a number has no name, a count is negative, names
-        are not distinct, or there is nothing.
+      ValueError: naming the entry: different shapes, a number without a name, a negative count,
+        repeated names, or no transition.
 
     Example:
       >>> counts = make_counts([0, 1, 0, 0], [0, 0, 0, 0], [1, 1, 1, 0])
@@ -121,7 +121,7 @@ def make_counts(
 
 
 def merged(table: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Columns of state, action, successor and count, in order, with those alike as one.
+    """Sorted columns of state, action, successor and count, with repeated transitions added up.
 
     >>> merged(np.array([[1, 0, 1], [0, 0, 0], [2, 1, 2], [5, 6, 7]])).tolist()
     [[0, 1], [0, 0], [1, 2], [6, 12]]
@@ -147,7 +147,7 @@ def _checked_names(what: str, names: Sequence[str] | None, least: int) -> tuple[
 
 
 def in_order(names: Iterable[str]) -> tuple[str, ...]:
-    """Names by number if all are integers, by alphabet if not.
+    """Names sorted by number if all are integers, else alphabetically.
 
     >>> in_order(["10", "9"]), in_order(["10", "9", "a"])
     (('9', '10'), ('10', '9', 'a'))
@@ -158,18 +158,11 @@ def in_order(names: Iterable[str]) -> tuple[str, ...]:
     return tuple(sorted(names))
 
 
-# --- beside the entries of a model ------------------------------------------------------------
+# --- alignment with a model ---------------------------------------------------------------------
 
 
 def state_names(model: MDP | DenseMDP | SparseMDP) -> tuple[str, ...]:
-    """What the states of a model are called: by its variable `state`, if it tells all apart.
-
-    Args:
-      model: concrete.
-
-    Returns:
-      S names; the numbers from 0 where there is no such variable.
-    """
+    """Names of the states: the values of the variable `state` if they are distinct, else the numbers."""
     if isinstance(model, SparseMDP) and "state" in model.valuation:
         names = tuple(map(str, np.asarray(model.valuation["state"]).tolist()))
         if len(set(names)) == len(names):
@@ -178,11 +171,7 @@ def state_names(model: MDP | DenseMDP | SparseMDP) -> tuple[str, ...]:
 
 
 def action_names(model: MDP | DenseMDP | SparseMDP) -> tuple[str, ...]:
-    """What the actions of a model are called: by name if they have some, by number if not.
-
-    Args:
-      model: concrete. The actions of a sparse model without numbers are the ranks of choices.
-    """
+    """Names of the actions, else their numbers or, without numbers, their ranks."""
     if isinstance(model, SparseMDP):
         if model.action_names:
             return model.action_names
@@ -201,15 +190,15 @@ def _row_action(model: SparseMDP) -> Integers:
 @brief
 @dataclass(frozen=True)
 class Places:
-    """Where the transitions of a model stand, by numbers.
+    """Index of a model's transitions by the numbers of their names.
 
     Attributes:
       states, actions: the names.
       row_state, row_action: ``int[R]``, of each choice.
       entry_start: ``int[R + 1]``.
       successor: ``int[T]``.
-      place: ``int[T]``, of each entry in the array of probabilities, flat.
-      shape: of that array.
+      place: ``int[T]``, the flat position of each entry in the array of probabilities.
+      shape: the shape of that array.
     """
 
     states: tuple[str, ...]
@@ -231,7 +220,7 @@ class Places:
         return _sorted_keys(row, self.successor, len(self.states))
 
     def ambiguous(self) -> str | None:
-        """What of the model has the same names twice."""
+        """A description of two choices or successors with the same names, or None."""
         for (key, order), what in ((self._rows, "choice"), (self._entries, "successor")):
             same = np.flatnonzero(key[1:] == key[:-1])
             if same.size:
@@ -239,20 +228,16 @@ class Places:
         return None
 
     def rows(self, state: Integers, action: Integers) -> Integers:
-        """The choices, -1 where there is none."""
+        """The rows of state-action pairs, -1 for none."""
         return _found(self._rows, np.asarray(state, np.int64) * len(self.actions) + action)
 
     def entries(self, row: Integers, successor: Integers) -> Integers:
-        """The entries of rows, -1 where there is none."""
+        """The entries of rows and successors, -1 for none."""
         return _found(self._entries, np.asarray(row, np.int64) * len(self.states) + successor)
 
 
 def places(model: MDP | DenseMDP | SparseMDP) -> Places:
-    """Where the transitions of a concrete model stand.
-
-    Raises:
-      ValueError: the model is of another kind, or has choices or successors that are named alike.
-    """
+    """The index of a concrete model; ValueError for another kind of model, or ambiguous names."""
     if isinstance(model, SparseMDP):
         host = model.host
         entry = np.arange(host.num_transitions)
@@ -295,17 +280,17 @@ def _found(keys: tuple[Integers, Integers], wanted: Integers) -> Integers:
 
 
 def align_counts(model: MDP | DenseMDP | SparseMDP, counts: TransitionCounts) -> NDArray[np.int64]:
-    """Counts in the place of a model's probabilities; states and actions are matched by name.
+    """Counts aligned with a model's probabilities; states and actions are matched by name.
 
     Args:
-      model: concrete.
+      model: a concrete model.
       counts: of some of its transitions.
 
     Returns:
-      ``int64``, of the shape of the model's probabilities; 0 where nothing was counted.
+      ``int64``, of the shape of the model's probabilities; 0 for unobserved transitions.
 
     Raises:
-      ValueError: naming the transition: the model does not have it; or as :func:`places`.
+      ValueError: a transition that the model does not have, or ambiguous names.
 
     Example:
       >>> from jaxltl import make_sparse
@@ -334,7 +319,7 @@ def align_counts(model: MDP | DenseMDP | SparseMDP, counts: TransitionCounts) ->
 def _renumbered(
     what: str, names: tuple[str, ...], number: Integers, to: tuple[str, ...]
 ) -> Integers:
-    """Numbers of names as the numbers that they have among others."""
+    """Indices of names as indices of the same names in another list."""
     if names == to:
         return number
     of = {name: i for i, name in enumerate(to)}
@@ -346,7 +331,7 @@ def _renumbered(
 
 
 def listed(names: Sequence[str], most: int = 8) -> str:
-    """Names for a message, not too many.
+    """The number of names and the first `most`, for messages.
 
     >>> listed("abcd", 2)
     "4: 'a', 'b', ..."
@@ -358,15 +343,7 @@ def listed(names: Sequence[str], most: int = 8) -> str:
 def place_of(
     known: Places, state: Integers, action: Integers, successor: Integers
 ) -> tuple[Integers, tuple[int, str] | None]:
-    """Where transitions stand, and the first that stands nowhere, with what is wrong with it.
-
-    Args:
-      known: of a model.
-      state, action, successor: ``int[N]``, its numbers.
-
-    Returns:
-      ``int[N]``, and None or a pair of number and reason.
-    """
+    """Flat positions ``int[N]`` of transitions, and the first unknown one with the reason, or None."""
     row = known.rows(state, action)
     entry = np.where(row >= 0, known.entries(row, successor), -1)
     if (entry >= 0).all():
@@ -378,7 +355,7 @@ def place_of(
     return entry, (i, f"action {a!r} in state {s!r} cannot lead to {t!r}")
 
 
-# --- a model of their own ---------------------------------------------------------------------
+# --- empirical models ---------------------------------------------------------------------------
 
 
 def model_from_counts(
@@ -475,7 +452,7 @@ def _may_miss(graph: str | LeastProbability, samples: NDArray[Any]) -> NDArray[n
 def _entries(
     counts: TransitionCounts, counted_row: Integers, state: Integers, is_open: NDArray[np.bool_]
 ) -> tuple[Integers, Integers, NDArray[np.int64]]:
-    """Starts of rows, successors and counts: what was counted, and all that open rows may do."""
+    """Row starts, successors and counts of the observed and of the possible transitions."""
     size, num_open = len(counts.states), int(is_open.sum())
     if num_open * size > _MOST_ENTRIES:
         raise ValueError(
@@ -498,7 +475,7 @@ def _entries(
 
 
 def _nominal(count: Integers, start: Integers) -> NDArray[np.float64]:
-    """Frequencies; of rows with zeros, after one more of each."""
+    """Empirical frequencies; rows with a zero use additive smoothing by one."""
     width = np.diff(start)
     more = np.repeat(np.minimum.reduceat(count, start[:-1]) == 0, width) + count.astype(np.float64)
     return more / np.repeat(np.add.reduceat(more, start[:-1]), width)
@@ -519,7 +496,7 @@ def _variable(names: tuple[str, ...]) -> NDArray[Any]:
 
 
 def _numbers(names: Iterable[Any], number: Mapping[str, int], what: str) -> list[int]:
-    """Of states, by name."""
+    """State numbers from names."""
     found = []
     for name in [names] if isinstance(names, str | int) else validation.sequence(what, names):
         if str(name) not in number:

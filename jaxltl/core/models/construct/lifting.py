@@ -1,4 +1,4 @@
-"""What crosses a product: trajectories and policies of a world with the memory of its task."""
+"""Lifting and projection of trajectories and policies between a model and its product."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ from jaxltl.core.pretty_print import brief
 
 
 def lift_trajectories(model: Product, trajectories: Trajectories) -> Trajectories:
-    """World trajectories with the memory that the automaton had along them.
+    """Trajectories of the base model with the automaton states along them.
 
     Args:
       model: the product.
-      trajectories: of the world.
+      trajectories: of the base model.
 
     Returns:
-      Trajectories of the product, states numbered ``s * Q + q``.
+      Trajectories of the product, with states ``s * Q + q``.
 
     Raises:
-      ValueError: they are not the world's.
+      ValueError: trajectories of another model.
 
     Example:
       >>> import jaxltl as jl
       >>> path = jl.make_mdp([[[1]], [[2]], [[2]]], [[[1.0]], [[1.0]], [[1.0]]], initial=[1, 0, 0],
       ...                    label={"a": [1]})
       >>> prod = jl.product(path, "F a")
-      >>> shown = jl.make_trajectories(path, [[(0, 0), (1, 0), (2, 0)]])
+      >>> shown = jl.models.make_trajectories(path, [[(0, 0), (1, 0), (2, 0)]])
       >>> lift_trajectories(prod, shown).state.tolist()  # s * Q + q
       [[0, 3, 5]]
     """
@@ -100,10 +100,7 @@ def project_trajectories(model: Product, trajectories: Trajectories) -> Trajecto
 
 
 def memory_along(model: Product, state: np.ndarray) -> np.ndarray:
-    """The memory along the states of world trajectories ``int[N, T]``, on the host.
-
-    What comes behind a trajectory's end is the memory of a run on.
-    """
+    """Automaton states along trajectories ``int[N, T]`` of the base model, continued in padding."""
     delta, letter = np.asarray(model.automaton.delta), np.asarray(model.letter)[state]
     read = letter[:, 1:] if model.label_on == "entry" else letter[:, :-1]
     memory = np.empty_like(state)
@@ -114,15 +111,10 @@ def memory_along(model: Product, state: np.ndarray) -> np.ndarray:
 
 
 def allowed_steps(model: ActionModel, trajectories: Trajectories) -> np.ndarray:
-    """Which steps that count take an action that the model has: ``bool[N, T]``, on the host.
-
-    Args:
-      model: the world, or a product, perhaps narrowed by
-        :func:`~jaxltl.core.models.construct.restrict.with_allowed`.
-      trajectories: of the world.
+    """Steps of the base model's trajectories with an available action, ``bool[N, T]``.
 
     Raises:
-      ValueError: they are not the world's, or no step of one is left.
+      ValueError: trajectories of another model, or one without such a step.
     """
     world = model.mdp if isinstance(model, Product) else model
     require_states(trajectories, world)

@@ -1,4 +1,4 @@
-"""Models whose probabilities and rewards are differentiable functions of parameters in a box."""
+"""Parametric Markov models: probabilities and rewards as differentiable functions on a box."""
 
 from __future__ import annotations
 
@@ -15,31 +15,31 @@ from jax.tree_util import Partial
 
 from jaxltl.core.models import facts
 from jaxltl.core.models.ops.array_namespace import is_traced
+from jaxltl.core.models.protocols import Array
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
 from jaxltl.core.pretty_print import brief
 from jaxltl.core import validation
 
-Ends = Any  # a number for all parameters, a number for each name, or float[D]
-_TRIALS = 64  # points that are tried for one at which the functions are a model
+Ends = Array  # for all parameters, for each name, or float[D]
+_TRIALS = 64  # candidate points for a valid model
 
 
 @brief(facts=facts.parametric)
 @struct.dataclass
 class ParametricMDP:
-    """A Markov chain or decision process for each point of a box of parameters.
+    """A Markov chain or MDP for each point of a box of parameters, with a constant graph.
 
-    Which transitions there are is the same at all points. Made by :func:`make_parametric`, or by
-    ``read_parametric(path).over(low, high)``.
+    Built by :func:`make_parametric`, or by ``read_parametric(path).over(low, high)``.
 
     Attributes:
-      model: the model at `inside`; its graph and labels are those of all.
+      model: the model at the point `inside`.
       numbers: ``float[D] -> (float[T], {name: float[R]})``, the probabilities and the rewards of
         choices, a pytree.
       low, high: ``float64[D]``, the box.
-      inside: ``float64[D]``, a point at which the numbers are as they must be.
-      parameters: the D names, static.
-      exact: ``float64[D] -> SparseMDP`` with the same transitions, each number of which is rounded
-        `roundings` times at most; None where `numbers` are all that is known. Static.
+      inside: ``float64[D]``, a point at which the probabilities are valid.
+      parameters: the D names; static.
+      exact: ``float64[D] -> SparseMDP`` with at most `roundings` roundings of each number; None if only
+        `numbers` are known. Static.
       roundings: static.
 
     Example:
@@ -60,14 +60,10 @@ class ParametricMDP:
     roundings: int = struct.field(pytree_node=False, default=0)
 
     def at(self, values: Mapping[str, float] | chex.Array) -> SparseMDP:
-        """The model at a point, on the host.
-
-        Args:
-          values: ``float[D]``, or a number for each name.
+        """The model at a point, ``float[D]`` or a number for each name.
 
         Raises:
-          ValueError: a parameter is missing, not finite or outside of the box, or what the
-            functions say there is no model with the same transitions.
+          ValueError: a point outside of the box, or at which the model is not valid.
         """
         point = _point("values", values, self.parameters)
         outside = (point < self.low) | (point > self.high)
@@ -80,11 +76,7 @@ class ParametricMDP:
         return self._at(point)
 
     def inside_of(self, name: str, points: Any) -> np.ndarray:
-        """Points of the box, ``float64[N, D]``, checked.
-
-        Raises:
-          ValueError: they have another shape, or one of them is outside.
-        """
+        """Validated points of the box, ``float64[N, D]``."""
         found, names = validation.float_array(f"{name}s", points), self.parameters
         if found.ndim != 2 or found.shape[1] != len(names) or not len(found):
             raise ValueError(
@@ -106,14 +98,7 @@ class ParametricMDP:
         return self.exact(point)
 
     def within(self, low: Ends, high: Ends) -> ParametricMDP:
-        """The same over a smaller box.
-
-        Args:
-          low, high: as for :func:`make_parametric`.
-
-        Raises:
-          ValueError: the box is none, or reaches out of the other.
-        """
+        """The model on a smaller box; ValueError if it is not contained in this one."""
         low, high = box_of(low, high, self.parameters)
         out = (low < self.low) | (high > self.high)
         if out.any():
@@ -188,7 +173,7 @@ def make_parametric(
 
 
 def _paired(numbers: Any, state: Any, x: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Probabilities, and rewards of choices."""
+    """Probabilities and rewards of choices."""
     found = numbers(x)
     probability, rewards = found if isinstance(found, tuple) else (found, {})
     size = state.shape[0]
@@ -216,7 +201,7 @@ def _evaluate(numbers: Any, x: jax.Array) -> Any:
 
 
 def _evaluated(model: SparseMDP, numbers: Any, point: np.ndarray) -> SparseMDP:
-    """The model whose numbers a function says, checked."""
+    """The validated model at a point."""
     found = _evaluate(numbers, np.asarray(point, jnp.zeros(()).dtype))
     probability, rewards = jax.tree.map(lambda x: np.asarray(x, np.float64), found)
     host = model.host
@@ -245,16 +230,12 @@ def _evaluated(model: SparseMDP, numbers: Any, point: np.ndarray) -> SparseMDP:
 def point_inside(
     low: np.ndarray, high: np.ndarray, model_at: Callable[[np.ndarray], SparseMDP]
 ) -> tuple[np.ndarray, SparseMDP]:
-    """A point of a box at which functions are a model, and the model.
-
-    Args:
-      low, high: ``float64[D]``.
-      model_at: the model at a point; ValueError where there is none.
+    """A point of a box at which functions are a valid model, and the model there.
 
     Raises:
-      ValueError: there is none at any of some points, with what is wrong at the first.
+      ValueError: none of `_TRIALS` points is valid, with the error at the first.
     """
-    # Multiples of irrational numbers, all different: no function is zero there by accident.
+    # Multiples of distinct irrational numbers, at which a nonzero rational function rarely vanishes.
     step = np.modf(np.sqrt(np.arange(low.size) + 2.0))[0]
     first = ""
     for trial in range(_TRIALS):
@@ -268,11 +249,7 @@ def point_inside(
 
 
 def box_of(low: Ends, high: Ends, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-    """The checked ends of a box, ``float64[D]`` both.
-
-    Raises:
-      ValueError: a name is missing or unknown, or the ends are not finite or cross.
-    """
+    """The validated bounds of a box, ``float64[D]`` both."""
     ends = [_point(of, x, names) for of, x in (("low", low), ("high", high))]
     crossed = ~(ends[0] < ends[1])
     if crossed.any():

@@ -1,7 +1,7 @@
-"""What polynomials and their quotients can be over a box, rounding included.
+"""Ranges of polynomials and rational functions over a box, with rounding errors.
 
-A polynomial of degree one in each of its parameters is extreme at corners of the box, and these are
-tried; others are bounded term by term.
+A multiaffine polynomial attains its extrema at corners of the box, which are enumerated; other
+polynomials are bounded term by term.
 """
 
 from __future__ import annotations
@@ -13,25 +13,21 @@ import numpy as np
 from jaxltl.core.models.parametric.rational import Polynomials, Rationals
 
 _EPS = float(np.finfo(np.float64).eps)
-_MOST = 10  # parameters of one polynomial whose corners are tried
+_MOST = 10  # parameters of a polynomial whose 2^n corners are enumerated
 
 
 class Ends(NamedTuple):
-    """``float64[F]``: no value is below `lower` or above `upper`."""
+    """Bounds ``float64[F]`` on the values of functions."""
 
     lower: np.ndarray
     upper: np.ndarray
 
 
 def ranges(functions: Rationals, low: np.ndarray, high: np.ndarray) -> Ends:
-    """Ends of rational functions over a box.
-
-    Args:
-      functions: F of them.
-      low, high: ``float64[D]``, not negative.
+    """Bounds on F rational functions over a box ``low <= x <= high`` of nonnegative parameters.
 
     Raises:
-      ValueError: the box reaches below 0, or a denominator may be 0 in it.
+      ValueError: a negative lower bound, or a denominator that may be 0.
     """
     if not (low >= 0).all():
         d = int(np.flatnonzero(~(low >= 0))[0])
@@ -55,7 +51,7 @@ def _ranges(of: Polynomials, low: np.ndarray, high: np.ndarray) -> Ends:
     owner, monomial = np.asarray(of.owner), np.asarray(of.monomial)
     coefficient = np.asarray(of.coefficient, np.float64)
     ends = np.stack([low, high])
-    # Term by term: of numbers that are not negative, monomials grow.
+    # Term by term: monomials of nonnegative parameters are monotone.
     least, most = (np.prod(x**powers, axis=1)[monomial] for x in ends)
     small = np.where(coefficient > 0, coefficient * least, coefficient * most)
     large = np.where(coefficient > 0, coefficient * most, coefficient * least)
@@ -69,7 +65,7 @@ def _ranges(of: Polynomials, low: np.ndarray, high: np.ndarray) -> Ends:
     number = used.sum(1)
     for n in np.unique(number[linear & (terms > 1) & (number <= _MOST)]):
         some = np.flatnonzero(linear & (terms > 1) & (number == n))
-        found = _corners(some, n, used, owner, powers[monomial], coefficient, ends)
+        found = _corners(some, n, used, _Terms(owner, powers[monomial], coefficient), ends)
         lower[some], upper[some] = (
             np.maximum(lower[some], found[0]),
             np.minimum(upper[some], found[1]),
@@ -89,16 +85,17 @@ def _powers(of: Polynomials, num_parameters: int) -> np.ndarray:
     return found
 
 
+class _Terms(NamedTuple):
+    owner: np.ndarray
+    powers: np.ndarray
+    coefficient: np.ndarray
+
+
 def _corners(
-    some: np.ndarray,
-    n: int,
-    used: np.ndarray,
-    owner: np.ndarray,
-    powers: np.ndarray,
-    coefficient: np.ndarray,
-    ends: np.ndarray,
+    some: np.ndarray, n: int, used: np.ndarray, terms: _Terms, ends: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The least and largest value at the corners, of polynomials of n parameters each."""
+    """Extrema at the corners, of polynomials in n parameters each."""
+    owner, powers, coefficient = terms
     place = np.full(used.shape[0], -1)
     place[some] = np.arange(some.size)
     parameter = np.nonzero(used[some])[1].reshape(some.size, n)

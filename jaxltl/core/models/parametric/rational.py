@@ -1,4 +1,4 @@
-"""Rational functions of parameters as arrays: many of them are evaluated by a few operations."""
+"""Vectorised evaluation of many polynomials and rational functions of parameters."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ Terms = Mapping[tuple[int, ...], Fraction]  # the coefficient of each monomial, 
 @brief
 @struct.dataclass
 class Polynomials:
-    """Sums of terms, a coefficient times a monomial.
+    """Polynomials, evaluated together.
 
     Attributes:
-      factor: ``int32[M, W]``, what the M monomials are products of: 0 is one, and the power 2^k of
-        parameter d is ``1 + k D + d``.
+      factor: ``int32[M, W]``, the factors of the M monomials: 0 is one, and the power 2^k of parameter d
+        is ``1 + k D + d``.
       owner: ``int32[C]``, the polynomial of each term, ascending.
       monomial: ``int32[C]``.
       coefficient: ``float[C]``.
-      count: how many polynomials there are, static.
-      squares: how often parameters are squared at most, static.
+      count: the number of polynomials; static.
+      squares: the largest number of repeated squarings; static.
     """
 
     factor: Any
@@ -39,7 +39,7 @@ class Polynomials:
     squares: int = struct.field(pytree_node=False)
 
     def __call__(self, x: jax.Array) -> jax.Array:
-        """Their values at ``float[D]``, ``float[count]``; differentiable, of any sign."""
+        """Values at ``float[D]``, ``float[count]``; differentiable."""
         powers = [jnp.ones(1, x.dtype), x]
         for _ in range(self.squares):
             powers.append(powers[-1] * powers[-1])
@@ -56,11 +56,7 @@ class Polynomials:
 
 
 def make_polynomials(polynomials: Sequence[Terms], num_parameters: int) -> Polynomials:
-    """Polynomials from exact coefficients, which are rounded once.
-
-    Args:
-      polynomials: of each the coefficients by the powers of the D parameters.
-      num_parameters: D.
+    """Polynomials from exact coefficients by the powers of the D parameters; each is rounded once.
 
     Example:
       >>> p_plus_2pq2 = {(1, 0): Fraction(1), (1, 2): Fraction(2)}
@@ -108,18 +104,13 @@ class Rationals:
     denominator: Polynomials | None
 
     def __call__(self, x: jax.Array) -> jax.Array:
-        """Their values at ``float[D]``, ``float[F]``; infinite or NaN at poles."""
+        """Values at ``float[D]``, ``float[F]``; infinite or NaN at poles."""
         value = self.numerator(x)
         return value if self.denominator is None else value / self.denominator(x)
 
 
 def make_rationals(functions: Sequence[tuple[Terms, Terms]], num_parameters: int) -> Rationals:
-    """Rational functions from numerators and denominators, none of which is zero.
-
-    Args:
-      functions: pairs of them, as of :func:`make_polynomials`.
-      num_parameters: D.
-    """
+    """Rational functions from pairs of numerator and nonzero denominator."""
     one = (0,) * num_parameters
     constant = [set(below) == {one} for _, below in functions]
     above = [
