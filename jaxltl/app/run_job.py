@@ -58,8 +58,7 @@ class Console:
 
 def job_of(task_file: Path) -> Job[Any, Any, Any]:
     """The kind of job that a task file describes."""
-    from jaxltl.app.files.task import method_of
-    from jaxltl.app.files.task_environment import is_environment_task
+    from jaxltl.app.files.task import is_environment_task, method_of
 
     if is_environment_task(task_file):
         from jaxltl.app import learn_environment

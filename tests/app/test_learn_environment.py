@@ -12,7 +12,8 @@ from click.testing import CliRunner
 from jaxltl.algos.common import chunks
 from jaxltl.app import learn_environment as job
 from jaxltl.app.environment_source import load_environment
-from jaxltl.app.files.task_environment import is_environment_task, read_task
+from jaxltl.app.files.task import is_environment_task
+from jaxltl.app.files.task_environment import read_task
 from jaxltl.cli import main
 from jaxltl.core.values.evaluation.evaluation import evaluate
 from tests.app.test_report import browser  # noqa: F401

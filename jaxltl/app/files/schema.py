@@ -94,7 +94,7 @@ def _fields(schema: Any) -> tuple[attrs.Attribute[Any], ...]:
 def _resolve(kind: type, fields: list[attrs.Attribute[Any]]) -> list[attrs.Attribute[Any]]:
     """Evaluates annotations, which are strings until then."""
     hints = get_type_hints(kind, include_extras=True)
-    return [field.evolve(type=hints[field.name]) for field in fields]
+    return [field.evolve(type=hints.get(field.name, field.type)) for field in fields]
 
 
 @dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(attrs.field,))

@@ -142,3 +142,14 @@ def method_of(path: str | Path) -> Any:
     """``[learner] method`` of a task file, unchecked; None if there is none."""
     learner = read_toml(Path(path), TaskFile.KIND)[0].get("learner")
     return learner.get("method") if isinstance(learner, dict) else None
+
+
+ENVIRONMENT_METHODS = ("ppo", "cce", "cpo")
+
+
+def is_environment_task(path: str | Path) -> bool:
+    """Whether a task file is of a simulated world, by its world or by its method."""
+    data = read_toml(Path(path), TaskFile.KIND)[0]
+    world, learner = (data.get(name) for name in ("world", "learner"))
+    simulated = isinstance(world, dict) and "environment" in world
+    return simulated or (isinstance(learner, dict) and learner.get("method") in ENVIRONMENT_METHODS)

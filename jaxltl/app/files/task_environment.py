@@ -6,12 +6,16 @@ for its hyperparameters, and ``[evaluation]``; ``examples/flat_world.toml`` show
 
 from __future__ import annotations
 
+import dataclasses
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 from typing import Annotated as Key
 
 import attrs
+
+from jaxltl.algos import cce, ppo, trust_region
 
 from jaxltl.app.files import schema
 from jaxltl.app.files.schema import (
@@ -23,7 +27,6 @@ from jaxltl.app.files.schema import (
     Table,
     Text,
     Unit,
-    WholeNumber,
     Widths,
     Meta,
     table,
@@ -96,51 +99,56 @@ class LearnerTable(Table):
     steps: Key[Count, "Steps of the learner."]
 
 
+def hparams_table(hparams: type[Any], *omit: str) -> Any:
+    """A base class with the declared hyperparameters of a learner; default the learner's."""
+    texts = re.findall(r"^ {6}(\w+): ([^;.]+)", hparams.__doc__ or "", re.MULTILINE)
+    fields = {
+        field.name: attrs.field(
+            default=None, type=Key[_type_of(field) | None, dict(texts).get(field.name, "")]
+        )
+        for field in dataclasses.fields(hparams)
+        if "valid" in field.metadata and field.name not in omit
+    }
+    return attrs.make_class(
+        "HparamsTable", fields, bases=(Table,), frozen=True, kw_only=True, slots=False
+    )
+
+
+def _type_of(field: dataclasses.Field[Any]) -> Any:
+    """The type of a hyperparameter in a file, from its declared valid values."""
+    valid = field.metadata["valid"]
+    values = valid.values
+    if values is bool:
+        return bool
+    if isinstance(values, tuple):
+        return Literal[values]
+    if values.integer:
+        whole = Annotated[int, Meta(str(values), values.contains)]
+        return Widths if "tuple" in str(field.type) else whole
+    number = Annotated[float, Meta(f"a number, {values}", values.contains)]
+    if not valid.may_be_schedule:
+        return number
+    title = f"a number, {values}; or [first, last], linear over all steps"
+    return Annotated[number | tuple[number, number], Meta(title)]
+
+
 @table
-class PpoTable(Table):
-    """``[ppo]``: see ``jaxltl.algos.ppo.Hparams`` for defaults."""
+class PpoTable(hparams_table(ppo.Hparams)):  # type: ignore[misc]
+    """``[ppo]``: hyperparameters, and the networks."""
 
     discount: Key[Unit, "Discount of rewards."] = 1.0
-    gae_lambda: Key[Unit | None, "Lambda of generalised advantages."] = None
-    learning_rate: Key[Schedule | None, "Step size of Adam."] = None
-    clip: Key[Schedule | None, "Clipping of probability ratios."] = None
-    value_clip: Key[Schedule | None, "Clipping of values."] = None
-    value_weight: Key[NonNegative | None, "Weight of the value loss."] = None
-    entropy_weight: Key[NonNegative | None, "Weight of the entropy."] = None
-    max_gradient_norm: Key[NonNegative | None, "Clipping of gradients."] = None
-    target_kl: Key[NonNegative | None, "Divergence at which a step's updates end."] = None
-    adam_epsilon: Key[NonNegative | None, "Epsilon of Adam."] = None
-    num_envs: Key[Count | None, "Environments in parallel."] = None
-    num_steps: Key[Count | None, "Steps of each environment in a step of the learner."] = None
-    num_epochs: Key[Count | None, "Passes over the collected steps."] = None
-    num_minibatches: Key[Count | None, "Minibatches of a pass."] = None
-    normalize_advantage: Key[bool | None, "Standardise advantages in each minibatch."] = None
-    normalize_observation: Key[bool | None, "Standardise observations."] = None
-    normalize_reward: Key[bool | None, "Scale rewards by the deviation of returns."] = None
-    squash: Key[Literal["clip", "tanh"] | None, "Map of Gaussian actions into a box."] = None
-    num_resets: Key[WholeNumber | None, "Initial worlds drawn before each step."] = None
     hidden: Key[Widths | None, "Widths of the networks' hidden layers."] = None
     activation: Key[Literal["tanh", "relu", "gelu", "silu"] | None, "Activation."] = None
     initial_deviation: Key[NonNegative | None, "Initial deviation of Gaussian actions."] = None
 
 
 @table
-class CceTable(Table):
-    """``[cce]``: see ``jaxltl.algos.cce.Hparams`` for other defaults."""
+class CceTable(hparams_table(cce.Hparams, "sample_share", "num_samples")):  # type: ignore[misc]
+    """``[cce]``: hyperparameters, the policy network, and the scores of samples."""
 
     rate: Key[Schedule, "Smoothing of the distribution's parameters."] = 0.5
-    temperature: Key[NonNegative | None, "Temperature of the weights."] = None
     margin: Key[Number | None, "Margin of the constraint."] = None
-    population: Key[Count | None, "Samples of a step."] = None
-    rho: Key[Confidence | None, "Share of elites."] = None
-    weighting: Key[Literal["until_feasible", "literal", "uniform"] | None, "Weights of elites."] = (
-        None
-    )
-    elite_reuse: Key[bool | None, "Keep elites for the next step."] = None
-    antithetic: Key[bool | None, "Draw samples in antithetic pairs."] = None
-    variance_floor: Key[NonNegative | None, "Least variance."] = None
     noise: Key[Schedule | None, "Noise added to the variance."] = None
-    restart_below: Key[NonNegative | None, "Deviation at which the search restarts."] = None
     hidden: Key[Widths, "Widths of the policy network's hidden layers."] = attrs.field(
         factory=lambda: [16]
     )
@@ -148,7 +156,7 @@ class CceTable(Table):
     deviation: Key[NonNegative, "Initial deviation of the network's parameters."] = 1.0
     objective: Key[Score, "Score that is maximised."] = "reward"
     cost: Key[Score | None, "Score that is constrained."] = None
-    limit: Key[Number | None, "Upper limit of the cost."] = None
+    limit: Key[Number | None, "Upper bound of the cost."] = None
     episodes: Key[Count, "Episodes by which a sample is scored."] = 10
 
     def __attrs_post_init__(self) -> None:
@@ -161,27 +169,10 @@ class CceTable(Table):
 
 
 @table
-class CpoTable(Table):
-    """``[cpo]``: see ``jaxltl.algos.trust_region.Hparams`` for other defaults."""
+class CpoTable(hparams_table(trust_region.Hparams, "method", "penalty")):  # type: ignore[misc]
+    """``[cpo]``: hyperparameters, and the cost."""
 
     discount: Key[Unit, "Discount of rewards."] = 1.0
-    cost_discount: Key[Unit | None, "Discount of costs."] = None
-    gae_lambda: Key[Unit | None, "Lambda of generalised advantages."] = None
-    cost_gae_lambda: Key[Unit | None, "Lambda of the costs' generalised advantages."] = None
-    delta: Key[NonNegative | None, "Divergence of a step, at most."] = None
-    damping: Key[NonNegative | None, "Damping of the Fisher matrix."] = None
-    initial_deviation: Key[NonNegative | None, "Initial deviation of Gaussian actions."] = None
-    backtrack: Key[Unit | None, "Factor of the line search."] = None
-    value_rate: Key[NonNegative | None, "Step size of the value networks."] = None
-    num_trajectories: Key[Count | None, "Trajectories of a step."] = None
-    hidden: Key[Widths | None, "Widths of the policy network's hidden layers."] = None
-    value_hidden: Key[Widths | None, "Widths of the value networks' hidden layers."] = None
-    normalize: Key[bool | None, "Standardise observations."] = None
-    cg_steps: Key[Count | None, "Steps of conjugate gradients."] = None
-    search_steps: Key[Count | None, "Steps of the line search."] = None
-    fisher_stride: Key[Count | None, "Every n-th state is used in the Fisher matrix."] = None
-    value_epochs: Key[Count | None, "Passes of the value fit."] = None
-    value_batches: Key[Count | None, "Minibatches of a pass of the value fit."] = None
     limit: Key[Number | None, "Upper bound of the expected cost of an episode; required."] = None
     cost: Key[
         Literal["world", "violation"], "Cost: the world's, or 1 where the formula is violated."
@@ -189,7 +180,6 @@ class CpoTable(Table):
 
 
 _TABLES = {"ppo": PpoTable, "cce": CceTable, "cpo": CpoTable}
-METHODS = tuple(_TABLES)
 
 
 @table
@@ -250,21 +240,13 @@ class EnvironmentTask:
         return self.task.formula
 
 
-def is_environment_task(path: str | Path) -> bool:
-    """Whether a task file is of a simulated world, by its world or by its method."""
-    data = schema.read_toml(Path(path), EnvironmentFile.KIND)[0]
-    world, learner = (data.get(name) for name in ("world", "learner"))
-    simulated = isinstance(world, dict) and "environment" in world
-    return simulated or (isinstance(learner, dict) and learner.get("method") in METHODS)
-
-
 def read_task(path: str | Path, raw: bytes | None = None) -> EnvironmentTask:
     """Reads a task file of a simulated world."""
     path = Path(path)
     data, found = schema.read_toml(path, EnvironmentFile.KIND, raw)
     file = schema.convert(path, EnvironmentFile, data)
     method = file.learner.method
-    tables = {name: getattr(file, name) for name in METHODS}
+    tables = {name: getattr(file, name) for name in _TABLES}
     for other, given in tables.items():
         if other != method and given is not None:
             raise ValueError(
