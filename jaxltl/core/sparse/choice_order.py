@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -41,7 +41,7 @@ class Choices(NamedTuple):
         """True if each state has one choice."""
         return self.order.size == self.states.size
 
-    def best(self, quantity: Floats, operation: Any) -> Floats:
+    def best(self, quantity: Floats, operation: np.ufunc) -> Floats:
         """The optimum over the choices of each state, by ``np.maximum`` or ``np.minimum``."""
         if self.is_chain:
             return quantity

@@ -96,7 +96,7 @@ class HostMDP:
         """The expected value of the next state, ``float64[R]``."""
         return self.matrix @ value
 
-    def over_choices(self, operation: Any, quantity: NDArray[Any]) -> NDArray[Any]:
+    def over_choices(self, operation: np.ufunc, quantity: NDArray[Any]) -> NDArray[Any]:
         """A reduction, such as ``np.maximum``, over the choices of each state: ``[R]`` to ``[S]``."""
         if self.is_chain:
             return quantity

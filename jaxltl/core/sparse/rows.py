@@ -70,7 +70,7 @@ class Rows:
         """The number of entries in a region, ``int32[R, ...]``."""
         return self._reduce(np.add, region.astype(np.int32), 0)
 
-    def _reduce(self, operation: Any, value: NDArray[Any], default: Any) -> NDArray[Any]:
+    def _reduce(self, operation: np.ufunc, value: NDArray[Any], default: Any) -> NDArray[Any]:
         found = np.full((self.num_rows, *value.shape[1:]), default, value.dtype)
         full = self.count > 0
         if full.any():

@@ -78,7 +78,7 @@ class Backup(NamedTuple):
     choices: Choices
     row: Integers
     places: Integers
-    operation: Any
+    operation: np.ufunc
 
     @property
     def small_chain(self) -> bool:
@@ -169,7 +169,7 @@ def _power(matrix: Floats, cost: Floats, value: Floats, num_steps: int) -> Float
     return value
 
 
-def backup_on(mdp: HostMDP, places: Integers, operation: Any) -> Backup:
+def backup_on(mdp: HostMDP, places: Integers, operation: np.ufunc) -> Backup:
     """The :class:`Backup` of some states, ascending."""
     count = np.diff(mdp.row_start)[places]
     choices = choices_of(count)
@@ -201,7 +201,7 @@ def until(
     target: Booleans,
     stay: Booleans,
     num_steps: int,
-    operation: Any,
+    operation: np.ufunc,
     by_step: bool = False,
 ) -> Steps:
     """Optimal probability of a target within n steps, through states where one may stay.
@@ -363,7 +363,7 @@ def total(
     magnitude: Floats,
     start: Floats,
     num_steps: int,
-    operation: Any,
+    operation: np.ufunc,
     by_step: bool = False,
 ) -> Steps:
     """Optimal expected reward of n steps, plus a terminal reward.

@@ -257,5 +257,5 @@ def _first_best(image: Floats, best: Floats, row_start: Integers) -> Integers:
     return found - row_start[:-1]
 
 
-def _reduction(sign: int) -> Any:
+def _reduction(sign: int) -> np.ufunc:
     return np.maximum if sign > 0 else np.minimum

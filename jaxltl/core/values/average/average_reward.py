@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
 
 import numpy as np
 
 from jaxltl.core.values.engine.validated import validated
+from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.sparse.solvers.average_reward import average
 from jaxltl.core.types import Solution
@@ -19,8 +19,8 @@ from jaxltl.core.values.engine.state_quantities import (
 
 @validated()
 def average_reward(
-    model: Any,
-    reward: Any,
+    model: Model,
+    reward: Array | str,
     *,
     objective: str = "max",
     tolerance: float = 1e-6,

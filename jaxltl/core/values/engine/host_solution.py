@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from jaxltl.core.models.compiled.compiled import flatten_policy
 from jaxltl.core.models.compiled.compiled import is_sparse as is_sparse
 from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.models.ops.operators import is_deterministic, require_weights, row_weights
+from jaxltl.core.models.protocols import ActionModel, Array, Model
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.mdp import HostMDP
@@ -37,7 +38,7 @@ def status_between(
 
 
 def solution_from_enclosure(
-    model: Any, sparse: SparseMDP | None, found: Enclosure, tolerance: float, *, relative: bool
+    model: Model, sparse: SparseMDP | None, found: Enclosure, tolerance: float, *, relative: bool
 ) -> Solution:
     """A solution in the shapes and precision of a model, with bounds rounded outwards.
 
@@ -108,7 +109,7 @@ class Chain(NamedTuple):
         return np.add.reduceat(taken, row_start[:-1])
 
 
-def induced_chain(model: Any, sparse: SparseMDP, policy: Any) -> Chain:
+def induced_chain(model: Model, sparse: SparseMDP, policy: Array) -> Chain:
     """Markov chain induced by a policy.
 
     Args:
@@ -124,7 +125,7 @@ def induced_chain(model: Any, sparse: SparseMDP, policy: Any) -> Chain:
     if is_sparse(model):
         weight = row_weights(sparse, flatten_policy(model, policy))
     else:
-        weight = _weights(model, sparse, np.asarray(policy))
+        weight = _weights(cast(ActionModel, model), sparse, np.asarray(policy))
         require_weights(host, weight, row_tolerance(np.float64))
     total = host.over_choices(np.add, weight)
     from scipy.sparse import csr_array
@@ -142,7 +143,7 @@ def induced_chain(model: Any, sparse: SparseMDP, policy: Any) -> Chain:
     return Chain(HostMDP(states, chain.indptr, chain.indices, chain.data), weight, depth)
 
 
-def _weights(model: Any, sparse: SparseMDP, policy: np.ndarray) -> np.ndarray:
+def _weights(model: ActionModel, sparse: SparseMDP, policy: np.ndarray) -> np.ndarray:
     """A padded model's policy as weights of its rows."""
     actions = (*model.state_shape, model.num_actions)
     if is_deterministic(policy) and policy.shape == actions[:-1]:
@@ -156,7 +157,7 @@ def _weights(model: Any, sparse: SparseMDP, policy: np.ndarray) -> np.ndarray:
     return flat[sparse.host.state, np.asarray(sparse.action)].astype(np.float64)
 
 
-def with_given_policy(solution: Solution, policy: Any) -> Solution:
+def with_given_policy(solution: Solution, policy: Array) -> Solution:
     """A solution with the policy that was evaluated, if one was given."""
     if policy is None:
         return solution
@@ -167,7 +168,12 @@ def with_given_policy(solution: Solution, policy: Any) -> Solution:
 
 
 def discounted(
-    model: Any, reward: Any, discount: Any, *, policy: Any = None, tolerance: Any = None
+    model: Model,
+    reward: Array | str,
+    discount: Array,
+    *,
+    policy: Array | None = None,
+    tolerance: Array | None = None,
 ) -> Solution:
     """Discounted values of a sparse model; arguments as of the functions for padded ones.
 
@@ -199,6 +205,6 @@ def discounted(
     return with_given_policy(Solution(**parts, method=found.method), policy)
 
 
-def default_tolerance(model: Any) -> float:
+def default_tolerance(model: Model) -> float:
     """The default width of an enclosure."""
     return 1e-6 if np.dtype(model.dtype) == np.float64 else 1e-3

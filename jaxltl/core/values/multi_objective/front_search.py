@@ -7,11 +7,11 @@ policy leaves.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
 from jaxltl.core.models.construct.convert import to_sparse
+from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.sparse.graph.qualitative import end_components
 from jaxltl.core.sparse.multi_objective import pareto_front as frontier
@@ -22,6 +22,7 @@ from jaxltl.core.sparse.multi_objective.weighted_sum import (
     weighted_optimum,
 )
 from jaxltl.core.sparse.solvers import reachability as optimal
+from jaxltl.core.sparse.solvers.total_cost import Enclosure
 from jaxltl.core.types import Status
 from jaxltl.core.values.engine.host_solution import induced_chain
 from jaxltl.core.values.multi_objective.objectives import Objective, Part, weighted_problem
@@ -34,7 +35,7 @@ _SHARPEST = 1e-12  # to which sums are solved where the border is near
 class FrontSearch:
     """Known points and half-spaces, all objectives maximised: `signs` is -1 for minimised ones."""
 
-    def __init__(self, model: Any, objectives: Sequence[Objective], tolerance: float) -> None:
+    def __init__(self, model: Model, objectives: Sequence[Objective], tolerance: float) -> None:
         self.model: SparseMDP = to_sparse(model)
         if not objectives:
             raise ValueError("there is no objective; give at least one.")
@@ -155,7 +156,7 @@ class FrontSearch:
             found.append(self._expected(part, x))
         return tuple(np.array(x) for x in zip(*found, strict=True))  # type: ignore[return-value]
 
-    def _expected(self, part: Part, found: Any) -> tuple[float, float, float]:
+    def _expected(self, part: Part, found: Enclosure) -> tuple[float, float, float]:
         """Value, lower and upper bound from the initial distribution."""
         first = np.flatnonzero(self.sums.start)
         share = self.sums.start[first]

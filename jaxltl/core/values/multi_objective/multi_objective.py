@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
 from jaxltl.core.values.engine.validated import validated
+from jaxltl.core.models.protocols import Model
 from jaxltl.core.types import Status
 from jaxltl.core import validation
 from jaxltl.core.values.multi_objective.objectives import Objective
@@ -37,7 +37,7 @@ __all__ = [
 
 @validated()
 def achievable(
-    model: Any,
+    model: Model,
     objectives: Sequence[Objective],
     thresholds: Sequence[float] | None = None,
     *,
@@ -94,7 +94,7 @@ def achievable(
 
 @validated()
 def pareto(
-    model: Any, objectives: Sequence[Objective], *, tolerance: float = 1e-4, max_points: int = 200
+    model: Model, objectives: Sequence[Objective], *, tolerance: float = 1e-4, max_points: int = 200
 ) -> Pareto:
     """Pareto curve of two or more objectives, up to a tolerance.
 
@@ -136,7 +136,7 @@ def pareto(
     return Pareto(points[np.lexsort(points.T[::-1])], front, gap, status)
 
 
-def _require(model: Any, objectives: Sequence[Objective]) -> None:
+def _require(model: Model, objectives: Sequence[Objective]) -> None:
     if hasattr(model, "nominal"):
         raise ValueError(
             "several objectives at once are not solved for where probabilities are "
@@ -151,7 +151,7 @@ def _require(model: Any, objectives: Sequence[Objective]) -> None:
 
 @validated()
 def multi_objective(
-    model: Any,
+    model: Model,
     objectives: Sequence[Objective],
     *,
     tolerance: float = TOLERANCE,

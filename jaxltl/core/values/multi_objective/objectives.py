@@ -8,7 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxltl.core.automata.translate import Task
 from jaxltl.core.automata.runs import live_states, universal_states
+from jaxltl.core.models.protocols import Array
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.multi_objective.weighted_sum import WeightedProblem
@@ -51,11 +53,11 @@ class Objective:
       0.75
     """
 
-    formula: Any = None
-    target: Any = None
-    stay: Any = None
-    avoid: Any = None
-    reward: Any = None
+    formula: Task | None = None
+    target: Array | str | None = None
+    stay: Array | str | None = None
+    avoid: Array | str | None = None
+    reward: Array | str | None = None
     direction: str = "max"
     threshold: float | None = None
 

@@ -16,6 +16,7 @@ from jaxltl.core.logic.ltl import as_formula
 from jaxltl.core.models.construct.state_formulas import state_letters
 from jaxltl.core.models.ops.operators import is_deterministic
 from jaxltl.core.models.product import Product
+from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.graph.accepting import accepting_region
@@ -65,7 +66,7 @@ def sparse_satisfaction(
     task: Task,
     *,
     objective: str = "max",
-    states: Any = None,
+    states: Array | None = None,
     label_on: str = "entry",
     tolerance: float | None = None,
 ) -> Satisfaction:
@@ -114,7 +115,7 @@ def sparse_satisfaction(
     )
 
 
-def starting_states(model: Any, states: Any) -> np.ndarray:
+def starting_states(model: Model, states: Array) -> np.ndarray:
     """The given states ``int64[I]``, else the initial states; ValueError if they are not states."""
     if states is None:
         return np.flatnonzero(np.asarray(model.initial) > 0)
@@ -191,7 +192,11 @@ def _best(
 
 
 def product_satisfaction(
-    model: Product, *, policy: Any = None, objective: str = "max", tolerance: Any = None
+    model: Product,
+    *,
+    policy: Array | None = None,
+    objective: str = "max",
+    tolerance: Array | None = None,
 ) -> Solution:
     """Optimal probability of acceptance on every state of a lazy product of a sparse model.
 
@@ -247,7 +252,7 @@ def product_satisfaction(
     return replace(found, **parts)
 
 
-def _chain(product: SparseProduct, model: Product, policy: Any) -> Chain:
+def _chain(product: SparseProduct, model: Product, policy: Array) -> Chain:
     """The chain of a policy of the model's rows."""
     policy = np.asarray(policy)
     written = sparse_mdp_of_product(product)

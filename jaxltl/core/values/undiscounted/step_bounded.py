@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.interval import IntervalMDP
+from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.models.sparse import SparseMDP, reward_structure
 from jaxltl.core.sparse.solvers import step_bounded as host
 from jaxltl.core.sparse.solvers.reward_bounded import bounded_cost, in_units
@@ -37,7 +38,7 @@ def _refuse_steps(by_step: bool) -> None:
 
 
 def next_probability(
-    model: Any, target: Any, *, objective: str = "max", nature: str | None = None
+    model: Model, target: Array | str, *, objective: str = "max", nature: str | None = None
 ) -> Solution:
     """Probability that the next state is in a set: ``opt_a P(target | s, a)``.
 
@@ -84,11 +85,11 @@ def next_probability(
 
 
 def bounded_reachability(
-    model: Any,
-    target: Any,
+    model: Model,
+    target: Array | str,
     num_steps: int,
     *,
-    stay: Any = None,
+    stay: Array | str | None = None,
     objective: str = "max",
     nature: str | None = None,
     by_step: bool = False,
@@ -138,8 +139,8 @@ def bounded_reachability(
 
 
 def cumulative_reward(
-    model: Any,
-    reward: Any,
+    model: Model,
+    reward: Array | str,
     num_steps: int,
     *,
     objective: str = "max",
@@ -182,8 +183,8 @@ def cumulative_reward(
 
 
 def instantaneous_reward(
-    model: Any,
-    reward: Any,
+    model: Model,
+    reward: Array | str,
     num_step: int,
     *,
     objective: str = "max",
@@ -228,12 +229,12 @@ def instantaneous_reward(
 
 
 def reward_bounded_reachability(
-    model: Any,
-    target: Any,
-    reward: Any,
+    model: Model,
+    target: Array | str,
+    reward: Array | str,
     bound: float,
     *,
-    stay: Any = None,
+    stay: Array | str | None = None,
     objective: str = "max",
     by_level: bool = False,
 ) -> Solution:
@@ -288,6 +289,6 @@ def reward_bounded_reachability(
 # --- what these and other host solvers share -----------------------------------------------------
 
 
-def _problem(model: Any, objective: str, num_steps: int = 0) -> tuple[SparseMDP, Any]:
+def _problem(model: Model, objective: str, num_steps: int = 0) -> tuple[SparseMDP, Any]:
     validation.integer("num_steps", num_steps)
     return to_sparse(model), reduction_for(objective)
