@@ -70,7 +70,7 @@ from jaxltl.core.models.mdp import support
 from jaxltl.core.models.ops.operators import forall_successor
 from jaxltl.core.types import Status
 from jaxltl.core.values.evaluation.data_guarantee import DataGuarantee, learn_guarantee
-from jaxltl.core.values.interval.contest import chances
+from jaxltl.core.values.interval.contest import greedy_distributions
 
 
 @jax.jit
@@ -269,7 +269,7 @@ def _expectations(
     shape, width = reached.shape, reached.shape[-1]
     low, high = (jnp.broadcast_to(x[:, :, None], shape).reshape(-1, width) for x in (lower, upper))
     key = -nature[:, None, None, None, None] * reached
-    share = chances(low, high, key.reshape(-1, width))
+    share = greedy_distributions(low, high, key.reshape(-1, width))
     return jnp.sum(share.reshape(shape) * reached, axis=-1)
 
 

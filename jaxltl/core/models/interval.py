@@ -1,4 +1,4 @@
-"""Models whose probabilities are known to lie in intervals, or in a ball, only."""
+"""Interval MDPs: uncertainty sets of intervals and L1 balls."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _RADIUS = "\0radius"
 @brief(facts=facts.interval)
 @struct.dataclass
 class IntervalMDP:
-    """A labelled decision process with an interval for each probability.
+    """A labelled MDP with an interval for each transition probability.
 
     A row stands for all distributions p with ``lower <= p <= upper`` and, where there is a radius,
     ``sum_t |p_t - center_t| <= radius``. Each time that it is taken, nature picks one of them,
@@ -134,7 +134,7 @@ class IntervalMDP:
 
     @property
     def box(self) -> IntervalMDP:
-        """The ends alone, the smallest that hold the ball: no less is possible within them."""
+        """The model without balls: the smallest intervals that contain them."""
         return replace(self, center=None, radius=None)
 
     def states_with_label(self, proposition: str) -> Array:
@@ -146,7 +146,7 @@ class IntervalMDP:
         return self.nominal.states_with_label(proposition)
 
     def changed(self, change: Callable[[SparseMDP], SparseMDP]) -> IntervalMDP:
-        """The model after a change that drops, repeats or moves entries, but adds up none."""
+        """The model after a change that drops, repeats or moves entries, but merges none."""
         ends = _travelling(self.lower, self.upper, self.center, self.radius)
         return _taken_apart(change(self.nominal.replace(rewards=self.rewards | ends)))  # type: ignore[attr-defined]
 
@@ -166,7 +166,7 @@ def require_interval(model: Model) -> IntervalMDP:
 
 
 def refuse_ball(model: IntervalMDP, why: str) -> None:
-    """Raises ValueError if a model has a radius, where only ends are understood."""
+    """Raises ValueError for a model with L1 balls, where only intervals are supported."""
     if model.radius is not None:
         raise ValueError(
             f"the model has a radius, and {why}; give its smallest intervals, "
@@ -207,7 +207,7 @@ def make_interval(
     center: Array | None = None,
     radius: Array | None = None,
 ) -> IntervalMDP:
-    """A model whose probabilities are replaced by intervals, and by a ball in each row.
+    """Interval MDP on the graph of a model, with optional L1 balls.
 
     Args:
       model: its graph, labels, rewards, names and initial distribution count, its probabilities
@@ -305,7 +305,7 @@ def interval_rows(
     rewards: Mapping[str, Rewards] | None = None,
     **rest: Any,
 ) -> IntervalMDP:
-    """A checked :class:`IntervalMDP` from arrays, on the host.
+    """Interval MDP from arrays of sparse rows, checked.
 
     Successors that stand twice in a row become one, whose ends are the sums. Ends that miss a
     distribution by less than 1e-6 are scaled to one.
@@ -385,7 +385,7 @@ def interval_rows(
 def _ball(
     center: Any, radius: Any, entries: tuple[int, ...], num_rows: int
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """A center and a radius as numbers, of the right shape; None if both are left out."""
+    """Center and radius with checked shapes, or None."""
     if center is None and radius is None:
         return None
     if center is None or radius is None:
@@ -442,7 +442,7 @@ def _around(
     center: np.ndarray,
     radius: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """The ends that a ball leaves, and the ball, whose center is between them."""
+    """Intervals tightened by the L1 ball, and the ball."""
     total = np.add.reduceat(center, entry_start[:-1])
     rounding = (np.diff(entry_start) + 2) * np.finfo(np.float64).eps
     center = np.where((np.abs(total - 1) > rounding)[row], center / total[row], center)
@@ -469,7 +469,7 @@ def _pointed(
     upper: np.ndarray,
     ball: tuple[np.ndarray, np.ndarray] | None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The ends, equal in rows that hold no distribution, by rounding: these are in proportion.
+    """Ends made equal in rows that hold no distribution because of rounding.
 
     To the upper ends where these sum to less than one, to the lower ones where these sum to more,
     and to the center of a ball that is farther from all distributions than its radius.
@@ -508,7 +508,7 @@ def _scaled(
     lower: np.ndarray,
     upper: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The ends, such that each row has a distribution between them."""
+    """Ends scaled so that each row contains a distribution."""
     low, high = (np.add.reduceat(x, entry_start[:-1]) for x in (lower, upper))
     rounding = (np.diff(entry_start) + 2) * np.finfo(np.float64).eps  # what is no miss
     bad = (low > 1 + NEAR) | (high < 1 - NEAR)
@@ -531,7 +531,7 @@ def _merged(
     numbers: list[np.ndarray],
     rewards: dict[str, Rewards],
 ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray], dict[str, Rewards]]:
-    """Entries of one row with one successor as one, with sums, if they earn the same."""
+    """Merges repeated successors of a row by summing their ends."""
     order = np.lexsort((successor, row))
     row, successor = row[order], successor[order]
     new = np.append(True, (row[1:] != row[:-1]) | (successor[1:] != successor[:-1]))

@@ -1,4 +1,4 @@
-"""Intervals of a probability from how often it came true, with ends that err outward.
+"""Confidence intervals of binomial proportions, rounded outwards.
 
 Each function takes ``count`` of ``total`` and the chance `failure` of a miss, and gives ends
 ``(lower, upper)`` in double precision. Rounding is accounted for: what an end excludes is excluded
@@ -23,7 +23,7 @@ Ends = tuple[Floats, Floats]
 
 
 def clopper_pearson(count: Integers, total: Integers, failure: float) -> Ends:
-    """The ends that a binomial test on each side excludes (Clopper and Pearson 1934).
+    """Clopper-Pearson interval (1934), from one binomial test on each side.
 
     ``P(Bin(n, lower) >= k) = P(Bin(n, upper) <= k) = failure / 2``. Each side misses with a chance
     of at most ``failure / 2``, whatever the probability, if n does not depend on what came.
@@ -45,7 +45,7 @@ def clopper_pearson(count: Integers, total: Integers, failure: float) -> Ends:
 
 
 def hoeffding(count: Integers, total: Integers, failure: float) -> Ends:
-    """The frequency and as much on both sides as Hoeffding (1963, theorem 1) allows.
+    """Hoeffding interval (1963, theorem 1) around the frequency.
 
     ``k / n -+ sqrt(log(2 / failure) / (2 n))``, if n does not depend on what came.
 
@@ -60,7 +60,7 @@ def hoeffding(count: Integers, total: Integers, failure: float) -> Ends:
 
 
 def anytime(count: Integers, total: Integers, failure: float) -> Ends:
-    """The probabilities that a mixture of all others does not outbid, at any time.
+    """Anytime-valid interval from a beta mixture martingale.
 
     ``p^k (1 - p)^(n - k) >= failure B(k + 1/2, n - k + 1/2) / B(1/2, 1/2)``: the likelihood of
     Jeffreys' mixture over that of p is a martingale, so the chance that it ever exceeds
@@ -84,13 +84,13 @@ def frequency(count: Integers, total: Integers) -> Floats:
 
 
 def hoeffding_deviation(total: Integers, failure: float) -> Floats:
-    """By how much a frequency misses at most, but for a chance of `failure`."""
+    """Hoeffding's deviation of a frequency at failure probability `failure`."""
     with np.errstate(divide="ignore"):
         return np.sqrt((np.log(2) - np.log(failure)) / (2.0 * np.asarray(total)))
 
 
 def around(center: Floats, deviation: Floats) -> Ends:
-    """What lies within a deviation, and in [0, 1]; a little more than rounding could hide."""
+    """The interval of a deviation around a center, clipped to [0, 1] and rounded outwards."""
     deviation = deviation * (1 + 16 * _EPS) + 4 * _EPS
     return np.maximum(center - deviation, 0), np.minimum(center + deviation, 1)
 
@@ -101,7 +101,7 @@ def _of_distinct(
     total: Integers,
     failure: float,
 ) -> Ends:
-    """Both ends from the lower ones, by symmetry, of each pair of numbers once."""
+    """Both ends from lower ends, by symmetry, computed once for each pair of counts."""
     count, total = np.broadcast_arrays(np.asarray(count), np.asarray(total))
     pair, place = np.unique(count.ravel() + 1j * total.ravel(), return_inverse=True)
     k, n = (x.astype(np.int64) for x in (pair.real, pair.imag))
@@ -153,7 +153,7 @@ def _mixed(k: Integers, n: Integers, failure: float) -> Floats:
 def _climbed(
     gap: Callable[[Floats, Integers], Ends], k: Integers, n: Integers, deviance: Floats | float
 ) -> Floats:
-    """The largest x, or nearly, at which a concave, rising function of log x is below zero.
+    """Newton's method for the root of an increasing concave function of log x, from the left.
 
     Newton's steps end left of the zero, where the function is below its tangents; so they climb to
     it, and what is found does not depend on what else is looked for.

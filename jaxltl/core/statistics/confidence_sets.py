@@ -1,4 +1,4 @@
-"""From counts of transitions to sets that hold their probabilities, all at once.
+"""Simultaneous confidence sets of transition probabilities from counts.
 
 Every row (state and action) is a die with its own probabilities. What is known of it after n throws
 is an interval for each outcome, or a ball in the L1 norm around the frequencies. A union bound
@@ -50,7 +50,7 @@ def _facts(sets: Any) -> Iterator[str]:
 @brief(facts=_facts)
 @dataclass(frozen=True)
 class ConfidenceSets:
-    """A set of distributions for each row; together they hold all true ones, with `confidence`.
+    """Confidence sets of all rows, simultaneously valid with probability `confidence`.
 
     Attributes:
       lower, upper: ``float64[T]`` or ``float64[..., K]`` as the counts, ends of intervals; 0 at
@@ -93,7 +93,7 @@ def intervals_from_counts(
     num_outcomes: Any = None,
     num_claims: int | None = None,
 ) -> ConfidenceSets:
-    """Sets that hold the probabilities of all rows at once, with a chance of `confidence`.
+    """Confidence sets of the probabilities of all rows, simultaneously valid.
 
     The chance to be wrong, ``1 - confidence``, is shared equally by M claims, each of which fails
     with a chance of at most ``(1 - confidence) / M``; so all hold together, however rows and
@@ -193,7 +193,7 @@ def intervals_from_counts(
 
 
 def l1_radius(total: Integers, num_outcomes: Integers, failure: float) -> Floats:
-    """How far frequencies are from the probabilities in all, but for a chance of `failure`.
+    """L1 deviation of frequencies from probabilities at failure probability `failure`.
 
     ``sqrt(2 / n log((2^J - 2) / failure))`` (Weissman et al. 2003, theorem 2.1), at most 2.
 
@@ -225,7 +225,7 @@ def samples_needed(
     num_claims: int = 1,
     num_outcomes: int = 2,
 ) -> int:
-    """How many throws of a row make every interval at most so wide, whatever comes.
+    """Number of samples of a row after which every interval has at most a given width.
 
     The widest interval is that of an outcome which comes half of the time.
 
@@ -289,7 +289,7 @@ def check_confidence(confidence: float) -> None:
 
 
 def _entries(counts: Any, entry_start: Any, used: Any) -> tuple[Integers, Integers, Booleans]:
-    """The counts of all successors by row, how many each row has, and which entries these are."""
+    """Counts of listed successors, their number per row, and their mask."""
     counts = np.asarray(counts)
     if entry_start is not None:
         start: Any = np.asarray(entry_start)

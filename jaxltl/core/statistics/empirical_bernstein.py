@@ -1,4 +1,4 @@
-"""Intervals of the mean of bounded numbers that come one after the other, at any time.
+"""Empirical-Bernstein confidence sequence of the mean of bounded random variables.
 
 The predictable plug-in empirical-Bernstein confidence sequence (Waudby-Smith and Ramdas 2024,
 "Estimating means of bounded random variables by betting", theorem 2): of numbers ``X_i`` in [0, 1]
@@ -25,7 +25,7 @@ _MOST = 0.5  # of a weight; more gains little where the variance is small, and l
 def bounded_mean(
     numbers: Floats, failure: float, *, planned: int | None = None
 ) -> tuple[float, float]:
-    """The ends of the interval of the mean of numbers in [0, 1], itself in [0, 1].
+    """Confidence interval of the mean of numbers in [0, 1].
 
     Args:
       numbers: ``float64[N]`` in the order in which they came; those outside are clipped.

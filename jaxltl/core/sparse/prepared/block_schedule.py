@@ -1,8 +1,8 @@
-"""Blocks of equal shape in which a sparse system is solved from its last states on.
+"""Topological block schedule of a sparse system, with blocks padded to equal shape.
 
 Nodes stand in an order in which most lead to earlier ones. A node has at most A rows, whose optimum
 it is, and a row at most W entries; what is wider is split among nodes of its own. Blocks of B nodes
-are evaluated one after the other. Where nodes lie on circles, layers nearer to where a strongly
+are evaluated one after the other. Where nodes lie on cycles, layers nearer to where a strongly
 connected component is left come first, and entries that lead on read what was found before.
 """
 
@@ -30,7 +30,7 @@ _ENTRY_COST = 1.5
 
 
 class Nodes(NamedTuple):
-    """A system: every node is the optimum of its rows, and a row the sum of its entries.
+    """Optimality equations: a node is the optimum of its rows, a row a weighted sum of entries.
 
     Attributes:
       number: how many nodes there are.
@@ -50,7 +50,7 @@ class Nodes(NamedTuple):
 
 
 class Segment(NamedTuple):
-    """Blocks that are evaluated in a row.
+    """Consecutive blocks of a schedule.
 
     Attributes:
       target: ``int32[C, A, W, B]``, places of nodes, or N, N + 1, N + 2 for ONE, GOAL, LOST.
@@ -64,13 +64,13 @@ class Segment(NamedTuple):
 
 
 class Schedule(NamedTuple):
-    """Segments: before the nodes on circles, these and those between them, and after them.
+    """Three segments: nodes before, on (or between) and after cycles.
 
     Attributes:
       segments: three of them, maybe empty.
       place: ``int[M]``, where each of the M nodes stands among the N.
       size: N.
-      levels: what depends on what goes so far, where there are no circles.
+      levels: what depends on what goes so far, where there are no cycles.
       choices: how often a choice may be split.
     """
 
@@ -82,7 +82,7 @@ class Schedule(NamedTuple):
 
 
 def schedule(nodes: Nodes, one: int, nothing: int) -> Schedule:
-    """The blocks of a system.
+    """The block schedule of a system.
 
     Args:
       nodes: the system.
@@ -116,7 +116,7 @@ def _ranks(group: Integers, count: int) -> Integers:
 
 
 def _shape(nodes: Nodes) -> tuple[int, int]:
-    """The numbers of rows and of entries that make the least work."""
+    """Block shape (rows per node, entries per row) of least padding."""
     rows = np.bincount(np.bincount(nodes.owner, minlength=nodes.number))
     widths = np.bincount(np.bincount(nodes.row, minlength=nodes.owner.size))
     mosts = [a for a in _WIDTHS if a > 1 and a < 2 * rows.size] if rows.size > 2 else [1]
@@ -134,7 +134,7 @@ def _shape(nodes: Nodes) -> tuple[int, int]:
 
 
 def _split(histogram: Integers, most: int) -> int:
-    """How many nodes it takes to split groups of more elements."""
+    """Number of auxiliary nodes that split groups of more than `most` elements."""
     total = 0
     for size in range(most + 1, histogram.size):
         left = size
@@ -146,7 +146,7 @@ def _split(histogram: Integers, most: int) -> int:
 
 
 def _narrow_rows(nodes: Nodes, width: int, one: int) -> Nodes:
-    """The same with rows of at most so many entries."""
+    """The system with wide rows split among auxiliary nodes."""
     count, owner, name, row, target, source = nodes
     while True:
         size = np.bincount(row, minlength=owner.size)
@@ -168,7 +168,7 @@ def _narrow_rows(nodes: Nodes, width: int, one: int) -> Nodes:
 
 
 def _groups(of: Integers, size: Integers, most: int) -> tuple[Integers, int, Integers, Integers]:
-    """Elements of groups that are too large, their new groups' number, first elements, groups."""
+    """Elements to move out of large groups, with the number, heads and ids of the new groups."""
     rank = _ranks(of, size.size)
     alone = (rank % most == 0) & (rank == size[of] - 1)  # one that would be a group of its own
     moved = np.flatnonzero((size[of] > most) & ~alone)
@@ -179,7 +179,7 @@ def _groups(of: Integers, size: Integers, most: int) -> tuple[Integers, int, Int
 
 
 def _narrow_nodes(nodes: Nodes, most: int, one: int) -> tuple[Nodes, int]:
-    """The same with nodes of at most so many rows, and in how many rounds they were split."""
+    """The system with nodes of many rows split, and the number of rounds."""
     count, owner, name, row, target, source = nodes
     rounds = 0
     while True:
@@ -211,7 +211,7 @@ def _narrow_nodes(nodes: Nodes, most: int, one: int) -> tuple[Nodes, int]:
 
 
 def _ordered(nodes: Nodes) -> list[list[Integers]]:
-    """Levels before, among and after the circles."""
+    """Topological levels before, on and after cycles."""
     edges = _edges(nodes)
     back, among = edges.reverse(), np.ones(nodes.number, bool)
     below = _peeled(back, np.diff(edges.start).astype(np.int32), among)
@@ -240,7 +240,7 @@ def _peeled(back: Edges, number: Integers, among: Booleans) -> list[Integers]:
 
 
 def _layers(edges: Edges, core: Integers) -> list[Integers]:
-    """The nodes of circles and between them, nearer to where these are left first."""
+    """Nodes on cycles, by their distance from the exits of their component."""
     number: Any = np.full(edges.num_nodes, -1, np.int64)
     number[core] = np.arange(core.size)
     width = edges.start[core + 1] - edges.start[core]
@@ -263,7 +263,7 @@ def _layers(edges: Edges, core: Integers) -> list[Integers]:
 
 
 def _distances(source: Integers, target: Integers, leaves: Booleans, label: Integers) -> Integers:
-    """How many steps it takes to where a component is left; far where nothing leaves it."""
+    """Distance from the exits of each strongly connected component."""
     size = leaves.size
     start = np.concatenate([[0], np.bincount(target, minlength=size).cumsum()])
     before = source[np.argsort(target, kind="stable")]
@@ -297,7 +297,7 @@ def _block_size(widths: list[int], entries: int) -> int:
 def _filled(
     nodes: Nodes, place: Integers, total: int, shape: tuple[int, int, int], nothing: int
 ) -> tuple[Integers, Integers, Integers]:
-    """The arrays of all blocks."""
+    """Padded arrays of all blocks."""
     most, width, size = shape
     blocks = total // size
     if total * most * width >= 2**31:

@@ -1,4 +1,4 @@
-"""What a prepared solve knows of a question: the schedule, and how numbers and answers go through.
+"""Plan of a prepared solve: preprocessing, schedule, and the maps of numbers and policies.
 
 Numbers are the probabilities of the T entries, the rewards of the R rows, one and zero, in this
 order: T + R is one, and T + R + 1 zero.
@@ -24,7 +24,7 @@ from jaxltl.core.sparse.solvers.reachability import ReducedProblem, quotient_pol
 
 
 class Loops(NamedTuple):
-    """Groups of rows that lead to where they are, and whose other entries share all the weight.
+    """Self-loops to eliminate: groups of rows whose other entries are normalised.
 
     Attributes:
       entry: ``int[E]``, the entries that lead elsewhere.
@@ -41,8 +41,8 @@ class Loops(NamedTuple):
     groups: int
 
 
-class Circles(NamedTuple):
-    """End components that are one node each, in which one goes to where the node is left.
+class Cycles(NamedTuple):
+    """Collapsed end components, in which the policy moves to the exit of the component.
 
     Attributes:
       state: ``int[M]``, their states.
@@ -58,7 +58,7 @@ class Circles(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """All that a question keeps for other numbers.
+    """Plan of a question for solves with other numbers.
 
     Attributes:
       schedule: the order of the nodes.
@@ -66,7 +66,7 @@ class Plan(NamedTuple):
       own: ``int32[S]``, the place of the node whose row a state takes, or -1.
       row: ``int32[S]``, the row that it takes else.
       loops: rows that lead to where they are.
-      circles: end components that are one node.
+      cycles: end components that are one node.
       terms: how many roundings stand behind a weight.
     """
 
@@ -75,7 +75,7 @@ class Plan(NamedTuple):
     own: Integers
     row: Integers
     loops: Loops | None
-    circles: Circles | None
+    cycles: Cycles | None
     terms: int
 
 
@@ -88,7 +88,7 @@ class _Entries(NamedTuple):
 
 
 def plan_optimum(reduced: ReducedProblem, cost: Floats | None) -> Plan:
-    """The plan of an optimum, or of a chain.
+    """Plan of an optimum, or of a Markov chain.
 
     Args:
       reduced: what the graph leaves.
@@ -117,8 +117,8 @@ def plan_optimum(reduced: ReducedProblem, cost: Floats | None) -> Plan:
     codes = order.size - 1 - codes
     codes[open_] = order.place
     own, row = _own(reduced, codes)
-    circles = _circles(reduced)
-    return Plan(order, codes[node].astype(np.int32), own, row, loops, circles, _terms(loops))
+    cycles = _circles(reduced)
+    return Plan(order, codes[node].astype(np.int32), own, row, loops, cycles, _terms(loops))
 
 
 def _optimum_nodes(
@@ -164,7 +164,7 @@ def _entries(mdp: HostMDP, small: HostMDP, origin: Integers, rows: Integers) -> 
 def _loops(
     found: _Entries, loop: Booleans, looping: Booleans, group: Integers, origin: Integers
 ) -> Loops:
-    """Of the rows that are marked, which are in groups by rank."""
+    """Self-loops of the marked rows, by group."""
     rest = np.flatnonzero(~loop & looping[found.row])
     of = group[found.row[rest]]
     order = np.argsort(of, kind="stable")
@@ -177,7 +177,7 @@ def _loops(
 def _with_costs(
     entries: _Entries, origin: Integers, cost: Floats | None, num_entries: int
 ) -> _Entries:
-    """What a row earns comes in through the constant one."""
+    """Adds rewards as entries of the constant one."""
     if cost is None:
         return entries
     paid = np.flatnonzero(cost[origin] > 0)
@@ -191,7 +191,7 @@ def _with_costs(
 
 
 def _own(reduced: ReducedProblem, codes: Integers) -> tuple[Integers, Integers]:
-    """The nodes whose rows states take, and the rows of the others."""
+    """Place of the node that decides for each state, and fixed rows elsewhere."""
     mdp, whole, part = reduced.mdp, reduced.contraction, reduced.quotient
     mine = mdp.state[whole.row[whole.mdp.row_start[:-1]]]  # the state that each node is
     chosen: Any = reduced.known_row
@@ -211,8 +211,8 @@ def _own(reduced: ReducedProblem, codes: Integers) -> tuple[Integers, Integers]:
     return own, row
 
 
-def _circles(reduced: ReducedProblem) -> Circles | None:
-    """The states of end components that are open; elsewhere rows are known."""
+def _circles(reduced: ReducedProblem) -> Cycles | None:
+    """States and rows of the collapsed end components with unknown value."""
     components, whole, part = reduced.components, reduced.contraction, reduced.quotient
     if components is None or part is None or reduced.problem is None:
         return None
@@ -227,7 +227,7 @@ def _circles(reduced: ReducedProblem) -> Circles | None:
     rows = np.flatnonzero(inside)
     width = np.diff(mdp.entry_start)[rows]
     mine = reduced.mdp.state[whole.row[mdp.row_start[:-1]]]
-    return Circles(
+    return Cycles(
         mine[region],
         whole.row[rows],
         number[mdp.state[rows]],
@@ -237,7 +237,7 @@ def _circles(reduced: ReducedProblem) -> Circles | None:
 
 
 def plan_policy(mdp: HostMDP, target: Booleans, stay: Booleans | None, cost: Floats | None) -> Plan:
-    """The plan of policies, whatever they are.
+    """Plan of policy evaluation, for policies given later.
 
     Args:
       mdp: the model.

@@ -1,4 +1,4 @@
-"""Values of many models of one game at once, each from a first guess.
+"""Warm-started discounted values of many models of one game.
 
 For learners that solve a model again and again as it changes. Under ``vmap`` over models of one
 graph the lanes become the last axis of every array, so that whole rows of lanes are read at
@@ -23,7 +23,7 @@ _WRITTEN_OUT = 16  # successors up to which a sum over them is written out
 
 
 class _Graph(NamedTuple):
-    """What all lanes share."""
+    """Data shared by all lanes."""
 
     successor: jax.Array  # [S, A, K]
     allowed: jax.Array  # [S, A]
@@ -31,7 +31,7 @@ class _Graph(NamedTuple):
 
 
 class _Models(NamedTuple):
-    """What differs, with a last axis of lanes, or none."""
+    """Data of each lane, lanes on the last axis."""
 
     gain: jax.Array  # [S, A]
     probability: jax.Array  # [S, A, K]; with K = 1 not read
@@ -52,7 +52,7 @@ def span_iteration(
     enough: jax.Array,
     active: jax.Array | bool = True,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """The value of a discounted game from a first guess, and the moves' values.
+    """Value iteration of a discounted game from a first guess, with MacQueen bounds.
 
     Sweeps ``v <- T v + c`` with ``T v(s) = max_a gain(s, a) + discount * P v`` (min where the
     environment moves), where c is the middle of MacQueen's (1966) bounds ``discount / (1 -
@@ -88,7 +88,7 @@ def span_iteration(
 
 
 class _Sweeps(NamedTuple):
-    """What a loop over sweeps carries; `change` is ``T v - v``, written out once for all uses."""
+    """Loop state; `change` is ``T v - v``, computed once for all uses."""
 
     value: jax.Array
     change: jax.Array
@@ -116,7 +116,7 @@ def _unfinished(models: _Models, now: _Sweeps) -> jax.Array:
 
 
 def _swept(graph: _Graph, models: _Models, start: _Sweeps, few: int = 0) -> _Sweeps:
-    """Sweeps until at most a few lanes are left that are not done."""
+    """Sweeps until at most `few` lanes have not converged."""
     live = _beside(models, graph.allowed.any(-1))
     ahead = models.discount / (1 - models.discount)
 
@@ -137,7 +137,7 @@ def _swept(graph: _Graph, models: _Models, start: _Sweeps, few: int = 0) -> _Swe
 
 
 def _last_lanes(graph: _Graph, models: _Models, found: _Sweeps, few: int) -> _Sweeps:
-    """The lanes that are not done go on by themselves: most models need a few sweeps, some many."""
+    """Continues with the lanes that have not converged: most models need few sweeps, some many."""
     going = _unfinished(models, found)
     place = jnp.cumsum(going) - 1
     who = jnp.nonzero(going, size=few, fill_value=0)[0]
@@ -151,7 +151,7 @@ def _last_lanes(graph: _Graph, models: _Models, found: _Sweeps, few: int) -> _Sw
 
 
 def _beside(models: _Models, x: jax.Array) -> jax.Array:
-    """One entry for all lanes."""
+    """Broadcasts shared data over the lanes."""
     return x.reshape(x.shape + (1,) * models.active.ndim)
 
 
@@ -165,7 +165,7 @@ def _change(graph: _Graph, models: _Models, value: jax.Array) -> jax.Array:
 
 
 def _quantities(graph: _Graph, models: _Models, value: jax.Array) -> list[jax.Array]:
-    """``gain + discount * P v``, a column for each action: so it is read in the order of memory."""
+    """``gain + discount * P v``, one column per action for contiguous reads."""
     num_actions, width = graph.successor.shape[1:]
 
     def reached(*where: Any) -> jax.Array:

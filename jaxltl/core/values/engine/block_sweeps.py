@@ -1,4 +1,4 @@
-"""Passes over the blocks of a schedule, forwards, backwards, and until nothing moves."""
+"""Gauss-Seidel sweeps over a block schedule, forwards and backwards."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from jaxltl.core.values.engine.linear import solve_linear
 
 @struct.dataclass
 class Blocks:
-    """A segment of a :class:`~jaxltl.core.sparse.prepared.block_schedule.Schedule` with its numbers.
+    """A segment of a :class:`~jaxltl.core.sparse.prepared.block_schedule.Schedule` with its weights.
 
     Attributes:
       target: ``int32[C, A, W, B]``, places.
@@ -32,7 +32,7 @@ class Blocks:
 
     @property
     def size(self) -> int:
-        """How many places there are."""
+        """Number of places."""
         return self.target.shape[0] * self.target.shape[3]
 
     @property
@@ -109,7 +109,7 @@ def images(blocks: Blocks, x: jax.Array) -> jax.Array:
 
 
 def chosen_names(names: jax.Array, rank: jax.Array, rounds: int) -> jax.Array:
-    """``int32[N]``, the names of the rows that nodes take.
+    """Names of the rows chosen by the nodes, ``int32[N]``.
 
     Args:
       names: ``int32[C, A, B]`` of all blocks.
@@ -125,13 +125,13 @@ def chosen_names(names: jax.Array, rank: jax.Array, rounds: int) -> jax.Array:
 def meets(
     segments: tuple[Blocks, ...], support: tuple[jax.Array, ...], x: jax.Array, cyclic: bool
 ) -> jax.Array:
-    """The places from which entries that have weight lead to some places.
+    """Backward reachability over entries with positive weight.
 
     Args:
       segments: of a system of one row a node.
       support: ``bool[C, 1, W, B]`` for each of them.
       x: ``bool[N + 3]``, where to get.
-      cyclic: whether the second segment has circles.
+      cyclic: whether the second segment has cycles.
     """
 
     def once(blocks: Blocks, has: jax.Array, x: jax.Array) -> jax.Array:
@@ -229,7 +229,7 @@ class Chosen:
         return self._solved(self._backward, b)
 
     def _solved(self, one_pass: Any, b: jax.Array) -> jax.Array:
-        # A pass leaves what goes round for the next one, and nothing where there are no circles.
+        # A pass leaves what goes round for the next one, and nothing where there are no cycles.
         first = one_pass(jnp.zeros_like(b), b)
         if not self.cyclic:
             return first

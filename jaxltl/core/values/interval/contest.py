@@ -1,4 +1,4 @@
-"""Values of a policy and of nature, each for a value or against it, enclosed inside ``jit``.
+"""Certified values of policy against nature, or with it, by policy iteration inside ``jit``.
 
 Values carry a sign, such that one side, the leader, wants them large and must get out of what is
 open: of a probability who makes it large, of a reward until a target who makes it small. Policy
@@ -38,7 +38,7 @@ _EQUAL = 2.0**12  # roundings by which equal values may differ
 
 @struct.dataclass
 class Contest:
-    """Rows of intervals between open states, and who wants what.
+    """Optimality equations of interval rows between open states.
 
     Attributes:
       target: ``int32[R, W]``, nodes; N is worth 0, N + 1 is worth 1.
@@ -49,7 +49,7 @@ class Contest:
       cost: ``float[R]``, with the sign.
       policy_leads, nature_leads: static.
       relative: whether widths are asked for as a share of the value, static.
-      circling: whether the leader may stay for ever for nothing, static.
+      has_free_cycles: whether the leader may stay for ever for nothing, static.
     """
 
     target: Any
@@ -62,7 +62,7 @@ class Contest:
     policy_leads: bool = struct.field(pytree_node=False)
     nature_leads: bool = struct.field(pytree_node=False)
     relative: bool = struct.field(pytree_node=False)
-    circling: bool = struct.field(pytree_node=False)
+    has_free_cycles: bool = struct.field(pytree_node=False)
 
     @property
     def size(self) -> int:
@@ -75,23 +75,23 @@ class Contest:
 
     @property
     def out(self) -> jax.Array:
-        """``bool[R, W]``, entries that leave their node."""
+        """Entries that leave their node, ``bool[R, W]``."""
         return (self.target != self.owner[:, None]) & (self.upper > 0)
 
     def ahead(self, z: jax.Array) -> jax.Array:
-        """How much more each entry leads to than where it comes from, ``float[R, W]``."""
+        """Differences ``x_t - x_s`` of the entries, ``float[R, W]``."""
         return jnp.where(self.out, _all(z)[self.target] - z[self.owner][:, None], 0)
 
     def greedy(self, gain: jax.Array) -> jax.Array:
-        """Nature's distributions at some gains."""
-        return chances(self.lower, self.upper, self.key(gain))
+        """Nature's optimal distributions for some gains."""
+        return greedy_distributions(self.lower, self.upper, self.key(gain))
 
     def key(self, gain: jax.Array) -> jax.Array:
-        """The order in which nature gives mass."""
+        """The key by which nature distributes mass."""
         return -gain if self.nature_leads else gain
 
     def best(self, gain: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """The gain that the policy prefers in each node, and its row: ``[N]``."""
+        """Optimal gain of each node, and its row, ``[N]``."""
         each = gain[self.choice]
         rank = jnp.argmax(each if self.policy_leads else -each, axis=1)[:, None]
         return (
@@ -101,7 +101,7 @@ class Contest:
 
 
 class Bounds(NamedTuple):
-    """What was found, of the nodes.
+    """Bounds of the nodes, and a pair of policy and nature.
 
     Attributes:
       near, far: ``float[N]``: what the leader attains, and what it cannot exceed.
@@ -123,17 +123,17 @@ class Bounds(NamedTuple):
 
 
 def _all(z: jax.Array) -> jax.Array:
-    """Values of the nodes and of the two ends."""
+    """Values of the nodes, then 0 and 1."""
     return jnp.concatenate([z, jnp.asarray([0, 1], z.dtype)])
 
 
 def rounding(width: Any, dtype: Any) -> Any:
-    """By how much a sum of so many terms may miss, of numbers that add up to one."""
+    """Bound on the rounding error of a sum of `width` masses."""
     return 4 * float(jnp.finfo(dtype).eps) * (width + 1)
 
 
-def chances(lower: jax.Array, upper: jax.Array, key: jax.Array) -> jax.Array:
-    """The distributions between ends that give mass first where a key is small, ``float[R, W]``.
+def greedy_distributions(lower: jax.Array, upper: jax.Array, key: jax.Array) -> jax.Array:
+    """Greedy distributions between ends, least key first, ``float[R, W]``.
 
     Differentiable in the ends, the order held fixed.
     """
@@ -143,7 +143,7 @@ def chances(lower: jax.Array, upper: jax.Array, key: jax.Array) -> jax.Array:
 
 
 def _left(lower: jax.Array, upper: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The mass that is left when it is an entry's turn, and how much the entry may take."""
+    """Mass that better entries leave to each entry, and its room."""
     width = key.shape[1]
     free = upper - lower
     rest = jnp.maximum(1 - jnp.sum(lower, axis=1, keepdims=True), 0)
@@ -195,7 +195,7 @@ def system(target: jax.Array, weight: jax.Array) -> tuple[Any, Any]:
 
 
 def leaving(target: jax.Array, probability: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The mass that leaves each node, 1 where there is none, and what it is divided by that."""
+    """Mass that leaves each node (1 where none does), and the weights divided by it."""
     own = jnp.arange(target.shape[0])[:, None]
     out = jnp.where(target != own, probability, 0)
     mass = jnp.sum(out, axis=1)
@@ -220,7 +220,7 @@ class _Play(NamedTuple):
 
 
 def enclose(contest: Contest, tolerance: jax.Array, max_rounds: jax.Array) -> Bounds:
-    """Bounds of both sides.
+    """Certified lower and upper bounds.
 
     Args:
       contest: who plays what.
@@ -247,7 +247,7 @@ def enclose(contest: Contest, tolerance: jax.Array, max_rounds: jax.Array) -> Bo
     apart = jnp.arange(contest.size + 2)
     near = _played(contest, start, -1.0, apart, tolerance, max_rounds)
     label = apart
-    if contest.circling:
+    if contest.has_free_cycles:
         label = jnp.concatenate([_groups(near.base, contest.eps)[0], apart[contest.size :]])
     again = start._replace(row=near.row, probability=near.probability)
     far = _played(contest, again, 1.0, label, tolerance, max_rounds)
@@ -270,7 +270,7 @@ def enclose(contest: Contest, tolerance: jax.Array, max_rounds: jax.Array) -> Bo
 
 
 def _groups(z: jax.Array, eps: float) -> tuple[jax.Array, jax.Array]:
-    """Numbers of values that rounding alone may tell apart, and the largest value of each."""
+    """Groups of values that are equal up to rounding, and the largest of each group."""
     order = jnp.argsort(z)
     ranked = z[order]
     apart = _EQUAL * eps * jnp.max(jnp.abs(z))
@@ -289,10 +289,10 @@ def _played(
     tolerance: jax.Array,
     max_rounds: jax.Array,
 ) -> _Play:
-    """Policy iteration until a bound is proven: from below the value, or from above it."""
+    """Policy iteration until a lower or an upper bound is proven."""
     out, size = contest.out, contest.size
     earning = out & (label[contest.target] != label[contest.owner][:, None])
-    equal = contest.circling and sign > 0
+    equal = contest.has_free_cycles and sign > 0
 
     def body(play: _Play) -> _Play:
         target = contest.target[play.row]
@@ -333,7 +333,7 @@ def _played(
 
 
 def _extra(contest: Contest, base: jax.Array, time: jax.Array, tolerance: jax.Array) -> jax.Array:
-    """How much more a step earns: little beside the tolerance, and more than rounding."""
+    """Extra of a step: small beside the tolerance, and more than rounding."""
     largest = jnp.max(jnp.abs(base))
     scale: jax.Array | float = 1.0
     if contest.relative:
@@ -348,7 +348,7 @@ def _extra(contest: Contest, base: jax.Array, time: jax.Array, tolerance: jax.Ar
 def _moved(
     contest: Contest, play: _Play, z: jax.Array, more: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Rows and distributions that are better than those that were solved."""
+    """Improved rows and distributions."""
     gain = contest.ahead(z) + more
     greedy = contest.greedy(gain)
     now = jnp.sum(play.probability * gain, axis=1) + contest.cost
@@ -379,7 +379,7 @@ def _moved(
 
 
 def _proves(contest: Contest, z: jax.Array, sign: float) -> jax.Array:
-    """Whether values are a bound: all gain strictly, or none gains; rounding included."""
+    """Whether values are a bound: every node gains strictly, or none gains, rounding included."""
     gain = contest.ahead(z)
     p = contest.greedy(gain)
     size = jnp.abs(gain)

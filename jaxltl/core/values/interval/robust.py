@@ -1,4 +1,4 @@
-"""Certified values of interval models: of a policy, or optimal, with nature for or against it."""
+"""Certified values of interval MDPs with adversarial or cooperative nature."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def robust_reachability(
     stay: Any = None,
     tolerance: Any = None,
 ) -> Solution:
-    """Probability of reaching a target when probabilities lie in intervals.
+    """Robust reachability probability of an interval MDP.
 
     ``x(s) = opt_a opt_p sum_t p_t x(t)`` outside of the target, p among the distributions of row a
     (Nilim and El Ghaoui 2005, Iyengar 2005); the least solution.
@@ -120,7 +120,7 @@ def robust_total_reward(
     nature: str | None = None,
     tolerance: Any = None,
 ) -> Solution:
-    """Expected reward until a target is reached when probabilities lie in intervals.
+    """Robust expected total reward of an interval MDP until a target is reached.
 
     ``x(s) = opt_a opt_p (r(s, a) + sum_t p_t x(t))`` outside of the target, infinite where the
     target is not surely reached.
@@ -171,7 +171,7 @@ def robust_discounted_value(
     nature: str | None = None,
     tolerance: float | None = None,
 ) -> Solution:
-    """Discounted value when probabilities lie in intervals.
+    """Robust discounted value of an interval MDP.
 
     ``V(s) = opt_a opt_p sum_t p_t (r(s, a, t) + discount V(t))`` (Iyengar 2005), by policy
     iteration; the bounds are ``V +- |Phi V - V| / (1 - discount)``, with rounding.
@@ -211,7 +211,7 @@ def robust_discounted_value(
 def robust_expectation(
     model: IntervalMDP, value: Any, *, objective: str = "max", nature: str | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The expected value of the next state of each choice, as nature makes it.
+    """Robust expectation of the next state's value, for each choice.
 
     ``min_p sum_t p_t value(t)``, or the maximum, over the distributions of each row: mass goes
     first to the least (largest) values.
@@ -247,7 +247,7 @@ def robust_expectation(
 
 
 def entry_reward(model: IntervalMDP, reward: Any) -> np.ndarray:
-    """What each entry earns, ``float64[T]``.
+    """Reward of each entry, ``float64[T]``.
 
     Raises:
       ValueError: some of it is not finite.
@@ -301,7 +301,7 @@ def interval_reward(model: IntervalMDP, reward: Any) -> np.ndarray:
 def robust_solution(
     sides: Sides, found: RobustValues, tolerance: float, *, relative: bool
 ) -> Solution:
-    """What the host found, with its status."""
+    """The :class:`Solution` of certified values."""
     size = sides.model.num_states
     value, lower, upper = (x[:size] for x in (found.value, found.lower, found.upper))
     status = status_between(lower, upper, tolerance, relative=relative)
@@ -324,7 +324,7 @@ def robust_solution(
 
 
 class Sides(NamedTuple):
-    """A question with the wishes of all who choose.
+    """An uncertain MDP with the directions of policy and nature.
 
     Attributes:
       model: the model that was asked about.
@@ -346,35 +346,35 @@ class Sides(NamedTuple):
 
     @property
     def choosing(self) -> np.ndarray:
-        """``bool[R']``, the rows by which nature chooses among rows, in no time."""
+        """Rows ``bool[R']`` by which nature chooses among rows, without a step."""
         if self.spread is None:
             return np.zeros(self.host.mdp.num_rows, bool)
         return self.spread.row < 0
 
     @property
     def added(self) -> np.ndarray:
-        """``bool[S']``, the states that were not there."""
+        """Auxiliary states, ``bool[S']``."""
         return np.arange(self.host.mdp.num_states) >= self.model.num_states
 
     def states(self, quantity: np.ndarray) -> np.ndarray:
-        """``bool[S']``, nothing of what is new."""
+        """A set of states ``bool[S']``, without auxiliary ones."""
         return np.append(quantity, np.zeros(np.count_nonzero(self.added), bool))
 
     def entries(self, quantity: np.ndarray) -> np.ndarray:
-        """``float64[T']``, nothing where nature chooses."""
+        """A quantity of entries ``float64[T']``, 0 where nature chooses."""
         if self.spread is None:
             return quantity
         return np.where(self.spread.entry < 0, 0, quantity[self.spread.entry])
 
     def rows(self, quantity: np.ndarray) -> np.ndarray:
-        """``float64[R']``, nothing where nature chooses."""
+        """A quantity of rows ``float64[R']``, 0 where nature chooses."""
         if self.spread is None:
             return quantity
         return np.where(self.choosing, 0, quantity[self.spread.row])
 
 
 def sides_of(model: Any, policy: Any, objective: str, nature: str | None) -> Sides:
-    """Who chooses what, and what for.
+    """Directions of policy and nature, games and given policies encoded.
 
     Args:
       model: an IntervalMDP, or a game on one or on a sparse model.
@@ -392,7 +392,7 @@ def sides_of(model: Any, policy: Any, objective: str, nature: str | None) -> Sid
 
 
 def world_of(model: Any) -> tuple[IntervalMDP, np.ndarray | None]:
-    """The interval model, and of a game the states where the system moves.
+    """The interval model, and in a game the states of the system.
 
     Raises:
       ValueError: the model, or what a game is on, is none.
@@ -423,7 +423,7 @@ def host_sides(
 
 
 def _under(model: IntervalMDP, policy: np.ndarray, where: Any) -> EncodedChoices:
-    """The model in which a policy's choices are made, in all states or those of one player."""
+    """The model under a policy, in all states or in those of one player."""
     host = model.host
     if is_deterministic(policy) and np.all(where):
         row_weights(model.nominal, policy)

@@ -1,4 +1,4 @@
-"""The probability of a formula of linear temporal logic when probabilities lie in intervals."""
+"""Robust satisfaction probability of LTL formulas in interval MDPs."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from jaxltl.core.values.undiscounted.sparse_satisfaction import (
 
 @brief(facts=facts.satisfaction)
 class RobustSatisfaction(NamedTuple):
-    """The probability of a task, with a policy that has a memory, and nature's choices.
+    """Robust satisfaction probability, with a finite-memory policy and nature's choices.
 
     Attributes:
       solution: value, lower and upper are ``float64[I]``, one for each state that was asked for;
@@ -73,7 +73,7 @@ def robust_satisfaction(
     states: Any = None,
     tolerance: float | None = None,
 ) -> RobustSatisfaction:
-    """Largest or smallest probability of a formula that nature, for or against it, leaves.
+    """Robust satisfaction probability of an LTL formula in an interval MDP.
 
     In the product with the formula's automaton: where policy and nature want the same, they reach
     the end components that both can keep to (Baier and Katoen 2008, section 10.6.4, with nature's
@@ -139,7 +139,7 @@ def robust_satisfaction(
 def _solution(
     found: RobustValues, tolerance: float, shape: tuple[int, ...], states: Integers, policy: Any
 ) -> Solution:
-    """What was found, of some states of the product."""
+    """The :class:`Solution` at some states of the product."""
     low, high = (x[states].reshape(shape) for x in (found.lower, found.upper))
     status = Status.CONVERGED if (high - low <= tolerance).all() else Status.PRECISION
     parts: dict[str, Any] = {
@@ -164,7 +164,7 @@ def robust_product_satisfaction(
     nature: str | None = None,
     tolerance: Any = None,
 ) -> Solution:
-    """The same from every pair of a state and a memory of a product of an interval model.
+    """Robust satisfaction probability from all states of a product of an interval MDP.
 
     Args:
       model: a product of an :class:`~jaxltl.core.models.interval.IntervalMDP`.
@@ -223,7 +223,7 @@ def robust_product_satisfaction(
 
 
 def _reading(host: UncertainMDP, priority: Integers) -> tuple[UncertainMDP, Integers, Integers]:
-    """The model in which what entries read is read by states of their own, where nobody chooses.
+    """The model in which auxiliary states with one choice carry the priorities of entries.
 
     Args:
       host: the model.
@@ -264,7 +264,7 @@ def _pairs(
     still: Booleans,
     on_entry: bool,
 ) -> tuple[SparseProduct, UncertainMDP]:
-    """What is reached of the product, with its intervals."""
+    """The reachable product, with its intervals."""
     mdp = model.nominal.host
     # Entries travel by number, from 1; a loop of what stands still has 1 too.
     numbered = HostMDP(
@@ -287,7 +287,7 @@ def _pairs(
 def _fixed(
     model: Product, product: SparseProduct, host: UncertainMDP, policy: np.ndarray, helpful: bool
 ) -> Sides:
-    """The product under a policy of the world's rows and the memory, in which nature chooses."""
+    """The product under a finite-memory policy."""
     world: Any = model.mdp
     mine = product.host.state
     memory = product.memory[mine]
@@ -315,7 +315,7 @@ def _solved(
     safety: bool,
     tolerance: float,
 ) -> RobustValues:
-    """The probability from all states of a product, for those who choose in it."""
+    """Robust satisfaction probability from all states of the product."""
     maximize, helpful = sides.maximize, sides.helpful
     if sides.spread is None:
         return _of_sides(host, yes, no, priority, maximize, helpful, safety, tolerance)
@@ -351,7 +351,7 @@ def _of_sides(
     safety: bool,
     tolerance: float,
 ) -> RobustValues:
-    """The same where a policy and nature choose."""
+    """Robust satisfaction probability for one policy and nature."""
     if priority is None:
         goal = no if safety else yes
         if safety:
@@ -370,7 +370,7 @@ def _of_sides(
 def _largest(
     host: UncertainMDP, priority: Integers, helpful: bool, tolerance: float
 ) -> RobustValues:
-    """The largest probability, and in doubt also if sums that miss one by rounding are one."""
+    """Maximal parity probability, for both readings of sums within rounding of one."""
     found = _as_read(host, priority, helpful, tolerance)
     wide = host.enlarged
     if wide is None:

@@ -1,4 +1,4 @@
-"""How much the value of an interval model changes with each end of each interval."""
+"""Derivatives of robust values in the ends of the intervals."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def robust_sensitivity(
     stay: Any = None,
     initial: Any = None,
 ) -> Sensitivity:
-    """The derivative of the value from the initial distribution in each end of each interval.
+    """Derivatives of a robust value in the ends of all intervals.
 
     ``dV = sum_s y(s) (v(t) - v(t*)) d end(s, t)`` with y how often each state is visited,
     ``y = initial + P' y`` under the policy and nature, an end that binds, and t* the successor that
@@ -122,7 +122,7 @@ def robust_sensitivity(
 
 
 def _visits(chain: HostMDP, goal: Booleans, stay: Booleans, weight: Floats) -> Floats:
-    """How often each state is visited before a goal is reached or lost: ``float64[S]``."""
+    """Expected visits of each state before a goal is reached or lost, ``float64[S]``."""
     from scipy.sparse import csc_array, eye_array
     from scipy.sparse.linalg import splu
 
@@ -143,7 +143,7 @@ def _visits(chain: HostMDP, goal: Booleans, stay: Booleans, weight: Floats) -> F
 
 
 def _against_the_rest(host: Any, ahead: Floats, maximize: bool) -> tuple[Floats, Booleans]:
-    """How much better each entry is than the one that is given the rest of its row's mass.
+    """Gain of each entry over the entry that receives the remaining mass of its row.
 
     Returns:
       ``float64[T]``, and ``bool[T]``: whether its upper end binds, else the lower one.

@@ -1,4 +1,4 @@
-"""What can be had in so many steps when probabilities lie in intervals, enclosed."""
+"""Certified step-bounded values of interval MDPs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from jaxltl.core.values.engine.state_quantities import solution_from_error, stat
 def robust_next_probability(
     model: IntervalMDP, target: Any, *, objective: str = "max", nature: str | None = None
 ) -> Solution:
-    """Probability that the next state is in a set, when probabilities lie in intervals.
+    """Robust probability that the next state is in a set.
 
     ``opt_a opt_p sum_t p_t [t in target]``, p among the distributions of row a.
 
@@ -63,7 +63,7 @@ def robust_bounded_reachability(
     objective: str = "max",
     nature: str | None = None,
 ) -> Solution:
-    """Probability to reach a set within so many steps, when probabilities lie in intervals.
+    """Robust step-bounded reachability probability.
 
     ``x_0 = [s in target]``, and ``x_{k+1}(s) = 1`` on the target, ``opt_a opt_p sum_t p_t x_k(t)``
     where one may stay, else 0; nature picks anew in each step (Givan, Leach and Dean 2000).
@@ -111,7 +111,7 @@ def robust_cumulative_reward(
     objective: str = "max",
     nature: str | None = None,
 ) -> Solution:
-    """Expected reward of the next so many steps, when probabilities lie in intervals.
+    """Robust expected reward of the next n steps.
 
     ``x_{k+1}(s) = opt_a opt_p sum_t p_t (r(s, a, t) + x_k(t))`` from ``x_0 = 0``; nature picks anew
     in each step.
@@ -148,7 +148,7 @@ def robust_instantaneous_reward(
     objective: str = "max",
     nature: str | None = None,
 ) -> Solution:
-    """Expected reward of the state in which one is after so many steps, with intervals.
+    """Robust expected reward of the state after n steps.
 
     ``x_{k+1}(s) = opt_a opt_p sum_t p_t x_k(t)`` from the rewards of states ``x_0 = r``.
 
@@ -198,7 +198,7 @@ def _earned(
 
 
 def _solution(found: StepBoundedValues, highest: float = 1) -> Solution:
-    """What sweeps found, enclosed."""
+    """The :class:`Solution` of step-bounded values."""
     nature: Any = found.probability
     solution = solution_from_error(
         found.value, found.error, found.row.astype(np.int32), found.num_steps, highest=highest

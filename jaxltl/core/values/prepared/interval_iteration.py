@@ -1,4 +1,4 @@
-"""Bounds from both sides of blocks with circles: values that rise, then policy iteration.
+"""Certified bounds on cyclic blocks: optimistic value iteration, then policy iteration.
 
 A lower bound rises from zero, and what is a little above it is an upper bound once a pass does not
 raise it (Hartmanns and Kaminski 2020). Where that takes long, policies are evaluated by Krylov
@@ -31,7 +31,7 @@ _KEPT = 0.75  # of the extra cost: who gains less stays, and the rest is what pr
 
 
 class Problem(NamedTuple):
-    """Blocks on circles, in a system.
+    """The cyclic blocks of a system.
 
     Attributes:
       core: the blocks.
@@ -54,12 +54,12 @@ class Problem(NamedTuple):
 
     @property
     def ceiling(self) -> float:
-        """What no value exceeds."""
+        """Upper bound of all values."""
         return jnp.inf if self.relative else 1.0
 
 
 class State(NamedTuple):
-    """Values of all places, ``float[N + 3]``, and how they came about."""
+    """State of the iteration, with values of all places ``float[N + 3]``."""
 
     low: jax.Array
     high: jax.Array
@@ -72,14 +72,14 @@ class State(NamedTuple):
     moved: jax.Array
 
 
-def enclose_circles(
+def enclose_cycles(
     problem: Problem, low: jax.Array, high: jax.Array, max_steps: jax.Array
 ) -> State:
-    """Encloses the values on circles.
+    """Encloses the values of the cyclic blocks.
 
     Args:
       problem: the blocks.
-      low, high: ``float[N + 3]``, bounds before the circles, and zero on them.
+      low, high: ``float[N + 3]``, bounds before the cycles, and zero on them.
       max_steps: passes at most.
 
     Returns:
@@ -115,7 +115,7 @@ def enclose_circles(
 
 
 def _above(problem: Problem, low: jax.Array, high: jax.Array, wide: jax.Array) -> jax.Array:
-    """A guess of an upper bound."""
+    """Candidate upper bound a little above the lower one."""
     span, given = problem.span, problem.given
     x = low[span]
     more = problem.relative
@@ -126,7 +126,7 @@ def _above(problem: Problem, low: jax.Array, high: jax.Array, wide: jax.Array) -
 
 
 def _risen(problem: Problem, s: State) -> State:
-    """One pass for each side."""
+    """One sweep of the lower bound and of the candidate upper bound."""
     span, unit = problem.span, problem.unit
     down: Any = partial(sweep, factor=1 - unit, shift=-problem.least, **problem.given)
     up: Any = partial(sweep, factor=1 + unit, shift=problem.least, **problem.given)
@@ -163,7 +163,7 @@ class _Policy(NamedTuple):
 
 
 class _Choices(NamedTuple):
-    """The rows of the blocks, and what is known of places whatever is chosen there."""
+    """Rows of the blocks, and places with a fixed value."""
 
     problem: Problem
     keep: jax.Array  # zero where `put` is known
@@ -210,7 +210,7 @@ def _of(rank: jax.Array, image: jax.Array) -> jax.Array:
 
 
 def _by_policies(problem: Problem, state: State, high: jax.Array) -> State:
-    """Bounds by policy iteration, or the state as it was."""
+    """Bounds by policy iteration; the unchanged state if it fails."""
     core, x = problem.core, state.low[problem.span]
     rows = _choices(problem, x.dtype)
     sign = rows.sign
@@ -257,7 +257,7 @@ def _by_policies(problem: Problem, state: State, high: jax.Array) -> State:
 
 
 def _proven(rows: _Choices, state: State, high: jax.Array, p: _Policy) -> State:
-    """The bounds that the last policy proves, or the state as it was."""
+    """Bounds certified by the last policy; the unchanged state if it proves none."""
     problem, sign, time = rows.problem, rows.sign, p.time
     core, span = problem.core, problem.span
     far, near = p.value, p.value - sign * 1.5 * p.extra * time
@@ -294,14 +294,14 @@ def _swept(
     shift: jax.Array,
     rank: jax.Array,
 ) -> jax.Array:
-    """The greedy rows after some passes, by which news goes on from where policies change."""
+    """Greedy rows after some sweeps, which propagate improvements."""
     x: Any = outer.at[problem.span].set(value)
     going: Any = partial(sweep, problem.core, shift=shift, **problem.given)
     return lax.fori_loop(0, _SWEEPS, lambda _, c: going(c[0], choose=True), (x, rank))[1]
 
 
 def _extra(problem: Problem, value: jax.Array, time: jax.Array, keep: jax.Array) -> jax.Array:
-    """What every step shall cost besides: little, but more than rounding."""
+    """Extra cost of a step: small beside the tolerance, and more than rounding."""
     time = jnp.maximum(time, 1)
     share = 1 / jnp.max(time)
     if problem.relative:

@@ -1,4 +1,4 @@
-"""Solves of one question with many numbers, inside ``jit``, ``vmap`` and ``grad``."""
+"""Prepared solves: one graph, many probabilities and rewards, in ``jit``, ``vmap``, ``grad``."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ from jaxltl.core.values.prepared.prepared_interval import (
     prepare_interval,
     solve_prepared_interval,
 )
-from jaxltl.core.values.prepared.interval_iteration import SLACK, Problem, enclose_circles
+from jaxltl.core.values.prepared.interval_iteration import SLACK, Problem, enclose_cycles
 
 
 @brief(facts=facts.prepared)
 @struct.dataclass
 class Prepared:
-    """A question about a model, put in order for solves with other numbers.
+    """A question about a model after preprocessing, for solves with other numbers.
 
     Made by :func:`prepare`, read by :func:`solve_prepared`. Give it to a compiled function as an
     argument: what a function closes over becomes part of the program.
@@ -55,10 +55,10 @@ class Prepared:
       row_state: ``int32[R]``, the state of each row.
       probability, reward: ``float[T]`` and ``float[R]``, as they were.
       loops: rows that lead to where they are: entries, groups, rows, groups of these; or None.
-      circles: end components that are one node, or None.
+      cycles: end components that are one node, or None.
       question: ``"probability"`` or ``"reward"``, static.
       objective: ``"max"``, ``"min"`` or ``"policy"``, static.
-      cyclic: whether some nodes are on circles, static.
+      cyclic: whether some nodes are on cycles, static.
       levels, choices, terms, groups: see the plan, static.
 
     Example:
@@ -79,7 +79,7 @@ class Prepared:
     probability: Any
     reward: Any
     loops: Any
-    circles: Any
+    cycles: Any
     question: str = struct.field(pytree_node=False)
     objective: str = struct.field(pytree_node=False)
     cyclic: bool = struct.field(pytree_node=False)
@@ -100,7 +100,7 @@ class Prepared:
 
     @property
     def size(self) -> int:
-        """The number N of places."""
+        """Number N of places."""
         return self.segments[2].last
 
 
@@ -114,11 +114,11 @@ def prepare(
     objective: str = "max",
     nature: str | None = None,
 ) -> Prepared | PreparedInterval:
-    """Puts the states of a model in order, once, for solves with other numbers.
+    """Prepares a question about a model for solves with other numbers inside ``jit``.
 
     What the graph decides is decided here: chains of single successors, states worth nothing, one
     or infinity, and end components are gone from what is solved. What is left stands in blocks of
-    equal shape, later states first, so that one pass solves what has no circles.
+    equal shape, later states first, so that one pass solves what has no cycles.
 
     Args:
       model: a concrete SparseMDP, or what :func:`~jaxltl.core.models.construct.convert.to_sparse` takes.
@@ -221,7 +221,7 @@ def _prepared(host: Any, plan: Plan, cost: Any, objective: str) -> Prepared:
         blocks.append(Blocks(part.target, part.source, weight, part.name, first))
         first = blocks[-1].last
     loops = None if plan.loops is None else tuple(x.astype(np.int32) for x in plan.loops[:4])
-    circles = None if plan.circles is None else tuple(x.astype(np.int32) for x in plan.circles)
+    cycles = None if plan.cycles is None else tuple(x.astype(np.int32) for x in plan.cycles)
     found = Prepared(
         segments=(blocks[0], blocks[1], blocks[2]),
         place=plan.place,
@@ -233,7 +233,7 @@ def _prepared(host: Any, plan: Plan, cost: Any, objective: str) -> Prepared:
         probability=host.probability.astype(dtype),
         reward=None if cost is None else cost.astype(dtype),
         loops=loops,
-        circles=circles,
+        cycles=cycles,
         question="probability" if cost is None else "reward",
         objective=objective,
         cyclic=plan.schedule.segments[1].target.size > 0,
@@ -257,9 +257,9 @@ def solve_prepared(
     tolerance: chex.Array | float | None = None,
     max_steps: chex.Array | int = 100_000,
 ) -> Solution:
-    """The answer to a prepared question, with other numbers where they are given.
+    """Solves a prepared question, with other probabilities, intervals or rewards.
 
-    Without circles one pass is exact but for rounding, which is known in advance. With circles,
+    Without cycles one pass is exact but for rounding, which is known in advance. With cycles,
     bounds of both sides are proven by passes, see :mod:`jaxltl.core.values.prepared.interval_iteration`.
 
     Args:
@@ -333,7 +333,7 @@ def solve_prepared(
 
 
 def given_numbers(prepared: Prepared, probability: Any, reward: Any) -> tuple[Any, Any]:
-    """Numbers that are given, with the shapes that they must have."""
+    """Given probabilities and rewards, with checked shapes."""
     probability, reward = (None if x is None else jnp.asarray(x) for x in (probability, reward))
     if probability is not None:
         require_shape("probability", probability, prepared.probability.shape)
@@ -372,7 +372,7 @@ class _Shares(NamedTuple):
 
 
 def _shares(prepared: Prepared, policy: Any) -> tuple[_Shares | None, Any]:
-    """How much of each row is taken, summing to one in each state, and the policy to show."""
+    """Weights of the rows under the policy, normalised, and the policy of the solution."""
     if prepared.objective != "policy":
         return None, None
     dtype = prepared.probability.dtype
@@ -399,7 +399,7 @@ def _shares(prepared: Prepared, policy: Any) -> tuple[_Shares | None, Any]:
 def checked_numbers(
     prepared: Prepared, probability: Any, reward: Any, share: _Shares | None
 ) -> tuple[jax.Array, jax.Array]:
-    """Whether numbers are finite, and whether they are what they must be."""
+    """Whether numbers are finite, and whether they are valid."""
     finite, valid = jnp.asarray(True), jnp.asarray(True)
     if probability is not None:
         probability = lax.stop_gradient(probability).astype(prepared.probability.dtype)
@@ -421,7 +421,7 @@ def checked_numbers(
 
 
 def refilled(prepared: Prepared, probability: Any, reward: Any, share: _Shares | None) -> Prepared:
-    """The same blocks with other weights."""
+    """The prepared question with other weights in its blocks."""
     dtype = prepared.probability.dtype
     p = prepared.probability if probability is None else jnp.asarray(probability, dtype)
     r = prepared.reward if reward is None else jnp.asarray(reward, dtype)
@@ -447,7 +447,7 @@ def refilled(prepared: Prepared, probability: Any, reward: Any, share: _Shares |
 
 
 class _Decided(NamedTuple):
-    """What the graph says of a policy: ``bool[N + 3]``."""
+    """Qualitative values of a policy, ``bool[N + 3]`` each."""
 
     keep: jax.Array
     put: jax.Array
@@ -455,7 +455,7 @@ class _Decided(NamedTuple):
 
 
 def _decided(prepared: Prepared, reward: Any, share: _Shares | None) -> _Decided:
-    """Which values of a policy are 0, 1 or infinite."""
+    """Places where the value of a policy is 0, 1 or infinite."""
     assert share is not None
     size = prepared.size
     earned = prepared.reward if reward is None else reward
@@ -480,7 +480,7 @@ def _decided(prepared: Prepared, reward: Any, share: _Shares | None) -> _Decided
 
 
 class _Found(NamedTuple):
-    """Enclosed values of the places, ``float[N]``, and how they were found."""
+    """Enclosed values of the places, ``float[N]``."""
 
     value: jax.Array
     lower: jax.Array
@@ -492,7 +492,7 @@ class _Found(NamedTuple):
 
 
 def _least(prepared: Prepared) -> float:
-    """What a sum may lose to numbers that are too small."""
+    """Bound on what a sum loses to underflow."""
     return 4 * prepared.terms * float(jnp.finfo(prepared.probability.dtype).tiny)
 
 
@@ -508,7 +508,7 @@ def _enclosed(
         given["put"] = decided.put[:size].astype(dtype)
     start = jnp.zeros(size + 3, dtype).at[size].set(1)
     if prepared.cyclic:
-        return _circling(prepared, start, given, unit, least, tolerance, max_steps)
+        return _solve_cyclic(prepared, start, given, unit, least, tolerance, max_steps)
     x, rank = sweep(prepared.segments[0], start, choose=decided is None, **given)
     x = x[:size]
     share = 1.3 * prepared.levels * unit
@@ -519,7 +519,7 @@ def _enclosed(
     return _Found(x, lower, upper, rank, zero, jnp.asarray(1, jnp.int32), jnp.asarray(known))
 
 
-def _circling(
+def _solve_cyclic(
     prepared: Prepared,
     start: jax.Array,
     given: dict[str, Any],
@@ -528,7 +528,7 @@ def _circling(
     tolerance: jax.Array,
     max_steps: Any,
 ) -> _Found:
-    """Bounds from both sides of what has circles."""
+    """Bounds from both sides where the system has cycles."""
     before, core, after = prepared.segments
     size = prepared.size
     down: Any = partial(sweep, factor=1 - unit, shift=-least, **given)
@@ -538,7 +538,7 @@ def _circling(
     def enclosed(core: Blocks, arrays: Any, tolerance: Any, low: Any, high: Any, most: Any) -> Any:
         options = {"maximize": given["maximize"], **arrays}
         problem = Problem(core, options, unit, least, tolerance, prepared.question == "reward")
-        return enclose_circles(problem, low, high, most)
+        return enclose_cycles(problem, low, high, most)
 
     # How much work it is depends on the lane.
     s = in_turn(
@@ -569,7 +569,7 @@ def _circling(
 
 
 def _attached(prepared: Prepared, found: _Found, decided: _Decided | None) -> jax.Array:
-    """The values of the places with their implicit derivative."""
+    """Values of the places with implicit derivatives."""
     size, dtype = prepared.size, prepared.probability.dtype
     if not size:
         return found.value
@@ -590,7 +590,7 @@ def _attached(prepared: Prepared, found: _Found, decided: _Decided | None) -> ja
 
 
 def chosen_rows(prepared: Prepared, rank: jax.Array | None) -> Chosen:
-    """The rows that nodes take; without ranks the first ones."""
+    """The linear system of the rows with given ranks; by default the first ones."""
     target = jnp.concatenate([x.target for x in prepared.segments])
     weight = jnp.concatenate([x.weight for x in prepared.segments])
     if rank is None:
@@ -613,7 +613,7 @@ def _answer(
     valid: jax.Array,
     taken: Any,
 ) -> Solution:
-    """The answer of the states. All is judged and refused at the nodes, which may be few."""
+    """The solution; checked at the nodes, which may be far fewer than the states."""
     dtype, size = prepared.probability.dtype, prepared.size
     relative = prepared.question == "reward"
     most = jnp.inf if relative else 1.0
@@ -648,21 +648,21 @@ def _answer(
 
 
 def _policy(prepared: Prepared, found: _Found) -> jax.Array:
-    """The rows of an optimum, ``int32[S]``."""
+    """An optimal policy, ``int32[S]``."""
     names = jnp.concatenate([x.name for x in prepared.segments])
     if found.rank is None or not names.shape[0]:
         return prepared.row
     chosen = chosen_names(names, found.rank, prepared.choices)
     own = prepared.own
     rows = jnp.where(own >= 0, chosen[jnp.maximum(own, 0)], prepared.row)
-    if prepared.circles is None:
+    if prepared.cycles is None:
         return rows
     return _going_round(prepared, rows)
 
 
 def _going_round(prepared: Prepared, rows: jax.Array) -> jax.Array:
-    """In an end component, rows that get to where the node's row leaves it."""
-    state, inside, owner, entry_row, successor = prepared.circles
+    """The policy completed inside end components by rows towards the exit."""
+    state, inside, owner, entry_row, successor = prepared.cycles
     picked = rows[state]
     there = prepared.row_state[picked] == state
     count, many = state.shape[0], inside.shape[0]

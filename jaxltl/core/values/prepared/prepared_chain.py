@@ -1,4 +1,4 @@
-"""Values of prepared Markov chains without bounds, for searches that prove what they find."""
+"""Uncertified values of prepared Markov chains, for searches that certify their result."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from jaxltl.core.values.prepared.prepared import (
     refilled,
 )
 
-ELIMINATED = 256  # nodes up to which circles are solved by elimination
+ELIMINATED = 256  # nodes up to which cycles are solved by elimination
 
 
 def is_direct(prepared: Prepared) -> bool:
-    """Whether :func:`evaluate_prepared` does the same work whatever the numbers are."""
+    """Whether the work of :func:`evaluate_prepared` is independent of the numbers."""
     return not prepared.cyclic or prepared.nodes.shape[0] <= ELIMINATED
 
 
@@ -35,9 +35,9 @@ def evaluate_prepared(
     probability: chex.Array | None = None,
     reward: chex.Array | None = None,
 ) -> tuple[jax.Array, jax.Array]:
-    """The values of a prepared Markov chain, without bounds.
+    """Uncertified values of a prepared Markov chain.
 
-    One linear system ``x = r + P x``: a pass where there are no circles, elimination up to
+    One linear system ``x = r + P x``: a pass where there are no cycles, elimination up to
     `ELIMINATED` nodes, and Krylov steps on passes beyond.
 
     Args:
@@ -95,7 +95,7 @@ def _evaluate(prepared: Prepared, probability: Any, reward: Any) -> tuple[jax.Ar
 
 
 def _eliminated(system: Chosen, nodes: jax.Array) -> tuple[Any, Any]:
-    """What solves a system and its transpose, by the inverse of what stands on its nodes."""
+    """Solvers of a system and of its transpose by a dense inverse on its nodes."""
     count, _, block = system.target.shape
     size, most = count * block, nodes.shape[0]
     number = jnp.full(size + 3, most, jnp.int32).at[nodes].set(jnp.arange(most, dtype=jnp.int32))

@@ -1,4 +1,4 @@
-"""Solves of one question about an interval model with many ends, in ``jit``, ``vmap``, ``grad``."""
+"""Prepared solves of interval models: one graph, many intervals, in ``jit``, ``vmap``, ``grad``."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from jaxltl.core.values.engine.iterate import in_turn
 from jaxltl.core.values.interval.contest import (
     Bounds,
     Contest,
-    chances,
+    greedy_distributions,
     enclose,
     leaving,
     rounding,
@@ -48,7 +48,7 @@ _LOOSE = 1e-6  # how far ends may miss a distribution, as in the models
 @brief(facts=facts.prepared)
 @struct.dataclass
 class PreparedInterval:
-    """A question about an interval model, put in order for solves with other ends.
+    """A question about an interval model after preprocessing, for solves with other intervals.
 
     Made by :func:`prepare_interval`, read by :func:`solve_prepared_interval`. Give it to a
     compiled function as an argument. Open states are nodes, of which there are N; the node N is
@@ -70,7 +70,7 @@ class PreparedInterval:
       question: ``"probability"`` or ``"reward"``, static.
       objective, nature_objective: ``"max"`` or ``"min"``, of the policy and of nature, static.
       num_rows: R, static.
-      circling: whether who gets out may stay for ever, static.
+      has_free_cycles: whether who gets out may stay for ever, static.
 
     Example:
       >>> from jaxltl.core.models import interval_rows
@@ -98,7 +98,7 @@ class PreparedInterval:
     objective: str = struct.field(pytree_node=False)
     nature_objective: str = struct.field(pytree_node=False)
     num_rows: int = struct.field(pytree_node=False)
-    circling: bool = struct.field(pytree_node=False)
+    has_free_cycles: bool = struct.field(pytree_node=False)
 
     @property
     def num_states(self) -> int:
@@ -121,7 +121,7 @@ def prepare_interval(
     objective: str = "max",
     nature: str | None = None,
 ) -> PreparedInterval:
-    """Decides what the graph of an interval model decides, once, for solves with other ends.
+    """Prepares a question about an interval model for solves with other intervals.
 
     Args:
       model: concrete.
@@ -253,7 +253,7 @@ def _prepared(
         objective=objective,
         nature_objective=direction,
         num_rows=whole.num_rows,
-        circling=plan.has_free_cycles,
+        has_free_cycles=plan.has_free_cycles,
     )
     return to_jax(found)
 
@@ -268,7 +268,7 @@ def solve_prepared_interval(
     tolerance: chex.Array | float | None = None,
     max_steps: chex.Array | int = 100,
 ) -> Solution:
-    """The answer to a prepared question about intervals, with other ends where they are given.
+    """Solves a prepared question about an interval model, with other intervals or rewards.
 
     ``x(s) = opt_a opt_p (r(s, a) + sum_t p_t x(t))``, p among the distributions of row a between
     its ends (Nilim and El Ghaoui 2005, Iyengar 2005), enclosed from both contest, see
@@ -357,7 +357,7 @@ def _solve(
 def _checked(
     prepared: PreparedInterval, lower: Any, upper: Any, reward: Any
 ) -> tuple[jax.Array, jax.Array]:
-    """Whether numbers are finite, and whether the same is decided by them."""
+    """Whether numbers are finite, and whether preprocessing holds for them."""
     finite, valid = jnp.asarray(True), jnp.asarray(True)
     if lower is not None or upper is not None:
         low = prepared.lower if lower is None else lower
@@ -400,7 +400,7 @@ def _checked(
 
 
 def _contest(prepared: PreparedInterval, lower: Any, upper: Any, reward: Any) -> Contest:
-    """The rows that are left, with their numbers."""
+    """The residual problem with its intervals and rewards."""
     low, high = (jnp.append(x, 0)[prepared.table] for x in (lower, upper))
     is_reward = prepared.question == "reward"
     cost = -reward[prepared.row] if is_reward else jnp.zeros(prepared.row.shape, low.dtype)
@@ -418,7 +418,7 @@ def _contest(prepared: PreparedInterval, lower: Any, upper: Any, reward: Any) ->
         policy_leads=nature if chain else prepared.objective == wanted,
         nature_leads=nature,
         relative=is_reward,
-        circling=prepared.circling,
+        has_free_cycles=prepared.has_free_cycles,
     )
 
 
@@ -487,7 +487,7 @@ def _answer(
 
 
 def _image(contest: Contest, x: jax.Array, sign: int) -> jax.Array:
-    """What the operator makes of values."""
+    """The optimality operator applied to values."""
     if not contest.size:
         return x
     gain = contest.ahead(sign * x)
@@ -496,11 +496,11 @@ def _image(contest: Contest, x: jax.Array, sign: int) -> jax.Array:
 
 
 def _attached(contest: Contest, found: Bounds, value: jax.Array, sign: int) -> jax.Array:
-    """Values with their implicit derivative: policy and order held fixed."""
+    """Values with implicit derivatives, policy and order of successors held fixed."""
     row, target = found.row, contest.target[found.row]
     value = lax.stop_gradient(value)
     key = lax.stop_gradient(contest.ahead(sign * value))[row]
-    p = chances(contest.lower[row], contest.upper[row], contest.key(key))
+    p = greedy_distributions(contest.lower[row], contest.upper[row], contest.key(key))
     ends = jnp.asarray([0, 1], value.dtype)
 
     def operator(x: jax.Array) -> jax.Array:

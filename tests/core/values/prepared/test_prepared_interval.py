@@ -9,7 +9,7 @@ import pytest
 
 from jaxltl.core.models.interval import interval_rows
 from jaxltl.core.types import Status
-from jaxltl.core.values.interval.contest import chances
+from jaxltl.core.values.interval.contest import greedy_distributions
 from jaxltl.core.values.interval.robust import robust_reachability, robust_total_reward
 from jaxltl.core.values.interval.sensitivity import robust_sensitivity
 from jaxltl.core.values.prepared.prepared_interval import prepare_interval, solve_prepared_interval
@@ -265,7 +265,7 @@ def test_nature_gives_mass_in_order(width):
     p = rng.dirichlet(np.ones(width), 10)
     lower, upper = p * rng.random(p.shape), np.minimum(p * (1 + rng.random(p.shape)), 1)
     key = rng.integers(0, 5, p.shape).astype(float)
-    found = chances(*map(jnp.asarray, (lower, upper, key)))
+    found = greedy_distributions(*map(jnp.asarray, (lower, upper, key)))
     for mine, low, high, order in zip(found, lower, upper, key, strict=True):
         rest, best = 1 - low.sum(), low.copy()
         for i in np.argsort(order, kind="stable"):
