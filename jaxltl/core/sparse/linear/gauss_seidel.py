@@ -98,7 +98,7 @@ class BlockProblem:
       blocks: the rows P; they sum to one at most, up to rounding.
       interior: ``bool[N]``, the nodes to solve for, which every policy that counts leaves.
       live: ``bool[M]``, the columns that read the interior node of their number; M is at least N.
-      near, far: ``float64[M]``, at least 0: bounds of the other columns, `near` is attained.
+      attained, outer: ``float64[M]``, at least 0: bounds of the other columns, as of `SweptBounds`.
       cost: ``float64[R]``, at least 0, or None for zero.
       allowed: ``bool[R]``, the rows that may be taken; None for all.
     """
@@ -106,8 +106,8 @@ class BlockProblem:
     blocks: RowBlocks
     interior: Booleans
     live: Booleans
-    near: Floats
-    far: Floats
+    attained: Floats
+    outer: Floats
     cost: Floats | None = None
     allowed: Booleans | None = None
 
@@ -136,14 +136,14 @@ class SweptBounds:
     """Bounds of the interior nodes.
 
     Attributes:
-      near, far: ``float64[N]``, the bound that the rows attain, and the other one.
+      attained, outer: ``float64[N]``, the bound that the rows attain, and the other one.
       row: ``int64[N]``.
       sweeps: how many there were.
       time: the longest truncated time of the policy.
     """
 
-    near: Floats
-    far: Floats
+    attained: Floats
+    outer: Floats
     row: Integers
     sweeps: int
     time: float
@@ -164,7 +164,7 @@ def solve_by_sweeps(
       time: a first guess of how long a policy stays, for an absolute tolerance.
     """
     cost = 0 if problem.cost is None else problem.cost.max()
-    if max(problem.far.max(initial=0), cost) > _LARGEST:
+    if max(problem.outer.max(initial=0), cost) > _LARGEST:
         return None
     with ThreadPoolExecutor(1) as pool:
         parallel = problem.blocks.matrix.nnz >= _THREADS
@@ -174,7 +174,7 @@ def solve_by_sweeps(
 
 def _solve(search: _Search, start: Floats | None, time: float | None) -> SweptBounds | None:
     problem = search.problem
-    value: Any = problem.far.astype(np.float32)
+    value: Any = problem.outer.astype(np.float32)
     live = np.flatnonzero(problem.live)
     value[live] = 0 if start is None else start[live]
     if time is None:
@@ -188,7 +188,7 @@ def _solve(search: _Search, start: Floats | None, time: float | None) -> SweptBo
         extra = search.extra_cost(value, np.full(1, time))
     if not search.sweep(value, extra, 0.0):
         return None
-    value = np.where(problem.live, value, problem.far)
+    value = np.where(problem.live, value, problem.outer)
     for _ in range(_PROOFS):
         proven = search.prove(value, extra) if search.sweep(value, extra, 0.0) else None
         if proven is None:
@@ -386,7 +386,7 @@ class _Search:
         self.sweeps += 1
         if not (sign * best + slack <= sign * value[:nodes])[live].all():
             return None
-        far = np.where(live, value[:nodes], best + sign * slack)
+        outer = np.where(live, value[:nodes], best + sign * slack)
         chain, cost = self.chain(row)
         found = self.truncated_time(chain)
         if found is None:
@@ -394,27 +394,27 @@ class _Search:
         time, least = found
         known = self._known_width()
         loss = _MARGIN * (extra * (1 + 2 * _LEFT) + 4 * unit * float(value.max(initial=0))) / least
-        near = np.where(problem.live, value - sign * (loss * time + known), problem.near)
-        image = chain @ near
+        attained = np.where(problem.live, value - sign * (loss * time + known), problem.attained)
+        image = chain @ attained
         if cost is not None:
             image += cost
-        slack = unit * (image + 2 * max(-float(near.min(initial=0)), 0.0))
-        if not (sign * near[:nodes] <= sign * image - slack)[live].all():
+        slack = unit * (image + 2 * max(-float(attained.min(initial=0)), 0.0))
+        if not (sign * attained[:nodes] <= sign * image - slack)[live].all():
             return None
-        near = np.where(live, near[:nodes], image - sign * slack)
-        return SweptBounds(near, far, row, self.sweeps, float(time.max(initial=0)))
+        attained = np.where(live, attained[:nodes], image - sign * slack)
+        return SweptBounds(attained, outer, row, self.sweeps, float(time.max(initial=0)))
 
     def excess(self, found: SweptBounds) -> float:
         """The width of bounds beyond that of the known values, in tolerances."""
-        width = np.abs(found.far - found.near)[self.problem.interior] - self._known_width()
+        width = np.abs(found.outer - found.attained)[self.problem.interior] - self._known_width()
         if self.settings.relative:
-            size = np.abs(found.near if self.sign > 0 else found.far)[self.problem.interior]
+            size = np.abs(found.attained if self.sign > 0 else found.outer)[self.problem.interior]
             width = width / np.maximum(size, 1e-300)
         return float(width.max(initial=0)) / self.settings.tolerance
 
     def _known_width(self) -> float:
         problem = self.problem
-        return float(np.abs(problem.far - problem.near)[~problem.live].max(initial=0))
+        return float(np.abs(problem.outer - problem.attained)[~problem.live].max(initial=0))
 
 
 def _first(image: Values, best: Values, begin: Integers, width: int) -> Integers:

@@ -155,8 +155,8 @@ class _Search:
     def __init__(self, world: PaddedProduct, sets: BitSets, sign: int, tolerance: float) -> None:
         self.world, self.sets, self.sign, self.tolerance = world, sets, sign, tolerance
         num_memory = world.delta.shape[0]
-        self.near = np.stack([self.has(sets.one, q) for q in range(num_memory)]).astype(float)
-        self.far = self.near.copy()
+        self.attained = np.stack([self.has(sets.one, q) for q in range(num_memory)]).astype(float)
+        self.outer = self.attained.copy()
         self.action, self.sweeps, self.known = sets.action, 0, 0.0
         self.guess: tuple[Floats, float] | None = None  # of values, and of how long runs stay
 
@@ -203,19 +203,19 @@ class _Search:
         found = _solved(problem, self.sign, budget, self.unit, guess)
         if found is None:
             return False
-        near, far, row = found.near, found.far, found.row
+        attained, outer, row = found.attained, found.outer, found.row
         self.sweeps += found.sweeps
         self.known = max(
-            self.known, float(np.abs(far - near)[problem.open[: far.size]].max(initial=0))
+            self.known, float(np.abs(outer - attained)[problem.open[: outer.size]].max(initial=0))
         )
         for i, q in enumerate(part):
             span = slice(i * host.num_states, (i + 1) * host.num_states)
             open_ = problem.open[span]
-            np.copyto(self.near[q], near[span], where=open_)
-            np.copyto(self.far[q], far[span], where=open_)
+            np.copyto(self.attained[q], attained[span], where=open_)
+            np.copyto(self.outer[q], outer[span], where=open_)
             action = self.rows.action[row[span] - i * host.num_rows]
             np.copyto(self.action[:, q], action, where=open_)
-        self.guess = (self.near[part[0]], found.time) if part.size == 1 else None
+        self.guess = (self.attained[part[0]], found.time) if part.size == 1 else None
         return True
 
     @cached_property
@@ -225,7 +225,7 @@ class _Search:
 
     def found(self) -> LayeredBounds:
         """The final bounds."""
-        low, high = (self.near, self.far) if self.sign > 0 else (self.far, self.near)
+        low, high = (self.attained, self.outer) if self.sign > 0 else (self.outer, self.attained)
         # Products too small for a float to hold are lost; relative errors do not count them.
         open_ = low != high
         low = np.where(open_, np.clip(low - _TINY, 0, 1), low)
@@ -239,7 +239,7 @@ class _Problem(NamedTuple):
     Attributes:
       host: as many states as columns; the first ones are nodes.
       cut: the blocks of its rows, if known.
-      open, live, near, far: as of BlockProblem, for all columns.
+      open, live, attained, outer: as of BlockProblem, for all columns.
       rows: ``bool[R]``, or None.
       stays: ``bool[M]``, where end components are searched.
       inner: ``bool[M]``, the columns that are read as nodes.
@@ -249,8 +249,8 @@ class _Problem(NamedTuple):
     cut: RowBlocks | None
     open: Booleans
     live: Booleans
-    near: Floats
-    far: Floats
+    attained: Floats
+    outer: Floats
     rows: Booleans | None
     stays: Booleans
     inner: Booleans
@@ -268,8 +268,8 @@ def _alone(search: _Search, q: int) -> _Problem:
         rows.cut,
         open_,
         inner & open_,
-        search.near[after, place],
-        search.far[after, place],
+        search.attained[after, place],
+        search.outer[after, place],
         mask,
         search.has(search.sets.stays, q),
         inner,
@@ -299,7 +299,7 @@ def _together(search: _Search, part: Integers) -> _Problem:
         np.concatenate([np.tile(host.probability, part.size), np.ones(ends)]),
     )
     every = np.concatenate([part, others])
-    near, far = (x[every].ravel() for x in (search.near, search.far))
+    attained, outer = (x[every].ravel() for x in (search.attained, search.outer))
     none = np.zeros(ends, bool)
     open_ = np.concatenate([*map(search.open, part), none])
     stays = np.concatenate([*(search.has(search.sets.stays, q) for q in part), none])
@@ -309,7 +309,7 @@ def _together(search: _Search, part: Integers) -> _Problem:
             [*(search.rows.of(world.allowed[:, q]) for q in part), np.ones(ends, bool)]
         )
     return _Problem(
-        written, None, open_, open_, near, far, mask, stays, np.arange(nodes + ends) < nodes
+        written, None, open_, open_, attained, outer, mask, stays, np.arange(nodes + ends) < nodes
     )
 
 
@@ -331,7 +331,7 @@ def _solved(
     if circles is None:
         blocks = problem.cut or _cut(host)
         sums = BlockProblem(
-            blocks, problem.open, problem.live, problem.near, problem.far, None, problem.rows
+            blocks, problem.open, problem.live, problem.attained, problem.outer, None, problem.rows
         )
         start, time = (None, None) if guess is None else guess
         return solve_by_sweeps(sums, settings, start, time)
@@ -342,8 +342,8 @@ def _solved(
         _cut(part.mdp),
         problem.open[leader],
         problem.live[leader],
-        problem.near[leader],
-        problem.far[leader],
+        problem.attained[leader],
+        problem.outer[leader],
         None,
         mask,
     )
@@ -351,7 +351,7 @@ def _solved(
     if found is None:
         return None
     row = quotient_policy(host, circles, part.row[found.row][part.node])
-    return replace(found, near=found.near[part.node], far=found.far[part.node], row=row)
+    return replace(found, attained=found.attained[part.node], outer=found.outer[part.node], row=row)
 
 
 def _cut(host: HostMDP) -> RowBlocks:

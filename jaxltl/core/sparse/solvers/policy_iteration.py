@@ -4,7 +4,7 @@ States that reach no cycle are solved by backward induction, with an error that 
 so are, at the end, those that no cycle reaches. The core in between is solved by policy iteration
 (Howard 1960) with sparse elimination, for a problem in which every step costs a small extra d:
 
-- A value v with ``sign (T v - v) <= 0`` bounds the optimum on the far side. For the extra cost, the
+- A value v with ``sign (T v - v) <= 0`` is an outer bound of the optimum. For the extra cost, the
   solution has ``sign (T v - v) = -d``, which leaves room for the rounding of one backup.
 - A value v with ``sign (T_pi v - v) >= 0``, for the policy pi and its expected time t, is attained
   by pi, as pi leaves; ``v - sign 1.5 d t`` is one, and is checked in the same way.
@@ -101,15 +101,15 @@ def policy_iteration(
             )
             found = solver.solve()
             rounds, method, node = found.rounds, found.method, solver.node
-            bounds[:, node], policy[node] = (found.near, found.far, found.value), found.policy
+            bounds[:, node], policy[node] = (found.attained, found.outer, found.value), found.policy
             # Values are at least 0, as relative errors of the levels above assume.
             lowest = 0 if maximize else 1
             bounds[lowest, node] = np.maximum(bounds[lowest, node], 0)
         after = Levels(above.node[::-1], [above.start[-1] - x for x in above.start[::-1]])
         solve_levels(rows, after, bounds, policy, sign)
         _widen(bounds, above.node, sign, (len(above.start) - 1) * unit)
-    near, far, value = bounds[:, :n]
-    low, high = (near, far) if sign > 0 else (far, near)
+    attained, outer, value = bounds[:, :n]
+    low, high = (attained, outer) if sign > 0 else (outer, attained)
     low = np.where(np.isfinite(low), np.maximum(low - TINY, 0), 0)
     high = np.where(np.isnan(high), np.inf, high + TINY)
     value = np.clip(value, low, high)
@@ -143,10 +143,10 @@ def _widen(bounds: Floats, node: Integers, sign: int, share: float) -> None:
 
 @dataclass(frozen=True)
 class _CoreValues:
-    """Bounds and policy of the core: `near` is attained by the policy, `far` is not exceeded."""
+    """Bounds and policy of the core: the policy attains `attained`, and none exceeds `outer`."""
 
-    near: Floats
-    far: Floats
+    attained: Floats
+    outer: Floats
     value: Floats
     policy: Integers
     rounds: int
@@ -236,8 +236,8 @@ class _CoreSolver:
                 best = replace(more, rounds=rounds + more.rounds)
         if best is None:
             low, high = np.zeros(equation.size), np.full(equation.size, np.inf)
-            near, far = (low, high) if equation.sign > 0 else (high, low)
-            best = _CoreValues(near, far, low, last, rounds, "nothing proven")
+            attained, outer = (low, high) if equation.sign > 0 else (high, low)
+            best = _CoreValues(attained, outer, low, last, rounds, "nothing proven")
         return replace(best, policy=self.row[best.policy])
 
     def _iterate(self, policy: Integers) -> tuple[_CoreValues | None, int, Integers]:
@@ -268,9 +268,9 @@ class _CoreSolver:
                 continue
             found = self._certified(solver, policy, value, extra)
             if found is not None:
-                near, far, time = found
+                attained, outer, time = found
                 best = _CoreValues(
-                    near, far, value - sign * extra * time, policy, rounds, solver.method
+                    attained, outer, value - sign * extra * time, policy, rounds, solver.method
                 )
                 if self._is_narrow(best, self.tolerance / 2):
                     break
@@ -326,16 +326,16 @@ class _CoreSolver:
         rows, cost = equation.matrix[policy], equation.cost[policy]
         if not ((time >= 0) & (time - rows @ time >= 0.5)).all():
             return None
-        near = value - sign * 1.5 * extra * time
-        slack = unit * (cost + rows @ np.abs(near))
-        if not (sign * near <= sign * (cost + rows @ near) - slack).all():
+        attained = value - sign * 1.5 * extra * time
+        slack = unit * (cost + rows @ np.abs(attained))
+        if not (sign * attained <= sign * (cost + rows @ attained) - slack).all():
             return None
-        return near, value, time
+        return attained, value, time
 
     def _is_narrow(self, found: _CoreValues, tolerance: float) -> bool:
         sign = self.equation.sign
-        width = sign * (found.far - found.near)
-        size = np.abs(found.near if sign > 0 else found.far) if self.relative else 1
+        width = sign * (found.outer - found.attained)
+        size = np.abs(found.attained if sign > 0 else found.outer) if self.relative else 1
         return bool((width <= tolerance * size).all())
 
     def _by_refinement(self, policy: Integers) -> _CoreValues | None:
@@ -368,8 +368,8 @@ class _CoreSolver:
         self, value: Floats, share: float, policy: Integers, rounds: int, method: str
     ) -> _CoreValues:
         sign = self.equation.sign
-        near, far = (value * (1 - side * sign * share) for side in (1, -1))
-        return _CoreValues(near, far, value, policy, rounds, method)
+        attained, outer = (value * (1 - side * sign * share) for side in (1, -1))
+        return _CoreValues(attained, outer, value, policy, rounds, method)
 
 
 def _reaches(rows: Any, goal: Booleans) -> Booleans:

@@ -454,8 +454,8 @@ def sweep_shortest_path(
             blocks=blocks,
             interior=problem.interior,
             live=problem.interior,
-            near=known,
-            far=known,
+            attained=known,
+            outer=known,
             cost=cost if cost.any() else None,
             allowed=allowed,
         ),
@@ -463,7 +463,7 @@ def sweep_shortest_path(
     )
     if found is None:
         return None
-    low, high = (found.near, found.far) if sign > 0 else (found.far, found.near)
+    low, high = (found.attained, found.outer) if sign > 0 else (found.outer, found.attained)
     low = np.where(problem.interior, np.maximum(low - TINY, 0), known)
     high = np.where(problem.interior, high + TINY, known)
     value = low + (high - low) / 2
