@@ -24,7 +24,6 @@ from jaxltl.core.values.multi_objective.multi_objective import (
     ConstrainedOptimum,
     Pareto,
 )
-from jaxltl.core.values.properties.multi import answer_several
 from jaxltl.core.values.properties.solve_property import Answer, PropertyStrategy, solve_property
 
 Found = Answer | Achievable | ConstrainedOptimum | Pareto
@@ -147,15 +146,7 @@ def solve(
         error, fault = one.error, INVALID
         if one.parsed is not None:
             try:
-                if one.parsed.operator == "multi":
-                    if isinstance(model, IntervalMDP):
-                        raise ValueError(
-                            f"{one.text}: several objectives are not solved for where "
-                            "probabilities are intervals; ask for one at a time."
-                        )
-                    found = answer_several(model, one.parsed, tolerance=tolerance)
-                else:
-                    found = solve_property(model, one.parsed, tolerance=tolerance)
+                found = solve_property(model, one.parsed, tolerance=tolerance)
             except ValueError as mistake:
                 error = str(mistake)
             except NotConverged as failure:

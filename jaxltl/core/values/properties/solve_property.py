@@ -1,4 +1,4 @@
-"""Answers to properties of models: each goes to the solver that it is a question for."""
+"""Model checking: dispatches a property to its solver."""
 
 from __future__ import annotations
 
@@ -9,6 +9,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxltl.core.values.properties.exact_reachability import exact_reachability
+from jaxltl.core.values.multi_objective.multi_objective import (
+    Achievable,
+    ConstrainedOptimum,
+    Pareto,
+)
+from jaxltl.core.values.properties.multi_objective import solve_multi_objective
 from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.logic.bounded import Bounded, Earned, unfolded
 from jaxltl.core.logic.labels import is_boolean
@@ -42,24 +49,23 @@ from jaxltl.core.values.undiscounted.sparse_satisfaction import (
 from jaxltl.core.values.undiscounted.total_reward import total_reward
 
 TOLERANCE = 1e-6
-FINER = (1.0, 1e-3, 1e-6)  # parts of the tolerance by which a threshold is tried
-TINY = 1e-12  # width of an interval of rewards that is narrow enough whatever they are
+FINER = (1.0, 1e-3, 1e-6)  # shares of the tolerance with which an open threshold is tried
+_EXACT = 1e-10  # tolerances up to which small chains are solved in rational arithmetic
+TINY = 1e-12  # absolute width of bounds on rewards that is always accepted
 _AVERAGE = "averages of end components"
 _OTHER = {"max": "min", "min": "max"}
 
 
 @brief
 class PropertyStrategy(NamedTuple):
-    """What attains an answer.
+    """An optimal strategy of a property.
 
     Attributes:
-      row: the row of the model that is taken: ``int32[S]``; with a memory ``int32[N]``, for each
-        state of the product.
-      by: how many steps (``"steps"``) or how much reward (``"reward"``) is left, if the row is the
-        first choice of a strategy that depends on that; else empty.
-      memory: the automaton and the product that a memory is from, or None.
-      nature: of an interval model nature's distributions, ``float64[T]``; with a memory of the
-        product's entries. Else None.
+      row: chosen rows ``int32[S]`` of the model; with a memory, ``int32[N]`` of the product.
+      by: ``"steps"`` or ``"reward"`` if the strategy also depends on the remaining steps or
+        reward, and `row` is its first choice; else empty.
+      memory: the product and its automaton, or None.
+      nature: of an interval model, nature's distributions ``float64[T]`` of the model or product.
 
     Example:
       >>> from jaxltl import make_sparse
@@ -77,15 +83,15 @@ class PropertyStrategy(NamedTuple):
 
 @brief(facts=facts.answer)
 class Answer(NamedTuple):
-    """What a property asked for.
+    """The result of a property.
 
     Attributes:
-      states: ``int[I]``, the states that were asked for.
-      value, lower, upper: ``float64[I]``; the bounds are certified.
-      holds: of a threshold, whether it is met in each state; None where the bounds do not tell.
-      status: CONVERGED where all bounds are narrow, or decide the threshold.
-      method: how it was found and proven, in a few words.
-      strategy: what attains the value; None where nothing is chosen.
+      states: ``int[I]``.
+      value, lower, upper: ``float64[I]``, with certified bounds.
+      holds: truth of a threshold in each state; None where the bounds do not decide it.
+      status: CONVERGED if all bounds are within the tolerance, or decide the threshold.
+      method: the algorithm and the proof.
+      strategy: an optimal strategy; None in chains.
 
     Example:
       >>> from jaxltl import make_sparse
@@ -107,7 +113,7 @@ class Answer(NamedTuple):
 
 
 class _Found(NamedTuple):
-    """The bounds of one solve at the states that were asked for."""
+    """The solution at the requested states."""
 
     solution: Solution
     method: str
@@ -115,7 +121,7 @@ class _Found(NamedTuple):
 
 
 class _Aim(NamedTuple):
-    """What a policy makes of a number, ``"max"`` or ``"min"``, and nature within intervals."""
+    """Directions of the policy and of nature: ``"max"`` or ``"min"``."""
 
     policy: str
     nature: str | None = None
@@ -140,23 +146,27 @@ def solve_property(
     *,
     states: Any = None,
     tolerance: float = TOLERANCE,
-) -> Answer:
-    """The value of a property, or whether its threshold is met, with certified bounds.
+) -> Answer | Achievable | ConstrainedOptimum | Pareto:
+    """Model checking: the value of a property, or its truth, with certified bounds.
 
     Args:
-      model: the model; with intervals, the policy's direction and nature's are both named, as in
-        ``Pmaxmin=?``, in chains nature's alone.
+      model: an interval model needs the directions of the policy and of nature, as in
+        ``Pmaxmin=?``; an interval chain that of nature.
       prop: a property or its text, see :func:`~jaxltl.core.logic.properties.parse_properties`.
-      states: ``int[I]``; default the initial states.
-      tolerance: the width of the bounds, absolute for probabilities and relative for the rest.
+      states: ``int[I]``; default the initial states. Not with ``multi(...)``.
+      tolerance: width of the bounds, absolute for probabilities and relative otherwise.
 
     Returns:
-      :class:`Answer`. A threshold that the bounds do not decide is tried with narrower ones; where
-      those do not tell either, `holds` is None and the status is not CONVERGED.
+      :class:`Answer`. A threshold that the bounds do not decide is tried with narrower bounds; if
+      it stays open, `holds` is None and the status is not CONVERGED. Of ``multi(...)``, from the
+      initial distribution:
+      :class:`~jaxltl.core.values.multi_objective.multi_objective.Achievable` if all objectives have
+      thresholds, :class:`~jaxltl.core.values.multi_objective.multi_objective.ConstrainedOptimum` if
+      one has none, :class:`~jaxltl.core.values.multi_objective.multi_objective.Pareto` if none has.
 
     Raises:
-      ValueError: an unknown label or reward; no direction though the model has choices, or
-        intervals; a question that the solvers do not take, with the reason.
+      ValueError: an unknown label or reward; a missing direction; a property that is not
+        supported, with the reason.
 
     Concrete arrays only, on the host; not differentiable.
 
@@ -168,17 +178,24 @@ def solve_property(
       [0.5]
       >>> solve_property(coin, 'P>0.4 [ X "a" ]').holds
       [True]
+      >>> solve_property(coin, 'multi(P>=0.5 [ F "a" ], P<=0.5 [ X "a" ])').holds
+      True
     """
     prop = parse_property(prop) if isinstance(prop, str) else prop
     if not isinstance(prop, Property):
         raise ValueError(f"prop is {validation.shorten(prop)}; give a property or its text.")
     if not isinstance(model, SparseMDP | IntervalMDP):
         raise ValueError(
-            f"{type(model).__name__} is no model that answers properties; give a "
-            "SparseMDP (to_sparse makes one) or an IntervalMDP."
+            f"properties of {type(model).__name__} are not supported; give a SparseMDP "
+            "(see to_sparse) or an IntervalMDP."
         )
     if prop.operator == "multi":
-        raise ValueError("multi(...) has several values; solve it with achievable or pareto.")
+        if states is not None or isinstance(model, IntervalMDP):
+            what = "from other than the initial states" if states is not None else "with intervals"
+            raise ValueError(
+                f"{prop.text}: multi(...) is not supported {what}; ask for one objective at a time."
+            )
+        return solve_multi_objective(model, prop, tolerance)
     if states is None:
         states = np.flatnonzero(np.asarray(model.initial) > 0)
     states = starting_states(model, states)
@@ -199,7 +216,7 @@ def solve_property(
 def as_answer(
     prop: Property, states: np.ndarray, solution: Solution, tolerance: float, method: str
 ) -> Answer:
-    """What bounds say of a property at the states that were asked for, without a strategy."""
+    """The answer of a solution at the requested states, without a strategy."""
     found = _Found(solution, method, None)
     holds = None if prop.relation is None else _verdicts(prop, found)
     return _answer(prop, states, found, holds, tolerance)
@@ -224,7 +241,7 @@ def _answer(
 
 
 def _status(prop: Property, found: _Found, tolerance: float) -> Status:
-    """CONVERGED if the bounds of the states that were asked for are narrow."""
+    """CONVERGED if the bounds at the requested states are within the tolerance."""
     lower, upper = found.solution.lower, found.solution.upper
     told = Status(int(np.max(found.solution.status)))
     if np.isnan(lower).any() or np.isnan(upper).any() or told == Status.INVALID:
@@ -256,7 +273,7 @@ def _verdicts(prop: Property, found: _Found) -> list[bool | None]:
 
 
 def meets(relation: str, threshold: Fraction, lower: float, upper: float) -> bool | None:
-    """Whether all numbers between two bounds meet a threshold, or none does; else None.
+    """Truth of a threshold for all numbers between two bounds; None if it differs.
 
     >>> meets(">=", Fraction(1, 2), 0.5, 0.75), meets("<", Fraction(1, 2), 0.25, 0.5)
     (True, None)
@@ -292,7 +309,7 @@ def _aim(model: SparseMDP | IntervalMDP, prop: Property) -> _Aim:
 
 
 def _robust_aim(model: IntervalMDP, prop: Property, sign: str) -> _Aim:
-    """Both directions; a threshold without any is for all strategies and all that nature picks."""
+    """Both directions; a threshold without them is over all strategies and choices of nature."""
     if prop.nature is not None:
         assert prop.objective is not None
         return _Aim(prop.objective, prop.nature)
@@ -318,7 +335,7 @@ def _robust_aim(model: IntervalMDP, prop: Property, sign: str) -> _Aim:
 def _solver(
     model: SparseMDP | IntervalMDP, prop: Property, aim: _Aim, states: np.ndarray
 ) -> Callable[[float], _Found]:
-    """What solves a property at a tolerance."""
+    """The solver of a property, as a function of the tolerance."""
     path, graph = prop.path, _graph(model)
     if prop.operator == "P":
         assert not isinstance(path, Earned)
@@ -402,14 +419,14 @@ def _plain(states: np.ndarray, solution: Solution, by: str = "") -> _Found:
 
 
 class _Probability(NamedTuple):
-    """Probabilities of paths of one model, at some states."""
+    """Probabilities of path formulas of one model, at some states."""
 
     model: SparseMDP | IntervalMDP
     states: np.ndarray
     text: str
 
     def of(self, path: Formula | Bounded, aim: _Aim) -> Callable[[float], _Found]:
-        """What solves a path at a tolerance; simple ones without an automaton."""
+        """The solver of a path formula; simple ones need no automaton."""
         if isinstance(path, Bounded):
             return self.within(path, aim)
         if path.operator == "!" and not is_boolean(path):
@@ -468,12 +485,28 @@ class _Probability(NamedTuple):
     def until(self, left: Formula, right: Formula, aim: _Aim) -> Callable[[float], _Found]:
         target: Any = self.where(right)
         stay: Any = None if left == TRUE else self.where(left)
-        return lambda tolerance: _plain(
-            self.states,
-            reachability_probability(
-                self.model, target, stay=stay, tolerance=tolerance, **aim.directions
-            ),
-        )
+
+        def solve(tolerance: float) -> _Found:
+            found = _plain(
+                self.states,
+                reachability_probability(
+                    self.model, target, stay=stay, tolerance=tolerance, **aim.directions
+                ),
+            )
+            if tolerance > _EXACT or not isinstance(self.model, SparseMDP):
+                return found
+            bounds = (
+                exact_reachability(self.model.host, target, stay) if self.model.is_chain else None
+            )
+            if bounds is None:
+                return found
+            lower, upper = (x[self.states] for x in bounds)
+            return found._replace(
+                solution=replace(found.solution, value=lower, lower=lower, upper=upper),
+                method="rational arithmetic",
+            )
+
+        return solve
 
     def next(self, target: np.ndarray, aim: _Aim) -> _Found:
         if isinstance(self.model, IntervalMDP):

@@ -14,7 +14,7 @@ from jaxltl.core.types import Solution
 
 
 def opposite_event(solution: Solution) -> Solution:
-    """Of the opposite event, with bounds rounded outwards; those that are 0 or 1 stay exact.
+    """Solution for the complementary event, with bounds rounded outwards unless they are exact.
 
     Args:
       solution: of an event.
@@ -33,7 +33,8 @@ def opposite_event(solution: Solution) -> Solution:
     def outwards(bound: Any, end: int) -> Any:
         rounded = one - bound
         beyond = xp.clip(xp.nextafter(rounded, end * one), 0, 1)
-        return xp.where((bound == 0) | (bound == 1), rounded, beyond)
+        # By Sterbenz's lemma, 1 - rounded has no rounding error, so that this test is exact.
+        return xp.where(one - rounded == bound, rounded, beyond)
 
     found: Any = one - value, outwards(far, -1), outwards(near, 2)
     if any(isinstance(x, jax.Array) for x in parts):

@@ -10,7 +10,7 @@ from jaxltl.core.values.multi_objective.multi_objective import (
     ConstrainedOptimum,
     Pareto,
 )
-from jaxltl.core.values.properties.multi import answer_several
+from jaxltl.core.values.properties.solve_property import solve_property
 from tests.core.values.properties.test_solve_property import random_rewarded
 from tests.storm_oracle import storm_model, storm_values
 
@@ -39,34 +39,34 @@ def fork(chance=0.5):
     ],
 )
 def test_what_can_be_met(text, verdict):
-    found = answer_several(fork(), text)
+    found = solve_property(fork(), text)
     assert isinstance(found, Achievable)
     assert found.holds is verdict and found.status == Status.CONVERGED
 
 
 def test_the_best_value_beside_thresholds():
-    found = answer_several(fork(), 'multi(Pmax=? [ F "a" ], P>=0.25 [ F "b" ])')
+    found = solve_property(fork(), 'multi(Pmax=? [ F "a" ], P>=0.25 [ F "b" ])')
     assert isinstance(found, ConstrainedOptimum) and found.holds
     assert found.lower <= 0.75 <= found.upper and found.upper - found.lower <= 1e-6
-    third = answer_several(fork(), 'multi(Pmax=? [ F "a" ], P>=1/3 [ F "b" ])')
+    third = solve_property(fork(), 'multi(Pmax=? [ F "a" ], P>=1/3 [ F "b" ])')
     assert third.lower <= 2 / 3 <= third.upper and third.status == Status.CONVERGED
-    none = answer_several(fork(), 'multi(Pmax=? [ F "a" ], P>=0.5 [ F "b" ], P>=0.6 [ F "a" ])')
+    none = solve_property(fork(), 'multi(Pmax=? [ F "a" ], P>=0.5 [ F "b" ], P>=0.6 [ F "a" ])')
     assert none.holds is False and np.isnan(none.value)
 
 
 def test_a_threshold_that_no_double_is_is_not_guessed():
     # 1/3 and 2/3 can just be met, but no double says so.
-    found = answer_several(fork(), 'multi(P>=1/3 [ F "a" ], P>=2/3 [ F "b" ])')
+    found = solve_property(fork(), 'multi(P>=1/3 [ F "a" ], P>=2/3 [ F "b" ])')
     assert found.holds is None and found.status == Status.PRECISION
     np.testing.assert_allclose(found.nearest.lower, [1 / 3, 2 / 3], rtol=1e-14)
     assert (found.nearest.gap <= 1e-14).all() and found.nearest.gap.any()
-    best = answer_several(fork(), 'multi(Pmin=? [ F "b" ], P>=1/3 [ F "a" ], P>=2/3 [ F "b" ])')
+    best = solve_property(fork(), 'multi(Pmin=? [ F "b" ], P>=1/3 [ F "a" ], P>=2/3 [ F "b" ])')
     assert best.holds is None and (best.nearest.gap <= 1e-14).all()
     assert best.nearest.gap[0] == 0 and best.nearest.lower[0] <= 2 / 3 <= best.nearest.upper[0]
 
 
 def test_the_curve():
-    found = answer_several(fork(), 'multi(Pmax=? [ F "a" ], Pmax=? [ F "b" ])')
+    found = solve_property(fork(), 'multi(Pmax=? [ F "a" ], Pmax=? [ F "b" ])')
     assert isinstance(found, Pareto)
     np.testing.assert_allclose(found.points, [[0, 1], [1, 0]], atol=1e-6)
 
@@ -77,15 +77,19 @@ def test_the_curve():
         ('multi(P>0.5 [ F "a" ], P>=0.5 [ F "b" ])', "write >="),
         ('multi(Pmin>=0.5 [ F "a" ], P>=0.5 [ F "b" ])', "write P>="),
         ('multi(P=? [ F "a" ], P>=0.5 [ F "b" ])', "Pmax=\\?"),
-        ('multi(LRAmax=? [ "a" ], P>=0.5 [ F "b" ])', "T are solved for"),
+        ('multi(LRAmax=? [ "a" ], P>=0.5 [ F "b" ])', "T are supported"),
         ('multi(Pmax=? [ F "c" ], P>=0.5 [ F "b" ])', "'c'"),
         ('multi(Pmax=? [ F{"x"}<=3 "a" ], P>=0.5 [ F "b" ])', "at most 100 steps"),
-        ('Pmax=? [ F "a" ]', "use answer"),
     ],
 )
 def test_what_is_not_solved_is_named(text, message):
     with pytest.raises(ValueError, match=message):
-        answer_several(fork(), text)
+        solve_property(fork(), text)
+
+
+def test_several_objectives_are_of_the_initial_distribution():
+    with pytest.raises(ValueError, match="not supported from other than the initial states"):
+        solve_property(fork(), 'multi(P>=0.5 [ F "a" ], P>=0.5 [ F "b" ])', states=[0])
 
 
 @pytest.mark.parametrize("seed", (1, 3, 4))
@@ -105,7 +109,7 @@ def test_storm_agrees(seed):
             (wanted,) = storm_values(storm, text)
         except RuntimeError:  # what Storm does not take
             continue
-        found = answer_several(model, text)
+        found = solve_property(model, text)
         if wanted is False or not found.holds:
             assert wanted is False and found.holds is False
         else:  # Storm's precision here is 1e-4

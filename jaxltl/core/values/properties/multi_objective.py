@@ -1,4 +1,4 @@
-"""Answers to ``multi(...)``: several objectives of one strategy, from a property's text."""
+"""Model checking of ``multi(...)``: several objectives of one strategy."""
 
 from __future__ import annotations
 
@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.logic.bounded import Bounded, unfolded
 from jaxltl.core.logic.labels import is_boolean
 from jaxltl.core.logic.ltl import TRUE, Formula
-from jaxltl.core.logic.properties import MAX_UNFOLDED_STEPS, Property, parse_property
+from jaxltl.core.logic.properties import MAX_UNFOLDED_STEPS, Property
 from jaxltl.core.models.construct.state_formulas import states_satisfying
 from jaxltl.core.models.sparse import SparseMDP, choice_reward
 from jaxltl.core.types import Status
@@ -25,44 +24,19 @@ from jaxltl.core.values.multi_objective.multi_objective import (
     Pareto,
     multi_objective,
 )
-from jaxltl.core.values.properties.solve_property import TOLERANCE
 
 
-@validated()
-def answer_several(
-    model: SparseMDP, prop: Property | str, *, tolerance: float = TOLERANCE
+def solve_multi_objective(
+    model: SparseMDP, prop: Property, tolerance: float
 ) -> Achievable | ConstrainedOptimum | Pareto:
-    """What ``multi(...)`` asks for, from the initial distribution.
+    """Solves ``multi(...)`` from the initial distribution.
 
-    A threshold is one on some strategy here, not on all: ``P>=0.9`` is to be reached, ``R<=3`` not
-    to be exceeded. Thresholds that are no doubles are tried rounded to either side, so that what
-    is told is true of the fraction that was written.
-
-    Args:
-      model: the model.
-      prop: a property or its text.
-      tolerance: as for :func:`~jaxltl.core.values.multi_objective.multi_objective.multi_objective`.
-
-    Returns:
-      :class:`~jaxltl.core.values.multi_objective.multi_objective.Achievable` where all have thresholds,
-      :class:`~jaxltl.core.values.multi_objective.multi_objective.ConstrainedOptimum` where one has none, and
-      :class:`~jaxltl.core.values.multi_objective.multi_objective.Pareto` where none has.
+    One strategy is to meet all thresholds. A threshold that is not a double is tried rounded to
+    either side, so that the result holds for the fraction that was written.
 
     Raises:
-      ValueError: an objective that is not solved for beside others, with the reason.
-
-    Concrete arrays only, on the host; not differentiable.
-
-    Example:
-      >>> from jaxltl import make_sparse
-      >>> model = make_sparse([0, 2, 3, 4], [0, 1, 2, 3, 4], [1, 2, 1, 2], [1, 1, 1, 1],
-      ...                     initial=[1, 0, 0], label={"a": [1], "b": [2]})
-      >>> answer_several(model, 'multi(P>=0.5 [ F "a" ], P>=0.4 [ F "b" ])').holds
-      True
+      ValueError: an objective that cannot be combined with others, with the reason.
     """
-    prop = parse_property(prop) if isinstance(prop, str) else prop
-    if prop.operator != "multi":
-        raise ValueError(f"{prop.text}: this is no multi(...); use answer.")
     strict = _solved(model, prop, tolerance, strict=True)
     exact = all(_rounded(x, True) == _rounded(x, False) for x in prop.parts)
     if exact or isinstance(strict, Pareto) or (isinstance(strict, Achievable) and strict.holds):
@@ -81,7 +55,7 @@ def answer_several(
 def _between(
     prop: Property, strict: ConstrainedOptimum, loose: ConstrainedOptimum
 ) -> ConstrainedOptimum:
-    """What is true of thresholds between these two."""
+    """The result for thresholds between those of two results."""
     if loose.holds is False or strict.holds is None:
         return loose if loose.holds is False else strict
     if not strict.holds:
@@ -96,7 +70,7 @@ def _between(
 
 
 def _missing(prop: Property, loose: Achievable | ConstrainedOptimum) -> NearestMixture | None:
-    """What is attained where thresholds that are a little easier are met, or nearly met."""
+    """The mixture of strategies nearest to the thresholds."""
     if loose.share is None:
         return loose.nearest
     wanted = [_rounded(x, True) for x in prop.parts]
@@ -115,7 +89,7 @@ def _solved(
 
 
 def _rounded(prop: Property, strict: bool) -> float | None:
-    """The threshold as a double that is harder to meet than it, or easier."""
+    """The threshold rounded to a double that is not easier to meet (`strict`), or not harder."""
     if prop.threshold is None:
         return None
     found = float(prop.threshold)
@@ -132,19 +106,19 @@ def _objective(model: SparseMDP, prop: Property, strict: bool) -> Objective:
     if prop.relation is not None:
         if prop.relation in (">", "<"):
             raise ValueError(
-                f"{prop.text}: of several objectives it is not told whether one is "
-                f"met with something to spare; write {prop.relation}=."
+                f"{prop.text}: strict thresholds are not supported inside multi(...); "
+                f"write {prop.relation}=."
             )
         wanted = "max" if prop.relation == ">=" else "min"
         if direction not in (None, wanted):
             raise ValueError(
-                f"{prop.text}: inside of multi(...) one strategy is to meet the "
+                f"{prop.text}: inside multi(...) one strategy must meet the "
                 f"threshold; write {prop.operator}{prop.relation}."
             )
         direction = wanted  # type: ignore[assignment]
     if direction is None:
         raise ValueError(
-            f"{prop.text}: inside of multi(...), ask for {prop.operator}max=? or "
+            f"{prop.text}: inside multi(...), ask for {prop.operator}max=? or "
             f"{prop.operator}min=?, or give a threshold."
         )
     given: dict[str, Any] = {"direction": direction, "threshold": _rounded(prop, strict)}
@@ -158,7 +132,7 @@ def _event(model: SparseMDP, prop: Property) -> dict[str, Any]:
     if isinstance(path, Bounded):
         if path.reward is not None or max(path.lower, path.upper or 0) > MAX_UNFOLDED_STEPS:
             raise ValueError(
-                f"{prop.text}: inside of multi(...) a bound may be on at most "
+                f"{prop.text}: inside multi(...) a bound must be on at most "
                 f"{MAX_UNFOLDED_STEPS} steps."
             )
         path = unfolded(path)
@@ -181,8 +155,8 @@ def _sum(model: SparseMDP, prop: Property) -> dict[str, Any]:
     path = prop.path
     if prop.operator == "LRA" or not (isinstance(path, Formula) or path.kind == "total"):  # type: ignore[union-attr]
         raise ValueError(
-            f"{prop.text}: inside of multi(...) probabilities, R [ F ... ], R [ C ] "
-            "and T are solved for."
+            f"{prop.text}: inside multi(...) only probabilities, R [ F ... ], R [ C ] "
+            "and T are supported."
         )
     reward = np.ones(model.num_rows) if prop.operator == "T" else choice_reward(model, prop.reward)
     if isinstance(path, Formula):
