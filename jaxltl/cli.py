@@ -6,7 +6,6 @@ Heavy modules are imported inside the commands, so that their first line is prin
 from __future__ import annotations
 
 import contextlib
-import functools
 import importlib
 import inspect
 import json
@@ -21,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 import jaxltl
+from jaxltl.app.command_options import Failure, compiling, float64, over_devices, plain_errors
 from jaxltl.app import processes
 from jaxltl.app import compilation, run_job
 from jaxltl.app.reports.drawing import artist
@@ -28,135 +28,6 @@ from jaxltl.app.reports.drawing import artist
 if TYPE_CHECKING:
     from jaxltl.app.protocols import Job
     from jaxltl.core.automata.automaton import Automaton
-
-
-class _Failure(click.ClickException):
-    """An error of usage, reported in one line."""
-
-    exit_code = 2
-
-    def show(self, file: Any = None) -> None:
-        click.echo(f"error: {self.message}", err=True)
-
-
-def _plain_errors(command: Callable[..., None]) -> Callable[..., None]:
-    """Reports expected errors without a traceback; others are bugs, and keep it."""
-
-    @functools.wraps(command)
-    def run(*args: Any, **options: Any) -> None:
-        try:
-            command(*args, **options)
-        except (ValueError, jaxltl.NotConverged) as error:
-            raise _Failure(str(error)) from None
-        except OSError as error:
-            where = f"{error.filename!r}: " if error.filename else ""
-            raise _Failure(f"{where}{error.strerror or error}") from None
-        except KeyboardInterrupt:
-            click.echo("interrupted", err=True)
-            raise SystemExit(130) from None
-
-    return run
-
-
-@contextlib.contextmanager
-def _float64() -> Iterator[None]:
-    """Double precision for a command; the library itself leaves JAX's settings alone."""
-    import jax
-
-    # Before JAX 0.8 the context lived in jax.experimental.
-    context = getattr(jax, "enable_x64", None)
-    if context is None:
-        from jax import experimental
-
-        context = experimental.enable_x64  # type: ignore[attr-defined]
-    with context(True):
-        yield
-
-
-def _compiling(*, fast: bool) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Adds the option --no-cache to a command that compiles; `fast` is for short programs."""
-
-    def wrap(command: Callable[..., None]) -> Callable[..., None]:
-        @click.option(
-            "--no-cache",
-            is_flag=True,
-            help="Neither read nor write the cache of compiled programs.",
-        )
-        @functools.wraps(command)
-        def run(*args: Any, no_cache: bool, **options: Any) -> None:
-            compilation.use_cache(not no_cache)
-            if fast:
-                compilation.compile_fast()
-                compilation.use_one_thread()
-            command(*args, **options)
-
-        return run
-
-    return wrap
-
-
-class _Devices(click.ParamType):
-    """A number of devices; 0 for all of them."""
-
-    name = "N"
-
-    def convert(self, value: Any, param: Any, ctx: Any) -> int:
-        if isinstance(value, int):
-            return value
-        if value == "all":
-            return 0
-        if value.isascii() and value.isdigit() and 0 < int(value) < 2**31:
-            return int(value)
-        raise _Failure(
-            f"--mesh {value}: give a number of devices, or all; other arguments come before --mesh."
-        )
-
-
-def _over_devices(command: Callable[..., None]) -> Callable[..., None]:
-    """Adds the options of devices and processes to a command, as one argument."""
-
-    @click.option(
-        "--mesh",
-        is_flag=False,
-        flag_value="all",
-        type=_Devices(),
-        help="Number of devices, or all. With srun or mpirun, those of all processes.",
-    )
-    @click.option(
-        "--coordinator",
-        metavar="HOST:PORT",
-        help="Address of process 0, without such a launcher.",
-    )
-    @click.option("--process", type=click.IntRange(0), metavar="I", help="Number of this process.")
-    @click.option(
-        "--processes",
-        "num_processes",
-        type=click.IntRange(1),
-        metavar="N",
-        help="Number of processes.",
-    )
-    @click.option(
-        "--wait",
-        default=processes.WAIT,
-        show_default=True,
-        metavar="SECONDS",
-        type=click.FloatRange(1, 86400),
-        help="Time after which a silent process is reported, at the start and later.",
-    )
-    @functools.wraps(command)
-    def run(
-        *args: Any,
-        mesh: int | None,
-        coordinator: str | None,
-        process: int | None,
-        num_processes: int | None,
-        wait: float,
-        **options: Any,
-    ) -> None:
-        devices = processes.DeviceOptions(mesh, coordinator, process, num_processes, wait)
-        command(*args, devices=devices, **options)
-
-    return run
 
 
 def _say(text: str) -> None:
@@ -203,9 +74,9 @@ def main() -> None:
 )
 @click.option("--again", is_flag=True, help="Repeat a finished run.")
 @click.option("--json", "as_json", is_flag=True, help="End with the result as one JSON line.")
-@_over_devices
-@_compiling(fast=True)
-@_plain_errors
+@over_devices
+@compiling(fast=True)
+@plain_errors
 def learn(
     task_file: Path,
     out: Path | None,
@@ -267,13 +138,13 @@ def learn(
 
 def _precision(job: Job[Any, Any, Any]) -> contextlib.AbstractContextManager[None]:
     """Double precision for solvers; simulators are written for single precision."""
-    return _float64() if job.DOUBLE else contextlib.nullcontext()
+    return float64() if job.DOUBLE else contextlib.nullcontext()
 
 
 @main.command()
 @click.argument("task_file", metavar="TASK.toml", type=click.Path(path_type=Path))
-@_compiling(fast=True)
-@_plain_errors
+@compiling(fast=True)
+@plain_errors
 def check(task_file: Path) -> None:
     """Check a task or game file and the files that it names, without learning."""
     _begin(f"checking {task_file}")
@@ -307,8 +178,8 @@ def check(task_file: Path) -> None:
     "[default: the cell where the strategy forbids most moves]",
 )
 @click.option("--json", "as_json", is_flag=True, help="End with the result as one JSON line.")
-@_compiling(fast=True)
-@_plain_errors
+@compiling(fast=True)
+@plain_errors
 def synthesize(
     game_file: Path, out: Path | None, environment: tuple[int, int] | None, as_json: bool
 ) -> None:
@@ -333,7 +204,7 @@ def synthesize(
     # Before the work, since the directory may not be writable.
     with atomic_write(out / "game.toml") as copy:
         copy.write(game_file.read_bytes())
-    with _float64(), _stages(synthesis.STAGES) as progress:
+    with float64(), _stages(synthesis.STAGES) as progress:
         found = synthesis.synthesize(file, progress)
         place = report.place_of(found, environment)
         progress("writing")
@@ -343,7 +214,7 @@ def synthesize(
     if as_json:
         _print_json(written)
     if not report.is_confirmed(written):
-        raise _Failure(
+        raise Failure(
             "the independent check refutes the result, which is a bug of jaxltl; "
             "please report it with the game file."
         )
@@ -414,7 +285,7 @@ def _write_synthesis(found: Any, out: Path, place: int | None, begin: float) -> 
     type=click.Choice(["auto", "dfa", "buchi", "parity"]),
     help="Acceptance condition; auto takes the simplest one of the language.",
 )
-@_plain_errors
+@plain_errors
 def automaton(
     formulas: tuple[str, ...],
     source: str | None,
@@ -505,8 +376,8 @@ def _render(result: Automaton, form: str, formula: str) -> str:
     metavar="DIRECTORY",
     help="With --mesh: directory of checkpoints, from which long solves resume.",
 )
-@_over_devices
-@_plain_errors
+@over_devices
+@plain_errors
 def solve(
     model_file: Path,
     properties: tuple[str, ...],
@@ -548,7 +419,7 @@ def solve(
 
     # Before the work, since the directory may not be writable.
     written = contextlib.nullcontext() if strategy is None else atomic_write(strategy)
-    double = contextlib.nullcontext if devices.mesh is None else _float64
+    double = contextlib.nullcontext if devices.mesh is None else float64
     with written as file, processes.process_group(devices, launch, say) as group, double():
         if group.mesh is None:
             begin = time.perf_counter()
@@ -617,7 +488,7 @@ def solve(
     help="Draw the bound over the number of samples (.svg, .png or .pdf).",
 )
 @click.option("--json", "as_json", is_flag=True, help="End with the result as one JSON line.")
-@_plain_errors
+@plain_errors
 def certify(
     log: Path,
     formula: str,
@@ -669,8 +540,8 @@ _EXPERIMENTS = {
     "50 for the regulator, 5 for the robot]",
 )
 @click.option("--json", "as_json", is_flag=True, help="End with the figures as one JSON line.")
-@_compiling(fast=False)
-@_plain_errors
+@compiling(fast=False)
+@plain_errors
 def reproduce(what: str, out: Path | None, seeds: int | None, as_json: bool) -> None:
     """Print published figures beside measured ones."""
     _begin(f"reproducing {what}")
@@ -678,7 +549,7 @@ def reproduce(what: str, out: Path | None, seeds: int | None, as_json: bool) -> 
     options = {} if seeds is None else {"seeds": seeds}
     if seeds is not None and "seeds" not in inspect.signature(experiment.figures).parameters:
         raise ValueError(f"reproduce {what} has no seeds; leave --seeds out.")
-    with _float64():
+    with float64():
         result = experiment.figures(progress=_say, **options)
         pictures = experiment.pictures(result) if hasattr(experiment, "pictures") else []
     click.echo(experiment.table(result))

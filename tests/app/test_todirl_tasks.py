@@ -12,7 +12,7 @@ from jaxltl.app import learn_todirl as job
 from jaxltl.app.files.task_todirl import read_task
 from jaxltl.app.protocols import Training
 from jaxltl.app.reports.learn_todirl import remarks
-from jaxltl.app.todirl_results import part_of
+from jaxltl.app.todirl.results import part_of
 from jaxltl.core.models.construct.batch import stack_products
 from jaxltl.core.models.mdp import from_dense
 from jaxltl.core.values.undiscounted.mixture import WINDOW, at_starts

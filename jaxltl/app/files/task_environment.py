@@ -102,13 +102,11 @@ class LearnerTable(Table):
 def hparams_table(hparams: type[Any], *omit: str) -> Any:
     """A base class with the declared hyperparameters of a learner; default the learner's."""
     texts = re.findall(r"^ {6}(\w+): ([^;.]+)", hparams.__doc__ or "", re.MULTILINE)
-    fields = {
-        field.name: attrs.field(
-            default=None, type=Key[_type_of(field) | None, dict(texts).get(field.name, "")]
-        )
-        for field in dataclasses.fields(hparams)
-        if "valid" in field.metadata and field.name not in omit
-    }
+    fields = {}
+    for field in dataclasses.fields(hparams):
+        if "valid" in field.metadata and field.name not in omit:
+            kind: Any = Key[_type_of(field) | None, dict(texts).get(field.name, "")]
+            fields[field.name] = attrs.field(default=None, type=kind)
     return attrs.make_class(
         "HparamsTable", fields, bases=(Table,), frozen=True, kw_only=True, slots=False
     )

@@ -9,7 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jaxltl.app.todirl_results import Judged, Outcome, Setup, Worlds, counted_worlds, part_of
+from jaxltl.app.todirl.results import Judged, Outcome, Setup, Worlds, counted_worlds, part_of
 from jaxltl.app.reports.drawing import Picture, drawing
 from jaxltl.app.reports.explorer import (
     LONGEST_RUN,

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxltl.app.todirl_results import Learned, Setup, part_of
+from jaxltl.app.todirl.results import Learned, Setup, part_of
 from jaxltl.app.wording import place as name_of
 from jaxltl.app.files.scenes import Scene
 from jaxltl.app.guarantee import bracket

@@ -1,0 +1,1 @@
+"""Parts of todirl jobs: results, guarantees, and the summary."""

@@ -1,0 +1,142 @@
+"""Results of a todirl job for ``result.json``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from jaxltl.app.files.scenes import Scene
+from jaxltl.app.job import about, plain, took
+from jaxltl.app.todirl.results import Judged, Learned, Outcome, Worlds, counted_worlds, part_of
+from jaxltl.core.types import Status
+from jaxltl.core.values.undiscounted.performance import infeasible_starts, summarize
+
+
+def summary(outcome: Outcome) -> dict[str, Any]:
+    """The outcome for ``result.json``; NaN becomes None."""
+    setup, learned, i = outcome.setup, outcome.learned, outcome.chosen
+    task, history, count = setup.task, learned.history, setup.num_training
+    infeasible = np.array(
+        [
+            np.asarray(infeasible_starts(part_of(setup.worlds.judged, w))).sum()
+            for w in range(len(setup.worlds.scenes))
+        ]
+    )
+    result = {
+        **about(task),
+        "memory": task.memory,
+        "label_on": task.label_on,
+        "radius": task.learner.radius,
+        "horizon": task.learner.horizon,
+        "guarantee": {
+            "asked": setup.asked,
+            "over": task.over,
+            "left_out": setup.left_out,
+            "loss": setup.loss,
+            "weight": learned.weight,
+        },
+        "trivial": setup.trivial,
+        "acceptance": setup.judge.acceptance,
+        "expert": "soft" if setup.soft else "quickest",
+        "num_memory": setup.worlds.model.num_memory,
+        "demonstrations": {
+            "number": [len(shown.length) for shown in setup.demonstrations],
+            "pairs": [int(np.sum(shown.length)) for shown in setup.demonstrations],
+            "synthetic": task.demonstrations.synthetic is not None,
+            "dropped": setup.dropped,
+        },
+        "training": _about_worlds(setup.training, outcome.training, infeasible[:count], ()),
+        "test": outcome.test
+        and setup.test
+        and _about_worlds(setup.test, outcome.test, infeasible[count:], task.left_out),
+        "learning": {
+            **_about_learning(learned, i),
+            "hyperparameters": task.learner.hyperparameters(),
+        },
+        "history": {
+            "step": history["step"],
+            **{k: history[k][:, i] for k in ("loss", "per_pair", "held_out", "gradient_norm")},
+        },
+        "seeds": {
+            "first": outcome.seed,
+            "number": len(learned.held_out),
+            "kept": i,
+            "held_out": learned.held_out,
+            "best_step": learned.best_step,
+            "training_mean": outcome.training.seeds.mean(axis=1),
+            "test_mean": (
+                outcome.test and outcome.test.seeds[:, counted_worlds(setup)].mean(axis=1)
+            ),
+        },
+        "network": {
+            "file": "network.npz",
+            "load": 'jaxltl.io.learned_reward.load_reward("network.npz")',
+            "hidden": task.learner.hidden,
+        },
+        **took(outcome.seconds),
+    }
+    return plain(result)
+
+
+def _about_learning(learned: Learned, i: int) -> dict[str, Any]:
+    """The final figures of one seed."""
+    history = learned.history
+    return {
+        "loss": history["loss"][-1][i],
+        "neg_log_likelihood": history["neg_log_likelihood"][-1][i],
+        "held_out": learned.held_out[i],
+        "best_step": learned.best_step[i],
+        "stopped_early": bool(learned.stopped[i]),
+        "steps": learned.num_steps,
+        "gradient_norm": history["gradient_norm"][-1][i],
+        "solver": Status(int(history["status"][:, i].max())).name,
+        "solver_error": history["error"][:, i].max(),
+    }
+
+
+def _about_worlds(
+    worlds: Worlds, judged: Judged, infeasible: np.ndarray, leave_out: Sequence[str]
+) -> dict[str, Any]:
+    found: dict[str, Any] = {"num_worlds": len(worlds.scenes)}
+    for who, performance in judged.performance.items():
+        mean = summarize(worlds.judged, performance, names=worlds.names, leave_out=leave_out)
+        found[who] = {
+            "mean": {"value": mean.mean, "lower": mean.lower, "upper": mean.upper},
+            "std": mean.std,
+            "worst_world": {"name": mean.worst_world, "value": mean.worst},
+            "worst_start": mean.worst_start,
+            "uncertain": list(mean.uncertain),
+        }
+        found["infeasible"], found["left_out"] = list(mean.infeasible), list(mean.left_out)
+        found["num_counted"] = mean.num_worlds
+    found["solver"] = Status(int(judged.status.max())).name
+    found["worlds"] = [
+        _about_world(scene, judged, w, int(infeasible[w])) for w, scene in enumerate(worlds.scenes)
+    ]
+    return found
+
+
+def _about_world(scene: Scene, judged: Judged, w: int, infeasible: int) -> dict[str, Any]:
+    one = part_of(judged.performance["learned"], w)
+    return {
+        "name": scene.name,
+        "mean": {"value": one.mean, "lower": one.lower, "upper": one.upper},
+        "minimum": {
+            "value": one.worst,
+            "lower": one.worst_lower,
+            "upper": one.worst_upper,
+            **scene.place(one.worst_state),
+        },
+        "status": Status(int(one.status)).name,
+        "expert": judged.performance["expert"].mean[w],
+        "random": judged.performance["random"].mean[w],
+        "num_starts": int(np.sum(np.asarray(scene.mdp.initial) > 0)),
+        "infeasible_starts": infeasible,
+        **(
+            {}
+            if judged.share is None or judged.attained is None
+            else {"share": judged.share[w], "attained": judged.attained[w]}
+        ),
+    }
