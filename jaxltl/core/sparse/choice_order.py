@@ -18,9 +18,9 @@ _SLICE, _ENTRY, _REDUCTION, _SPAN, _REDUCED = 1000, 0.25, 2000, 20, 0.15
 class Choices(NamedTuple):
     """The choices of N states, states with the most choices first.
 
-    The first choices of all states come first, in order, then the second ones of states that have two,
-    and so on, so that an optimum goes over slices. Where few states have further choices, these are
-    listed state by state, for one reduction.
+    The first choices of all states come first, in order, then the second ones of states that have
+    two, and so on, so that an optimum goes over slices. Where few states have further choices,
+    these are listed state by state, for one reduction.
 
     Attributes:
       states: ``int[N]``, the number of each state in the original order.

@@ -19,8 +19,8 @@ from jaxltl.core.sparse.rows import Rows, concatenated_ranges, offsets_from_coun
 class HostMDP:
     """Transitions of a Markov decision process, without padding.
 
-    The choices of state s are the rows ``row_start[s]`` to ``row_start[s + 1] - 1``, and the successors
-    of row r the entries ``entry_start[r]`` to ``entry_start[r + 1] - 1``.
+    The choices of state s are the rows ``row_start[s]`` to ``row_start[s + 1] - 1``, and the
+    successors of row r the entries ``entry_start[r]`` to ``entry_start[r + 1] - 1``.
 
     Attributes:
       row_start: ``int32[S + 1]``, strictly ascending: every state has a choice.

@@ -27,9 +27,9 @@ class AcceptingRegion(NamedTuple):
 def accepting_region(mdp: HostMDP, priority: Integers) -> AcceptingRegion:
     """Accepting end components under the min-even parity condition.
 
-    For each even p: the maximal end components of the rows that read no priority below p, with a row
-    that reads p (Baier and Katoen 2008, section 10.6.4, for Rabin pairs). The largest probability of
-    acceptance is that of reaching them.
+    For each even p: the maximal end components of the rows that read no priority below p, with a
+    row that reads p (Baier and Katoen 2008, section 10.6.4, for Rabin pairs). The largest
+    probability of acceptance is that of reaching them.
 
     Args:
       mdp: the product.

@@ -72,8 +72,8 @@ def positive_under_all_policies(
 ) -> Booleans:
     """States from which every policy reaches a goal with positive probability.
 
-    The least set with the goal and all states each of whose rows has a successor in it (the complement
-    of Prob0E). From all other states some policy avoids the goal.
+    The least set with the goal and all states each of whose rows has a successor in it (the
+    complement of Prob0E). From all other states some policy avoids the goal.
 
     Args:
       mdp: the model.
@@ -161,7 +161,8 @@ def almost_sure_reachability(
 ) -> tuple[Booleans, Booleans]:
     """States from which some policy reaches a goal almost surely (Prob1E), ``bool[S]``.
 
-    Also the rows ``bool[R]`` of these states that never leave them; `rows` are those that may be taken.
+    Also the rows ``bool[R]`` of these states that never leave them; `rows` are those that may be
+    taken.
     """
     kept = np.ones(mdp.num_rows, bool) if rows is None else rows.copy()
     inside = backward_reachable(mdp, goal, rows)
@@ -232,9 +233,9 @@ def end_components(
 ) -> EndComponents:
     """Maximal end components within some states and rows (Baier and Katoen 2008, section 10.6.3).
 
-    States that cannot stay are removed first, so that strongly connected components are computed on few.
-    Self-loops connect nothing and are added at the end; otherwise each state at the rim of a transient
-    region would be removed in a round by itself.
+    States that cannot stay are removed first, so that strongly connected components are computed
+    on few. Self-loops connect nothing and are added at the end; otherwise each state at the rim of
+    a transient region would be removed in a round by itself.
 
     Args:
       mdp: the model.

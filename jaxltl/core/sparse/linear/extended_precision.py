@@ -1,9 +1,9 @@
 """Optimality equations beyond double precision: two-float iterative refinement, and fractions.
 
 Written as ``sum_j w_j (x_i - x_j) + l_i x_i = c_i``, without self-loops, an equation subtracts no
-weights, and each policy's solution is a quotient of sums of products of the weights w, l and costs c
-(matrix-tree theorem). Weights that err by a share e of themselves therefore change it by a share of
-at most about ``2 n e`` for n unknowns, however long an episode may take (O'Cinneide 1993,
+weights, and each policy's solution is a quotient of sums of products of the weights w, l and costs
+c (matrix-tree theorem). Weights that err by a share e of themselves therefore change it by a share
+of at most about ``2 n e`` for n unknowns, however long an episode may take (O'Cinneide 1993,
 Entrywise perturbation theory and error analysis for Markov chains).
 
 With values in two floats, differences are accurate in all their digits, and so are the inflow

@@ -2,8 +2,8 @@
 
 Where few steps lead anywhere, elimination fills and sweeps converge soon. Sweeps go through blocks
 of states, each of which reads what those before it found; the slowest mode is extrapolated away
-(Aitken 1926); single precision comes first, as half the memory moves. None of this is trusted: as in
-:mod:`jaxltl.core.sparse.solvers.policy_iteration`, every step costs a small extra d, so that the
+(Aitken 1926); single precision comes first, as half the memory moves. None of this is trusted: as
+in :mod:`jaxltl.core.sparse.solvers.policy_iteration`, every step costs a small extra d, so that the
 value found is one bound by one backup, and its policy attains the other one,
 ``v - sign d m t``, where m is a margin and t the expected time of the policy, truncated where it
 stays for longer with probability at most 1/4.

@@ -38,9 +38,9 @@ class Separation(NamedTuple):
 def separation(points: Floats, vector: Floats, scale: Floats) -> Separation:
     """Distance of a vector ``float64[n]`` beyond the mixtures of points ``float64[N, n]``.
 
-    A linear program resolves distances relative to its largest one. It is therefore solved again for
-    the points near the face that it finds, relative to the vector, until all of these are far apart.
-    `scale` ``float64[n]`` is the unit of each objective.
+    A linear program resolves distances relative to its largest one. It is therefore solved again
+    for the points near the face that it finds, relative to the vector, until all of these are far
+    apart. `scale` ``float64[n]`` is the unit of each objective.
     """
     ahead = (points - vector) / scale
     chosen = np.arange(len(points))

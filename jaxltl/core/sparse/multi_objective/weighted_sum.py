@@ -37,8 +37,8 @@ class WeightedProblem(NamedTuple):
     Attributes:
       mdp: the model, N reachable states.
       start: ``float64[N]``, the initial distribution.
-      priority: ``int[B, R]``, for each probability objective the least priority that a row reads; it is
-        satisfied where the least recurring one is even.
+      priority: ``int[B, R]``, for each probability objective the least priority that a row reads;
+        it is satisfied where the least recurring one is even.
       gain: ``float64[K, R]``, at least 0: rewards to maximise.
       cost: ``float64[C, R]``, at least 0: rewards to minimise.
       ended: ``bool[N]``, where all rewards with a target have reached it.

@@ -1,7 +1,7 @@
 """Step-bounded probabilities and rewards by backward induction, with bounds of their rounding.
 
-Sums of nonnegative terms have small relative errors: each product and sum adds less than one unit of
-rounding, so that the error of n backups is known in advance.
+Sums of nonnegative terms have small relative errors: each product and sum adds less than one unit
+of rounding, so that the error of n backups is known in advance.
 """
 
 from __future__ import annotations

@@ -28,10 +28,11 @@ def average_reward(
 ) -> Solution:
     """Optimal expected long-run average reward per step: ``lim 1/n E[r_1 + ... + r_n]``.
 
-    For multichain models too (Puterman 1994, chapter 9): the best expected gain of the end component in
-    which a run ends. Gains are enclosed by the span of ``T v - v``, from value iteration and policy
-    iteration, and are the terminal rewards of an optimal stopping problem. Solved in double precision;
-    bounds include all rounding. Games have :func:`~jaxltl.core.values.average.mean_payoff.mean_payoff`.
+    For multichain models too (Puterman 1994, chapter 9): the best expected gain of the end
+    component in which a run ends. Gains are enclosed by the span of ``T v - v``, from value
+    iteration and policy iteration, and are the terminal rewards of an optimal stopping problem.
+    Solved in double precision; bounds include all rounding. Games have
+    :func:`~jaxltl.core.values.average.mean_payoff.mean_payoff`.
 
     Args:
       model: a SparseMDP, or any concrete model that :func:`to_sparse` takes.
@@ -42,9 +43,9 @@ def average_reward(
       max_steps: sweeps of value iteration at most.
 
     Returns:
-      :class:`Solution`; `value` is ``float64[S]``, `policy` rows ``int32[S]`` that attain the bound on
-      the safe side (`lower` of a maximum). `residual` is half the width of the gain's widest
-      enclosure.
+      :class:`Solution`; `value` is ``float64[S]``, `policy` rows ``int32[S]`` that attain the
+      bound on the safe side (`lower` of a maximum). `residual` is half the width of the gain's
+      widest enclosure.
 
     Raises:
       ValueError: the reward, the objective, or a model with intervals.

@@ -48,8 +48,8 @@ def achievable(
 
     Weighted sums are solved one after the other: each adds a point that its policy attains and a
     half-space that no policy leaves (Forejt, Kwiatkowska and Parker 2012). Thresholds are met if a
-    mixture of points meets them, and not if a half-space excludes them. Near the border sums are solved
-    more accurately, down to rounding.
+    mixture of points meets them, and not if a half-space excludes them. Near the border sums are
+    solved more accurately, down to rounding.
 
     Args:
       model: a SparseMDP, or any concrete model that :func:`to_sparse` takes.
@@ -160,8 +160,8 @@ def multi_objective(
     """Multi-objective query, as ``multi(...)`` of PRISM and Storm.
 
     Args:
-      model, objectives: as for :func:`achievable`. Those with a threshold must meet it. One without a
-        threshold is optimised; if two or more have none, none may have one.
+      model, objectives: as for :func:`achievable`. Those with a threshold must meet it. One
+        without a threshold is optimised; if two or more have none, none may have one.
       tolerance: the width of the bounds, relative where the value exceeds one.
       max_points: weighted sums at most.
 

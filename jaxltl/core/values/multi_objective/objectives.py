@@ -28,8 +28,8 @@ class Objective:
     """One of several objectives: a probability or an expected reward.
 
     Give one of ``formula`` (the probability of an LTL formula), ``avoid`` (never to enter a set),
-    ``reward`` (the expected total; with a target until that is reached, almost surely under every policy
-    that counts), or ``target`` alone (to reach a set, through `stay`).
+    ``reward`` (the expected total; with a target until that is reached, almost surely under every
+    policy that counts), or ``target`` alone (to reach a set, through `stay`).
 
     Attributes:
       formula: a formula, its text, or an automaton.
@@ -41,8 +41,8 @@ class Objective:
       threshold: at least that, or at most that for ``"min"``; None to optimise.
 
     Raises:
-      ValueError: on use: none or several of the four are given, or a direction, a label or a shape is
-        wrong.
+      ValueError: on use: none or several of the four are given, or a direction, a label or a shape
+        is wrong.
 
     Example:
       >>> from jaxltl import make_sparse, multi_objective

@@ -108,8 +108,8 @@ class ConstrainedOptimum(NamedTuple):
     """Optimal value of one objective under thresholds on the others.
 
     Attributes:
-      value, lower, upper: the value and its certified bounds; NaN if the thresholds cannot be met. If
-        that is unknown, they hold provided that they can; one bound is infinite.
+      value, lower, upper: the value and its certified bounds; NaN if the thresholds cannot be met.
+        If that is unknown, they hold provided that they can; one bound is infinite.
       holds: whether the thresholds can be met; None if unknown.
       share: the probabilities with which the front's policies are drawn initially, which attain the
         bound on the safe side; None without any.

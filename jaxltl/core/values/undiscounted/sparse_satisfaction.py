@@ -72,18 +72,19 @@ def sparse_satisfaction(
 ) -> Satisfaction:
     """Optimal probability of satisfying an LTL formula from some states of a sparse model.
 
-    Computed on the reachable product with the formula's automaton, up to states whose verdict is known.
-    It is the probability of reaching accepting states and, under Buchi and parity acceptance, accepting
-    end components (Baier and Katoen 2008, section 10.6.4); for a safety formula, of avoiding rejecting
-    states. Minima under Buchi and parity acceptance are one minus maxima for the negation.
+    Computed on the reachable product with the formula's automaton, up to states whose verdict is
+    known. It is the probability of reaching accepting states and, under Buchi and parity
+    acceptance, accepting end components (Baier and Katoen 2008, section 10.6.4); for a safety
+    formula, of avoiding rejecting states. Minima under Buchi and parity acceptance are one minus
+    maxima for the negation.
 
     Args:
       model: the model.
       task: a formula, its text, or an automaton over the letters that occur in the model.
       objective: ``"max"`` or ``"min"``.
       states: ``int[I]``, where runs start; default the initial states.
-      label_on: ``"entry"``, reads the label of the first state at once; ``"exit"``, as it is left. The
-        probabilities are equal, as the run has the same word.
+      label_on: ``"entry"``, reads the label of the first state at once; ``"exit"``, as it is left.
+        The probabilities are equal, as the run has the same word.
       tolerance: of :func:`~jaxltl.core.values.undiscounted.reachability.reachability_probability`.
 
     Returns:

@@ -96,9 +96,9 @@ def bounded_reachability(
 ) -> Solution:
     """Probability of reaching a set within n steps through states where one may stay.
 
-    ``x_0 = [s in target]``, and ``x_{k+1}(s) = 1`` in the target, ``opt_a (P x_k)(s, a)`` where one may
-    stay, else 0 (Baier and Katoen 2008, section 10.1.1). Where n is large, what further steps change is
-    bounded, so that they need not be taken.
+    ``x_0 = [s in target]``, and ``x_{k+1}(s) = 1`` in the target, ``opt_a (P x_k)(s, a)`` where
+    one may stay, else 0 (Baier and Katoen 2008, section 10.1.1). Where n is large, what further
+    steps change is bounded, so that they need not be taken.
 
     Args:
       model: a SparseMDP, or any concrete model that :func:`to_sparse` takes.
@@ -197,8 +197,8 @@ def instantaneous_reward(
 
     Args:
       model, objective, nature, by_step: as for :func:`bounded_reachability`.
-      reward: the name of a reward, a structure, or an array ``[S]``; of a structure only the rewards of
-        states count. None is the only reward of the model.
+      reward: the name of a reward, a structure, or an array ``[S]``; of a structure only the
+        rewards of states count. None is the only reward of the model.
       num_step: n.
 
     Returns:
@@ -241,8 +241,8 @@ def reward_bounded_reachability(
     """Probability of reaching a set before more than a bound of reward is earned.
 
     With l units left, ``x_l(s) = 1`` in the target, and the least solution of
-    ``x_l(s) = opt_a sum_t P(t | s, a) x_{l - c(s, a, t)}(t)`` elsewhere, zero below level 0 (Andova,
-    Hermanns and Katoen 2003). Rewards in the target do not count.
+    ``x_l(s) = opt_a sum_t P(t | s, a) x_{l - c(s, a, t)}(t)`` elsewhere, zero below level 0
+    (Andova, Hermanns and Katoen 2003). Rewards in the target do not count.
 
     Args:
       model, target, stay, objective: as for :func:`bounded_reachability`.
@@ -257,8 +257,8 @@ def reward_bounded_reachability(
       number of levels, L + 1.
 
     Raises:
-      ValueError: a shape, the objective, a negative reward, or rewards without a common unit of which
-        the bound has at most 10^7.
+      ValueError: a shape, the objective, a negative reward, or rewards without a common unit of
+        which the bound has at most 10^7.
 
     Concrete arrays only, on the host; not differentiable.
 
