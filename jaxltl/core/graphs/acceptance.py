@@ -1,7 +1,7 @@
-"""Where a run of a product is accepted for ever after: accepting end and bottom components.
+"""Accepting end components and bottom strongly connected components of products.
 
-Almost every run stays in one end component from some point on and takes all of its transitions
-infinitely often (de Alfaro 1997), so what it reads infinitely often is decided on the graph.
+Almost every trajectory ends in one end component and takes all of its transitions infinitely often
+(de Alfaro 1997), so the graph decides acceptance.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ class Accepting(NamedTuple):
 
     Attributes:
       region: ``bool[S, Q]``.
-      action: ``int32[S, Q]``: in the region, the action of a policy by which almost every
-        run is accepted.
-      inside: ``bool[S, Q, A]``: in the region, the actions of the state's end component; who takes
-        them all for ever reads its least priority, which is even, for ever. False elsewhere.
+      action: ``int32[S, Q]``: in the region, a policy that is accepted almost surely.
+      inside: ``bool[S, Q, A]``: in the region, the actions of the state's end component; a policy
+        that takes them all infinitely often reads its least priority, which is even, infinitely
+        often. False elsewhere.
       least: ``int32[S, Q]``: in the region, that priority; -1 elsewhere.
     """
 
@@ -37,19 +37,12 @@ class Accepting(NamedTuple):
 
 
 def accepting_end_components(model: Product) -> Accepting:
-    """The states of end components in which the least priority can be even for ever.
+    """The union of accepting end components of a product, with a policy that is accepted there.
 
-    For each even p: the maximal end components of the actions that read no priority
-    below p, with an action that reads p (Baier and Katoen 2008, section 10.6.4, for Rabin
-    pairs). The policy goes round by that action.
-
-    Args:
-      model: the product.
-
-    Returns:
-      :class:`Accepting`. A run is accepted with the largest probability of reaching its
-      region. Its end components do not overlap: those of a greater p lie within those of a lesser
-      one or outside of them all, and then the largest counts.
+    For each even p: the maximal end components of the actions that read no priority below p, with
+    an action that reads p (Baier and Katoen 2008, section 10.6.4, for Rabin pairs). The policy
+    takes that action infinitely often. The maximal satisfaction probability is that of reaching the
+    region. Components of different p do not overlap: the first p counts.
     """
     graph = graph_of(model)
     xp, available = graph.xp, graph.available
@@ -81,14 +74,9 @@ def accepting_end_components(model: Product) -> Accepting:
 
 
 def accepting_bottom_components(model: Product, policy: jax.Array) -> jax.Array:
-    """The states of closed components, under a policy, whose least priority is even.
+    """The states ``bool[S, Q]`` of accepting bottom strongly connected components of a policy.
 
-    Args:
-      model: the product.
-      policy: ``float[S, Q, A]``.
-
-    Returns:
-      ``bool[S, Q]``. A run is accepted with the probability of reaching this region.
+    The satisfaction probability of the policy is that of reaching them.
     """
     graph = graph_of(model, policy)
     xp = graph.xp
@@ -97,12 +85,12 @@ def accepting_bottom_components(model: Product, policy: jax.Array) -> jax.Array:
     inside = bottom.inside.any(-1)
 
     def body(i: Any, least: Any) -> Any:
-        # From the greatest down, so that the least stands last.
+        # In descending order, so that the least is written last.
         p = priority.max() - i
         met = (bottom.inside & graph.reads(priority == p)).any(-1)
         return xp.where(graph.anywhere(met, bottom.component) & inside, p, least)
 
-    # Nothing met is no acceptance.
+    # A component that reads no priority is not accepting.
     start = xp.full(graph.state_shape, 1, priority.dtype)
     least = graph.times(priority.max() + 1, body, start)
     return to_jax(inside & (least % 2 == 0))

@@ -1,9 +1,9 @@
-"""Strongly connected components by sweeps, for models that no host holds.
+"""Strongly connected components by sweeps, for models over a mesh.
 
-Orzan's (2004) colouring: every state takes the least number that it reaches. A state that keeps its
-own is the root of a component, and those of its colour that it reaches are the rest. What is left
-is coloured again, with numbers that count the other way, so that neither order of the states along
-a path is a bad one. Sweeps go on while news spreads, so paths cost as many as they are long.
+Colouring (Orzan 2004): each state takes the least number that it can reach. A state with its own
+number is the root of a component, which consists of the states of its colour that it can reach. The
+other states are coloured again with numbers in the reverse order, so that no order of the states
+along a path is always bad. The number of sweeps is at most the length of a longest shortest path.
 """
 
 from __future__ import annotations
@@ -20,16 +20,9 @@ from jaxltl.core.models.ops import operators
 def components_by_sweeps(
     graph: Any, core: jax.Array, allowed: jax.Array, closed: bool
 ) -> tuple[jax.Array, jax.Array]:
-    """Components among some states, and the actions that stay in them, as of a HostGraph.
+    """Components among some states, and the actions inside: ``int32[S]``, ``bool[S, A]``.
 
-    Args:
-      graph: a :class:`~jaxltl.core.graphs.graph.TracedGraph`.
-      core: ``bool[S]``.
-      allowed: ``bool[S, A]``; unless `closed`, they surely stay in `core`.
-      closed: whether only components count that no allowed action leaves.
-
-    Returns:
-      ``int32[S]``, the smallest number of a state of the same component, and ``bool[S, A]``.
+    Arguments as of ``HostGraph.components``; unless `closed`, allowed actions stay in `core`.
     """
     stay = allowed & graph.available & core[..., None]
 
@@ -54,12 +47,9 @@ def components_by_sweeps(
 
 
 def strong_components(graph: Any, states: jax.Array, moves: jax.Array) -> jax.Array:
-    """The smallest number in each state's component under some moves: ``int32[S]``.
+    """The least state of each state's component under some actions: ``int32[S]``.
 
-    Args:
-      graph: a :class:`~jaxltl.core.graphs.graph.TracedGraph`.
-      states: ``bool[S]``, those that count; each other is alone.
-      moves: ``bool[S, A]``, their actions, all successors of which can follow.
+    States outside of `states` are components by themselves.
     """
     number = _numbers(states.shape)
     none = jnp.int32(number.size)
@@ -78,8 +68,8 @@ def strong_components(graph: Any, states: jax.Array, moves: jax.Array) -> jax.Ar
         def spread(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
             found, _ = carry
             sent = jnp.where(moves & found[..., None], (colours + 1)[..., None], 0)
-            # Colours do not fall along moves, so the greatest that arrives is the state's own, if
-            # any is.
+            # Colours do not decrease along edges, so the greatest one that arrives is the state's
+            # own, if that one arrives.
             new = found | (
                 left & (operators.greatest_predecessor(graph.model, sent) == colours + 1)
             )

@@ -1,4 +1,4 @@
-"""Maximal end components, and the components that no action leaves."""
+"""Maximal end components, and bottom strongly connected components."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ class EndComponents(NamedTuple):
     """Maximal end components within a region.
 
     Attributes:
-      component: ``int32[S]``: the smallest (flat) state number of the state's component;
-        outside of all components, the state's own number.
-      inside: ``bool[S, A]``: actions that surely stay in the state's component.
+      component: ``int32[S]``: the smallest (flat) state number of the state's component; the
+        state's own number outside of all components.
+      inside: ``bool[S, A]``: the actions all of whose successors are in the state's component.
 
     Example:
       >>> import numpy as np
@@ -40,15 +40,15 @@ def end_components(
 ) -> EndComponents:
     """Maximal end components that lie within a region (de Alfaro 1997).
 
-    An end component is a set of states with actions that never leave it and
-    connect it. Computed on the host by strongly connected components, and only
-    among the states that can stay in the region for ever; under ``jit`` by a callback.
+    An end component is a set of states with actions that never leave it and connect it. Computed on
+    the host by strongly connected components of the states that can stay in the region; under
+    ``jit`` by a callback.
 
     Args:
       model: the model.
       region: ``bool[S]``.
-      allowed: ``bool[S, A]``, the actions that count; default the available ones. Of a sparse
-        model ``bool[R]``, as is `inside`.
+      allowed: ``bool[S, A]``; default the available actions. For a sparse model ``bool[R]``, as is
+        `inside`.
 
     Returns:
       :class:`EndComponents`. Exact and Boolean: there is no derivative.
@@ -68,19 +68,14 @@ def end_components(
 def components_within(graph: Graph, region: Any, allowed: Any = None) -> EndComponents:
     """:func:`end_components` of a graph."""
     allowed = graph.available if allowed is None else allowed & graph.available
-    # Only states that can remain in the region matter; usually there are few.
+    # Few states can stay in the region, as a rule.
     core = region & avoid(graph, ~region, allowed)
     allowed = allowed & graph.forall(core) & graph.on_choices(core)
     return EndComponents(*graph.components(core, allowed, closed=False))
 
 
 def bottom_components(model: Any, allowed: jax.Array) -> EndComponents:
-    """Strongly connected components that no allowed action leaves.
-
-    Args:
-      model: the model.
-      allowed: ``bool[S, A]``, the actions that are all taken, such as a policy's support.
-    """
+    """Bottom strongly connected components of the chain that takes all allowed actions."""
     graph = graph_of(model, allowed)
     return to_jax(closed_components(graph, take(graph, allowed)))
 

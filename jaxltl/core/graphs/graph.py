@@ -1,6 +1,6 @@
-"""What the fixpoints ask of a model, answered by the host or inside ``jit``.
+"""Graph operations of models, with NumPy on the host or with JAX inside ``jit``.
 
-An algorithm is written once, on a graph. On concrete arrays that is a
+Graph algorithms are written once, for both. On concrete arrays the graph is a
 :class:`~jaxltl.core.sparse.graph.product_graph.HostGraph`, which compiles nothing; where anything is traced it
 is a :class:`TracedGraph`, made of the primitives. Both give the same answers, bit for bit.
 """
@@ -33,11 +33,7 @@ from jaxltl.core.sparse.rows import rows_from_padded, rows_from_dense
 
 @dataclass(frozen=True)
 class TracedGraph:
-    """The same questions as of a HostGraph, by the primitives; inside ``jit`` and ``vmap``.
-
-    Attributes:
-      model: a model.
-    """
+    """The operations of a HostGraph by the operators of a model, inside ``jit`` and ``vmap``."""
 
     model: Any
 
@@ -57,7 +53,7 @@ class TracedGraph:
         return choices(self.model).available
 
     def on_choices(self, states: jax.Array) -> jax.Array:
-        """What holds of states, of their actions: ``bool[S, 1]`` or ``bool[R]``."""
+        """A set of states as a mask of choices: ``bool[S, 1]`` or ``bool[R]``."""
         return choices(self.model).spread(states)
 
     def exists(self, region: jax.Array) -> jax.Array:
@@ -86,7 +82,7 @@ class TracedGraph:
         return _sweeps(self, goal, allowed & self.available, rule, among, chance=chance)
 
     def components(self, core, allowed, closed: bool):
-        """As of a HostGraph, by a callback to one; where no host has the model, by sweeps."""
+        """The components of a HostGraph, by a callback; by sweeps for a model over a mesh."""
         if is_sharded(self.model):
             return components_by_sweeps(self, core, allowed, closed)
         shape, flat = self.state_shape, int(np.prod(self.state_shape))
@@ -116,7 +112,7 @@ class TracedGraph:
         return jnp.zeros(label.size, bool).at[label].max(mark.ravel())[component]
 
     def repeat(self, body: Any, start: tuple[Any, ...]) -> tuple[Any, ...]:
-        """Repeats while the last entry of what is carried is true."""
+        """Repeats `body` while the last entry of the carry is true."""
         return lax.while_loop(lambda carry: carry[-1], body, start)
 
     def times(self, count: Any, body: Any, start: Any) -> Any:
@@ -139,7 +135,7 @@ def _sweeps(graph: TracedGraph, goal, allowed, rule, among, *, chance):
         some, first = graph.first(hit)
         joins = jnp.where(rule, some, ~graph.first(allowed & ~hit)[0])
         new = joins & among & ~region
-        # Where every action leads nearer none is better than the first.
+        # If all actions lead nearer, the first one is taken.
         action = jnp.where(new, jnp.where(rule, first, graph.first(allowed)[1]), action)
         return region | new, action, jnp.where(new, n + 1, rank), new.any(), n + 1
 
@@ -161,14 +157,14 @@ def graph_of(model: Any, *arguments: Any) -> Graph:
 
 
 def is_table(model: Any) -> bool:
-    """Whether a model's transitions are written out, in none but the library's representations."""
+    """Whether a model is an MDP or DenseMDP, or a product or game of one."""
     lazy = model.mdp if isinstance(model, Game) else model
     world = lazy.mdp if isinstance(lazy, Product) else lazy
     return isinstance(world, MDP | DenseMDP)
 
 
 def host_graph(model: Any) -> HostGraph:
-    """The graph of a concrete model on the host; what its unavailable actions hold is not read."""
+    """The graph of a concrete padded model; unavailable actions are not read."""
     lazy = model.mdp if isinstance(model, Game) else model
     world = lazy.mdp if isinstance(lazy, Product) else lazy
     available, used = np.asarray(world.available), support(world)
@@ -193,5 +189,5 @@ def host_graph(model: Any) -> HostGraph:
 
 
 def take(graph: Graph, tree: Any) -> Any:
-    """Arrays as a graph computes with them: NumPy's on the host, else JAX's."""
+    """A tree with the arrays of a graph's namespace."""
     return jax.tree.map(graph.xp.asarray, tree)

@@ -1,4 +1,4 @@
-"""Where the probability of reaching a set is exactly 0 or 1: of a policy, largest and smallest."""
+"""Qualitative reachability: prob0 and prob1 states of a policy, a maximum and a minimum."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from jaxltl.core.graphs.graph import Graph
 
 
 class Sets(NamedTuple):
-    """What the graph decides: probability one, probability zero, and witnessing actions."""
+    """Prob1 states, prob0 states, and a policy that attains these probabilities."""
 
     one: Any
     zero: Any
@@ -19,7 +19,7 @@ class Sets(NamedTuple):
 
 
 def policy_sets(graph: Graph, target: Any, policy: Any) -> Sets:
-    """What a policy's support decides."""
+    """Prob0 and prob1 states of a policy, from its support."""
     allowed = graph.available & (policy > 0)
     zero = ~attract(graph, target, allowed).region
     doomed = attract(graph, zero, allowed, among=~target).region
@@ -27,7 +27,7 @@ def policy_sets(graph: Graph, target: Any, policy: Any) -> Sets:
 
 
 def max_sets(graph: Graph, target: Any) -> Sets:
-    """Where the largest probability is 1 or 0, with actions that attain it."""
+    """Prob0 and prob1 states of the maximal probability, with a policy that attains it."""
     some = attract(graph, target)
     sure = surely(graph, target, reaching=some)
     action = graph.xp.where(sure.region, sure.action, some.action)
@@ -35,7 +35,7 @@ def max_sets(graph: Graph, target: Any) -> Sets:
 
 
 def min_sets(graph: Graph, target: Any) -> Sets:
-    """Where the smallest probability is 1 or 0, with actions that attain it."""
+    """Prob0 and prob1 states of the minimal probability, with a policy that attains it."""
     zero = avoid(graph, target)
     doomed = attract(graph, zero, among=~target).region
     stays, action = graph.first(graph.available & graph.forall(zero))

@@ -1,4 +1,4 @@
-"""Attractors on the host: sweeps over what is open, then a worklist, linear in the transitions."""
+"""Attractors on the host: sweeps over open states, then a worklist, linear in the transitions."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
-"""Sets of pairs of a world's state and a memory, as one word of bits for each state.
+"""Qualitative reachability in large products, with a bit set of memory states for each world state.
 
-What is asked of the graph of a product is then asked of all memories at once: who leads to a set is
-the union of its successors' words. Sweeps go through blocks of states, and each reads what those
-before it found.
+One bit operation treats all memory states: the predecessors of a set are unions of words. Sweeps go
+through blocks of states, and each block uses the results of those before it.
 """
 
 from __future__ import annotations
@@ -15,24 +14,24 @@ from numpy.typing import NDArray
 
 from jaxltl.core.array_types import Booleans, Integers
 
-LARGEST = 64  # memories that a word has room for
+LARGEST = 64  # number of memory states of a word
 _BLOCK = 2**15  # states of a block
-_SWEEPS = 400  # after which a search is given up
+_SWEEPS = 400  # maximal number of sweeps of a search
 
 Words = NDArray[np.unsignedinteger[Any]]
 
 
 @dataclass(frozen=True)
 class BitGraph:
-    """The graph of a world beside a memory, read where a state is entered.
+    """The graph of a product that reads labels of states that are entered.
 
     Attributes:
-      columns: for each action and successor ``int32[S]``; S where there is none.
-      permitted: for each action the memories in which it may be taken, ``word[S]``.
-      after: ``word[L * 256]`` for each eight bits of a word: the memories from which a letter leads
-        to one of these.
-      letter: ``int64[S]``, 256 times the letter that each state shows.
-      full: all memories.
+      columns: for each action and successor ``int32[S]``; S in padding.
+      permitted: for each action the memory states in which it is available, ``word[S]``.
+      after: ``word[L * 256]`` for each byte of a word: the memory states from which a letter leads
+        to one of its memory states.
+      letter: ``int64[S]``, 256 times the letter of each state.
+      full: the word of all memory states.
     """
 
     columns: list[list[Integers]]
@@ -51,7 +50,7 @@ class BitGraph:
         return np.zeros(self.num_states, self.permitted[0].dtype)
 
     def read(self, words: Words, part: Any) -> Words:
-        """The memories in which entering a state of a block leads to a pair of a set."""
+        """The memory states in which entering a state of a block leads to a pair of a set."""
         letter = self.letter[part]
         found: Any = self.after[0][letter + (words & 255).astype(np.int64)]
         for i, table in enumerate(self.after[1:], 1):
@@ -59,13 +58,13 @@ class BitGraph:
         return found
 
     def seen(self, words: Words) -> Words:
-        """The same of all states, with the empty set for none."""
+        """The same for all states, and the empty word for padding."""
         found = np.zeros(self.num_states + 1, words.dtype)
         found[:-1] = self.read(words, slice(None))
         return found
 
     def hits(self, action: int, seen: Words, part: Any) -> Words:
-        """The memories of some states in which an action may lead to a set."""
+        """The memory states in which an action may lead to a set, for some states."""
         first, *others = self.columns[action]
         found = seen[first[part]]
         for column in others:
@@ -81,17 +80,14 @@ class BitGraph:
         kept: list[Words] | None = None,
         action: Integers | None = None,
     ) -> Words | None:
-        """The least set with a goal to which some action may lead, or else every one.
+        """The attractor ``word[S]`` of a goal; None if it takes too many sweeps.
 
         Args:
           goal: ``word[S]``.
-          among: ``word[S]``, what may join.
-          forced: whether every action must, else some.
-          kept: for each action where it counts; default where it is permitted.
-          action: ``int[S, Q]``, filled with an action by which each that joins may come nearer.
-
-        Returns:
-          ``word[S]``; None if that takes too many sweeps.
+          among: ``word[S]``, the pairs that may join.
+          forced: whether all actions must lead to the region, else some.
+          kept: for each action the pairs in which it counts; default where it is permitted.
+          action: ``int[S, Q]``, filled with an action that leads nearer, for each pair that joins.
         """
         region, kept = goal.copy(), self.permitted if kept is None else kept
         seen = self.seen(region)
@@ -137,13 +133,13 @@ class BitGraph:
         return found
 
     def only(self, words: Words) -> list[Words]:
-        """For each action where it is permitted and surely leads to a set."""
+        """For each action the pairs in which it is permitted and all successors are in a set."""
         seen = self.seen(self.full & ~words)
         return [x & ~self.hits(a, seen, slice(None)) for a, x in enumerate(self.permitted)]
 
 
 def _note(action: Integers, part: Any, words: Words, number: int) -> None:
-    """Writes a number where bits are set."""
+    """Writes a number at the pairs of a set."""
     state = np.flatnonzero(words)
     if not state.size:
         return
@@ -153,7 +149,7 @@ def _note(action: Integers, part: Any, words: Words, number: int) -> None:
 
 
 def _first(action: Integers, words: Words, kept: list[Words]) -> None:
-    """Writes the first action that counts; the array has its zeros where that is the first one."""
+    """Writes the first action that counts, into an array of zeros."""
     left = words & ~kept[0]
     for a in range(1, len(kept)):
         _note(action, slice(None), left & kept[a], a)
@@ -184,15 +180,9 @@ def bit_graph(
     letter: Integers,
     allowed: Booleans | None = None,
 ) -> BitGraph:
-    """The graph of a world beside an automaton of 64 states at most.
+    """The graph of a padded world and an automaton with at most 64 states.
 
-    Args:
-      successor: ``int[S, A, K]``.
-      used: ``bool[S, A, K]``.
-      available: ``bool[S, A]``.
-      delta: ``int[Q, L]``.
-      letter: ``int[S]``.
-      allowed: ``bool[S, Q, A]``, or None for all.
+    `used` is ``bool[S, A, K]``, `allowed` a mask ``bool[S, Q, A]`` or None.
     """
     num_states, num_actions, width = successor.shape
     num_memory = delta.shape[0]
@@ -224,12 +214,12 @@ def bit_graph(
 
 
 class BitSets(NamedTuple):
-    """What the graph decides of an optimum.
+    """Prob0 and prob1 states of an optimum.
 
     Attributes:
       one, zero: ``word[S]``, where the probability is 1 and where it is 0.
-      stays: ``word[S]``, what is left and can be kept for ever: where end components are.
-      action: ``int32[S, Q]``, actions that attain what is decided.
+      stays: ``word[S]``, the other pairs that can be kept for ever: candidates of end components.
+      action: ``int32[S, Q]``, a policy that attains 0 and 1.
     """
 
     one: Words
@@ -239,11 +229,7 @@ class BitSets(NamedTuple):
 
 
 def decided(graph: BitGraph, target: Words, num_memory: int, *, maximize: bool) -> BitSets | None:
-    """Where the largest or least probability of reaching a target is 1 or 0.
-
-    Returns:
-      None if the graph is too deep for sweeps.
-    """
+    """Prob0 and prob1 states of a reachability optimum; None if the graph is too deep."""
     everything = graph.full | graph.nothing
     action = np.zeros((graph.num_states, num_memory), np.int32)
     before = everything & ~target
@@ -266,7 +252,7 @@ def _largest(
     everything = graph.full | graph.nothing
     outside = everything & ~some
     while True:
-        # First all that are forced out, then what cannot reach the target inside.
+        # First the pairs that are forced out, then those that cannot reach the target inside.
         grown = graph.grow(outside, before, forced=True)
         if grown is None:
             return None

@@ -1,8 +1,8 @@
-"""The graph of a model on the host: who leads where, attractors, components.
+"""Graph of a padded model or a lazy product on the host: successors, attractors, components.
 
-States are those of a world beside a memory, ``[S, Q]``; an ordinary model has one memory state,
-whose axis is not shown. The product is never copied out: rows are the world's, and the memory
-only decides where a successor is read.
+The states of a product are pairs ``[S, Q]``; other models have one memory state, whose axis is not
+shown. The product is not written out: rows are the world's, and the memory selects the entry of a
+successor.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from jaxltl.core.sparse.rows import Rows, concatenated_ranges
 
 @dataclass(frozen=True)
 class HostGraph:
-    """What the fixpoints ask of a model, by NumPy; ``TracedGraph`` answers the same under jit.
+    """Graph operations of a model with NumPy; ``TracedGraph`` is their JAX form.
 
     Attributes:
       rows: the world's rows, numbered ``s * A + a``; none where an action is unavailable.
       world_available: ``bool[S, A]``.
       next_memory: ``int[S, Q]``, the memory after reading the label of a world state in q.
-      letter: ``int[S]``, what the automaton reads of a world state.
-      on_entry: whether the label of the state that is entered is read, not of the one left.
+      letter: ``int[S]``, the letter of each world state.
+      on_entry: whether the automaton reads the label of the state that is entered.
       state_shape: ``(S,)`` or ``(S, Q)``.
-      allowed: ``bool[S, Q, A]``, to which the world's actions are narrowed, or None.
+      allowed: ``bool[S, Q, A]``, a mask of the product's actions, or None.
     """
 
     rows: Rows
@@ -77,7 +77,7 @@ class HostGraph:
         return np.concatenate([[0], count.cumsum()]), order
 
     def on_choices(self, states: Booleans) -> Booleans:
-        """What holds of states, of their actions: ``bool[S, 1]``."""
+        """A set of states as a mask of actions: ``bool[S, 1]``."""
         return states[..., None]
 
     def exists(self, region: Booleans) -> Booleans:
@@ -114,11 +114,7 @@ class HostGraph:
         return np.ascontiguousarray(found.swapaxes(1, 2))
 
     def reads(self, marked: Booleans) -> Booleans:
-        """Whether an action can make the automaton read a marked transition: ``bool[S, Q, A]``.
-
-        Args:
-          marked: ``bool[Q, L]``, transitions of the automaton.
-        """
+        """Whether an action can read a marked transition ``bool[Q, L]``: ``bool[S, Q, A]``."""
         here = marked[:, self.letter].T
         if not self.on_entry:
             return here[:, :, None] & self.available
@@ -156,10 +152,9 @@ class HostGraph:
     def components(
         self, core: Booleans, allowed: Booleans, closed: bool
     ) -> tuple[Integers, Booleans]:
-        """Components among some states, ``int32[S]``, and the actions that stay in them.
+        """Components among some states, ``int32[S]``, and the actions inside, ``bool[S, A]``.
 
-        Strongly connected components are refined until no action leaves its own; or, if only
-        closed ones are asked for, those are kept that no action leaves.
+        Maximal end components; or, if `closed`, bottom strongly connected components.
         """
         num_actions = self.num_actions
         states = np.flatnonzero(core)
@@ -191,7 +186,7 @@ class HostGraph:
         return component.reshape(self.state_shape), inside.reshape(*self.state_shape, -1)
 
     def _edges(self, states: Integers) -> tuple[Integers, Integers]:
-        """All moves of some flat states: ``i * A + a`` of the i-th, and the flat successor."""
+        """Edges of some flat states: ``i * A + a`` for the i-th, and the flat successor."""
         num_actions, num_memory = self.num_actions, self.num_memory
         s, q = np.divmod(states, num_memory)
         row = (s[:, None] * num_actions + np.arange(num_actions)).ravel()
@@ -213,7 +208,7 @@ class HostGraph:
     # --- loops and arrays ---------------------------------------------------------------------
 
     def repeat(self, body: Any, start: tuple[Any, ...]) -> tuple[Any, ...]:
-        """Repeats while the last entry of what is carried is true."""
+        """Repeats `body` while the last entry of the carry is true."""
         while start[-1]:
             start = body(start)
         return start

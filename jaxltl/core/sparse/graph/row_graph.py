@@ -1,4 +1,4 @@
-"""The graph of sparse rows, with masks of rows in place of masks of actions."""
+"""Graph of a model with sparse rows; masks of rows take the place of masks of actions."""
 
 from __future__ import annotations
 
@@ -17,11 +17,7 @@ from jaxltl.core.sparse.rows import group_starts, decrement, sorted_unique, conc
 
 @dataclass(frozen=True)
 class RowGraph:
-    """What the fixpoints ask of a sparse model; a mask is ``bool[R]`` and an action a row.
-
-    Attributes:
-      host: the model.
-    """
+    """The operations of a HostGraph for sparse rows: a mask is ``bool[R]``, an action is a row."""
 
     host: HostMDP
 
@@ -37,7 +33,7 @@ class RowGraph:
         return np.ones(self.host.num_rows, bool)
 
     def on_choices(self, states: Booleans) -> Booleans:
-        """What holds of states, of their rows: ``bool[R]``."""
+        """A set of states as a mask of rows: ``bool[R]``."""
         return states[self.host.state]
 
     def exists(self, region: Booleans) -> Booleans:
@@ -79,7 +75,7 @@ class RowGraph:
             decrement(left, state)
             joins = (rule[state] | (left[state] == 0)) & open_[state]
             state, hit = state[joins], hit[joins]
-            # Rows are in order, so one state's stand together.
+            # Rows are in order, so those of one state are contiguous.
             first = group_starts(state)
             frontier = state[first]
             row[frontier] = hit[first]
@@ -93,7 +89,7 @@ class RowGraph:
     def components(
         self, core: Booleans, allowed: Booleans, closed: bool
     ) -> tuple[Integers, Booleans]:
-        """As of a HostGraph: ``int32[S]``, and the rows that stay, ``bool[R]``."""
+        """The components of a HostGraph: ``int32[S]``, and the rows inside, ``bool[R]``."""
         host = self.host
         if not closed:
             found = end_components(host, core, allowed)

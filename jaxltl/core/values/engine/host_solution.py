@@ -5,12 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any, NamedTuple, cast
 
+import jax
 import numpy as np
+from jax import lax
 
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.compiled.compiled import flatten_policy
 from jaxltl.core.models.compiled.compiled import is_sparse as is_sparse
-from jaxltl.core.models.ops.array_namespace import to_jax
+from jaxltl.core.models.ops.array_namespace import is_traced, namespace, to_jax
 from jaxltl.core.models.ops.operators import is_deterministic, require_weights, row_weights
 from jaxltl.core.models.protocols import ActionModel, Array, Model
 from jaxltl.core.models.sparse import SparseMDP
@@ -87,6 +89,31 @@ def solution_from_enclosure(
         "residual": np.asarray(found.residual, dtype),
     }
     return Solution(**to_jax(parts), method=method)
+
+
+def complement_event(solution: Solution) -> Solution:
+    """The solution of the complementary event, with bounds rounded outwards.
+
+    Bounds that are 0 or 1 stay exact, and NumPy arrays stay NumPy arrays. Differentiable in the
+    value.
+    """
+    parts = solution.value, solution.upper, solution.lower
+    if is_traced(parts):
+        parts = parts[0], *lax.stop_gradient(parts[1:])
+    xp, value, far, near = namespace(*parts)
+    one = xp.ones((), value.dtype)
+
+    def outwards(bound: Any, end: int) -> Any:
+        rounded = one - bound
+        beyond = xp.clip(xp.nextafter(rounded, end * one), 0, 1)
+        return xp.where((bound == 0) | (bound == 1), rounded, beyond)
+
+    found: Any = one - value, outwards(far, -1), outwards(near, 2)
+    if any(isinstance(x, jax.Array) for x in parts):
+        found = to_jax(found)
+    else:
+        found = tuple(np.asarray(x) for x in found)
+    return replace(solution, value=found[0], lower=found[1], upper=found[2])
 
 
 @brief

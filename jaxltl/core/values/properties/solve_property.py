@@ -38,7 +38,7 @@ from jaxltl.core.values.interval.step_bounded import (
     robust_next_probability,
 )
 from jaxltl.core.values.undiscounted import step_bounded as bounded
-from jaxltl.core.values.undiscounted.complement import opposite_event
+from jaxltl.core.values.engine.host_solution import complement_event
 from jaxltl.core.values.undiscounted.reachability import reachability_probability
 from jaxltl.core.values.undiscounted.sparse_satisfaction import (
     Satisfaction,
@@ -478,7 +478,7 @@ class _Probability(NamedTuple):
 
         def found(tolerance: float) -> _Found:
             result = solve(tolerance)
-            return result._replace(solution=opposite_event(result.solution))
+            return result._replace(solution=complement_event(result.solution))
 
         return found
 

@@ -27,7 +27,7 @@ from jaxltl.core.types import Solution, Status
 from jaxltl.core.values import facts
 from jaxltl.core.values.engine.certificates import rounding_unit
 from jaxltl.core.values.engine.host_solution import solution_from_enclosure
-from jaxltl.core.values.undiscounted.complement import opposite_event
+from jaxltl.core.values.engine.host_solution import complement_event
 from jaxltl.core.values.undiscounted.reachability import (
     QUICK_LIMIT,
     Question,
@@ -138,7 +138,7 @@ def optimal_actions(
     attaining = _attaining(problem)
     if attaining is not None:
         keeps, bounds = attaining
-        bounds = opposite_event(bounds) if problem.opposite else bounds
+        bounds = complement_event(bounds) if problem.opposite else bounds
         narrower = _bounded(problem, keeps, bounds, objective, goal)
         if int(narrower.status) == Status.CONVERGED:
             return narrower

@@ -28,7 +28,7 @@ from jaxltl.core.types import Solution
 from jaxltl.core.values.engine.host_solution import is_sparse
 from jaxltl.core.values.interval.robust import refuse_nature
 from jaxltl.core.values.interval.satisfaction import robust_product_satisfaction
-from jaxltl.core.values.undiscounted.complement import opposite_event
+from jaxltl.core.values.engine.host_solution import complement_event
 from jaxltl.core.values.undiscounted.reachability import (
     QUICK_LIMIT,
     on_rows,
@@ -100,7 +100,7 @@ def satisfaction_probability(
     reach = reachability_probability(
         model, target, policy=policy, method=method, tolerance=tolerance
     )
-    return opposite_event(reach) if kind == "safety" else reach
+    return complement_event(reach) if kind == "safety" else reach
 
 
 @validated()
@@ -195,7 +195,7 @@ def _optimal(
             problem.accepting.region, _visiting(problem, found), found.policy
         )
         found = replace(found, policy=to_jax(xp.where(region, action, chosen).astype(xp.int32)))
-    return opposite_event(found) if problem.opposite else found
+    return complement_event(found) if problem.opposite else found
 
 
 # One program for a model over a mesh, instead of one for each operation.

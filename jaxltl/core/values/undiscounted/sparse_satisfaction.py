@@ -30,7 +30,7 @@ from jaxltl.core.values.engine.host_solution import (
     default_tolerance,
     solution_from_enclosure,
 )
-from jaxltl.core.values.undiscounted.complement import opposite_event
+from jaxltl.core.values.engine.host_solution import complement_event
 
 
 @brief(facts=facts.satisfaction)
@@ -189,7 +189,7 @@ def _best(
     row = np.asarray(found.policy)
     if visiting is not None:
         row = np.where(visiting.region, visiting.row, row)
-    return (opposite_event(found) if opposite else found), row
+    return (complement_event(found) if opposite else found), row
 
 
 def product_satisfaction(
