@@ -17,6 +17,8 @@ import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
 
+ROW_SUM_TOLERANCE = 1e-6  # largest error of the sum of a distribution that is given
+
 _MAX_REPR = 60  # characters of a value in an error message
 _INEXACT = 2.0**53  # integers from here on are not all floats
 

@@ -13,6 +13,7 @@ from jax import lax
 from jax.tree_util import Partial
 
 from jaxltl.core import validation
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.environments.environment import (
     Environment,
     Timestep,
@@ -53,11 +54,11 @@ class Agent:
       1
     """
 
-    act: Callable[..., tuple[Any, Any]]
-    memory: Any = ()
+    act: Callable[..., tuple[PyTree, PyTree]]
+    memory: PyTree = ()
 
 
-def make_agent(function: Callable[..., Any]) -> Agent:
+def make_agent(function: Callable[..., PyTree]) -> Agent:
     """A memoryless :class:`Agent` from a function; masks of actions are ignored.
 
     Args:
@@ -75,7 +76,11 @@ def make_agent(function: Callable[..., Any]) -> Agent:
 
 
 def _without_memory(
-    function: Callable[..., Any], memory: Any, observation: Any, allowed: Any, key: chex.PRNGKey
+    function: Callable[..., PyTree],
+    memory: PyTree,
+    observation: PyTree,
+    allowed: Any,
+    key: chex.PRNGKey,
 ) -> tuple[Any, Any]:
     del allowed
     return function(observation, key), memory
@@ -109,9 +114,9 @@ class Episode(NamedTuple):
       ((6,), (5,), ())
     """
 
-    world: Any
-    observation: Any
-    action: Any
+    world: PyTree
+    observation: PyTree
+    action: PyTree
     reward: jax.Array
     cost: jax.Array
     label: jax.Array
@@ -161,7 +166,7 @@ def run_episode(
 
     end, made = lax.scan(move, begin, jnp.arange(num_steps))
 
-    def append(row: Any, end: Any) -> Any:
+    def append(row: PyTree, end: PyTree) -> PyTree:
         return jax.tree.map(lambda x, y: jnp.concatenate([x, y[None]]), row, end)
 
     return Episode(
@@ -182,8 +187,8 @@ def run_episode(
 class Underway(NamedTuple):
     """The state of an episode during its simulation."""
 
-    world: Any
-    memory: Any
+    world: PyTree
+    memory: PyTree
     terminated: jax.Array
     truncated: jax.Array
 
@@ -192,9 +197,9 @@ class Underway(NamedTuple):
 class Move(NamedTuple):
     """One step of an :class:`Episode`, with the state before it."""
 
-    world: Any
-    observation: Any
-    action: Any
+    world: PyTree
+    observation: PyTree
+    action: PyTree
     reward: jax.Array
     cost: jax.Array
     label: jax.Array
@@ -234,7 +239,7 @@ def continue_episode(
 
 
 def auto_reset_step(
-    environment: Environment, world: Any, action: Any, key: chex.PRNGKey
+    environment: Environment, world: PyTree, action: PyTree, key: chex.PRNGKey
 ) -> tuple[Any, Timestep]:
     """A step that resets the environment where an episode ends.
 

@@ -185,8 +185,7 @@ def trace_verdicts(
 ) -> jax.Array:
     """The verdict after each prefix of traces, the empty one first.
 
-    A verdict other than undecided never changes. After `length` letters it stays what it was,
-    whatever the padding says: a trace that is cut off gets no verdict for that.
+    A decided verdict never changes, and padding after `length` letters is not read.
 
     Args:
       monitor: from :func:`make_monitor`.

@@ -280,7 +280,7 @@ def sequence_environment(
         )
     shape = (len(sampler.length), len(rows))
     marks, steps = make_box(0, 1, shape, bool), make_box(0, np.inf, (), np.int32)
-    told: Any = Sequence(marks, marks, steps)  # type: ignore[arg-type]
+    spaces: Any = Sequence(marks, marks, steps)  # type: ignore[arg-type]
     numbers = np.array(
         [
             validation.finite_number("violation", violation),
@@ -294,10 +294,10 @@ def sequence_environment(
         observe=Partial(_observe, inner),
         labels=Partial(_labels, inner),
         allowed=None if inner.allowed is None else Partial(_allowed, inner),
-        observations=SequenceObservation(inner.observations, told),
+        observations=SequenceObservation(inner.observations, spaces),
         starts=None,
         outcomes=None,
-    )  # so many sequences are drawn that they are not told
+    )  # there are too many sequences for `starts`
 
 
 def remaining(sequence: Sequence, index: chex.Numeric) -> Sequence:
@@ -329,7 +329,7 @@ def _reset(
     world_key, key = jax.random.split(key)
     drawn = draw_sequence(key, sampler)
     found = _read(inner, events, inner.reset(world_key), drawn, jnp.int32(0))
-    # An episode has a first step: what is over at once is asked for again.
+    # A sequence that the first event decides starts again, since an episode has at least one step.
     over = found.verdict != Verdict.UNDECIDED
     return found._replace(
         stage=jnp.where(over, 0, found.stage),
@@ -342,7 +342,7 @@ def _step(
     events: jax.Array,
     numbers: jax.Array,
     state: SequenceWorld,
-    action: Any,
+    action: PyTree,
     key: chex.PRNGKey,
 ) -> Timestep:
     found = Timestep(*inner.step(state.world, action, key))

@@ -29,8 +29,8 @@ from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.rows import offsets_from_counts
 
-_BATCH = 1024  # worlds that are stepped at once, and fewer
-_BYTES = 2**26  # if what they lead to takes more than this
+_BATCH = 1024  # states of a batch, at most
+_BYTES = 2**26  # bytes of the successors of a batch, at most
 _LIVE, _TERMINATED, _TRUNCATED = range(3)
 
 
@@ -164,7 +164,7 @@ class _Kind(NamedTuple):
     environment: Environment
     distinct: Callable[[Any], Any]
     keys: Any
-    like: Any
+    like: PyTree
 
 
 # --- worlds as bytes ------------------------------------------------------------------------------
@@ -289,7 +289,7 @@ def _fits(worlds: PyTree, shape: Any) -> bool:
     )
 
 
-def _same_type(x: Any, like: Any) -> bool:
+def _same_type(x: Any, like: PyTree) -> bool:
     """True also for NumPy's double-precision numbers in single precision."""
     kind = getattr(x, "dtype", None)
     return kind == like.dtype or (
@@ -313,7 +313,7 @@ def _left_out_is_idle(kind: _Kind) -> bool:
     """True proves that no result depends on the parts that `distinct` leaves out."""
     environment = kind.environment
 
-    def listed(world: PyTree, action: Any, key: Any) -> Any:
+    def listed(world: PyTree, action: PyTree, key: chex.PRNGKey) -> Any:
         found = Timestep(*environment.step(world, action, key))
         told = None
         if environment.outcomes is not None:
@@ -358,7 +358,7 @@ class _Followers(NamedTuple):
 class _Listed(NamedTuple):
     """The result of the search, as parts; `world` and `ended` are of states."""
 
-    world: list[Any]
+    world: list[PyTree]
     ended: np.ndarray
     start: np.ndarray
     successor: list[np.ndarray]
@@ -378,14 +378,14 @@ def _follow(kind: _Kind, draws: int, world: PyTree) -> _Followers:
     def seen(found: Timestep) -> jax.Array:
         return jnp.append(_seen(kind, found.world), _ended(found))
 
-    def drawn(action: Any) -> Timestep:
-        def one(key: Any) -> Timestep:
+    def drawn(action: PyTree) -> Timestep:
+        def one(key: chex.PRNGKey) -> Timestep:
             found = Timestep(*environment.step(world, action, key))
             return Timestep(*jax.tree.map(jnp.asarray, tuple(found)))
 
         return jax.vmap(one)(kind.keys[:draws])
 
-    def one(action: Any) -> _Followers:
+    def one(action: PyTree) -> _Followers:
         tries = drawn(action)
         found, probability = jax.tree.map(lambda x: x[:1], tries), jnp.ones(1)
         if environment.outcomes is not None:
@@ -396,7 +396,7 @@ def _follow(kind: _Kind, draws: int, world: PyTree) -> _Followers:
             found = Timestep(told.world, *rest)
         mask = jnp.bool_(True)
         drawn_again = jax.vmap(seen)(tries)
-        if environment.outcomes is None:  # else what is earned is what they tell
+        if environment.outcomes is None:  # otherwise `outcomes` gives the rewards
             paid = jax.vmap(lambda x: _bytes((x.reward, x.cost)))(tries)
             drawn_again = jnp.concatenate([drawn_again, paid], axis=-1)
         return _Followers(
@@ -419,7 +419,7 @@ def _followers(draws: int, kind: _Kind, plain: PyTree) -> _Followers:
     return jax.vmap(lambda x: _follow(kind, draws, _typed(kind, x)))(plain)
 
 
-def _search(kind: _Kind, begun: Any, max_states: int) -> _Listed:
+def _search(kind: _Kind, begun: PyTree, max_states: int) -> _Listed:
     """Breadth-first search in batches."""
     environment = kind.environment
     shape = kind.like
@@ -479,7 +479,7 @@ def _search(kind: _Kind, begun: Any, max_states: int) -> _Listed:
     )
 
 
-def _batches(frontier: Any, count: int, size: int) -> Iterator[tuple[int, Any]]:
+def _batches(frontier: PyTree, count: int, size: int) -> Iterator[tuple[int, Any]]:
     """Batches of one size, the last one padded, with their numbers of valid rows."""
     for begin in range(0, count, size):
         place = np.minimum(np.arange(begin, begin + size), count - 1)
@@ -545,7 +545,7 @@ def _check(found: _Followers, base: int, told: bool) -> None:
 # --- as a model -----------------------------------------------------------------------------------
 
 
-def _joined(parts: list[Any]) -> Any:
+def _joined(parts: list[PyTree]) -> PyTree:
     return jax.tree.map(lambda *x: np.concatenate(x), *parts)
 
 
@@ -571,7 +571,7 @@ def _model(kind: _Kind, listed: _Listed, initial: np.ndarray, label: np.ndarray)
         np.asarray(x, np.float64)[state, action]
         for x in (followers.probability, followers.reward, followers.cost)
     ]
-    # Each state that has ended gets a row of its own, a loop without reward.
+    # Ended states have a self-loop without reward.
     over = np.flatnonzero(listed.ended != _LIVE)
     owner = np.concatenate([live[state], over])
     order = np.argsort(owner, kind="stable")

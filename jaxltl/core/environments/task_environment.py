@@ -382,7 +382,7 @@ def stack_tasks(environments: Sequence[Environment]) -> Environment:
     return _stacked(made)
 
 
-def residual_formula(task: Environment | TaskTables | Automaton, memory: Any) -> str:
+def residual_formula(task: Environment | TaskTables | Automaton, memory: PyTree) -> str:
     """The residual formula in a state of a task's automaton: the obligation on the remaining word.
 
     States of automata from files, very large automata, stacks and results of ``jit`` have no text, and
@@ -446,19 +446,22 @@ def _read(tables: TaskTables, label: jax.Array) -> jax.Array:
 
 
 def _reset(
-    tables: TaskTables, labels: Callable[..., Any], reset: Callable[..., Any], key: chex.PRNGKey
+    tables: TaskTables,
+    labels: Callable[..., PyTree],
+    reset: Callable[..., PyTree],
+    key: chex.PRNGKey,
 ) -> TaskWorld:
     return _begin(tables, labels, reset(key))
 
 
 def _starts(
-    tables: TaskTables, labels: Callable[..., Any], starts: Callable[..., Any]
+    tables: TaskTables, labels: Callable[..., PyTree], starts: Callable[..., PyTree]
 ) -> tuple[TaskWorld, jax.Array]:
     worlds, probability = starts()
     return jax.vmap(lambda world: _begin(tables, labels, world))(worlds), probability
 
 
-def _begin(tables: TaskTables, labels: Callable[..., Any], world: PyTree) -> TaskWorld:
+def _begin(tables: TaskTables, labels: Callable[..., PyTree], world: PyTree) -> TaskWorld:
     """The initial product state, after the automaton has read the first label."""
     tables = jax.tree.map(jnp.asarray, tables)
     letter = _read(tables, labels(world))
@@ -469,10 +472,10 @@ def _begin(tables: TaskTables, labels: Callable[..., Any], world: PyTree) -> Tas
 
 def _step(
     tables: TaskTables,
-    labels: Callable[..., Any],
+    labels: Callable[..., PyTree],
     step: Callable[..., Timestep],
     before: TaskWorld,
-    action: Any,
+    action: PyTree,
     key: chex.PRNGKey,
 ) -> Timestep:
     return _read_on(tables, labels, before, Timestep(*step(before.world, action, key)))
@@ -480,10 +483,10 @@ def _step(
 
 def _outcomes(
     tables: TaskTables,
-    labels: Callable[..., Any],
-    outcomes: Callable[..., Any],
+    labels: Callable[..., PyTree],
+    outcomes: Callable[..., PyTree],
     before: TaskWorld,
-    action: Any,
+    action: PyTree,
 ) -> tuple[Timestep, jax.Array]:
     told, probability = outcomes(before.world, action)
     told = Timestep(*told)
@@ -494,7 +497,7 @@ def _outcomes(
 
 
 def _read_on(
-    tables: TaskTables, labels: Callable[..., Any], before: TaskWorld, found: Timestep
+    tables: TaskTables, labels: Callable[..., PyTree], before: TaskWorld, found: Timestep
 ) -> Timestep:
     """A step of the product, from a step of the environment."""
     tables = jax.tree.map(jnp.asarray, tables)
@@ -506,7 +509,7 @@ def _read_on(
     decided = verdict != Verdict.UNDECIDED
     terminated = over | decided
     discount = found.discount * tables.discount[reading]
-    # Ng, Harada & Russell 1999; what comes after the end has the potential zero.
+    # Ng, Harada & Russell 1999; the potential after the end is zero.
     after = jnp.where(terminated, 0, tables.learner_discount * discount * tables.potential[memory])
     reward = jnp.where(decided, tables.decided[verdict], tables.reward[reading])
     world = TaskWorld(found.world, memory, verdict, accepted, before.visits + accepted)
@@ -518,7 +521,9 @@ def _read_on(
     )
 
 
-def _observe(tables: TaskTables, observe: Callable[..., Any], joint: TaskWorld) -> TaskObservation:
+def _observe(
+    tables: TaskTables, observe: Callable[..., PyTree], joint: TaskWorld
+) -> TaskObservation:
     if tables.embedding is None:
         memory = jax.nn.one_hot(joint.memory, tables.delta.shape[-2])
     else:
@@ -526,7 +531,7 @@ def _observe(tables: TaskTables, observe: Callable[..., Any], joint: TaskWorld) 
     return TaskObservation(observe(joint.world), memory)
 
 
-def _of_world(function: Callable[..., Any], joint: TaskWorld) -> Any:
+def _of_world(function: Callable[..., PyTree], joint: TaskWorld) -> Any:
     return function(joint.world)
 
 
@@ -585,7 +590,7 @@ def _padded(tables: Sequence[TaskTables]) -> list[TaskTables]:
     ]
 
 
-def _stacked(trees: Sequence[Any]) -> Any:
+def _stacked(trees: Sequence[PyTree]) -> PyTree:
     return jax.tree.map(lambda *rows: jnp.stack([jnp.asarray(row) for row in rows]), *trees)
 
 

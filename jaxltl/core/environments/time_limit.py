@@ -13,6 +13,7 @@ import numpy as np
 from jax.tree_util import Partial
 
 from jaxltl.core import validation
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.environments.environment import Environment, Timestep, require_environment
 
 
@@ -59,7 +60,7 @@ def with_time_limit(environment: Environment, num_steps: int) -> Environment:
 
 def without_time_limit(environment: Environment) -> tuple[Environment, int | None]:
     """The environment inside :func:`with_time_limit` and the limit; any other environment and None."""
-    timed: Any = require_environment(environment)
+    timed: PyTree = require_environment(environment)
     if timed.step.func is not _step_clock:
         return environment, None
     parts = {
@@ -70,12 +71,16 @@ def without_time_limit(environment: Environment) -> tuple[Environment, int | Non
     return replace(environment, horizon=None, **parts), int(timed.step.args[1])
 
 
-def _reset_clock(reset: Callable[..., Any], key: chex.PRNGKey) -> Any:
+def _reset_clock(reset: Callable[..., PyTree], key: chex.PRNGKey) -> Any:
     return reset(key), jnp.int32(0)
 
 
 def _step_clock(
-    step: Callable[..., Timestep], limit: jax.Array, timed: Any, action: Any, key: chex.PRNGKey
+    step: Callable[..., Timestep],
+    limit: jax.Array,
+    timed: PyTree,
+    action: PyTree,
+    key: chex.PRNGKey,
 ) -> Timestep:
     found, time = Timestep(*step(timed[0], action, key)), timed[1] + 1
     return found._replace(
@@ -83,13 +88,13 @@ def _step_clock(
     )
 
 
-def _start_clock(starts: Callable[..., Any]) -> Any:
+def _start_clock(starts: Callable[..., PyTree]) -> Any:
     worlds, probability = starts()
     return (worlds, jnp.zeros(jnp.shape(probability), jnp.int32)), probability
 
 
 def _clocked(
-    outcomes: Callable[..., Any], limit: jax.Array, timed: Any, action: Any
+    outcomes: Callable[..., PyTree], limit: jax.Array, timed: PyTree, action: PyTree
 ) -> tuple[Timestep, jax.Array]:
     found, probability = outcomes(timed[0], action)
     found, time = Timestep(*found), timed[1] + 1
@@ -99,5 +104,5 @@ def _clocked(
     ), probability
 
 
-def _of_first(function: Callable[..., Any], timed: Any) -> Any:
+def _of_first(function: Callable[..., PyTree], timed: PyTree) -> Any:
     return function(timed[0])

@@ -322,7 +322,7 @@ def _check_probability(probability: np.ndarray) -> None:
 
 
 def _row_scale(total: np.ndarray, available: np.ndarray) -> np.ndarray:
-    wrong = available & (np.abs(total - 1) > 1e-6)
+    wrong = available & (np.abs(total - 1) > validation.ROW_SUM_TOLERANCE)
     if wrong.any():
         s, a = np.argwhere(wrong)[0]
         raise ValueError(
@@ -358,7 +358,7 @@ def checked_initial(initial: chex.Array | None, num_states: int) -> np.ndarray:
     if initial.shape != (num_states,):
         raise ValueError(f"initial has shape {initial.shape}; expected ({num_states},).")
     refuse_negative(initial)
-    if abs(initial.sum() - 1) > 1e-6:
+    if abs(initial.sum() - 1) > validation.ROW_SUM_TOLERANCE:
         raise ValueError(f"the initial distribution sums to {initial.sum():.9g}, not 1.")
     return initial / initial.sum()
 

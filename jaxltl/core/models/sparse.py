@@ -544,8 +544,8 @@ def scaled(
     """Normalised rows; ValueError for a row whose sum is not within 1e-6 of one."""
     total = np.add.reduceat(probability, entry_start[:-1])
     off = np.abs(total - 1)
-    if off.max() > 1e-6:
-        row = int(np.flatnonzero(off > 1e-6)[0])
+    if off.max() > validation.ROW_SUM_TOLERANCE:
+        row = int(np.flatnonzero(off > validation.ROW_SUM_TOLERANCE)[0])
         raise ValueError(
             f"{placed(row_start, row, first)}: the probabilities sum to "
             f"{total[row]:.9g}, not 1; correct the row."

@@ -9,7 +9,7 @@ import numpy as np
 from jaxltl.core import validation
 from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
 from jaxltl.core.models.mdp import MDP, DenseMDP, support
-from jaxltl.core.models.construct.padded import to_padded as to_padded  # for whoever converts
+from jaxltl.core.models.construct.padded import to_padded as to_padded
 from jaxltl.core.models.product import Product, flat_successor
 from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse

@@ -1,4 +1,4 @@
-"""Transition counts from logs: aligned with the entries of a model, or as a model of their own."""
+"""Transition counts from logs: aligned with the entries of a model, or as an empirical model."""
 
 from __future__ import annotations
 
@@ -375,7 +375,7 @@ def model_from_counts(
     `any`, which may lead to every state.
 
     Args:
-      counts: what was counted.
+      counts: the observed transitions.
       initial: the state in which runs start, several that are equally likely, or the probabilities
         of some, by name.
       labels: the states where each proposition holds, by name.

@@ -19,15 +19,16 @@ from jax import lax
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from jaxltl.core import validation
+from jaxltl.core.models.protocols import PyTree
 
 
 def vmap_over_mesh(
-    function: Callable[..., Any],
+    function: Callable[..., PyTree],
     mesh: Mesh,
     axis: str | Sequence[str] | None = None,
     *,
     in_axes: Any = 0,
-) -> Callable[..., Any]:
+) -> Callable[..., PyTree]:
     """``jax.vmap(function, in_axes)`` with the batch distributed over the devices of a mesh.
 
     Device d of D runs the d-th N / D elements, under ``vmap``, as ``PartitionSpec(axis)`` places them.
@@ -65,7 +66,7 @@ def vmap_over_mesh(
     validation.instance("mesh", mesh, Mesh, "a jax.sharding.Mesh, such as jax.make_mesh makes")
     names = axes_of(mesh, axis)
 
-    def over(*arguments: Any, **options: Any) -> Any:
+    def over(*arguments: PyTree, **options: Any) -> PyTree:
         lanes = tuple(_spread(in_axes, arguments))
         number = _number(lanes, arguments)
         if not any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(arguments)):
@@ -75,7 +76,7 @@ def vmap_over_mesh(
     return over
 
 
-def on_host(tree: Any) -> Any:
+def on_host(tree: PyTree) -> PyTree:
     """NumPy copies of a tree's arrays, in every process; random keys stay keys.
 
     Collects arrays that are distributed over several processes, so that all processes call it.
@@ -91,7 +92,7 @@ def on_host(tree: Any) -> Any:
       [0, 1, 2]
     """
 
-    def one(x: Any) -> Any:
+    def one(x: Any) -> PyTree:
         if not isinstance(x, jax.Array):
             return np.asarray(x)
         if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
@@ -127,7 +128,7 @@ def _first_axes(sharding: NamedSharding) -> tuple[str, ...]:
     return () if first is None else (first,) if isinstance(first, str) else tuple(first)
 
 
-def _here(mesh: Any) -> Any:
+def _here(mesh: Any) -> PyTree:
     """The ambient mesh of a trace, else the given one."""
     ambient = jax.sharding.get_abstract_mesh()
     return automatic(mesh) if ambient.empty else ambient
@@ -161,7 +162,7 @@ def require_split(name: str, sharding: Any, **sizes: int) -> None:
             )
 
 
-def split_axis(tree: Any, sharding: NamedSharding | None, axis: int = 0) -> Any:
+def split_axis(tree: PyTree, sharding: NamedSharding | None, axis: int = 0) -> PyTree:
     """A tree whose arrays have one axis split over the devices of a sharding; None: unchanged. Under ``jit``."""
     if sharding is None:
         return tree
@@ -169,7 +170,7 @@ def split_axis(tree: Any, sharding: NamedSharding | None, axis: int = 0) -> Any:
     return jax.tree.map(lambda x: _constrained(x, _here(sharding.mesh), spec), tree)
 
 
-def replicate(tree: Any, sharding: NamedSharding | None) -> Any:
+def replicate(tree: PyTree, sharding: NamedSharding | None) -> PyTree:
     """A tree with arrays replicated over the devices of a sharding; None: unchanged."""
     if sharding is None:
         return tree
@@ -178,11 +179,11 @@ def replicate(tree: Any, sharding: NamedSharding | None) -> Any:
 
 
 def shard_function(
-    function: Callable[..., Any],
+    function: Callable[..., PyTree],
     sharding: NamedSharding | None,
     axes: Sequence[int | None],
     out_axes: Any,
-) -> Callable[..., Any]:
+) -> Callable[..., PyTree]:
     """A function that each device applies to its share of the arguments, under ``jit``; None: unchanged.
 
     `axes` are the split axes of the arguments, None for replicated ones, and `out_axes` those of the
@@ -205,7 +206,9 @@ def shard_function(
     )
 
 
-def vmap_split(function: Callable[..., Any], sharding: NamedSharding | None, in_axes: Any) -> Any:
+def vmap_split(
+    function: Callable[..., PyTree], sharding: NamedSharding | None, in_axes: Any
+) -> PyTree:
     """:func:`vmap_over_mesh` over the devices of a sharding; ``vmap`` for None."""
     if sharding is None:
         return jax.vmap(function, in_axes)
@@ -266,7 +269,7 @@ def _spread(in_axes: Any, arguments: tuple[Any, ...]) -> list[bool]:
     return lanes
 
 
-def _number(lanes: tuple[bool, ...], arguments: Any) -> int:
+def _number(lanes: tuple[bool, ...], arguments: PyTree) -> int:
     """The batch size."""
     shapes = [np.shape(x) for x, has in zip(jax.tree.leaves(arguments), lanes, strict=True) if has]
     numbers = sorted({shape[:1] for shape in shapes})
@@ -280,17 +283,17 @@ def _number(lanes: tuple[bool, ...], arguments: Any) -> int:
 
 
 def _placed(
-    arguments: Any, lanes: tuple[bool, ...], number: int, mesh: Mesh, axes: tuple[str, ...]
-) -> Any:
+    arguments: PyTree, lanes: tuple[bool, ...], number: int, mesh: Mesh, axes: tuple[str, ...]
+) -> PyTree:
     """Arguments on the devices of the mesh."""
     if jax.sharding.get_abstract_mesh().empty:
         mesh = automatic(mesh)
     even = number % _count(mesh, axes) == 0
     own, all_ = (NamedSharding(mesh, PartitionSpec(*x)) for x in ((axes,), ()))
 
-    def one(x: Any, sharding: NamedSharding) -> Any:
+    def one(x: Any, sharding: NamedSharding) -> PyTree:
         if not isinstance(x, jax.Array | np.ndarray):
-            return x  # a number, whose type gives way to others'
+            return x  # a weakly typed number
         if not isinstance(x, jax.Array) or x.is_fully_addressable:
             if not sharding.is_fully_addressable:
                 return _from_each(x, sharding)
@@ -331,13 +334,13 @@ def _constrained(x: jax.Array, mesh: Any, spec: PartitionSpec) -> jax.Array:
 
 @partial(jax.jit, static_argnames=("function", "mesh", "axes", "lanes", "options"))
 def _mapped(
-    function: Callable[..., Any],
+    function: Callable[..., PyTree],
     mesh: Mesh,
     axes: tuple[str, ...],
     lanes: tuple[bool, ...],
     options: tuple[tuple[str, Any], ...],
-    arguments: Any,
-) -> Any:
+    arguments: PyTree,
+) -> PyTree:
     here = _here(mesh)
     leaves, tree = jax.tree.flatten(arguments)
     number = _number(lanes, arguments)

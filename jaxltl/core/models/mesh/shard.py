@@ -302,7 +302,7 @@ def _assembled(
     facts = np.concatenate(layout.exchanged({d: _facts(x) for d, x in parts.items()}))
     halo = _halo(layout, parts)
     total = facts[:, _INITIAL].sum()
-    if abs(total - 1) > 1e-6:
+    if abs(total - 1) > validation.ROW_SUM_TOLERANCE:
         raise ValueError(f"the initial distribution sums to {total:.9g}, not 1.")
     labels = np.unique(
         np.concatenate(layout.exchanged({d: np.unique(x.label, axis=0) for d, x in parts.items()})),
@@ -416,7 +416,7 @@ class _Halo(NamedTuple):
     rounds: Any
     sent: list[dict[int, np.ndarray]]
     asked: list[np.ndarray] | None  # the states that each range asks for, in order
-    first: dict[tuple[int, int], int]  # where what comes from another range begins
+    first: dict[tuple[int, int], int]  # the first place of each received range
 
     def own(self, d: int) -> int:
         """The place of a device's first own state."""

@@ -165,14 +165,12 @@ class Columns(NamedTuple):
         return [x] * len(like)
 
     def sum(self, quantity: list[jax.Array]) -> jax.Array:
-        """See :class:`Actions`."""
         total = quantity[0]
         for x in quantity[1:]:
             total = jnp.add(total, x)
         return total
 
     def max(self, quantity: list[jax.Array]) -> jax.Array:
-        """See :class:`Actions`."""
         best = quantity[0]
         for x in quantity[1:]:
             best = jnp.maximum(best, x)
@@ -248,7 +246,6 @@ class Rows(NamedTuple):
         return kernels.gather(x, self.state)
 
     def sum(self, quantity: jax.Array) -> jax.Array:
-        """See :class:`Actions`."""
         if quantity.dtype == bool:
             quantity = quantity.astype(jnp.int32)
         return kernels.segment_reduce(jax.ops.segment_sum, quantity, self.state, self.num_states)
@@ -261,14 +258,12 @@ class Rows(NamedTuple):
         return jnp.where(jnp.isnan(best), jnp.nan, kernels.gather(quantity, row))
 
     def argmax(self, quantity: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """See :class:`Actions`."""
         fixed = lax.stop_gradient(quantity)
         best = kernels.segment_reduce(jax.ops.segment_max, fixed, self.state, self.num_states)
         some, row = self.first(fixed >= kernels.gather(best, self.state))
         return jnp.where(some, best, jnp.nan), row
 
     def first(self, condition: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """See :class:`Actions`."""
         last = self.shape[0]
         number = jnp.arange(last, dtype=jnp.int32)
         found = kernels.segment_reduce(
@@ -278,11 +273,9 @@ class Rows(NamedTuple):
         return some, jnp.where(some, found, self.start[:-1]).astype(jnp.int32)
 
     def all(self, condition: jax.Array) -> jax.Array:
-        """See :class:`Actions`."""
         return ~self.first(~condition)[0]
 
     def logits(self, quantity: jax.Array) -> jax.Array:
-        """See :class:`Actions`."""
         return quantity
 
     def top(self, logits: jax.Array) -> jax.Array:
@@ -291,12 +284,10 @@ class Rows(NamedTuple):
         return kernels.segment_reduce(jax.ops.segment_max, fixed, self.state, self.num_states)
 
     def logsumexp(self, logits: jax.Array) -> jax.Array:
-        """See :class:`Actions`."""
         top = lax.stop_gradient(self.top(logits))
         return jnp.log(self.sum(jnp.exp(logits - self.spread(top)))) + top
 
     def softmax(self, logits: jax.Array) -> jax.Array:
-        """See :class:`Actions`."""
         raised = jnp.exp(logits - self.spread(lax.stop_gradient(self.top(logits))))
         return raised / self.spread(self.sum(raised))
 
@@ -307,13 +298,11 @@ class Rows(NamedTuple):
         return self.sum(_beside(policy, quantity) * quantity)
 
     def one_hot(self, choice: jax.Array, dtype: Any) -> jax.Array:
-        """See :class:`Actions`."""
         number = jnp.arange(self.shape[0], dtype=jnp.int32)
         mine = kernels.gather(jnp.asarray(choice), self.state)
         return (number == mine).astype(jax.dtypes.canonicalize_dtype(dtype))
 
     def best(self, quantity: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """See :class:`Columns`."""
         best, row = self.argmax(quantity)
         return best, self.one_hot(row, best.dtype)
 

@@ -77,7 +77,6 @@ class ModelOperator:
         return Columns()
 
     def expectation(self, value: jax.Array) -> list[jax.Array]:
-        """As :meth:`SuccessorTable.expectation`."""
         shape = self.model.state_shape
 
         def one(value: jax.Array) -> list[jax.Array]:
@@ -109,7 +108,6 @@ class ShardedSuccessorTable:
         return Columns()
 
     def expectation(self, value: jax.Array) -> list[jax.Array]:
-        """As :meth:`SuccessorTable.expectation`."""
 
         def one(successor: Any, probability: Any, sent: Any, value: jax.Array) -> list[jax.Array]:
             seen = seen_by(self.model, sent, value)
