@@ -247,7 +247,7 @@ def test_chance_is_averaged_out_by_decaying_steps(method):
     off = np.abs(np.asarray(state.value) - exact)[learned].max()
     assert off < 0.05
     # Steps of constant size do not settle.
-    rough, metrics = train(problem, replace(hparams, step_size=0.5, step_power=0.0), 600)
+    rough, metrics = train(problem, replace(hparams, step_size=0.5, step_power=None), 600)
     assert np.abs(np.asarray(rough.value) - exact)[learned].max() > 2 * off
     assert metrics.residual[-1] > 0.01
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import jax.numpy as jnp
 import numpy as np
@@ -113,7 +113,9 @@ def make_problem(
         choice_reward(here, reward)  # raises for an unknown name
     problem = Problem(
         model=model,
-        prepared=prepare(here, target, stay=stay, reward=reward, objective=objective),
+        prepared=cast(
+            Prepared, prepare(here, target, stay=stay, reward=reward, objective=objective)
+        ),
         weight=np.asarray(here.initial, np.float64),
         low=model.low,
         high=model.high,
