@@ -29,7 +29,7 @@ SolutionT = TypeVar("SolutionT", bound="Solution")
 
 
 class Status(enum.IntEnum):
-    """How a solver or a learner ended, ordered by severity. One code per lane under ``vmap``.
+    """Status of a solver or a learner, ordered by severity; one code per lane under ``vmap``.
 
     - ``CONVERGED``: certified; the bounds are as narrow as the tolerance.
     - ``COMPLETED``: a learner's numbers are finite, or its stopping condition holds; no claim of
@@ -249,7 +249,7 @@ def _invalid_policy(policy: np.ndarray, batch: tuple[int, ...], lane: int) -> st
 
 
 def _invalid_weights(policy: np.ndarray) -> str:
-    """Describes what is invalid in weights ``[R]`` of a sparse model's rows."""
+    """Error message for invalid weights ``[R]`` of a sparse model's rows."""
     if (bad := ~(policy >= 0)).any():
         row = int(np.argmax(bad))
         return (
@@ -260,7 +260,7 @@ def _invalid_weights(policy: np.ndarray) -> str:
 
 
 def describe_row(row: np.ndarray, state: tuple[Any, ...]) -> str:
-    """Describes what is invalid in a policy's row of a state."""
+    """Error message for an invalid row of a policy."""
     where = int(state[0]) if len(state) == 1 else tuple(int(i) for i in state)
     weights = "[" + ", ".join(f"{x:.4g}" for x in row) + "]"
     if np.isnan(row).any():

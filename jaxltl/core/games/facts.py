@@ -1,4 +1,4 @@
-"""What games' objectives, regions and strategies tell of themselves."""
+"""Text representations of objectives, regions and strategies of games."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _INNER = 92
 
 
 def parity(value: Any) -> Iterator[str]:
-    """Of a Parity objective."""
+    """Facts of a parity objective."""
     yield f"priorities below {value.num_priorities}"
     yield count(value.priority.size, "state")
     for name in ("won", "lost"):
@@ -21,7 +21,7 @@ def parity(value: Any) -> Iterator[str]:
 
 
 def gr1(value: Any) -> Iterator[str]:
-    """Of a GR1 objective."""
+    """Facts of a GR(1) objective."""
     yield count(value.assumptions.shape[-2], "assumption")
     yield count(value.guarantees.shape[-2], "guarantee")
     yield count(value.lost.shape[-1], "state")
@@ -29,7 +29,7 @@ def gr1(value: Any) -> Iterator[str]:
 
 
 def winning(value: Any) -> Iterator[str]:
-    """Of both players' regions."""
+    """Facts of winning regions."""
     region = readable(value.region)
     if region is None:
         yield f"region {array_text(value.region)}"
@@ -48,7 +48,7 @@ def winning(value: Any) -> Iterator[str]:
 
 
 def permissive(value: Any) -> Iterator[str]:
-    """Of a permissive strategy."""
+    """Facts of a permissive strategy."""
     region = readable(value.region)
     if region is None:
         yield f"region {array_text(value.region)}"

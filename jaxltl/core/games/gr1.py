@@ -1,4 +1,4 @@
-"""Games of generalised reactivity: the triple fixpoint, its layers, and both strategies.
+"""GR(1) games: triple fixpoint, its layers, and strategies of both players.
 
 Piterman, Pnueli and Sa'ar (2006), "Synthesis of reactive(1) designs", with chance as in
 :mod:`jaxltl.core.games.winning`: within what the system can remain in, and for each guarantee, sets
@@ -33,7 +33,7 @@ class Reactive(NamedTuple):
 
 
 class Layers(NamedTuple):
-    """For each guarantee and assumption the round in which a state is first covered.
+    """Rounds of the triple fixpoint in which states are first covered.
 
     Attributes:
       region: ``bool[S]``.
@@ -49,7 +49,7 @@ NEVER = np.iinfo(np.int32).max
 
 
 class _Arena(NamedTuple):
-    """Whose turn it is on a graph, and what the system is to achieve."""
+    """A game graph with its owners and its objective."""
 
     graph: Graph
     system: Any
@@ -57,11 +57,11 @@ class _Arena(NamedTuple):
 
 
 def solve_gr1(graph: Graph, system: Any, objective: GR1, moves: Any = None) -> Reactive:
-    """From where the system achieves a GR(1) objective, and winning strategies of both.
+    """Winning region of a GR(1) objective, and winning strategies of both players.
 
     Args:
       graph: the game's graph.
-      system: ``bool[S]``, whose turn it is.
+      system: ``bool[S]``, the system's states.
       objective: what the system is to achieve.
       moves: ``bool[S, A]``, those that there are; default the available ones.
 
@@ -92,14 +92,14 @@ def solve_gr1(graph: Graph, system: Any, objective: GR1, moves: Any = None) -> R
 
 
 def _keep(arena: _Arena, moves: Any, inside: Any, counters: Any) -> tuple[Any, Any]:
-    """The part of a set that the environment cannot force the play out of."""
+    """The subset in which the system can remain."""
     graph, system, _ = arena
     out = attract(graph, ~inside, moves, rule=~system, among=inside)
     return inside & ~out.region, graph.xp.where(inside & out.region, out.action, counters)
 
 
 def _within(arena: _Arena, moves: Any, inside: Any) -> Any:
-    """The system's moves that surely stay inside, and all of the environment's."""
+    """Moves of the system that surely stay inside, and all moves of the environment."""
     return moves & (arena.graph.forall(inside) | ~arena.graph.on_choices(arena.system))
 
 
@@ -109,7 +109,7 @@ def _near(arena: _Arena, found: Any) -> Any:
 
 
 def _pursue(arena: _Arena, j: int, inside: Any, allowed: Any) -> tuple[Any, Any]:
-    """Where the system, without leaving a set, meets guarantee j or an assumption fails.
+    """States from which the system, inside a set, meets guarantee j or an assumption fails.
 
     Returns:
       ``bool[S]``, and the system's moves there, ``int32[S]``.
@@ -136,7 +136,7 @@ def _pursue(arena: _Arena, j: int, inside: Any, allowed: Any) -> tuple[Any, Any]
 
 
 def _waiting(arena: _Arena, i: int, inside: Any, allowed: Any, near: Any, found: Any) -> Any:
-    """Where assumption i fails for as long as the play is not near to a set `found`."""
+    """States in which assumption i fails while the play is not near the set `found`."""
     missed = inside & ~near
     forced = attract(
         arena.graph,
@@ -149,7 +149,7 @@ def _waiting(arena: _Arena, i: int, inside: Any, allowed: Any, near: Any, found:
 
 
 def _prevent(arena: _Arena, inside: Any, allowed: Any, found: Any) -> Any:
-    """The environment's moves, ``int32[M, S]``, that meet every assumption and avoid a set."""
+    """Moves of the environment, ``int32[M, S]``, that meet every assumption and avoid a set."""
     graph, system, objective = arena
     missed = inside & ~found
     allowed = allowed & ~_near(arena, found)
@@ -162,15 +162,15 @@ def _prevent(arena: _Arena, inside: Any, allowed: Any, found: Any) -> Any:
 
 
 def gr1_layers(graph: Graph, system: Any, objective: GR1) -> Layers:
-    """The rounds of the triple fixpoint, one step a round, in the region.
+    """Rounds of the triple fixpoint inside the region, one step each.
 
-    In round r with Y what is covered before, layer (r, i) is the greatest X from which the
+    In round r, with Y the states covered before, layer (r, i) is the greatest X from which the
     system, moving within the region, is at guarantee j, or comes into Y with positive
     probability, or stays in X where assumption i does not hold.
 
     Args:
       graph: the game's graph.
-      system: ``bool[S]``, whose turn it is.
+      system: ``bool[S]``, the system's states.
       objective: the objective.
 
     Returns:

@@ -1,4 +1,4 @@
-"""What a player of a game is to achieve, as sets and priorities of states.
+"""Objectives of games: parity and GR(1) conditions on states.
 
 Every objective is one of two: :class:`Parity`, of which safety, reachability, Buchi and
 co-Buchi are cases, and :class:`GR1`, of which generalised Buchi is one. Sets of states are
@@ -32,8 +32,8 @@ class Parity:
 
     Attributes:
       priority: ``int32[S]``, at least 0.
-      won: ``bool[S]``: whoever enters has achieved the objective, whatever follows.
-      lost: ``bool[S]``: whoever enters has failed it.
+      won: ``bool[S]``: the objective is achieved on entering.
+      lost: ``bool[S]``: the objective is failed on entering.
       num_priorities: priorities are below it; static.
 
     Example:
@@ -85,7 +85,7 @@ def states_with_label(model: Any, condition: States, place: str = "condition") -
       model: an MDP, a DenseMDP, a Product or a Game.
       condition: ``bool[S]``, or a formula without temporal operators. In a product it
         speaks of the world's states.
-      place: what is asked for, to begin an error with.
+      place: beginning of the error message.
 
     Returns:
       ``bool[S]``, or ``bool[S, Q]`` in a product. Boolean: there is no derivative.
@@ -151,7 +151,7 @@ def reach(game: Any, goal: States, *, safe: States = "true") -> Parity:
     Args:
       game: the game.
       goal: ``bool[S]`` or a Boolean formula over propositions.
-      safe: states not to leave before.
+      safe: states to remain in until then.
 
     Returns:
       :class:`Parity`.
@@ -271,7 +271,7 @@ def parity(
 
 
 def _parity(game: Any, priority: Any, num_priorities: int, safe: States, won: Any = None) -> Parity:
-    """Priorities, and what is won; unsafe states that are not won are lost."""
+    """A parity objective whose unsafe states are lost unless won."""
     priority = priority if is_traced(priority) else np.asarray(priority)
     won = np.zeros(game.state_shape, bool) if won is None else won
     xp, priority, won, safe = namespace(priority, won, states_with_label(game, safe, "safe"))
@@ -292,7 +292,7 @@ def generalized_buchi(game: Any, sets: Sequence[States], *, safe: States = "true
       safe: states never to leave.
 
     Returns:
-      :class:`GR1`, whose one assumption always holds.
+      :class:`GR1` with one assumption that always holds.
 
     Raises:
       ValueError: a set has the wrong shape, or a formula is not Boolean or mentions an unknown
@@ -321,7 +321,7 @@ def gr1(
       game: the game.
       assumptions, guarantees: sets of states, arrays or Boolean formulas, each of which is
         to be met infinitely often; G and F are not written.
-      safe: states never to leave, whatever the environment does.
+      safe: states never to leave.
 
     Returns:
       :class:`GR1`.

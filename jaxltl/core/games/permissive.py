@@ -1,6 +1,6 @@
 """Permissive strategies: many ways to win at once, as a mask of moves (dissertation, 5.4.1).
 
-A permissive strategy leaves the system a choice, and whatever it chooses it wins. Learning inside
+A permissive strategy leaves the system several moves, and every choice among them wins. Learning inside
 its mask is therefore correct from the first move on.
 """
 
@@ -48,7 +48,7 @@ class Permissive:
       base_state, automaton_state: ``int32[S]``, the state of the world and of the task's
         automaton that each of the game's world states stands for.
       maximal: whether it includes every winning strategy; static.
-      reason: what it includes, in words; static.
+      reason: the strategies that it includes, in words; static.
 
     Example:
       >>> import jaxltl as jl
@@ -77,15 +77,15 @@ def permissive_strategy(
     method: str = "auto",
     bound: int | None = None,
 ) -> Permissive:
-    """Many winning strategies at once, on the host.
+    """Permissive strategy: a mask of moves of which every choice wins; on the host.
 
     - ``"stay"``: every move that surely stays in the winning region. Wins only where
       staying does, as for safety; it then includes every winning strategy (dissertation,
       proposition 1), and otherwise no strategy does.
     - ``"rank"``, for Buchi and GR(1): away from the goal, moves that come nearer to it.
-    - ``"counter"``, for Buchi: whatever meets the accepting states again within `bound` of
+    - ``"counter"``, for Buchi: paths that meet the accepting states again within `bound` of
       the system's moves (dissertation, example 3).
-    - ``"parity"``: whatever meets a state of odd priority at most `bound` times before one of
+    - ``"parity"``: paths that meet a state of odd priority at most `bound` times before one of
       a lower even priority (Bernet, Janin and Walukiewicz 2002); without `bound` as many
       times as there are such states, which includes every memoryless winning strategy. Its
       memory is the product of the counts.
@@ -160,9 +160,9 @@ def permissive_strategy(
 
 
 def apply_strategy(strategy: Permissive) -> Restriction:
-    """The game in which the system can only do what a permissive strategy allows.
+    """The game restricted to the moves of a permissive strategy.
 
-    What is reachable from the initial states where the strategy wins, as an ordinary game
+    The part reachable from initial states in the winning region, as an ordinary game
     (dissertation, algorithm 3, step 2). Every run of it wins.
 
     Args:
@@ -189,7 +189,7 @@ def apply_strategy(strategy: Permissive) -> Restriction:
 
 
 def shield_policy(policy: jax.Array, allowed: jax.Array) -> jax.Array:
-    """A policy kept to the moves that a mask allows.
+    """A policy restricted to the allowed moves of a mask.
 
     Args:
       policy: ``float[S, A]``, or ``int32[S]`` for a deterministic policy.
@@ -236,7 +236,7 @@ def shield_policy(policy: jax.Array, allowed: jax.Array) -> jax.Array:
 
 
 class _Arena(NamedTuple):
-    """A game with NumPy's arrays, its graph, and what the system is to achieve."""
+    """A game in NumPy arrays, its graph, and the system's objective."""
 
     game: Any
     graph: HostGraph
@@ -280,7 +280,7 @@ def _require_start(game: Game, region: np.ndarray) -> None:
 
 
 def _always_wins(arena: _Arena, region: np.ndarray, mask: np.ndarray) -> bool:
-    """Whether every run within a mask achieves the objective, whoever chooses."""
+    """Whether every path within a mask achieves the objective."""
     _, graph, objective = arena
     if isinstance(objective, Parity) and objective.num_priorities == 1:
         return True  # nothing but safety
@@ -303,7 +303,7 @@ def _choose(objective: Any, maximal: bool, bound: int | None) -> str:
 
 
 def _on(game, region, mask, maximal: bool, reason: str, origin: Restriction | None = None):
-    """The strategy as it is handed out, with JAX's arrays."""
+    """The strategy with JAX arrays."""
     base = np.arange(game.mdp.mdp.num_states if _is_lazy(game) else game.num_states, dtype=np.int32)
     state, memory = (base, np.zeros_like(base)) if origin is None else origin[1:]
     game, region, mask, state, memory = to_jax((game, region, mask, state, memory))
@@ -317,7 +317,7 @@ def _is_lazy(game: Game) -> bool:
 def _explicit(
     arena: _Arena, region: np.ndarray, mask: np.ndarray
 ) -> tuple[_Arena, Restriction | None]:
-    """A game that can be put beside memory: a product is first made explicit, in its region."""
+    """The game with explicit states, restricted to its winning region."""
     game, _, objective = arena
     if not _is_lazy(game):
         return arena, None
@@ -333,7 +333,7 @@ def _at(objective: Any, origin: np.ndarray) -> Any:
 
 
 def _beside(game: Game, delta: np.ndarray, initial: int, letter: chex.Array, label_on: str) -> Game:
-    """The game beside a memory that reads a letter of each state."""
+    """Product of the game with a memory that reads a letter of each state."""
     num_letters = delta.shape[1]
     automaton = Automaton(
         delta=delta.astype(np.int32),
@@ -353,7 +353,7 @@ def _closed(graph: HostGraph, region: Any) -> bool:
 
 
 def _without_won(objective: Parity) -> Parity:
-    """The same objective where what is won is never left: the best priority from then on."""
+    """The objective with won states absorbing, of the best priority."""
     return replace(
         objective,
         priority=np.where(objective.won, 0, objective.priority),
@@ -363,7 +363,7 @@ def _without_won(objective: Parity) -> Parity:
 
 
 def _remember_won(game: Game, objective: Parity) -> tuple[Game, Parity, Restriction]:
-    """The game beside one bit that tells whether the run has been won already, made explicit."""
+    """Product of the game with one bit: whether the objective is achieved already."""
     first = jax.tree.map(np.asarray, restrict(game))
     width = game.state_shape[1] if _is_lazy(game) else 1
     objective = _at(objective, first.base_state * width + first.memory)
@@ -450,9 +450,9 @@ def _by_layers(arena: _Arena, region, stay) -> Permissive:
 
 
 def _beside_goals(game: Game, objective: GR1, delta: np.ndarray) -> Game:
-    """The game beside the guarantee that is pursued, which moves on where it holds."""
+    """Product of the game with the index of the pursued guarantee."""
     num_goals = len(delta)
-    # A letter tells which guarantees hold; those that occur are few.
+    # A letter is the set of guarantees that hold; few of them occur.
     rows, letter = np.unique(np.asarray(objective.guarantees).T, axis=0, return_inverse=True)
     step = np.array([[delta[j, int(row[j])] for row in rows] for j in range(num_goals)])
     return _beside(game, step, 0, letter.ravel(), "exit")
@@ -526,10 +526,10 @@ def _by_parity(arena: _Arena, region, stay, bound) -> Permissive:
 
 
 def budgets(caps: list[int], num_priorities: int) -> np.ndarray:
-    """The memory of the parity construction: how often odd priorities may still be met.
+    """Memory of the parity construction: remaining visits of odd priorities.
 
     State ``n`` writes the remaining counts of the priorities 1, 3, ... as digits, the first the
-    most significant; the last state says that they are spent. Meeting an odd priority takes one
+    most significant; in the last state they are spent. Meeting an odd priority takes one
     from the number down to its digit; meeting any priority restores all less significant ones.
 
     Returns:
@@ -565,7 +565,7 @@ def _safe_beside(
     origin: Restriction | None,
     reason: str,
 ) -> Permissive:
-    """The strategy that stays where the objective can be achieved without some memory states."""
+    """The strategy restricted to states that win without some memory states."""
     # The objective itself still counts: the environment may move for ever where the system
     # does not, and then no counter of the system's moves runs out.
     kept = Parity(

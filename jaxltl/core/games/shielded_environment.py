@@ -1,4 +1,4 @@
-"""A simulated world in which only those actions may be taken that are sure to keep a task.
+"""Shielded environments: the action mask of a permissive strategy of a model.
 
 What a finite model of the world says of a task, a permissive strategy, becomes the mask of allowed
 actions. A learner that takes none but allowed actions is right from its first step on, whatever
@@ -37,7 +37,7 @@ from jaxltl.core.sparse.graph.product_graph import HostGraph
 
 @brief
 class ShieldedWorld(NamedTuple):
-    """A world beside the state of the strategy that shields it.
+    """State of an environment and of its shielding strategy.
 
     Attributes:
       world: the inner one.
@@ -76,7 +76,7 @@ def shield_environment(
     strategy: Permissive | Winning | ArrayLike,
     state_of: Callable[..., Any] | None = None,
 ) -> Environment:
-    """The same world, with the mask of what a strategy of a model of it allows.
+    """The environment with the action mask of a strategy of its model.
 
     With a :class:`~jaxltl.core.games.permissive.Permissive` strategy its worlds are
     :class:`ShieldedWorld`: what the strategy remembers runs beside the world, whichever automaton
@@ -179,7 +179,7 @@ def _require_places(environment: Environment, place: Callable[..., Any], count: 
 
 
 def _guide(strategy: Permissive | Winning) -> _Guide:
-    """The strategy on what it reaches, with every move of every player there."""
+    """The strategy on its reachable states, with all moves of both players."""
     if isinstance(strategy, Winning):
         graph = graph_of(strategy.game)
         assert isinstance(graph, HostGraph)

@@ -26,7 +26,7 @@ Integers = NDArray[np.integer[Any]]
 
 @brief
 class Verification(NamedTuple):
-    """What a check of both players' claims found; true if both hold.
+    """Result of :func:`verify`; true if both players' claims hold.
 
     Attributes:
       system: the system's strategy wins almost surely in the region.
@@ -170,7 +170,7 @@ def _claim(winning: Any) -> _Claim:
 
 
 def _refute_system(claim: _Claim) -> str:
-    """What is wrong with the system's claim; nothing if it holds."""
+    """The error in the system's claim; empty if it holds."""
     bad = np.flatnonzero(claim.region & claim.lost)
     if bad.size:
         return f"state {_name(claim, bad[0])} is in the region but already lost"
@@ -195,7 +195,7 @@ def _refute_system(claim: _Claim) -> str:
 
 
 def _refute_environment(claim: _Claim) -> str:
-    """What is wrong with the environment's claim; nothing if it holds."""
+    """The error in the environment's claim; empty if it holds."""
     bad = np.flatnonzero(claim.won & ~claim.region)
     if bad.size:
         return f"state {_name(claim, bad[0])} is already won but outside the region"
@@ -222,7 +222,7 @@ def _refute_environment(claim: _Claim) -> str:
 
 
 def _failures(claim: _Claim):
-    """What fails the objective: components in which a set is avoided and all of others are met."""
+    """End components that fail the objective: one set is avoided and all others are met."""
     if claim.priority is not None:
         yield from _least_priorities(claim.priority, 1)
         return
@@ -235,7 +235,7 @@ def _failures(claim: _Claim):
 
 
 def _successes(claim: _Claim):
-    """What achieves the objective, in the same form."""
+    """End components that achieve the objective, in the same form."""
     if claim.priority is not None:
         yield from _least_priorities(claim.priority, 0)
         return
@@ -286,7 +286,7 @@ def _unavailable(claim: _Claim, action: Integers, where: Booleans) -> str:
 
 
 class _Play(NamedTuple):
-    """What one player faces: edges from nodes ``state * memories + memory`` by numbered pairs.
+    """The graph that one player faces: edges from nodes ``state * memories + memory`` by numbered pairs.
 
     The pair ``move * memories + memory`` is a choice; all its edges are possible at once.
     """
@@ -321,7 +321,7 @@ def _fix(claim: _Claim, owner: Booleans, action: Integers, goals: Booleans) -> _
 
 
 def _moves(game: Any) -> _Moves:
-    """Every possible move of a game whose products are lazy only if they are padded."""
+    """All moves of a game, with sparse products made explicit."""
     model = game.mdp
     if isinstance(model, SparseMDP):
         host = model.host
@@ -353,7 +353,7 @@ def _moves(game: Any) -> _Moves:
 
 
 def _component(play: _Play, inside: Booleans, meet: Booleans) -> int | None:
-    """A node of an end component among some nodes that meets every set of states, if any does."""
+    """A node of an end component that meets every set of states, or None."""
     if not inside.any():
         return None
     label = _end_components(play, inside)
@@ -400,7 +400,7 @@ def _staying(play: _Play, sources: Booleans, targets: Booleans) -> Booleans:
 
 
 def _trim(play: _Play, alive: Booleans, inside: Booleans) -> None:
-    """Drops the pairs that lead to an inside node without a pair, again and again, in place."""
+    """Removes pairs that lead to inside nodes without pairs, until none is left, in place."""
     remaining = np.bincount(play.owner[alive], minlength=play.nodes)
     stuck = np.flatnonzero(inside & (remaining == 0)).tolist()
     while stuck:

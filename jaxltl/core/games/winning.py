@@ -1,7 +1,7 @@
-"""Who wins a game from where, and how: exact, on supports, with strategies for both players.
+"""Winning regions and strategies of both players in stochastic games, exact on supports.
 
-In a stochastic game the system wins almost surely or the environment wins with positive
-probability; without chance both are sure. Regions are fixpoints of attractors
+The system wins almost surely, or the environment wins with positive probability; without chance
+both win surely. Regions are fixpoints of attractors
 (:mod:`jaxltl.core.graphs.attractor`), which work inside ``jit`` and ``vmap``; on concrete
 arrays the host finds them in time linear in the transitions, and compiles nothing.
 """
@@ -33,21 +33,21 @@ from jaxltl.core.pretty_print import brief
 @brief(facts=facts.winning, drawn=True)
 @struct.dataclass
 class Winning:
-    """The two players' regions, and a strategy of each that wins in its own.
+    """Winning regions of both players, and a winning strategy of each.
 
     A strategy for GR(1) has memory: the system pursues guarantee j, at first the one of
-    number 0, and leaving a state of that guarantee goes on to the next in a circle; the
+    number 0, and after a state of that guarantee the next one, cyclically; the
     environment does the same with its assumptions.
 
     Attributes:
       game: the game that was solved; of a formula, the product with its automaton.
-      objective: what the system is to achieve in it.
-      region: ``bool[S]``: from here the system wins, almost surely; from all other states
-        the environment prevents it, with positive probability.
+      objective: the system's objective.
+      region: ``bool[S]``, the system's almost-sure winning region; elsewhere the environment
+        prevents the objective with positive probability.
       action: ``int32[S]``, for GR(1) ``int32[S, J]``: the system's winning moves, at its
         own states in the region.
       counter_action: ``int32[S]``, for GR(1) ``int32[S, M]``: the environment's, at its own
-        states outside of the region.
+        states outside the region.
 
     Example:
       >>> import jaxltl as jl
@@ -74,7 +74,7 @@ class Winning:
 def winning_region(
     game: Any, spec: Parity | GR1 | Automaton | Formula | str, *, chance: str = "random"
 ) -> Winning:
-    """From where the system wins, and winning strategies of both players.
+    """Winning region of the system, and winning strategies of both players.
 
     Parity by nested fixpoints in the manner of Zielonka (1998) and, where chance takes
     part, of Banerjee, Majumdar, Mallik, Schmuck and Soudjani (2022); GR(1) by the triple
@@ -86,7 +86,7 @@ def winning_region(
         on a sparse model are rows, in its product with a task those of
         :func:`~jaxltl.core.models.construct.convert.to_sparse`.
       spec: an objective on the game's states (see :mod:`jaxltl.core.games.objective`), or a
-        formula or an automaton, which is put beside the game (``label_on="exit"``).
+        formula or an automaton, whose product with the game is solved (``label_on="exit"``).
       chance: ``"random"``: by the model's probabilities; ``"adversarial"``: the environment
         decides where a random move leads, so that winning is sure. States from S on are
         then the moves that it decides (on the host only; sparse models are padded).
@@ -119,13 +119,13 @@ def winning_region(
 
 
 def solve(game: Game, objective: Parity | GR1, moves: jax.Array | None = None) -> Winning:
-    """:func:`winning_region` of an objective, where only some moves exist.
+    """:func:`winning_region` of an objective, restricted to some moves.
 
     Args:
       game: the game.
-      objective: what the system is to achieve.
+      objective: the system's objective.
       moves: ``bool[S, A]``, on a sparse model ``bool[R]``; default the available ones. A state
-        without any is won for the player who need not move there.
+        without any is won by the opponent of its owner.
     """
     form, _ = compiled_form(game)
     graph = graph_of(form, objective, moves)
@@ -151,7 +151,7 @@ def _flat(form: Game, objective: Parity | GR1) -> Any:
 
 
 def almost_sure_buchi(game: Any, accepting: States) -> Winning:
-    """From where the system can meet a set infinitely often with probability one.
+    """Almost-sure winning region of a Buchi objective.
 
     Args:
       game: the game.
@@ -161,7 +161,7 @@ def almost_sure_buchi(game: Any, accepting: States) -> Winning:
       :class:`Winning`, of the objective :func:`buchi`.
 
     Raises:
-      ValueError: as of :func:`buchi`.
+      ValueError: see :func:`buchi`.
 
     Example:
       >>> from jaxltl import from_dense
@@ -183,7 +183,8 @@ def on_states(
 def task_game(game: Game, spec: Automaton | Formula | str) -> tuple[Game, Parity]:
     """The product of a game with a task, and the task as an objective on its states.
 
-    A state ``(s, q)`` has read what came before s, and shows the priority of reading s.
+    In a state ``(s, q)`` the automaton has read the labels before s; its priority is that of
+    reading s.
     """
     joint = product(game, spec, label_on="exit")
     automaton, letter = joint.mdp.automaton, joint.mdp.letter
@@ -203,7 +204,7 @@ def task_game(game: Game, spec: Automaton | Formula | str) -> tuple[Game, Parity
 
 
 def objective_at(objective: Parity | GR1, origin: jax.Array | np.ndarray) -> Any:
-    """The objective on states that each stand for an original one."""
+    """The objective on states of another game, each with an original state."""
     _, arrays, origin = namespace(objective, origin)
     states = objective.lost.ndim
 
@@ -216,7 +217,7 @@ def objective_at(objective: Parity | GR1, origin: jax.Array | np.ndarray) -> Any
 def adversarial_chance(game: Game) -> tuple[Game, jax.Array]:
     """The game in which the environment decides where each random move leads, on the host.
 
-    What the system wins surely in a stochastic game it wins in this deterministic one.
+    The system wins this deterministic game where it wins the stochastic one surely.
 
     Args:
       game: a game over an MDP, or over a Product of one.
@@ -224,7 +225,7 @@ def adversarial_chance(game: Game) -> tuple[Game, jax.Array]:
     Returns:
       A game whose first S states (a product's, numbered ``s * Q + q``) are those of
       `game`, followed by one for each random move, where the environment chooses among
-      its successors; and ``int32[S']``, the original state that each stands for.
+      its successors; and ``int32[S']``, the original states.
 
     Raises:
       ValueError: the world has no successor lists.
@@ -263,14 +264,14 @@ def adversarial_chance(game: Game) -> tuple[Game, jax.Array]:
 
 
 class _Found(NamedTuple):
-    """A set that the system wins, with moves: its own inside, the environment's outside."""
+    """A winning region, with the system's moves inside and the environment's outside."""
 
     region: Any
     action: Any
 
 
 class _Arena(NamedTuple):
-    """Whose turn it is on a graph, and what the system is to achieve."""
+    """A game graph with its owners and its objective."""
 
     graph: Graph
     system: Any
@@ -278,12 +279,12 @@ class _Arena(NamedTuple):
 
 
 def solve_parity(graph: Graph, system: Any, objective: Parity, moves: Any = None) -> _Found:
-    """Who wins a parity game, with the moves of both.
+    """Winning region of a parity game, with moves of both players.
 
     Args:
       graph: the game's graph.
-      system: ``bool[S]``, whose turn it is.
-      objective: what the system is to achieve.
+      system: ``bool[S]``, the system's states.
+      objective: the system's objective.
       moves: ``bool[S, A]``; default the available ones.
     """
     moves = graph.available if moves is None else moves & graph.available
@@ -293,7 +294,7 @@ def solve_parity(graph: Graph, system: Any, objective: Parity, moves: Any = None
 
 
 def _level(arena: _Arena, p: int, won: _Found, open_: Any, allowed: Any) -> _Found:
-    """The open states that the system wins, where it also wins on reaching `won`.
+    """The open states from which the system wins, if reaching `won` is winning too.
 
     Args:
       p: no open state has a priority below it.
@@ -309,14 +310,14 @@ def _level(arena: _Arena, p: int, won: _Found, open_: Any, allowed: Any) -> _Fou
 
 
 def _even(arena: _Arena, p: int, won: _Found, open_: Any, allowed: Any) -> _Found:
-    """The greatest set in which the system can remain, so that meeting p for ever is good."""
+    """Greatest fixpoint: the system can remain, and meeting p infinitely often is winning."""
     graph, system, objective = arena
     xp = graph.xp
     here = open_ & (objective.priority == p)
 
     def body(carry):
         inside, found, _ = carry
-        # Where the environment can force the play out, with positive probability.
+        # The environment can force the play out with positive probability.
         left = attract(graph, ~inside, allowed, rule=~system, among=open_ & inside)
         action = xp.where(inside & left.region, left.action, found.action)
         inside = inside & ~left.region
@@ -331,7 +332,7 @@ def _even(arena: _Arena, p: int, won: _Found, open_: Any, allowed: Any) -> _Foun
 
 
 def _odd(arena: _Arena, p: int, won: _Found, open_: Any, allowed: Any) -> _Found:
-    """The least set from which the system can avoid meeting p for ever."""
+    """Least fixpoint: the system can avoid meeting p infinitely often."""
     graph, system, objective = arena
     xp = graph.xp
     here = open_ & (objective.priority == p)

@@ -1,4 +1,4 @@
-"""What results tell of themselves, beyond their fields."""
+"""Text representations of results."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _INNER = 92
 
 
 def evaluation(value: Any) -> Iterator[str]:
-    """Of an Evaluation, whose ``str`` is a table."""
+    """Facts of an Evaluation; its ``str`` is a table."""
     yield value.status.name
     yield count(value.num_episodes, "episode")
     for name in ("success", "reward", "cost", "length"):
@@ -91,14 +91,14 @@ def answer(value: Any) -> Iterator[str]:
 
 
 def satisfaction(value: Any) -> Iterator[str]:
-    """Of the best policy with a memory for a task, beside what is reached of the product."""
+    """Facts of an optimal finite-memory policy and its product."""
     yield nested_repr(value.solution, _INNER)
     yield nested_repr(value.automaton, _INNER)
     yield f"{count(len(value.product.base_state), 'state')} of the product"
 
 
 def objective(value: Any) -> Iterator[str]:
-    """Of an Objective: what was given."""
+    """Facts of an Objective."""
     for name in ("formula", "target", "stay", "avoid", "reward", "threshold"):
         given = getattr(value, name)
         if given is not None:

@@ -30,7 +30,7 @@ from jaxltl.core.values.discounted.discounted import expected_reward
 
 @validated()
 def mean_payoff(game: Any, reward: chex.Array, *, max_steps: int = 100_000) -> Solution:
-    """Average reward for a move that the system can secure in a deterministic game, exactly.
+    """Mean payoff: the exact average reward that the system secures in a deterministic game.
 
     The value of ``liminf (r_1 + ... + r_n) / n`` under optimal play (Ehrenfeucht and
     Mycielski 1979): the mean of a cycle, from each state. Found on the host by policy iteration

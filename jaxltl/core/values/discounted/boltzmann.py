@@ -1,4 +1,4 @@
-"""Values of the softmax policy of its own action values."""
+"""Boltzmann values: fixed points of the softmax policy evaluation operator."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def boltzmann_expansion(num_actions: Any) -> Any:
         high = lax.fori_loop(0, 30, halved, ends)[1]
     else:
         high = reduce(lambda ends, i: halved(i, ends), range(30), ends)[1]
-    # Bisection, and rounding in what it looks at.
+    # Errors of the bisection and of rounding.
     found = xp.where(n > 1, high / 2 * (1 + 64 * float(jnp.finfo(high.dtype).eps)) + 1e-7, 1.0)
     return found if xp is jnp else float(found)
 
@@ -79,12 +79,12 @@ def boltzmann_value(
     tolerance: jax.Array | float | None = None,
     max_steps: jax.Array | int = 5_000,
 ) -> Solution:
-    """Value of the softmax policy of its own action values (2.1)-(2.3).
+    """Boltzmann value: the value of a policy that is the softmax of its action values (2.1)-(2.3).
 
     ``V = sum_a softmax(Q)_a Q_a`` with ``Q = R + discount * P V``. This operator
     contracts only while ``discount * boltzmann_expansion(A) < 1``. Beyond, it can cycle or
     have several fixed points: damped steps of one half are polished by Newton's method,
-    the enclosure is infinite, and the status tells when no fixed point was reached. See
+    the enclosure is infinite, and the status is not UNCERTIFIED if no fixed point was reached. See
     :func:`boltzmann_fixed_points`.
 
     Args:
@@ -191,7 +191,7 @@ def _boltzmann_value(
 
 
 class _Given(NamedTuple):
-    """What decides when a Boltzmann value is good enough."""
+    """Stopping criterion of Boltzmann values."""
 
     contracts: jax.Array
     gap: jax.Array
@@ -244,7 +244,7 @@ def boltzmann_fixed_points(
     num_starts: int = 64,
     tolerance: float = 1e-6,
 ) -> list[Solution]:
-    """Distinct fixed points of the Boltzmann operator that were found from many starts.
+    """Distinct fixed points of the Boltzmann operator, searched from many starts.
 
     Damped and Newton iterations from zero, from the optimal and the worst value, and from
     random values between. A search, not a proof that there are no others.
@@ -257,14 +257,12 @@ def boltzmann_fixed_points(
         tenth of it times ``1 - discount``.
 
     Returns:
-      Converged solutions (``CONVERGED`` or ``UNCERTIFIED``), ordered by the sum of their values; a
-      list as long as there were fixed points.
+      Solutions with status ``CONVERGED`` or ``UNCERTIFIED``, ordered by the sum of their values.
 
     Raises:
       ValueError: the reward has the wrong shape.
 
-    The list is made on the host and not differentiable; :func:`boltzmann_value` is, and goes on
-    from one of these by `initial`.
+    Not differentiable; :func:`boltzmann_value` with one of these as `initial` is.
 
     Example:
       >>> from jaxltl import make_mdp
@@ -280,7 +278,7 @@ def boltzmann_fixed_points(
     weight = jax.random.uniform(key, (num_starts, *(1 for _ in best.shape)), best.dtype)
     weight = weight.at[0].set(0).at[-1].set(1)
     starts = worst + weight * (best - worst)
-    # A residual this small leaves a value within the tolerance, as far as the discount tells.
+    # For a contraction by the discount this residual bounds the error by the tolerance.
     residual = tolerance * (1 - discount) / 10
     found: list[Solution] = []
     for method in ("damped", "newton"):

@@ -1,4 +1,4 @@
-"""Discounted values of a policy, and optimal ones.
+"""Discounted values of policies, and optimal discounted values.
 
 Every solver stops on a certified error, returns the enclosure that certifies it, and is
 differentiable by the implicit function theorem in the reward, the discount and the
@@ -73,8 +73,8 @@ def action_value(
 def expected_reward(model: Any, reward: jax.Array) -> jax.Array:
     """A reward on pairs ``[S, A]`` or transitions ``[S, A, K]`` as its expectation ``[S, A]``.
 
-    Zero at unavailable actions; what stands there and in padding is not read. Of a sparse model it
-    is that of :func:`~jaxltl.core.models.sparse.choice_reward`.
+    Zero at unavailable actions; values there and in padding are not read. For a sparse model see
+    :func:`~jaxltl.core.models.sparse.choice_reward`.
 
     Raises:
       ValueError: the reward has another shape.
@@ -93,24 +93,24 @@ def expected_reward(model: Any, reward: jax.Array) -> jax.Array:
 
 
 def reward_size(model: Any, reward: Any) -> jax.Array:
-    """The largest sum of magnitudes behind an expected reward; its rounding is in terms of that.
+    """Largest expected magnitude of a reward, by which rounding errors are bounded.
 
     Large rewards of transitions may cancel in the expectation, their rounding does not.
     """
     return jnp.max(expected_reward(model, jax.tree.map(jnp.abs, reward)))
 
 
-# --- what discounted solvers share -----------------------------------------------------------
+# --- shared by discounted solvers -----------------------------------------------------------
 
 
 class Parameters(NamedTuple):
-    """What the parts of :mod:`jaxltl.core.values.engine.newton` read of a discounted problem.
+    """Numbers of a discounted problem, for :mod:`jaxltl.core.values.engine.newton`.
 
     Attributes:
       discount: a scalar.
       size: the largest reward, see :func:`reward_size`.
       unit: relative rounding of a backup.
-      tolerance: certified error asked for, or None.
+      tolerance: width of the enclosure, or None.
       policy: a policy's weights, in columns, or None.
     """
 
@@ -122,7 +122,7 @@ class Parameters(NamedTuple):
 
 
 def judge(value: jax.Array, image: jax.Array, given: Parameters) -> tuple[jax.Array, jax.Array]:
-    """Whether MacQueen's bounds are narrow enough or will not narrow, and half their width."""
+    """Stopping criterion by MacQueen's bounds, and half their width."""
     found = _enclosed(value, image, given)
     return found.ended, found.half
 
@@ -133,7 +133,7 @@ def _enclosed(value: jax.Array, image: jax.Array, given: Parameters) -> Enclosur
 
 
 def parameters(model: Any, reward: Any, discount: Any, tolerance: Any) -> Parameters:
-    """Of a problem with a reward as it was given."""
+    """Parameters of a problem."""
     goal = None if tolerance is None else jnp.asarray(tolerance, model.dtype)
     return Parameters(
         jnp.asarray(discount, model.dtype),
@@ -157,13 +157,13 @@ def solution_of(
     policy: jax.Array,
     num_steps: jax.Array,
 ) -> Solution:
-    """The solution that a value and its image certify, without derivatives.
+    """The solution certified by a value and its image, without derivatives.
 
     Args:
       model: the model.
       given: the problem's parameters.
       value, image: ``float[N]``.
-      policy: what belongs to it.
+      policy: of the solution.
       num_steps: applications of the operator.
     """
     found = _enclosed(value, image, given)
@@ -188,7 +188,7 @@ def differentiable(
 
     Args:
       solution: without derivatives.
-      backup: closes over what it is differentiable in.
+      backup: closes over the differentiable arguments.
       system: makes ``I - J``, with J the derivative of `backup` in v at the solution.
     """
 

@@ -63,7 +63,7 @@ def minimax_value(
     tolerance: chex.Numeric | None = None,
     max_steps: chex.Numeric = 100_000,
 ) -> Solution:
-    """Discounted reward that the system can secure against every environment.
+    """Minimax value: discounted reward that the system secures against every environment.
 
     ``V(s) = max_a R(s, a) + g(s) * sum_t P(t | s, a) V(t)`` where the system moves, the same
     with min where the environment does (Shapley 1953; dissertation, section 5.2.4). With
@@ -77,7 +77,7 @@ def minimax_value(
 
     Args:
       game: a Game; any other model is the game in which the system always moves.
-      reward: ``float[S, A]`` or ``float[S, A, K]``; what is paid at environment states counts. In
+      reward: ``float[S, A]`` or ``float[S, A, K]``; rewards at environment states count. In
         a game on a sparse model as of :func:`~jaxltl.core.models.sparse.choice_reward`.
       discount: scalar in [0, 1).
       per: ``"move"`` or ``"system_move"``, which moves are discounted.
@@ -162,7 +162,7 @@ def strategy_value(
     tolerance: chex.Numeric | None = None,
     max_steps: chex.Numeric = 100_000,
 ) -> Solution:
-    """Discounted reward of a strategy of the system, in the worst case or against a policy.
+    """Discounted value of a strategy, against the worst case or a policy of the environment.
 
     ``V(s) = sum_a mu(s, a) (R(s, a) + g(s) * P V)`` where the system moves; where the
     environment does, the minimum over its moves (dissertation, (5.2)), or the mean under its
@@ -220,7 +220,7 @@ def strategy_value(
     followed = graph.xp.ones_like(system)
     drawn = followed if environment is not None else system
     moves = graph.available & graph.xp.where(graph.on_choices(drawn), used, True)
-    # Whoever plays, nobody keeps away from where play gets stuck.
+    # Fixed policies do not avoid states without moves.
     lost = attract(graph, ~graph.first(moves)[0], moves, rule=followed).region
     moves = moves & ~graph.on_choices(lost)
     defined = _returns(graph, per, system | lost, moves, drawn)
@@ -244,15 +244,15 @@ def strategy_value(
 
 
 def _read(game: Game, states: Any) -> Any:
-    """The states of a player whose rows of a policy are read: those that have moves at all."""
-    if isinstance(game.mdp, SparseMDP):  # whose every state has a choice
+    """A player's states with available moves: rows of its policy that are read."""
+    if isinstance(game.mdp, SparseMDP):  # every state has a choice
         return states
     xp, states, available = namespace(states, game.available)
     return states & xp.any(available, axis=-1)
 
 
 class _Drawn(NamedTuple):
-    """Moves of players whose policies are given.
+    """Policies of the players that do not optimise.
 
     Attributes:
       weight: ``float[S, A]``, distributions.
@@ -269,10 +269,10 @@ class _Drawn(NamedTuple):
 
 @jax.jit
 def _joint(game: Game, strategy: chex.Array, environment: chex.Array | None) -> _Drawn:
-    """The policies of both players as one, zero where neither is read."""
+    """Joint policy of both players, zero where neither is read."""
     read, over = _read(game, game.system), choices(game)
     weight, given, valid = valid_policy(game, jnp.asarray(strategy), read)
-    weight = jnp.where(over.spread(read), weight, 0)  # nothing of what is not read
+    weight = jnp.where(over.spread(read), weight, 0)  # rows that are not read
     if environment is not None:
         read = _read(game, ~game.system)
         other = valid_policy(game, jnp.asarray(environment), read)
@@ -283,7 +283,7 @@ def _joint(game: Game, strategy: chex.Array, environment: chex.Array | None) -> 
 
 
 def _returns(graph: Graph, per: str, goal: Any, moves: Any, drawn: Any) -> Any:
-    """Whether the environment always comes back to a goal, as values per system move need."""
+    """Whether the environment always returns to a goal, so that values per system move exist."""
     if per == "move":
         return np.True_
     back = attract(graph, goal, moves, rule=drawn).region
@@ -298,21 +298,21 @@ def _returns(graph: Graph, per: str, goal: Any, moves: Any, drawn: Any) -> Any:
     return back.all()
 
 
-# --- what is played ------------------------------------------------------------------------
+# --- the game ------------------------------------------------------------------------
 
 
 class _Play(NamedTuple):
-    """A discounted game over numbered states, as the loops read it; lanes may differ in it all.
+    """Numbers of a discounted game over flat states; lanes may differ in all of them.
 
     Attributes:
       system: ``bool[N]``.
       drawn: ``bool[N]``, where moves are drawn by `weight`; None where nobody's are.
       weight: in columns.
-      horizon: the largest value of h, or infinite, or NaN where there is none.
+      horizon: the largest value of h; infinite or NaN without a bound.
       discount: a scalar.
       unit: relative rounding of a backup.
       size: the largest reward.
-      tolerance: certified error asked for, or None.
+      tolerance: width of the enclosure, or None.
     """
 
     system: jax.Array
@@ -326,7 +326,7 @@ class _Play(NamedTuple):
 
 
 def _chosen(over: Any, q: Any, play: _Play) -> tuple[jax.Array, Any]:
-    """What both players' best moves are worth, and their weights."""
+    """Values and weights of both players' best moves."""
     own = jax.tree.map(lambda s, x: jnp.where(s, x, -x), over.spread(play.system, q), q)
     best, weight = best_action(over, own, play)
     best = jnp.where(play.system, best, -best)
@@ -342,7 +342,7 @@ def _mean(over: Any, weight: Any, q: Any) -> jax.Array:
 
 
 def _gains(rows: Any, play: _Play, reward: Any, moves: Any, live: jax.Array) -> Any:
-    """Columns of a reward, infinitely bad for who moves where it is not allowed; else zero."""
+    """Columns of a reward: infinitely bad for the owner at moves that are not allowed."""
     never = jnp.where(play.system, -jnp.inf, jnp.inf).astype(play.discount.dtype)
     if play.drawn is not None:
         never = jnp.where(play.drawn, 0, never)
@@ -360,7 +360,7 @@ def _gains(rows: Any, play: _Play, reward: Any, moves: Any, live: jax.Array) -> 
 
 
 def _horizon(rows: Any, play: _Play, moves, live, per: str, defined, max_steps) -> jax.Array:
-    """A function h with ``h >= 1 + g P h`` for all moves; infinite or NaN if there is none.
+    """A function h with ``h >= 1 + g P h`` for all moves; infinite or NaN without one.
 
     With tau the expected number of undiscounted moves before the next discounted one, at most,
     and L its maximum: ``h = (1 + discount * L) / (1 - discount) + tau``. It is the value of the
@@ -405,7 +405,7 @@ def _certify(play: _Play, value: jax.Array, image: jax.Array) -> Enclosure:
     With ``c = max(T v - v)``: if c >= 0, ``u = v + c h`` has ``T u <= u``, so the fixed point
     is at most ``T u <= T v + c (h - 1)``. If c < 0 the same holds with the constant
     ``1 / (1 - discount)``, as no move is discounted more. Likewise below. As the width grows
-    with h, its maximum in place of h tells whether the enclosure is narrow enough everywhere.
+    with h, the maximum of h in place of h gives a sufficient stopping criterion.
     """
     horizon = play.horizon
     unit = backup_error(play.unit, play.size, jnp.max(jnp.abs(image), axis=0))
@@ -420,7 +420,7 @@ def _certify(play: _Play, value: jax.Array, image: jax.Array) -> Enclosure:
 
 def _judge(value: jax.Array, image: jax.Array, play: _Play) -> tuple[jax.Array, jax.Array]:
     found = _certify(play, value, image)
-    # Where the horizon is not finite no number of sweeps proves anything.
+    # Without a finite horizon no number of sweeps gives a bound.
     return found.converged | found.exhausted | ~jnp.isfinite(found.half), found.half
 
 
@@ -508,7 +508,7 @@ def _solve(
 
 
 def _approached(rows: Any, numbers: newton.Backup, zero: jax.Array, method: str, max_steps: Any):
-    """A value near the fixed point, its image, the steps, and the weights of the choices there."""
+    """Approximate fixed point, its image, the number of steps, and the weights of its choices."""
     policies = method == "policy_iteration"
     if method == "strategy_iteration":
         value, image, num_steps = _strategy_iteration(rows, numbers, zero, max_steps)
@@ -536,7 +536,7 @@ _UNCHANGED = 3  # solves without a change of strategy after which more would not
 
 
 class _Strategies(NamedTuple):
-    """Where strategy iteration is: z is to be looked at, the value of the choices `weight`."""
+    """State of strategy iteration: z is the value of the choices `weight`."""
 
     z: jax.Array
     weight: Any

@@ -45,11 +45,11 @@ def occupancy_measure(
       tolerance: width of the enclosure; default: what the dtype allows.
 
     Returns:
-      :class:`Solution` whose `value`, `lower` and `upper` are ``float[S, A]``, of a sparse model
+      :class:`Solution`; `value`, `lower` and `upper` are ``float[S, A]``, of a sparse model
       ``float[R]``.
 
     Raises:
-      ValueError: policy has the wrong shape, or is none (under ``jit`` the status is INVALID).
+      ValueError: the policy has the wrong shape or is invalid (inside ``jit``: a status).
 
     Differentiable in the policy, the discount, `initial` and the probabilities.
 
@@ -115,7 +115,7 @@ def _occupancy(model, policy, discount, start, tolerance) -> Solution:
 
 
 def _inflow_terms(model: Any) -> Any:
-    """How many numbers are added up for what flows into a state, in some order: ``[S]`` or more."""
+    """Number of terms of each state's inflow, ``[S]`` or more."""
     if isinstance(model, Product):
         return _inflow_terms(model.mdp)[:, None] + model.num_memory
     if isinstance(model, MDP):
@@ -131,7 +131,7 @@ def _inflow_terms(model: Any) -> Any:
 def _visits(model, policy, discount, start, linear) -> tuple[jax.Array, jax.Array]:
     visits, n = linear.transpose_counted(start)
     flow = start + discount * pushforward(model, choices(model).spread(visits) * policy)
-    # One step more brings down what elimination has left.
+    # One step of iterative refinement.
     more, m = linear.transpose_counted(flow - visits)
     return visits + more, n + m + 1
 

@@ -31,7 +31,7 @@ from jaxltl.core.values.engine.iterate import iterate
 from jaxltl.core.values.engine.linear import System
 
 _LEAST = 0.95  # of the logarithm of the least normal number, to which probabilities may fall
-_SWEEPS_BETWEEN = 4  # sweeps between two looks at what is left
+_SWEEPS_BETWEEN = 4  # sweeps between two tests of the remainder
 
 
 @validated(method=("newton", "value_iteration"))
@@ -129,7 +129,7 @@ def soft_maximum(over: Any, q: Any, given: Parameters) -> tuple[jax.Array, Any]:
 def policy_logits(
     model: Any, reward: jax.Array, discount: jax.Array | float, value: jax.Array
 ) -> jax.Array:
-    """Action values with minus infinity at unavailable actions, whose softmax is the policy."""
+    """Logits of the soft policy: action values, minus infinity at unavailable actions."""
     q = reward + discount * expectation(model, value)
     return choices(model).logits(q)
 
@@ -172,7 +172,7 @@ def soft_policy_adjoint(
 
     With ``g = c - pi sum_a c`` and x the solution of ``x = discount * P'(g + pi x)``, it is
     ``g + pi x``: the transpose of the sensitivity (3.6), one linear system for any number of
-    parameters. Solved by sweeps, as the series ``sum_k (discount * P_pi')^k b``: what is left
+    parameters. Solved by sweeps, as the series ``sum_k (discount * P_pi')^k b``: the remainder
     is known exactly and shrinks at the rate of the discount or faster.
 
     Args:

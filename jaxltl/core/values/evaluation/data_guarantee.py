@@ -184,7 +184,7 @@ def _confidence_of_sets(model: SparseMDP, graph: Graph, confidence: float) -> fl
 
 
 def _with_sets(model: SparseMDP, sets: ConfidenceSets) -> tuple[IntervalMDP, np.ndarray]:
-    """The model with intervals; all entries are kept, which are those that it had."""
+    """The interval model, with all transitions of the model."""
     ball = {} if sets.radius is None else {"center": sets.center, "radius": sets.radius}
     found = make_interval(model, sets.lower, sets.upper, **ball)
     if found.num_transitions == model.num_transitions:
@@ -199,7 +199,7 @@ def _with_sets(model: SparseMDP, sets: ConfidenceSets) -> tuple[IntervalMDP, np.
 def _gain(
     model: IntervalMDP, found: RobustSatisfaction, center: np.ndarray, share: np.ndarray
 ) -> np.ndarray:
-    """Expected visits of each choice, times what nature takes there: ``float64[R]``."""
+    """Expected visits of each row times the loss to nature there: ``float64[R]``."""
     from scipy.sparse import csr_array, eye_array
     from scipy.sparse.linalg import spsolve
 
@@ -210,7 +210,7 @@ def _gain(
     entry = taken[host.row]
     nature = np.asarray(found.solution.nature)
     open_ = (value > 0) & (value < 1)
-    # Inside what is open every state is left almost surely, with nature as it is.
+    # Under this nature every undecided state is left almost surely.
     inner = entry & open_[host.state[host.row]] & open_[host.successor] & (nature > 0)
     size = host.num_states
     step = csr_array(

@@ -1,4 +1,4 @@
-"""What searches over parameters ask of a policy, from episodes: an objective and costs."""
+"""Objective and costs of a policy, estimated from episodes for parameter search."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ OF_TASKS = ("success", "failure", "violation", "undecided", "visits", "discounte
 
 @struct.dataclass
 class _Scores:
-    """What is counted, and of how many episodes; static."""
+    """Settings: quantities to estimate and number of episodes; static."""
 
     objective: Score = struct.field(pytree_node=False)
     costs: tuple[Score, ...] = struct.field(pytree_node=False)

@@ -1,4 +1,4 @@
-"""How well an agent does in an environment: shares and means over fresh episodes, with intervals.
+"""Statistical evaluation of agents: frequencies and means over fresh episodes, with intervals.
 
 Any agent, any environment; of one with a task (:mod:`~jaxltl.core.environments.task_environment`) also
 how often the task is satisfied and violated. Episodes are independent, so each interval is one of
@@ -41,7 +41,7 @@ from jaxltl.core.values import facts
 
 @brief(codes={"verdict": Verdict})
 class EpisodeTotals(NamedTuple):
-    """What is counted of one episode; with a leading axis of many.
+    """Counts of one episode; with a leading axis, of many.
 
     Attributes:
       reward: sum of the rewards.
@@ -84,7 +84,7 @@ def episode_totals(
     num_steps: int,
     discount: chex.Numeric = 1.0,
 ) -> EpisodeTotals:
-    """What an episode adds up to, the one that ``run_episode`` gives for the same key.
+    """Summary of the episode that ``run_episode`` returns for the same key.
 
     For ``jit`` and ``vmap``. Nothing is kept of a step, and it ends with the episode; side by side
     with others, with the longest.
@@ -143,7 +143,7 @@ def episode_totals(
 
 
 def task_world(world: Any) -> Any:
-    """The part of a world that tells a verdict, also inside of others; None if there is none."""
+    """The part of an environment's state that has a verdict, also nested; None without one."""
 
     def tells(x: Any) -> bool:
         return hasattr(x, "verdict")
@@ -151,13 +151,13 @@ def task_world(world: Any) -> Any:
     return next(filter(tells, jax.tree.leaves(world, is_leaf=tells)), None)
 
 
-# --- what is told ---------------------------------------------------------------------------------
+# --- results --------------------------------------------------------------------------------------
 
 
 @brief(facts=facts.estimate)
 @dataclass(frozen=True)
 class Estimate:
-    """A share or a mean with its interval.
+    """A frequency or a mean with its confidence interval.
 
     Attributes:
       mean: over the episodes; a share is in [0, 1], else it has the unit of what is averaged.
@@ -181,7 +181,7 @@ class Estimate:
 @brief(facts=facts.evaluation)
 @dataclass(frozen=True)
 class Evaluation:
-    """What :func:`evaluate` found; printed as a table.
+    """Result of :func:`evaluate`; printed as a table.
 
     Attributes:
       success, violation, undecided: shares of the episodes, by the task's verdict at their end;
@@ -193,11 +193,11 @@ class Evaluation:
       terminated, truncated, cut_off: how many episodes ended each way; at most `num_steps` steps
         were simulated of any.
       num_episodes: that were simulated.
-      num_steps, confidence, threshold, discount: as asked.
+      num_steps, confidence, threshold, discount: the arguments.
       decision: True if the chance of success is at least the threshold, False if it is below, None
         if that is open, or no threshold was given.
       status: CONVERGED; MAX_STEPS if a threshold was not decided; NONFINITE if a sum was not
-        finite, whose mean is then not either.
+        finite, and then the mean is not finite either.
 
     Example:
       >>> from jaxltl import from_dense
@@ -290,7 +290,7 @@ def evaluate(
     batch: int = 256,
     sharding: NamedSharding | None = None,
 ) -> Evaluation:
-    """How well an agent does: shares and means over fresh episodes, with honest intervals.
+    """Evaluates an agent: frequencies and means over fresh episodes, with confidence intervals.
 
     Episode i is ``run_episode(fold_in(key, i), environment, agent, num_steps=num_steps)``, whatever
     the batch. Each interval alone holds with probability `confidence` (several at once: take
@@ -300,7 +300,7 @@ def evaluate(
       number of episodes is fixed.
     - With a `threshold` the simulation stops after the first batch after which success is known to
       be at least that, or below. The number of episodes then depends on what came, and the shares'
-      intervals are those of Jeffreys' mixture, whose chance to miss *at any time* is at most
+      intervals are those of Jeffreys' mixture: the probability to miss *at any time* is at most
       ``1 - confidence`` (Ville; Robbins 1970): so is the chance of a wrong decision.
     - Lengths and visits are bounded by `num_steps`: empirical Bernstein, which holds at any time
       (Waudby-Smith and Ramdas 2024, theorem 2).
@@ -318,15 +318,15 @@ def evaluate(
       threshold: on the chance of success, in (0, 1).
       discount: in (0, 1), of `discounted_reward` and `discounted_visits`.
       batch: episodes that are simulated side by side; they alone take memory.
-      sharding: a ``NamedSharding`` whose spec names the mesh axis over which they are split; in
-        several processes each makes the same call, and is told the same.
+      sharding: a ``NamedSharding`` with the mesh axis over which episodes are split; in
+        several processes each makes the same call and returns the same.
 
     Returns:
       :class:`Evaluation`, on the host.
 
     Raises:
       ValueError: episodes that never end, a number out of range, a threshold without a task, or an
-        agent that is none, or whose actions do not fit.
+        invalid agent, or actions that do not fit.
 
     Not differentiable: what is returned is numbers of Python, from concrete arguments.
 
@@ -410,7 +410,7 @@ def _batch(
 
 
 def _decided(success: int, count: int, threshold: float, failure: float) -> bool | None:
-    """Whether the chance of success is at least a threshold, if that is known."""
+    """Whether the success probability is at least a threshold; None if undecided."""
     lower, upper = anytime(np.array([success]), np.array([count]), failure)
     if lower[0] >= threshold:
         return True
@@ -471,7 +471,7 @@ def _told(
 
 
 def share_estimate(count: int, total: int, failure: float, fixed: bool = True) -> Estimate:
-    """A share with its interval: exact for a fixed number of trials, or valid at any time.
+    """A frequency with its interval: exact for a fixed number of trials, or anytime-valid.
 
     Example:
       >>> found = share_estimate(8, 10, 0.05)
@@ -515,7 +515,7 @@ def _bounded_estimate(
 
 
 def _mean_error(x: Any) -> tuple[float, float]:
-    """The mean, and its standard error; infinite of one number."""
+    """The mean and its standard error, which is infinite for one number."""
     x = np.asarray(x, np.float64)
     with np.errstate(invalid="ignore", over="ignore"):
         error = float(x.std(ddof=1)) / math.sqrt(len(x)) if len(x) > 1 else math.inf
@@ -526,7 +526,7 @@ def _mean_error(x: Any) -> tuple[float, float]:
 
 
 def checked_steps(environment: Environment, num_steps: int | None) -> int:
-    """After how many steps episodes are cut off; refused if nothing tells."""
+    """Number of steps after which episodes are truncated; ValueError if it is unknown."""
     steps = environment.horizon if num_steps is None else num_steps
     if steps is None:
         raise ValueError(
@@ -537,7 +537,7 @@ def checked_steps(environment: Environment, num_steps: int | None) -> int:
 
 
 def _checked_agent(agent: Any, environment: Environment) -> tuple[Agent, Any]:
-    """An agent as a tree of arrays, whose actions are the environment's; and the world's shapes."""
+    """The agent as a tree of arrays, checked against the environment; and the state's shapes."""
     agent = require_agent(agent)
     agent = replace(agent, act=as_partial(agent.act, "agent.act"))
 

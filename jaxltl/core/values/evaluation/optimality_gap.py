@@ -1,4 +1,4 @@
-"""How far an agent in a finite world is from the best that anyone could do, certified."""
+"""Certified optimality gap of an agent in a finite environment."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _SUM = 1e-4  # by how much a network's distribution may miss one; it is scaled
 
 @brief(facts=facts.gap)
 class OptimalityGap(NamedTuple):
-    """What :func:`optimality_gap` found, for each of the N worlds where an episode may begin.
+    """Result of :func:`optimality_gap`, for each of the N initial states.
 
     Attributes:
       start: ``int32[N]``, their states in the table.
@@ -82,7 +82,7 @@ class OptimalityGap(NamedTuple):
 def tabulate_policy(
     policy: Callable[..., Any], environment: Environment, table: Table, num_memory: int
 ) -> np.ndarray:
-    """What an agent does in each world of a table and each memory of a task.
+    """Action probabilities of an agent in each tabulated state and automaton state.
 
     Args:
       policy: a function of ``(observation, memory)``: an action, or the probabilities
@@ -144,13 +144,13 @@ def optimality_gap(
     *,
     num_steps: int | None = None,
 ) -> OptimalityGap:
-    """The best probability of a task minus an agent's, from each beginning, with bounds on it.
+    """Optimality gap: the optimal satisfaction probability minus an agent's, with bounds.
 
-    Both are of doing the task for sure within so many steps, ``P(some prefix of n steps at most is
+    Both are probabilities of surely satisfying the formula within n steps, ``P(some prefix of n steps at most is
     such that every continuation satisfies it)``: what an episode of n steps at most of
     :func:`~jaxltl.core.environments.task_environment.task_environment` counts as success. They are
     step-bounded reachability in the product of the table and the task (Baier and Katoen 2008,
-    section 10.1.1), enclosed with their rounding; exactly 0 or 1 where the graph says so. The agent
+    section 10.1.1), enclosed including rounding; exactly 0 or 1 where the graph decides. The agent
     decides by the world and the automaton's state alone; the optimum is that of all policies, also
     of those that know the time. Without a limit of steps both are the probabilities of the task, by
     the exact solvers.
@@ -245,7 +245,7 @@ def _rows_of(policy: Any) -> np.ndarray:
 def _bounded(
     table: Table, model: Any, task: Automaton, policy: np.ndarray, start: np.ndarray, steps: int
 ) -> tuple[Any, Any]:
-    """The agent's probability and the best within so many steps, from each beginning."""
+    """Step-bounded probabilities of the agent and the optimum, from each initial state."""
     base, decisions, letter = table.model.host, verdicts(task), np.asarray(model.letter)
     found = sparse_product(
         base,
@@ -287,7 +287,7 @@ def _bounded(
 
 
 def _unbounded(table: Table, model: Any, policy: np.ndarray, start: np.ndarray) -> tuple[Any, Any]:
-    """The same without a limit."""
+    """Probabilities of the agent and the optimum without a step bound."""
     if np.asarray(table.truncated).any():
         raise ValueError(
             "optimality_gap: the environment cuts episodes off, and what would come is not in the "
@@ -318,7 +318,7 @@ def _unbounded(table: Table, model: Any, policy: np.ndarray, start: np.ndarray) 
 def _mass(
     policy: np.ndarray, action: np.ndarray, state: np.ndarray, memory: np.ndarray
 ) -> np.ndarray:
-    """The probability with which rows are taken."""
+    """Weights of rows under the agent."""
     if is_deterministic(policy):
         return (policy[state, memory] == action).astype(np.float64)
     return policy[state, memory, action].astype(np.float64)

@@ -1,6 +1,6 @@
 """Answers to properties of models that lie on the devices of a mesh, and how far they have come.
 
-Bounds are found by sweeps, which a question can be left after and gone on from.
+Bounds are computed by sweeps, and a run can resume from saved bounds.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Question:
       prop: the property.
       states: ``int[I]``, the initial states, by their numbers in the given model.
       shape: of the bounds: ``(N,)``, of a product ``(N, Q)``.
-      advance: from bounds, half the width that is asked for and how many steps to make at most: the
+      advance: from bounds, half of the requested width and the greatest number of steps: the
         next solution. Of rewards, where bounds are no help, it is the last.
       taken: from quantities of `shape`, those of the initial states, ``float64[I]``.
     """
@@ -52,7 +52,7 @@ class Question:
 
     @property
     def goes_on(self) -> bool:
-        """Whether bounds are narrowed step by step."""
+        """Whether the solver narrows bounds step by step."""
         return self.prop.operator == "P"
 
     def tolerance(self, wanted: float, part: float = 1.0) -> float:
@@ -60,7 +60,7 @@ class Question:
         return 0.49 * wanted * part
 
     def answer(self, found: Solution, wanted: float) -> Answer:
-        """What a solution says."""
+        """The answer of a solution."""
         names = ("value", "lower", "upper")
         small: Any = {name: self.taken(getattr(found, name)) for name in names}
         nobody: Any = np.zeros(0, np.int32)
@@ -69,12 +69,12 @@ class Question:
         return as_answer(self.prop, self.states, told, wanted, f"{method} on the mesh")
 
     def is_answered(self, answer: Answer, part: float) -> bool:
-        """Whether no narrower bounds are to be tried, of those in :data:`FINER`."""
+        """Whether the bounds are the narrowest of those in :data:`FINER`."""
         return self.prop.relation is None or answer.status == Status.CONVERGED or part <= FINER[-1]
 
 
 def question_on_mesh(model: ShardedMDP, prop: Property) -> Question:
-    """What it takes to answer a property over the devices that a model lies on.
+    """Solver of a property of a model on a mesh of devices.
 
     Args:
       model: the model.
@@ -115,7 +115,7 @@ def question_on_mesh(model: ShardedMDP, prop: Property) -> Question:
 
 
 def _path(prop: Property) -> Formula:
-    """What is asked for, where it is answered here."""
+    """The reduction of the property, if it is supported."""
     path = prop.path
     if prop.operator in ("P", "R", "T") and isinstance(path, Formula):
         return path
@@ -168,7 +168,7 @@ def _objective(model: ShardedMDP, prop: Property) -> str:
 
 
 def _starts(model: ShardedMDP) -> jax.Array:
-    """Where the initial states are, in order of their numbers; on every device."""
+    """Positions of the initial states in order; on every device."""
     number = int(on_host(jax.jit(lambda x: (x > 0).sum())(model.initial)))
     found = jax.jit(
         lambda x: jnp.flatnonzero(x > 0, size=number), out_shardings=_everywhere(model)

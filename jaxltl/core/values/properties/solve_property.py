@@ -158,7 +158,7 @@ def solve_property(
 
     Returns:
       :class:`Answer`. A threshold that the bounds do not decide is tried with narrower bounds; if
-      it stays open, `holds` is None and the status is not CONVERGED. Of ``multi(...)``, from the
+      it remains undecided, `holds` is None and the status is not CONVERGED. Of ``multi(...)``, from the
       initial distribution:
       :class:`~jaxltl.core.values.multi_objective.multi_objective.Achievable` if all objectives have
       thresholds, :class:`~jaxltl.core.values.multi_objective.multi_objective.ConstrainedOptimum` if
@@ -394,7 +394,7 @@ def _graph(model: SparseMDP | IntervalMDP) -> SparseMDP:
 def _without_intervals(
     model: SparseMDP | IntervalMDP, prop: Property | str, what: str
 ) -> SparseMDP:
-    """The model, for those who know nothing of intervals."""
+    """The model, if it is not an interval model."""
     if not isinstance(model, IntervalMDP):
         return model
     raise ValueError(
