@@ -1,4 +1,4 @@
-"""What is acted in: MDPs, games, products, and the primitives through which they are seen."""
+"""Models: MDPs, games, products and interval models, with their operators."""
 
 import lazy_loader
 
