@@ -1,4 +1,4 @@
-"""Steps along quasi-Newton directions, with one place where the loss is evaluated."""
+"""L-BFGS with a weak Wolfe line search that evaluates the loss at one place of its program."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _MEMORY = 10
 
 @struct.dataclass
 class Point:
-    """Parameters with the loss, its gradient and whatever else was found there."""
+    """Parameters with the loss, its gradient and its terms."""
 
     parameters: Any
     loss: jax.Array
@@ -31,13 +31,13 @@ class Point:
 
 @struct.dataclass
 class Search:
-    """What goes from one step to the next.
+    """The state of the search between steps.
 
     Attributes:
-      point: where the last step ended.
-      direction: where the next step goes.
+      point: the end of the last step.
+      direction: of the next step.
       memory: optax's, of the last steps and gradients.
-      known: whether the point was evaluated yet.
+      known: whether the point was evaluated.
     """
 
     point: Point
@@ -64,7 +64,7 @@ def _directions() -> optax.GradientTransformation:
 
 
 def start(parameters: Any, point: Point) -> Search:
-    """Before anything was evaluated; `point` gives the shapes."""
+    """The state before the first evaluation; `point` gives the shapes."""
     zero = optax.tree.zeros_like(parameters)
     # optax starts from weakly typed zeros, which a second run would compile anew for.
     memory = trees.strong(_directions().init(parameters))
@@ -74,16 +74,10 @@ def start(parameters: Any, point: Point) -> Search:
 def step(evaluate: Callable[[Any, Point], Point], search: Search) -> tuple[Search, Point]:
     """One step of L-BFGS (Liu and Nocedal 1989) to a point that satisfies Wolfe's conditions.
 
-    The step's size is bracketed and halved or doubled (Lewis and Overton 2013), which ends for
-    every smooth loss; where rounding hides a decrease, the slope is what counts (Hager and Zhang
-    2005). Parameters that give no number are too far.
-
-    Args:
-      evaluate: the point at some parameters, from there and the point before.
-      search: where to go on from.
-
-    Returns:
-      The search after the step, and the point before it.
+    The step size is bracketed and bisected or doubled (Lewis and Overton 2013), which terminates
+    for every smooth loss; where rounding hides a decrease, the slope decides (Hager and Zhang
+    2005). A loss of NaN counts as too long a step. `evaluate` maps parameters and the previous
+    point to a point. Returns the search after the step, and the point before it.
     """
     eps = float(jnp.finfo(search.point.loss.dtype).eps)
 
@@ -109,7 +103,7 @@ def step(evaluate: Callable[[Any, Point], Point], search: Search) -> tuple[Searc
             done=good | (k.n + 1 >= _MOST),
             n=k.n + 1,
         )
-        # The very first evaluation is of the start, and gives the first direction.
+        # The first evaluation is of the initial parameters, and gives the first direction.
         scale = -jnp.minimum(1, 1 / optax.tree.norm(new.gradient))
         first = k._replace(
             base=new,
@@ -136,7 +130,7 @@ def step(evaluate: Callable[[Any, Point], Point], search: Search) -> tuple[Searc
     found = lax.while_loop(lambda k: ~k.done, trial, begin)
     new = found.best
     moved, memory = _directions().update(new.gradient, search.memory, new.parameters)
-    # A direction that does not descend, or a step that led nowhere, starts afresh.
+    # No descent direction, or no progress: restart from the gradient.
     fresh = ~(optax.tree.vdot(moved, new.gradient) > 0) | ~found.moved
     scale = jnp.minimum(1, 1 / optax.tree.norm(new.gradient))
     moved = trees.either(fresh, optax.tree.scale(scale, new.gradient), moved)

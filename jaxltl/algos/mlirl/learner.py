@@ -433,7 +433,7 @@ init, step, run, train, run_until, train_until = learner.bind(_init, _step, keep
 def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
     """The softmax policy of the reward: ``float[S, A]``, in a product ``[S, Q, A]``.
 
-    :func:`solve` tells with it how well its value is known.
+    :func:`solve` gives certified bounds of its value.
 
     Args:
       state: of one run; ``vmap`` over several.
