@@ -511,6 +511,19 @@ except SystemExit:
         assert xla_flags(FAST_COMPILATION, version) == "", "flags that no test has tried there"
 
 
+def test_double_precision_holds_in_callbacks(tmp_path):
+    """They run in other threads, where a precision of this thread alone would not hold."""
+    code = """
+import jax, numpy as np
+from jaxltl.app.command_options import float64
+with float64():
+    shape = jax.ShapeDtypeStruct((), np.float64)
+    third = jax.jit(lambda x: jax.pure_callback(lambda y: np.asarray(y) / 3, shape, x))
+    print(float(third(np.float64(1))))
+print(jax.config.jax_enable_x64)"""
+    assert alone(code, tmp_path).split() == [str(1 / 3), "False"]
+
+
 def test_short_work_solves_its_systems_in_one_thread(tmp_path):
     code = """
 import os

@@ -43,17 +43,19 @@ def plain_errors(command: Callable[..., None]) -> Callable[..., None]:
 
 @contextlib.contextmanager
 def float64() -> Iterator[None]:
-    """Double precision for a command; the library itself leaves JAX's settings alone."""
+    """Double precision for a command; the library itself leaves JAX's settings alone.
+
+    Set for all threads: `jax.enable_x64` is local to a thread, and callbacks run in others, where
+    JAX would convert their arrays to single precision.
+    """
     import jax
 
-    # Before JAX 0.8 the context lived in jax.experimental.
-    context = getattr(jax, "enable_x64", None)
-    if context is None:
-        from jax import experimental
-
-        context = experimental.enable_x64  # type: ignore[attr-defined]
-    with context(True):
+    before = jax.config.jax_enable_x64
+    jax.config.update("jax_enable_x64", True)
+    try:
         yield
+    finally:
+        jax.config.update("jax_enable_x64", before)
 
 
 def compiling(*, fast: bool) -> Callable[[Callable[..., None]], Callable[..., None]]:
