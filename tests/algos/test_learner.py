@@ -551,7 +551,7 @@ def test_a_traced_hyperparameter_out_of_range_is_invalid(name):
         _, metrics = module.train(jax.random.key(0), problem, changed, num_steps=2, max_rows=2)
         return metrics.status
 
-    assert (trained(-0.5) == Status.INVALID).all() and (trained(jnp.nan) == Status.INVALID).all()
+    assert (trained(-0.5) >= Status.INVALID).all() and (trained(jnp.nan) >= Status.INVALID).all()
     assert (trained(getattr(hparams, field)) < Status.INVALID).all()
 
 

@@ -458,8 +458,8 @@ def test_a_rest_before_all_is_seen_does_not_end_the_run():
 
 def test_values_that_are_not_numbers_are_told():
     mdp = make_mdp([[[0]]], [[[1.0]]])
-    problem = maximin_q.make_problem(mdp, [[1.0]])
-    hparams = maximin_q.Hparams(discount=float("nan"), num_chains=2, moves_per_step=2)
+    problem = maximin_q.make_problem(mdp, [[1e308]])  # values overflow
+    hparams = maximin_q.Hparams(discount=0.9, num_chains=2, moves_per_step=2)
     done = maximin_q.train_until(
         jax.random.key(0), problem, hparams, until=maximin_q.value_is_stable(1e-3), num_steps=100
     )

@@ -1,4 +1,4 @@
-"""Steps of many environments side by side, and the advantages that are estimated from them."""
+"""Transitions of parallel environments, and their generalised advantages."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ from jaxltl.core.pretty_print import brief
 @brief
 @struct.dataclass
 class Walkers:
-    """N environments on their way; all have a first axis of N.
+    """N parallel environments; all arrays have a first axis of N.
 
     Attributes:
-      world: where each is.
+      world: their states.
       memory: of the network.
-      episode_return, episode_length: of the episode so far.
-      discounted: its rewards so far, each discounted to the present.
+      episode_return, episode_length: of the current episode.
+      discounted: rewards of the episode, discounted to the present.
     """
 
     world: Any
@@ -45,15 +45,15 @@ class Walkers:
 
 
 class Rows(NamedTuple):
-    """Steps that were made: ``[T, N, ...]``, or flattened, or some of them.
+    """Transitions ``[T, N, ...]``, flattened, or a minibatch.
 
     Attributes:
-      observation: before the step, as the network reads it.
+      observation: before the transition, as the network reads it.
       start: whether an episode begins with it, so that the memory is the initial one.
       allowed: ``bool[A]``, or None.
-      raw: the action that was drawn.
-      log_density: of it, when it was drawn.
-      value: that was expected.
+      raw: the sampled action before squashing.
+      log_density: of `raw` under the collecting policy.
+      value: estimate before the transition.
       advantage: of the action.
     """
 
@@ -80,14 +80,14 @@ class Told(NamedTuple):
 
 
 def _unless_nonfinite(moments: Moments, numbers: jax.Array) -> Moments:
-    """With a batch taken in, unless a number in it is not finite."""
+    """Moments with a batch added, or unchanged if a number of it is not finite."""
     new = updated_moments(moments, numbers)
     fine = jnp.all(jnp.isfinite(new.mean)) & jnp.all(jnp.isfinite(new.squares))
     return trees.choose(fine, new, moments)
 
 
 class _Path(NamedTuple):
-    """What is kept of each step, ``[T, N, ...]``."""
+    """Records of the transitions, ``[T, N, ...]``."""
 
     observation: Any
     memory: Any
@@ -108,7 +108,7 @@ class _Path(NamedTuple):
 def collected(
     key: chex.PRNGKey, state: Any, problem: Any, hparams: Any
 ) -> tuple[Any, Any, Rows, Told]:
-    """T steps of N environments: the state after them, what they began from, and what they tell."""
+    """T transitions of N environments: the next state, initial memories, transitions and figures."""
     walkers, path = _walked(key, state, problem, hparams)
     dtype = walkers.discounted.dtype
     seen = normalized(state.moments, path.observation)
@@ -159,7 +159,7 @@ def collected(
 def _discounted_sums(
     walkers: Walkers, reward: jax.Array, discount: jax.Array, ended: jax.Array
 ) -> tuple[jax.Array, Walkers]:
-    """``float[T, N]``, rewards of each episode so far, and the walkers who keep the last."""
+    """``float[T, N]``, discounted rewards of each episode so far, and the environments with the last."""
 
     def on(before: jax.Array, row: Any) -> tuple[jax.Array, jax.Array]:
         reward, discount, ended = row
@@ -198,7 +198,7 @@ def _walk(
     *,
     sharding: Any,
 ) -> tuple[Walkers, _Path]:
-    """Steps of all environments, or of those of one device."""
+    """Transitions of all environments, or of one device's."""
     parameters, moments, problem, hparams, pool = given
     environment = problem.environment
 
@@ -265,7 +265,7 @@ def _walk(
 
 
 def _starts(key: chex.PRNGKey, environment: Any, hparams: Any) -> tuple[Any, Any]:
-    """What each step begins episodes with, ``[T, N]`` worlds or keys; or all a pool of worlds."""
+    """Initial states or keys ``[T, N]`` of the episodes that begin, or a pool of initial states."""
     size, number = (hparams.num_steps, hparams.num_envs), hparams.num_resets
     if number:
         return None, jax.vmap(environment.reset)(jax.random.split(key, number))
@@ -276,7 +276,7 @@ def _starts(key: chex.PRNGKey, environment: Any, hparams: Any) -> tuple[Any, Any
 def _evaluated_all(
     problem: Any, parameters: Any, memory: Any, observation: Any, num_axes: int
 ) -> Output:
-    """Of observations with so many leading axes, each with its memory."""
+    """Outputs of the network for observations with `num_axes` leading axes."""
     function: Any = partial(evaluated, problem, parameters)
     for _ in range(num_axes):
         function = jax.vmap(function)
@@ -284,9 +284,9 @@ def _evaluated_all(
 
 
 def _at_ends(cut: jax.Array, following: jax.Array, ends: Any, judge: Any) -> jax.Array:
-    """Values that follow, with those of the worlds where episodes were cut off put in.
+    """Next values, with those at truncated observations inserted.
 
-    They are few, so that only they are evaluated, some at a time.
+    Truncations are rare, so only these observations are evaluated, a batch at a time.
     """
     size, some = cut.size, min(cut.size, max(cut.shape[1], 32))
     problem, parameters, moments = judge

@@ -1,4 +1,4 @@
-"""The loss of proximal policy optimisation, and its descent over minibatches."""
+"""The loss of proximal policy optimisation, and epochs of minibatch updates."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from jaxltl.core.models.mesh import lanes
 
 
 class Figures(NamedTuple):
-    """Of a minibatch before its update, or means over those that were made."""
+    """Parts of the loss of a minibatch before its update, or means over updates."""
 
     policy_loss: jax.Array
     value_loss: jax.Array
@@ -32,32 +32,27 @@ class Figures(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """Numbers of this step, schedules read off."""
+    """Values of schedules in this step."""
 
     clip: Any
     value_clip: Any
 
 
 def descent(hparams: Any) -> optax.GradientTransformation:
-    """Adam without its learning rate, which is multiplied in where it is known."""
+    """Adam without its learning rate, which a schedule supplies."""
     return optax.scale_by_adam(eps=hparams.adam_epsilon)
 
 
 def loss(
     parameters: Any, rows: Rows, begun: Any, problem: Any, hparams: Any, limits: Limits
 ) -> tuple[jax.Array, Figures]:
-    """What is minimised (Schulman et al. 2017, equation 9), and its parts::
+    """The loss (Schulman et al. 2017, equation 9) and its parts, of rows ``[N', ...]``::
 
         mean of -min(r A, clip(r, 1 - c, 1 + c) A)
               + value_weight (V - target)^2 / 2 - entropy_weight H,
 
-    with r the ratio of the new to the old probability of what was done, and A the advantage,
-    centred and scaled in this minibatch where that is asked for.
-
-    Args:
-      parameters: of the network.
-      rows: ``[N', ...]``, or of whole environments ``[T, N', ...]`` for a network with memory.
-      begun: its memories before the first of T steps.
+    with r the ratio of the new to the old probability of the action, and A the advantage. For a
+    network with memory, rows are ``[T, N', ...]`` of whole environments and `begun` their memories.
     """
     actions = problem.environment.actions
     said = _said(parameters, rows, begun, problem)
@@ -113,14 +108,10 @@ class _Going(NamedTuple):
 def improved(
     key: chex.PRNGKey, state: Any, rows: Rows, begun: Any, problem: Any, hparams: Any
 ) -> tuple[Any, Any, Figures, jax.Array, jax.Array]:
-    """Parameters and the optimiser's state after some epochs of minibatches.
+    """Parameters and the optimiser's state after the epochs, mean figures, and numbers of updates.
 
-    An update whose gradient is not finite is left out, and so are all after the first minibatch
-    on which the policy is further from the old one than `target_kl`.
-
-    Returns:
-      parameters, optimizer, mean :class:`Figures`, how many updates were made, and how many were
-      left out because a number was not finite.
+    Updates with a gradient that is not finite are skipped and counted, as are all after the first
+    minibatch whose divergence exceeds `target_kl`.
     """
     limits = Limits(at(hparams.clip, state.step), _at(hparams.value_clip, state.step))
     rate = at(hparams.learning_rate, state.step)

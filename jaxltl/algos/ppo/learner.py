@@ -1,17 +1,16 @@
-"""Proximal policy optimisation: a policy and a value, improved on what the policy itself did.
+"""Proximal policy optimisation (PPO) in any environment.
 
-A step draws T steps of N environments with the policy of that moment, estimates generalised
-advantages, and makes some epochs of minibatches of Adam on the clipped surrogate (Schulman et al.
-2017). Environments are those of :mod:`jaxltl.core.environments.environment`; an episode that is cut off
-is worth what the value network expects of the world in which it was cut off, one that is over
-nothing more. Where the environment allows only some actions, no other is ever taken, and the
-entropy is that over those allowed: a network learns inside what a shield leaves.
+A step collects T transitions of each of N environments with the current policy, estimates
+generalised advantages, and makes some epochs of Adam on minibatches of the clipped surrogate
+(Schulman et al. 2017). The value after a truncation is that of the value network at the truncated
+observation; after a termination it is 0. Actions outside of an environment's mask are never taken,
+and the entropy is that over allowed actions: a network learns inside a shield.
 
-What published implementations list (Huang et al. 2022, Andrychowicz et al. 2021) is here by name
-in :class:`Hparams`.
+The implementation details of Huang et al. (2022) and Andrychowicz et al. (2021) are options of
+:class:`Hparams`.
 
-Example: a corridor of which one leaves at its beginning; to go to the end and back earns most.
-(A step is compiled in some seconds, so its shapes alone are shown.)
+Example: a corridor left at its beginning; to go to the end and back earns most. (A step compiles
+for seconds, so only shapes are shown.)
 
   >>> import jax, jax.numpy as jnp, numpy as np
   >>> from jax.tree_util import Partial
@@ -27,26 +26,22 @@ Example: a corridor of which one leaves at its beginning; to go to the end and b
   ...     return {"place": place / width, "end": place == 3}
   >>> def allowed(width, place):
   ...     return jnp.array([place < 3, True, True])
-  >>> width = np.array(3.0)  # an argument, so that another one compiles nothing anew
+  >>> width = np.array(3.0)  # an argument, so that another value does not recompile
   >>> corridor = jl.make_environment(*(Partial(f, width) for f in (reset, step, observe)),
   ...                                actions=3, allowed=Partial(allowed, width))
   >>> problem = ppo.make_problem(corridor, network=ppo.ActorCritic(3, hidden=()))
   >>> hparams = ppo.Hparams(
   ...     discount=0.9, learning_rate=0.01, num_envs=4, num_steps=6, num_epochs=1,
   ...     num_minibatches=2, normalize_observation=True, normalize_reward=True)
-  >>> state = ppo.init(jax.random.key(0), problem, hparams)  # ppo.train is init and run
-  >>> after, metrics = jax.eval_shape(  # run is step after step; run_until, train_until end early
-  ...     lambda state: ppo.step(state, problem, hparams), state)
+  >>> state = ppo.init(jax.random.key(0), problem, hparams)
+  >>> after, metrics = jax.eval_shape(lambda state: ppo.step(state, problem, hparams), state)
   >>> state.transitions.item(), metrics.episode_return.shape
   (0, ())
-  >>> agent = ppo.greedy(state, problem, hparams)  # or ppo.policy, which draws
+  >>> agent = ppo.greedy(state, problem, hparams)  # or ppo.policy, which samples
   >>> episode = jax.eval_shape(
   ...     lambda key: jl.run_episode(key, corridor, agent, num_steps=5), jax.random.key(1))
   >>> episode.reward.shape
   (5,)
-
-Many seeds are ``jax.vmap(lambda key: train(key, problem, hparams, num_steps=...))(keys)``; so are
-many settings, by ``vmap`` over the numbers of ``Hparams``.
 """
 
 from __future__ import annotations
@@ -119,11 +114,11 @@ __all__ = [
 @brief
 @struct.dataclass
 class Problem:
-    """An environment and a network, made by :func:`make_problem`.
+    """An environment and a network; made by :func:`make_problem`.
 
     Attributes:
-      environment: where to act.
-      memory: of the network before it has seen anything, a tree of arrays; ``()`` for one without.
+      environment: with finitely many actions, or a box of floats.
+      memory: initial memory of the network, a tree of arrays; ``()`` without memory.
       network: a ``flax.linen`` module; static.
     """
 
@@ -135,50 +130,45 @@ class Problem:
 @brief
 @struct.dataclass
 class Hparams:
-    """How to learn. Numbers are traced, so new values do not recompile; None is static.
+    """Settings; numbers are traced, None is static.
 
-    A *schedule* is a number, or changes from step to step: ``schedules.Linear(first, last,
-    num_steps)``, ``schedules.Polynomial``, or ``Partial(function)`` of the number of the step from
-    1, as optax's schedules are functions.
+    A *schedule* is a number, ``schedules.Linear(first, last, num_steps)``, ``schedules.Polynomial``, or
+    a ``Partial(function)`` of the number of the step from 1.
 
     Attributes:
-      discount: of rewards, in [0, 1]; times what the environment says of each step.
-      gae_lambda: of the generalised advantages: 1 has no bias, 0 least variance; default 0.95.
+      discount: of rewards, in [0, 1]; multiplied by the environment's.
+      gae_lambda: of the advantages: 1 has no bias, 0 least variance; default 0.95.
       learning_rate: of Adam; a schedule; default 2.5e-4.
-      clip: how far the ratio of probabilities may move before it is worth nothing; a schedule;
-        default 0.2.
-      value_clip: the same of values, in their units; a schedule; None: they are not clipped;
+      clip: bound on the change of the probability ratio in the surrogate; a schedule; default 0.2.
+      value_clip: bound on the change of values in their loss; a schedule; None: no bound;
         default None.
-      value_weight: of the value's squared error, halved; default 0.5.
+      value_weight: of half the squared error of values; default 0.5.
       entropy_weight: of the entropy of the actions; default 0.01.
-      max_gradient_norm: gradients are shortened to it; None: they are not; default 0.5.
-      target_kl: no further updates in a step once a minibatch's estimated divergence from the
-        policy that acted exceeds it; None: all are made; default None.
+      max_gradient_norm: gradients are clipped to this norm; None: they are not; default 0.5.
+      target_kl: updates of a step stop when a minibatch's estimated divergence from the collecting
+        policy exceeds it; None: they do not; default None.
       adam_epsilon: of Adam; default 1e-5.
-      num_envs: N, environments side by side; static; default 8.
-      num_steps: T, of each of them in a step of the learner; static; default 128.
-      num_epochs: passes over what was collected; static; default 4.
+      num_envs: N, parallel environments; static; default 8.
+      num_steps: T, transitions of each of them in a step; static; default 128.
+      num_epochs: passes over the collected transitions; static; default 4.
       num_minibatches: of each pass; with a recurrent network, each has whole environments; static;
         default 4.
-      normalize_advantage: whether advantages are centred and scaled in each minibatch; static;
+      normalize_advantage: whether advantages are standardised in each minibatch; static;
         default True.
-      normalize_observation: whether the network reads observations (their floats) centred and
-        scaled by their moments up to the step before, clipped to ten deviations; static;
-        default False.
+      normalize_observation: whether the network reads observations (their floats) standardised by
+        their moments up to the last step, clipped to ten deviations; static; default False.
       normalize_reward: whether rewards are divided by the standard deviation of discounted sums of
         rewards so far, and clipped to ten; static; default False.
-      squash: how a Gaussian action gets into its box: ``"clip"``, or ``"tanh"`` along axes that
-        have both bounds; static. Either way the network speaks in units in which such axes are
-        [-1, 1]. Default ``"clip"``.
-      num_resets: how many worlds in which episodes begin are drawn before the T steps of a step;
-        static. None: T N, one for whatever might end, which is fast and takes memory. 0: N of them
-        in each of the T steps, which is the same to the learner. Some other number: that many,
-        handed out in turn, and from the first again if they do not suffice; where a reset is
-        costly and episodes are long, this is fastest. Default None.
-      sharding: a ``NamedSharding`` whose spec names the mesh axis over which the environments, and
-        each minibatch, are split, such as ``NamedSharding(mesh, PartitionSpec("environments"))``;
-        static. The run is the same up to the order of sums. What a step collected is sent to
-        all devices once, for a minibatch is drawn from all of it. Default None.
+      squash: map of a Gaussian action into its box: ``"clip"``, or ``"tanh"`` along axes with both
+        bounds; static. Networks use units in which such axes are [-1, 1]. Default ``"clip"``.
+      num_resets: initial states drawn before the T transitions of a step; static. None: T N, one for
+        every possible end: fast, and takes memory. 0: N in each transition, with the same results.
+        Another number: that many, used cyclically; fastest where resets are costly and episodes
+        long. Default None.
+      sharding: a ``NamedSharding`` whose spec names the mesh axis that splits the environments and
+        each minibatch, such as ``NamedSharding(mesh, PartitionSpec("environments"))``; static. Runs
+        are equal up to the order of sums. Collected transitions are replicated once for each step,
+        since a minibatch may contain any of them. Default None.
     """
 
     discount: Number = traced(Range(0, 1))
@@ -206,17 +196,17 @@ class Hparams:
 @brief
 @struct.dataclass
 class State:
-    """A policy on its way.
+    """A policy, its optimiser, and the environments.
 
     Attributes:
-      key: of the whole run.
-      step: ``int32[]``, steps of the learner made.
+      key: random key of the run.
+      step: ``int32[]``, number of steps.
       parameters: of the network, a pytree.
       optimizer: optax's state.
       walkers: the N environments.
-      moments: of the observation, a tree as it is, of its float leaves; None: not asked for.
-      return_moments: of discounted sums of rewards; None: not asked for.
-      transitions: ``int32[]``, steps of environments made; at most 2^31 - 1 are counted.
+      moments: of the floats of observations, a tree of the observation's structure; or None.
+      return_moments: of discounted sums of rewards; or None.
+      transitions: ``int32[]``, of environments so far; saturates at 2^31 - 1.
     """
 
     key: jax.Array
@@ -232,24 +222,23 @@ class State:
 @brief(facts=partial(history, codes={"status": Status}))
 @struct.dataclass
 class Metrics:
-    """Figures of a step; scalars, of a run ``[T]``. Those of episodes are of the policy before it.
+    """Figures of a step; scalars. Those of episodes are of the policy before it.
 
     Attributes:
-      transitions: steps of environments made so far, this step's included.
-      reward, cost: mean of a step of an environment.
-      episodes: how many ended in this step.
-      episode_return, episode_length: their mean sum of rewards, without discount, and mean number
-        of steps; NaN if there is none.
-      policy_loss, value_loss, entropy: mean parts of the loss over the updates that were made.
-      kl: mean estimate of the divergence from the policy that acted, ``mean(r - 1 - log r)``.
-      clip_fraction: share of ratios that were clipped.
-      gradient_norm: mean, before it is shortened.
-      explained_variance: share of the variance of the values' targets that they explained.
+      transitions: of environments so far.
+      reward, cost: mean of a transition.
+      episodes: number of episodes that ended.
+      episode_return, episode_length: their mean undiscounted return and length; NaN without any.
+      policy_loss, value_loss, entropy: mean parts of the loss over the updates.
+      kl: mean estimate of the divergence from the collecting policy, ``mean(r - 1 - log r)``.
+      clip_fraction: share of clipped ratios.
+      gradient_norm: mean, before clipping.
+      explained_variance: share of the variance of the values' targets that values explained.
       learning_rate: of this step.
       updates: minibatches that changed the parameters.
-      nonfinite: minibatches left out because a number of theirs was not finite.
-      status: COMPLETED; NONFINITE if `nonfinite` is positive or an advantage was not finite;
-        INVALID if somewhere no action was allowed (the first is taken there, and parameters stay).
+      nonfinite: minibatches skipped because a number was not finite.
+      status: COMPLETED; NONFINITE if `nonfinite` is positive or an advantage was not finite; INVALID if
+        no action was allowed somewhere (the first is taken there, and parameters stay unchanged).
     """
 
     transitions: jax.Array
@@ -277,35 +266,31 @@ def make_problem(
     """A checked :class:`Problem`.
 
     Args:
-      environment: its actions are finitely many, or a box of floats.
-      network: a ``flax.linen`` module, called with one observation, ``network(observation) ->
-        (action parameters, value)``; with a memory ``network(memory, observation) -> (memory,
-        (action parameters, value))``. Of finitely many actions the parameters are logits
-        ``float[A]``, of a box ``(mean, log_deviation)``, both of an action's shape; the value is a
-        scalar. Default :class:`ActorCritic`.
-      memory: of a recurrent network before it has seen anything; default what its method
-        ``initial_memory()`` returns, if it has one.
+      environment: with finitely many actions, or a box of floats.
+      network: a ``flax.linen`` module of one observation, ``network(observation) -> (action
+        parameters, value)``; with memory ``network(memory, observation) -> (memory, (action
+        parameters, value))``. Action parameters are logits ``float[A]``, or for a box
+        ``(mean, log_deviation)`` of an action's shape; the value is a scalar.
+        Default :class:`ActorCritic`.
+      memory: initial memory of a recurrent network; default its ``initial_memory()``.
 
     Returns:
       :class:`Problem`.
 
     Raises:
-      ValueError: a network that returns something else, or keeps more than parameters; a memory
-        that is not the network's; a box of integers; no environment.
+      ValueError: a network that returns other shapes or keeps more than parameters; a memory that
+        does not fit; a box of integers; not an environment.
 
     Example:
       >>> from jaxltl import make_environment
-      >>> from jaxltl.core.environments import Timestep
+      >>> from jaxltl.environments import Timestep
       >>> def go(place, action, key):
       ...     place = place + 2 * action - 1
       ...     return Timestep(place, reward=1.0 * (place == 3), terminated=abs(place) == 3)
       >>> corridor = make_environment(
       ...     lambda key: jnp.int32(0), go, lambda place: place[None] / 3, actions=2)
-      >>> problem = make_problem(corridor)
-      >>> problem.network.num_actions
+      >>> make_problem(corridor).network.num_actions
       2
-
-      Then ``state, metrics = train(key, problem, Hparams(discount=0.99), num_steps=100)``.
     """
     require_environment(environment)
     actions = environment.actions
@@ -358,35 +343,21 @@ def _check(problem: Problem, hparams: Hparams) -> None:
 
 
 def policy(state: State, problem: Problem, hparams: Hparams) -> Agent:
-    """What was learned, an :class:`~jaxltl.core.environments.episodes.Agent` that draws its actions.
-
-    Never one that is not allowed. For :func:`~jaxltl.core.environments.episodes.run_episode`.
-
-    Args:
-      state: of one run, as of ``train``.
-      problem, hparams: of the run.
-
-    Returns:
-      :class:`~jaxltl.core.environments.episodes.Agent`, a pytree.
-
-    Raises:
-      ValueError: the state or the problem is none of PPO's.
-    """
+    """The learned policy as an agent that samples its actions, for ``run_episode``."""
     return _agent(state, problem, hparams, True)
 
 
 def greedy(state: State, problem: Problem, hparams: Hparams) -> Agent:
-    """The same, taking the most likely action each time; of a box the Gaussian's mean.
+    """The learned policy as an agent that takes the most likely action, or a Gaussian's mean.
 
     Args:
-      state: of one run, as of ``train``.
-      problem, hparams: of the run.
+      state, problem, hparams: of a run.
 
     Returns:
       :class:`~jaxltl.core.environments.episodes.Agent`, a pytree.
 
     Raises:
-      ValueError: the state or the problem is none of PPO's.
+      ValueError: the state or the problem is not PPO's.
     """
     return _agent(state, problem, hparams, False)
 
@@ -425,7 +396,7 @@ def _act(
 
 
 def _init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
-    """The network at its own random start, and N environments at theirs."""
+    """Random parameters, and N environments at initial states."""
     _check(problem, hparams)
     return _begun(require_key(key), problem, hparams)
 
@@ -465,7 +436,7 @@ def _begun(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
 
 
 def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
-    """T steps of N environments, and some epochs of minibatches of what they tell."""
+    """T transitions of N environments, and some epochs of minibatches of them."""
     _check(problem, hparams)
     validation.instance("state", state, State, "one of ppo.init or ppo.train")
     collect_key, update_key = jax.random.split(learner.step_key(state))

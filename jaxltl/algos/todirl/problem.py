@@ -88,7 +88,7 @@ class Hparams:
     patience: Number = traced(Range(1), default=50)
     mu: Number | None = traced(Range(0, open_above=True), default=None)
     tolerance: Number | None = traced(Range(0, open_above=True), default=None)
-    optimizer: str = static(("adam", "sgd", "rmsprop", "lbfgs"), default="adam")
+    optimizer: str = static(("lbfgs", "adam", "rmsprop", "sgd"), default="adam")
     method: str = static(("newton", "value_iteration"), default="value_iteration")
     horizon: int | None = static(COUNT, default=None)
 

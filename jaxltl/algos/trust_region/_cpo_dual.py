@@ -1,4 +1,4 @@
-"""The step of CPO in closed form: multipliers and weights of its linear-quadratic problem."""
+"""CPO's linear-quadratic problem in closed form: multipliers and weights."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 
 class Case(enum.IntEnum):
-    """Which part of the constrained problem decided a step."""
+    """The part of the constrained problem that determines a step."""
 
     FREE = 0  # the whole trust region keeps to the limit (always so for TRPO)
     INACTIVE = 1  # the best step of the trust region keeps to the limit (the paper's case b)

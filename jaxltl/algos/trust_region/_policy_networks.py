@@ -1,4 +1,4 @@
-"""Gaussian policies and value networks of trust-region search, and the scale of what they read."""
+"""Gaussian policies and value networks of trust-region methods, on standardised observations."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from jaxltl.algos.common.settings import applied
 
 
 class Network(nn.Module):
-    """Tanh layers and a linear one, which starts at `last_scale` of the usual size."""
+    """Tanh layers and a linear layer, initialised at `last_scale` times the usual scale."""
 
     hidden: tuple[int, ...]
     outputs: int
@@ -32,17 +32,17 @@ class Network(nn.Module):
 
 
 def mean_network(hparams: Any, num_actions: int, dtype: Any) -> Network:
-    """The network of a policy's means."""
+    """The network of a policy's mean."""
     return Network(hparams.hidden, num_actions, 0.1, dtype)
 
 
 def value_network(hparams: Any, dtype: Any) -> Network:
-    """The network of a value, or of a cost's."""
+    """The network of a value of rewards or costs."""
     return Network(hparams.value_hidden, 1, 0.1, dtype)
 
 
 def gaussian(parameters: Any, hparams: Any, inputs: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Mean and standard deviation of the actions at some inputs."""
+    """Mean and standard deviation of the actions."""
     log_deviation = parameters["log_deviation"]
     network = mean_network(hparams, log_deviation.shape[0], log_deviation.dtype)
     mean = jnp.asarray(applied(network, parameters["mean"], inputs))
@@ -50,7 +50,7 @@ def gaussian(parameters: Any, hparams: Any, inputs: jax.Array) -> tuple[jax.Arra
 
 
 def log_density(action: jax.Array, mean: jax.Array, deviation: jax.Array) -> jax.Array:
-    """Up to a constant."""
+    """Log density of a Gaussian with independent entries, up to a constant."""
     return -jnp.sum(((action - mean) / deviation) ** 2 / 2 + jnp.log(deviation), -1)
 
 
@@ -62,34 +62,31 @@ def kl_divergence(old: tuple[jax.Array, jax.Array], new: tuple[jax.Array, jax.Ar
 
 
 def values_at(values: Any, hparams: Any, inputs: jax.Array) -> jax.Array:
-    """``float[V, ...]``, before it is scaled."""
+    """Values ``float[V, ...]`` before scaling."""
     network = value_network(hparams, inputs.dtype)
     return jax.vmap(lambda p: jnp.asarray(applied(network, p, inputs))[..., 0])(values)
 
 
 def value_inputs(inputs: jax.Array) -> jax.Array:
-    """``float[T, N, O + 1]``: the time beside the normalised observations."""
+    """``float[T, N, O + 1]``: standardised observations and the time."""
     time = jnp.linspace(-1, 1, inputs.shape[0], dtype=inputs.dtype)
     time = jnp.broadcast_to(time[:, None, None], (*inputs.shape[:2], 1))
     return jnp.concatenate([inputs, time], -1)
 
 
 def inputs_at(inputs: jax.Array, time: jax.Array, horizon: int) -> jax.Array:
-    """``float[N, O + 1]``: inputs beside some times ``int[N]`` of a horizon.
-
-    The last step's is also that of later ones, for which nothing is fitted.
-    """
+    """``float[N, O + 1]``: inputs and times ``int[N]``; times beyond the horizon count as its last step."""
     times = jnp.linspace(-1, 1, horizon, dtype=inputs.dtype)
     return jnp.concatenate([inputs, times[jnp.minimum(time, horizon - 1)][:, None]], -1)
 
 
 def normalized(moments: Moments, hparams: Any, observation: jax.Array) -> jax.Array:
-    """Observations centred and scaled, where that is asked for."""
+    """Standardised observations if ``hparams.normalize``."""
     return standardized(moments, observation) if hparams.normalize else observation
 
 
 def refolded(network: Any, old: Moments, new: Moments) -> Any:
-    """A network's parameters that make of newly scaled inputs what they made of old ones.
+    """Parameters of the same function of observations under new moments.
 
     Without this the policy would change with the moments, outside of any trust region.
     """

@@ -1,4 +1,4 @@
-"""One step in the trust region: its direction, and how far it goes."""
+"""A trust-region step: its direction and the line search."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from jaxltl.algos.trust_region._value_fit import positive
 
 
 class Surrogate(NamedTuple):
-    """What a policy would change, estimated from the trajectories of another one."""
+    """Gains and divergence of a policy, estimated from trajectories of another."""
 
     reward: jax.Array
     cost: jax.Array
@@ -28,7 +28,7 @@ class Surrogate(NamedTuple):
 
 
 def fisher_product(divergence: Callable[[jax.Array], jax.Array], parameters: jax.Array):
-    """``v -> H v``, the Hessian of `divergence` at `parameters`, linearised once."""
+    """``v -> H v`` with H the Hessian of `divergence` at `parameters`, linearised once."""
     return jax.linearize(jax.grad(divergence), parameters)[1]
 
 
@@ -41,19 +41,10 @@ def surrogate(
     valid: jax.Array,
     hparams: Any,
 ) -> tuple[jax.Array, jax.Array]:
-    """Gains ``float[V]`` of a policy over the one that drew the samples, and the mean divergence.
+    """Gains ``float[V]`` over the sampling policy, and the mean divergence.
 
-    ``sum_i (pi(a_i) / old(a_i) - 1) A_i``, and ``mean_i KL(old || pi)``. Differentiable in the
-    parameters.
-
-    Args:
-      parameters: of the policy.
-      old: mean and deviation ``float[B, A]`` of the policy that drew the actions.
-      inputs: ``float[B, O]``, normalised observations.
-      action: ``float[B, A]``.
-      weighted: ``float[V, B]``, advantages times the weights of the samples.
-      valid: ``bool[B]``.
-      hparams: of the networks.
+    ``sum_i (pi(a_i) / old(a_i) - 1) A_i`` and ``mean_i KL(old || pi)``, differentiable in the
+    parameters; `old` has mean and deviation ``float[B, A]``, `weighted` is ``float[V, B]``.
     """
     new = gaussian(parameters, hparams, inputs)
     log_ratio = log_density(action, *new) - log_density(action, *old)
@@ -70,7 +61,7 @@ def direction(
     delta: jax.Array,
     hparams: Any,
 ) -> tuple[jax.Array, Dual]:
-    """The solution of the linear-quadratic problem, in the span of ``H^-1 g`` and ``H^-1 b``."""
+    """The solution of the linear-quadratic problem in the span of ``H^-1 g`` and ``H^-1 b``."""
     damping = jnp.asarray(hparams.damping, flat.dtype)
 
     def damped(v: jax.Array) -> jax.Array:
@@ -107,11 +98,10 @@ def line_search(
     delta: jax.Array,
     hparams: Any,
 ) -> tuple[jax.Array, Surrogate]:
-    """The longest of ever shorter steps that is good, and what it does; zero if there is none.
+    """The longest accepted step of a geometric sequence, and its effect; zero if none is accepted.
 
-    Good is, with the true divergence and the sample's importance weights: a divergence of at
-    most delta; a cost that is below the limit, or falls; and, unless the limit is exceeded now,
-    a higher reward. Comparisons with NaN are false.
+    Accepted are a divergence of at most delta; a cost below the limit, or falling; and, unless the
+    limit is exceeded, a higher reward. Comparisons with NaN are false.
     """
     ratio = jnp.asarray(hparams.backtrack, flat.dtype)
 

@@ -1,4 +1,4 @@
-"""Advantages of finite trajectories, and value networks fitted to what they are estimated from."""
+"""Advantages of finite trajectories, and regression of value networks on their targets."""
 
 from __future__ import annotations
 
@@ -24,28 +24,14 @@ def advantages(
     gae_lambda: chex.Numeric,
     after: chex.Numeric = 0.0,
 ) -> jax.Array:
-    """Generalised advantages (Schulman et al. 2016, equation 16) of finite trajectories::
+    """Generalised advantages (Schulman et al. 2016, equation 16) of finite trajectories.
 
-        A_t = d_t + discount_t lambda A_{t+1},    d_t = r_t + discount_t V_{t+1} - V_t,
+    ``A_t = d_t + discount_t lambda A_{t+1}`` with ``d_t = r_t + discount_t V_{t+1} - V_t``; after the
+    last valid step ``A = 0`` and ``V = after``. Zero where `valid` is false.
 
-    with A = 0 after the last step, and V = `after`.
-
-    Args:
-      signal: ``float[T, ...]``, rewards or costs.
-      value: ``float[T, ...]``, V of the states where they are earned.
-      valid: ``bool[T, ...]``, whether the step was made; true up to the end of a trajectory.
-      discount: in [0, 1]; one number, or ``float[T, ...]`` of what comes after each step.
-      gae_lambda: in [0, 1].
-      after: ``float[...]``, V of what comes after a trajectory that was truncated; zero where
-        nothing does.
-
-    Returns:
-      ``float[T, ...]``, zero where `valid` is false.
-
-    Example:
-      >>> ones, zeros = jnp.ones(3), jnp.zeros(3)
-      >>> advantages(ones, zeros, jnp.array([True, True, False]), 0.5, 1.0).tolist()
-      [1.5, 1.0, 0.0]
+    >>> ones, zeros = jnp.ones(3), jnp.zeros(3)
+    >>> advantages(ones, zeros, jnp.array([True, True, False]), 0.5, 1.0).tolist()
+    [1.5, 1.0, 0.0]
     """
     value = jnp.where(valid, value, 0)
     following = jnp.concatenate([value[1:], jnp.zeros_like(value[:1])])
@@ -64,7 +50,7 @@ def fitted(
     valid: jax.Array,
     hparams: Any,
 ) -> tuple[Any, Any, jax.Array]:
-    """Value networks fitted to targets ``float[V, T, N]`` by least squares, and their scales."""
+    """Value networks after Adam's steps on the squared error to targets ``float[V, T, N]``."""
     mean = jnp.where(valid, target, 0).sum((1, 2)) / jnp.maximum(valid.sum(), 1)
     deviation = jnp.sqrt(weighted_variance(target, valid))
     deviation = jnp.where(deviation > 0, deviation, 1)
@@ -97,12 +83,12 @@ def fitted(
 
 
 def weighted_variance(x: jax.Array, valid: jax.Array) -> jax.Array:
-    """Of ``float[V, T, N]`` over valid entries: ``float[V]``."""
+    """Variance ``float[V]`` of ``float[V, T, N]`` over valid entries."""
     number = jnp.maximum(valid.sum(), 1)
     mean = jnp.where(valid, x, 0).sum((1, 2), keepdims=True) / number
     return jnp.where(valid, (x - mean) ** 2, 0).sum((1, 2)) / number
 
 
 def positive(x: jax.Array) -> jax.Array:
-    """`x`, or 1 where it is zero, to divide by."""
+    """The number, or 1 where it is zero, for a division."""
     return jnp.where(x > 0, x, 1)

@@ -1,0 +1,228 @@
+"""Policies learned by trust-region methods: their distribution, agents and trajectories."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.tree_util import Partial
+
+from jaxltl.algos.trust_region._policy_networks import (
+    gaussian,
+    normalized,
+)
+from jaxltl.core import validation
+from jaxltl.core.environments.environment import (
+    Timestep,
+    flat_observation,
+    require_key,
+)
+from jaxltl.core.environments.episodes import Agent
+from jaxltl.core.pretty_print import brief
+
+from jaxltl.algos.trust_region.problem import Problem, as_action, observed_vector
+from jaxltl.algos.trust_region.state import Hparams, State
+
+
+@brief
+class Batch(NamedTuple):
+    """Trajectories, zero after their end or where excluded.
+
+    Attributes:
+      observation: ``float[T, N, O]``, flattened.
+      action: ``float[T, N, A]``, flattened, before clipping.
+      reward, cost: ``float[T, N]``.
+      discount: ``float[T, N]``, the environment's.
+      valid: ``bool[T, N]``, whether the step was made.
+      finite: ``bool[N]``; other trajectories are excluded and have no valid step.
+      last: ``float[N, O]``, the observation after the last step.
+      truncated: ``bool[N]``, truncated and not terminated.
+    """
+
+    observation: jax.Array
+    action: jax.Array
+    reward: jax.Array
+    cost: jax.Array
+    discount: jax.Array
+    valid: jax.Array
+    finite: jax.Array
+    last: jax.Array
+    truncated: jax.Array
+
+
+def require_run(problem: Problem, hparams: Hparams) -> None:
+    validation.instance("problem", problem, Problem, "one of trust_region.make_problem")
+    validation.instance("hparams", hparams, Hparams, "trust_region.Hparams")
+
+
+def require_state(state: State) -> None:
+    validation.instance("state", state, State, "one of trust_region.init or trust_region.train")
+
+
+def _require_observed(state: State, observation: jax.Array) -> None:
+    """Raises ValueError for observations of another size."""
+    size = state.moments.mean.shape
+    if not hasattr(observation, "dtype") or jnp.shape(observation)[-1:] != size:
+        raise ValueError(
+            f"observation is {validation.shorten(observation)}; the policy was trained on vectors "
+            f"float[..., {size[0]}], as flat_observation makes of an environment's."
+        )
+
+
+def policy(state: State, problem: Problem, hparams: Hparams) -> Agent:
+    """The learned policy as an agent that samples its actions, for ``run_episode``."""
+    return _agent(_sampled_action, state, problem, hparams)
+
+
+def greedy(state: State, problem: Problem, hparams: Hparams) -> Agent:
+    """The learned policy as an agent that takes the mean action.
+
+    Args:
+      state, problem, hparams: of a run.
+
+    Returns:
+      :class:`~jaxltl.core.environments.episodes.Agent`, a pytree.
+    """
+    return _agent(_mean_action, state, problem, hparams)
+
+
+_Run = tuple[State, Problem, Hparams]
+
+
+def _agent(
+    choose: Callable[..., tuple[jax.Array, Any]], state: State, problem: Problem, hparams: Hparams
+) -> Agent:
+    require_run(problem, hparams)
+    require_state(state)
+    return Agent(Partial(choose, (state, problem, hparams)))
+
+
+def _sampled_action(
+    run: _Run, memory: Any, observation: Any, allowed: None, key: chex.PRNGKey
+) -> tuple[jax.Array, Any]:
+    state, problem, hparams = run
+    mean, deviation = act(state, hparams, flat_observation(observation))
+    noise = jax.random.normal(key, mean.shape, mean.dtype)
+    return as_action(problem, mean + deviation * noise), memory
+
+
+def _mean_action(
+    run: _Run, memory: Any, observation: Any, allowed: None, key: chex.PRNGKey
+) -> tuple[jax.Array, Any]:
+    state, problem, hparams = run
+    return as_action(problem, act(state, hparams, flat_observation(observation))[0]), memory
+
+
+def act(state: State, hparams: Hparams, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Mean and standard deviation of the action, both ``float[..., A]``.
+
+    Args:
+      state, hparams: of a run.
+      observation: ``float[..., O]``.
+
+    Returns:
+      Two arrays, in units of the action before clipping; differentiable in the parameters.
+
+    Raises:
+      ValueError: arguments of another learner, or an observation of another size.
+    """
+    validation.instance("hparams", hparams, Hparams, "trust_region.Hparams")
+    require_state(state)
+    _require_observed(state, observation)
+    return gaussian(state.parameters, hparams, normalized(state.moments, hparams, observation))
+
+
+def rollout(
+    key: chex.PRNGKey,
+    state: State,
+    problem: Problem,
+    hparams: Hparams,
+    *,
+    num_trajectories: int,
+    sampled: bool = True,
+) -> Batch:
+    """Trajectories of the policy.
+
+    Args:
+      key: random key.
+      state, problem, hparams: of a run.
+      num_trajectories: N; static.
+      sampled: whether actions are sampled, or the policy's mean is taken; static.
+
+    Returns:
+      :class:`Batch`; sums over its first axis are those of trajectories.
+
+    Raises:
+      ValueError: arguments of another learner, or no positive number of trajectories.
+    """
+    require_run(problem, hparams)
+    require_state(state)
+    number = validation.integer("num_trajectories", num_trajectories, least=1, most=2**31 - 1)
+    return _rollout(
+        require_key(key), state, problem, hparams, number, validation.boolean("sampled", sampled)
+    )
+
+
+@partial(jax.jit, static_argnames=("num_trajectories", "sampled"))
+def _rollout(
+    key: chex.PRNGKey,
+    state: State,
+    problem: Problem,
+    hparams: Hparams,
+    num_trajectories: int,
+    sampled: bool,
+) -> Batch:
+    start, path = jax.random.split(key)
+    worlds = jax.vmap(problem.environment.reset)(jax.random.split(start, num_trajectories))
+
+    def taken(world: Any, action: jax.Array, key: chex.PRNGKey) -> Timestep:
+        return Timestep(*problem.environment.step(world, as_action(problem, action), key))
+
+    def move(carry: Any, key: chex.PRNGKey) -> Any:
+        worlds, active, cut = carry
+        action_key, world_key = jax.random.split(key)
+        observation = jax.vmap(partial(observed_vector, problem))(worlds)
+        mean, deviation = act(state, hparams, observation)
+        action = mean
+        if sampled:
+            action += deviation * jax.random.normal(action_key, mean.shape, mean.dtype)
+        found = jax.vmap(taken)(worlds, action, jax.random.split(world_key, num_trajectories))
+
+        def held(x: jax.Array, y: jax.Array) -> jax.Array:
+            return jnp.where(active.reshape(-1, *[1] * (x.ndim - 1)), x, y)
+
+        row = (observation, action, found.reward, found.cost, found.discount, active)
+        after = jax.tree.map(held, found.world, worlds)
+        cut |= active & found.truncated & ~found.terminated
+        return (after, active & ~(found.terminated | found.truncated), cut), row
+
+    active = jnp.ones(num_trajectories, bool)
+    (worlds, _, truncated), (observation, action, reward, cost, discount, valid) = lax.scan(
+        move, (worlds, active, ~active), jax.random.split(path, problem.horizon)
+    )
+    last, dtype = jax.vmap(partial(observed_vector, problem))(worlds), observation.dtype
+    parts = (observation, action, reward[..., None], cost[..., None], discount[..., None])
+    finite = jnp.array([jnp.all(jnp.all(jnp.isfinite(x), -1) | ~valid, 0) for x in parts]).all(
+        0
+    ) & (jnp.all(jnp.isfinite(last), -1) | ~truncated)
+    valid &= finite
+    truncated &= finite
+    observation, action, reward, cost, discount = (
+        jnp.where(valid[..., None], x, 0).astype(dtype) for x in parts
+    )
+    return Batch(
+        observation,
+        action,
+        reward[..., 0],
+        cost[..., 0],
+        discount[..., 0],
+        valid,
+        finite,
+        jnp.where(truncated[:, None], last, 0),
+        truncated,
+    )

@@ -1,0 +1,140 @@
+"""Hyperparameters, state and metrics of trust-region methods."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import jax
+from flax import struct
+
+from jaxltl.algos.common.settings import COUNT, MAX_INT, Number, static, traced
+from jaxltl.core.validation import Range
+from jaxltl.algos.common.moments import Moments
+from jaxltl.core.pretty_print import brief, history
+from jaxltl.core.types import Status
+
+
+METHODS = ("trpo", "cpo")
+
+
+@brief
+@struct.dataclass
+class Hparams:
+    """Settings; numbers are traced, None is static.
+
+    Attributes:
+      discount: of rewards, in [0, 1]; multiplied by the environment's.
+      cost_discount: of costs; 1 limits the expected sum of a trajectory's costs; default 1.0.
+      gae_lambda: of the advantages of rewards: 1 has no bias, 0 least variance; default 0.97.
+      cost_gae_lambda: of the advantages of costs; near 1 for late costs; default 0.97.
+      delta: bound on the mean divergence of a step; default 0.01.
+      damping: multiple of the identity added to the Fisher matrix; default 1e-3.
+      penalty: TRPO only: maximise ``reward - penalty * cost``; None: the reward; default None.
+      initial_deviation: standard deviation of the first policy; default 1.0.
+      backtrack: factor of the line search; default 0.8.
+      value_rate: Adam's learning rate for the value networks; default 3e-3.
+      method: ``"trpo"`` or ``"cpo"``; static; default ``"cpo"``.
+      num_trajectories: N, sampled in each step; static; default 200.
+      hidden, value_hidden: widths of the tanh layers of the policy and of the value networks;
+        ``()`` is linear; static; default ``(32, 32)``.
+      normalize: whether networks read observations standardised by their moments so far; new moments
+        do not change the policy as a function; static; default True.
+      cg_steps: of the conjugate gradient method; static; default 10.
+      search_steps: maximal number of tries of the line search; static; default 15.
+      fisher_stride: stride of the samples that estimate the Fisher matrix; static; default 1.
+      value_epochs, value_batches: passes over the samples, and minibatches of each; static;
+        default 5 and 8.
+    """
+
+    discount: Number = traced(Range(0, 1))
+    cost_discount: Number = traced(Range(0, 1), default=1.0)
+    gae_lambda: Number = traced(Range(0, 1), default=0.97)
+    cost_gae_lambda: Number = traced(Range(0, 1), default=0.97)
+    delta: Number = traced(Range(0, open_above=True), default=0.01)
+    damping: Number = traced(Range(0, open_above=True), default=1e-3)
+    penalty: Number | None = traced(Range(open_below=True, open_above=True), default=None)
+    initial_deviation: Number = traced(Range(0, open_above=True), default=1.0)
+    backtrack: Number = traced(Range(0, 1), default=0.8)
+    value_rate: Number = traced(Range(0, open_above=True), default=3e-3)
+    method: str = static(METHODS, default="cpo")
+    num_trajectories: int = static(COUNT, default=200)
+    hidden: tuple[int, ...] = static(COUNT, default=(32, 32))
+    value_hidden: tuple[int, ...] = static(COUNT, default=(32, 32))
+    normalize: bool = static(bool, default=True)
+    cg_steps: int = static(COUNT, default=10)
+    search_steps: int = static(COUNT, default=15)
+    fisher_stride: int = static(COUNT, default=1)
+    value_epochs: int = static(Range(0, MAX_INT, integer=True), default=5)
+    value_batches: int = static(COUNT, default=8)
+
+
+@brief
+@struct.dataclass
+class State:
+    """A policy, value networks and moments of observations.
+
+    Attributes:
+      key: random key of the run.
+      step: ``int32[]``, number of steps.
+      parameters: of the policy: ``{"mean": network, "log_deviation": float[A]}``.
+      values: parameters of the value networks with a leading axis [V]: of rewards, and with CPO of
+        costs. They also read the time, on which sums over a finite horizon depend.
+      value_moments: ``float[2, V]``, mean and deviation that scale their output.
+      optimizer: of `values`.
+      moments: of the observations.
+      trajectories: ``int32[]``, sampled so far; saturates at 2^31 - 1.
+    """
+
+    key: jax.Array
+    step: jax.Array
+    parameters: Any
+    values: Any
+    value_moments: jax.Array
+    optimizer: Any
+    moments: Moments
+    trajectories: jax.Array
+
+
+@brief(facts=partial(history, codes={"status": Status}))
+@struct.dataclass
+class Metrics:
+    """Figures of a step; scalars unless a shape is given. Means are those of the policy before the step,
+    over its finite trajectories.
+
+    Attributes:
+      trajectories: sampled so far.
+      reward: mean undiscounted sum of a trajectory's rewards.
+      cost: mean sum of its costs, discounted by `cost_discount`.
+      cost_error: standard error of `cost`.
+      length: mean number of steps.
+      deviation: geometric mean of the actions' standard deviations.
+      kl: mean divergence of the step.
+      reward_gain, cost_gain: of the step, estimated by importance weights; the reward gain in the
+        discounted advantage that is maximised.
+      scale: factor of the line search; 0 if no step was accepted.
+      case: a code of :class:`Case`.
+      trust_multiplier, cost_multiplier: lambda and nu, the dual variables.
+      unexplained: ``float[V]``, share of the variance of the values' targets that the networks did
+        not explain.
+      nonfinite: trajectories with a number that is not finite; no other figure includes them.
+      status: COMPLETED; MAX_STEPS if no step was accepted; NONFINITE if `nonfinite` is positive or the
+        step was not finite (the policy then stays unchanged).
+    """
+
+    trajectories: jax.Array
+    reward: jax.Array
+    cost: jax.Array
+    cost_error: jax.Array
+    length: jax.Array
+    deviation: jax.Array
+    kl: jax.Array
+    reward_gain: jax.Array
+    cost_gain: jax.Array
+    scale: jax.Array
+    case: jax.Array
+    trust_multiplier: jax.Array
+    cost_multiplier: jax.Array
+    unexplained: jax.Array
+    nonfinite: jax.Array
+    status: jax.Array
