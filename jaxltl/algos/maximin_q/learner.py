@@ -237,7 +237,8 @@ init, step, run, train, run_until, train_until = learner.bind(_init, _step)
 def measure(state: State, problem: Problem, hparams: Hparams) -> Metrics:
     """The :class:`Metrics` of a `state`."""
     dtype = problem.game.dtype
-    error, finite = jnp.asarray(jnp.nan, dtype), jnp.all(jnp.isfinite(state.value))
+    error, known = jnp.asarray(jnp.nan, dtype), state.visits > 0  # entries of others are infinite
+    finite = jnp.all(jnp.isfinite(state.value)) & jnp.all(jnp.isfinite(state.q) | ~known)
     if problem.exact is not None:
         error = jnp.max(jnp.where(problem.measured, jnp.abs(state.value - problem.exact), 0))
     return Metrics(
