@@ -1,4 +1,4 @@
-"""Which samples of a population count, and how much (algorithm 2, steps 7 to 10)."""
+"""Elites of a population and their weights (algorithm 2, steps 7 to 10)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from jaxltl.core.pretty_print import brief
 @brief
 @struct.dataclass
 class Sample:
-    """One evaluated policy: ``float[D]``, its objective, costs ``float[C]``, and its excess.
+    """An evaluated policy: ``float[D]``, its objective, costs ``float[C]``, and its excess.
 
     `excess` is ``max_c (cost_c - limit_c) / scale_c``; `found` whether there is such a policy.
     """
@@ -31,7 +31,7 @@ class Sample:
 @brief
 @struct.dataclass
 class Pool:
-    """Evaluated policies: ``float[n, D]``, ``float[n]``, ``float[n, C]`` and which count."""
+    """Evaluated policies: ``float[n, D]``, ``float[n]``, ``float[n, C]``, and which of them are `active`."""
 
     parameters: jax.Array
     objective: jax.Array
@@ -52,11 +52,11 @@ def num_elites(rho: float, num_samples: int) -> int:
 @brief
 @struct.dataclass
 class Elites:
-    """Who was chosen among n samples.
+    """The elites among n samples.
 
     Attributes:
-      index: ``int32[num]``, the chosen ones, best first.
-      taken: ``bool[num]``, which of these count: the first k_l, if they can be used.
+      index: ``int32[num]``, best first.
+      taken: ``bool[num]``, which of these count: the first k_l, if usable.
       enough_feasible: whether at least k_l are feasible, so that the objective decided.
       feasible, usable: ``bool[n]``.
       excess: ``float[n]``, the largest normalised violation.
@@ -80,22 +80,11 @@ def select(
     scale: jax.Array | float = 1.0,
     active: jax.Array | bool = True,
 ) -> Elites:
-    """The elites of algorithm 2, steps 7 to 10.
+    """The k feasible samples with the highest objective, or if there are fewer, with the least excess.
 
-    With at least k feasible samples the k of them with the highest objective; else the k with
-    the least ``max_c (cost_c - limit_c) / scale_c``, feasible or not. Of equals the earlier
-    sample is taken, so that there are always k, where the indicator of (4.4) takes all equals;
-    the two agree if there are none. A sample with an objective that is NaN or plus infinity,
-    or a cost that is NaN, comes last and is never taken.
-
-    Args:
-      objective: ``float[n]``.
-      cost: ``float[n, C]``.
-      limit: ``float[C]``.
-      num: how many are returned; static.
-      count: k_l, at most `num`; default `num`.
-      scale: ``float[C]`` or a number.
-      active: ``bool[n]``, which samples exist.
+    Ties go to the earlier sample, so that there are always k, where the indicator of (4.4) takes all
+    of them. Samples with an objective NaN or plus infinity, or a cost NaN, are last and never taken.
+    `num` is the static number of indices returned and `count` is k_l, at most `num`.
 
     Example:
       >>> cost = jnp.array([[0.0], [2.0], [1.0], [0.0]])
@@ -128,13 +117,7 @@ def elite_weights(
     weighting: str = "until_feasible",
     temperature: jax.Array | float = 1.0,
 ) -> jax.Array:
-    """Weights of the elites, which sum to 1 (to 0 if none is taken).
-
-    Args:
-      objective: ``float[k]``, the elites'.
-      taken: ``bool[k]``.
-      enough_feasible: as :func:`select` tells.
-      weighting, temperature: see :class:`Hparams`.
+    """Weights of the elites, with sum 1, or 0 if none is taken; see :class:`Hparams`.
 
     Example:
       >>> half = jnp.log(jnp.array([3.0, 1.0]))
@@ -152,7 +135,7 @@ def elite_weights(
 
 
 def rows_of(pool: Pool, index: jax.Array) -> Pool:
-    """The policies of an index; read as columns, for populations are computed that way round."""
+    """The policies of an index, gathered as columns, the memory order of populations."""
     return jax.tree.map(lambda x: x.T.at[..., index].get(mode="promise_in_bounds").T, pool)
 
 
@@ -164,7 +147,7 @@ def better(
     score: jax.Array,
     record: jax.Array,
 ) -> Sample:
-    """The old sample, or that of the highest score if it beats the record."""
+    """The old sample, or the one with the highest score if that exceeds the record."""
     i = jnp.argmax(jnp.where(among, score, -jnp.inf))
     one = rows_of(fresh, i)
     new = Sample(one.parameters, one.objective, one.cost, excess[i], among[i])

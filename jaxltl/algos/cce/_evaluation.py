@@ -1,4 +1,4 @@
-"""What is asked of a policy in a search: one objective and the costs, for all of a population."""
+"""Evaluation of a population: objectives and costs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from jaxltl.core.types import require_shape
 
 
 def per_cost(name: str, value: Any, num_costs: int) -> np.ndarray:
-    """One number for each cost, of one for all or of as many."""
+    """One number for each cost, broadcast from a scalar."""
     value = validation.float_array(name, value)
     if value.ndim:
         require_shape(name, value, (num_costs,))
@@ -24,7 +24,7 @@ def per_cost(name: str, value: Any, num_costs: int) -> np.ndarray:
 
 
 def split(value: Any) -> tuple[jax.Array, jax.Array]:
-    """The objective and ``[C]`` costs in whatever evaluate returned."""
+    """The objective and costs ``[C]`` in the result of ``evaluate``."""
     if isinstance(value, tuple | list):
         if len(value) != 2:
             raise ValueError(
@@ -59,7 +59,7 @@ def evaluate_all(
 
 
 def scores(problem: Any, parameters: jax.Array, key: chex.PRNGKey) -> tuple[jax.Array, jax.Array]:
-    """Objective and costs ``[C]`` of one rollout under some parameters."""
+    """Objective and costs ``[C]`` of one evaluation."""
     objective, cost = split(problem.evaluate(parameters, key))
     require_shape("the cost that evaluate returned", cost, problem.limit.shape)
     return objective.astype(parameters.dtype), cost.astype(parameters.dtype)

@@ -1,22 +1,22 @@
-"""Natural exponential families, as the cross-entropy method needs them.
+"""Natural exponential families for the cross-entropy method.
 
-A family is a frozen dataclass of ordinary parameters (a mean and a standard deviation, say).
-Densities are ``f_v(x) = exp(v . Gamma(x) - K(v))`` (dissertation, definition 2), and the *mean
-parameter* is ``m(v) = E_v[Gamma(x)] = grad K(v)``. The functions are open
-(``functools.singledispatch``): a family of one's own needs ``sufficient_statistics``,
-``mean_parameter``, ``from_mean_parameter``, ``log_density``, ``sample``, ``project``,
-``center`` and ``standard_deviation``; ``sample_antithetic``, ``widen`` and ``at_least`` are asked
-for by options only.
+A family is a frozen dataclass of ordinary parameters (such as mean and standard deviation) with
+density ``f_v(x) = exp(v . Gamma(x) - K(v))`` (dissertation, definition 2) and *mean parameter*
+``m(v) = E_v[Gamma(x)] = grad K(v)``. The functions dispatch on the type
+(``functools.singledispatch``): a new family registers ``sufficient_statistics``,
+``mean_parameter``, ``from_mean_parameter``, ``log_density``, ``sample``, ``project``, ``center`` and
+``standard_deviation``; options of the method need ``sample_antithetic``, ``widen``, ``at_least``.
 
-``project`` moves the mean parameter without ever forming it. As ``E x^2 - (E x)^2`` the variance
-of a Gaussian with mean 3 and standard deviation 1e-3 comes out negative in single precision;
-here every variance is a sum of squares.
+``project`` moves the mean parameter without forming it. As ``E x^2 - (E x)^2`` the variance of a
+Gaussian with mean 3 and standard deviation 1e-3 is negative in single precision; here every
+variance is a sum of squares.
 
 Example:
+
   >>> import jax, jax.numpy as jnp
   >>> from jaxltl.algos.cce import exponential_family as families
   >>> start = families.diagonal_gaussian(jnp.zeros(2), 1.0)
-  >>> def moved(key):  # halfway to eight draws of its own
+  >>> def moved(key):  # halfway to eight of its samples
   ...     samples = families.sample(start, key, 8)
   ...     family = families.project(start, samples, jnp.ones(8), rate=0.5)
   ...     return family, families.log_density(family, samples)
@@ -51,6 +51,7 @@ from flax import struct
 from jax import lax
 from jax.scipy.special import digamma, gammaln
 
+from jaxltl.algos.cce._gamma_shape import convex_part, log_digamma_gap, shape_of_gap
 from jaxltl.algos.common import splitmix
 from jaxltl.core.pretty_print import brief
 
@@ -76,8 +77,8 @@ class FullGaussian:
 
     Attributes:
       mean: ``float[D]``.
-      factor: ``float[D, D]``, lower triangular, the covariance being ``factor @ factor.T``.
-        Kept instead of the covariance, which rounding could make indefinite.
+      factor: ``float[D, D]``, lower triangular with covariance ``factor @ factor.T``, which rounding
+        cannot make indefinite.
     """
 
     mean: jax.Array
@@ -102,7 +103,7 @@ Family = DiagonalGaussian | FullGaussian | Gamma
 
 
 def diagonal_gaussian(mean: chex.Array, std: chex.Array | float) -> DiagonalGaussian:
-    """A :class:`DiagonalGaussian` from ``float[D]`` and a standard deviation (or one for each).
+    """A :class:`DiagonalGaussian` with a mean and standard deviations.
 
     Args:
       mean: ``float[D]``.
@@ -112,7 +113,7 @@ def diagonal_gaussian(mean: chex.Array, std: chex.Array | float) -> DiagonalGaus
       :class:`DiagonalGaussian`.
 
     Raises:
-      ValueError: `mean` is no vector, `std` does not fit it, or is not positive.
+      ValueError: `mean` is not a vector, `std` does not fit it, or is not positive.
 
     Example:
       >>> diagonal_gaussian([0.0, 1.0], 0.5).variance.tolist()
@@ -125,7 +126,7 @@ def diagonal_gaussian(mean: chex.Array, std: chex.Array | float) -> DiagonalGaus
 
 
 def full_gaussian(mean: chex.Array, covariance: chex.Array) -> FullGaussian:
-    """A :class:`FullGaussian` from ``float[D]`` and a positive definite ``float[D, D]``.
+    """A :class:`FullGaussian` with a mean and a positive definite covariance.
 
     Args:
       mean: ``float[D]``.
@@ -153,7 +154,7 @@ def full_gaussian(mean: chex.Array, covariance: chex.Array) -> FullGaussian:
 
 
 def gamma(shape: chex.Array, rate: chex.Array | float) -> Gamma:
-    """A :class:`Gamma` from shapes ``float[D]`` and rates (or one for all).
+    """A :class:`Gamma` with shapes and rates.
 
     Args:
       shape: positive, ``float[D]``.
@@ -207,52 +208,35 @@ def _require_positive(name: str, x: jax.Array) -> None:
 
 @singledispatch
 def sufficient_statistics(family: Any, samples: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """``Gamma(x)`` of each sample, as a pair of arrays.
+    """``Gamma(x)`` of samples ``float[..., D]`` of a `family`, a pair of arrays.
 
-    Args:
-      family: says which; its values are not used.
-      samples: ``float[..., D]``.
-
-    Returns:
-      Two arrays, the second ``float[..., D, D]`` for a full Gaussian, else ``float[..., D]``.
+    The second is ``float[..., D, D]`` for a full Gaussian, else ``float[..., D]``. Here and below a type
+    that is not registered raises TypeError; differentiable in `samples`.
 
     Raises:
-      TypeError: there is no such family.
+      TypeError: the family is not registered.
     """
     raise TypeError(_unknown(family))
 
 
 @singledispatch
 def mean_parameter(family: Any) -> tuple[jax.Array, jax.Array]:
-    """``m(v) = E_v[Gamma(x)]``, the mean of :func:`sufficient_statistics`.
-
-    Args:
-      family: any member.
-
-    Returns:
-      Two arrays, as :func:`sufficient_statistics` has them for one sample; differentiable.
+    """``m(v) = E_v[Gamma(x)]`` of a `family`, a pair of arrays; differentiable in its parameters.
 
     Raises:
-      TypeError: there is no such family.
+      TypeError: the family is not registered.
     """
     raise TypeError(_unknown(family))
 
 
 @singledispatch
 def from_mean_parameter(family: Any, eta: tuple[jax.Array, jax.Array]) -> Any:
-    """The member with a given mean parameter, ``m^{-1}(eta)``.
+    """The member of the type of `family` with mean parameter `eta`, ``m^{-1}(eta)``.
 
-    For checks and starts: variances are differences here, so use :func:`project` to move.
-
-    Args:
-      family: says which; its values are not used.
-      eta: as :func:`mean_parameter` returns.
-
-    Returns:
-      A member of the same family.
+    Variances are differences here; :func:`project` moves a family without cancellation.
 
     Raises:
-      TypeError: there is no such family.
+      TypeError: the family is not registered.
 
     Example:
       >>> start = diagonal_gaussian([1.0, 2.0], 0.5)
@@ -264,50 +248,29 @@ def from_mean_parameter(family: Any, eta: tuple[jax.Array, jax.Array]) -> Any:
 
 @singledispatch
 def log_density(family: Any, samples: jax.Array) -> jax.Array:
-    """``log f_v(x)``: ``float[...]`` from ``float[..., D]``. Differentiable in both.
+    """``log f_v(x)`` in nats, ``float[...]`` of `samples` ``float[..., D]``; differentiable in both.
 
-    Args:
-      family: any member.
-      samples: ``float[..., D]``.
-
-    Returns:
-      ``float[...]``, in nats.
+    Here v is the natural parameter of `family`.
 
     Raises:
-      TypeError: there is no such family.
+      TypeError: the family is not registered.
     """
     raise TypeError(_unknown(family))
 
 
 @singledispatch
 def sample(family: Any, key: chex.PRNGKey, num_samples: int) -> jax.Array:
-    """Independent draws, ``float[num_samples, D]``; `num_samples` is static.
-
-    Args:
-      family: any member.
-      key: a PRNG key.
-      num_samples: n; static.
-
-    Returns:
-      ``float[n, D]``.
+    """``float[num_samples, D]``, independent samples of a `family` by a `key`; `num_samples` is static.
 
     Raises:
-      TypeError: there is no such family.
+      TypeError: the family is not registered.
     """
     raise TypeError(_unknown(family))
 
 
 @singledispatch
 def sample_antithetic(family: Any, key: chex.PRNGKey, num_samples: int) -> jax.Array:
-    """Draws of which samples 2 i and 2 i + 1 mirror each other about the mean, ``[n, D]``.
-
-    Args:
-      family: any symmetric member.
-      key: a PRNG key.
-      num_samples: n; static.
-
-    Returns:
-      ``float[n, D]``.
+    """``float[num_samples, D]``: samples 2 i and 2 i + 1 of `family` by `key` are mirrored at the mean.
 
     Raises:
       ValueError: the family is not symmetric.
@@ -317,24 +280,22 @@ def sample_antithetic(family: Any, key: chex.PRNGKey, num_samples: int) -> jax.A
 
 @singledispatch
 def project(family: Any, samples: jax.Array, weights: jax.Array, rate: jax.Array | float) -> Any:
-    """The mean parameter moved towards that of weighted samples (dissertation, (4.11))::
+    """The family with its mean parameter moved to that of weighted samples (dissertation, (4.11)).
 
-        m(v') = rate * sum_i w_i Gamma(x_i) / sum_i w_i + (1 - rate) * m(v),
-
-    which is the member closest, by the cross entropy, to the mixture of the weighted samples and
-    ``f_v``. In centred form: variances are sums of squares, never differences.
+    ``m(v') = rate * sum_i w_i Gamma(x_i) / sum_i w_i + (1 - rate) * m(v)`` gives the member closest in
+    cross entropy to the mixture of the weighted samples and ``f_v``. Variances are sums of squares.
 
     Args:
       family: ``f_v``.
       samples: ``float[n, D]``.
       weights: ``float[n]``, not negative, of positive sum.
-      rate: in [0, 1]. At 0 the family stays as it is, bit for bit but for a full Gaussian.
+      rate: in [0, 1]; at 0 the family is unchanged, bit for bit except for a full Gaussian.
 
     Returns:
       ``f_v'``.
 
     Raises:
-      TypeError: there is no such family.
+      TypeError: the family is not registered.
 
     Example:
       >>> start = diagonal_gaussian([0.0], 1.0)
@@ -347,66 +308,40 @@ def project(family: Any, samples: jax.Array, weights: jax.Array, rate: jax.Array
 
 @singledispatch
 def center(family: Any) -> jax.Array:
-    """``E_v[x]``, ``float[D]``.
-
-    Args:
-      family: any member.
-
-    Returns:
-      ``float[D]``.
+    """``E_v[x]``, ``float[D]``, of a `family`.
 
     Raises:
-      TypeError: there is no such family.
+      TypeError: the family is not registered.
     """
     raise TypeError(_unknown(family))
 
 
 @singledispatch
 def standard_deviation(family: Any) -> jax.Array:
-    """Of each entry, ``float[D]``.
-
-    Args:
-      family: any member.
-
-    Returns:
-      ``float[D]``.
+    """``float[D]``, standard deviations of the entries under a `family`.
 
     Raises:
-      TypeError: there is no such family.
+      TypeError: the family is not registered.
     """
     raise TypeError(_unknown(family))
 
 
 @singledispatch
 def widen(family: Any, variance: jax.Array | float) -> Any:
-    """The same mean, and `variance` (a number or ``float[D]``) added to that of each entry.
-
-    Args:
-      family: any member.
-      variance: ``float[D]`` or one for all entries, at least 0.
-
-    Returns:
-      A member of the same family.
+    """A `family` with the same mean and a `variance` (a number or ``float[D]``) added to that of entries.
 
     Raises:
-      TypeError: there is no such family.
+      TypeError: the family is not registered.
     """
     raise TypeError(_unknown(family))
 
 
 @singledispatch
 def at_least(family: Any, variance: jax.Array | float) -> Any:
-    """The same mean, and a variance of at least a number, in every direction.
-
-    Args:
-      family: any member.
-      variance: a number of at least 0.
-
-    Returns:
-      A member of the same family.
+    """A `family` with the same mean and at least a `variance` in every direction.
 
     Raises:
-      TypeError: there is no such family.
+      TypeError: the family is not registered.
     """
     raise TypeError(_unknown(family))
 
@@ -419,10 +354,10 @@ def _unknown(family: Any) -> str:
 
 
 def _normal(key: chex.PRNGKey, num_samples: int, like: jax.Array) -> jax.Array:
-    """Standard normal numbers, ``float[num_samples, D]``.
+    """Standard normal numbers ``float[num_samples, D]``.
 
-    Only D streams are drawn from the key: a keyed hash of each number would cost more than small
-    policies cost to evaluate.
+    Only D streams are drawn from the key: one keyed hash for each number would cost more than the
+    evaluation of small policies.
     """
     stream = splitmix.streams(key, (*like.shape, 1))
     word = splitmix.words(stream, jnp.arange(num_samples, dtype=jnp.uint32))
@@ -550,7 +485,7 @@ def _(
 
 
 def _factor(rows: jax.Array) -> jax.Array:
-    """The lower factor of ``rows.T @ rows``, with a diagonal that is not negative."""
+    """The lower factor of ``rows.T @ rows`` with a nonnegative diagonal."""
     upper = jnp.linalg.qr(rows, mode="r")
     return (jnp.where(jnp.diagonal(upper) < 0, -1, 1)[:, None] * upper).T
 
@@ -603,7 +538,7 @@ def _(family: Gamma) -> tuple[jax.Array, jax.Array]:
 
 @from_mean_parameter.register
 def _(family: Gamma, eta: tuple[jax.Array, jax.Array]) -> Gamma:
-    shape = _shape_of_gap(jnp.log(eta[0]) - eta[1])
+    shape = shape_of_gap(jnp.log(eta[0]) - eta[1])
     return Gamma(shape, shape / eta[0])
 
 
@@ -629,58 +564,11 @@ def _(family: Gamma, samples: jax.Array, weights: jax.Array, rate: jax.Array | f
     mean = old + rate * (weights @ (samples - old))
     # log E x - E log x of the mixture. The linear terms, which sum to zero, are taken out of
     # the logarithms, so that only numbers that are not negative are added.
-    own = weights @ _convex_part((samples - mean) / mean)
-    rest = _gap(family.shape) + _convex_part((old - mean) / mean)
-    shape = _shape_of_gap(rate * own + (1 - rate) * rest)
+    own = weights @ convex_part((samples - mean) / mean)
+    rest = log_digamma_gap(family.shape) + convex_part((old - mean) / mean)
+    shape = shape_of_gap(rate * own + (1 - rate) * rest)
     shape = jnp.where(rate > 0, shape, family.shape)
     return Gamma(shape, jnp.where(rate > 0, shape / mean, family.rate))
-
-
-def _convex_part(z: jax.Array) -> jax.Array:
-    """``z - log(1 + z)``, accurate near zero, for z > -1."""
-    small = jnp.abs(z) < 0.05
-    safe = jnp.where(small, z, 0)
-    series = jnp.zeros_like(z)
-    for n in range(13, 1, -1):
-        series = (-1) ** n / n + safe * series
-    least = -1 + jnp.finfo(z.dtype).epsneg
-    return jnp.where(small, safe * safe * series, z - jnp.log1p(jnp.maximum(z, least)))
-
-
-# Coefficients of 1/k^2, 1/k^4, ... in the asymptotic series of log k - digamma(k) - 1/(2k).
-_SERIES = (1 / 12, -1 / 120, 1 / 252, -1 / 240, 1 / 132, -691 / 32760, 1 / 12)
-
-
-def _gap(shape: jax.Array) -> jax.Array:
-    """``log k - digamma(k)``, positive and decreasing; as a difference it would cancel."""
-    bound = 4.0 if jnp.finfo(shape.dtype).bits < 64 else 10.0  # the series is exact above
-    large = shape > bound
-    inverse = 1 / jnp.where(large, shape, bound)
-    square = jnp.square(inverse)
-    series = jnp.zeros_like(shape)
-    for c in reversed(_SERIES):
-        series = square * (c + series)
-    small = jnp.where(large, bound, shape)
-    return jnp.where(large, inverse / 2 + series, jnp.log(small) - digamma(small))
-
-
-def _shape_of_gap(gap: jax.Array) -> jax.Array:
-    """The shape k with ``log k - digamma(k) = gap``, by Newton's method on logarithms.
-
-    ``log gap`` is nearly linear in ``log k``, of slope -1 at both ends, so that a few steps
-    from Minka's (2002) approximation suffice everywhere.
-    """
-    gap = jnp.maximum(gap, jnp.finfo(gap.dtype).tiny * 16)
-    start = (3 - gap + jnp.sqrt(jnp.square(gap - 3) + 24 * gap)) / (12 * gap)
-
-    def newton(_: Any, log_shape: jax.Array) -> jax.Array:
-        def log_gap(x: jax.Array) -> jax.Array:
-            return jnp.log(_gap(jnp.exp(x)))
-
-        value, slope = jax.jvp(log_gap, (log_shape,), (jnp.ones_like(log_shape),))
-        return log_shape - (value - jnp.log(gap)) / slope
-
-    return jnp.exp(lax.fori_loop(0, 5, newton, jnp.log(start)))
 
 
 @center.register

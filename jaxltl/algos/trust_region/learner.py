@@ -41,8 +41,12 @@ compiles for seconds, so only shapes are shown.)
   ((), (2,))
   >>> mean, deviation = jax.eval_shape(
   ...     lambda state: trust_region.act(state, hparams, jnp.zeros(2)), state)
-  >>> mean.shape, deviation.shape
+  >>> mean.shape, deviation.shape  # trust_region.policy samples; trust_region.greedy is the mean
   ((2,), (2,))
+  >>> batch = jax.eval_shape(lambda state: trust_region.rollout(
+  ...     jax.random.key(1), state, problem, hparams, num_trajectories=3), state)
+  >>> batch.reward.shape  # a trust_region.Batch
+  (4, 3)
 """
 
 from __future__ import annotations

@@ -56,11 +56,13 @@ class Batch(NamedTuple):
 
 
 def require_run(problem: Problem, hparams: Hparams) -> None:
+    """Raises ValueError for a problem or hyperparameters of another learner."""
     validation.instance("problem", problem, Problem, "one of trust_region.make_problem")
     validation.instance("hparams", hparams, Hparams, "trust_region.Hparams")
 
 
 def require_state(state: State) -> None:
+    """Raises ValueError for a state of another learner."""
     validation.instance("state", state, State, "one of trust_region.init or trust_region.train")
 
 
