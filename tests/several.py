@@ -120,7 +120,7 @@ def problem_and_state() -> tuple[Any, Any, Any]:
 
 def run(directory: Path, place: Any) -> None:
     """Steps of the lanes, saved after every 50, and what comes out, printed by the first."""
-    from jaxltl.algos.common.chunks import run_in_chunks
+    from jaxltl.algos.common.chunks import Options, run_in_chunks
     from jaxltl.core.models.mesh.lanes import on_host
 
     step, states, goal = problem_and_state()
@@ -134,10 +134,12 @@ def run(directory: Path, place: Any) -> None:
         0.01,
         num_steps=STEPS,
         lanes=True,
-        chunk=50,
-        checkpoint=path,
-        mesh=place.mesh,
-        report=lambda done, _: made.append(done),
+        options=Options(
+            chunk=50,
+            checkpoint=path,
+            mesh=place.mesh,
+            report=lambda done, _: made.append(done),
+        ),
     )
     state = on_host(found.state)
     if place.is_first:

@@ -19,7 +19,7 @@ import numpy as np
 
 import jaxltl
 from jaxltl.algos.common.checkpoint import atomic_write
-from jaxltl.algos.common.chunks import Chunks, run_in_chunks, trace_lanes
+from jaxltl.algos.common.chunks import Chunks, Options, run_in_chunks, trace_lanes
 from jaxltl.app.protocols import LearningTask, Training
 from jaxltl.app.reports.drawing import Picture, drawing
 from jaxltl.core.automata.automaton import Automaton
@@ -36,11 +36,18 @@ def settings(kind: Callable[..., Hparams], given: Mapping[str, Any]) -> Hparams:
 
 
 def run_seeds(
-    algorithm: Any, problem: Any, hparams: Any, training: Training, **options: Any
+    algorithm: Any,
+    problem: Any,
+    hparams: Any,
+    training: Training,
+    *,
+    chunk: int | None = None,
+    **options: Any,
 ) -> tuple[Chunks, dict[str, np.ndarray]]:
     """Runs a learner from N seeds in parallel; returns its chunks and metrics ``[T, N]`` by name.
 
-    `options` are those of :func:`~jaxltl.algos.common.chunks.run_in_chunks`.
+    `chunk` is the number of steps between reports; `options` are other keywords of
+    :func:`~jaxltl.algos.common.chunks.run_in_chunks`.
     """
     mesh = training.mesh if training.num_seeds > 1 else None
     first = (algorithm.init, training.seed, training.num_seeds, problem, hparams)
@@ -59,9 +66,12 @@ def run_seeds(
         problem,
         hparams,
         lanes=True,
-        report=report and (lambda step, metrics: report(step, vars(metrics))),
-        checkpoint=training.checkpoint,
-        mesh=mesh,
+        options=Options(
+            chunk=chunk,
+            report=report and (lambda step, metrics: report(step, vars(metrics))),
+            checkpoint=training.checkpoint,
+            mesh=mesh,
+        ),
         **options,
     )
     if mesh is not None:  # later work is done in each process

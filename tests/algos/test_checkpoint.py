@@ -11,7 +11,7 @@ import pytest
 
 from jaxltl.algos import behavioral_cloning
 from jaxltl.algos.common import checkpoint
-from jaxltl.algos.common.chunks import run_in_chunks
+from jaxltl.algos.common.chunks import Options, run_in_chunks
 from tests.algos.test_learner import assert_bitwise, start, toy_init, toy_step
 
 
@@ -68,7 +68,9 @@ def test_states_of_another_run_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"does not belong to this run: .* is missing"):
         checkpoint.load(path, start("cce"))
     with pytest.raises(ValueError, match="Delete the file to start afresh"):
-        run_in_chunks(toy_step, start("toy"), jnp.zeros(3), 0.1, num_steps=3, checkpoint=path)
+        run_in_chunks(
+            toy_step, start("toy"), jnp.zeros(3), 0.1, num_steps=3, options=Options(checkpoint=path)
+        )
 
 
 def test_a_state_of_another_problem_is_refused(tmp_path):

@@ -35,7 +35,7 @@ from jaxltl.algos import (
 )
 from jaxltl.algos.cce.exponential_family import diagonal_gaussian
 from jaxltl.algos.common import checkpoint, learner, loops
-from jaxltl.algos.common.chunks import run_in_chunks
+from jaxltl.algos.common.chunks import Options, run_in_chunks
 from jaxltl.core.environments.environment import Timestep, make_box, make_environment
 from jaxltl.core.models.game import make_game
 from jaxltl.core.models.mdp import MDP
@@ -738,8 +738,7 @@ def test_a_run_in_chunks_is_the_run():
         problem,
         hparams,
         num_steps=10,
-        chunk=4,
-        report=lambda done, row: reports.append((done, int(row.at))),
+        options=Options(chunk=4, report=lambda done, row: reports.append((done, int(row.at)))),
     )
     whole, metrics = module.run(start("toy"), problem, hparams, num_steps=10)
     assert_bitwise(found.state, whole)
@@ -754,7 +753,9 @@ def test_runs_side_by_side_in_chunks():
     """Each with its own number and its own end."""
     module, problem, _, _ = case("toy")
     given = np.array([0.1, 0.2, 0.3])
-    chunks = partial(run_in_chunks, module.step, problem=problem, num_steps=9, chunk=4)
+    chunks = partial(
+        run_in_chunks, module.step, problem=problem, num_steps=9, options=Options(chunk=4)
+    )
     found = chunks(
         starts("toy"),
         hparams=given,
@@ -788,7 +789,11 @@ def test_an_interrupted_run_resumes_and_ends_bitwise_equal(name, tmp_path):
         seen.append(done)
         raise KeyboardInterrupt
 
-    run = partial(run_in_chunks, module.step, problem=problem, num_steps=6, chunk=3)
+    def run(state, hparams, problem=problem, **options):
+        return run_in_chunks(
+            module.step, state, problem, hparams, num_steps=6, options=Options(chunk=3, **options)
+        )
+
     with pytest.raises(KeyboardInterrupt):
         run(state=start(name), hparams=hparams, report=interrupt, checkpoint=path)
     found = run(

@@ -1,8 +1,8 @@
-"""Arrays that lie on the devices of several processes, as files: each process writes its own part.
+"""Arrays distributed over the devices of several processes, as files with one part for each process.
 
-A part has a name of its own each time that it is written. The file that tells which parts there
-are comes last, by one process, when all have written theirs; until then the parts before stay. So
-whenever a process dies, that file and what it names are whole.
+A part has a new name each time it is written. One process writes the file that names the parts last,
+when all processes have written theirs, and the previous parts stay until then. So whenever a process
+dies, that file and the parts that it names are complete.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def is_shared(x: Any) -> bool:
 
 
 def is_apart(x: Any) -> bool:
-    """Whether it does, and not all of it on those of each."""
+    """Whether an array lies on the devices of several processes and is not replicated."""
     return is_shared(x) and not x.is_fully_replicated
 
 

@@ -1,4 +1,4 @@
-"""Runs of lanes over the devices of a mesh, with what a program has to know of them on the host."""
+"""Runs of lanes over the devices of a mesh, with metrics on the host."""
 
 from __future__ import annotations
 
@@ -16,16 +16,10 @@ Run = Callable[..., tuple[Any, Any]]
 
 
 def run_over_mesh(mesh: Mesh, run: Run, step: Callable[..., Any]) -> Any:
-    """``run(step, state, problem, hparams, lengths)`` of lanes, whose metrics come to the host.
+    """Runs of lanes by ``run(step, state, problem, hparams, lengths)``, with metrics on the host.
 
-    Args:
-      mesh: the devices.
-      run: of one lane, which yields its state and its metrics, with a first axis of rows.
-      step: of one lane.
-
-    Returns:
-      A function of the lanes' states, the problem, the lanes' numbers with what they share, and
-      the lengths; it yields the states, which stay where they are, and metrics ``[rows, N, ...]``.
+    The returned function of the lanes' states, the problem, their hyperparameters (with shared values)
+    and the lengths yields the states, which stay on their devices, and metrics ``[rows, N, ...]``.
     """
     lanes = vmap_over_mesh(_lane(run, step), mesh, in_axes=(0, None, (0, None), None))
 

@@ -1,8 +1,8 @@
-"""Distributions of actions: categorical among those allowed, or Gaussian within a box.
+"""Distributions of actions: masked categorical, or Gaussian within a box.
 
-All functions are of one action. What is drawn is *raw*: the number of the action, or what a
-Gaussian draws, in units in which a box that has both bounds is ``[-1, 1]``. The environment is
-handed :func:`as_action` of it: clipped, or squashed by a hyperbolic tangent.
+All functions concern one action. A *raw* action is the index of the action, or a Gaussian sample in
+units in which a box with both bounds is ``[-1, 1]``. The environment receives :func:`as_action` of
+it: clipped, or squashed by a hyperbolic tangent.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _WEIGHTS = _WEIGHTS / np.sqrt(2 * np.pi)
 
 
 def noise(key: chex.PRNGKey, shape: tuple[int, ...], actions: Actions, dtype: Any) -> jax.Array:
-    """What chance adds to so many actions, drawn all at once."""
+    """Gumbel or normal noise of a batch of actions."""
     if isinstance(actions, Finite):
         return jax.random.gumbel(key, (*shape, actions.num), dtype)
     return jax.random.normal(key, (*shape, *actions.shape), dtype)
@@ -41,7 +41,7 @@ def drawn(actions: Actions, parameters: Any, allowed: Any, noise: jax.Array | No
 
 
 def as_action(actions: Actions, raw: jax.Array, squash: str) -> jax.Array:
-    """What the environment is handed."""
+    """The action of a raw action."""
     if isinstance(actions, Finite):
         return raw
     low, high = (jnp.broadcast_to(x, actions.shape) for x in (actions.low, actions.high))
@@ -60,14 +60,14 @@ def chosen(
     sampled: bool,
     squash: str,
 ) -> jax.Array:
-    """The action that an agent takes by what its network says: drawn, or the most likely one."""
+    """The action of an agent: sampled, or the most likely one."""
     kind = jax.tree.leaves(parameters)[0].dtype
     raw = drawn(actions, parameters, allowed, noise(key, (), actions, kind) if sampled else None)
     return as_action(actions, raw, squash)
 
 
 def log_density(actions: Actions, parameters: Any, allowed: Any, raw: jax.Array) -> jax.Array:
-    """Of a raw action; that of the action itself differs by what parameters do not change."""
+    """Log density of a raw action; that of the action differs by a term without parameters."""
     if isinstance(actions, Finite):
         return jax.nn.log_softmax(_masked(parameters, allowed))[raw]
     mean, log_deviation = parameters
@@ -76,9 +76,9 @@ def log_density(actions: Actions, parameters: Any, allowed: Any, raw: jax.Array)
 
 
 def entropy(actions: Actions, parameters: Any, allowed: Any, squash: str) -> jax.Array:
-    """Of one action's distribution, over those that are allowed.
+    """Entropy of an action, over allowed ones.
 
-    Of a squashed Gaussian, by Gauss-Hermite quadrature; of one that is clipped, the Gaussian's.
+    For a squashed Gaussian by Gauss-Hermite quadrature; for a clipped one, that of the Gaussian.
     """
     if isinstance(actions, Finite):
         log = jax.nn.log_softmax(_masked(parameters, allowed))
@@ -98,7 +98,7 @@ def entropy(actions: Actions, parameters: Any, allowed: Any, squash: str) -> jax
 
 
 def _masked(logits: jax.Array, allowed: Any) -> jax.Array:
-    """Scores of which those of forbidden actions are infinitely worse, whatever they are."""
+    """Logits with those of disallowed actions minus infinity."""
     if allowed is None:
         return logits
     # An infinitely bad one that is allowed must still be better than all that are not.

@@ -1,6 +1,6 @@
-"""Networks that act and judge: what a policy of PPO is made of, and how any such one is called.
+"""Actor-critic networks for finitely many actions or a box, with or without memory.
 
-Example: networks of finitely many actions, of a box, and with a memory.
+Example:
 
   >>> import jax, jax.numpy as jnp
   >>> import jaxltl as jl
@@ -44,13 +44,12 @@ from jaxltl.core.pretty_print import brief
 
 @brief
 class Output(NamedTuple):
-    """What a network says of one observation.
+    """Output of an actor-critic network for one observation.
 
     Attributes:
-      memory: after it; ``()`` for a network without.
-      action: the parameters of the distribution of actions: ``float[A]``, logits, where there are
-        finitely many; of a box a pair of arrays of an action's shape, mean and logarithm of the
-        standard deviation.
+      memory: the next one; ``()`` without memory.
+      action: parameters of the distribution of actions: logits ``float[A]``, or for a box mean and
+        log standard deviation, both of an action's shape.
       value: ``float[]``.
     """
 
@@ -60,14 +59,13 @@ class Output(NamedTuple):
 
 
 def orthogonal(scale: float) -> Any:
-    """An initialiser: a uniformly drawn matrix with orthonormal rows or columns, times a scale.
+    """An initialiser of orthogonal matrices with a `scale`.
 
-    By Gram and Schmidt, twice over, and not by LAPACK's factorisation as in ``flax``: on few
-    processors several batched ones in one program, as seeds side by side ask for, may each hold the
-    thread that another waits for (jaxlib 0.10.1).
+    By Gram-Schmidt twice over instead of LAPACK as in ``flax``: on few processors several batched
+    LAPACK calls in one program may deadlock (jaxlib 0.10.1).
 
     Args:
-      scale: of the rows or columns.
+      scale: norm of the rows or columns.
 
     Returns:
       ``(key, shape, dtype) -> float[shape]``, as ``flax.linen`` takes it, of matrices.
@@ -96,11 +94,11 @@ def orthogonal(scale: float) -> Any:
 
 
 def dense(width: int, scale: float, name: str) -> nn.Dense:
-    """A layer of a network, orthogonal at the start, of the floats that are the default.
+    """A dense layer with orthogonal initialisation and default floats.
 
     Args:
-      width: how many numbers it returns.
-      scale: of its matrix at the start, see :func:`orthogonal`.
+      width: number of outputs.
+      scale: of its matrix, see :func:`orthogonal`.
       name: among the layers of a module.
 
     Returns:
@@ -116,7 +114,7 @@ def dense(width: int, scale: float, name: str) -> nn.Dense:
 
 
 class _Layers(nn.Module):
-    """Dense layers and a last one without activation, orthogonal at the start."""
+    """Hidden layers and a linear layer, orthogonal at initialisation."""
 
     hidden: Sequence[int]
     outputs: int
@@ -131,7 +129,7 @@ class _Layers(nn.Module):
 
 
 def _heads(module: Any, x: jax.Array) -> tuple[Any, jax.Array]:
-    """Parameters of the actions and the value, by two networks of which neither reads the other."""
+    """Action parameters and value, by two networks that share nothing."""
     hidden = tuple(module.hidden)
     outputs = module.num_actions or int(np.prod(module.shape))
     scores = _Layers(hidden, outputs, 0.01, module.activation, name="actor")(x)
@@ -144,17 +142,17 @@ def _heads(module: Any, x: jax.Array) -> tuple[Any, jax.Array]:
 
 
 class ActorCritic(nn.Module):
-    """Two multilayer perceptrons on the flattened observation: one acts, the other judges.
+    """Two multilayer perceptrons of the flattened observation: an actor and a critic.
 
-    Orthogonal at the start: of scale sqrt(2) in between, .01 where it acts, so that all actions are
-    alike at first, and 1 where it judges (Huang et al. 2022, details 2 and 3).
+    Initialisation is orthogonal, of scale sqrt(2) in hidden layers, .01 for the actor's output, so that
+    all actions are alike at first, and 1 for the critic's (Huang et al. 2022, details 2 and 3).
 
     Attributes:
-      num_actions: A, if there are finitely many; else 0.
-      shape: of an action, if it is of a box. The standard deviation is a parameter of its own that
-        does not depend on the observation.
+      num_actions: A, or 0 for a box.
+      shape: of an action of a box, whose log standard deviation is a parameter that does not depend
+        on the observation.
       hidden: widths of the hidden layers of each.
-      activation: by its name in ``flax.linen``.
+      activation: its name in ``flax.linen``.
       initial_deviation: of a box's actions, in units of half its width where it has bounds.
     """
 
@@ -170,11 +168,11 @@ class ActorCritic(nn.Module):
 
 
 class RecurrentActorCritic(nn.Module):
-    """A dense layer and a gated recurrent unit, whose memory an :class:`ActorCritic`'s heads read.
+    """A dense layer and a gated recurrent unit, whose memory the heads of :class:`ActorCritic` read.
 
     Attributes:
       num_actions, shape, hidden, activation, initial_deviation: as there.
-      memory: the size of the memory.
+      memory: size of the memory.
     """
 
     num_actions: int = 0
@@ -210,7 +208,7 @@ def default_network(actions: Any) -> ActorCritic:
         :class:`~jaxltl.core.environments.environment.Box`.
 
     Returns:
-      The module, its hidden layers as they are by default.
+      The module with its defaults.
     """
     if isinstance(actions, Finite):
         return ActorCritic(num_actions=actions.num)
@@ -218,17 +216,17 @@ def default_network(actions: Any) -> ActorCritic:
 
 
 def initial_memory(network: nn.Module, memory: Any = None) -> Any:
-    """What a network remembers before it has seen anything, a tree of arrays; ``()``: it cannot.
+    """The initial memory of a network, a tree of arrays; ``()`` without memory.
 
     Args:
-      network: whose method ``initial_memory()`` says so, if it has one.
-      memory: in place of that; None: not given.
+      network: with a method ``initial_memory()`` if it has memory.
+      memory: replaces the network's; None: not given.
 
     Returns:
       A tree of arrays.
 
     Raises:
-      ValueError: what is given are no numbers, or has not the shapes that the network's own has.
+      ValueError: not numbers, or shapes other than those of the network's own.
     """
     begin = getattr(network, "initial_memory", tuple)
     if memory is None:
@@ -249,7 +247,7 @@ def initial_memory(network: nn.Module, memory: Any = None) -> Any:
 
 
 def has_memory(problem: Any) -> bool:
-    """Whether the problem's network is recurrent.
+    """Whether the network of a problem is recurrent.
 
     Args:
       problem: with a `memory`, such as PPO's.
@@ -266,13 +264,13 @@ def has_memory(problem: Any) -> bool:
 
 
 def evaluated(problem: Any, parameters: Any, memory: Any, observation: Any) -> Output:
-    """What the problem's network says of one observation.
+    """The output of a problem's network for one observation.
 
     Args:
       problem: with a `network` and its `memory`, such as PPO's.
       parameters: of the network.
-      memory: before the observation; ``()`` for a network without.
-      observation: of one world.
+      memory: before the observation; ``()`` without memory.
+      observation: one, not a batch.
 
     Returns:
       :class:`Output`; differentiable in the parameters.
@@ -294,13 +292,13 @@ def evaluated(problem: Any, parameters: Any, memory: Any, observation: Any) -> O
 
 
 def fresh_parameters(key: Any, network: nn.Module, memory: Any, observation: Any) -> Any:
-    """A network's parameters at its own random start.
+    """The random initial parameters of a network.
 
     Args:
-      key: a PRNG key.
+      key: random key.
       network: the module.
-      memory: before anything is seen; ``()`` for a network without.
-      observation: of one world; its numbers do not matter.
+      memory: the initial memory; ``()`` without memory.
+      observation: one; only its shapes matter.
 
     Returns:
       The parameters, a dict of dicts of arrays.
@@ -310,20 +308,20 @@ def fresh_parameters(key: Any, network: nn.Module, memory: Any, observation: Any
 
 
 def require_network(network: Any, memory: Any, observation: Any, space: Any, finite: bool) -> None:
-    """Refuses a network that does not return what is to be returned.
+    """Raises ValueError for a network that returns other shapes.
 
     Args:
       network: the user's.
-      memory, observation: shapes of what it reads.
-      space: shape and type of one action; of finitely many, of the logits.
-      finite: whether there are finitely many.
+      memory, observation: shapes of its inputs.
+      space: shape and type of one action, or of the logits.
+      finite: whether there are finitely many actions.
 
     Raises:
-      ValueError: naming what it returns and what it should.
+      ValueError: with the shapes returned and expected.
 
     Example:
       >>> seen, logits = jax.ShapeDtypeStruct((3,), float), jax.ShapeDtypeStruct((2,), float)
-      >>> require_network(ActorCritic(num_actions=2), (), seen, logits, True)  # nothing to say
+      >>> require_network(ActorCritic(num_actions=2), (), seen, logits, True)
     """
     recurrent = bool(jax.tree.leaves(memory))
     read = (memory, observation) if recurrent else (observation,)

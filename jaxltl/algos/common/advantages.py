@@ -1,4 +1,4 @@
-"""Generalised advantages: how much better than expected what was done turned out."""
+"""Generalised advantage estimation."""
 
 from __future__ import annotations
 
@@ -18,20 +18,19 @@ def generalized_advantages(
     gae_lambda: chex.Numeric,
     ended: chex.Numeric = False,
 ) -> jax.Array:
-    """Generalised advantages (Schulman et al. 2016, equation 16), episodes one after the other::
+    """Generalised advantages (Schulman et al. 2016, equation 16) of consecutive episodes.
 
-        A_t = d_t + discount_t lambda A_{t+1},    d_t = r_t + discount_t V'_t - V_t,
-
-    with A = 0 after the last of T steps, and after the last step of an episode.
+    ``A_t = d_t + discount_t lambda A_{t+1}`` with ``d_t = r_t + discount_t V'_t - V_t``, and A = 0 after
+    the last of T steps and after the end of an episode.
 
     Args:
       reward: ``float[T, ...]``.
-      value: ``float[T, ...]``, V of the worlds where they are earned.
-      following: ``float[T, ...]``, V' of the worlds that the steps lead to, those in which an
-        episode is cut off included; zero where nothing comes after.
-      discount: in [0, 1]; one number, or ``float[T, ...]`` of what comes after each step.
+      value: ``float[T, ...]``, V before each step.
+      following: ``float[T, ...]``, V' after each step, also where an episode is truncated; zero after
+        a termination.
+      discount: in [0, 1]; a number, or ``float[T, ...]``.
       gae_lambda: in [0, 1].
-      ended: ``bool[T, ...]``, whether an episode ended with the step, in whatever way.
+      ended: ``bool[T, ...]``, whether an episode ended with the step.
 
     Returns:
       ``float[T, ...]``.

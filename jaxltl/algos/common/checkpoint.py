@@ -1,11 +1,9 @@
-"""Files of a learner's state: written whole or not at all, and read back bit for bit.
+"""Checkpoints: a learner's state in a file, written atomically and read bit for bit.
 
-With the state goes a fingerprint of what it was learned from: every array of the problem and of
-the settings by shape, dtype and a hash of its bytes, and every static field. A state of another
-problem is refused, though its shapes be the same.
-
-Of arrays that lie on the devices of several processes each writes its part, and the file names
-them. It is read onto any other mesh, by any number of processes, or by one without.
+A fingerprint of what the state was learned from is stored with it: shape, dtype and hash of every
+array of the problem and of the hyperparameters, and every static field. A checkpoint of another
+problem is refused even if shapes agree. Arrays on the devices of several processes are written in
+parts, one by each process, and read onto any other mesh by any number of processes.
 
 Example:
   >>> import os, tempfile
@@ -55,26 +53,26 @@ _PARTS = "parts"  # the name of what is in other files
 
 @contextlib.contextmanager
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
-    """A binary file that appears under its name only when complete.
+    """A binary file that appears under its name when it is complete.
 
     Args:
-      path: where it is to be.
+      path: of the file.
 
     Yields:
       The file, open for bytes.
 
     Raises:
-      ValueError: the place cannot be written to.
+      ValueError: the directory cannot be written to.
 
     Example:
       >>> import pathlib, tempfile
       >>> path = pathlib.Path(tempfile.mkdtemp()) / "note"
       >>> with atomic_write(path) as file:
-      ...     _ = file.write(b"all of it")
+      ...     _ = file.write(b"complete")
       ...     path.exists()
       False
       >>> path.read_bytes()
-      b'all of it'
+      b'complete'
     """
     path = Path(path)
     try:
@@ -105,7 +103,7 @@ def read_arrays(file: BinaryIO) -> dict[str, np.ndarray]:
       NumPy arrays.
 
     Raises:
-      ValueError: it is none, or damaged. The message tells what is wrong and lacks the file's name.
+      ValueError: another format, or damaged; the message describes the fault without the file's name.
 
     Example:
       >>> import io
@@ -151,16 +149,16 @@ def _umask() -> int:
 def save(path: str | os.PathLike[str], state: Any, given: Mapping[str, str] | None = None) -> None:
     """Writes a learner's state as an ``.npz``, atomically.
 
-    In several processes all of them call it, with a directory that they share. What lies on the
-    devices of several is written by each, beside the file, which the first process writes last.
+    With several processes all call it, with a shared directory. Each writes its part of arrays on the
+    devices of several, and the first process writes the file last.
 
     Args:
-      path: the file.
-      state: any tree of arrays.
-      given: :func:`fingerprint` of the problem and settings.
+      path: of the file.
+      state: a tree of arrays.
+      given: :func:`fingerprint` of the problem and hyperparameters.
 
     Raises:
-      ValueError: the place cannot be written to.
+      ValueError: the directory cannot be written to.
     """
     path, named = Path(path), [(name, _data(leaf)) for name, leaf in _named(state)]
     apart = {name: leaf for name, leaf in named if parts.is_apart(leaf)}
@@ -179,12 +177,10 @@ def save(path: str | os.PathLike[str], state: Any, given: Mapping[str, str] | No
 
 
 def remove(path: str | os.PathLike[str]) -> None:
-    """Removes a state that :func:`save` wrote, with its parts and what was begun and not finished.
-
-    No process may still be writing it.
+    """Removes a checkpoint with its parts and unfinished files; no process may be writing it.
 
     Args:
-      path: the file; nothing is said of one that is not there.
+      path: of the file; a missing one is no error.
     """
     path = Path(path)
     parts.remove([path, *parts.parts_of(path), *parts.unfinished(path)])
@@ -194,18 +190,18 @@ def load(path: str | os.PathLike[str], like: Any, given: Mapping[str, str] | Non
     """Reads a state saved by :func:`save`, bit for bit.
 
     Args:
-      path: the file.
-      like: a state of the same learner and problem (for example from ``init``); a first axis of
-        length zero stands for one of any length. What lies on several devices there comes to lie
-        on them, whatever devices the state was saved from; each process reads what it needs.
-      given: as in :func:`save`, which has to be the same.
+      path: of the file.
+      like: a state of the same learner and problem, for example from ``init``; a first axis of length
+        zero matches any length. Arrays are placed on the devices of `like`, whatever devices they
+        were saved from, and each process reads what it needs.
+      given: as for :func:`save`.
 
     Returns:
-      A tree as `like`, with the arrays of the file.
+      A tree like `like` with the arrays of the file.
 
     Raises:
-      ValueError: the file is damaged, its arrays do not fit `like`, or it was saved for another
-        problem or with other settings.
+      ValueError: the file is damaged, its arrays do not fit `like`, or it was saved for another problem
+        or other hyperparameters.
     """
     with parts.reading(path) as others:
         try:
@@ -228,11 +224,11 @@ def load(path: str | os.PathLike[str], like: Any, given: Mapping[str, str] | Non
 
 
 class _Another(Exception):
-    """An array that another learner or problem has."""
+    """An array of another learner or problem."""
 
 
 def _loaded(path: str, name: str, leaf: Any, found: Any, others: parts.Parts) -> Any:
-    """An array where it is to be, from the file's or from the parts beside it."""
+    """An array on its devices, from the file or from the parts."""
     expected = _data(leaf)
     if found is None or not _fits(found, expected):
         is_ = "missing" if found is None else f"{found.dtype}{list(found.shape)}"
@@ -274,7 +270,7 @@ def _require_same(path: str, before: dict[str, str], now: dict[str, str]) -> Non
 
 
 def _named(tree: Any) -> list[tuple[str, Any]]:
-    """Leaves with distinct file-safe names, whose numbers keep nested paths apart."""
+    """Leaves with distinct file-safe names, whose numbers distinguish nested paths."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
     return [
         (f"{i}{jax.tree_util.keystr(path)}".replace("/", "_"), _array_of(leaf))
@@ -283,7 +279,7 @@ def _named(tree: Any) -> list[tuple[str, Any]]:
 
 
 def _array_of(leaf: Any) -> Any:
-    """As ``jnp.asarray``, but NumPy's arrays stay on the host, where nothing is compiled."""
+    """As ``jnp.asarray``, but NumPy arrays stay on the host, where nothing is compiled."""
     if not isinstance(leaf, np.ndarray):
         return jnp.asarray(leaf)
     return leaf.astype(jax.dtypes.canonicalize_dtype(leaf.dtype), copy=False)
@@ -298,15 +294,15 @@ def _data(leaf: jax.Array) -> jax.Array:
 
 
 def fingerprint(**given: Any) -> dict[str, str]:
-    """What is told apart of arguments, by place: types, static fields, and arrays by their bytes.
+    """Descriptions of arguments by place: types, static fields, and arrays by a hash of their bytes.
 
-    Functions count by their code, not by where they lie, so that another process finds the same.
+    Functions are described by their code, so that other processes find the same.
 
     Args:
-      given: trees of arrays, by names of one's own.
+      given: trees of arrays by name.
 
     Returns:
-      By the place of each part, a text that tells it from others.
+      By place, a text that distinguishes the value from others.
 
     Example:
       >>> one, two = (fingerprint(x=(np.arange(2), {"b": y})) for y in (0.5, 0.25))
@@ -347,7 +343,7 @@ def _described(name: str, value: Any) -> Iterator[tuple[str, str]]:
 
 
 def _array(value: Any) -> str:
-    """Shape, dtype and a hash of the bytes; small things also as they are."""
+    """Shape, dtype and a hash of the bytes; small arrays also as text."""
     if isinstance(value, jax.Array):
         value = _data(value)
     array = np.asarray(value)
@@ -373,7 +369,7 @@ def _code(code: types.CodeType) -> str:
 
 
 def _constant(value: Any) -> str:
-    """Sets in an order that does not change from process to process."""
+    """The representation of a constant; sets in an order that is the same in every process."""
     return repr(sorted(map(repr, value)) if isinstance(value, frozenset) else value)
 
 

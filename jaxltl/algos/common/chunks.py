@@ -4,7 +4,7 @@ Example: half of what is lacking in each step, for two runs side by side.
 
   >>> import jax, jax.numpy as jnp
   >>> from flax import struct
-  >>> from jaxltl.algos.common.chunks import run_in_chunks
+  >>> from jaxltl.algos.common.chunks import Options, run_in_chunks
   >>> @struct.dataclass
   ... class State:
   ...     step: jax.Array
@@ -13,7 +13,8 @@ Example: half of what is lacking in each step, for two runs side by side.
   ...     guess = state.guess + hparams * (problem - state.guess)
   ...     return State(state.step + 1, guess), {"guess": guess}
   >>> start = State(jnp.zeros(2, jnp.int32), jnp.zeros(2))
-  >>> chunks = run_in_chunks(step, start, 5.0, 0.5, num_steps=4, chunk=2, lanes=True)
+  >>> chunks = run_in_chunks(step, start, 5.0, 0.5, num_steps=4, lanes=True,
+  ...                        options=Options(chunk=2))
   >>> chunks.state.step.tolist(), chunks.step.tolist(), chunks.metrics["guess"].shape
   ([4, 4], [1, 2, 3, 4], (4, 2))
 """
@@ -22,7 +23,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from typing import Any, NamedTuple
 
@@ -43,14 +44,40 @@ from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core import validation
 
 
-class Chunks(NamedTuple):
-    """What :func:`run_in_chunks` ends with.
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Options of :func:`run_in_chunks`.
 
     Attributes:
-      state: where it ended; with lanes, a first axis of N.
-      metrics: of evenly spaced steps of each chunk, NumPy arrays with a first axis of rows, those
-        before an interruption included; with lanes ``[rows, N, ...]``.
-      step: ``int[rows]``, the number of the step that each row is of, from 1.
+      chunk: steps between reports; default `max_rows`, or a hundredth of the steps.
+      max_rows: bound on the rows of metrics of a chunk.
+      report: called with the number of steps and the newest metrics after each chunk.
+      checkpoint: a file written atomically after each chunk. If it exists, the run resumes from it
+        and ends with the same bits.
+      mesh: devices of the lanes (:mod:`~jaxltl.core.models.mesh.lanes`). With several processes each
+        passes the same arguments and receives the whole result except the state, which stays where
+        it is. Checkpoints of other devices, or of none, are resumed too.
+
+    Example:
+      >>> Options(chunk=50).max_rows
+      10
+    """
+
+    chunk: int | None = None
+    max_rows: int = 10
+    report: Callable[[int, Any], None] | None = None
+    checkpoint: str | os.PathLike[str] | None = None
+    mesh: Mesh | None = None
+
+
+class Chunks(NamedTuple):
+    """Result of :func:`run_in_chunks`.
+
+    Attributes:
+      state: the last state; with lanes, a first axis of N.
+      metrics: of evenly spaced steps of each chunk, NumPy arrays with a first axis of rows, including
+        those before an interruption; with lanes ``[rows, N, ...]``.
+      step: ``int[rows]``, the number of the step of each row, from 1.
       done: whether the condition was met; with lanes ``bool[N]``.
     """
 
@@ -70,40 +97,30 @@ def run_in_chunks(
     until: Until | None = None,
     keep: str = "after",
     lanes: bool = False,
-    chunk: int | None = None,
-    max_rows: int = 10,
-    report: Callable[[int, Any], None] | None = None,
-    checkpoint: str | os.PathLike[str] | None = None,
-    mesh: Mesh | None = None,
+    options: Options = Options(),
 ) -> Chunks:
-    """Steps in compiled chunks, with a report and a saved state after each.
+    """Steps in compiled chunks, with a report and a checkpoint after each.
 
     Args:
-      step, problem: as for :func:`~jaxltl.algos.common.learner.run`.
-      state: where to start; with `lanes` of N runs side by side, with a first axis of N.
-      hparams: numbers; with `lanes` shared by the runs, or one for each, ``[N]``.
-      num_steps: the number of steps to reach: a state that has already made some
-        (``state.step``) makes only the rest.
-      until, keep: as for :func:`~jaxltl.algos.common.learner.run_until`. A run that has met the condition
-        stays where it is, so that none depends on the others; when all have, the loop ends.
+      step, problem: of a learner.
+      state: the first state; with `lanes`, of N runs, with a first axis of N.
+      hparams: numbers; with `lanes`, shared by the runs or one for each, ``[N]``.
+      num_steps: the number of steps to reach; a state with ``state.step`` steps makes the rest.
+      until, keep: as for :meth:`~jaxltl.algos.common.learner.Learner.run_until`. A finished run stays
+        unchanged, so that lanes are independent; the loop ends when all have finished.
       lanes: whether there are N runs.
-      chunk: steps between reports; default `max_rows`, or a hundredth of `num_steps`.
-      max_rows: metrics are kept of at most so many steps of a chunk.
-      report: called with the number of steps and the newest metrics after each chunk.
-      checkpoint: a file that holds all of this after every chunk, written atomically. If it
-        exists, the run goes on from it, and ends with the same bits.
-      mesh: devices over which the lanes lie (:mod:`~jaxltl.core.models.mesh.lanes`). In several
-        processes each calls this with the same arguments, and has all of the result but the state,
-        which stays where it is. Checkpoints of other devices, or of none, are gone on from too.
+      options: :class:`Options`.
 
     Returns:
       :class:`Chunks`.
 
     Raises:
-      ValueError: the checkpoint belongs to another learner, problem or setting.
+      ValueError: a hyperparameter is out of range, or the checkpoint belongs to another learner,
+        problem or hyperparameters.
     """
     lanes = validation.boolean("lanes", lanes)
-    chunk = chunk or max(max_rows, -(-num_steps // 100))
+    chunk = options.chunk or max(options.max_rows, -(-num_steps // 100))
+    checkpoint, mesh = options.checkpoint, options.mesh
     num_lanes = len(state.step) if lanes else None
     require_hparams(hparams, batched=lanes)
     hparams = _spread(hparams, state) if lanes else hparams
@@ -121,7 +138,7 @@ def run_in_chunks(
         advance = run_over_mesh(mesh, run_blocks, _lane_steps(step, keep, None))
     ended, made = on_host((now.done, now.count))
     while made.max() < num_steps and not ended.all():
-        lengths = block_lengths(min(chunk, num_steps - int(made.max())), max_rows)
+        lengths = block_lengths(min(chunk, num_steps - int(made.max())), options.max_rows)
         now, fresh = advance(strong(now), problem, (hparams, until), lengths)
         rows = jax.tree.map(
             lambda x, y: np.concatenate([x, y]), jax.device_get(rows), jax.device_get(fresh)
@@ -129,8 +146,8 @@ def run_in_chunks(
         ended, made = on_host((now.done, now.count))
         if checkpoint is not None:
             files.save(checkpoint, (now, rows), given)
-        if report is not None:
-            report(int(made.max()), jax.tree.map(lambda x: x[-1], rows[1]))
+        if options.report is not None:
+            options.report(int(made.max()), jax.tree.map(lambda x: x[-1], rows[1]))
     step_of = np.asarray(rows[0])
     return Chunks(
         now.state, jax.tree.map(np.asarray, rows[1]), step_of[:, 0] if lanes else step_of, ended
@@ -138,7 +155,7 @@ def run_in_chunks(
 
 
 def _begin(step: Step, state: Any, problem: Any, hparams: Any, num_lanes: int | None) -> Progress:
-    """Before the first chunk; nothing is compiled for it."""
+    """Progress before the first chunk, without compilation."""
     lanes = () if num_lanes is None else (num_lanes,)
     shape = _metrics_of(step, state, problem, hparams, num_lanes)
     metrics = jax.tree.map(lambda x: np.zeros((*lanes, *x.shape), x.dtype), shape)
@@ -156,11 +173,11 @@ def _metrics_of(step: Step, state: Any, problem: Any, hparams: Any, num_lanes: i
 
 
 def trace_lanes(step: Step, state: Any, problem: Any, hparams: Any) -> None:
-    """Does of :func:`run_in_chunks` with lanes what takes only the shapes of the first states.
+    """Traces the step of :func:`run_in_chunks` with lanes, for which shapes of states suffice.
 
     Args:
       step, problem, hparams: as for :func:`run_in_chunks`.
-      state: of N runs side by side, or its shapes.
+      state: of N runs, or its shapes.
 
     Example:
       >>> from flax import struct
@@ -177,7 +194,7 @@ def trace_lanes(step: Step, state: Any, problem: Any, hparams: Any) -> None:
 
 @cache  # compiled once for each step, so it must stay the same function
 def _lane_steps(step: Step, keep: str, num_lanes: int | None) -> Step:
-    """A step of :class:`Progress`, of one run or of several; its rows are counts and metrics."""
+    """A step of :class:`Progress`, of one run or of several, with rows of counts and metrics."""
 
     def one(now: Progress, problem: Any, given: Any) -> tuple[Progress, Any]:
         hparams, until = given
@@ -208,7 +225,7 @@ def _lane_steps(step: Step, keep: str, num_lanes: int | None) -> Step:
 
 
 def _spread(hparams: Any, state: Any) -> Any:
-    """Numbers for each of N runs, floats in the precision of the states."""
+    """Hyperparameters of each of N runs, floats in the precision of the states."""
     size = len(state.step)
     floats = [x.dtype for x in jax.tree.leaves(state) if jnp.issubdtype(x.dtype, jnp.floating)]
 

@@ -1,4 +1,4 @@
-"""Mean and spread of numbers that come in batches, by which networks' inputs are scaled."""
+"""Running mean and standard deviation, which standardise the inputs of networks."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from jaxltl.core.pretty_print import brief
 @brief
 @struct.dataclass
 class Moments:
-    """Of the numbers so far: how many, their mean, and summed squares around it.
+    """Number, mean and sum of squared deviations of a stream of numbers.
 
     Attributes:
       count: ``float[]``.
@@ -27,12 +27,7 @@ class Moments:
 
 
 def no_moments(shape: tuple[int, ...], dtype: jax.typing.DTypeLike | None = None) -> Moments:
-    """Those of nothing.
-
-    Args:
-      shape: of one of the numbers to come.
-      dtype: default a float of the default precision.
-    """
+    """The moments of an empty stream of arrays of a `shape`; `dtype` defaults to float."""
     zeros = jnp.zeros(shape, jnp.result_type(float) if dtype is None else dtype)
     return Moments(jnp.zeros_like(zeros, shape=()), zeros, zeros)
 
@@ -40,12 +35,12 @@ def no_moments(shape: tuple[int, ...], dtype: jax.typing.DTypeLike | None = None
 def updated_moments(
     moments: Moments, numbers: jax.Array, valid: jax.Array | None = None
 ) -> Moments:
-    """With a batch taken in (Chan, Golub & LeVeque 1979).
+    """The moments with a batch added (Chan, Golub & LeVeque 1979).
 
     Args:
       moments: so far.
       numbers: ``[..., *shape]``.
-      valid: ``bool[...]``, which of them count; default all.
+      valid: ``bool[...]``, which of them to count; default all.
 
     Example:
       >>> now = updated_moments(no_moments(()), jnp.array([1.0, 5.0]))
@@ -73,23 +68,21 @@ def updated_moments(
 
 
 def scale_of(moments: Moments) -> jax.Array:
-    """The standard deviation; 1 where nothing has varied."""
+    """The standard deviation; 1 where it is zero."""
     spread = jnp.sqrt(moments.squares / jnp.maximum(moments.count, 1))
     noise = 8 * jnp.finfo(spread.dtype).eps * jnp.abs(moments.mean)
     return jnp.where(spread > noise, spread, 1)
 
 
 def standardized(moments: Moments, numbers: jax.Array) -> jax.Array:
-    """Numbers, centred and divided by their standard deviation."""
+    """Numbers minus their mean, divided by their standard deviation."""
     return (numbers - moments.mean) / scale_of(moments)
 
 
 def normalized(moments: Any, observation: Any) -> Any:
-    """A tree whose floats are :func:`standardized` and clipped to ten deviations.
+    """A tree of observations with floats :func:`standardized` and clipped to ten deviations.
 
-    Args:
-      moments: a tree of :class:`Moments`, as the observation; None: it is returned as it is.
-      observation: leaves that are no floats stay as they are.
+    `moments` is a tree of :class:`Moments`, or None for no change.
     """
     if moments is None:
         return observation

@@ -1,4 +1,4 @@
-"""Numbers that change from step to step, and the theorem's conditions on them (chapter 4).
+"""Schedules of hyperparameters, and the convergence conditions of theorem 1 (chapter 4) on them.
 
 Example:
   >>> from jaxltl.algos import cce
@@ -49,13 +49,13 @@ class Polynomial:
 @brief
 @struct.dataclass
 class Linear:
-    """From `first` in the first step in a straight line to `last` after `num_steps` steps.
+    """Linear interpolation from `first` in the first step to `last` after `num_steps` steps, then constant.
 
-    Then it stays there. Numbers are traced.
+    Numbers are traced.
 
     Attributes:
       first, last: the ends.
-      num_steps: steps of the way between them.
+      num_steps: of the interpolation.
 
     Example:
       >>> [float(at(Linear(1.0, 0.0, 4), step)) for step in range(6)]
@@ -77,7 +77,7 @@ Schedule = Any  # a number, a Polynomial, or a pytree that is called with l = 1,
 
 
 def is_schedule(given: Any) -> bool:
-    """Whether it is a schedule of the step, and no number: a tree of arrays, so that it is traced.
+    """Whether an object is a schedule of the step, in a pytree so that it is traced, and not a number.
 
     Args:
       given: anything.
@@ -95,14 +95,14 @@ def is_schedule(given: Any) -> bool:
 
 
 def at(schedule: Schedule, step: jax.Array | int) -> Any:
-    """A schedule's number in the step after `step` steps, l = step + 1.
+    """The value of a schedule in step l = `step` + 1.
 
     Args:
       schedule: a number, :class:`Polynomial`, :class:`Linear`, or a function of l in a pytree.
       step: at least 0; may be traced.
 
     Returns:
-      A number, as the schedule gives it; None of None.
+      A number; None of None. Differentiable in the schedule's numbers.
 
     Example:
       >>> at(Linear(1.0, 0.0, 2), 1).item(), at(0.5, 1)
@@ -116,15 +116,15 @@ def at(schedule: Schedule, step: jax.Array | int) -> Any:
 
 @brief
 class Condition(NamedTuple):
-    """One of theorem 1's conditions.
+    """A condition of theorem 1.
 
     Attributes:
-      name: in a few words.
-      holds: whether it does; None if that cannot be told.
-      reason: why.
+      name: of the condition.
+      holds: whether it holds; None if that is unknown.
+      reason: the numbers that decide.
 
     Example:
-      >>> Condition("samples grow", False, "their number stays").holds
+      >>> Condition("samples grow", False, "constant").holds
       False
     """
 
@@ -135,13 +135,13 @@ class Condition(NamedTuple):
 
 @brief
 class Conditions(NamedTuple):
-    """What :func:`theorem_conditions` tells.
+    """Result of :func:`theorem_conditions`.
 
     Attributes:
       holds: True if all conditions hold, False if one fails, else None.
-      failing: the names of those that fail.
+      failing: names of those that fail.
       conditions: all, with reasons.
-      assumed: what the theorem assumes of the problem, which settings cannot show.
+      assumed: assumptions of the theorem on the problem, which hyperparameters cannot show.
     """
 
     holds: bool | None
@@ -161,16 +161,16 @@ _ASSUMED = (
 
 
 def theorem_conditions(hparams: Any, *, num_steps: int | None = None) -> Conditions:
-    """Whether the settings meet the conditions of theorem 1, on the host.
+    """Whether hyperparameters satisfy the conditions of theorem 1 (assumption 2b); on the host.
 
-    They are (assumption 2b): ``n_l`` grows as ``l^beta`` with beta > 0; ``alpha_l`` is positive,
-    decreases to 0 and has an infinite sum; ``lambda_l = O(l^-lambda)`` for some lambda > 0 with
-    ``beta + 2 lambda > 1``; and that the method is algorithm 2 as printed.
+    ``n_l`` grows as ``l^beta`` with beta > 0; ``alpha_l`` is positive, decreases to 0 and has an infinite
+    sum; ``lambda_l = O(l^-lambda)`` with lambda > 0 and ``beta + 2 lambda > 1``; and the method is
+    algorithm 2 as printed.
 
     Args:
-      hparams: concrete numbers.
-      num_steps: the length of the run. `population` bounds n_l, so that the samples can grow
-        only for so long; None asks for ever.
+      hparams: of ``cce``, concrete.
+      num_steps: length of the run; `population` bounds n_l, so that samples grow for a limited number
+        of steps. None: an infinite run.
 
     Returns:
       :class:`Conditions`.
@@ -208,7 +208,7 @@ def theorem_conditions(hparams: Any, *, num_steps: int | None = None) -> Conditi
 
 
 def _polynomial(schedule: Schedule) -> tuple[float, float, float] | None:
-    """Scale, power and offset, or None of a function."""
+    """Scale, power and offset; None for a function."""
     if isinstance(schedule, Polynomial):
         return float(schedule.scale), float(schedule.power), float(schedule.offset)
     return None if callable(schedule) else (float(schedule), 0.0, 0.0)

@@ -283,7 +283,7 @@ def make_problem(
 
     Example:
       >>> from jaxltl import make_environment
-      >>> from jaxltl.environments import Timestep
+      >>> from jaxltl.core.environments.environment import Timestep
       >>> def go(place, action, key):
       ...     place = place + 2 * action - 1
       ...     return Timestep(place, reward=1.0 * (place == 3), terminated=abs(place) == 3)
