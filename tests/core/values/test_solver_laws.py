@@ -357,7 +357,7 @@ def test_what_is_not_certified_has_not_converged(name):
         if one.status == Status.CONVERGED:
             assert (one.lower <= one.value).all() and (one.value <= one.upper).all(), case
             width = (one.upper - one.lower).max()
-            assert width <= cases[case][2]["tolerance"] or name in UNDISCOUNTED, case
+            assert width <= cases[case][2]["tolerance"], case
     for case in [c for c in found if c.split()[-1] in solver.needs]:
         assert found[case].status == Status.NONFINITE, case
         assert found[case].num_steps <= 8, case
@@ -398,7 +398,7 @@ def test_no_more_steps_are_made_than_allowed(name):
 
 
 @pytest.mark.parametrize("tolerance", [1e-3, 1e-7])
-@pytest.mark.parametrize(("name", "kind"), [pair for pair in PAIRS if pair[0] in DISCOUNTED])
+@pytest.mark.parametrize(("name", "kind"), PAIRS)
 def test_the_tolerance_is_the_width_of_the_enclosure(name, kind, tolerance):
     """For every kind of model, on the host and inside jit."""
     solver = SOLVERS[name]

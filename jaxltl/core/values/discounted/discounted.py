@@ -250,11 +250,10 @@ def policy_value(
     """
     if isinstance(model, IntervalMDP):
         if max_steps is not None:
-            raise ValueError(
-                "models with intervals are solved by policy iteration; give no method."
-            )
+            raise ValueError("interval models are solved by policy iteration; give no max_steps.")
+        width: Any = tolerance
         return robust_discounted_value(
-            model, reward, discount, policy=policy, nature=nature, tolerance=tolerance
+            model, reward, float(discount), policy=policy, nature=nature, tolerance=width
         )
     refuse_nature(nature)
     concrete = not is_traced((model, policy, reward, discount, tolerance))
@@ -354,9 +353,13 @@ def optimal_value(
     if isinstance(model, IntervalMDP):
         if method != "auto" or max_steps is not None or evaluation_sweeps is not None:
             raise ValueError(
-                "models with intervals are solved by policy iteration; give no method."
+                "interval models are solved by policy iteration; give no method, max_steps or "
+                "evaluation_sweeps."
             )
-        return robust_discounted_value(model, reward, discount, nature=nature, tolerance=tolerance)
+        width: Any = tolerance
+        return robust_discounted_value(
+            model, reward, float(discount), nature=nature, tolerance=width
+        )
     refuse_nature(nature)
     concrete = not is_traced((model, reward, discount, tolerance))
     default = method == "auto" and max_steps is None and evaluation_sweeps is None

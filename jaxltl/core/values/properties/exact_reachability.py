@@ -45,8 +45,8 @@ def exact_reachability(
         rows[s] = {t: p / (1 - loop) for t, p in rows[s].items()}
         order.append(s)
         for u in list(rows)[len(order) :]:
-            weight = rows[u].pop(s, None)
-            for t, p in rows[s].items() if weight is not None else ():
+            weight = rows[u].pop(s, Fraction(0))
+            for t, p in rows[s].items() if weight else ():
                 rows[u][t] = rows[u].get(t, Fraction(0)) + weight * p
     value = {s: Fraction(int(target[s])) for s in range(chain.num_states)}
     for s in reversed(order):
