@@ -1,10 +1,8 @@
-"""Files of other tools, format by format.
+"""Readers and writers of external file formats.
 
-``jaxltl.read_model`` and ``jaxltl.write_model`` choose among the formats of models by a file's
-name and beginning; here each has its own functions, with its options. Automata come in the Hanoi
-format, games in its extended form and in that of PGSolver, logs as tables of text. What is named
-here is imported when it is first used. Files have no derivatives; what is read of functions
-(``read_parametric``) is differentiable in its parameters.
+``jaxltl.read_model`` and ``jaxltl.write_model`` detect the format of a model; the functions here
+have options of their own. Names are imported on first use. Only ``read_parametric`` is
+differentiable, in its parameters.
 """
 
 import lazy_loader

@@ -1,4 +1,4 @@
-"""Coloured worlds as text files: a letter for each cell, and which kinds of cells there are.
+"""Text files of coloured gridworlds: one letter per cell, and the kinds of cells.
 
 Example:
   >>> import pathlib, tempfile
@@ -36,13 +36,13 @@ LETTERS = "rywpb"  # of the colours, in text files
 
 
 def write_world(world: World) -> str:
-    """A world as text: its margin, slip and kinds of cells, then a letter for each colour.
+    """Text form of a coloured gridworld: margin, slip, kinds of cells and a letter per cell.
 
     Args:
       world: a :class:`~jaxltl.envs.temporal_gridworld.World`.
 
     Returns:
-      The text, of which :func:`read_world` makes the same world.
+      The text; :func:`read_world` restores the same world.
     """
     slip = 0.0
     if world.mdp.num_successors > 1:
@@ -56,21 +56,20 @@ def write_world(world: World) -> str:
 
 
 def read_world(text: str) -> World:
-    """The world of a text, such as :func:`write_world` makes.
+    """Parses a coloured gridworld from the text form of :func:`write_world`.
 
-    Lines with a colon are settings: ``margin`` (default 1), ``slip`` (default 0), and the colours
-    of a kind of cell, such as ``o1: 5 red, 4 black``; if there are none of the latter, kinds are
-    those of the dissertation. All other lines are rows of the map with its margin, with a letter
-    for each cell: r, y, w, p or b.
+    Lines with a colon are settings: ``margin`` (default 1), ``slip`` (default 0) and the colours of
+    a kind of cell, such as ``o1: 5 red, 4 black`` (default: the kinds of the dissertation). The
+    other lines are the rows of the map including its margin, with the letters r, y, w, p and b.
 
     Args:
-      text: what is read.
+      text: the text form.
 
     Returns:
       A :class:`~jaxltl.envs.temporal_gridworld.World`.
 
     Raises:
-      ValueError: naming the line, or the row and column of the map, and what is wrong.
+      ValueError: with the line, or the row and column of the map, for malformed text.
     """
     margin, slip = 1, 0.0
     kinds: dict[str, dict[str, int]] = {}
@@ -131,21 +130,21 @@ def _read_rows(rows: Sequence[str]) -> NDArray[np.int32]:
 
 
 def save_world(path: str | os.PathLike[str], world: World) -> None:
-    """Writes a world as text to a file, which appears only when complete.
+    """Writes a coloured gridworld to a text file, atomically.
 
     Args:
       path: the file.
-      world: what is written.
+      world: the world.
 
     Raises:
-      ValueError: the place cannot be written to.
+      ValueError: the file cannot be written.
     """
     with atomic_write(path) as file:
         file.write(write_world(world).encode())
 
 
 def load_world(path: str | os.PathLike[str]) -> World:
-    """The world of a text file, see :func:`read_world`.
+    """Reads a coloured gridworld from a text file, see :func:`read_world`.
 
     Args:
       path: the file.
@@ -154,7 +153,7 @@ def load_world(path: str | os.PathLike[str]) -> World:
       A :class:`~jaxltl.envs.temporal_gridworld.World`.
 
     Raises:
-      ValueError: the file cannot be read, or :func:`read_world` refuses it; naming the file.
+      ValueError: the file cannot be read or is malformed.
     """
     try:
         return read_world(Path(path).read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""Tables of comma-separated values, read line by line in bounded memory."""
+"""Streaming reader of CSV tables with bounded memory."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ _BOM = b"\xef\xbb\xbf"
 
 @dataclass(frozen=True)
 class Lines:
-    """Some lines of a table, one after the other.
+    """Consecutive lines of a CSV table, restricted to the requested columns.
 
     Attributes:
-      name: the file's.
-      first: the number of the first line.
-      fields: of each line, those that were asked for.
-      times: how many of the lines have the same.
+      name: file name.
+      first: number of the first line.
+      fields: requested fields of each line.
+      times: number of lines with the same fields.
     """
 
     name: str
@@ -36,30 +36,19 @@ class Lines:
     times: Counter[tuple[str, ...]]
 
     def error(self, fields: tuple[str, ...], message: str) -> ValueError:
-        """The error of the first line with such fields, to be raised."""
+        """ValueError for the first line with the given fields."""
         return _error(self.name, self.first + self.fields.index(fields), message)
 
 
 def read_columns(
     path: str | os.PathLike[str], columns: Sequence[str], optional: Sequence[str] = ()
 ) -> Iterator[Lines]:
-    """Some columns of a table with a header, in UTF-8, compressed or not.
+    """Requested columns of a UTF-8 CSV table with a header, in batches of lines.
 
-    Fields are separated by commas and may stand in double quotes, within which commas are part of
-    them. Blanks around fields do not count. All lines have as many fields as the header, and an
-    empty line may stand at the end only.
-
-    Args:
-      path: the file.
-      columns: the names of at least two columns, which may stand in any order, among others.
-      optional: of columns that may be missing.
-
-    Yields:
-      The lines, some at a time: the fields of `columns`, then of those `optional` that there are.
-      None is empty.
-
-    Raises:
-      ValueError: naming the file and the line: it is no such table.
+    At least two columns. Fields may be quoted, surrounding blanks are removed, all lines have as
+    many fields as the header, and empty lines are allowed at the end only. Yields the fields of
+    `columns`, then those of `optional` that exist; none is empty. ValueErrors name the file and the
+    line.
     """
     name, empty = str(path), 0
     place: tuple[int, ...] = ()
@@ -89,7 +78,7 @@ def _error(name: str, line: int, message: str) -> ValueError:
 
 
 def _whole_lines(name: str, parts: Iterable[bytes]) -> Iterator[tuple[int, bytes]]:
-    """The same bytes cut after lines, with the numbers of the first ones."""
+    """Splits the byte stream at line ends; yields the first line number and the bytes."""
     line, held = 1, b""
     for part in (x[i : i + _STEP] for x in parts for i in range(0, len(x), _STEP)):
         data = held + part
@@ -105,7 +94,7 @@ def _whole_lines(name: str, parts: Iterable[bytes]) -> Iterator[tuple[int, bytes
 
 
 def _rows(name: str, first: int, data: bytes) -> list[list[str]]:
-    """The fields of whole lines."""
+    """Parses complete lines into fields."""
     if first == 1:
         data = data.removeprefix(_BOM)
     if b"\r" in data:
@@ -146,7 +135,7 @@ def _is_empty(row: list[str]) -> bool:
 def _places(
     name: str, header: Sequence[str], columns: Sequence[str], optional: Sequence[str]
 ) -> tuple[int, ...]:
-    """Where the columns stand."""
+    """Indices of the requested columns in the header."""
     twice = [x for i, x in enumerate(header) if x and x in header[:i]]
     if twice:
         raise _error(name, 1, f"the header has the column {twice[0]!r} twice; rename one.")

@@ -1,4 +1,4 @@
-"""Files as bytes: compressed or not, of bounded size, and written whole or not at all."""
+"""Binary file access: transparent decompression, bounded size and atomic writes."""
 
 from __future__ import annotations
 
@@ -28,13 +28,10 @@ _SUFFIX: dict[str, Compression] = {".gz": "gzip", ".xz": "xz"}
 
 
 def read_bytes(path: str | os.PathLike[str], limit: int = MAX_BYTES) -> bytes:
-    """The bytes of a file, decompressed if it begins as gzip or xz does, whatever its name.
+    """Contents of a file, decompressed if it starts with the magic number of gzip or xz.
 
-    What a compressed file may grow to is bounded: by `limit`, and beyond 256 MiB by 300 times its
-    size. Nothing beyond the bound is ever held.
-
-    Raises:
-      ValueError: naming the file: it cannot be read, is damaged, or is larger than allowed.
+    The size is bounded by `limit` and, for compressed files, by 256 MiB plus 300 times the file
+    size. Errors are ValueErrors with the file name.
     """
     data = raw_bytes(path, limit)
     return b"".join(pieces(data, str(path), limit)) if compression_of(data) else data
@@ -46,11 +43,7 @@ def _check_path(path: Any) -> None:
 
 
 def raw_bytes(path: str | os.PathLike[str], limit: int = MAX_BYTES) -> bytes:
-    """The bytes of a file as they are, at most `limit`.
-
-    Raises:
-      ValueError: naming the file: it cannot be read, or is larger than allowed.
-    """
+    """Contents of a file without decompression, at most `limit` bytes."""
     _check_path(path)
     name, parts, size = str(path), [], 0
     try:
@@ -67,7 +60,7 @@ def raw_bytes(path: str | os.PathLike[str], limit: int = MAX_BYTES) -> bytes:
 
 
 class FileBytes:
-    """The bytes of an open file, read where and when they are asked for, by slices."""
+    """Lazy read-only view of an open file: ``file[a:b]`` reads these bytes."""
 
     def __init__(self, file: BinaryIO):
         self._file, self._size = file, os.fstat(file.fileno()).st_size
@@ -83,11 +76,7 @@ class FileBytes:
 
 @contextlib.contextmanager
 def opened(path: str | os.PathLike[str]) -> Iterator[FileBytes]:
-    """A file of any size, of which nothing is read yet.
-
-    Raises:
-      ValueError: naming the file: it cannot be read, now or later on.
-    """
+    """Opens a file of any size without reading it; I/O errors become ValueErrors."""
     _check_path(path)
     try:
         file = open(path, "rb")  # noqa: SIM115 - a null byte in the name is a ValueError here only
@@ -101,11 +90,7 @@ def opened(path: str | os.PathLike[str]) -> Iterator[FileBytes]:
 
 
 def pieces(data: bytes | FileBytes, name: str, limit: int = MAX_BYTES) -> Iterator[bytes]:
-    """What the bytes of a file hold, piece by piece, bounded as in :func:`read_bytes`.
-
-    Raises:
-      ValueError: naming the file: it is damaged, or holds more than allowed.
-    """
+    """Decompressed contents of a file in pieces, with the size bounds of :func:`read_bytes`."""
     kind = compression_of(data)
     if kind is None:
         yield from (data[i : i + _STEP] for i in range(0, len(data), _STEP))
@@ -120,12 +105,9 @@ def pieces(data: bytes | FileBytes, name: str, limit: int = MAX_BYTES) -> Iterat
 
 
 def streamed(path: str | os.PathLike[str], limit: int = MAX_BYTES) -> Iterator[bytes]:
-    """The bytes of a file piece by piece, as of :func:`read_bytes`, never all of them at once.
+    """Decompressed contents of a file in pieces; only compressed input is held in memory.
 
     Of a compressed file, what it holds compressed is in memory.
-
-    Raises:
-      ValueError: as :func:`read_bytes`.
     """
     _check_path(path)
     packed: list[bytes] = []
@@ -159,15 +141,7 @@ def _too_large(name: str, limit: int) -> ValueError:
 
 
 def read_text(path: str | os.PathLike[str], expected: str) -> str:
-    """The text of a file, decompressed as by :func:`read_bytes`.
-
-    Args:
-      path: the file.
-      expected: what the file should hold, to be named in an error: "a game".
-
-    Raises:
-      ValueError: naming the file: it cannot be read; or the first line and byte that are no UTF-8.
-    """
+    """Decoded UTF-8 contents of a file, decompressed as by :func:`read_bytes`."""
     data = read_bytes(path)
     try:
         return data.decode()
@@ -180,7 +154,7 @@ def read_text(path: str | os.PathLike[str], expected: str) -> str:
 
 
 def compression_of(data: bytes | FileBytes) -> Compression | None:
-    """How bytes are compressed, by how they begin."""
+    """Compression by magic number."""
     return next((kind for kind in _BEGINS if _begins(data, 0, kind)), None)
 
 
@@ -189,7 +163,7 @@ def _begins(data: bytes | FileBytes, place: int, kind: Compression) -> bool:
 
 
 def compression_by_name(path: str | os.PathLike[str]) -> Compression | None:
-    """How a file is compressed, by the end of its name."""
+    """Compression by file suffix."""
     return _SUFFIX.get(Path(path).suffix.lower())
 
 
@@ -214,7 +188,7 @@ def _decompressed(
 
 
 def _stream(data: bytes | FileBytes, place: int, kind: Compression) -> Iterator[tuple[bytes, int]]:
-    """The pieces of the stream that begins at a place, each with the place that is reached."""
+    """Decompresses one stream; yields each piece with the input offset after it."""
     unpack: Any
     if kind == "gzip":
         unpack = zlib.decompressobj(wbits=31)
@@ -237,16 +211,9 @@ def _stream(data: bytes | FileBytes, place: int, kind: Compression) -> Iterator[
 def write_bytes(
     path: str | os.PathLike[str], compression: Compression | Literal["by name"] | None = "by name"
 ) -> Iterator[BinaryIO]:
-    """A binary file to write to, compressed on the way, that appears only when complete.
+    """Context manager of a binary output file, compressed and atomic; the output is deterministic.
 
     The same bytes give the same file: no time is written.
-
-    Args:
-      path: the file.
-      compression: "gzip", "xz", None, or by the end of the name, ``.gz`` or ``.xz``.
-
-    Raises:
-      ValueError: the place cannot be written to.
     """
     if compression == "by name":
         compression = compression_by_name(path)

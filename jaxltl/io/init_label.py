@@ -1,4 +1,4 @@
-"""The label "init", by which formats tell the set of initial states."""
+"""The label "init", which marks the initial states in several formats."""
 
 from __future__ import annotations
 
@@ -9,11 +9,7 @@ from jaxltl.core.models.sparse import SparseMDP
 
 
 def labels_with_init(model: SparseMDP) -> dict[str, NDArray[np.bool_]]:
-    """Where each label holds, by its name, ``bool[S]``; first "init", where runs may start.
-
-    Raises:
-      ValueError: the initial states are not equally likely, or another label has that name.
-    """
+    """Label masks ``bool[S]`` by name, with the initial states as "init" first."""
     initial, label = np.asarray(model.initial), np.asarray(model.label, bool)
     where = initial > 0
     if np.ptp(initial[where]) > 1e-12:

@@ -1,4 +1,4 @@
-"""Intervals in text files: probabilities such as ``[0.4, 0.6]``, and rewards that are points."""
+"""Interval syntax in text formats: probabilities ``[0.4, 0.6]`` and point rewards ``[1, 1]``."""
 
 from __future__ import annotations
 
@@ -27,19 +27,14 @@ _POINT = re.compile(rb"\[([^\[\],]*),([^\[\],]*)\]")
 
 
 def has_bracket(block: Block, token: Integers) -> bool:
-    """Whether some tokens begin with a bracket."""
+    """True if any of the tokens starts with a bracket."""
     return bool((block.data[block.start[token]] == ord("[")).any())
 
 
 def with_whole_brackets(block: Block, column: int, lines: NDArray[np.bool_] | None = None) -> Block:
-    """A block in which what begins with a bracket in a column is one token, up to the closing one.
+    """Merges the tokens of each bracketed interval in a column into one token.
 
-    Lines that are shorter, and brackets that nothing closes, stay as they are.
-
-    Args:
-      block: the block.
-      column: of the token in its line, from 0.
-      lines: ``bool[L]``, those that are looked at; default all.
+    Shorter lines and unclosed brackets are unchanged; `lines` restricts the lines, ``bool[L]``.
     """
     looked_at = block.count > column
     if lines is not None:
@@ -67,11 +62,7 @@ def with_whole_brackets(block: Block, column: int, lines: NDArray[np.bool_] | No
 
 
 def intervals(block: Block, token: Integers) -> tuple[Floats, Floats]:
-    """Tokens as lower and upper ends, each a number or ``[l, u]``: ``float64[...]`` twice.
-
-    Raises:
-      ValueError: one is neither, or the ends are crossed or no probabilities, naming its line.
-    """
+    """Lower and upper bounds of tokens ``p`` or ``[l, u]``: ``float64[...]`` twice."""
     numbers = _numbers(block, token)
     if numbers is None:
         low, high = 0, token.size  # the first wrong one is among these
@@ -91,7 +82,7 @@ def intervals(block: Block, token: Integers) -> tuple[Floats, Floats]:
 
 
 def _numbers(block: Block, token: Integers) -> Block | None:
-    """A line for each token, with its number or the two of its interval; None if one is neither."""
+    """One line per token with its one or two numbers; None if a token is malformed."""
     length = block.end[token] - block.start[token] + 1
     joined = block.joined(token)
     joined[length.cumsum() - 1] = ord("\n")
@@ -117,11 +108,7 @@ def _numbers(block: Block, token: Integers) -> Block | None:
 
 
 def point_rewards(text: Text) -> Text:
-    """A text in which rewards such as ``[[1, 1], 0]`` are numbers, ``[1, 0]``; lines stay.
-
-    Raises:
-      ValueError: an interval is no point, naming its line.
-    """
+    """Replaces point intervals in rewards, ``[[1, 1], 0]``, by numbers, ``[1, 0]``."""
 
     def changed(found: re.Match[bytes]) -> bytes:
         return found[1] + _POINT.sub(lambda point: _number(text, found, point), found[2]) + found[3]
@@ -143,11 +130,10 @@ def _number(text: Text, found: re.Match[bytes], point: re.Match[bytes]) -> bytes
 
 
 def first_without_distribution(total: Floats) -> tuple[int, str, str] | None:
-    """The first choice with no distribution, what of it is wrong, and how; None if there is none.
+    """First choice whose probabilities or bounds have an infeasible sum, or None.
 
-    Args:
-      total: the sums of each choice, ``float64[R]``, or those of lower and upper ends,
-        ``float64[R, 2]``.
+    `total` has the sums of each choice, ``float64[R]``, or of its bounds, ``float64[R, 2]``.
+    Returns the choice, the subject of the message and the problem.
     """
     ends = total.reshape(len(total), -1)
     above, below = ends[:, 0] > 1 + NEAR, ends[:, -1] < 1 - NEAR
@@ -164,12 +150,12 @@ def first_without_distribution(total: Floats) -> tuple[int, str, str] | None:
 
 
 def exact_part(model: SparseMDP | IntervalMDP) -> SparseMDP:
-    """All of a model but its intervals."""
+    """The nominal sparse model, without interval bounds."""
     return model.nominal if isinstance(model, IntervalMDP) else model
 
 
 def value_texts(model: SparseMDP | IntervalMDP, comma: str) -> Callable[[slice], list[str]]:
-    """What gives the texts of some entries' probabilities, ``0.5`` or ``[0.4,0.6]``."""
+    """Function from a slice of entries to probability texts, ``0.5`` or ``[0.4,0.6]``."""
     if not isinstance(model, IntervalMDP):
         probability = model.host.probability
         return lambda part: list(map(repr, probability[part].tolist()))

@@ -1,4 +1,4 @@
-"""A learned reward network in a file, and planning with it in worlds never seen.
+"""Files of learned reward networks, and planning with them in new environments.
 
 Example:
   >>> import pathlib, tempfile
@@ -47,21 +47,20 @@ from jaxltl.core.values.undiscounted.optimal_actions import optimal_actions
 
 @dataclass(frozen=True)
 class LearnedReward:
-    """A reward over what is seen, the memory and the action, with all that planning needs.
+    """Reward network over observation, memory state and action, with its planning settings.
 
     Attributes:
       parameters: of ``RewardNetwork(hidden)``, ``{"params": ...}``.
       hidden: widths of the hidden layers.
-      memory: the automaton whose state the network sees.
-      label_on: which label a step of the product reads.
-      discount: with which it was learned.
-      horizon: the number of steps of a run, or None.
-      radius: how far around its cell it sees.
-      formula: the task.
-      kinds: names of what a cell of the observation can be, in the order of its one-hot parts.
-      guarantee: ``"best"``: plans take the actions alone that lose nothing of the memory's task;
-        a probability of it, for which as many of them are mixed in as it takes; or ``"none"``.
-      over: of which initial states a probability is, their ``"mean"`` or the ``"worst"``.
+      memory: automaton whose state is an input of the network.
+      label_on: label that a product step reads.
+      discount, horizon: of the learner; the horizon may be None.
+      radius: radius of the observed neighbourhood.
+      formula: task formula.
+      kinds: names of the one-hot components of an observed cell.
+      guarantee: ``"best"`` restricts plans to optimal actions for the task; a probability mixes in
+        as much of them as it takes; ``"none"``.
+      over: initial states that a probability refers to, ``"mean"`` or ``"worst"``.
     """
 
     parameters: Any
@@ -78,33 +77,33 @@ class LearnedReward:
 
     @property
     def network(self) -> todirl.RewardNetwork:
-        """The flax module of the parameters."""
+        """Flax module of the parameters."""
         return todirl.RewardNetwork(self.hidden)
 
     @property
     def hparams(self) -> todirl.Hparams:
-        """What planning takes from the learner's hyperparameters."""
+        """Hyperparameters of the planner."""
         return todirl.Hparams(discount=self.discount, horizon=self.horizon)
 
 
 def plan_in(learned: LearnedReward, world: MDP, observation: Any) -> tuple[Product, Solution]:
-    """The soft-optimal policy of a learned reward in a world, and the product that it is for.
+    """Soft-optimal policy of a learned reward in a world, with the product model.
+
+    Differentiable as :func:`~jaxltl.algos.todirl.plan` is, without a guarantee.
 
     Args:
       learned: the reward.
-      world: its labels have the propositions of the memory's automaton.
-      observation: ``float[S, O]``, what is seen in each of its states, such as
+      world: a model whose labels include the propositions of the memory automaton.
+      observation: ``float[S, O]``, the observation in each state, such as
         ``temporal_gridworld.observations(world, learned.radius)``.
 
     Returns:
       The product, and the solution with the policy ``float[S, Q, A]``; its value is that of the
-      reward, before moves that lose nothing are mixed in for a probability.
+      learned reward before the guarantee is applied.
 
     Raises:
-      ValueError: the world shows what the automaton does not know, the observation does not
-        have the shape that the network reads, or no policy has the probability there.
-
-    Differentiable as :func:`~jaxltl.algos.todirl.plan` is, where nothing is guaranteed.
+      ValueError: for labels unknown to the automaton, a wrong observation shape, or an unattainable
+        probability.
     """
     model = product(world, learned.memory, label_on=learned.label_on)
     seen = jnp.asarray(observation, model.dtype)
@@ -147,17 +146,16 @@ _ABOUT = (
 
 
 def save_reward(path: str | Path, learned: LearnedReward) -> None:
-    """Writes a learned reward as an ``.npz``, atomically; :func:`load_reward` reads it.
+    """Writes a learned reward as ``.npz``, atomically.
 
-    Its arrays: the parameters by their names, such as ``params/kernel``, and ``about``, a text of
-    JSON with all else.
+    The arrays are the parameters by path, such as ``params/kernel``, and ``about``, JSON text.
 
     Args:
       path: the file.
-      learned: what is written.
+      learned: the reward.
 
     Raises:
-      ValueError: the place cannot be written to.
+      ValueError: the file cannot be written.
     """
     about = {key: getattr(learned, key) for key in _ABOUT}
     text = json.dumps({**about, "memory": to_dict(learned.memory)})
@@ -167,7 +165,7 @@ def save_reward(path: str | Path, learned: LearnedReward) -> None:
 
 
 def load_reward(path: str | Path) -> LearnedReward:
-    """The learned reward that :func:`save_reward` wrote.
+    """Reads a learned reward from a file of :func:`save_reward`.
 
     Args:
       path: the file.
@@ -176,7 +174,7 @@ def load_reward(path: str | Path) -> LearnedReward:
       :class:`LearnedReward`.
 
     Raises:
-      ValueError: the file cannot be read, or is no such file.
+      ValueError: the file cannot be read or is malformed.
     """
     try:
         with open(path, "rb") as file:

@@ -1,4 +1,4 @@
-"""Logs of transitions, and of which labels states have: tables of comma-separated values."""
+"""Transition logs and state labels in CSV tables."""
 
 from __future__ import annotations
 
@@ -40,39 +40,36 @@ def read_log(
     states: Sequence[str] | None = None,
     actions: Sequence[str] | None = None,
 ) -> TransitionCounts:
-    """How often each transition stands in a log.
+    """Transition counts of a CSV log.
 
-    A log is a text in UTF-8, compressed by gzip or xz or not, of lines with fields separated by
-    commas (RFC 4180)::
+    A log is UTF-8 text (RFC 4180), plain or compressed by gzip or xz::
 
         state,action,next
         hall,left,kitchen
         hall,left,hall
 
-    Its first line names the columns, which may stand in any order and among others. States and
-    actions may have any names. A column `count` says how often a transition came that stands in one
-    line; 0 for one that is possible and never came. The file is read line by line: what is kept are
-    the names and the distinct transitions.
+    The header names the columns, in any order and among others. An optional column `count` has the
+    number of occurrences; 0 marks a possible transition that was not observed. The file is
+    streamed; memory is proportional to the number of names and distinct transitions.
 
     Args:
       path: the file.
       model: an :class:`~jaxltl.core.models.mdp.MDP` or
-        :class:`~jaxltl.core.models.sparse.SparseMDP` that every transition has to fit, with its
-        names: its variable `state` or the numbers of states, and the names or numbers of actions.
-      columns: the names of the columns of the state, the action and the next state.
-      count: that of the counts.
-      states, actions: all names that there are, in the order of their numbers. Default: those of
-        the log, by number if all are integers, else by alphabet.
+        :class:`~jaxltl.core.models.sparse.SparseMDP` that must contain every transition; its names
+        are the variable `state` or the state numbers, and the names or numbers of actions.
+      columns: names of the columns of state, action and next state.
+      count: name of the column of counts.
+      states, actions: all names, in order. Default: those of the log, in numerical order if all are
+        integers, else in alphabetical order.
 
     Returns:
-      :class:`~jaxltl.core.models.construct.counts.TransitionCounts`.
-      :func:`~jaxltl.core.models.construct.counts.align_counts` puts it beside the probabilities of a model, and
-      :func:`~jaxltl.core.models.construct.counts.model_from_counts` makes a model of it.
+      :class:`~jaxltl.core.models.construct.counts.TransitionCounts`, for
+      :func:`~jaxltl.core.models.construct.counts.align_counts` and
+      :func:`~jaxltl.core.models.construct.counts.model_from_counts`.
 
     Raises:
-      ValueError: naming the file and the line: the file cannot be read, is no such table, has an
-        empty field, a line with too few or too many, a second header, a count that is no integer
-        from 0, or a name or transition that is not among those given.
+      ValueError: with file and line, for malformed tables, invalid counts, and unknown names or
+        transitions.
 
     Example:
       >>> import pathlib, tempfile
@@ -120,21 +117,21 @@ def read_labels(
     *,
     columns: tuple[str, str] = ("state", "label"),
 ) -> dict[str, tuple[str, ...]]:
-    """Which states have which labels, from a table with the columns state and label.
+    """States of each label, from a CSV table of states and labels.
 
-    A state stands in as many lines as it has labels, and in none if it has none.
+    Each line assigns one label to one state.
 
     Args:
       path: the file, as of :func:`read_log`.
-      states: all states that there are. Default: any.
-      columns: the names of the columns.
+      states: all states. Default: any.
+      columns: names of the columns.
 
     Returns:
       The states of each label, in the order of the file, as
       :func:`~jaxltl.core.models.construct.counts.model_from_counts` takes them.
 
     Raises:
-      ValueError: naming the file and the line, as :func:`read_log`.
+      ValueError: with file and line, as :func:`read_log`.
 
     Example:
       >>> import pathlib, tempfile
@@ -168,7 +165,7 @@ def _check_columns(columns: Sequence[str], number: int) -> None:
 
 @dataclass
 class _Names:
-    """Names by number; new ones are added if they are not all known."""
+    """Name-to-index map; unless complete, new names are appended."""
 
     number: dict[str, int]
     complete: bool
@@ -190,7 +187,7 @@ def _unknown(what: str, name: str, names: Sequence[str]) -> str:
 def _numbered(
     lines: Lines, states: _Names, actions: _Names, known: Places | None
 ) -> NDArray[np.int64]:
-    """The distinct lines as numbers of states, actions and next states, and counts: ``[4, N]``."""
+    """Distinct lines as state, action and next-state indices and counts, ``[4, N]``."""
     distinct = list(lines.times)
     texts, times = list(zip(*distinct, strict=True)), list(lines.times.values())
     if len(texts) > 3:
@@ -226,7 +223,7 @@ def _numbers(
 
 
 def _count(lines: Lines, fields: tuple[str, ...]) -> int:
-    """How often a line says that a transition came."""
+    """Validated count of a line."""
     if _COUNT.fullmatch(fields[3]) and (count := int(fields[3])) <= _MOST:
         return count
     raise lines.error(
@@ -235,7 +232,7 @@ def _count(lines: Lines, fields: tuple[str, ...]) -> int:
 
 
 def _by_name(table: NDArray[np.int64], states: _Names, actions: _Names) -> TransitionCounts:
-    """Counts whose numbers follow the order of names."""
+    """Counts renumbered by the order of names."""
     orders = []
     for names in (states, actions):
         order = tuple(names.number) if names.complete else in_order(names.number)

@@ -1,4 +1,4 @@
-"""Models from files and into files, whatever their format."""
+"""Reading and writing models in any supported format."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _BEGINNING = 4096  # bytes by which a format is known
 
 
 class Format(NamedTuple):
-    """A format: how it is called, the ends of names, and what reads and writes it."""
+    """File format: name, suffixes, reader, writer and supported kinds of models."""
 
     name: str
     suffixes: tuple[str, ...]
@@ -61,24 +61,22 @@ FORMATS = (
 
 
 def read_model(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP | Game:
-    """The model of a file, by the end of its name or, where that says nothing, by how it begins.
+    """Reads a model, with the format detected by file suffix or contents.
 
-    Known are UMB (``.umb``), PRISM's explicit files (``.tra`` with what stands beside it,
-    ``.pexp``), DRN (``.drn``), parity games of PGSolver (``.pg``, ``.gm``, ``.pgsolver``) and in
-    extended HOA (``.hoa``, ``.ehoa``), and the library's own ``.npz``; all but the last may be
-    compressed, with ``.gz`` or ``.xz`` after that.
+    Formats: UMB (``.umb``), PRISM's explicit files (``.tra`` with its companions, ``.pexp``), DRN
+    (``.drn``), parity games of PGSolver (``.pg``, ``.gm``, ``.pgsolver``) and in extended HOA
+    (``.hoa``, ``.ehoa``), and ``.npz``; all but the last may be compressed (``.gz``, ``.xz``).
 
     Args:
       path: the file.
 
     Returns:
       A :class:`~jaxltl.core.models.sparse.SparseMDP`, a game over one, or an
-      :class:`~jaxltl.core.models.interval.IntervalMDP`. The objective of a parity game is what
-      :func:`~jaxltl.io.pgsolver.objective_of` says of it.
+      :class:`~jaxltl.core.models.interval.IntervalMDP`. :func:`~jaxltl.io.pgsolver.objective_of`
+      gives the objective of a parity game.
 
     Raises:
-      ValueError: the format is not known, or the file is missing or malformed. The message names
-        the file, the place in it and what was expected there.
+      ValueError: with file and place, for unknown formats and missing or malformed files.
 
     Example:
       >>> import tempfile
@@ -94,17 +92,17 @@ def read_model(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP | Game:
 
 
 def write_model(path: str | os.PathLike[str], model: Any) -> None:
-    """Writes a model in the format that the end of the file's name says, whole or not at all.
+    """Writes a model in the format of the file suffix, atomically.
 
     Args:
       path: the file.
       model: a model that :func:`~jaxltl.core.models.construct.convert.to_sparse` takes, a
-        :class:`~jaxltl.core.models.game.Game` over one, or an
+        :class:`~jaxltl.core.models.game.Game` or an
         :class:`~jaxltl.core.models.interval.IntervalMDP`.
 
     Raises:
-      ValueError: the format is not known or cannot hold the model, naming what of it, or the place
-        cannot be written to.
+      ValueError: the format is unknown or cannot represent the model, or the file cannot be
+        written.
 
     Example:
       >>> import tempfile
@@ -141,7 +139,7 @@ def _by_name(path: str | os.PathLike[str]) -> Format | None:
 
 
 def _by_beginning(path: str | os.PathLike[str]) -> Format:
-    """The format of a file with another name; PRISM's is not known without it."""
+    """Format detected by content; PRISM files require their suffix."""
     name, data = str(path), raw_bytes(path)
     if data.startswith(b"PK"):
         return _named("numpy")

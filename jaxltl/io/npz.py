@@ -1,4 +1,4 @@
-"""Models in the library's own ``.npz`` files: arrays by name, padded or sparse."""
+"""Models in the library's own ``.npz`` files, padded or sparse."""
 
 from __future__ import annotations
 
@@ -57,16 +57,7 @@ _PARTS = ("state", "choice", "transition")
 
 
 def parse_arrays(raw: bytes, name: str, more: Sequence[str] = ()) -> dict[str, NDArray[Any]]:
-    """The arrays of a model's ``.npz``, each known and of the right kind.
-
-    Args:
-      raw: the file's bytes.
-      name: the file's name, for messages.
-      more: names of arrays that it may hold beside a model's.
-
-    Raises:
-      ValueError: it is no ``.npz``, would be too large, or an array is unknown or of another kind.
-    """
+    """Arrays of a model's ``.npz``, checked by name and kind; `more` are further allowed names."""
     _check_size(raw, name)
     try:
         arrays = read_arrays(io.BytesIO(raw))
@@ -93,7 +84,7 @@ def parse_arrays(raw: bytes, name: str, more: Sequence[str] = ()) -> dict[str, N
 
 
 def _check_size(raw: bytes, name: str) -> None:
-    """Raises a ValueError where an archive would grow beyond what is read."""
+    """Raises ValueError for archives whose decompressed size exceeds the limit."""
     try:
         with zipfile.ZipFile(io.BytesIO(raw)) as archive:
             size = sum(entry.file_size for entry in archive.infolist())
@@ -107,11 +98,7 @@ def _check_size(raw: bytes, name: str) -> None:
 
 
 def model_of(arrays: Arrays, name: str) -> tuple[MDP, tuple[str, ...] | None]:
-    """The padded model of a file's arrays, in JAX's default precision, and its actions' names.
-
-    Raises:
-      ValueError: an array is missing or wrong.
-    """
+    """Padded model in JAX's default precision, and its action names."""
     with _errors_in(name):
         if set(arrays) & set(_ENDS):
             raise ValueError("its probabilities are intervals; a padded model has single numbers.")
@@ -123,7 +110,7 @@ def model_of(arrays: Arrays, name: str) -> tuple[MDP, tuple[str, ...] | None]:
 
 @contextlib.contextmanager
 def _errors_in(name: str) -> Iterator[None]:
-    """Errors begin with the file's name."""
+    """Prefixes ValueErrors with the file name."""
     try:
         yield
     except ValueError as error:
@@ -135,7 +122,7 @@ def _is_sparse(arrays: Arrays) -> bool:
 
 
 def _padded_model(arrays: Arrays) -> tuple[MDP, SparseMDP]:
-    """The model of transition, or of successor and probability, and the same in full precision."""
+    """Padded model, and the same in double precision as a sparse model."""
     options: dict[str, Any] = {
         k: arrays[k] for k in ("available", "initial", "label") if k in arrays
     }
@@ -169,7 +156,7 @@ def _action_names(arrays: Arrays, count: int) -> tuple[str, ...] | None:
 
 
 def _padded_interval(arrays: Arrays) -> tuple[IntervalMDP, int]:
-    """The model of successor, lower and upper, ``[S, A, K]``, and A; probability is passed over."""
+    """Interval model from padded arrays ``[S, A, K]``, and A; ignores ``probability``."""
     missing = {"successor", *_ENDS} - set(arrays)
     if missing:
         raise ValueError(
@@ -218,14 +205,7 @@ def _propositions(arrays: Arrays) -> list[str]:
 
 
 def sparse_model(arrays: Arrays) -> SparseMDP | IntervalMDP:
-    """The model of the arrays row_start, entry_start, successor and probability.
-
-    With the arrays lower and upper it is an interval model, whose probability is passed over, and
-    with center and radius one with a ball besides.
-
-    Raises:
-      ValueError: an array is missing or wrong.
-    """
+    """Sparse model from CSR arrays; an interval model with lower and upper (center and radius)."""
     is_interval = bool(set(arrays) & set(_OF_INTERVALS))
     chances = tuple(_ENDS) if is_interval else ("probability",)
     missing = {"row_start", "entry_start", "successor", *chances} - set(arrays)
@@ -258,7 +238,7 @@ def sparse_model(arrays: Arrays) -> SparseMDP | IntervalMDP:
 
 
 def _with_initial(model: Any, arrays: Arrays) -> Any:
-    """The model with the initial distribution as it stands; what was checked may be scaled."""
+    """Restores the exact initial distribution; validation may have rescaled it."""
     if "initial" not in arrays:
         return model
     exact = replace(exact_part(model), initial=np.asarray(arrays["initial"], np.float64))
@@ -266,13 +246,13 @@ def _with_initial(model: Any, arrays: Arrays) -> Any:
 
 
 def read_npz(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP | Game:
-    """The model of an ``.npz`` file, in double precision.
+    """Reads a model from an ``.npz`` file, in double precision.
 
-    A padded file has the array ``transition``, ``[S, A, S]``, or ``successor`` and ``probability``,
-    ``[S, A, K]``; a sparse one, such as :func:`write_npz` writes, the fields of
-    :class:`~jaxltl.core.models.sparse.SparseMDP`. With an array ``system`` it is a game, with
-    ``lower`` and ``upper`` in place of ``probability`` an interval model, and with ``center`` and
-    ``radius`` besides one with a ball.
+    A padded file has ``transition``, ``[S, A, S]``, or ``successor`` and ``probability``,
+    ``[S, A, K]``; a sparse one (:func:`write_npz`) the fields of
+    :class:`~jaxltl.core.models.sparse.SparseMDP`. The array ``system`` makes it a game; ``lower``
+    and ``upper`` replace ``probability`` in interval models, with ``center`` and ``radius`` for an
+    L1 ball.
 
     Args:
       path: the file.
@@ -282,7 +262,7 @@ def read_npz(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP | Game:
       :class:`~jaxltl.core.models.interval.IntervalMDP`.
 
     Raises:
-      ValueError: naming the file and the array that is unknown, missing or wrong.
+      ValueError: with file and array, for unknown, missing or invalid arrays.
     """
     name = str(path)
     try:
@@ -312,17 +292,17 @@ def read_npz(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP | Game:
 
 
 def write_npz(path: str | os.PathLike[str], model: Any) -> None:
-    """Writes a model as a sparse ``.npz``, whole or not at all, which :func:`read_npz` reads.
+    """Writes a model as a sparse ``.npz``, atomically.
 
-    It reads back bit for bit, except that an empty reward becomes zeros on states.
+    :func:`read_npz` restores it bit for bit; an empty reward becomes zeros on states.
 
     Args:
       path: the file.
-      model: a model that :func:`~jaxltl.core.models.construct.convert.to_sparse` takes, a game over one, or
+      model: a model that :func:`~jaxltl.core.models.construct.convert.to_sparse` takes, a game or
         an interval model.
 
     Raises:
-      ValueError: a variable holds other things, or the place cannot be written to.
+      ValueError: for variables of an unsupported type, or the file cannot be written.
 
     Example:
       >>> import pathlib, tempfile

@@ -1,9 +1,8 @@
-"""Parity games in the text format of PGSolver.
+"""Parity games in the PGSolver text format.
 
-The format is that of Friedmann and Lange's PGSolver ("The PGSolver collection of parity game
-solvers", 2010), which Oink, Knor and the tools around them read: vertices with a priority, an
-owner, successors and perhaps a name. The largest priority met infinitely often decides; if it is
-even, player 0 wins, who is the system here.
+Friedmann and Lange, "The PGSolver collection of parity game solvers" (2010), also read by Oink and
+Knor. Max-even: player 0, here the system, wins if the largest priority visited infinitely often is
+even.
 """
 
 from __future__ import annotations
@@ -28,11 +27,11 @@ MAX_NUMBER = 2**31 - 1  # of vertices and of priorities
 
 @brief
 class ParityGame(NamedTuple):
-    """A game and what the system is to achieve in it.
+    """Parity game: game graph and objective of the system.
 
     Attributes:
       game: a Game over a :class:`~jaxltl.core.models.sparse.SparseMDP`.
-      objective: the parity objective, min-even, of the fewest priorities that say the same.
+      objective: min-even parity objective with the fewest priorities.
     """
 
     game: Game
@@ -40,22 +39,21 @@ class ParityGame(NamedTuple):
 
 
 def read_pgsolver(path: str | os.PathLike[str]) -> ParityGame:
-    """The parity game of a file, plain or compressed.
+    """Reads a parity game from a PGSolver file.
 
-    A vertex is a state and an edge is a choice, in the order of the file. The model's `valuation`
-    keeps what the file says of a state: ``"vertex"``, its number there, ``"priority"``, which is
-    max-even, and ``"name"`` if any vertex has one. The start, if the file has one, is the initial
-    state; without one all states are, uniformly.
+    States and choices are the vertices and edges in the order of the file. The model's `valuation`
+    has the vertex numbers in ``"vertex"``, max-even priorities in ``"priority"`` and, if any, names
+    in ``"name"``. The initial distribution is the start vertex, or uniform without one.
 
     Args:
-      path: the file; ``.gz`` and ``.xz`` are read too.
+      path: the file, plain or compressed (``.gz``, ``.xz``).
 
     Returns:
       :class:`ParityGame`.
 
     Raises:
-      ValueError: naming the file, the line and what was expected there: text that breaks the
-        format, a vertex that is defined twice or not at all, or a number beyond 2^31.
+      ValueError: with file and line, for malformed text, duplicate or undefined vertices, and
+        numbers beyond 2^31.
 
     Example:
       >>> import tempfile
@@ -73,13 +71,7 @@ def read_pgsolver(path: str | os.PathLike[str]) -> ParityGame:
 
 
 def min_even(priority: NDArray[Any], neutral: NDArray[np.bool_] | None = None) -> NDArray[Any]:
-    """Max-even priorities as min-even ones, as few as can be.
-
-    The order turns round, and neighbours of one parity become one number.
-
-    Args:
-      priority: ``int[S]``, at least 0.
-      neutral: ``bool[S]``, states that decide nothing, or None.
+    """Converts max-even to min-even priorities, compressed to the fewest values.
 
     Example:
       >>> min_even(np.array([7, 4, 2, 5, 0, 1])).tolist()
@@ -95,7 +87,7 @@ def min_even(priority: NDArray[Any], neutral: NDArray[np.bool_] | None = None) -
 
 
 def parity_objective(priority: NDArray[Any]) -> Parity:
-    """The objective of min-even priorities ``int32[S]``."""
+    """Parity objective of min-even priorities ``int32[S]``."""
     none = to_jax(np.zeros(priority.shape, bool))
     return Parity(to_jax(priority), none, none, int(priority.max(initial=0)) + 1)
 
@@ -117,7 +109,7 @@ _EXPECTED = (
 
 
 class _Reader:
-    """A text with what is found in it."""
+    """Parser of PGSolver text."""
 
     def __init__(self, name: str, text: str) -> None:
         self.name, self.text = name, text
@@ -241,7 +233,7 @@ class _Reader:
         return at if found is None else found.end()
 
     def _broken(self, at: int) -> ValueError:
-        """What is wrong with the statement that begins at a place."""
+        """ValueError for the malformed statement at an offset."""
         text, begin = self.text, at
         if not self.vertex and re.match("[a-z]", text[at]):
             return self.error(
@@ -264,20 +256,19 @@ class _Reader:
 def write_pgsolver(
     path: str | os.PathLike[str], game: Game, objective: Parity | None = None
 ) -> None:
-    """Writes a deterministic game as a parity game.
+    """Writes a deterministic game as a PGSolver parity game.
 
-    What :func:`read_pgsolver` read is written with the vertices' numbers, priorities and names
-    that it had. Other games count states from 0, and their priorities are turned into max-even
-    ones. A state that decides the run has a loop to itself alone. If one state has all of the
-    initial distribution, it is the start.
+    Games of :func:`read_pgsolver` keep their vertex numbers, priorities and names. Others are
+    numbered from 0, with priorities converted to max-even. States decided by the objective become
+    self-loops. The start is the initial state if there is exactly one.
 
     Args:
       path: the file, compressed if it ends in ``.gz`` or ``.xz``.
       game: a Game over an MDP, a DenseMDP or a SparseMDP.
-      objective: what the system is to achieve; default that of the file that the game is from.
+      objective: the system's objective; default that of the file of the game.
 
     Raises:
-      ValueError: the game has a random move, no objective is known, or a name has a quote in it.
+      ValueError: for random moves, no objective, or names with a quotation mark.
 
     Example:
       >>> import pathlib, tempfile
@@ -323,17 +314,17 @@ def write_pgsolver(
 
 
 def objective_of(game: Game) -> Parity:
-    """The objective that came with a game's file.
+    """Parity objective stored in the file of a game.
 
     Args:
       game: of :func:`read_pgsolver`, :func:`~jaxltl.io.hoa.game.read_hoa_game` or
         :func:`~jaxltl.io.model_files.read_model`.
 
     Returns:
-      Its parity objective, min-even.
+      The min-even parity objective.
 
     Raises:
-      ValueError: the game is from no file that says one.
+      ValueError: the game stores no objective.
 
     Example:
       >>> import pathlib, tempfile
@@ -347,14 +338,7 @@ def objective_of(game: Game) -> Parity:
 
 
 def edges_of(game: Game, place: str) -> tuple[NDArray[Any], NDArray[Any]]:
-    """The moves of a deterministic game: where those of each state start, and where they lead.
-
-    Returns:
-      ``int[S + 1]`` and ``int[R]``.
-
-    Raises:
-      ValueError: a move is random.
-    """
+    """Row offsets ``int[S + 1]`` and successors ``int[R]`` of a deterministic game."""
     model = game.mdp
     if isinstance(model, SparseMDP):
         row_start, width = np.asarray(model.row_start), np.diff(np.asarray(model.entry_start))
@@ -381,14 +365,9 @@ def edges_of(game: Game, place: str) -> tuple[NDArray[Any], NDArray[Any]]:
 def max_even(
     valuation: dict[str, Any], objective: Parity | None
 ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-    """Max-even priorities of an objective, and the states that decide the run.
+    """Max-even priorities of an objective, and the mask of decided states.
 
-    Args:
-      valuation: of the game's model; the priorities in it are kept if they say the same.
-      objective: default what the valuation says.
-
-    Raises:
-      ValueError: neither is there.
+    The priorities of the valuation are kept if they are equivalent, and are the default objective.
     """
     given = valuation.get("priority")
     if objective is None:

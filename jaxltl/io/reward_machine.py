@@ -1,8 +1,8 @@
-"""Reward machines: automata with a reward on transitions, from their text form.
+"""Reward machines: automata with rewards on transitions, in their text format.
 
 Toro Icarte, Klassen, Valenzano and McIlraith, "Using reward machines for high-level task
 specification and decomposition in reinforcement learning" (ICML 2018) and "Reward machines:
-exploiting reward function structure in reinforcement learning" (JAIR 2022), whose files these are.
+exploiting reward function structure in reinforcement learning" (JAIR 2022).
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ from jaxltl.io.hoa.table import alphabet_of
 
 @brief
 class RewardMachine(NamedTuple):
-    """An automaton, and what it pays.
+    """Reward machine: an automaton with transition rewards.
 
     Attributes:
-      automaton: with co-safe acceptance, whose final states are those in which the machine has
-        ended. Its `state_names` are the numbers in the file.
-      reward: ``float64[Q, L]``, of reading letter l in state q; zero once the machine has ended.
+      automaton: co-safe, with the terminal states as final ones; `state_names` are the file's
+        numbers.
+      reward: ``float64[Q, L]``, of letter l in state q; zero in terminal states.
     """
 
     automaton: Automaton
@@ -46,26 +46,25 @@ class RewardMachine(NamedTuple):
 def read_reward_machine(
     source: str | os.PathLike[str], letters: Iterable[Letter] | None = None
 ) -> RewardMachine:
-    """The reward machine of a file or a text.
+    """Reads a reward machine from a file or a text.
 
-    The first line is the initial state, the second the list of terminal states, and each other one
-    a transition ``(u, v, 'e&!n', ConstantRewardFunction(1))``; ``#`` begins a comment. A guard is a
-    proposition, ``True`` or ``False``, or made of them by ``! & |`` and brackets. Of a state's
-    transitions the first whose guard holds is taken; where none holds the machine ends, in a state
-    of its own named "ended", with reward 0. In a terminal state it has ended: nothing more is
-    earned, and transitions from there are not read.
+    The first line has the initial state, the second the list of terminal states, each other line a
+    transition ``(u, v, 'e&!n', ConstantRewardFunction(1))``; ``#`` starts a comment. Guards are
+    Boolean formulas over propositions, ``True`` and ``False`` with ``! & |`` and parentheses. The
+    first transition whose guard holds is taken; if none holds the machine ends, in a state named
+    "ended", with reward 0. Terminal states earn nothing, and their transitions are ignored.
 
     Args:
       source: a file, or the text itself.
-      letters: the letters that occur, each a collection of proposition names, such as
-        ``jaxltl.models.occurring_letters(world)``; None stands for all 2^P subsets.
+      letters: possible letters, each a collection of proposition names, such as
+        ``jaxltl.models.occurring_letters(world)``; None for all 2^P subsets.
 
     Returns:
-      :class:`RewardMachine`; :func:`machine_reward` is its reward in a product with a world.
+      :class:`RewardMachine`; :func:`machine_reward` is its reward in a product.
 
     Raises:
-      ValueError: naming the file, the line and what was expected there; for rewards that are no
-        constants, and for more than 12 propositions without `letters`.
+      ValueError: with file and line, for malformed text, rewards that are not constant, and more
+        than 12 propositions without `letters`.
 
     Example:
       A robot gets coffee and then 1 for bringing it to the office; a broken plant costs 5.
@@ -119,7 +118,7 @@ _NAME = re.compile(r"[A-Za-z_][\w.-]*", re.ASCII)
 
 
 class _Reader:
-    """The lines of a text that say something, each with its number."""
+    """Parser of reward machines; keeps non-empty lines with their numbers."""
 
     def __init__(self, place: str, text: str) -> None:
         self.place = place
@@ -183,7 +182,7 @@ class _Reader:
 
 
 def _quoted(name: str) -> str:
-    """A name that is never an operator."""
+    """Quoted proposition name, which the LTL parser cannot take for an operator."""
     text = proposition_text(name)
     return text if text.startswith('"') else f'"{text}"'
 
@@ -217,25 +216,24 @@ def _machine(
 
 
 def machine_reward(product: Any, reward: ArrayLike | jax.Array) -> Any:
-    """What a machine is expected to pay for each action in a product.
+    """Expected reward of a reward machine in a product model.
 
-    With ``label_on="entry"`` a step from (s, q) reads the label of the state that it enters,
-    ``R(s, q, a) = sum_t P(t | s, a) reward[q, L(t)]``; with ``"exit"`` that of the state that it
-    leaves, ``R(s, q, a) = reward[q, L(s)]``. An entry product has also read the label of the state
-    it starts in, and what that pays is not in the rewards of steps; a machine that does not read it
-    starts in ``(s, automaton.initial)``, which is a state of the product like others.
+    With ``label_on="entry"`` a step from (s, q) reads the label of the successor,
+    ``R(s, q, a) = sum_t P(t | s, a) reward[q, L(t)]``; with ``"exit"`` the label of s,
+    ``R(s, q, a) = reward[q, L(s)]``. The letter that an entry product reads in its initial state
+    earns no step reward; a machine that does not read it starts in ``(s, automaton.initial)``.
 
     Args:
       product: of a world or a game with the machine's automaton.
       reward: ``float[Q, L]``, such as of :func:`read_reward_machine`.
 
     Returns:
-      ``float[S, Q, A]``, as the solvers of discounted problems take it, zero at unavailable
-      actions; differentiable in the reward and in the world's transitions. Of a product over a
-      SparseMDP ``float64[R]``, a number for each choice of ``to_sparse(product)``.
+      ``float[S, Q, A]``, zero at unavailable actions, differentiable in the reward and the world's
+      probabilities; for a product over a SparseMDP ``float64[R]``, per choice of
+      ``to_sparse(product)``.
 
     Raises:
-      ValueError: the reward has another shape, or the model is no product.
+      ValueError: the reward has another shape, or the model is not a product.
 
     Example:
       >>> machine = read_reward_machine('''

@@ -1,7 +1,6 @@
-"""Models of Storm, by its Python package stormpy, which is imported only here and only when asked.
+"""Conversion between sparse models and stormpy models.
 
-Both ways go through a file of the UMB format, which holds all that either side has of a model:
-see :mod:`jaxltl.io.umb.umb`.
+Through a temporary UMB file (:mod:`jaxltl.io.umb.umb`); stormpy is imported only here, on use.
 """
 
 from __future__ import annotations
@@ -20,23 +19,21 @@ from jaxltl.io.umb.umb import read_umb, write_umb
 
 
 def from_stormpy(model: Any) -> SparseMDP | IntervalMDP | Game:
-    """A sparse model of Storm's as one of the library's, bit for bit.
+    """Converts a sparse stormpy model, bit for bit.
 
-    States and choices keep their order. Kept are labels (without Storm's own ``"init"``, which is
-    the initial distribution), rewards of states, choices and transitions, labels of choices as
-    names of actions, and the values of variables, where Storm has them; exact probabilities become
-    the nearest doubles.
+    Keeps the order of states and choices, labels (``"init"`` becomes the initial distribution),
+    rewards, choice labels as action names, and state valuations; exact probabilities become the
+    nearest doubles.
 
     Args:
-      model: a sparse Markov chain, decision process or stochastic game (`SparseDtmc`, `SparseMdp`,
-        `SparseSmg`), or one of the first two with intervals.
+      model: a `SparseDtmc`, `SparseMdp` or `SparseSmg`, or one of the first two with intervals.
 
     Returns:
       A :class:`~jaxltl.core.models.sparse.SparseMDP`, a Game over one, or an
       :class:`~jaxltl.core.models.interval.IntervalMDP`.
 
     Raises:
-      ValueError: stormpy (version 2 or later) is not installed, or the model is none of these.
+      ValueError: stormpy (version 2 or later) is missing, or the model has another type.
 
     Example:
       >>> from importlib.util import find_spec
@@ -65,20 +62,20 @@ def from_stormpy(model: Any) -> SparseMDP | IntervalMDP | Game:
 
 
 def to_stormpy(model: Any) -> Any:
-    """A model as a sparse model of Storm's, bit for bit.
+    """Converts a model to a sparse stormpy model, bit for bit.
 
-    Of an initial distribution Storm has the states where it is positive.
+    The initial distribution is reduced to its support.
 
     Args:
-      model: a model that :func:`~jaxltl.core.models.construct.convert.to_sparse` takes, a Game over one, or
+      model: a model that :func:`~jaxltl.core.models.construct.convert.to_sparse` takes, a Game or
         an :class:`~jaxltl.core.models.interval.IntervalMDP`.
 
     Returns:
-      A `SparseDtmc` where every state has one choice, a `SparseMdp`, or a `SparseSmg`; of an
-      interval model one with intervals.
+      A `SparseDtmc` if every state has one choice, else a `SparseMdp` or `SparseSmg`; with
+      intervals for an interval model.
 
     Raises:
-      ValueError: stormpy (version 2 or later) is not installed.
+      ValueError: stormpy (version 2 or later) is missing.
 
     Example:
       >>> from importlib.util import find_spec

@@ -1,7 +1,6 @@
-"""Text files of numbers, cut into tokens by NumPy, a few megabytes at a time.
+"""Vectorised tokenizer of text files, in blocks of a few megabytes.
 
-A block holds whole lines. Columns are read from it as arrays, and what is no number is named with
-its line. Anything up to a blank separates tokens, and lines end with a line feed.
+Blocks consist of whole lines. Bytes up to the blank separate tokens; lines end with a line feed.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ _INFINITE = re.compile(rb"([+-]?)inf(?:inity)?", re.IGNORECASE)
 
 @dataclass(frozen=True)
 class Text:
-    """A part of a text file: its bytes from `begin` to `stop`, where line `line` begins."""
+    """Byte range ``[begin, stop)`` of a text file, starting at line number `line`."""
 
     name: str
     data: bytes
@@ -38,11 +37,11 @@ class Text:
     line: int = 1
 
     def error(self, line: int, message: str) -> ValueError:
-        """An error of a line, to be raised."""
+        """ValueError with the file name and line."""
         return ValueError(f"{self.name!r}, line {line}: {message}")
 
     def first_line(self, comment: bytes) -> tuple[bytes, int, Text]:
-        """The first line with something on it, its number, and what follows."""
+        """First non-empty line without comments, its number, and the remaining text."""
         place, line = self.begin, self.line
         while place < self.stop:
             end = self.data.find(b"\n", place, self.stop) + 1 or self.stop
@@ -53,7 +52,7 @@ class Text:
         return b"", line, Text(self.name, self.data, self.stop, self.stop, line)
 
     def blocks(self, comment: bytes) -> Iterator[Block]:
-        """The lines, without empty ones and those that begin with the sign of a comment."""
+        """Blocks of lines, without empty lines and comment lines."""
         place, line = self.begin, self.line
         while place < self.stop:
             cut = self.stop
@@ -70,14 +69,14 @@ class Text:
 
 @dataclass(frozen=True)
 class Block:
-    """Some lines of a text by their tokens.
+    """Tokens of consecutive lines.
 
     Attributes:
-      text: where they are from.
-      data: ``uint8[B]``, their bytes, the last of which is blank.
-      start, end: ``int[N]``, where the tokens are.
-      first: ``int[L + 1]``; those of line i are ``first[i]`` to ``first[i + 1] - 1``.
-      line: ``int[L]``, the numbers of the lines in the file.
+      text: their source.
+      data: bytes, ``uint8[B]``, the last of which is blank.
+      start, end: offsets of the tokens, ``int[N]``.
+      first: first token of each line, ``int[L + 1]``.
+      line: line numbers in the file, ``int[L]``.
     """
 
     text: Text
@@ -93,11 +92,11 @@ class Block:
 
     @property
     def count(self) -> Integers:
-        """How many tokens a line has, ``int[L]``."""
+        """Number of tokens of each line, ``int[L]``."""
         return np.diff(self.first)
 
     def error(self, token: int, expected: str) -> ValueError:
-        """The error of a token, which is not what is expected."""
+        """ValueError for an unexpected token."""
         shown = (
             self.data[self.start[token] : self.end[token]][:60].tobytes().decode(errors="replace")
         )
@@ -109,27 +108,23 @@ class Block:
         )
 
     def whole(self, line: int) -> bytes:
-        """A line as it stands."""
+        """Bytes of a line."""
         begin, end = self.start[self.first[line]], self.end[self.first[line + 1] - 1]
         return self.data[begin:end].tobytes()
 
     def joined(self, token: Integers) -> NDArray[np.uint8]:
-        """The bytes of tokens, each with a blank after it."""
+        """Bytes of the tokens, each followed by a blank."""
         length = self.end[token] - self.start[token] + 1
         joined = self.data[concatenated_ranges(self.start[token], length)]
         joined[length.cumsum() - 1] = 32
         return joined
 
     def texts(self, token: Integers) -> list[bytes]:
-        """Tokens as they stand."""
+        """Tokens as bytes."""
         return self.joined(token).tobytes().split(b" ")[:-1]
 
     def integers(self, token: Integers, expected: str, below: int = 2**31 - 1) -> Integers:
-        """Tokens as integers from 0 up to a bound, ``int32[...]``.
-
-        Raises:
-          ValueError: one is none, naming its line.
-        """
+        """Tokens as integers in ``[0, below)``, ``int32[...]``."""
         joined = self.joined(token)
         length = self.end[token] - self.start[token]
         texts = joined.tobytes().split(b" ")[:-1]
@@ -147,16 +142,7 @@ class Block:
     def floats(
         self, token: Integers, expected: str, other: Callable[[bytes], float | None] | None = None
     ) -> Floats:
-        """Tokens as the nearest doubles: decimals, fractions such as 1/3, and infinity.
-
-        Args:
-          token: their numbers.
-          expected: what they are, for the message.
-          other: reads what is none of these, or gives None.
-
-        Raises:
-          ValueError: one is none, or too large, naming its line.
-        """
+        """Tokens as doubles: decimals, fractions, infinity; `other` parses further forms."""
         joined = self.joined(token)
         longest = int((self.end[token] - self.start[token]).max(initial=0))
         if longest <= _LONGEST and _DECIMAL_BYTE[joined].all():
@@ -190,24 +176,20 @@ class Block:
         return found
 
     def columns(self, width: int, more: int, form: str) -> Integers:
-        """The first tokens of lines that have `width` tokens, or up to `more` beyond that.
-
-        Raises:
-          ValueError: a line has another number, with the form that it should have.
-        """
+        """First tokens of the lines, each of which must have `width` to ``width + more`` tokens."""
         wrong = (self.count < width) | (self.count > width + more)
         if wrong.any():
             raise self.malformed(int(wrong.argmax()), form)
         return self.first[:-1]
 
     def malformed(self, line: int, form: str) -> ValueError:
-        """The error of a line that has not the form that it should have."""
+        """ValueError for a malformed line."""
         shown = self.whole(line)[:60].decode(errors="replace")
         return self.text.error(int(self.line[line]), f"{shown!r}; expected {form}.")
 
 
 def as_double(text: bytes) -> float | None:
-    """The double nearest to a decimal or a fraction, or infinity; None for anything else."""
+    """Nearest double of a decimal, fraction or infinity; None for other text."""
     if len(text) > _LONGEST:
         return None
     if _DECIMAL.fullmatch(text):
@@ -224,7 +206,7 @@ def as_double(text: bytes) -> float | None:
 
 
 def as_fraction(text: bytes) -> Fraction | None:
-    """A decimal exactly; None for anything else, and for powers of ten that no double has."""
+    """Exact value of a decimal; None for other text and for exponents beyond those of doubles."""
     found = _DECIMAL.fullmatch(text) if len(text) <= _LONGEST else None
     exponent = re.search(rb"[eE]([+-]?\d+)", text)
     if found is None or (exponent and (len(exponent[1]) > 4 or abs(int(exponent[1])) > 400)):
@@ -236,17 +218,13 @@ def as_fraction(text: bytes) -> Fraction | None:
 
 
 def numbered(texts: list[bytes], known: dict[bytes, int]) -> Integers:
-    """The numbers of names, ``int32``; new ones are added to those that are known."""
+    """Indices of names, ``int32``; adds new names to `known`."""
     found = (known.setdefault(text, len(known)) for text in texts)
     return np.fromiter(found, np.int32, len(texts))
 
 
 def decoded(text: Text, names: dict[bytes, int]) -> list[str]:
-    """Names as text.
-
-    Raises:
-      ValueError: one is not UTF-8.
-    """
+    """Names decoded as UTF-8."""
     try:
         return [name.decode() for name in names]
     except UnicodeDecodeError as error:
@@ -255,12 +233,12 @@ def decoded(text: Text, names: dict[bytes, int]) -> list[str]:
 
 
 def joined_lines(form: str, *columns: Any) -> bytes:
-    """Lines of a form with one entry of each column."""
+    """Formats lines with one entry of each column."""
     return "".join(map(form.__mod__, zip(*columns, strict=True))).encode()
 
 
 def bytes_of(allowed: bytes) -> NDArray[np.bool_]:
-    """Which bytes are among some, ``bool[256]``."""
+    """Membership table ``bool[256]`` of some bytes."""
     table = np.zeros(256, bool)
     table[list(allowed)] = True
     return table
@@ -271,7 +249,7 @@ _DECIMAL_BYTE = bytes_of(b"0123456789+-.eE ")
 
 
 def edges(data: NDArray[np.uint8]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Where what is not blank begins, and where it ends; the last byte is blank."""
+    """Start and end offsets of tokens; the last byte must be blank."""
     blank = np.ones(data.size + 1, bool)
     np.less_equal(data, 32, out=blank[1:])
     edge = np.flatnonzero(blank[1:] != blank[:-1])
@@ -279,7 +257,7 @@ def edges(data: NDArray[np.uint8]) -> tuple[NDArray[Any], NDArray[Any]]:
 
 
 def _block(text: Text, data: NDArray[np.uint8], line: int, comment: bytes) -> tuple[Block, int]:
-    """A block, and how many lines of the file it took."""
+    """Tokenizes a block; also returns its number of lines in the file."""
     if data[-1] > 32:
         data = np.append(data, np.uint8(10))
     start, end = edges(data)
@@ -299,5 +277,5 @@ def _block(text: Text, data: NDArray[np.uint8], line: int, comment: bytes) -> tu
 
 
 def refuse(name: str, message: str) -> NoReturn:
-    """Refuses a file as a whole."""
+    """Raises ValueError for a file."""
     raise ValueError(f"{name!r}: {message}")

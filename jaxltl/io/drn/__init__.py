@@ -1,1 +1,1 @@
-"""DRN, Storm's text format, and its parametric models."""
+"""Storm's DRN text format, with and without parameters."""

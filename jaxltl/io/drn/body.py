@@ -1,4 +1,4 @@
-"""The states, actions and successors of a file in the DRN format, and what stands before them."""
+"""Header, states, actions and transitions of a DRN file."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ _LABEL = re.compile(rb'"([^"]+)"|([^\s"]+)')
 
 @dataclass(frozen=True)
 class Header:
-    """What stands before ``@model``.
+    """Header of a DRN file, up to ``@model``.
 
     Attributes:
       kind: "DTMC" or "MDP".
-      value_type: as it is given, or "".
-      parameters: their names.
-      placeholders: what stands for ``$name``.
-      rewards: the names of rewards; some may be empty.
-      num_states, num_choices: as announced; None where they are not.
-      body: what follows.
+      value_type: ``@value_type``, or "".
+      parameters: names of the parameters.
+      placeholders: value of each ``$name``.
+      rewards: names of the rewards; some may be empty.
+      num_states, num_choices: announced counts, or None.
+      body: the text after the header.
     """
 
     kind: str
@@ -52,20 +52,17 @@ class Header:
 
 @dataclass
 class Body:
-    """The model as columns, gathered block by block.
+    """States, actions and transitions of a DRN file as columns, collected block by block.
 
     Attributes:
-      state: of each action, ``int32[R]``.
-      line: of each action, ``int64[R]``.
-      row: of each successor, ``int32[T]``.
-      successor, value: of each successor, ``[T]``; values of interval models ``[T, 2]``.
-      action: the number of each action's name, ``int32[R]``.
-      action_names, label_names: names by number.
-      labelled, label: which states have which label, a pair each.
-      rewards: how many rewards a state or action has; 0 until some have any.
-      state_reward, choice_reward: the first state or action of an array ``[n, rewards]``, and it.
-      num_states, num_rows: so far.
-      after_action: whether the last line that was no successor was an action.
+      state, line: state and line number of each action, ``int32[R]`` and ``int64[R]``.
+      row, successor, value: row, successor and probability (or its two bounds) of each transition.
+      action: index into `action_names` of each action, ``int32[R]``.
+      labelled, label: pairs of states and indices into `label_names`.
+      rewards: number of rewards per state or action; 0 until the first one is read.
+      state_reward, choice_reward: pairs of a first state or action and rewards ``[n, rewards]``.
+      num_states, num_rows: counts so far.
+      after_action: True if the last line other than a transition was an action.
     """
 
     state: list[Integers] = field(default_factory=list)
@@ -90,11 +87,7 @@ class Body:
 
 
 def read_header(text: Text) -> Header:
-    """What stands before ``@model``.
-
-    Raises:
-      ValueError: naming the line; for models of other types.
-    """
+    """Parses the header, up to ``@model``; ValueError with the line for other model types."""
     found = _MODEL.search(text.data)
     if found is None:
         refuse(text.name, "it has no line '@model'; expected a model in the DRN format.")
@@ -185,16 +178,7 @@ def _count(text: Text, given: dict[str, tuple[int, str]], key: str) -> int | Non
 
 
 def read_body(header: Header, probabilities: Values, numbers: Values) -> Body:
-    """The states, actions and successors.
-
-    Args:
-      header: what stands before.
-      probabilities: reads those; of interval models their ends are read.
-      numbers: reads rewards.
-
-    Raises:
-      ValueError: naming the line and what was expected.
-    """
+    """Parses states, actions and transitions, with number parsers for probabilities and rewards."""
     body, text = Body(), header.body
     is_interval = header.value_type in INTERVALS
     for block in (point_rewards(text) if is_interval else text).blocks(b"//"):
@@ -235,7 +219,7 @@ def read_body(header: Header, probabilities: Values, numbers: Values) -> Body:
 
 
 def _begins(block: Block, at: Integers, word: bytes) -> NDArray[np.bool_]:
-    """Which tokens are a word."""
+    """Mask of the tokens that equal a word."""
     found = block.end[at] - block.start[at] == len(word)
     for i, letter in enumerate(word):
         found[found] = block.data[block.start[at[found]] + i] == letter
@@ -245,7 +229,7 @@ def _begins(block: Block, at: Integers, word: bytes) -> NDArray[np.bool_]:
 def _order(
     block: Block, body: Body, is_state: NDArray[np.bool_], is_action: NDArray[np.bool_]
 ) -> Integers:
-    """The last line up to each one that is no successor, -1 for none in the block."""
+    """Index of the last state or action line up to each line of the block, or -1."""
     index = np.arange(is_state.size)
     last = np.maximum.accumulate(np.where(is_state | is_action, index, -1))
     within = np.where(last >= 0, is_action[last], body.after_action)
@@ -314,10 +298,10 @@ def _read_actions(
 def _rewards(
     block: Block, body: Body, lines: Integers, numbers: Values, form: str
 ) -> tuple[NDArray[Any] | None, Integers, dict[int, bytes]]:
-    """Rewards ``[n, rewards]`` (None without any), the token after them, and odd lines' rests.
+    """Rewards ``[n, rewards]`` or None, index of the next token, and the rest of irregular lines.
 
-    Rewards are written as ``[1, 2]``, so that each is a token with a sign before or after it.
-    Lines that are written otherwise, or have quotation marks, are taken apart one by one.
+    Regular lines have rewards ``[1, 2]``, one token each with a bracket or comma. Irregular lines,
+    with other spacing or with quotation marks, are parsed one by one.
     """
     at, count = block.first[:-1][lines], block.count[lines]
     third = np.minimum(at + 2, block.start.size - 1)
@@ -369,7 +353,7 @@ def _odd_line(
     reward: NDArray[Any] | None,
     place: int,
 ) -> bytes:
-    """Sets the rewards of a line that is taken apart as it stands; gives what follows them."""
+    """Parses the rewards of one irregular line; returns them (or None) and the rest of the line."""
     found = _LINE.fullmatch(block.whole(line))
     if found is None:
         raise block.malformed(line, form)
@@ -435,7 +419,7 @@ def _check_counts(header: Header, body: Body) -> None:
 
 
 def names_of(header: Header, body: Body) -> dict[str, Any]:
-    """Labels, initial states and actions, as :func:`~jaxltl.core.models.sparse.make_sparse` has."""
+    """Labels, initial states and actions as arguments of ``make_sparse``."""
     text, num_labels = header.body, len(body.label_names)
     if body.num_states * num_labels > 64 * len(text.data) + 2**28:
         refuse(
@@ -473,7 +457,7 @@ def _actions(text: Text, body: Body) -> tuple[Integers | None, tuple[str, ...]]:
 
 
 def rewards_of(header: Header, body: Body) -> Iterator[tuple[str, NDArray[Any], NDArray[Any]]]:
-    """Each reward: its name, and its values on states ``[S]`` and on choices ``[R]``, or none."""
+    """Yields the name, state rewards ``[S]`` and choice rewards ``[R]`` (or empty arrays)."""
     text, width = header.body, body.rewards
     if width * (body.num_states + body.num_rows) > 8 * len(text.data) + 2**24:
         refuse(text.name, f"{width} rewards of {body.num_states} states are more than it writes.")

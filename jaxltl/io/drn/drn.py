@@ -1,4 +1,4 @@
-"""Markov chains and decision processes in DRN, Storm's text format."""
+"""DRN files of Markov chains and MDPs, in Storm's text format."""
 
 from __future__ import annotations
 
@@ -35,26 +35,25 @@ _STEP = 2**16  # states that are written at a time
 
 
 def read_drn(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP:
-    """The Markov chain or decision process in a DRN file, which may be compressed.
+    """Reads a Markov chain, MDP or interval model from a DRN file.
 
-    The states labelled ``init`` are the initial ones, each as likely as another. Numbers are the
-    nearest doubles to the decimals, fractions (``1/3``) and placeholders (``$name``) in the file.
-    Actions whose names are all numbers have numbers and no names, and where all are
-    ``__NOLABEL__`` there are none; where some are, their name is "". Comments, in which Storm
-    writes the values of variables, are passed over. Labels are in the order in which they occur.
-    The value types ``double-interval`` and ``rational-interval`` make it an interval model, whose
-    probabilities are ``[l, u]`` and whose rewards are numbers, or points ``[r, r]``.
+    The states labelled ``init`` are the initial states, with equal probability. Decimals, fractions
+    (``1/3``) and placeholders (``$name``) become the nearest doubles. Actions are numbered without
+    names if all names are numbers, absent if all are ``__NOLABEL__``, and that name is otherwise
+    "". Labels keep the order of the file; comments, which hold Storm's state variables, are
+    ignored. The value types ``double-interval`` and ``rational-interval`` give an interval model,
+    with probabilities ``[l, u]`` and rewards that are numbers or points ``[r, r]``.
 
     Args:
       path: the file, plain or compressed with gzip or xz.
 
     Returns:
-      A :class:`~jaxltl.core.models.sparse.SparseMDP`, or of intervals an
+      A :class:`~jaxltl.core.models.sparse.SparseMDP` or
       :class:`~jaxltl.core.models.interval.IntervalMDP`.
 
     Raises:
-      ValueError: naming file and line, and what was expected; for models with parameters, with
-        observations, or in continuous time.
+      ValueError: with file and line, for malformed text, parameters, observations or continuous
+        time.
 
     Example:
       >>> import pathlib, tempfile
@@ -131,7 +130,7 @@ def _model(header: Header, body: Body) -> SparseMDP | IntervalMDP:
 
 
 def _rewards(header: Header, body: Body) -> dict[str, Rewards]:
-    """Rewards by name, without parts that are zero."""
+    """Rewards by name; all-zero arrays become None."""
     found = {}
     for name, state, choice in rewards_of(header, body):
         found[name] = Rewards(
@@ -144,18 +143,18 @@ def _rewards(header: Header, body: Body) -> dict[str, Rewards]:
 
 
 def write_drn(path: str | os.PathLike[str], model: SparseMDP | IntervalMDP) -> None:
-    """Writes a model as a DRN file, from which :func:`read_drn` and Storm read the same doubles.
+    """Writes a model as a DRN file; :func:`read_drn` and Storm read back the same doubles.
 
-    The format has no place for the values of variables, for labels that hold nowhere and for the
-    order of labels. Rewards of interval models are written as numbers, as Storm reads no points.
+    State variables, labels of no state and the order of labels are lost. Rewards of interval models
+    are written as numbers, since Storm does not read point intervals.
 
     Args:
-      path: the file; compressed if its name ends in ``.gz`` or ``.xz``.
-      model: a concrete model, whose initial states are equally likely.
+      path: the file, compressed if it ends in ``.gz`` or ``.xz``.
+      model: a concrete model with equally likely initial states.
 
     Raises:
-      ValueError: the format cannot hold the model, naming what it cannot, such as rewards of
-        transitions; or the place cannot be written to.
+      ValueError: the format cannot represent the model (transition rewards, for example), or the
+        file cannot be written.
 
     Example:
       >>> import pathlib, tempfile
@@ -173,7 +172,7 @@ def write_drn(path: str | os.PathLike[str], model: SparseMDP | IntervalMDP) -> N
 
 
 def _written(given: SparseMDP | IntervalMDP) -> Iterator[bytes]:
-    """The file in pieces; what cannot be written is found before the first."""
+    """The file in pieces; validates the model before the first piece."""
     model = exact_part(given)
     labels, actions = _label_texts(model), _action_texts(model)
     rewards = []
@@ -267,7 +266,7 @@ def _action_lines(
 
 
 def _bracketed(rewards: list[Any], part: slice, count: int) -> list[str]:
-    """Rewards as ``[1.0, 2.0]``, one text for each state or action."""
+    """Rewards as ``[1.0, 2.0]``, one text per state or action."""
     if not rewards:
         return [""] * count
     columns = [
@@ -279,7 +278,7 @@ def _bracketed(rewards: list[Any], part: slice, count: int) -> list[str]:
 
 
 def _label_texts(model: SparseMDP) -> list[tuple[str, NDArray[np.bool_]]]:
-    """What stands after a state that has a label, and where it does; first the initial states."""
+    """Text and mask of each label, the initial states first."""
     found = []
     for name, where in labels_with_init(model).items():
         _check_name("label", name, '"')
@@ -289,7 +288,7 @@ def _label_texts(model: SparseMDP) -> list[tuple[str, NDArray[np.bool_]]]:
 
 
 def _action_texts(model: SparseMDP) -> Callable[[int], str] | None:
-    """What an action is called, by its number."""
+    """Function from action numbers to action names; None without actions."""
     if model.action is None:
         return None
     if not model.action_names:

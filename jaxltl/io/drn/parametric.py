@@ -1,4 +1,4 @@
-"""Models whose probabilities and rewards are functions of parameters, from DRN files."""
+"""Parametric models from DRN files: rational functions as probabilities and rewards."""
 
 from __future__ import annotations
 
@@ -42,10 +42,10 @@ Term = tuple[Fraction, list[tuple[int, int]]]  # a coefficient, and parameters w
 @brief
 @dataclass(frozen=True)
 class RationalFunction:
-    """The quotient of two polynomials in the parameters of a model.
+    """Rational function: the quotient of two polynomials in the parameters.
 
     Attributes:
-      numerator, denominator: polynomials, each a table of exact coefficients by exponents.
+      numerator, denominator: polynomials, as maps from exponents to exact coefficients.
 
     Example:
       >>> import pathlib, tempfile
@@ -62,13 +62,13 @@ class RationalFunction:
     denominator: Polynomial
 
     def at(self, point: tuple[Fraction, ...]) -> Fraction:
-        """Its exact value; ZeroDivisionError at a pole."""
+        """Exact value at a point; raises ZeroDivisionError at a pole."""
         above, below = (_value(factors, point) for factors in self._factors)
         return above / below
 
     @cached_property
     def _factors(self) -> tuple[list[Term], list[Term]]:
-        """The terms of both, with the parameters that they have alone."""
+        """Terms of numerator and denominator, with nonzero exponents only."""
         above, below = (
             [(c, [(d, k) for d, k in enumerate(powers) if k]) for powers, c in of.items()]
             for of in (self.numerator, self.denominator)
@@ -79,19 +79,18 @@ class RationalFunction:
 @brief
 @dataclass(frozen=True)
 class ParametricModel:
-    """A Markov chain or decision process whose numbers are functions of parameters.
+    """Markov chain or MDP whose probabilities and rewards are rational functions.
 
-    Rows, entries, labels and actions are as in :class:`~jaxltl.core.models.sparse.SparseMDP`, but
-    for the successors of a row, which are in the order of the file.
+    The layout is that of :class:`~jaxltl.core.models.sparse.SparseMDP`, with the successors of a
+    row in the order of the file.
 
     Attributes:
-      parameters: the names of the parameters.
-      functions: the distinct functions, the first of which is zero.
-      row_start, entry_start, successor: the transitions.
-      probability: ``int32[T]``, the number of each entry's function.
-      rewards: for each name the numbers of the functions on states, ``int32[S]``, and on choices,
-        ``int32[R]``.
-      names: labels, initial states and actions, as ``make_sparse`` takes them.
+      parameters: names of the parameters.
+      functions: distinct functions, the first of which is zero.
+      row_start, entry_start, successor: transitions.
+      probability: function index of each transition, ``int32[T]``.
+      rewards: function indices on states, ``int32[S]``, and choices, ``int32[R]``, by name.
+      names: labels, initial states and actions, as arguments of ``make_sparse``.
     """
 
     parameters: tuple[str, ...]
@@ -104,14 +103,13 @@ class ParametricModel:
     names: dict[str, Any]
 
     def at(self, values: Mapping[str, float | Fraction]) -> SparseMDP:
-        """The model at a point, its functions evaluated exactly and then rounded.
+        """Instantiates the model at a point, in exact arithmetic rounded to doubles.
 
         Args:
           values: a finite number for each parameter.
 
         Raises:
-          ValueError: a parameter is missing or unknown, a function has a pole there, or the
-            probabilities of a row are none.
+          ValueError: for missing or unknown parameters, a pole, or rows that are no distributions.
         """
         if not isinstance(values, Mapping):
             raise ValueError(
@@ -146,15 +144,15 @@ class ParametricModel:
         )
 
     def over(self, low: Ends, high: Ends) -> ParametricMDP:
-        """The same as JAX functions of the parameters, over a box of them.
+        """Parametric MDP in JAX over a box of parameters.
 
         Args:
-          low, high: one number for all parameters, a number for each name, or ``float[D]``; such
-            that no probability becomes zero in the box.
+          low, high: bounds, as one number, a number per name, or ``float[D]``; no probability may
+            vanish within the box.
 
         Raises:
-          ValueError: a name is missing, the ends cross, or the functions are no probabilities in
-            the box.
+          ValueError: for missing names, crossed bounds, or rows that are no distributions in the
+            box.
 
         Example:
           >>> import tempfile, pathlib
@@ -203,13 +201,13 @@ class ParametricModel:
 
 @struct.dataclass
 class _Numbers:
-    """The probabilities and rewards of a model, from the values of its functions.
+    """Probabilities and rewards as functions of the parameters.
 
     Attributes:
-      functions: all of them.
-      function: ``int32[E]``, the function of each entry that is not zero, in order.
-      entry: ``int32[E]``, the transitions that these are parts of; None if they are all of them.
-      rewards: the functions on the states of choices and on choices, ``int32[R]`` both.
+      functions: all functions.
+      function: function of each nonzero entry, ``int32[E]``.
+      entry: transition to which each entry contributes, ``int32[E]``; None for one entry each.
+      rewards: functions on the state of each choice and on the choice, ``int32[R]`` both.
       num_transitions: static.
     """
 
@@ -233,7 +231,7 @@ class _Numbers:
         return probability, rewards
 
     def ranges(self, low: np.ndarray, high: np.ndarray) -> tuple[Ranges, dict[str, Ranges]]:
-        """What they can be over a box of parameters of at least 0, on the host."""
+        """Enclosures of probabilities and rewards over a box of non-negative parameters (host)."""
         value = ranges(self.functions, low, high)
         lower, upper = (x[self.function] for x in value)
         if self.entry is not None:
@@ -251,12 +249,7 @@ class _Numbers:
 
 
 class _Exact:
-    """Exact instantiation; equal for equal models, so that reading a file again compiles nothing.
-
-    Attributes:
-      model: what is instantiated.
-      successor: what its transitions lead to wherever none of them is gone.
-    """
+    """Exact instantiation, hashed by content: reading a file again triggers no recompilation."""
 
     def __init__(self, model: ParametricModel, successor: Integers) -> None:
         self.model, self.successor = model, successor
@@ -291,21 +284,19 @@ class _Exact:
 
 
 def read_parametric(path: str | os.PathLike[str]) -> ParametricModel:
-    """The Markov chain or decision process in a DRN file whose numbers may have parameters.
+    """Reads a parametric Markov chain or MDP from a DRN file.
 
-    Functions are sums, products, quotients and whole powers of numbers, which are exact, and of
-    parameters, such as ``(-1)*p+1`` or ``p^2/(p+q)``, without blanks between.
+    Functions consist of exact numbers, parameters, sums, products, quotients and integer powers,
+    without blanks: ``(-1)*p+1``, ``p^2/(p+q)``.
 
     Args:
       path: the file, plain or compressed with gzip or xz.
 
     Returns:
-      :class:`ParametricModel`; its :meth:`~ParametricModel.over` is differentiable in the
-      parameters.
+      :class:`ParametricModel`; :meth:`~ParametricModel.over` is differentiable in the parameters.
 
     Raises:
-      ValueError: naming file and line, and what was expected; as for
-        :func:`~jaxltl.io.drn.drn.read_drn`.
+      ValueError: with file and line, as :func:`~jaxltl.io.drn.drn.read_drn`.
 
     Example:
       >>> import tempfile, pathlib
@@ -378,7 +369,7 @@ def read_parametric(path: str | os.PathLike[str]) -> ParametricModel:
 
 
 def _everywhere(function: Integers, size: int) -> Integers:
-    """Functions of a reward on each state or choice; the first one, zero, where none is given."""
+    """Function numbers of a reward; all zero (the zero function) where the reward is absent."""
     return function if function.size else np.zeros(size, np.int32)
 
 
@@ -390,7 +381,7 @@ def _starts(owner: Integers, size: int) -> Integers:
 
 
 class _Malformed(ValueError):
-    """What is wrong with a text that should be a function."""
+    """Syntax error in a rational function; the message completes "it is ..."."""
 
 
 def _constant(parameters: tuple[str, ...], value: Fraction | int) -> Polynomial:
@@ -463,7 +454,7 @@ def _divide(a: RationalFunction, b: RationalFunction) -> RationalFunction:
 def _parsed(
     text: bytes, parameters: tuple[str, ...], placeholders: Mapping[str, RationalFunction]
 ) -> RationalFunction:
-    """A function from its text."""
+    """Parses a rational function."""
     try:
         shown = text.decode()
     except UnicodeDecodeError:
@@ -488,7 +479,7 @@ def _parsed(
 
 @dataclass
 class _Reader:
-    """Reads a function from tokens, by precedence."""
+    """Recursive-descent parser of rational functions."""
 
     tokens: list[str]
     parameters: tuple[str, ...]

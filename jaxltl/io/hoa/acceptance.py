@@ -1,4 +1,4 @@
-"""Acceptance conditions of the Hanoi format as priorities where possible, else as colours."""
+"""HOA acceptance conditions as parity conditions where possible, else as colours."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MAX_COLORS = 62  # acceptance sets as bits of one int64
 
 
 def acceptance_of(header: Header, delta: NDArray[Any], priority: NDArray[Any]) -> str:
-    """The acceptance that the priorities allow, and that `write_hoa` noted in the header."""
+    """Acceptance type that the priorities allow and the `write_hoa` header names."""
     own = header.tool == "jaxltl"
     if priority.max() > 1 or (own and header.acceptance_name == "parity"):
         return "parity"
@@ -32,7 +32,7 @@ def acceptance_of(header: Header, delta: NDArray[Any], priority: NDArray[Any]) -
 
 
 def condition_given(condition: Tree, number: int, visited: bool) -> Tree:
-    """The condition once it is known whether a set is visited infinitely often, simplified."""
+    """Substitutes Inf(number) by `visited` and Fin(number) by its negation, and simplifies."""
     operator = condition[0]
     if operator in ("inf", "fin"):
         if condition[1] != number:
@@ -54,7 +54,7 @@ def condition_given(condition: Tree, number: int, visited: bool) -> Tree:
 
 
 def _sets_of(condition: Tree) -> list[int]:
-    """The sets that a condition mentions, sorted."""
+    """Acceptance sets of a condition, sorted."""
     found: set[int] = set()
     stack = [condition]
     while stack:
@@ -67,13 +67,10 @@ def _sets_of(condition: Tree) -> list[int]:
 
 
 def decisive_sets(condition: Tree) -> tuple[list[tuple[int, bool]], bool] | None:
-    """The sets from the most important one on, if a condition has such an order.
+    """Order of acceptance sets by importance if the condition is a parity condition, else None.
 
     A set is decisive if visiting it infinitely often settles acceptance, given that the more
     important sets are not. Buchi, co-Buchi and all styles of parity have such an order.
-
-    Returns:
-        Each set with what it decides, and what holds if none is visited; None without an order.
     """
     order = []
     while condition not in (TRUE, FALSE):
@@ -92,7 +89,7 @@ def decisive_sets(condition: Tree) -> tuple[list[tuple[int, bool]], bool] | None
 def edge_priority(
     marks: frozenset[int], sets: int, order: list[tuple[int, bool]], otherwise: bool
 ) -> int:
-    """The min-even priority of an edge, from its most important set."""
+    """Min-even priority of an edge, from its most important acceptance set."""
     priority = 0
     for number, accepts in order:
         priority += (priority % 2 == 0) != accepts
@@ -108,7 +105,7 @@ def _belongs(marks: frozenset[int], number: int, sets: int) -> bool:
 def colors_of(
     condition: Tree, marks: list[frozenset[int]], header: Header
 ) -> tuple[NDArray[np.int64], Tree]:
-    """The sets of each edge as bits, and the condition over the numbers of these bits."""
+    """Acceptance sets of each edge as bit masks, and the condition over bit numbers."""
     sets = _sets_of(condition)
     if len(sets) > MAX_COLORS:
         raise error_at(

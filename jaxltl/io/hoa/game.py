@@ -1,9 +1,8 @@
-"""Games of reactive synthesis in the extended Hanoi format.
+"""Synthesis games in the extended HOA format.
 
-A deterministic automaton whose header says by `controllable-AP:` which propositions the system
-chooses (Pérez 2019, "The extended HOA format for synthesis"): in each step the environment chooses
-its propositions, then the system, who sees them, its own; the run of the automaton decides.
-SYNTCOMP has its parity games in it; Strix, Knor and ltlsynt write and read it.
+A deterministic automaton with `controllable-AP:` (Pérez 2019, "The extended HOA format for
+synthesis"): in each step the environment chooses the inputs and then the system, observing them,
+the outputs. Used by SYNTCOMP, Strix, Knor and ltlsynt.
 """
 
 from __future__ import annotations
@@ -46,13 +45,12 @@ _LONGEST, _LONGEST_ALL = 1000, 10**6  # paths in the diagrams of guards that are
 
 @brief
 class HoaGame(NamedTuple):
-    """A game, what the system is to achieve, and who chooses which propositions.
+    """Parity game with the propositions of the environment (inputs) and the system (outputs).
 
     Attributes:
       game: a Game over a :class:`~jaxltl.core.models.sparse.SparseMDP`.
       objective: the parity objective.
-      inputs: the propositions that the environment chooses.
-      outputs: those that the system chooses.
+      inputs, outputs: propositions of the environment and of the system.
     """
 
     game: Game
@@ -62,27 +60,25 @@ class HoaGame(NamedTuple):
 
 
 def read_hoa_game(source: str | os.PathLike[str]) -> HoaGame:
-    """The game of a deterministic automaton with `controllable-AP:`.
+    """Reads a parity game from a deterministic HOA automaton with `controllable-AP:`.
 
-    The environment moves in the automaton's states, one for each colour by which a state is
-    entered. Its inputs are put together where they leave the system the same choices; each such
-    class leads to a state of the system's, whose moves are the classes of outputs. The names of
-    actions are the conditions on inputs and outputs; the model's `valuation` holds in ``"state"``
-    the automaton's state (-1 for the lost state that missing edges lead to) and in ``"priority"``
-    max-even priorities. Guards are kept as decision diagrams, so that many propositions are no
-    matter where few classes are made of them. States that no run comes to are left out, and a
-    condition that takes hundreds of terms to write is named ``condition`` and a number.
+    The environment moves in the automaton's states, one copy per priority of an incoming edge.
+    Inputs that leave the same residual guards form a class; each class leads to a state of the
+    system, whose moves are the classes of outputs. Action names are the conditions, abbreviated to
+    ``condition`` and a number if they have hundreds of terms. The `valuation` holds in ``"state"``
+    the automaton state (-1 for the losing sink of missing edges) and in ``"priority"`` max-even
+    priorities. Guards are decision diagrams, so the cost depends on the number of classes, not of
+    propositions. Unreachable states are removed.
 
     Args:
-      source: a file, plain or compressed, or the text itself, which begins with ``HOA:``.
+      source: a file, plain or compressed, or HOA text.
 
     Returns:
       :class:`HoaGame`.
 
     Raises:
-      ValueError: naming the file, the line and what was expected: text that breaks the format, an
-        automaton that is not deterministic, a condition that is no parity condition, no
-        `controllable-AP:`, or guards of too many classes.
+      ValueError: with file and line, for malformed text, nondeterminism, an acceptance condition
+        other than parity, a missing `controllable-AP:`, or too many classes of guards.
 
     Example:
       >>> from jaxltl import winning_region
@@ -122,7 +118,7 @@ def _read(tokens: list[Token]) -> HoaGame:
 
 
 def _controllable(items: list[list[Any]], header: Header) -> list[int]:
-    """The numbers of the propositions that the system chooses."""
+    """Indices of the propositions that the system controls."""
     given = [values for values in items if values[0] == "controllable-AP:"]
     if len(given) != 1:
         raise error_at(
@@ -142,11 +138,11 @@ def _controllable(items: list[list[Any]], header: Header) -> list[int]:
 
 
 class _TooMany(ValueError):
-    """The guards make more of diagrams or moves than are kept."""
+    """The guards exceed the limits on diagram nodes or moves."""
 
 
 class _Guards(Diagrams):
-    """Conditions as decision diagrams, the environment's propositions before the system's."""
+    """Binary decision diagrams of guards, with inputs ordered before outputs."""
 
     def __init__(self, variable: list[int]) -> None:
         super().__init__()
@@ -159,7 +155,7 @@ class _Guards(Diagrams):
         return super().node(variable, low, high)
 
     def num_paths(self, guard: int) -> int:
-        """The number of paths to true, which bounds the length of a guard's text."""
+        """Number of paths to true, an upper bound on the length of a guard's text."""
         for _, low, high in self.nodes[len(self.paths) :]:  # what a node leads to is older
             self.paths.append(min(self.paths[low] + self.paths[high], 2**40))
         return self.paths[guard]
@@ -178,19 +174,14 @@ class _Guards(Diagrams):
 
 
 class _Split:
-    """What inputs leave of guards: the classes of inputs, each with a condition of its own.
-
-    Args:
-      guards: the diagrams.
-      width: variables below it are inputs.
-    """
+    """Partition of the inputs (variables below `width`) into classes with equal residual guards."""
 
     def __init__(self, guards: Diagrams, width: int) -> None:
         self.guards, self.width, self.work = guards, width, 0
         self.known: dict[tuple[int, ...], dict[tuple[int, ...], int]] = {}
 
     def of(self, parts: tuple[int, ...]) -> dict[tuple[int, ...], int]:
-        """The different parts that inputs leave, each with the condition on inputs for it."""
+        """Residual guards by class of inputs, each with its input condition."""
         if parts in self.known:
             return self.known[parts]
         top = min(self.guards.nodes[part][0] for part in parts)
@@ -213,7 +204,7 @@ _Entry = tuple[int, int]  # a state, with the priority of the edge by which it i
 
 
 class _Reader:
-    """A header with what is made of the states under it."""
+    """Builds the game from a parsed header and states."""
 
     def __init__(self, header: Header, outputs: list[int]) -> None:
         inputs = [p for p in range(len(header.propositions)) if p not in set(outputs)]
@@ -244,7 +235,7 @@ class _Reader:
             ) from None
 
     def _moves(self, states: list[State]) -> tuple[list[dict[_Entry, int]], bool]:
-        """Where each state leads, and by what; and whether the last one is an added lost one."""
+        """Guard of each successor of each state; and True if a losing sink was appended."""
         truth = label_reader(self.header, self.guards)
         found: list[dict[_Entry, int]] = []
         lost = (len(states), 1)
@@ -269,7 +260,7 @@ class _Reader:
         return [*found, {lost: TRUE}] if incomplete else found, incomplete
 
     def _letter(self, guard: int) -> NDArray[np.bool_]:
-        """A letter that a guard holds in, by the numbers of propositions."""
+        """A letter that satisfies a guard, by the indices of propositions."""
         held: set[int] = set()
         while guard != TRUE:
             variable, low, high = self.guards.nodes[guard]
@@ -319,7 +310,7 @@ class _Reader:
         return HoaGame(game, objective_of(game), self.inputs, self.outputs)
 
     def _text(self, guard: int) -> str:
-        """A condition as a formula; one that would be long gets a name alone."""
+        """Formula of a guard; a long one is abbreviated to ``condition`` and a number."""
         if guard in self.texts:
             return self.texts[guard]
         self.length += (length := self.guards.num_paths(guard))
@@ -335,7 +326,7 @@ class _Reader:
 
 
 def _model(rows: list[list[tuple[int, str]]], valuation: dict[str, Any], start: int) -> SparseMDP:
-    """A deterministic model of the moves of each state, with their names."""
+    """Deterministic sparse model from the moves of each state."""
     moves = [move for row in rows for move in row]
     number = {text: i for i, text in enumerate(dict.fromkeys(text for _, text in moves))}
     return make_sparse(
@@ -365,28 +356,26 @@ def write_hoa_game(
     *,
     name: str = "",
 ) -> str:
-    """A deterministic game as an automaton in the extended Hanoi format, of max-even parity.
+    """Writes a deterministic game in the extended HOA format, with max-even parity acceptance.
 
-    If the players take turns and the system's states decide nothing, each pair of moves is an edge;
-    else each state of the game is one of the automaton, whose edges read the owner's propositions
-    only. Where the names of a state's actions are conditions of which exactly one holds at a time,
-    as :func:`read_hoa_game` makes them, they are the guards; else moves are numbered in binary by
-    propositions ``i0, i1, ...`` of the environment and ``o0, o1, ...`` of the system, and the last
-    one has the numbers that are left. Who wins is kept.
+    If the players alternate and the system's states have neutral priority, each pair of moves is an
+    edge; else each game state is an automaton state whose edges read the owner's propositions.
+    Action names are the guards where those of a state form a partition, as :func:`read_hoa_game`
+    makes them; otherwise moves are numbered in binary by propositions ``i0, i1, ...`` of the
+    environment and ``o0, o1, ...`` of the system, with the unused numbers assigned to the last
+    move. The winner is preserved.
 
     Args:
-      game: a Game over an MDP, a DenseMDP or a SparseMDP with one initial state.
-      objective: what the system is to achieve; default that of the file that the game is from.
-      inputs, outputs: propositions of the environment and the system, for guards by name; default
-        those that occur.
-      name: of the automaton.
+      game: a Game over an MDP, DenseMDP or SparseMDP with one initial state.
+      objective: the system's objective; default that of the file of the game.
+      inputs, outputs: propositions of the environment and the system; default those of the guards.
+      name: name of the automaton.
 
     Returns:
-      The text, from `HOA:` to `--END--`.
+      HOA text.
 
     Raises:
-      ValueError: the game has a random move, several initial states or more than 256 priorities, or
-        no objective is known.
+      ValueError: for random moves, several initial states, over 256 priorities or no objective.
 
     Example:
       >>> from jaxltl import from_dense, make_game
@@ -433,7 +422,7 @@ _Edges = list[list[tuple[str, int, int]]]  # of each state: label, successor, co
 
 
 class _Arena(NamedTuple):
-    """A deterministic game with the labels of its moves."""
+    """Deterministic game graph with labelled moves."""
 
     row_start: NDArray[Any]
     successor: NDArray[Any]
@@ -443,7 +432,7 @@ class _Arena(NamedTuple):
     label: list[str]
 
     def plain(self) -> tuple[NDArray[Any], _Edges]:
-        """Each state as one of the automaton; with the number of each."""
+        """One automaton state per game state; returns the state numbers and the edges."""
         number = np.arange(self.system.size)
         edges: _Edges = []
         for v in number.tolist():
@@ -452,7 +441,7 @@ class _Arena(NamedTuple):
         return number, edges
 
     def paired(self, start: int) -> tuple[NDArray[Any], _Edges] | None:
-        """The environment's states, equal ones as one; None where the game is not of that kind."""
+        """Merges each move of both players into one edge; None if players do not alternate."""
         source = np.repeat(self.system, np.diff(self.row_start))
         takes_turns = (source != self.system[self.successor]).all() and not self.system[start]
         system, environment = self.color[self.system], self.color[~self.system]
@@ -486,7 +475,7 @@ def _both(left: str, right: str) -> str:
 
 
 class _Labels(NamedTuple):
-    """The label of each move, over the numbers of propositions."""
+    """HOA label of each move, over the indices of propositions."""
 
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
@@ -494,7 +483,7 @@ class _Labels(NamedTuple):
 
 
 def _numbered(row_start: NDArray[Any], system: NDArray[np.bool_]) -> _Labels:
-    """The moves of each state numbered in binary."""
+    """Labels that encode the moves of each state in binary."""
     count = np.diff(row_start)
     widths = [max([(int(n) - 1).bit_length() for n in np.unique(count[owned])], default=0)
               for owned in (~system, system)]  # fmt: skip
@@ -513,7 +502,7 @@ def _numbered(row_start: NDArray[Any], system: NDArray[np.bool_]) -> _Labels:
 def _named(
     game: Game, row_start: NDArray[Any], inputs: Sequence[str], outputs: Sequence[str]
 ) -> _Labels | None:
-    """The names of actions as guards; None where they are none."""
+    """Labels from action names that are guards; None if they are not a partition."""
     model = game.mdp
     if not isinstance(model, SparseMDP) or model.action is None or not model.action_names:
         return None
@@ -547,7 +536,7 @@ def _named(
 
 
 def _read_guard(formula: Formula, place: dict[str, int], guards: _Guards) -> tuple[str, int] | None:
-    """A condition as a label and as a diagram; None where it is not made of ``! & |``."""
+    """Label and diagram of a Boolean formula; None for temporal operators."""
     found: dict[Formula, tuple[str, int]] = {}
     for node in subformulas(formula):
         parts = [found[x] for x in node.operands]

@@ -1,4 +1,4 @@
-"""Tokens, grammar and parse trees of the Hanoi Omega-Automata format."""
+"""Lexer, grammar and parse trees of the HOA format."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FALSE: Tree = ("false",)
 
 
 def unquoted(token: str) -> str:
-    """The text of a quoted token."""
+    """Unescapes a quoted token."""
     return re.sub(r"(?s)\\(.)", r"\1", token[1:-1])
 
 
@@ -74,12 +74,12 @@ _TERMINAL = {
 
 
 def error_at(line: int | None, message: str) -> ValueError:
-    """The error of a line, to be raised."""
+    """ValueError with a line number."""
     return ValueError(f"read_hoa: line {line}: {message}")
 
 
 def split_texts(text: str) -> list[list[Token]]:
-    """The tokens of each automaton, up to `--END--`; aborted ones are left out."""
+    """Tokens of each automaton, up to `--END--`; automata with `--ABORT--` are skipped."""
     if not isinstance(text, str):
         raise ValueError(
             f"read_hoa: expected text in the Hanoi format, got {type(text).__name__}. "
@@ -127,7 +127,7 @@ def _tokens(text: str) -> Iterator[Token]:
 
 
 def _comment_end(text: str, start: int, line: int) -> int:
-    """Where the comment that starts at `start` ends; comments nest."""
+    """End of the (nested) comment that starts at `start`."""
     depth = 0
     for match in re.compile(r"/\*|\*/").finditer(text, start):
         depth += 1 if match[0] == "/*" else -1
@@ -170,7 +170,7 @@ marks: _BEGIN INT* _FINISH
 
 @dataclass(frozen=True)
 class Edge:
-    """One edge as it is written."""
+    """Parsed edge."""
 
     label: Tree | None
     targets: list[Token]
@@ -180,7 +180,7 @@ class Edge:
 
 @dataclass(frozen=True)
 class State:
-    """One state as it is written, with its edges."""
+    """Parsed state with its edges."""
 
     label: Tree | None
     number: Token
@@ -196,7 +196,7 @@ def _parser() -> Lark:
     from lark.lexer import Lexer
 
     class Ready(Lexer):
-        """Passes on tokens that are already made; comments nest, which no terminal of Lark can."""
+        """Lexer that passes tokens through; Lark terminals cannot match nested comments."""
 
         def __init__(self, _: Any) -> None: ...
 
@@ -226,7 +226,7 @@ def _parser() -> Lark:
 
 
 def parse_tokens(tokens: list[Token]) -> tuple[tuple[Token, list[Any]], list[State]]:
-    """The version and items of the header, and the states."""
+    """Parses version, header items and states."""
     from lark.exceptions import UnexpectedToken
 
     try:

@@ -1,4 +1,4 @@
-"""The header of an automaton in the Hanoi format, checked."""
+"""Validated header of a HOA automaton."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MAX_PRIORITIES = 256  # the formula of a parity condition nests once for each
 
 @dataclass(frozen=True)
 class Header:
-    """What the header says; `states` is None if it does not count them."""
+    """Header fields; `states` is None without ``States:``."""
 
     states: int | None
     start: Token
@@ -36,7 +36,7 @@ class Header:
 
 
 def read_header(version: Token, items: list[list[Any]]) -> Header:
-    """The header's items, checked against one another."""
+    """Validates the header items and their consistency."""
     if version not in ("v1", "v1.1"):
         raise error_at(version.line, f"version {version} is unknown. Write the automaton as v1.")
     given: dict[str, list[Any]] = {}
@@ -108,7 +108,7 @@ def _proposition_names(item: list[Any] | None) -> tuple[str, ...]:
 
 
 def only_target(targets: Sequence[Token], place: str) -> Token:
-    """The state, where a conjunction of states may be written."""
+    """The single state of a conjunction; ValueError for universal branching."""
     if len(targets) > 1:
         raise error_at(
             targets[0].line,
@@ -119,7 +119,7 @@ def only_target(targets: Sequence[Token], place: str) -> Token:
 
 
 def _condition(tree: Tree, sets: int) -> Tree:
-    """The acceptance formula over numbers, where `sets + x` stands for the complement of x.
+    """Acceptance formula over set indices, with `sets + x` for the complement of x.
 
     It has the operators `true`, `false`, `and`, `or`, and `inf` and `fin` with a number.
     """
@@ -134,7 +134,7 @@ def _condition(tree: Tree, sets: int) -> Tree:
 
 
 def set_number(number: Token, sets: int) -> int:
-    """The number of an acceptance set, which has to exist."""
+    """Index of an acceptance set, checked against the declared count."""
     if int(number) >= sets:
         raise error_at(
             number.line,

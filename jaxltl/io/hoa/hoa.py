@@ -1,7 +1,6 @@
-"""Deterministic automata in the Hanoi Omega-Automata format, version 1.
+"""Deterministic automata in the Hanoi Omega-Automata (HOA) format, version 1.
 
-The format is described at https://adl.github.io/hoaf/ (Babiak et al. 2015, "The Hanoi
-omega-automata format"). Spot, Owl and the tools around them write and read it.
+https://adl.github.io/hoaf/ (Babiak et al. 2015, "The Hanoi omega-automata format").
 """
 
 from __future__ import annotations
@@ -37,28 +36,26 @@ if TYPE_CHECKING:
 
 
 def read_hoa(text: str, letters: Iterable[Letter] | None = None) -> Automaton:
-    """The one deterministic automaton that a text in the Hanoi format holds.
+    """Reads one deterministic automaton from HOA text.
 
-    Read are labels on edges, on states and implicit ones, aliases, acceptance marks on edges and
-    on states, and any acceptance formula; `acc-name:` is not relied on. Buchi, co-Buchi and
-    parity conditions of all four styles, and whatever else is decided by the most important set
-    that is met infinitely often, keep their states; other conditions are turned into parity.
-    Where an edge is missing, a rejecting state is added. Propositions are sorted.
+    Supports labels on edges and states, implicit labels, aliases, acceptance marks on edges and
+    states and any acceptance formula; `acc-name:` is ignored. Buchi, co-Buchi and parity conditions
+    keep their states, others are converted to parity. Missing edges lead to an added rejecting
+    state. Propositions are sorted.
 
     Args:
       text: the automaton, from `HOA:` to `--END--`.
-      letters: the letters that occur, each a collection of proposition names; names that are
-        not in the automaton are ignored. None stands for all 2^P subsets.
+      letters: possible letters, each a collection of proposition names, of which unknown names are
+        ignored; None for all 2^P subsets.
 
     Returns:
-      An automaton with Buchi acceptance if its priorities are 0 and 1, else with parity
-      acceptance. What `write_hoa` wrote has the acceptance it was written from. Letters are in
-      the order of the binary numbers with proposition p as bit p.
+      An automaton with Buchi acceptance for priorities 0 and 1, else parity; the output of
+      `write_hoa` keeps its acceptance. Letters are ordered as binary numbers with proposition p as
+      bit p.
 
     Raises:
-      ValueError: with the line, for text that breaks the format, and for an automaton that is
-        not deterministic; for a text that holds no automaton or several; for more than 12
-        propositions without `letters`.
+      ValueError: with the line, for malformed text, nondeterminism, no or several automata, or more
+        than 12 propositions without `letters`.
 
     Example:
       >>> infinitely_often_a = read_hoa('''
@@ -77,16 +74,16 @@ def read_hoa(text: str, letters: Iterable[Letter] | None = None) -> Automaton:
 
 
 def read_hoa_stream(text: str, letters: Iterable[Letter] | None = None) -> list[Automaton]:
-    """The automata that a text in the Hanoi format holds, one after the other.
+    """Reads a sequence of automata from HOA text.
 
-    An automaton that ends with `--ABORT--` is left out.
+    Automata that end with `--ABORT--` are skipped.
 
     Args:
       text: the automata, each from `HOA:` to `--END--`.
-      letters: as in `read_hoa`, for all of them.
+      letters: as in `read_hoa`, for all automata.
 
     Returns:
-      A list, empty where the text is.
+      The automata.
 
     Raises:
       ValueError: as `read_hoa`.
@@ -101,23 +98,23 @@ def read_hoa_stream(text: str, letters: Iterable[Letter] | None = None) -> list[
 
 
 def write_hoa(automaton: Automaton, name: str = "") -> str:
-    """The automaton in the Hanoi format, version 1.
+    """HOA text of an automaton, version 1.
 
-    Co-safe and safety automata are written as Buchi automata with marks on states, Buchi and
-    parity (min even) automata with marks on transitions. If the letters are all subsets of the
-    propositions, edges have short labels. Otherwise each letter has its own edge, nothing is
-    said of the other subsets, and `letters` is needed to read the same automaton again.
+    Co-safe and safety automata become Buchi automata with marks on states; Buchi and parity (min
+    even) automata have marks on transitions. If the letters are not all subsets of the
+    propositions, each letter has its own edge, and `read_hoa` needs `letters` to restore the
+    automaton.
 
     Args:
       automaton: the automaton.
-      name: of the automaton, such as its formula.
+      name: its name, such as a formula.
 
     Returns:
-      A text from which `read_hoa` makes the same tables, provided that propositions and
-      letters are in the order that it gives them, as those of `to_automaton` are.
+      The text; `read_hoa` restores the same tables if propositions and letters are sorted, as those
+      of `to_automaton` are.
 
     Raises:
-      ValueError: for priorities above 255, whose acceptance formula no reader would bear.
+      ValueError: for priorities above 255.
 
     Example:
       >>> from jaxltl import to_automaton
@@ -163,7 +160,7 @@ def _is_full(automaton: Automaton) -> bool:
 
 
 def _properties(automaton: Automaton) -> list[str]:
-    """What is true of the file; `terminal` or `cosafe`, or `weak` alone, is read back."""
+    """HOA properties; `terminal`, `cosafe` and `weak` determine the acceptance on reading."""
     full, kind = _is_full(automaton), automaton.acceptance
     words = ["trans-labels", "explicit-labels"]
     words.append("state-acc" if kind in ("cosafe", "safety") else "trans-acc")
@@ -178,7 +175,7 @@ def _properties(automaton: Automaton) -> list[str]:
 
 
 def parity_text(count: int, style: str = "min") -> str:
-    """The formula of min-even or max-even parity with sets 0..count-1, as Spot and Owl write it."""
+    """Acceptance formula of min-even or max-even parity over sets 0..count-1, as in Spot."""
     if count > MAX_PRIORITIES:
         raise ValueError(
             f"write_hoa: priority {count - 1} takes an acceptance formula of {count} sets; the "
@@ -193,7 +190,7 @@ def parity_text(count: int, style: str = "min") -> str:
 
 
 def _written_state(automaton: Automaton, q: int) -> Iterator[str]:
-    """The lines of state q and its edges."""
+    """Lines of state q and its edges."""
     on_state = automaton.acceptance in ("cosafe", "safety")
     priorities = automaton.priority[q]
     head = f"State: {q}"
@@ -227,7 +224,7 @@ def _edges(automaton: Automaton, q: int) -> Iterator[tuple[int, int, list[Cube]]
 
 
 def quoted(text: str) -> str:
-    """A text as the format quotes it."""
+    """Quotes and escapes a text."""
     return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
 
 
@@ -251,7 +248,7 @@ def _read(tokens: list[Token], letters: Iterable[Letter] | None) -> Automaton:
 def _automaton(
     header: Header, table: Table, alphabet: NDArray[np.bool_], names: tuple[str, ...]
 ) -> Automaton:
-    """The automaton with min-even priorities."""
+    """Automaton with min-even priorities."""
     delta: NDArray[Any] = table.target[table.edge_of]
     initial = int(header.start)
     base: NDArray[Any] = np.arange(len(delta))

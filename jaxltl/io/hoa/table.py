@@ -1,4 +1,4 @@
-"""Edges of an automaton in the Hanoi format as a table over its letters."""
+"""Transition tables of HOA automata over explicit letters."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ MAX_FREE_PROPOSITIONS = 12  # 2^12 letters
 def alphabet_of(
     names: tuple[str, ...], letters: Iterable[Letter] | None, line: int
 ) -> NDArray[np.bool_]:
-    """The letters `[L, P]`, by the binary number with proposition p as bit p."""
+    """Letters `[L, P]`, ordered as binary numbers with proposition p as bit p."""
     if letters is None:
         if len(names) > MAX_FREE_PROPOSITIONS:
             raise error_at(
@@ -50,7 +50,7 @@ def alphabet_of(
 
 
 def by_number(header: Header, states: list[State]) -> list[State]:
-    """The states in the order of their numbers, each defined once; start and targets exist."""
+    """States sorted by number; validates unique definitions, the initial state and all targets."""
     defined: dict[int, State] = {}
     for state in states:
         number = int(state.number)
@@ -89,10 +89,7 @@ def by_number(header: Header, states: list[State]) -> list[State]:
 
 @dataclass(frozen=True)
 class Table:
-    """The edge that each state takes by each letter, `[Q, L]`, and all edges, by their number.
-
-    The last state is a rejecting one, added for missing edges, if `sink` is its number.
-    """
+    """Edge index of each state and letter, `[Q, L]`, and the edges; `sink` is added."""
 
     edge_of: NDArray[np.int64]
     target: NDArray[np.int64]
@@ -102,16 +99,16 @@ class Table:
 
 
 class Algebra(Protocol):
-    """Sets of letters, in whatever form."""
+    """Boolean algebra of sets of letters, with `Set` as their representation."""
 
     def constant(self, value: bool) -> Any:
         """All letters, or none."""
 
     def proposition(self, number: int) -> Any:
-        """The letters in which a proposition holds."""
+        """Letters in which a proposition is true."""
 
     def letter(self, number: int) -> Any:
-        """One letter, with proposition p as bit p."""
+        """A single letter, with proposition p as bit p."""
 
     def negation(self, guard: Any) -> Any: ...
 
@@ -122,7 +119,7 @@ class Algebra(Protocol):
 
 @dataclass(frozen=True)
 class _Letters:
-    """Sets of the letters that are the rows of a table `[L, P]`, as `bool[L]`."""
+    """Sets of rows of a letter table `[L, P]`, as ``bool[L]``."""
 
     columns: NDArray[np.bool_]
     negation = staticmethod(np.logical_not)
@@ -144,7 +141,7 @@ class _Letters:
 
 
 def read_table(header: Header, states: list[State], columns: NDArray[np.bool_]) -> Table:
-    """The transitions of the body as arrays over the letters."""
+    """Transition table of the body over explicit letters."""
     algebra = _Letters(columns)
     truth = label_reader(header, algebra)
     edge_of = np.full((len(states), len(columns)), -1, np.int64)
@@ -172,14 +169,14 @@ def read_table(header: Header, states: list[State], columns: NDArray[np.bool_]) 
 
 
 def marks_of(header: Header, state: State, edge: Edge) -> frozenset[int]:
-    """The acceptance sets of an edge, its own and those of its state."""
+    """Acceptance sets of an edge and its source state."""
     return frozenset(set_number(number, header.sets) for number in [*state.marks, *edge.marks])
 
 
 def nondeterminism(
     header: Header, q: int, edge: Edge, other: Edge, letter: NDArray[np.bool_]
 ) -> ValueError:
-    """The error of two edges that one letter takes, to be raised."""
+    """ValueError for two edges that share a letter."""
     return error_at(
         edge.line,
         f"state {q} has two edges for the letter {letter_text(header.propositions, letter)}, to "
@@ -191,7 +188,7 @@ def nondeterminism(
 def guarded_edges(
     header: Header, state: State, algebra: Algebra, truth: Callable[[Tree], Any]
 ) -> Iterator[tuple[Edge, Any]]:
-    """Each edge of a state, and the letters that take it."""
+    """Edges of a state, each with its set of letters."""
     labelled = sum(edge.label is not None for edge in state.edges)
     if state.label is not None:
         if labelled:
@@ -224,7 +221,7 @@ def guarded_edges(
 
 
 def label_reader(header: Header, algebra: Algebra) -> Callable[[Tree], Any]:
-    """The function from a label to the letters in which it holds."""
+    """Evaluator of labels: maps a parse tree to its set of letters."""
     aliases: dict[str, Any] = {}
     width = len(header.propositions)
 

@@ -1,1 +1,1 @@
-"""PRISM's explicit files."""
+"""PRISM's explicit-state files."""

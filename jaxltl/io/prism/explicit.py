@@ -1,4 +1,4 @@
-"""Models in the explicit files of PRISM and of Storm: transitions, labels, states and rewards."""
+"""Explicit-state files of PRISM and Storm: transitions, labels, states and rewards."""
 
 from __future__ import annotations
 
@@ -37,31 +37,28 @@ _NUMBERED = re.compile(rb"_(0|[1-9]\d{0,8}|1\d{9})")  # how actions without name
 
 
 def read_prism(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP:
-    """The Markov chain or decision process in explicit files of PRISM, or of Storm's older dialect.
+    """Reads a Markov chain, MDP or interval model from PRISM's or Storm's explicit files.
 
-    Beside ``name.tra`` are looked for ``name.lab`` (labels), ``name.sta`` (values of variables),
-    ``name.srew`` and ``name.trew`` (rewards), with several rewards ``name1.srew``, ``name2.srew``
-    and so on; ``name.pexp`` has all in one file. Any of them may be compressed with gzip or xz.
-    Files whose first line is ``dtmc`` or ``mdp``, and labels between ``#DECLARATION`` and
-    ``#END``, are Storm's.
+    The companions of ``name.tra`` are ``name.lab`` (labels), ``name.sta`` (state variables) and
+    ``name.srew`` and ``name.trew`` (rewards; numbered ``name1.srew``, ``name2.srew`` if several);
+    ``name.pexp`` has all in one file. Each may be compressed with gzip or xz. Storm's dialect
+    starts with ``dtmc`` or ``mdp`` and has its labels between ``#DECLARATION`` and ``#END``.
 
-    The states labelled ``init`` are the initial ones, each as likely as another; without labels it
-    is state 0. A state without transitions (a deadlock) gets a loop, as in PRISM. Numbers are the
-    nearest doubles to the decimals and fractions (``1/3``) in the files. A reward of transitions
-    that is the same for all successors of every choice is one of choices. A reward without a name
-    is called "", and several ones by their numbers. Probabilities of which some are written as
-    ``[l,u]`` make it an interval model.
+    The states labelled ``init`` are the initial states, with equal probability; without labels,
+    state 0. Deadlock states get a self-loop, as in PRISM. Decimals and fractions (``1/3``) become
+    the nearest doubles. A transition reward that is constant on every choice becomes a choice
+    reward. Rewards without a name are called "", or by their number if there are several.
+    Probabilities ``[l,u]`` give an interval model.
 
     Args:
-      path: of the ``.tra`` or ``.pexp`` file.
+      path: the ``.tra`` or ``.pexp`` file.
 
     Returns:
-      A :class:`~jaxltl.core.models.sparse.SparseMDP`, or of intervals an
+      A :class:`~jaxltl.core.models.sparse.SparseMDP` or
       :class:`~jaxltl.core.models.interval.IntervalMDP`.
 
     Raises:
-      ValueError: naming file and line, and what was expected; for models with observations, or in
-        continuous time.
+      ValueError: with file and line, for malformed text, observations or continuous time.
 
     Example:
       >>> import tempfile
@@ -89,22 +86,21 @@ def write_prism(
     *,
     dialect: Literal["prism", "storm"] = "prism",
 ) -> None:
-    """Writes a model as explicit files, such as :func:`read_prism` reads.
+    """Writes a model as explicit-state files.
 
-    Doubles are written so that the same ones are read. A reward on choices and on transitions is
-    written as their sum, on transitions. Actions with numbers and no names are called ``_0``,
-    ``_1`` and so on, and read back as numbers.
+    Doubles are written exactly. Choice and transition rewards are written as their sum, on
+    transitions. Numbered actions without names are written as ``_0``, ``_1``, ....
 
     Args:
-      path: of the ``.tra`` file, beside which the others are written, or of a ``.pexp`` file, and
-        ``.gz`` or ``.xz`` to compress them.
-      model: a concrete model. Initial states must be equally likely.
-      dialect: PRISM's files, or those that Storm reads. The latter have no variables, no names of
-        rewards, no intervals, and in chains no actions.
+      path: the ``.tra`` file, next to which the others are written, or a ``.pexp`` file; compressed
+        with the suffix ``.gz`` or ``.xz``.
+      model: a concrete model with equally likely initial states.
+      dialect: ``"prism"``, or ``"storm"`` without state variables, names of rewards, intervals, and
+        actions of chains.
 
     Raises:
-      ValueError: the format cannot hold the model, naming what it cannot; the place cannot be
-        written to; or files of another model stand beside, which would be read with this one.
+      ValueError: the format cannot represent the model, a file cannot be written, or companion
+        files of another model exist.
 
     Example:
       >>> import pathlib, tempfile
@@ -149,7 +145,7 @@ def write_prism(
 
 
 def files_beside(path: str | os.PathLike[str]) -> list[Path]:
-    """The files that are read with one of transitions; none beside others."""
+    """Companion files (labels, states, rewards) of a ``.tra`` file."""
     found = _NAME.fullmatch(Path(path).name)
     if found is None or found["kind"].lower() != "tra":
         return []
@@ -157,7 +153,7 @@ def files_beside(path: str | os.PathLike[str]) -> list[Path]:
 
 
 def _siblings(path: Path, found: re.Match[str]) -> Iterator[tuple[str, str, Path]]:
-    """The files that belong to one with transitions: kind, number and path."""
+    """Companion files of a ``.tra`` file: kind, number and path."""
     form = re.compile(re.escape(found["stem"]) + r"\.?(\d{0,9})\.(lab|sta|srew|trew)(\.gz|\.xz)?")
     try:
         names = sorted(os.listdir(path.parent))
@@ -218,15 +214,15 @@ def _in_one(path: Path) -> list[Section]:
 
 @dataclass(frozen=True)
 class _Rows:
-    """The lines of a file of transitions, as columns.
+    """Transitions as columns.
 
     Attributes:
       num_states: S.
-      is_chain: whether choices have no numbers.
-      state, choice, target, action: ``int32[T]``; action -1 stands for none.
-      probability: ``float64[T]``, or ``float64[T, 2]`` where some are intervals.
-      line: ``int32[T]``, 0 where there is no line.
-      names: of the actions.
+      is_chain: True if transitions have no choice numbers.
+      state, choice, target, action: ``int32[T]``; action -1 for none.
+      probability: ``float64[T]``, or bounds ``float64[T, 2]``.
+      line: ``int32[T]``, 0 for added self-loops.
+      names: action names.
     """
 
     num_states: int
@@ -241,7 +237,7 @@ class _Rows:
 
 
 def _sizes(text: Text) -> tuple[bool, list[int], Text]:
-    """Whether it is a chain, the sizes that the first line gives (none in Storm's), the rest."""
+    """True for a chain, the sizes of the first line (none for Storm), and the remaining text."""
     kind = _KIND.search(text.data, text.begin, min(text.stop, text.begin + 2000))
     if kind and kind[1] not in _KINDS:
         raise text.error(
@@ -326,7 +322,7 @@ def _read_rows(text: Text) -> _Rows:
 def _columns(
     block: Block, at: NDArray, width: int, below: int, names: dict[bytes, int], is_interval: bool
 ) -> tuple[NDArray, ...]:
-    """The columns of :class:`_Rows` from some lines, which begin at the tokens `at`."""
+    """Columns of :class:`_Rows` for lines whose first tokens are `at`."""
     action = np.full(at.size, -1, np.int32)
     named = block.count > width
     action[named] = numbered(block.texts(at[named] + width), names)
@@ -346,7 +342,7 @@ def _columns(
 
 
 def _new_rows(text: Text, rows: _Rows, form: str) -> NDArray[np.bool_]:
-    """Where another choice begins, ``bool[T]``; they must ascend."""
+    """Mask of the first transition of each choice, ``bool[T]``; choices must ascend."""
     state, choice = rows.state, rows.choice
     other = np.ones(state.size, bool)
     other[1:] = state[1:] != state[:-1]
@@ -367,7 +363,7 @@ def _new_rows(text: Text, rows: _Rows, form: str) -> NDArray[np.bool_]:
 
 
 def _with_loops(rows: _Rows) -> _Rows:
-    """States without transitions get a loop."""
+    """Adds self-loops to deadlock states."""
     has = np.zeros(rows.num_states, bool)
     has[rows.state] = True
     missing = np.flatnonzero(~has).astype(np.int32)

@@ -1,4 +1,4 @@
-"""Labels, values of variables and rewards of a model in PRISM's explicit files."""
+"""Labels, state variables and rewards of PRISM's explicit files."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ Section = tuple[str, str, Text]  # "tra", "lab", "sta", "srew" or "trew"; of whi
 def read_labels(
     sections: list[Section], num_states: int
 ) -> tuple[NDArray[np.bool_], list[str], Floats]:
-    """Labels ``bool[S, P]``, their names, and the initial distribution."""
+    """Label matrix ``bool[S, P]``, label names and the initial distribution."""
     text = next((text for kind, _, text in sections if kind == "lab"), None)
     if text is None:
         return np.zeros((num_states, 0), bool), [], np.eye(1, num_states)[0]
@@ -85,7 +85,7 @@ def _prism_labels(text: Text, num_states: int) -> tuple[NDArray[np.bool_], list[
 
 
 def _without(tokens: Integers, size: int) -> Integers:
-    """All tokens but some."""
+    """Indices of all other tokens."""
     kept = np.ones(size, bool)
     kept[tokens] = False
     return np.flatnonzero(kept)
@@ -115,7 +115,7 @@ def _storm_labels(text: Text, num_states: int) -> tuple[NDArray[np.bool_], list[
 
 
 def read_valuation(sections: list[Section], num_states: int) -> dict[str, NDArray]:
-    """The values of variables, ``[S]`` each: truth values, integers or doubles."""
+    """Values of the state variables, ``[S]`` each: bool, int64 or float64."""
     text = next((text for kind, _, text in sections if kind == "sta"), None)
     if text is None:
         return {}
@@ -148,7 +148,7 @@ def read_valuation(sections: list[Section], num_states: int) -> dict[str, NDArra
 
 
 def _fields(block: Block, width: int) -> list[list[bytes]]:
-    """Columns of lines such as ``0:(1,true)``: the state, and `width` values."""
+    """Columns of lines such as ``0:(1,true)``: the state and `width` values."""
     block.columns(1, 0, form := "'state:(value,value)' without blanks")
     joined = block.joined(block.first[:-1])
     sign = np.flatnonzero(_SIGN[joined])
@@ -171,7 +171,7 @@ def _fields(block: Block, width: int) -> list[list[bytes]]:
 
 
 def _values(block: Block, name: str, texts: list[bytes]) -> NDArray:
-    """Truth values, integers, or doubles."""
+    """Values of a column as bool, int64 or float64."""
     is_true = np.fromiter((x == b"true" for x in texts), bool, len(texts))
     if (is_true | np.fromiter((x == b"false" for x in texts), bool, len(texts))).all():
         return is_true
@@ -202,23 +202,7 @@ _TO_BLANKS = bytes.maketrans(b":(),", b"    ")
 
 
 def read_rewards(sections: list[Section], model: SparseMDP, is_chain: bool) -> dict[str, Rewards]:
-    """The reward structures of a model's files.
-
-    Args:
-      sections: all that the files hold; those of rewards, ``"srew"`` of states and ``"trew"`` of
-        transitions, are read.
-      model: the model that they are for.
-      is_chain: whether it is a Markov chain, whose transitions have no choice to name.
-
-    Returns:
-      The structures by the names that the files give in their first lines. One without a name goes
-      by "", or by the number of its file where several have none; a state reward and a transition
-      reward of one name are one structure.
-
-    Raises:
-      ValueError: naming the file and the line: two rewards of one name and kind, text that breaks
-        the format, or a state, a choice or a transition that the model has not.
-    """
+    """Reward structures of a model by name, from its ``srew`` and ``trew`` sections."""
     parts: dict[str, tuple[str, Text, Rewards]] = {}
     found = [s for s in sections if s[0] in ("srew", "trew")]
     unnamed = len({number for _, number, text in found if not _reward_name(text)})
@@ -262,7 +246,7 @@ def _reward_name(text: Text) -> str:
 
 
 def _reward_lines(text: Text, num_states: int, form: str) -> tuple[int | None, Text]:
-    """How many rewards are announced, None in Storm's files, and the rest."""
+    """Announced number of rewards (None for Storm) and the remaining text."""
     first, line, rest = text.first_line(b"#")
     sizes = first.split()
     if not first:

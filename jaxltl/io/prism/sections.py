@@ -1,4 +1,4 @@
-"""What PRISM's explicit files say of a model, section by section, in lines."""
+"""Writer of the sections of PRISM's explicit files."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ _STEP = 2**17  # lines that are held at a time
 
 @dataclass(frozen=True)
 class Written:
-    """A section of a model's files.
+    """Section of the output.
 
     Attributes:
       kind: "tra", "lab", "sta", "srew" or "trew".
-      number: of the reward, where there are several.
-      header: the lines that introduce it where all are in one file.
-      lines: gives the lines, in pieces.
+      number: number of the reward if there are several.
+      header: lines that introduce the section in a single file.
+      lines: generator of the lines, in pieces.
     """
 
     kind: str
@@ -36,11 +36,7 @@ class Written:
 
 
 def written_sections(given: SparseMDP | IntervalMDP, dialect: str) -> list[Written]:
-    """The sections of a model's files, in order.
-
-    Raises:
-      ValueError: the format cannot hold the model.
-    """
+    """Sections of a model's files, in order; ValueError if the format cannot represent it."""
     storm, model = dialect == "storm", exact_part(given)
     chances = value_texts(given, ",")
     if storm and model is not given:
@@ -66,7 +62,7 @@ def written_sections(given: SparseMDP | IntervalMDP, dialect: str) -> list[Writt
 
 
 def _plain(names: Any, what: str, refused: str) -> list[str]:
-    """Names, none of which breaks the format."""
+    """Names, validated against the characters that the format reserves."""
     for name in names:
         if any(c in refused for c in name) or any(ord(c) < 32 for c in name):
             raise ValueError(
@@ -110,7 +106,7 @@ def _transitions(
 
 
 def _action_texts(model: SparseMDP) -> Callable[[int], str] | None:
-    """What stands after a transition, by the number of its action."""
+    """Function from action numbers to the action column."""
     if model.action is None:
         return None
     if not model.action_names:
@@ -120,7 +116,7 @@ def _action_texts(model: SparseMDP) -> Callable[[int], str] | None:
 
 
 def _labels(model: SparseMDP, storm: bool) -> tuple[list[str], list[NDArray[np.bool_]]]:
-    """The names of the labels, "init" first, and where they hold."""
+    """Label names, "init" first, and their masks."""
     found = labels_with_init(model)
     return _plain(tuple(found), "label", ' "' if storm else '"'), list(found.values())
 
@@ -192,7 +188,7 @@ def _rewards(
 
 
 def _on_entries(model: SparseMDP, reward: Rewards) -> NDArray[np.float64] | None:
-    """Rewards of choices and transitions, ``[T]``."""
+    """Sum of choice and transition rewards per transition, ``[T]``."""
     choice = None
     if reward.choice is not None:
         choice = np.asarray(reward.choice, np.float64)[model.host.row]
@@ -237,5 +233,5 @@ def _transition_rewards(
 
 
 def _infinity(lines: bytes, storm: bool) -> bytes:
-    """Numbers with infinity as PRISM reads it."""
+    """Spells infinity as PRISM does."""
     return lines if storm else lines.replace(b"inf", b"Infinity")

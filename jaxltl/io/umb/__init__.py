@@ -1,1 +1,1 @@
-"""The Unified Markov Binary format."""
+"""The Unified Markov Binary (UMB) format."""

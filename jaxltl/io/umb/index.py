@@ -1,4 +1,4 @@
-"""The index of a UMB file: what the model has, and how large each member must be."""
+"""Index of a UMB archive: counts, types and expected member sizes."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ _MOST_RECORD = 2**16  # bytes of one state's valuation
 
 @dataclass(frozen=True)
 class Type:
-    """A type of values, by its name and its size in bits."""
+    """Value type: name and size in bits."""
 
     name: str
     size: int
 
     @property
     def end(self) -> Type | None:
-        """The type of each end of an interval; None for what is none."""
+        """Type of the interval bounds; None for types other than intervals."""
         if not self.name.endswith("-interval"):
             return None
         return Type(self.name.removesuffix("-interval"), self.size // 2)
@@ -49,7 +49,7 @@ class Type:
 
 @dataclass(frozen=True)
 class Annotation:
-    """Values on states, choices or branches; `name` is the one for people."""
+    """Annotation of states, choices or branches; `name` is the alias."""
 
     group: str
     id: str
@@ -63,14 +63,14 @@ class Annotation:
 
 @dataclass(frozen=True)
 class Variable:
-    """A variable of a state.
+    """State variable.
 
     Attributes:
       name, type: as in the file.
-      offset: what is added to its code.
-      start: where its code starts in the record, in bits.
-      presence: the bit that says whether it is there; None if it always is.
-      is_text: whether it is the number of a text.
+      offset: added to the encoded value.
+      start: first bit in the record.
+      presence: bit that is set if the value is present; None if it always is.
+      is_text: True if the value is a string index.
     """
 
     name: str
@@ -83,19 +83,19 @@ class Variable:
 
 @dataclass(frozen=True)
 class Record:
-    """The variables of one class of states and the bytes that they take."""
+    """Record layout of one class of states; `size` is in bytes."""
 
     variables: tuple[Variable, ...]
     size: int
 
 
 class Items(NamedTuple):
-    """What a member holds: for each state, choice or branch so many bits.
+    """Layout of a member.
 
     Attributes:
-      part: of which of them.
-      bits: of one.
-      more: how many more there are than of these.
+      part: "states", "choices" or "branches".
+      bits: bits per element.
+      more: additional elements.
     """
 
     part: str
@@ -103,21 +103,17 @@ class Items(NamedTuple):
     more: int = 0
 
     def size(self, count: int) -> int:
-        """The bytes of the member for so many."""
+        """Size of the member in bytes."""
         return bit_bytes(count) if self.bits == 1 else (count + self.more) * self.bits // 8
 
     def span(self, begin: int, end: int) -> tuple[int, int]:
-        """The bytes that tell of a range."""
+        """Byte range of the elements begin..end."""
         return begin * self.bits // 8, -(-(end + self.more) * self.bits // 8)
 
 
 @dataclass(frozen=True)
 class Index:
-    """What is said of a model: counts, types, annotations and variables.
-
-    That of a range of states has the counts of these, and where they, their choices and their
-    branches begin.
-    """
+    """Validated index of a model, or of a range of its states (which then starts at `begins`)."""
 
     players: int
     states: int
@@ -136,7 +132,7 @@ class Index:
         return {"states": self.states, "choices": self.choices, "branches": self.branches}
 
     def of(self, *ranges: tuple[int, int]) -> Index:
-        """Of a range of states, of their choices and of their branches."""
+        """Index of a range of states, with the ranges of its choices and branches."""
         first, row, entry = (begin for begin, _ in ranges)
         states, choices, branches = (end - begin for begin, end in ranges)
         return replace(
@@ -144,7 +140,7 @@ class Index:
         )
 
     def items(self) -> dict[str, Items]:
-        """What is in each member that tells of states, choices or branches one by one."""
+        """Layout of each member with elements per state, choice or branch."""
         found = {
             "state-to-choices.bin": Items("states", 64, 1),
             "state-is-initial.bin": Items("states", 1),
@@ -164,7 +160,7 @@ class Index:
         return found
 
     def bounds(self) -> dict[str, tuple[int, int]]:
-        """The least and the largest size in bytes of each member that is read."""
+        """Minimal and maximal size in bytes of each known member."""
         counts = self.counts
         sizes = {name: x.size(counts[x.part]) for name, x in self.items().items()}
         found = {name: (size, size) for name, size in sizes.items()}
@@ -181,17 +177,12 @@ class Index:
 
 
 def bit_bytes(count: int) -> int:
-    """The bytes of so many bits, in words of 64."""
+    """Bytes of a bit vector, padded to 64-bit words."""
     return -(-count // 64) * 8
 
 
 def parse_index(content: bytes, place: str) -> Index:
-    """Reads and checks an index; `place` begins what is told of an error.
-
-    Raises:
-      ValueError: it is no JSON, lacks a key, a value is of the wrong kind, or the model is of a
-        kind that is not read, named.
-    """
+    """Parses and validates the index; errors start with `place`."""
     try:
         data = json.loads(content.decode())
     except (ValueError, RecursionError) as error:
@@ -255,7 +246,7 @@ def _check_kind(system: Mapping[str, Any], counts: Mapping[str, int], place: str
 
 
 def _annotations(data: Any, place: str) -> tuple[Annotation, ...]:
-    """Labels, rewards and what we write beside them; other groups are passed over."""
+    """Labels, rewards and annotations specific to jaxltl; other groups are ignored."""
     found: list[Annotation] = []
     for group in ("aps", OTHER_LABELS, "rewards", INITIAL):
         table = _table(
@@ -312,7 +303,7 @@ def _annotation(group: str, key: str, value: Any, place: str) -> Annotation:
 
 
 def _texts_of_ours(data: Mapping[str, Any]) -> frozenset[str]:
-    """The whole numbers that are those of texts; other tools refuse files with the type string."""
+    """Integer variables that jaxltl uses as string indices; Storm refuses the type string."""
     for key in ("file-data", "parameters", TEXTS):
         data = data.get(key, {}) if isinstance(data, dict) else {}
     names: list[Any] = data if isinstance(data, list) else []
@@ -322,7 +313,7 @@ def _texts_of_ours(data: Mapping[str, Any]) -> frozenset[str]:
 def _records(
     data: Any, texts_of_ours: frozenset[str], place: str
 ) -> tuple[tuple[Record, ...], int]:
-    """The classes of states, and how many texts their variables have."""
+    """Record layouts of the classes of states, and the number of strings."""
     states = _table(data, "valuations", place).get("states")
     if states is None:
         return (), 0
@@ -398,7 +389,7 @@ def _type(data: Any, what: str, place: str) -> Type:
 
 
 def _check_number(kind: Type, what: str, place: str) -> None:
-    """Raises a ValueError unless a type is of numbers or intervals in whole words."""
+    """Raises ValueError unless the type is numeric, with a size in whole words."""
     known = ("double", "rational", "double-interval", "rational-interval")
     if kind.name not in known or kind.size % _SIZES[kind.name]:
         raise ValueError(
@@ -429,7 +420,7 @@ def _count(data: Mapping[str, Any], key: str, place: str) -> int:
 
 
 def _shown(value: Any) -> str:
-    """A value for people, cut short; of what is nested only its kind."""
+    """Abbreviated value for error messages."""
     if isinstance(value, dict):
         return "an object"
     if isinstance(value, list):
@@ -447,7 +438,7 @@ def _shown(value: Any) -> str:
 
 
 def ids_for(names: Sequence[str], prefix: str) -> list[str]:
-    """Distinct ids, each the name itself where that may be one."""
+    """Distinct identifiers, equal to the names where these are valid."""
     found: dict[str, None] = {}
     taken = set(names)
     for i, name in enumerate(names):

@@ -1,4 +1,4 @@
-"""What the members of a UMB file say of a model, or of a range of its states."""
+"""Members of a UMB archive: labels, rewards, actions and probabilities of a range of states."""
 
 from __future__ import annotations
 
@@ -26,11 +26,7 @@ _LARGEST_INDEX = 2**26  # bytes
 
 
 def read_index(stream: Stream) -> Index:
-    """The index of an archive, from a stream at its beginning.
-
-    Raises:
-      ValueError: there is none, or as of :func:`~jaxltl.io.umb.index.parse_index`.
-    """
+    """Index of an archive, from a stream at its start."""
     for member, size in members(stream):
         if member == "index.json":
             if size > _LARGEST_INDEX:
@@ -44,11 +40,7 @@ def read_index(stream: Stream) -> Index:
 
 
 def known_members(stream: Stream, index: Index) -> Iterator[tuple[str, int]]:
-    """The members that the index tells of, and their sizes, which follow from it.
-
-    Raises:
-      ValueError: one has another size, or there are two of them.
-    """
+    """Names and sizes of the indexed members, checked for size and duplicates."""
     bounds, seen = index.bounds(), set()
     for member, size in members(stream):
         if member in seen:
@@ -67,7 +59,7 @@ def known_members(stream: Stream, index: Index) -> Iterator[tuple[str, int]]:
 
 
 def check_memory(size: int, place: str) -> None:
-    """Raises a ValueError if twice so many bytes are more than the memory."""
+    """Raises ValueError if twice the size exceeds the physical memory."""
     try:
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, ValueError, OSError):  # another system
@@ -80,7 +72,7 @@ def check_memory(size: int, place: str) -> None:
 
 
 def needed(found: dict[str, Bytes], member: str, place: str) -> Bytes:
-    """What a member holds, which must be there."""
+    """Contents of a required member."""
     if member not in found:
         raise ValueError(f"{place}{member} is missing.")
     return found[member]
@@ -89,7 +81,7 @@ def needed(found: dict[str, Bytes], member: str, place: str) -> Bytes:
 def starts_of(
     found: dict[str, Bytes], member: str, count: int, total: int, place: str
 ) -> NDArray[np.int64]:
-    """Where the spans of a member start; without it, each has one."""
+    """Offsets of the spans of a member; one element per span if the member is absent."""
     if member in found:
         return read_starts(found.pop(member), total, f"{place}{member}: ")
     if count != total:
@@ -101,7 +93,7 @@ def starts_of(
 
 
 def check_chain(row_start: NDArray[np.int64], place: str, *, first: int = 0) -> None:
-    """Raises a ValueError unless each state, of which `first` is the first, has one choice."""
+    """Raises ValueError unless each state has one choice; `first` is the first state's number."""
     count = np.diff(row_start)
     if (count != 1).any():
         state = int(np.flatnonzero(count != 1)[0])
@@ -114,7 +106,7 @@ def check_chain(row_start: NDArray[np.int64], place: str, *, first: int = 0) -> 
 def labels_of(
     found: dict[str, Bytes], index: Index, place: str
 ) -> tuple[NDArray[np.bool_], tuple[str, ...]]:
-    """Where each label holds, ``bool[S, P]``, and their names."""
+    """Label matrix ``bool[S, P]`` and label names."""
     ours = {x.id: x for x in index.annotations if x.group == OTHER_LABELS}
     others = iter([x for x in index.annotations if x.group == "aps"])
     all_of = []
@@ -130,7 +122,7 @@ def labels_of(
 
 
 def rewards_of(found: dict[str, Bytes], index: Index, place: str) -> dict[str, Rewards]:
-    """The rewards by their names."""
+    """Reward structures by name."""
     rewards, begins = {}, dict(zip(PARTS, index.begins, strict=True))
     for one in index.annotations:
         if one.group == "rewards":
@@ -149,7 +141,7 @@ def rewards_of(found: dict[str, Bytes], index: Index, place: str) -> dict[str, R
 
 
 def actions_of(found: dict[str, Bytes], index: Index, place: str) -> dict[str, Any]:
-    """The number of each choice's action, and the names."""
+    """Action numbers of choices, and action names."""
     member = f"{ACTIONS}/values.bin"
     action = np.zeros(index.choices, np.int32)
     if member in found:
@@ -163,7 +155,7 @@ def actions_of(found: dict[str, Bytes], index: Index, place: str) -> dict[str, A
 
 
 def texts_of(found: dict[str, Bytes], folder: str, place: str) -> tuple[str, ...]:
-    """The texts of a folder by their numbers; none if it has none."""
+    """Strings of a folder; empty if it has none."""
     mapping, strings = f"{folder}/string-mapping.bin", f"{folder}/strings.bin"
     if mapping not in found:
         return ()
@@ -175,7 +167,7 @@ def texts_of(found: dict[str, Bytes], folder: str, place: str) -> tuple[str, ...
 def probability_of(
     found: dict[str, Bytes], index: Index, entry_start: NDArray[np.int64], place: str
 ) -> NDArray[np.float64]:
-    """The probability of each branch, or lower and upper ends ``[T, 2]``."""
+    """Branch probabilities ``[T]``, or lower and upper bounds ``[T, 2]``."""
     member, kind = "branch-to-probability.bin", index.probability
     if kind is not None and kind.end is not None and index.players > 1:
         raise ValueError(
@@ -196,6 +188,6 @@ def probability_of(
 
 
 def uniform(initial: NDArray[np.bool_]) -> NDArray[np.float64] | None:
-    """The distribution over some states that a reader takes; None if these are all or none."""
+    """Uniform distribution over the marked states; None if all or none are marked."""
     count = int(initial.sum())
     return None if count in (0, initial.size) else initial / count

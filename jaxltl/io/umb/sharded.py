@@ -1,9 +1,7 @@
-"""UMB files onto the devices of a mesh, read by ranges of states.
+"""Sharded reading of UMB archives, by ranges of states of a device mesh.
 
-A process reads what the file says of the states of its own devices. Which choices a range of states
-has, and which branches these have, the file says in members of their own, so that a compressed
-archive is gone through again where it holds them in another order; of a plain one, nothing but the
-ranges is read.
+The choices of a range of states and their branches are known from offset members, so a compressed
+archive is read again if these come later; of a plain archive only the ranges are read.
 """
 
 from __future__ import annotations
@@ -53,26 +51,23 @@ _Span = tuple[int, int]
 def read_sharded(
     path: str | os.PathLike[str], mesh: Mesh, *, axis: str | None = None
 ) -> ShardedMDP:
-    """The model of a UMB file on the devices of a mesh, each process reading its own states.
+    """Reads a UMB model onto a device mesh; each process reads the states of its own devices.
 
-    The same as ``shard(read_model(path), mesh)``, except that the initial distribution may differ
-    in its last bit, of a model that need not fit into one process. Of a plain archive each process
-    reads its ranges alone. One that is compressed it goes through as a whole, once if the members
-    stand in the order in which :func:`~jaxltl.io.model_files.write_model` writes them, and keeps
-    its ranges. Rewards become expected rewards of choices; variables of states and the names of
-    actions are left out.
+    Equals ``shard(read_model(path), mesh)`` up to the last bit of the initial distribution, for
+    models that need not fit into one process. Compressed archives are read as a whole, once if the
+    members are in the order of :func:`~jaxltl.io.model_files.write_model`. Rewards become expected
+    rewards of choices; state variables and action names are dropped.
 
     Args:
-      path: the file, of a chain or a decision process; plain, or compressed by gzip or xz.
+      path: the file of a Markov chain or MDP, plain or compressed by gzip or xz.
       mesh, axis: as for :func:`~jaxltl.core.models.mesh.shard.shard`.
 
     Returns:
       :class:`~jaxltl.core.models.mesh.sharded.ShardedMDP`.
 
     Raises:
-      ValueError: as of :func:`~jaxltl.core.models.mesh.shard.shard` for the mesh, and as of
-        :func:`~jaxltl.io.model_files.read_model` for the file, as far as this process reads it; or
-        it holds a game or probabilities that are intervals.
+      ValueError: as :func:`~jaxltl.core.models.mesh.shard.shard` for the mesh and
+        :func:`~jaxltl.io.model_files.read_model` for the parts read; for games and interval models.
 
     Example:
       >>> import tempfile, jax
@@ -115,7 +110,7 @@ def read_sharded(
 
 
 def _check_kind(index: Index, place: str) -> None:
-    """Raises a ValueError, by name, of what no mesh takes."""
+    """Raises ValueError for games and interval models."""
     what = None
     if index.players > 1:
         what = f"the model is a game of {index.players} players"
@@ -135,7 +130,7 @@ def _check_memory(index: Index, ranges: list[_Span], place: str) -> None:
 
 
 class _Archive(NamedTuple):
-    """An archive that can be gone through again and again."""
+    """Archive that can be read repeatedly."""
 
     data: FileBytes
     name: str
@@ -151,7 +146,7 @@ class _Archive(NamedTuple):
         return Stream(pieces(self.data, self.name, _UNLIMITED), self.place)
 
     def whole(self, index: Index, wanted: str) -> Bytes:
-        """All of a member that is there."""
+        """Contents of a whole member."""
         stream = self.stream()
         for member, size in known_members(stream, index):
             if member == wanted:
@@ -160,13 +155,13 @@ class _Archive(NamedTuple):
 
 
 class _Runs(NamedTuple):
-    """Some runs of a member's bytes, in order."""
+    """Disjoint byte ranges of a member, in order."""
 
     spans: list[_Span]
     arrays: list[Bytes]
 
     def of(self, span: _Span) -> Bytes:
-        """The bytes of a span within one of the runs."""
+        """Bytes of a span contained in one of the ranges."""
         begin, end = span
         if begin == end:
             return np.empty(0, np.uint8)
@@ -175,7 +170,7 @@ class _Runs(NamedTuple):
 
 
 def _taken(stream: Stream, member: str, spans: Sequence[_Span]) -> _Runs:
-    """Some bytes of the member at which a stream stands; spans that touch become one."""
+    """Reads byte ranges of the current member of a stream; adjacent ranges are merged."""
     runs: list[_Span] = []
     for begin, end in sorted(x for x in spans if x[0] < x[1]):
         if runs and begin <= runs[-1][1]:
@@ -196,12 +191,12 @@ def _taken(stream: Stream, member: str, spans: Sequence[_Span]) -> _Runs:
 
 
 class _Held(NamedTuple):
-    """What was read of some ranges of states.
+    """Data read for ranges of states.
 
     Attributes:
-      spans: the ranges of states, of their choices and of their branches.
-      starts: where the choices of each range's states begin, and the branches of their choices.
-      found: the bytes of members.
+      spans: ranges of states, choices and branches.
+      starts: offsets of choices and branches for each range.
+      found: bytes of the other members.
     """
 
     spans: dict[str, list[_Span]]
@@ -210,10 +205,10 @@ class _Held(NamedTuple):
 
 
 def _read(archive: _Archive, index: Index, ranges: list[_Span]) -> _Held:
-    """All that is told of some ranges, as soon as it is known which choices and branches they have.
+    """Reads all members of some ranges of states, with as few passes over the archive as possible.
 
-    Where there are as many choices as states, each must have one, and so for branches; what is
-    read elsewhere in hope of that is read again if it is not so, and found to be wrong.
+    With as many choices as states (branches as choices) a one-to-one map is presumed; members read
+    at wrong ranges are read again.
     """
     items, held = index.items(), _Held({"states": ranges}, {}, {})
     _presume(index, held)
@@ -250,7 +245,7 @@ def _presume(index: Index, held: _Held) -> None:
 def _lead_on(
     archive: _Archive, index: Index, held: _Held, items: dict[str, Items], member: str
 ) -> bool:
-    """Notes which choices or branches some ranges have; whether something was taken in vain."""
+    """Sets the ranges of the choices (branches) of a part; True if members must be read again."""
     part = items[member].part
     ahead, total = _AHEAD[part][1], index.counts[_AHEAD[part][1]]
     runs, size = held.found[member], items[member].size(index.counts[part])
@@ -279,7 +274,7 @@ def _lead_on(
 def _parts(
     archive: _Archive, index: Index, ranges: list[_Span]
 ) -> Iterator[tuple[_Span, ModelPart, tuple[str, ...]]]:
-    """The parts of a model for some ranges of states, and the names of labels."""
+    """Model parts of ranges of states, with the label names."""
     place = archive.place
     held, items = _read(archive, index, ranges), index.items()
     whole = {x: held.found[x].arrays[0] for x in _WHOLE if x in held.found and x != _IS_INITIAL}
@@ -311,7 +306,7 @@ def _of_range(runs: _Runs, item: Items, span: _Span) -> Bytes:
 
 
 def _some_initial(held: _Held, index: Index) -> int:
-    """How many states are initial; 0 if all are alike."""
+    """Number of initial states; 0 if the initial distribution is uniform over all states."""
     if _IS_INITIAL not in held.found:
         return 0
     count = count_bits(held.found[_IS_INITIAL].arrays[0], index.states)
@@ -326,7 +321,7 @@ def _part(
     some: int,
     place: str,
 ) -> tuple[ModelPart, tuple[str, ...]]:
-    """A part from the members of its range, and the names of labels."""
+    """Model part of one range of states, and the label names."""
     row_start, entry_start = starts
     target = needed(found, "branch-to-target.bin", place).view("<u8")
     if index.players == 0:

@@ -1,7 +1,7 @@
-"""Tar archives as streams: the members one by one, and archives whose bytes are always the same.
+"""Streaming reader of tar archives, and a deterministic writer.
 
-Read are POSIX (ustar) archives with the common ways to long names and large sizes. A member's
-header is believed only so far as bytes follow it, and nothing is ever written where it says.
+POSIX (ustar) archives with the usual extensions for long names and large sizes. Member sizes are
+not trusted beyond the available bytes, and nothing is extracted to disk.
 """
 
 from __future__ import annotations
@@ -25,13 +25,11 @@ _STEP = 2**20  # bytes of a file that are read at a time
 
 
 class Stream:
-    """Bytes that come in pieces, or those of a file, read in any portions.
-
-    What is skipped of a file is not read.
+    """Sequential reader of a file or of byte pieces; skipped bytes of a file are not read.
 
     Attributes:
-      place: what a message about the archive begins with.
-      position: how many bytes were taken.
+      place: prefix of error messages.
+      position: number of bytes consumed.
     """
 
     def __init__(self, source: Iterator[bytes] | FileBytes, place: str):
@@ -43,7 +41,7 @@ class Stream:
         return next(self._source, None)
 
     def _some(self, most: int) -> memoryview:
-        """Between one byte and `most`; none at the end."""
+        """Between 1 and `most` bytes; empty at the end."""
         while not self._held:
             piece = self._next()
             if piece is None:
@@ -54,11 +52,7 @@ class Stream:
         return some
 
     def fill(self, target: Any, what: str) -> None:
-        """Fills a writable array of uint8 or a bytearray; `what` it is goes into the error.
-
-        Raises:
-          ValueError: the bytes end before.
-        """
+        """Fills a uint8 array or bytearray; ValueError at a premature end."""
         view, done = memoryview(target), 0
         while done < len(view):
             some = self._some(len(view) - done)
@@ -71,11 +65,7 @@ class Stream:
             done += len(some)
 
     def skip(self, count: int, what: str) -> None:
-        """Passes over bytes.
-
-        Raises:
-          ValueError: the bytes end before.
-        """
+        """Skips bytes; ValueError at a premature end."""
         end = self.position + count
         if isinstance(self._source, FileBytes) and count > len(self._held):
             self._held, self.position = memoryview(b""), min(end, len(self._source))
@@ -84,19 +74,13 @@ class Stream:
                 raise ValueError(f"{self.place}{what}: the archive ends within it; it is cut off.")
 
     def drain(self) -> None:
-        """Passes over what is left, so that a checksum at its end is looked at."""
+        """Reads to the end, which verifies the checksum of a compressed stream."""
         while self._some(2**20):
             pass
 
 
 def members(stream: Stream) -> Iterator[tuple[str, int]]:
-    """The names and sizes of the regular files of a tar archive, in order.
-
-    After each the stream stands at its content, of which as much as wanted may be taken.
-
-    Raises:
-      ValueError: it is no such archive, is cut off, or a name leads outside.
-    """
+    """Names and sizes of regular files; after each, the stream is at the start of its contents."""
     long_name: str | None = None
     long_size: int | None = None
     first = True
@@ -131,7 +115,7 @@ def members(stream: Stream) -> Iterator[tuple[str, int]]:
 
 
 def _read_header(header: bytes, place: str, first: bool) -> tuple[bytes, str, int]:
-    """The type, name and size that a header gives."""
+    """Type, name and size of a member header."""
     if header[257:262] != b"ustar":
         if first:
             raise ValueError(f"{place}this is no tar archive: 'ustar' is missing at byte 257.")
@@ -151,7 +135,7 @@ def _read_header(header: bytes, place: str, first: bool) -> tuple[bytes, str, in
 
 
 def _number(field: bytes, what: str) -> int:
-    """A number in octal digits, or in binary where the first bit is set."""
+    """Octal field, or binary if the first bit is set (GNU)."""
     if field[0] == 0x80:
         return int.from_bytes(field[1:], "big")
     digits = field.split(b"\0")[0].strip(b" ")
@@ -168,7 +152,7 @@ def _text(name: bytes, place: str) -> str:
 
 
 def _extension(stream: Stream, name: str, size: int) -> bytes:
-    """The content of a header that tells of the next member."""
+    """Contents of an extended header."""
     if size > _LONGEST_NAME:
         raise ValueError(
             f"{stream.place}{name!r}: an extended header of {size} bytes; at most "
@@ -181,7 +165,7 @@ def _extension(stream: Stream, name: str, size: int) -> bytes:
 
 
 def _extended(content: bytes, place: str, name: str | None) -> tuple[str | None, int | None]:
-    """The name and the size that a POSIX extended header gives its member, if it does."""
+    """Name and size overrides of a POSIX extended header."""
     size, place_in = None, 0
     while place_in < len(content):
         record = _RECORD.match(content, place_in)
@@ -204,7 +188,7 @@ def _extended(content: bytes, place: str, name: str | None) -> tuple[str | None,
 
 
 def _checked_name(name: str, place: str) -> str:
-    """A name without ./ before it, if it stays within the archive."""
+    """Member name without leading ./; ValueError for paths outside the archive."""
     parts = name.split("/")
     while parts[0] == ".":
         del parts[0]
@@ -223,7 +207,7 @@ def _checked_name(name: str, place: str) -> str:
 
 
 def tar_pieces(contents: Sequence[tuple[str, Any]]) -> Iterator[memoryview]:
-    """The bytes of an archive of named contents, bytes or arrays of uint8, piece by piece."""
+    """Bytes of a tar archive of named contents, in pieces."""
     for name, content in contents:
         view = memoryview(content)
         yield memoryview(_header(name, len(view)))
@@ -267,10 +251,9 @@ _PROBED = 2**15
 
 
 def write_gzip(file: BinaryIO, pieces: Iterator[memoryview], threads: int = 4) -> None:
-    """Writes one gzip stream, block by block in several threads.
+    """Writes a gzip stream, compressed in blocks by several threads.
 
-    Blocks are cut at fixed places and hold no time, so that the same bytes give the same file
-    however many threads there are.
+    Blocks have fixed boundaries and no time stamp: the output does not depend on the threads.
     """
     file.write(b"\x1f\x8b\x08\0\0\0\0\0\0\xff")
     checksum = size = 0
@@ -288,7 +271,7 @@ def write_gzip(file: BinaryIO, pieces: Iterator[memoryview], threads: int = 4) -
 
 
 def _blocks(pieces: Iterator[memoryview]) -> Iterator[Any]:
-    """Large pieces cut into blocks, small ones put together."""
+    """Splits large pieces into blocks and merges small ones."""
     held = bytearray()
     for piece in pieces:
         if len(piece) < _GZIP_BLOCK:
@@ -306,7 +289,7 @@ def _blocks(pieces: Iterator[memoryview]) -> Iterator[Any]:
 
 
 def _deflated(block: Any) -> bytes:
-    """A block that ends at a byte, so that another may follow."""
+    """Deflate block flushed to a byte boundary, so that blocks can be concatenated."""
 
     def deflate(data: Any, strategy: int) -> bytes:
         packer: Any = zlib.compressobj(1, zlib.DEFLATED, -15, 9, strategy)

@@ -1,7 +1,6 @@
-"""Models in the Unified Markov Binary format, version 1, which Storm and PRISM read and write.
+"""Models in the Unified Markov Binary (UMB) format, version 1, of Storm and PRISM.
 
-The format is described at https://github.com/pmc-tools/umb: an archive of an index in JSON and of
-little-endian arrays, plain or compressed.
+https://github.com/pmc-tools/umb: a tar archive of a JSON index and little-endian arrays.
 """
 
 from __future__ import annotations
@@ -61,33 +60,29 @@ _INTERVAL = {"type": "double-interval", "size": 128}
 
 
 def read_umb(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP | Game:
-    """The Markov chain, decision process or turn-based game in a UMB file.
+    """Reads a Markov chain, MDP, interval model or turn-based game from a UMB file.
 
-    Read are plain archives and those compressed by gzip or xz: labels, rewards on states, choices
-    and branches, names of actions, and variables of states. Probabilities and rewards that are
-    rational become the nearest doubles. Branches of a choice with the same target become one.
-    Player 0 of a game is the system. Probabilities that are intervals make it an interval model,
-    whose rewards may be written as intervals of one point. Where no state is initial, the initial
-    distribution is uniform over all.
+    Reads labels, rewards on states, choices and branches, action names and state variables.
+    Rational numbers become the nearest doubles, and branches of a choice with equal targets are
+    merged. Player 0 of a game is the system. Interval probabilities give an interval model, whose
+    rewards may be point intervals. Without initial states the initial distribution is uniform over
+    all.
 
-    Left out, as nothing follows from them: who made the file, the players' names, actions of
-    branches, annotations other than labels and rewards, variables of choices and branches, and
-    whole numbers of more than 64 bits. A variable that some state lacks is a double, NaN there, or
-    an empty text.
+    Ignored: metadata, names of players, branch actions, other annotations, variables of choices and
+    branches, and integers of more than 64 bits. A variable that is absent in some states is a
+    double (NaN there) or an empty string.
 
     Args:
-      path: the file.
+      path: the file, plain or compressed by gzip or xz.
 
     Returns:
       A :class:`~jaxltl.core.models.sparse.SparseMDP`, an
-      :class:`~jaxltl.core.models.interval.IntervalMDP`, or a game
-      (:class:`~jaxltl.core.models.game.Game`) over a SparseMDP.
+      :class:`~jaxltl.core.models.interval.IntervalMDP`, or a
+      :class:`~jaxltl.core.models.game.Game` over a SparseMDP.
 
     Raises:
-      ValueError: the file cannot be read, is damaged or no UMB file, its parts do not fit one
-        another, or it holds what is not read: games with intervals, rates, observations, more
-        than two players who have a choice, choices whose branches have no probabilities. The
-        message names the file, the member, what was found and what was expected.
+      ValueError: with file and member, for unreadable, damaged or inconsistent files, interval
+        games, rates, observations, more than two players with choices, and missing probabilities.
     """
     name = str(path)
     place = f"{name!r}: "
@@ -102,7 +97,7 @@ def read_umb(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP | Game:
 
 
 def _read_members(data: bytes, index: Index, name: str, place: str) -> dict[str, Bytes]:
-    """The members that the index tells of; each has the size that follows from the index."""
+    """Contents of all indexed members, checked for size."""
     check_memory(sum(most for _, most in index.bounds().values()), place)
     found: dict[str, Bytes] = {}
     stream = Stream(pieces(data, name), place)
@@ -159,7 +154,7 @@ def _valuation(found: dict[str, Bytes], index: Index, place: str) -> dict[str, N
 
 
 def _initial(found: dict[str, Bytes], index: Index) -> NDArray[np.float64] | None:
-    """A distribution; None is the uniform one over all states."""
+    """Initial distribution; None for the uniform one over all states."""
     exact = found.get(f"annotations/{INITIAL}/probability/states/values.bin")
     if exact is not None:
         return exact.view("<f8").astype(np.float64, copy=False)
@@ -171,7 +166,7 @@ def _initial(found: dict[str, Bytes], index: Index) -> NDArray[np.float64] | Non
 def _owners(
     found: dict[str, Bytes], index: Index, row_start: NDArray[np.int64], place: str
 ) -> NDArray[np.bool_] | None:
-    """Where the system moves in a game of two; None if there is one player or chance alone."""
+    """Mask of the system's states in a two-player game; None for other models."""
     if index.players < 2:
         return None
     member = "state-to-player.bin"
@@ -203,25 +198,22 @@ def write_umb(
     *,
     compression: Compression | Literal["by name"] | None = "by name",
 ) -> None:
-    """Writes a model as a UMB file that Storm and PRISM read, whole or not at all.
+    """Writes a model as a UMB file for Storm and PRISM, atomically.
 
-    :func:`read_umb` gives back the same model bit for bit, except that variables narrower than 32
-    bits become int32 (floating ones double), that an empty reward is written as zeros on states,
-    and that names of actions go with their numbers. An initial distribution that is not
-    uniform and a label named init, which other tools have of their own, are kept where other
-    tools pass over them; those see the set of states with a positive initial probability. The
-    same model gives the same bytes.
+    :func:`read_umb` restores the model bit for bit, except that numeric variables are widened to at
+    least 32-bit integers or to doubles, an empty reward becomes zeros on states, and action names
+    require numbers. A non-uniform initial distribution and a label named init are stored in
+    extensions that other tools ignore; they read its support. The output is deterministic.
 
     Args:
       path: the file.
-      model: a model that :func:`~jaxltl.core.models.construct.convert.to_sparse` takes, an interval model,
-        whose rewards are written as intervals of one point, or a game over a model.
-      compression: "gzip", "xz", None for none, or by the end of the name: xz for ``.xz``, else
-        gzip.
+      model: a model that :func:`~jaxltl.core.models.construct.convert.to_sparse` takes, an interval
+        model, whose rewards are written as point intervals, or a game.
+      compression: "gzip", "xz", None for none, or by suffix: xz for ``.xz``, else gzip.
 
     Raises:
-      ValueError: a variable holds neither truth values, numbers nor texts, a name is no Unicode,
-        or the place cannot be written to.
+      ValueError: for variables of an unsupported type, names that are not Unicode, or the file
+        cannot be written.
 
     Example:
       >>> import pathlib, tempfile
@@ -250,7 +242,7 @@ def write_umb(
 
 
 def _contents(model: Any, place: str) -> list[tuple[str, Any]]:
-    """The members of a model's file, the index first."""
+    """Members of the output, the index first."""
     system, interval = None, None
     if isinstance(model, Game):
         model, system = model.mdp, np.asarray(model.system, bool).ravel()
@@ -311,7 +303,7 @@ def _contents(model: Any, place: str) -> list[tuple[str, Any]]:
 def _valuations(
     valuation: dict[str, Any], index: dict[str, Any], place: str
 ) -> list[tuple[str, Any]]:
-    """The members for a valuation, which is entered in the index."""
+    """Members of a valuation; adds its description to the index."""
     written = write_variables(valuation, place)
     states: dict[str, Any] = {"unique": False, "classes": [{"variables": written.variables}]}
     if written.named:
@@ -323,12 +315,12 @@ def _valuations(
 
 
 def _packed(array: Any, dtype: str) -> Bytes:
-    """An array as bytes."""
+    """Array as bytes."""
     return np.ascontiguousarray(array, np.dtype(dtype)).view(np.uint8)
 
 
 def _written_texts(texts: Sequence[str], folder: str, place: str) -> list[tuple[str, Any]]:
-    """The members for texts by their numbers; none if there are none."""
+    """Members of an array of strings; none if it is empty."""
     if not texts:
         return []
     start, content = write_texts(texts, f"{place}{folder}: ")
@@ -343,12 +335,7 @@ def _pairs(lower: Any, upper: Any) -> Bytes:
 def _annotations(
     model: SparseMDP, initial: NDArray[np.float64], points: bool
 ) -> tuple[dict[str, Any], list[tuple[str, Any]]]:
-    """The labels, the rewards and the initial distribution if need be: described, and members.
-
-    Args:
-      model, initial: the model.
-      points: whether rewards are written as intervals, as Storm has them in interval models.
-    """
+    """Index entries and members of labels, rewards and a non-uniform initial distribution."""
     described: dict[str, Any] = {"aps": {}, "rewards": {}}
     contents: list[tuple[str, Any]] = []
 

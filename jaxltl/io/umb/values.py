@@ -1,4 +1,4 @@
-"""The values in a UMB file's members: bits, numbers, texts and the variables of states."""
+"""Encoding of UMB values: bits, numbers, strings and state variables."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _MOST_TEXT = 2**30  # bytes of the texts of one variable
 
 
 def read_bits(content: Bytes, count: int) -> NDArray[np.bool_]:
-    """The first `count` bits, the least significant first."""
+    """The first `count` bits, least significant first."""
     return np.unpackbits(content, count=count, bitorder="little").view(bool)
 
 
 def count_bits(content: Bytes, count: int) -> int:
-    """How many of the first `count` bits are set."""
+    """Number of ones among the first `count` bits."""
     step, found = 2**20, 0
     for begin in range(0, count, 8 * step):
         block = content[begin // 8 : begin // 8 + step]
@@ -32,7 +32,7 @@ def count_bits(content: Bytes, count: int) -> int:
 
 
 def write_bits(bits: NDArray[np.bool_]) -> Bytes:
-    """Bits in words of 64."""
+    """Bit vector padded to 64-bit words."""
     content = np.zeros(bit_bytes(bits.size), np.uint8)
     packed = np.packbits(bits, bitorder="little")
     content[: packed.size] = packed
@@ -40,11 +40,7 @@ def write_bits(bits: NDArray[np.bool_]) -> Bytes:
 
 
 def read_starts(content: Bytes, total: int, place: str) -> NDArray[np.int64]:
-    """Where spans start, ``int64[n + 1]``, from 0 to `total`.
-
-    Raises:
-      ValueError: they start or end elsewhere, or fall.
-    """
+    """Offsets ``int64[n + 1]``, checked to ascend from 0 to `total`."""
     start = content.view("<u8")
     if start[0] != 0 or start[-1] != total:
         raise ValueError(
@@ -60,11 +56,7 @@ def read_starts(content: Bytes, total: int, place: str) -> NDArray[np.int64]:
 
 
 def read_numbers(content: Bytes, kind: Type, place: str) -> NDArray[np.float64]:
-    """Numbers of a type as doubles; rationals are rounded to the nearest.
-
-    Raises:
-      ValueError: a denominator is 0, or a number is beyond the doubles.
-    """
+    """Numbers as doubles; rationals are rounded to nearest."""
     if kind.name == "rational":
         return _read_rationals(content.reshape(-1, kind.size // 8), place)
     code = {"double": "<f8", "int": "<i8", "uint": "<u8"}[kind.name]
@@ -72,11 +64,7 @@ def read_numbers(content: Bytes, kind: Type, place: str) -> NDArray[np.float64]:
 
 
 def read_ends(content: Bytes, kind: Type, place: str) -> NDArray[np.float64]:
-    """Lower and upper ends of intervals, ``float64[n, 2]``; of numbers twice the same.
-
-    Raises:
-      ValueError: as of :func:`read_numbers`.
-    """
+    """Interval bounds ``float64[n, 2]``; numbers become point intervals."""
     if kind.end is None:
         found = read_numbers(content, kind, place)
         return np.stack([found, found], 1)
@@ -84,11 +72,7 @@ def read_ends(content: Bytes, kind: Type, place: str) -> NDArray[np.float64]:
 
 
 def read_points(content: Bytes, kind: Type, place: str, *, first: int = 0) -> NDArray[np.float64]:
-    """Numbers, which may be written as intervals of one point; `first` is the first one's number.
-
-    Raises:
-      ValueError: an interval is no point, or as of :func:`read_numbers`.
-    """
+    """Numbers or point intervals as doubles; `first` is the first index, for messages."""
     if kind.end is None:
         return read_numbers(content, kind, place)
     ends = read_ends(content, kind, place)
@@ -103,7 +87,7 @@ def read_points(content: Bytes, kind: Type, place: str, *, first: int = 0) -> ND
 
 
 def _read_rationals(content: Bytes, place: str) -> NDArray[np.float64]:
-    """Numerators and denominators, half of each record, as doubles."""
+    """Rationals (numerator and denominator, half a record each) as doubles."""
     half = content.shape[1] // 2
     found = np.zeros(len(content))
     hard = np.ones(len(content), bool)
@@ -132,11 +116,7 @@ def _quotient(record: bytes, half: int, place: str) -> float:
 
 
 def read_texts(start: NDArray[np.int64], content: Bytes, place: str) -> tuple[str, ...]:
-    """The texts that lie between the starts.
-
-    Raises:
-      ValueError: one is not UTF-8.
-    """
+    """Strings between the offsets."""
     data = content.tobytes()
     try:
         return tuple(data[i:j].decode() for i, j in itertools.pairwise(start.tolist()))
@@ -155,23 +135,10 @@ def read_variables(
     texts: Sequence[str],
     place: str,
 ) -> dict[str, NDArray[Any]]:
-    """The variables of states, ``[S]`` each, by name.
+    """State variables by name, ``[S]`` each.
 
-    Whole numbers are int32 or, where the type is larger, int64 (or uint64); what is absent in
-    some state is a double, NaN there, or an empty text. Texts that would take more than 1 GB are
-    objects. Whole numbers of more than 64 bits are left out.
-
-    Args:
-      content: the records of the states, one after the other.
-      of_class: which record a state has; None: all the first.
-      records: the classes.
-      count: the number of states.
-      texts: those that variables have by their numbers.
-      place: what an error begins with.
-
-    Raises:
-      ValueError: the content has another size than the records, a class or a text does not exist,
-        or a variable has a type of intervals, two kinds of types or values beyond 64 bits.
+    Integers become int32, int64 or uint64 by type, and are dropped beyond 64 bits. Variables absent
+    in some states are doubles (NaN) or strings (empty). Strings over 1 GB in total are objects.
     """
     if of_class is None:
         of_class = np.zeros(count, np.uint32)
@@ -213,7 +180,7 @@ _Part = tuple[NDArray[np.intp], NDArray[Any]]  # some states, and the values the
 def _read_variable(
     raw: Bytes, variable: Variable, texts: Sequence[str], what: str
 ) -> NDArray[Any] | None:
-    """A variable's value in each record, or None if it is left out."""
+    """Value of a variable in each record, or None if it is unsupported."""
     kind = variable.type
     if kind.name.endswith("-interval"):
         raise ValueError(f"{what}is {kind.name}; expected single values.")
@@ -240,7 +207,7 @@ def _read_variable(
 
 
 def _texts(number: NDArray[Any], texts: Sequence[str], what: str) -> NDArray[Any]:
-    """The texts of some numbers."""
+    """Strings by index."""
     used, which = np.unique(number, return_inverse=True)
     if used[0] < 0 or used[-1] >= len(texts):
         raise ValueError(f"{what}has the text {used[-1]}; there are {len(texts)}.")
@@ -251,7 +218,7 @@ def _texts(number: NDArray[Any], texts: Sequence[str], what: str) -> NDArray[Any
 
 
 def _field(raw: Bytes, start: int, size: int) -> Bytes:
-    """The bits from `start` of every record as little-endian bytes, zeros above them."""
+    """Bit field of every record as little-endian bytes, zero-padded."""
     first, shift, width = start // 8, start % 8, -(-size // 8)
     field = raw[:, first : first + width]
     if shift:
@@ -265,7 +232,7 @@ def _field(raw: Bytes, start: int, size: int) -> Bytes:
 
 
 def _whole_numbers(field: Bytes, variable: Variable, what: str) -> NDArray[Any]:
-    """Encoded numbers plus the offset, in the smallest of int32, int64 and uint64 for the type."""
+    """Integers with offset, in the smallest of int32, int64 and uint64 that fits the type."""
     size, offset, signed = variable.type.size, variable.offset, variable.type.name == "int"
     wide = np.zeros((len(field), 8), np.uint8)
     wide[:, : field.shape[1]] = field
@@ -293,7 +260,7 @@ def _whole_numbers(field: Bytes, variable: Variable, what: str) -> NDArray[Any]:
 
 
 def _joined(parts: Sequence[_Part], count: int, what: str) -> NDArray[Any]:
-    """A variable's values from all classes of states."""
+    """Values of a variable, merged over all classes of states."""
     if len(parts) == 1 and parts[0][0].size == count:
         return parts[0][1]
     texts = {values.dtype.kind in "UO" for _, values in parts}
@@ -309,13 +276,13 @@ def _joined(parts: Sequence[_Part], count: int, what: str) -> NDArray[Any]:
 
 
 class Written(NamedTuple):
-    """Variables as they are written.
+    """Encoded state variables.
 
     Attributes:
-      variables: what the index says of them.
-      records: those of all states, one after the other.
-      texts: those that variables have by their numbers.
-      named: the variables that are texts.
+      variables: their descriptions in the index.
+      records: records of all states.
+      texts: strings by index.
+      named: names of the variables that hold strings.
     """
 
     variables: list[Any]
@@ -325,11 +292,7 @@ class Written(NamedTuple):
 
 
 def write_variables(valuation: Mapping[str, Any], place: str) -> Written:
-    """The variables of all states; each begins at a whole byte of its record.
-
-    Raises:
-      ValueError: a variable holds neither truth values, nor numbers, nor texts.
-    """
+    """Encodes state variables; each starts at a byte boundary of the record."""
     described: list[Any] = []
     fields: list[NDArray[Any]] = []
     texts: list[str] = []
@@ -367,11 +330,7 @@ def write_variables(valuation: Mapping[str, Any], place: str) -> Written:
 
 
 def write_texts(texts: Sequence[str], place: str) -> tuple[Bytes, bytes]:
-    """Where texts start, and the texts.
-
-    Raises:
-      ValueError: one is no Unicode.
-    """
+    """Offsets and UTF-8 bytes of strings."""
     try:
         encoded = [text.encode() for text in texts]
     except UnicodeEncodeError as error:
