@@ -106,7 +106,8 @@ def complement_event(solution: Solution) -> Solution:
     def outwards(bound: Any, end: int) -> Any:
         rounded = one - bound
         beyond = xp.clip(xp.nextafter(rounded, end * one), 0, 1)
-        return xp.where((bound == 0) | (bound == 1), rounded, beyond)
+        # By Sterbenz's lemma, 1 - rounded has no rounding error, so that this test is exact.
+        return xp.where(one - rounded == bound, rounded, beyond)
 
     found: Any = one - value, outwards(far, -1), outwards(near, 2)
     if any(isinstance(x, jax.Array) for x in parts):
