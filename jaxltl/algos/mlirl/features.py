@@ -169,6 +169,9 @@ def _nearer(model: Product, best: Solution) -> np.ndarray | None:
     ahead = np.where(reached, 0, np.where(lost, ahead.max(initial=0), ahead)) + most
     way = np.where(reached, inside, ahead)
     entered = np.where(reached, most, ahead)
+    # Differences of expected steps are rounded by about this much; the best action's one is 1.
+    if not np.finfo(np.float64).eps * max(way.max(), entered.max()) < 0.1:
+        return None
     next_way = visits.expectation(np.append(way, 0)[: visits.num_states])[: mdp.num_rows]
     decrease = way[mdp.state] - np.where(reached[mdp.state], next_way, mdp.expectation(entered))
     return on_actions(sparse, decrease, model).astype(model.dtype)
