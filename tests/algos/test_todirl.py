@@ -416,7 +416,7 @@ def test_bad_settings_are_refused():
     problem = small()
     with pytest.raises(ValueError, match=r"horizon=3, but the problem has horizon=None; make_pro"):
         todirl.objective(parameters(problem), problem, todirl.Hparams(discount=0.9, horizon=3))
-    with pytest.raises(ValueError, match="optimizer='best'; choose one of adam, sgd"):
+    with pytest.raises(ValueError, match="optimizer='best'; choose one of"):
         todirl.init(jax.random.key(0), problem, todirl.Hparams(discount=0.9, optimizer="best"))
 
 
