@@ -244,6 +244,8 @@ def _invalid_policy(policy: np.ndarray, batch: tuple[int, ...], lane: int) -> st
         return _invalid_weights(policy)
     rows = policy.reshape(-1, policy.shape[-1])
     bad = ~(np.abs(rows.sum(-1) - 1) <= row_tolerance(rows.dtype)) | ~(rows >= 0).all(-1)
+    if not bad.any():  # inside jit, weights or probabilities may be subnormal
+        return f"the policy has a subnormal weight, or {_INVALID[Status.INVALID]}"
     state = int(np.argmax(bad))
     return describe_row(rows[state], np.unravel_index(state, policy.shape[:-1]))
 

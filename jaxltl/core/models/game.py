@@ -15,9 +15,9 @@ from flax import struct
 from jaxltl.core.models import facts
 from jaxltl.core.models.construct.padded import to_padded
 from jaxltl.core.models.interval import IntervalMDP
-from jaxltl.core.models.mdp import support
+from jaxltl.core.models.mdp import MDP, DenseMDP, support
 from jaxltl.core.models.ops import operators
-from jaxltl.core.models.ops.array_namespace import namespace, to_jax
+from jaxltl.core.models.ops.array_namespace import is_traced, namespace, to_jax
 from jaxltl.core.models.ops.choices import choice_shape, choices
 from jaxltl.core.models.protocols import Model, base_model
 from jaxltl.core.models.sparse import SparseMDP
@@ -115,6 +115,8 @@ def make_game(model: Model, system: Sequence[bool] | chex.Array) -> Game:
       [True, False]
     """
     owner = _owners(system, model.state_shape)
+    if isinstance(base := base_model(model), MDP | DenseMDP) and not is_traced(base):
+        support(base)  # refuses probabilities that underflow
     if not isinstance(model, SparseMDP | IntervalMDP):  # whose every state has a choice
         check_moves(np.asarray(choices(model).available), owner)
     return Game(model, to_jax(owner))

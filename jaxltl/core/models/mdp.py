@@ -10,9 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from numpy.typing import DTypeLike
 
 from jaxltl.core.models import facts
 from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
+from jaxltl.core.models.ops.underflow import target_dtype, underflow_text, underflows
 from jaxltl.core.models.protocols import Model
 from jaxltl.core.pretty_print import brief
 from jaxltl.core import validation
@@ -139,11 +141,21 @@ def support(world: Model) -> np.ndarray:
     """``bool[S, A, K]``, successors of positive probability; ValueError if one is subnormal."""
     if not isinstance(world, MDP | DenseMDP):
         raise ValueError(validation.unsupported_model(world))
-    weight = world.transition if isinstance(world, DenseMDP) else world.probability
-    used, available = np.asarray(weight) > 0, np.asarray(world.available)
+    weight = np.asarray(world.transition if isinstance(world, DenseMDP) else world.probability)
+    used, available = weight > 0, np.asarray(world.available)
     if not available.all():
         used &= available[..., None]
+    dtype = target_dtype(weight.dtype)
+    small = used & (weight < jnp.finfo(dtype).tiny)
+    if small.any():
+        _raise_underflow(weight, small, dtype)
     return used
+
+
+def _raise_underflow(probability: np.ndarray, small: np.ndarray, dtype: np.dtype) -> None:
+    s, a, k = np.argwhere(small)[0]
+    text = underflow_text(probability[s, a, k], dtype)
+    raise ValueError(f"state {s}, action {a}: probability (entry {k}) {text}.")
 
 
 def make_mdp(
@@ -185,7 +197,7 @@ def make_mdp(
       (2, 1)
     """
     successor = np.asarray(successor)
-    probability = np.asarray(probability)
+    probability = validation.float_array("probability", probability)
     if probability.ndim != 3 or successor.shape != probability.shape:
         raise ValueError(
             f"successor has shape {successor.shape} and probability {probability.shape}; "
@@ -214,13 +226,16 @@ def make_mdp(
     scale = _row_scale(probability.sum(axis=-1, dtype=np.float64), available)
     dtype = jnp.result_type(float)
     used &= available[:, :, None]
-    probability = np.where(used, probability * scale[:, :, None], 0).astype(dtype)
+    probability = np.where(used, probability * scale[:, :, None], 0)
+    if (small := underflows(probability, dtype)) is not None:
+        _raise_underflow(probability, small, dtype)
+    probability = probability.astype(dtype)
     label, names = checked_label(label, propositions, num_states)
     return MDP(
         successor=to_jax(np.where(used, successor, 0).astype(np.int32)),
         probability=to_jax(probability),
         available=to_jax(available),
-        initial=to_jax(checked_initial(initial, num_states).astype(dtype)),
+        initial=to_jax(checked_initial(initial, num_states, dtype).astype(dtype)),
         label=to_jax(label),
         propositions=names,
     )
@@ -253,7 +268,7 @@ def from_dense(
       >>> mdp.successor.shape, mdp.propositions, mdp.label[:, 0].tolist()
       ((2, 1, 2), ('goal',), [False, True])
     """
-    transition = np.asarray(transition)
+    transition = validation.float_array("transition", transition)
     if transition.ndim != 3 or transition.shape[0] != transition.shape[2]:
         raise ValueError(f"transition has shape {transition.shape}; it must be [S, A, S].")
     _check_probability(transition)
@@ -300,6 +315,7 @@ def to_dense(mdp: MDP) -> DenseMDP:
         empty = jnp.zeros(shape, mdp.dtype)
         transition = empty.at[*place, mdp.successor].add(mdp.probability)
     else:
+        support(mdp)  # refuses probabilities that underflow
         transition = np.zeros(shape, mdp.dtype)
         np.add.at(transition, (*place, np.asarray(mdp.successor)), np.asarray(mdp.probability))
     return DenseMDP(
@@ -333,7 +349,7 @@ def _row_scale(total: np.ndarray, available: np.ndarray) -> np.ndarray:
 
 
 def _checked_available(available: chex.Array, shape: tuple[int, int]) -> np.ndarray:
-    available = np.asarray(available, bool)
+    available = validation.boolean_array("available", available)
     if available.shape != shape:
         raise ValueError(f"available has shape {available.shape}; expected {shape}.")
     stuck = ~available.any(axis=1)
@@ -345,12 +361,14 @@ def _checked_available(available: chex.Array, shape: tuple[int, int]) -> np.ndar
     return available
 
 
-def checked_initial(initial: chex.Array | None, num_states: int) -> np.ndarray:
-    """An initial distribution, checked, on the host.
+def checked_initial(
+    initial: chex.Array | None, num_states: int, dtype: DTypeLike = np.float64
+) -> np.ndarray:
+    """A checked initial distribution ``float64[S]`` that sums to 1; None: the uniform one.
 
     Raises:
-      ValueError: a wrong shape, a probability that is negative or NaN, with its state, or a sum
-        that is not 1.
+      ValueError: a wrong shape, a probability that is negative, NaN or too small for `dtype`, or a
+        sum that is not 1 within 1e-6.
     """
     if initial is None:
         return np.full(num_states, 1 / num_states)
@@ -360,7 +378,11 @@ def checked_initial(initial: chex.Array | None, num_states: int) -> np.ndarray:
     refuse_negative(initial)
     if abs(initial.sum() - 1) > validation.ROW_SUM_TOLERANCE:
         raise ValueError(f"the initial distribution sums to {initial.sum():.9g}, not 1.")
-    return initial / initial.sum()
+    initial = initial / initial.sum()
+    if (small := underflows(initial, dtype)) is not None:
+        s = int(np.argmax(small))
+        raise ValueError(f"initial probability of state {s} {underflow_text(initial[s], dtype)}.")
+    return initial
 
 
 def refuse_negative(initial: np.ndarray, *, first: int = 0) -> None:
@@ -393,7 +415,7 @@ def checked_label(
                 f"states where each holds, {{{names[0]!r}: [...]}}."
             )
         label = np.zeros((num_states, 0), bool)
-    label = np.asarray(label, bool)
+    label = validation.boolean_array("label", label)
     if label.shape != (num_states, len(names)):
         raise ValueError(
             f"label has shape {label.shape}; expected ({num_states}, {len(names)}): "

@@ -12,11 +12,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from numpy.typing import DTypeLike
 
 from jaxltl.core.models import facts
 from jaxltl.core.models.mdp import checked_initial, checked_label
 from jaxltl.core.models.ops.array_namespace import is_traced
 from jaxltl.core.models.ops.kernels import gather, segment_ids, segment_reduce
+from jaxltl.core.models.ops.underflow import underflow_text, underflows
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.rows import SCIPY_SIZE
@@ -325,7 +327,10 @@ def sparse_part(
     `begins` are the numbers of its first state, choice and transition in the whole model, and
     `num_states` the states of the whole model; error messages use these numbers.
     """
-    successor, probability = np.asarray(successor), np.asarray(probability, np.float64)
+    successor, probability = (
+        np.asarray(successor),
+        validation.float_array("probability", probability),
+    )
     if successor.ndim != 1 or successor.shape != probability.shape:
         raise ValueError(
             f"successor has shape {successor.shape} and probability {probability.shape}; "
@@ -416,6 +421,7 @@ def check_entries(
     *,
     first: int = 0,
     num_states: int | None = None,
+    dtype: DTypeLike = np.float64,
 ) -> None:
     """Raises ValueError if a state, a row or an entry is invalid.
 
@@ -445,6 +451,23 @@ def check_entries(
             f"{placed(row_start, row, first)}: probability {probability[e]}; "
             "probabilities must be finite and not negative."
         )
+    refuse_underflow(row_start, entry_start, probability, dtype, first=first)
+
+
+def refuse_underflow(
+    row_start: np.ndarray,
+    entry_start: np.ndarray,
+    probability: np.ndarray,
+    dtype: DTypeLike,
+    *,
+    first: int = 0,
+) -> None:
+    """Raises ValueError if a positive probability is zero or subnormal in a dtype."""
+    if (small := underflows(probability, dtype)) is not None:
+        e = int(np.argmax(small))
+        row = int(np.searchsorted(entry_start, e, "right")) - 1
+        text = underflow_text(probability[e], dtype)
+        raise ValueError(f"{placed(row_start, row, first)}: probability {text}.")
 
 
 def _checked_rewards(
@@ -457,7 +480,7 @@ def _checked_rewards(
         given = getattr(reward, part)
         if given is None:
             continue
-        given = np.asarray(given, np.float64)
+        given = validation.float_array(f"reward {name!r}", given)
         if given.shape != (size,):
             raise ValueError(
                 f"reward {name!r} has shape {given.shape} on its {part} part; expected ({size},)."

@@ -56,9 +56,10 @@ def _with_allowed(model: Model, allowed: chex.Array) -> Model:
     if not isinstance(model, MDP | DenseMDP | Product | Game):
         raise ValueError(validation.unsupported_model(model))
     shape = (*model.state_shape, model.num_actions)
-    if np.shape(allowed) != shape or allowed.dtype != bool:
+    allowed = allowed if isinstance(allowed, jax.Array) else np.asarray(allowed)
+    if allowed.shape != shape or allowed.dtype != bool:
         raise ValueError(
-            f"allowed is {allowed.dtype}{list(np.shape(allowed))}; expected bool{list(shape)}."
+            f"allowed is {allowed.dtype}{list(allowed.shape)}; expected bool{list(shape)}."
         )
     if not is_traced((model, allowed)):
         mask, available = np.asarray(allowed), np.asarray(model.available)

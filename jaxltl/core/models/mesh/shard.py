@@ -21,6 +21,7 @@ from jaxltl.core.models.construct.padded import row_actions
 from jaxltl.core.models.mesh.lanes import on_host
 from jaxltl.core.models.mesh.layout import StateLayout, state_layout
 from jaxltl.core.models.mesh.sharded import RowTable, ShardedMDP
+from jaxltl.core.models.ops.underflow import target_dtype, underflow_text, underflows
 from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import (
     SparseMDP,
@@ -198,12 +199,13 @@ def to_mesh(model: ShardedMDP, quantity: Any, fill: Any = 0) -> jax.Array:
       >>> to_mesh(model, np.array([1.0, 2.0])).shape
       (2,)
     """
-    quantity = np.asarray(quantity)
-    if quantity.dtype == np.float64:
-        quantity = quantity.astype(model.dtype)
-    index = model.number
+    quantity, index = np.asarray(quantity), model.number
     if quantity.shape[:1] != (model.num_given,):
         index = _rows_of(model, quantity.shape)
+    if quantity.dtype.kind == "f":
+        if index is model.row or quantity.ndim > 1:
+            _refuse_underflow(quantity, model.dtype)
+        quantity = quantity.astype(model.dtype)
     sharding, found = model.sharding, {}
     for piece in index.addressable_shards:
         number = np.asarray(piece.data)
@@ -214,6 +216,12 @@ def to_mesh(model: ShardedMDP, quantity: Any, fill: Any = 0) -> jax.Array:
     return jax.make_array_from_single_device_arrays(
         shape, sharding, [jax.device_put(x, device) for device, x in found.items()]
     )
+
+
+def _refuse_underflow(weight: np.ndarray, dtype: np.dtype) -> None:
+    if (small := underflows(weight, dtype)) is not None:
+        place = np.argwhere(small)[0].tolist()
+        raise ValueError(f"the weight at {place} {underflow_text(weight[tuple(place)], dtype)}.")
 
 
 def _rows_of(model: ShardedMDP, shape: tuple[int, ...]) -> jax.Array:
@@ -348,7 +356,8 @@ def _checked(part: Any, layout: StateLayout, d: int, num_labels: int) -> _Range:
         raise ValueError(
             f"part({start}, {stop}) is {validation.shorten(found)}; it must return a ModelPart."
         )
-    successor, probability = np.asarray(found.successor), np.asarray(found.probability, np.float64)
+    successor = np.asarray(found.successor)
+    probability = validation.float_array("probability", found.probability)
     entry_start = checked_starts("entry_start", found.entry_start, successor.size, "transitions")
     row_start = found.row_start
     if row_start is None:
@@ -357,13 +366,25 @@ def _checked(part: Any, layout: StateLayout, d: int, num_labels: int) -> _Range:
     count = row_start.size - 1
     if count != stop - start:
         raise ValueError(f"part({start}, {stop}) has {count} states; it must have {stop - start}.")
+    dtype = target_dtype(np.float64)
     check_entries(
-        row_start, entry_start, successor, probability, first=start, num_states=layout.num_given
+        row_start,
+        entry_start,
+        successor,
+        probability,
+        first=start,
+        num_states=layout.num_given,
+        dtype=dtype,
     )
     probability = scaled(row_start, entry_start, probability, first=start)
     owner = np.repeat(np.arange(count), np.diff(row_start))
     action = np.arange(owner.size) - row_start[owner] if found.action is None else found.action
     initial = np.full(count, 1 / layout.num_given) if found.initial is None else found.initial
+    if (small := underflows(np.asarray(initial, np.float64), dtype)) is not None:
+        s = int(np.argmax(small))
+        raise ValueError(
+            f"initial probability of state {start + s} {underflow_text(initial[s], dtype)}."
+        )
     label = np.zeros((count, num_labels), bool) if found.label is None else found.label
     for name, x, shape in (
         ("action", action, (owner.size,)),

@@ -19,6 +19,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxltl.core.models import facts
 from jaxltl.core.models.ops import kernels, operators
+from jaxltl.core.models.ops.underflow import is_positive
 from jaxltl.core.models.product import distinct_labels, letters_by_state
 from jaxltl.core.models.protocols import Model
 from jaxltl.core.pretty_print import brief
@@ -222,7 +223,7 @@ def _(model: ShardedMDP, quantity: jax.Array) -> jax.Array:
         for successor, weight in tables:
             count, width = successor.shape
             mine = rows[first : first + count].reshape(count, 1, *wide)
-            used = (weight > 0).reshape(count, width, *(1,) * len(wide))
+            used = is_positive(weight).reshape(count, width, *(1,) * len(wide))
             seen = seen.at[successor].max(jnp.where(used, mine, 0))
             first += count
         if model.rounds is None:

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
+from jaxltl.core.models.ops.underflow import is_positive
 
 # Transitions of a state up to which sums over them are unrolled, so that XLA fuses them into one
 # pass; beyond, programs would grow too large.
@@ -106,12 +107,12 @@ def stacked(columns: Sequence[jax.Array]) -> jax.Array:
 
 def positive_hits(weight: jax.Array, inside: jax.Array) -> jax.Array:
     """True where a successor of positive weight lies in a region."""
-    return (weight > 0) & inside
+    return is_positive(weight) & inside
 
 
 def where_positive(weight: jax.Array, value: jax.Array) -> jax.Array:
     """The value where the weight is positive, else the largest number of its dtype."""
-    return jnp.where(weight > 0, value, dtype_max(value.dtype))
+    return jnp.where(is_positive(weight), value, dtype_max(value.dtype))
 
 
 def dtype_max(dtype: Any) -> Any:

@@ -32,7 +32,8 @@ from jaxltl.core.models.ops.choices import first_action as first_action
 from jaxltl.core.models.ops.choices import is_deterministic as is_deterministic
 from jaxltl.core.models.ops.choices import row_entries
 from jaxltl.core.models.ops.kernels import where_positive
-from jaxltl.core.models.protocols import Model
+from jaxltl.core.models.ops.underflow import is_positive, is_subnormal, underflow_text, underflows
+from jaxltl.core.models.protocols import Model, base_model
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.types import describe_row, row_tolerance
 from jaxltl.core import validation
@@ -228,6 +229,31 @@ def unpadded_states(model: Model) -> jax.Array | bool:
     return True
 
 
+def is_representable(model: Model) -> jax.Array:
+    """``bool[]``: no transition probability is subnormal, and none of a sparse row is zero.
+
+    Constructors refuse such models; a model that enters ``jit`` in lower precision may be one.
+    """
+    return jnp.all(_representable(base_model(model)))
+
+
+@singledispatch
+def _representable(model: Model) -> jax.Array:
+    return jnp.bool_(True)
+
+
+@_representable.register(MDP)
+@_representable.register(DenseMDP)
+def _(model: MDP | DenseMDP) -> jax.Array:
+    return ~is_subnormal(lax.stop_gradient(model.successor_probability))
+
+
+@_representable.register
+def _(model: SparseMDP) -> jax.Array:
+    probability = jnp.asarray(lax.stop_gradient(model.probability))
+    return probability >= jnp.finfo(probability.dtype).tiny
+
+
 @singledispatch
 def greatest_predecessor(model: Model, quantity: jax.Array) -> jax.Array:
     """Largest quantity among the choices that lead to a state, ``[S, ...]`` from ``[S, ..., A]``.
@@ -266,7 +292,9 @@ def _(model: MDP, value: jax.Array, term: Any, combine: Any) -> jax.Array:
 @greatest_predecessor.register
 def _(model: MDP, quantity: jax.Array) -> jax.Array:
     wide = quantity.shape[1:-1]
-    used = (model.successor_probability > 0).reshape(*model.successor.shape, *(1,) * len(wide))
+    used = is_positive(model.successor_probability).reshape(
+        *model.successor.shape, *(1,) * len(wide)
+    )
     sent = jnp.where(used, jnp.moveaxis(quantity, -1, 1)[:, :, None], 0)  # [S, A, K, ...]
     return jnp.zeros(quantity.shape[:-1], quantity.dtype).at[model.successor].max(sent)
 
@@ -335,12 +363,12 @@ def _(model: DenseMDP, policy: jax.Array) -> jax.Array:
 
 @exists_successor.register
 def _(model: DenseMDP, region: jax.Array) -> jax.Array:
-    return jnp.any((model.successor_probability > 0) & region, axis=-1)
+    return jnp.any(is_positive(model.successor_probability) & region, axis=-1)
 
 
 @forall_successor.register
 def _(model: DenseMDP, region: jax.Array) -> jax.Array:
-    return jnp.all((model.successor_probability <= 0) | region, axis=-1)
+    return jnp.all(~is_positive(model.successor_probability) | region, axis=-1)
 
 
 @least_successor.register
@@ -465,7 +493,8 @@ def valid_policy(model: Model, policy: jax.Array, where: jax.Array | bool = True
     used = jnp.where(
         over.spread(row), jnp.where(available, policy, 0), uniform.astype(policy.dtype)
     )
-    return Policy(used, lax.stop_gradient(given), jnp.all(row))
+    valid = jnp.all(row) & ~jnp.any(is_subnormal(policy)) & is_representable(model)
+    return Policy(used, lax.stop_gradient(given), valid)
 
 
 def require_policy(model: Model, policy: Any, where: Any = True) -> None:
@@ -499,6 +528,12 @@ def require_policy(model: Model, policy: Any, where: Any = True) -> None:
     if not (good | ~np.asarray(where)).all():
         state = np.argwhere(~good & where)[0]
         raise ValueError(f"{describe_row(given[tuple(state)], tuple(state))}.")
+    if (small := underflows(table, model.dtype)) is not None:
+        *state, action = np.argwhere(small)[0].tolist()
+        raise ValueError(
+            f"the policy's weight of action {action} in state {', '.join(map(str, state))} "
+            f"{underflow_text(table[(*state, action)], model.dtype)}."
+        )
 
 
 def row_weights(model: SparseMDP, policy: Any, where: Any = True) -> np.ndarray:
@@ -527,6 +562,10 @@ def row_weights(model: SparseMDP, policy: Any, where: Any = True) -> np.ndarray:
         )
     weight = policy.astype(np.float64)
     require_weights(host, weight, row_tolerance(policy.dtype), where)
+    if (small := underflows(policy, policy.dtype)) is not None:
+        row = int(np.argmax(small))
+        text = underflow_text(policy[row], policy.dtype)
+        raise ValueError(f"the policy's weight of choice {row} {text}.")
     return weight
 
 

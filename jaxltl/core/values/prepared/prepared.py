@@ -18,7 +18,8 @@ from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.mesh.sharded import refuse_sharded
 from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
 from jaxltl.core.models.ops.operators import is_deterministic
-from jaxltl.core.models.sparse import Rewards, choice_reward
+from jaxltl.core.models.ops.underflow import is_subnormal
+from jaxltl.core.models.sparse import Rewards, choice_reward, refuse_underflow
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.prepared.reachability_plan import Plan, plan_optimum, plan_policy
 from jaxltl.core.sparse.solvers.reachability import reduce_reachability, reduce_total_reward
@@ -204,6 +205,7 @@ def prepare(
 
 def _prepared(host: Any, plan: Plan, cost: Any, objective: str) -> Prepared:
     dtype = jnp.zeros(()).dtype
+    refuse_underflow(host.row_start, host.entry_start, host.probability, dtype)
     vector = np.concatenate(
         [host.probability, np.zeros(host.num_rows) if cost is None else cost, [1.0, 0.0]]
     )
@@ -391,6 +393,7 @@ def _shares(prepared: Prepared, policy: Any) -> tuple[_Shares | None, Any]:
     )
     slack = row_tolerance(dtype)
     valid = jnp.all(jnp.abs(total - 1) <= slack) & jnp.all(weight >= 0)
+    valid &= ~jnp.any(is_subnormal(weight))
     finite = jnp.all(jnp.isfinite(weight))
     total = jnp.where(total > 0, total, 1)
     return _Shares(weight / total[prepared.row_state], used, valid, finite), policy

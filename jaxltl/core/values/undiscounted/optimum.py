@@ -26,6 +26,7 @@ from jaxltl.core.models.ops.operators import (
     action_argmax,
     action_mean,
     expectation,
+    is_representable,
     policy_operator,
     valid_policy,
 )
@@ -328,7 +329,9 @@ def _optimize(model, sets: Sets, components, tolerance, max_steps, start, *, obj
         upper=upper,
         residual=residual,
         num_steps=n,
-        status=status_code(bounds.half <= goal, jnp.isfinite(residual)),
+        status=status_code(
+            bounds.half <= goal, jnp.isfinite(residual), valid=is_representable(model)
+        ),
     )
     solution = jax.tree.map(lax.stop_gradient, solution)
 

@@ -36,6 +36,7 @@ from jaxltl.core.models.ops.operators import (
     action_argmax,
     action_mean,
     expectation,
+    is_representable,
     policy_operator,
     valid_policy,
 )
@@ -157,7 +158,7 @@ def total_reward_by_sweeps(
         jnp.where(finite, x, jnp.where(earns, jnp.inf, bad))
         for x, bad in ((value, jnp.nan), (found.lower, -jnp.inf), (found.upper, jnp.inf))
     )
-    none = status_code(earns, earns)
+    none = status_code(earns, earns, valid=is_representable(model))
     solution = Solution(
         value=value,
         policy=chosen,
