@@ -32,8 +32,8 @@ from jaxltl.core.models.ops.choices import first_action as first_action
 from jaxltl.core.models.ops.choices import is_deterministic as is_deterministic
 from jaxltl.core.models.ops.choices import row_entries
 from jaxltl.core.models.ops.kernels import where_positive
-from jaxltl.core.models.ops.underflow import is_positive, is_subnormal, underflow_text, underflows
 from jaxltl.core.models.protocols import Model, base_model
+from jaxltl.core.models.ops.underflow import is_positive, is_subnormal, underflow_text, underflows
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.types import describe_row, row_tolerance
 from jaxltl.core import validation
@@ -469,12 +469,15 @@ class Policy(NamedTuple):
     Attributes:
       distribution: ``float[S, A]``, uniform where the given row is not a distribution.
       given: the given rows, NaN where an unavailable action has weight.
-      valid: ``bool[]``, True if all rows are distributions over available actions.
+      valid: ``bool[]``, True if all rows are distributions over available actions, none with a
+        subnormal weight.
+      representable: ``bool[]``, see :func:`is_representable`, for the model.
     """
 
     distribution: jax.Array
     given: jax.Array
     valid: jax.Array
+    representable: jax.Array
 
 
 def valid_policy(model: Model, policy: jax.Array, where: jax.Array | bool = True) -> Policy:
@@ -493,8 +496,8 @@ def valid_policy(model: Model, policy: jax.Array, where: jax.Array | bool = True
     used = jnp.where(
         over.spread(row), jnp.where(available, policy, 0), uniform.astype(policy.dtype)
     )
-    valid = jnp.all(row) & ~jnp.any(is_subnormal(policy)) & is_representable(model)
-    return Policy(used, lax.stop_gradient(given), valid)
+    valid = jnp.all(row) & ~jnp.any(is_subnormal(policy))
+    return Policy(used, lax.stop_gradient(given), valid, is_representable(model))
 
 
 def require_policy(model: Model, policy: Any, where: Any = True) -> None:

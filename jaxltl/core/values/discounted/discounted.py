@@ -294,7 +294,12 @@ def _policy_value(model, policy, reward, discount, tolerance, max_steps) -> Solu
 
     solution = solution_of(model, given, value, image, checked.distribution, n)
     solution = differentiable(solution, backup, lambda: System(rows, weight, given.discount))
-    return refuse(replace(solution, policy=checked.distribution), checked.given, checked.valid)
+    return refuse(
+        replace(solution, policy=checked.distribution),
+        checked.given,
+        checked.valid,
+        checked.representable,
+    )
 
 
 # --- optimal values --------------------------------------------------------------------------

@@ -264,6 +264,7 @@ class _Drawn(NamedTuple):
     weight: jax.Array
     given: jax.Array
     valid: jax.Array
+    representable: jax.Array
     used: jax.Array
 
 
@@ -271,7 +272,7 @@ class _Drawn(NamedTuple):
 def _joint(game: Game, strategy: chex.Array, environment: chex.Array | None) -> _Drawn:
     """Joint policy of both players, zero where neither is read."""
     read, over = _read(game, game.system), choices(game)
-    weight, given, valid = valid_policy(game, jnp.asarray(strategy), read)
+    weight, given, valid, representable = valid_policy(game, jnp.asarray(strategy), read)
     weight = jnp.where(over.spread(read), weight, 0)  # rows that are not read
     if environment is not None:
         read = _read(game, ~game.system)
@@ -279,7 +280,7 @@ def _joint(game: Game, strategy: chex.Array, environment: chex.Array | None) -> 
         weight = jnp.where(over.spread(read), other.distribution, weight)
         given = jnp.where(over.spread(read), other.given, given)
         valid &= other.valid
-    return _Drawn(weight, given, valid, lax.stop_gradient(weight) > 0)
+    return _Drawn(weight, given, valid, representable, lax.stop_gradient(weight) > 0)
 
 
 def _returns(graph: Graph, per: str, goal: Any, moves: Any, drawn: Any) -> Any:
@@ -504,7 +505,11 @@ def _solve(
     )
     solution = jax.tree.map(lax.stop_gradient, solution)
     solution = replace(solution, value=answer(implicit(backup, solution.value)))
-    return solution if drawn is None else refuse(solution, drawn.given, drawn.valid)
+    return (
+        solution
+        if drawn is None
+        else refuse(solution, drawn.given, drawn.valid, drawn.representable)
+    )
 
 
 def _approached(rows: Any, numbers: newton.Backup, zero: jax.Array, method: str, max_steps: Any):

@@ -111,7 +111,7 @@ def _occupancy(model, policy, discount, start, tolerance) -> Solution:
             lax.stop_gradient(bound <= goal), lax.stop_gradient(finite), bound <= 8 * rounding
         ),
     )
-    return refuse(solution, checked.given, checked.valid)
+    return refuse(solution, checked.given, checked.valid, checked.representable)
 
 
 def _inflow_terms(model: Any) -> Any:

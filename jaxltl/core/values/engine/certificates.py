@@ -155,11 +155,16 @@ def m_matrix_error(
     return error, jnp.max(residual), proven
 
 
-def refuse(solution: Solution, policy: jax.Array, valid: jax.Array) -> Solution:
-    """The solution, or INVALID_POLICY without value and bounds unless the policy is valid.
+def refuse(
+    solution: Solution, policy: jax.Array, valid: jax.Array, representable: jax.Array
+) -> Solution:
+    """The solution, without value and bounds if the policy or the model is invalid.
 
-    `policy` is the argument of the solver, NaN at unavailable actions.
+    `policy` is the argument of the solver, NaN at unavailable actions. The status is INVALID_POLICY,
+    or INVALID for a model whose probabilities are not representable.
     """
+    code = jnp.where(representable, Status.INVALID_POLICY, Status.INVALID)
+    valid = valid & representable
 
     def where(good: jax.Array, bad: float) -> jax.Array:
         return jnp.where(valid, good, jnp.asarray(bad, good.dtype))
@@ -171,5 +176,5 @@ def refuse(solution: Solution, policy: jax.Array, valid: jax.Array) -> Solution:
         lower=where(solution.lower, -jnp.inf),
         upper=where(solution.upper, jnp.inf),
         residual=where(solution.residual, jnp.nan),
-        status=jnp.where(valid, solution.status, Status.INVALID_POLICY).astype(jnp.int32),
+        status=jnp.where(valid, solution.status, code).astype(jnp.int32),
     )

@@ -125,7 +125,8 @@ def task_performance(
 
 @partial(jax.jit, static_argnames=("method",))
 def _task_performance(model: Product, policy: jax.Array, tolerance, *, method: str) -> Performance:
-    policy, _, valid = valid_policy(model, policy)
+    policy, _, valid, representable = valid_policy(model, policy)
+    valid &= representable
     simple = model.automaton.acceptance in ("cosafe", "safety")
     if method == "blocks" and not simple:
         raise ValueError(
