@@ -16,7 +16,7 @@ from flax import struct
 
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.games import facts
-from jaxltl.core.games.gr1 import NEVER, gr1_layers, solve_gr1
+from jaxltl.core.games.generalized_reactivity import NEVER, gr1_layers, solve_gr1
 from jaxltl.core.games.objective import GR1, Parity
 from jaxltl.core.games.winning import objective_at, on_states, solve_parity
 from jaxltl.core.graphs.attractor import attract

@@ -16,7 +16,7 @@ from flax import struct
 
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.games import facts
-from jaxltl.core.games.gr1 import solve_gr1
+from jaxltl.core.games.generalized_reactivity import solve_gr1
 from jaxltl.core.games.objective import GR1, Parity, States, buchi
 from jaxltl.core.graphs.attractor import attract
 from jaxltl.core.graphs.graph import Graph, graph_of, take
