@@ -65,7 +65,7 @@ class ChainSystem(NamedTuple):
         # The norm of the inverse, and so the relative error, is at least that of x over that of b.
         error = norm((b - matvec(x)).ravel()) * jnp.maximum(norm(x.ravel()), size)
         accurate = error <= float(jnp.finfo(b.dtype).eps) ** 0.7 * size**2  # false for NaN
-        return lax.cond(accurate, lambda: x, lambda: self._direct(matvec, b, transposed))
+        return _unless(accurate, x, lambda: self._direct(matvec, b, transposed))
 
     def _direct(self, matvec: Operator, b: jax.Array, transposed: bool) -> jax.Array:
         """The solution by inversion if the system is small, else by elimination on the host."""
@@ -82,7 +82,20 @@ class ChainSystem(NamedTuple):
             b,
             vmap_method="sequential",
         )
-        return lax.cond(jnp.all(jnp.isfinite(x)), lambda: x, lambda: krylov_refined(matvec, b))
+        return _unless(jnp.all(jnp.isfinite(x)), x, lambda: krylov_refined(matvec, b))
+
+
+def _unless(done: jax.Array, x: jax.Array, otherwise: Callable[[], jax.Array]) -> jax.Array:
+    """x if `done`, else ``otherwise()``, which a batch evaluates only if some lane needs it.
+
+    A loop of at most one step: ``lax.cond`` with a batched predicate evaluates both branches, and
+    batches all that they close over.
+    """
+
+    def body(_: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        return jnp.ones_like(done), otherwise()
+
+    return lax.while_loop(lambda state: ~state[0], body, (done, x))[1]
 
 
 def _eliminated(transposed: bool) -> Callable[..., np.ndarray]:
