@@ -10,10 +10,12 @@ import math
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
+from jaxltl.core.pretty_print import brief
 from jaxltl.core import validation
 from jaxltl.core.validation import Range
 
 
+@brief
 @dataclass(frozen=True)
 class LeastProbability:
     """The assumption that no possible transition is less likely than a given probability.

@@ -186,7 +186,7 @@ def to_mesh(model: ShardedMDP, quantity: Any, fill: Any = 0) -> jax.Array:
       fill: the value at padded states and choices.
 
     Returns:
-      ``[N, ...]``, of rows ``[N, A]``. Derivatives start at the result.
+      ``[N, ...]``, of rows ``[N, A]``. Not differentiable in `quantity`; derivatives start at the result.
 
     Raises:
       ValueError: a wrong shape, or a weight of a choice that is zero or subnormal in the model's

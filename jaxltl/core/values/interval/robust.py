@@ -43,7 +43,10 @@ def nature_direction(nature: str | None, objective: str) -> str:
 
 def width_asked(tolerance: Any) -> float:
     """The width of the enclosure: `tolerance`, or the default."""
-    return TOLERANCE if tolerance is None else float(tolerance)
+    if tolerance is None:
+        return TOLERANCE
+    validation.require_in_range("tolerance", tolerance)
+    return float(tolerance)
 
 
 def refuse_nature(nature: str | None) -> None:
