@@ -9,7 +9,7 @@ import os
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, BinaryIO, Literal
+from typing import BinaryIO, Literal
 
 from jaxltl.algos.common.checkpoint import atomic_write
 from jaxltl.core import validation
@@ -37,7 +37,7 @@ def read_bytes(path: str | os.PathLike[str], limit: int = MAX_BYTES) -> bytes:
     return b"".join(pieces(data, str(path), limit)) if compression_of(data) else data
 
 
-def _check_path(path: Any) -> None:
+def _check_path(path: object) -> None:
     if not isinstance(path, str | os.PathLike):  # numbers would be files that are open already
         raise ValueError(f"path is {validation.shorten(path)}; give the name of a file.")
 
@@ -189,7 +189,7 @@ def _decompressed(
 
 def _stream(data: bytes | FileBytes, place: int, kind: Compression) -> Iterator[tuple[bytes, int]]:
     """Decompresses one stream; yields each piece with the input offset after it."""
-    unpack: Any
+    unpack: zlib._Decompress | lzma.LZMADecompressor
     if kind == "gzip":
         unpack = zlib.decompressobj(wbits=31)
     else:

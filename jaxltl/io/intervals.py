@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from jaxltl.core.models.interval import NEAR, IntervalMDP, refuse_ball
-from jaxltl.core.models.sparse import SparseMDP
-from jaxltl.io.tokens import Block, Floats, Integers, Text, as_double, bytes_of, edges
+from jaxltl.core.models.interval import NEAR
+from jaxltl.core.array_types import Booleans, Floats, Integers
+from jaxltl.io.tokens import Block, Text, as_double, bytes_of, edges
 
 EXPECTED = "a probability or an interval [l, u] with 0 <= l <= u <= 1"
 _SIGN = bytes_of(b"[,]\n")
@@ -31,7 +29,7 @@ def has_bracket(block: Block, token: Integers) -> bool:
     return bool((block.data[block.start[token]] == ord("[")).any())
 
 
-def with_whole_brackets(block: Block, column: int, lines: NDArray[np.bool_] | None = None) -> Block:
+def with_whole_brackets(block: Block, column: int, lines: Booleans | None = None) -> Block:
     """Merges the tokens of each bracketed interval in a column into one token.
 
     Shorter lines and unclosed brackets are unchanged; `lines` restricts the lines, ``bool[L]``.
@@ -75,9 +73,7 @@ def intervals(block: Block, token: Integers) -> tuple[Floats, Floats]:
     upper = lower
     if (numbers.count > 1).any():
         upper = numbers.floats(numbers.first[1:] - 1, EXPECTED)
-    bad = ~((lower >= 0) & (lower <= upper) & (upper <= 1 + NEAR))
-    if bad.any():
-        raise block.error(int(token[int(bad.argmax())]), EXPECTED)
+    block.require((lower >= 0) & (lower <= upper) & (upper <= 1 + NEAR), token, EXPECTED)
     return lower, upper
 
 
@@ -144,23 +140,3 @@ def first_without_distribution(total: Floats) -> tuple[int, str, str] | None:
         return row, "the probabilities", f"sum to {total[row]:.9g}; expected 1"
     what, side, place = ("lower", "most", 0) if above[row] else ("upper", "least", 1)
     return row, f"the {what} ends", f"sum to {ends[row, place]:.9g}; expected at {side} 1"
-
-
-# --- writing --------------------------------------------------------------------------------
-
-
-def exact_part(model: SparseMDP | IntervalMDP) -> SparseMDP:
-    """The nominal sparse model, without interval bounds."""
-    return model.nominal if isinstance(model, IntervalMDP) else model
-
-
-def value_texts(model: SparseMDP | IntervalMDP, comma: str) -> Callable[[slice], list[str]]:
-    """Function from a slice of entries to probability texts, ``0.5`` or ``[0.4,0.6]``."""
-    if not isinstance(model, IntervalMDP):
-        probability = model.host.probability
-        return lambda part: list(map(repr, probability[part].tolist()))
-    refuse_ball(model, "the format holds intervals")
-    lower, upper, form = model.host.lower, model.host.upper, f"[%r{comma}%r]"
-    return lambda part: [
-        form % ends for ends in zip(lower[part].tolist(), upper[part].tolist(), strict=True)
-    ]

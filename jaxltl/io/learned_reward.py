@@ -28,11 +28,11 @@ import json
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from jaxltl.algos import todirl
 from jaxltl.algos.common.checkpoint import atomic_write, read_arrays
@@ -40,6 +40,7 @@ from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.text import from_dict, to_dict
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.product import Product, product
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.types import Solution, worst
 from jaxltl.core.values.undiscounted.mixture import reaching, require_attainable
 from jaxltl.core.values.undiscounted.optimal_actions import optimal_actions
@@ -63,7 +64,7 @@ class LearnedReward:
       over: initial states that a probability refers to, ``"mean"`` or ``"worst"``.
     """
 
-    parameters: Any
+    parameters: PyTree
     hidden: tuple[int, ...]
     memory: Automaton
     label_on: str
@@ -86,7 +87,7 @@ class LearnedReward:
         return todirl.Hparams(discount=self.discount, horizon=self.horizon)
 
 
-def plan_in(learned: LearnedReward, world: MDP, observation: Any) -> tuple[Product, Solution]:
+def plan_in(learned: LearnedReward, world: MDP, observation: ArrayLike) -> tuple[Product, Solution]:
     """Soft-optimal policy of a learned reward in a world, with the product model.
 
     Differentiable as :func:`~jaxltl.algos.todirl.plan` is, without a guarantee.
@@ -194,13 +195,13 @@ def load_reward(path: str | Path) -> LearnedReward:
     return found
 
 
-def _flat(parameters: Any) -> dict[str, jax.Array]:
+def _flat(parameters: PyTree) -> dict[str, jax.Array]:
     leaves, _ = jax.tree_util.tree_flatten_with_path(parameters)
     return {"/".join(str(part.key) for part in path): leaf for path, leaf in leaves}
 
 
-def _nested(arrays: dict[str, np.ndarray]) -> dict[str, Any]:
-    tree: dict[str, Any] = {}
+def _nested(arrays: dict[str, np.ndarray]) -> PyTree:
+    tree: PyTree = {}
     for name, array in arrays.items():
         *rooms, last = name.split("/")
         place = tree

@@ -6,7 +6,6 @@ import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +23,7 @@ from jaxltl.core.models.construct.counts import (
     places,
 )
 from jaxltl.core.models.mdp import MDP, DenseMDP
+from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.io.csv_columns import Lines, read_columns
 
 _COUNT = re.compile(r"[0-9]{1,16}")
@@ -33,7 +33,7 @@ _HELD = 2**16  # distinct lines that are kept before those alike are put togethe
 
 def read_log(
     path: str | os.PathLike[str],
-    model: Any = None,
+    model: MDP | DenseMDP | SparseMDP | None = None,
     *,
     columns: tuple[str, str, str] = ("state", "action", "next"),
     count: str = "count",

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Literal
 
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
+from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.io.files import pieces, raw_bytes, write_bytes
 from jaxltl.io.drn.drn import read_drn, write_drn
@@ -22,17 +24,18 @@ from jaxltl.io.umb.umb import read_umb, write_umb
 _BEGINNING = 4096  # bytes by which a format is known
 
 
-class Format(NamedTuple):
+@dataclass(frozen=True)
+class Format:
     """File format: name, suffixes, reader, writer and supported kinds of models."""
 
     name: str
     suffixes: tuple[str, ...]
-    read: Callable[[Any], SparseMDP | IntervalMDP | Game]
-    write: Callable[[Any, Any], None]
-    of: str  # what it holds: "models", "all" for games too, or "games"
+    read: Callable[[str | os.PathLike[str]], SparseMDP | IntervalMDP | Game]
+    write: Callable[..., None]  # of a path and a model of this kind
+    holds: Literal["models", "games", "all"]
 
 
-def _write_hoa(path: str | os.PathLike[str], game: Any) -> None:
+def _write_hoa(path: str | os.PathLike[str], game: Game) -> None:
     text = write_hoa_game(game)
     with write_bytes(path) as file:
         file.write(text.encode())
@@ -91,7 +94,7 @@ def read_model(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP | Game:
     return (_by_name(path) or _by_beginning(path)).read(path)
 
 
-def write_model(path: str | os.PathLike[str], model: Any) -> None:
+def write_model(path: str | os.PathLike[str], model: Model) -> None:
     """Writes a model in the format of the file suffix, atomically.
 
     Args:
@@ -118,15 +121,15 @@ def write_model(path: str | os.PathLike[str], model: Any) -> None:
             f"{str(path)!r}: the format is not known by the end of the name; known are {_known()}."
         )
     is_game = isinstance(model, Game)
-    if is_game and form.of == "models":
+    if is_game and form.holds == "models":
         raise ValueError(
             f"{str(path)!r}: {form.name} holds no games; write "
-            f"{_listed(x for x in FORMATS if x.of != 'models')}."
+            f"{_listed(x for x in FORMATS if x.holds != 'models')}."
         )
-    if not is_game and form.of == "games":
+    if not is_game and form.holds == "games":
         raise ValueError(
             f"{str(path)!r}: {form.name} holds games only, and this is no Game; write "
-            f"{_listed(x for x in FORMATS if x.of != 'games')}."
+            f"{_listed(x for x in FORMATS if x.holds != 'games')}."
         )
     form.write(path, model if isinstance(model, Game | IntervalMDP) else to_sparse(model))
 
@@ -168,9 +171,9 @@ def _named(name: str) -> Format:
     return next(x for x in FORMATS if x.name == name)
 
 
-def _listed(formats: Any) -> str:
-    return " or ".join(f"{x.name} ({', '.join(x.suffixes)})" for x in formats)
+def _listed(formats: Iterable[Format], separator: str = " or ") -> str:
+    return separator.join(f"{x.name} ({', '.join(x.suffixes)})" for x in formats)
 
 
 def _known() -> str:
-    return ", ".join(f"{x.name} ({', '.join(x.suffixes)})" for x in FORMATS)
+    return _listed(FORMATS, ", ")

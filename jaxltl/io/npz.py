@@ -8,10 +8,9 @@ import os
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaxltl.algos.common.checkpoint import atomic_write, read_arrays
 from jaxltl.core.models.construct.convert import to_sparse
@@ -19,12 +18,14 @@ from jaxltl.core.models.construct.padded import to_padded
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.interval import IntervalMDP, interval_rows
 from jaxltl.core.models.mdp import MDP, DenseMDP, from_dense, make_mdp
-from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
+from jaxltl.core.models.protocols import Array, Model
+from jaxltl.core.models.sparse import Annotations, Rewards, SparseMDP, make_sparse
 from jaxltl.core.sparse.rows import offsets_from_counts
 from jaxltl.io.files import ALWAYS_ALLOWED, MAX_RATIO, raw_bytes
-from jaxltl.io.intervals import exact_part
+from jaxltl.io.text_output import exact_part
 
-Arrays = Mapping[str, NDArray[Any]]
+Arrays = Mapping[str, Array]
+SparseT = TypeVar("SparseT", SparseMDP, IntervalMDP)
 
 # By name: the kinds that NumPy may have of each, and what they are called.
 _NUMBERS = ("biuf", "numbers")
@@ -56,7 +57,7 @@ _REWARD, _VARIABLE = "reward:", "variable:"
 _PARTS = ("state", "choice", "transition")
 
 
-def parse_arrays(raw: bytes, name: str, more: Sequence[str] = ()) -> dict[str, NDArray[Any]]:
+def parse_arrays(raw: bytes, name: str, more: Sequence[str] = ()) -> dict[str, Array]:
     """Arrays of a model's ``.npz``, checked by name and kind; `more` are further allowed names."""
     _check_size(raw, name)
     try:
@@ -123,25 +124,21 @@ def _is_sparse(arrays: Arrays) -> bool:
 
 def _padded_model(arrays: Arrays) -> tuple[MDP, SparseMDP]:
     """Padded model, and the same in double precision as a sparse model."""
-    options: dict[str, Any] = {
-        k: arrays[k] for k in ("available", "initial", "label") if k in arrays
-    }
-    options["propositions"] = _propositions(arrays)
-    exact: Any
-    given: Mapping[str, Any] = arrays
+    available, initial, label = map(arrays.get, ("available", "initial", "label"))
+    options = {"available": available, "initial": initial, "label": label}
+    names = _propositions(arrays)
+    exact: MDP | DenseMDP
     if "transition" in arrays:
-        mdp = from_dense(given["transition"], **options)
-        exact = DenseMDP(
-            given["transition"], mdp.available, mdp.initial, mdp.label, mdp.propositions
-        )
+        transition = arrays["transition"]
+        mdp = from_dense(transition, propositions=names, **options)
+        exact = DenseMDP(transition, mdp.available, mdp.initial, mdp.label, mdp.propositions)
     elif {"successor", "probability"} <= set(arrays):
-        mdp = make_mdp(given["successor"], given["probability"], **options)
-        exact = replace(mdp, successor=given["successor"], probability=given["probability"])
+        successor, probability = arrays["successor"], arrays["probability"]
+        mdp = make_mdp(successor, probability, propositions=names, **options)
+        exact = replace(mdp, successor=successor, probability=probability)
     else:
         raise ValueError("it needs the array transition, or successor and probability.")
-    if "initial" in arrays:
-        exact = replace(exact, initial=given["initial"])
-    return mdp, to_sparse(exact)
+    return mdp, to_sparse(exact if initial is None else replace(exact, initial=initial))
 
 
 def _action_names(arrays: Arrays, count: int) -> tuple[str, ...] | None:
@@ -178,7 +175,7 @@ def _padded_interval(arrays: Arrays) -> tuple[IntervalMDP, int]:
         raise ValueError(f"available has shape {available.shape}; expected {used.shape[:2]}.")
     used &= available[..., None]
     state, action = np.nonzero(available)
-    options: dict[str, Any] = {k: arrays[k] for k in ("initial", "label") if k in arrays}
+    ball: dict[str, Array] = {}
     for key, kept in (("center", used), ("radius", available)):
         if key in arrays:
             if arrays[key].shape != kept.shape:
@@ -186,16 +183,19 @@ def _padded_interval(arrays: Arrays) -> tuple[IntervalMDP, int]:
                     f"{key} has shape {arrays[key].shape}; expected {kept.shape}, as of "
                     f"{'lower' if key == 'center' else 'available'}."
                 )
-            options[key] = arrays[key][kept]
+            ball[key] = arrays[key][kept]
     found = interval_rows(
         offsets_from_counts(available.sum(-1)),
         offsets_from_counts(used.sum(-1)[state, action]),
         successor[used],
         lower[used].astype(np.float64),
         upper[used].astype(np.float64),
+        initial=arrays.get("initial"),
+        label=arrays.get("label"),
         action=action,
         propositions=_propositions(arrays),
-        **options,
+        center=ball.get("center"),
+        radius=ball.get("radius"),
     )
     return found, used.shape[1]
 
@@ -211,7 +211,7 @@ def sparse_model(arrays: Arrays) -> SparseMDP | IntervalMDP:
     missing = {"row_start", "entry_start", "successor", *chances} - set(arrays)
     if missing:
         raise ValueError(f"it needs the array {min(missing)}.")
-    rewards: dict[str, dict[str, NDArray[Any]]] = {}
+    rewards: dict[str, dict[str, Array]] = {}
     for key, array in arrays.items():
         if key.startswith(_REWARD):
             reward, _, part = key.removeprefix(_REWARD).rpartition(":")
@@ -221,28 +221,42 @@ def sparse_model(arrays: Arrays) -> SparseMDP | IntervalMDP:
                     "transition after it."
                 )
             rewards.setdefault(reward, {})[part] = array
-    options: dict[str, Any] = {k: arrays[k] for k in ("initial", "label", "action") if k in arrays}
-    options |= {k: arrays[k] for k in _BALL if k in arrays}
-    options["propositions"] = _propositions(arrays)
-    if "actions" in arrays:
-        options["action_names"] = [str(x) for x in arrays["actions"].ravel()]
-    options["rewards"] = {k: Rewards(**v) for k, v in rewards.items()}
-    options["valuation"] = {
-        key.removeprefix(_VARIABLE): array
-        for key, array in arrays.items()
-        if key.startswith(_VARIABLE)
-    }
-    rows = (arrays[k] for k in ("row_start", "entry_start", "successor", *chances))
-    found = interval_rows(*rows, **options) if is_interval else make_sparse(*rows, **options)
-    return _with_initial(found, arrays)
+    annotations = Annotations(
+        label=arrays.get("label"),
+        action=arrays.get("action"),
+        propositions=_propositions(arrays),
+        action_names=[str(x) for x in arrays.get("actions", np.zeros(0, str)).ravel()],
+        rewards={k: Rewards(**v) for k, v in rewards.items()},
+        valuation={
+            key.removeprefix(_VARIABLE): array
+            for key, array in arrays.items()
+            if key.startswith(_VARIABLE)
+        },
+    )
+    initial = arrays.get("initial")
+    rows = (arrays["row_start"], arrays["entry_start"], arrays["successor"])
+    if not is_interval:
+        model = make_sparse(*rows, arrays["probability"], initial=initial, **annotations)
+        return _with_initial(model, arrays)
+    interval = interval_rows(
+        *rows,
+        *(arrays[k] for k in _ENDS),
+        initial=initial,
+        center=arrays.get("center"),
+        radius=arrays.get("radius"),
+        **annotations,
+    )
+    return _with_initial(interval, arrays)
 
 
-def _with_initial(model: Any, arrays: Arrays) -> Any:
+def _with_initial(model: SparseT, arrays: Arrays) -> SparseT:
     """Restores the exact initial distribution; validation may have rescaled it."""
     if "initial" not in arrays:
         return model
-    exact = replace(exact_part(model), initial=np.asarray(arrays["initial"], np.float64))
-    return replace(model, nominal=exact) if isinstance(model, IntervalMDP) else exact
+    initial = np.asarray(arrays["initial"], np.float64)
+    if isinstance(model, IntervalMDP):
+        return replace(model, nominal=replace(model.nominal, initial=initial))
+    return replace(model, initial=initial)
 
 
 def read_npz(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP | Game:
@@ -273,25 +287,24 @@ def read_npz(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP | Game:
                     "the probabilities of this game are intervals; chains and "
                     "decision processes are read with them."
                 )
-            model: Any
+            model: SparseMDP | IntervalMDP
             if _is_sparse(arrays):
                 model = sparse_model(arrays)
             elif set(arrays) & set(_OF_INTERVALS):
-                model, num_actions = _padded_interval(arrays)
-                named = replace(
-                    model.nominal, action_names=_action_names(arrays, num_actions) or ()
-                )
-                model = _with_initial(replace(model, nominal=named), arrays)
+                interval, num_actions = _padded_interval(arrays)
+                names = _action_names(arrays, num_actions) or ()
+                named = replace(interval.nominal, action_names=names)
+                model = _with_initial(replace(interval, nominal=named), arrays)
             else:
-                mdp, model = _padded_model(arrays)
-                names = _action_names(arrays, mdp.num_actions)
-                model = replace(model, action_names=names or ())
+                mdp, sparse = _padded_model(arrays)
+                names = _action_names(arrays, mdp.num_actions) or ()
+                model = replace(sparse, action_names=names)
             return make_game(model, arrays["system"]) if "system" in arrays else model
     except MemoryError:
         raise ValueError(f"{name!r}: the model does not fit into the memory.") from None
 
 
-def write_npz(path: str | os.PathLike[str], model: Any) -> None:
+def write_npz(path: str | os.PathLike[str], model: Model) -> None:
     """Writes a model as a sparse ``.npz``, atomically.
 
     :func:`read_npz` restores it bit for bit; an empty reward becomes zeros on states.
@@ -314,15 +327,16 @@ def write_npz(path: str | os.PathLike[str], model: Any) -> None:
       >>> read_npz(path).probability.tolist()
       [0.5, 0.5, 1.0, 1.0]
     """
-    arrays: dict[str, Any] = {}
+    arrays: dict[str, Array] = {}
     if isinstance(model, Game):
-        model, arrays["system"] = model.mdp, np.asarray(model.system, bool).ravel()
+        arrays["system"] = np.asarray(model.system, np.bool_).ravel()
+        model = model.mdp
     keys = ["row_start", "entry_start", "successor", "probability", "initial", "label"]
     if isinstance(model, IntervalMDP):
         keys.remove("probability")
         ends = _ENDS if model.radius is None else _OF_INTERVALS
         arrays |= {k: np.asarray(getattr(model, k), np.float64) for k in ends}
-    sparse = to_sparse(exact_part(model))
+    sparse = to_sparse(model.nominal if isinstance(model, IntervalMDP) else model)
     for key in keys:
         arrays[key] = np.asarray(getattr(sparse, key))
     if sparse.action is not None:

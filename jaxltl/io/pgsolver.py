@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import os
 import re
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxltl.core.array_types import Integers
 from jaxltl.core.games.objective import Parity
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.mdp import support
@@ -70,7 +72,7 @@ def read_pgsolver(path: str | os.PathLike[str]) -> ParityGame:
     return _Reader(str(path), read_text(path, "a game of PGSolver's format")).game()
 
 
-def min_even(priority: NDArray[Any], neutral: NDArray[np.bool_] | None = None) -> NDArray[Any]:
+def min_even(priority: Integers, neutral: NDArray[np.bool_] | None = None) -> Integers:
     """Converts max-even to min-even priorities, compressed to the fewest values.
 
     Example:
@@ -86,7 +88,7 @@ def min_even(priority: NDArray[Any], neutral: NDArray[np.bool_] | None = None) -
     return found
 
 
-def parity_objective(priority: NDArray[Any]) -> Parity:
+def parity_objective(priority: Integers) -> Parity:
     """Parity objective of min-even priorities ``int32[S]``."""
     none = to_jax(np.zeros(priority.shape, bool))
     return Parity(to_jax(priority), none, none, int(priority.max(initial=0)) + 1)
@@ -163,7 +165,7 @@ class _Reader:
             )
         return self._made(vertex, priority, degree, order[where])
 
-    def _targets(self) -> NDArray[Any]:
+    def _targets(self) -> Integers:
         try:
             return np.array([int(x) for x in ",".join(self.successors).split(",")], np.int64)
         except (ValueError, OverflowError):  # thousands of digits, or beyond 2^63
@@ -175,10 +177,10 @@ class _Reader:
 
     def _made(
         self,
-        vertex: NDArray[Any],
-        priority: NDArray[Any],
-        degree: NDArray[Any],
-        successor: NDArray[Any],
+        vertex: Integers,
+        priority: Integers,
+        degree: Integers,
+        successor: Integers,
     ) -> ParityGame:
         valuation = {"vertex": vertex, "priority": priority}
         if any(self.names):
@@ -258,31 +260,32 @@ def write_pgsolver(
 ) -> None:
     """Writes a deterministic game as a PGSolver parity game.
 
-    Games of :func:`read_pgsolver` keep their vertex numbers, priorities and names. Others are
-    numbered from 0, with priorities converted to max-even. States decided by the objective become
-    self-loops. The start is the initial state if there is exactly one.
+        Games of :func:`read_pgsolver` keep their vertex numbers, priorities and names. Others are
+        numbered from 0, with priorities converted to max-even. States decided by the objective become
+        self-loops. The start is the initial state if there is exactly one.
 
-    Args:
-      path: the file, compressed if it ends in ``.gz`` or ``.xz``.
-      game: a Game over an MDP, a DenseMDP or a SparseMDP.
-      objective: the system's objective; default that of the file of the game.
+        Args:
+          path: the file, compressed if it ends in ``.gz`` or ``.xz``.
+          game: a Game over an MDP, a DenseMDP or a SparseMDP.
+          objective: the system's objective; default that of the file of the game.
 
-    Raises:
-      ValueError: for random moves, no objective, or names with a quotation mark.
+        Raises:
+          ValueError: for random moves, no objective, or names with a quotation mark.
 
-    Example:
-      >>> import pathlib, tempfile
-      >>> from jaxltl import from_dense, make_game
-      >>> from jaxltl.core.games import parity
-      >>> world = from_dense([[[0, 1.0], [1, 0]], [[1.0, 0], [1, 0]]], initial=[1, 0])
-      >>> game = make_game(world, [True, False])
-      >>> path = pathlib.Path(tempfile.mkdtemp()) / "game.pg"
-      >>> write_pgsolver(path, game, parity(game, [0, 1]))
-      >>> print(path.read_text().strip())
-      parity 1;
-      start 0;
-      0 2 0 1,0;
-      1 1 1 0,0;
+        Example:
+          >>> import pathlib, tempfile
+          >>> from jaxltl import from_dense, make_game
+          >>> from jaxltl.core.array_types import Integers
+    from jaxltl.core.games import parity
+          >>> world = from_dense([[[0, 1.0], [1, 0]], [[1.0, 0], [1, 0]]], initial=[1, 0])
+          >>> game = make_game(world, [True, False])
+          >>> path = pathlib.Path(tempfile.mkdtemp()) / "game.pg"
+          >>> write_pgsolver(path, game, parity(game, [0, 1]))
+          >>> print(path.read_text().strip())
+          parity 1;
+          start 0;
+          0 2 0 1,0;
+          1 1 1 0,0;
     """
     row_start, successor = edges_of(game, "write_pgsolver")
     valuation = game.mdp.valuation if isinstance(game.mdp, SparseMDP) else {}
@@ -337,7 +340,7 @@ def objective_of(game: Game) -> Parity:
     return parity_objective(min_even(max_even(valuation, None)[0]))
 
 
-def edges_of(game: Game, place: str) -> tuple[NDArray[Any], NDArray[Any]]:
+def edges_of(game: Game, place: str) -> tuple[Integers, Integers]:
     """Row offsets ``int[S + 1]`` and successors ``int[R]`` of a deterministic game."""
     model = game.mdp
     if isinstance(model, SparseMDP):
@@ -363,8 +366,8 @@ def edges_of(game: Game, place: str) -> tuple[NDArray[Any], NDArray[Any]]:
 
 
 def max_even(
-    valuation: dict[str, Any], objective: Parity | None
-) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+    valuation: Mapping[str, NDArray[np.generic]], objective: Parity | None
+) -> tuple[Integers, NDArray[np.bool_]]:
     """Max-even priorities of an objective, and the mask of decided states.
 
     The priorities of the valuation are kept if they are equivalent, and are the default objective.

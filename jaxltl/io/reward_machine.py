@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +23,7 @@ from jaxltl.core.logic.ltl import Formula, Letter, parse_ltl, proposition_text
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.product import Product, read_probability
+from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief
 from jaxltl.io.files import read_text
@@ -215,7 +216,7 @@ def _machine(
     return RewardMachine(automaton, reward)
 
 
-def machine_reward(product: Any, reward: ArrayLike | jax.Array) -> Any:
+def machine_reward(product: Model, reward: ArrayLike | jax.Array) -> Array:
     """Expected reward of a reward machine in a product model.
 
     With ``label_on="entry"`` a step from (s, q) reads the label of the successor,

@@ -8,17 +8,20 @@ from __future__ import annotations
 import tempfile
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import Any, TypeAlias
 
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
+from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import SparseMDP
-from jaxltl.io.intervals import exact_part
 from jaxltl.io.umb.umb import read_umb, write_umb
 
+StormModel: TypeAlias = Any  # a sparse model of the optional package stormpy
 
-def from_stormpy(model: Any) -> SparseMDP | IntervalMDP | Game:
+
+def from_stormpy(model: StormModel) -> SparseMDP | IntervalMDP | Game:
     """Converts a sparse stormpy model, bit for bit.
 
     Keeps the order of states and choices, labels (``"init"`` becomes the initial distribution),
@@ -61,7 +64,7 @@ def from_stormpy(model: Any) -> SparseMDP | IntervalMDP | Game:
             raise ValueError(f"from_stormpy: {reason}") from None
 
 
-def to_stormpy(model: Any) -> Any:
+def to_stormpy(model: Model) -> StormModel:
     """Converts a model to a sparse stormpy model, bit for bit.
 
     The initial distribution is reduced to its support.
@@ -85,7 +88,8 @@ def to_stormpy(model: Any) -> Any:
       ...     assert to_stormpy(coin).nr_states == 3
     """
     storm = _stormpy()
-    sparse = to_sparse(exact_part(model.mdp if isinstance(model, Game) else model))
+    base = model.mdp if isinstance(model, Game) else model
+    sparse = to_sparse(base.nominal if isinstance(base, IntervalMDP) else base)
     options = storm.io.UmbImportOptions()
     options.build_state_valuations = bool(sparse.valuation)  # else Storm warns that there are none
     options.build_choice_labeling = sparse.action is not None
@@ -99,7 +103,7 @@ def to_stormpy(model: Any) -> Any:
         return storm.build_model_from_umb(str(path), options=options)
 
 
-def _stormpy() -> Any:
+def _stormpy() -> ModuleType:
     try:
         import stormpy
         import stormpy.io

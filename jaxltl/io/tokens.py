@@ -6,18 +6,16 @@ Blocks consist of whole lines. Bytes up to the blank separate tokens; lines end 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.sparse.rows import concatenated_ranges
-
-Integers = NDArray[np.integer[Any]]
-Floats = NDArray[np.float64]
 
 _SIZE = 2**22  # bytes of a block
 _LONGEST = 10_000  # bytes of a number
@@ -131,12 +129,10 @@ class Block:
         if not _DIGIT[joined].all() or not length.all():
             bad = next(i for i, x in enumerate(texts) if not x.isdigit())
             raise self.error(int(token[bad]), expected)
-        large = length > 18
-        if not large.any():
-            found: Integers = np.fromiter(map(int, texts), np.int64, len(texts))
-            large = found >= below
-        if large.any():
-            raise self.error(int(token[int(large.argmax())]), f"{expected} below {below}")
+        expected = f"{expected} below {below}"
+        self.require(length <= 18, token, expected)
+        found = np.fromiter(map(int, texts), np.int64, len(texts))
+        self.require(found < below, token, expected)
         return found.astype(np.int32)
 
     def floats(
@@ -170,17 +166,24 @@ class Block:
     ) -> Floats:
         """Tokens as probabilities."""
         found = self.floats(token, "a probability", other)
-        bad = ~((found >= 0) & (found <= 1 + 1e-6))
-        if bad.any():
-            raise self.error(int(token[int(bad.argmax())]), "a probability from 0 to 1")
+        self.require((found >= 0) & (found <= 1 + 1e-6), token, "a probability from 0 to 1")
         return found
 
     def columns(self, width: int, more: int, form: str) -> Integers:
         """First tokens of the lines, each of which must have `width` to ``width + more`` tokens."""
-        wrong = (self.count < width) | (self.count > width + more)
-        if wrong.any():
-            raise self.malformed(int(wrong.argmax()), form)
+        self.require_form((self.count >= width) & (self.count <= width + more), form)
         return self.first[:-1]
+
+    def require(self, valid: Booleans, token: Integers, expected: str) -> None:
+        """Raises ValueError for the first invalid token."""
+        if not valid.all():
+            raise self.error(int(token[int(valid.argmin())]), expected)
+
+    def require_form(self, valid: Booleans, form: str, lines: Integers | None = None) -> None:
+        """Raises ValueError for the first malformed line; `lines` are the checked ones."""
+        if not valid.all():
+            i = int(valid.argmin())
+            raise self.malformed(i if lines is None else int(lines[i]), form)
 
     def malformed(self, line: int, form: str) -> ValueError:
         """ValueError for a malformed line."""
@@ -232,12 +235,12 @@ def decoded(text: Text, names: dict[bytes, int]) -> list[str]:
         raise text.error(line, f"the name {error.object[:60]!r} is not UTF-8.") from None
 
 
-def joined_lines(form: str, *columns: Any) -> bytes:
+def joined_lines(form: str, *columns: Iterable[object]) -> bytes:
     """Formats lines with one entry of each column."""
     return "".join(map(form.__mod__, zip(*columns, strict=True))).encode()
 
 
-def bytes_of(allowed: bytes) -> NDArray[np.bool_]:
+def bytes_of(allowed: bytes) -> Booleans:
     """Membership table ``bool[256]`` of some bytes."""
     table = np.zeros(256, bool)
     table[list(allowed)] = True
@@ -248,7 +251,7 @@ _DIGIT = bytes_of(b"0123456789 ")
 _DECIMAL_BYTE = bytes_of(b"0123456789+-.eE ")
 
 
-def edges(data: NDArray[np.uint8]) -> tuple[NDArray[Any], NDArray[Any]]:
+def edges(data: NDArray[np.uint8]) -> tuple[Integers, Integers]:
     """Start and end offsets of tokens; the last byte must be blank."""
     blank = np.ones(data.size + 1, bool)
     np.less_equal(data, 32, out=blank[1:])
@@ -274,6 +277,36 @@ def _block(text: Text, data: NDArray[np.uint8], line: int, comment: bytes) -> tu
     numbers = line + of[first][~skipped].astype(np.int64)
     starts = np.concatenate([[0], count.cumsum()])
     return Block(text, data, start, end, starts, numbers), int(is_end.sum())
+
+
+def label_matrix(text: Text, num_states: int, num_labels: int) -> Booleans:
+    """Zero label matrix ``bool[S, P]``; ValueError if it is out of proportion to the text."""
+    if num_states * num_labels > 64 * (text.stop - text.begin) + 2**28:
+        refuse(
+            text.name,
+            f"{num_labels} labels of {num_states} states would take "
+            f"{num_states * num_labels / 2**30:.0f} GB.",
+        )
+    return np.zeros((num_states, num_labels), bool)
+
+
+def split_init(
+    text: Text, holds: Booleans, names: list[str]
+) -> tuple[Booleans, tuple[str, ...], Floats]:
+    """Separates the label "init": other labels, their names, and the initial distribution."""
+    if "init" not in names:
+        refuse(text.name, "no state has the label 'init'; expected at least one initial state.")
+    column = names.index("init")
+    initial = holds[:, column].astype(np.float64)
+    if not initial.any():
+        refuse(text.name, "no state has the label 'init'; expected at least one initial state.")
+    rest = tuple(names[:column] + names[column + 1 :])
+    return np.delete(holds, column, 1), rest, initial / initial.sum()
+
+
+def truncated(announced: int, count: int, what: str) -> str:
+    """Message for a wrong number of items."""
+    return f"{announced} {what} are announced and {count} follow; the file is cut or changed."
 
 
 def refuse(name: str, message: str) -> NoReturn:

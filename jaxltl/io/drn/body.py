@@ -5,16 +5,26 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.io.intervals import intervals, point_rewards, with_whole_brackets
-from jaxltl.io.tokens import Block, Integers, Text, decoded, numbered, refuse
+from jaxltl.core.array_types import Booleans, Floats, Integers
+from jaxltl.io.tokens import (
+    Block,
+    Text,
+    decoded,
+    label_matrix,
+    numbered,
+    refuse,
+    split_init,
+    truncated,
+)
 
-# Reads tokens of a block as numbers, or as something else that NumPy can hold.
-Values = Callable[[Block, Integers], NDArray[Any]]
+Numbers = NDArray[np.generic]  # doubles, or indices of rational functions
+Values = Callable[[Block, Integers], Numbers]  # parser of the tokens of a block
 
 NO_LABEL = b"__NOLABEL__"  # the name of actions that have none
 INTERVALS = ("double-interval", "rational-interval")  # types of values
@@ -69,15 +79,15 @@ class Body:
     line: list[Integers] = field(default_factory=list)
     row: list[Integers] = field(default_factory=list)
     successor: list[Integers] = field(default_factory=list)
-    value: list[NDArray[Any]] = field(default_factory=list)
+    value: list[Numbers] = field(default_factory=list)
     action: list[Integers] = field(default_factory=list)
     action_names: dict[bytes, int] = field(default_factory=dict)
     label_names: dict[bytes, int] = field(default_factory=dict)
     labelled: list[Integers] = field(default_factory=list)
     label: list[Integers] = field(default_factory=list)
     rewards: int = 0
-    state_reward: list[tuple[int, NDArray[Any]]] = field(default_factory=list)
-    choice_reward: list[tuple[int, NDArray[Any]]] = field(default_factory=list)
+    state_reward: list[tuple[int, Numbers]] = field(default_factory=list)
+    choice_reward: list[tuple[int, Numbers]] = field(default_factory=list)
     num_states: int = 0
     num_rows: int = 0
     after_action: bool = False
@@ -194,14 +204,11 @@ def read_body(header: Header, probabilities: Values, numbers: Values) -> Body:
         _read_actions(block, body, np.flatnonzero(is_action), state, numbers)
         entry = np.flatnonzero(~is_state & ~is_action)
         if entry.size:
-            first, form = at[entry], "'successor : probability'"
-            wrong = block.count[entry] != 3
+            first, valid = at[entry], block.count[entry] == 3
             colon = np.minimum(first + 1, block.start.size - 1)
-            wrong |= (block.end[colon] != block.start[colon] + 1) | (
-                block.data[block.start[colon]] != ord(":")
-            )
-            if wrong.any():
-                raise block.malformed(int(entry[int(wrong.argmax())]), form)
+            valid &= block.end[colon] == block.start[colon] + 1
+            valid &= block.data[block.start[colon]] == ord(":")
+            block.require_form(valid, "'successor : probability'", entry)
             body.successor.append(block.integers(first, "a state", header.num_states))
             body.value.append(
                 np.stack(intervals(block, first + 2), 1)
@@ -209,16 +216,14 @@ def read_body(header: Header, probabilities: Values, numbers: Values) -> Body:
                 else probabilities(block, first + 2)
             )
             body.row.append(row[entry].astype(np.int32))
-        body.num_states, body.num_rows, body.after_action = (
-            int(state[-1]) + 1,
-            int(row[-1]) + 1,
-            (bool(is_action[order[-1]]) if order[-1] >= 0 else body.after_action),
-        )
+        body.num_states, body.num_rows = int(state[-1]) + 1, int(row[-1]) + 1
+        if order[-1] >= 0:
+            body.after_action = bool(is_action[order[-1]])
     _check_counts(header, body)
     return body
 
 
-def _begins(block: Block, at: Integers, word: bytes) -> NDArray[np.bool_]:
+def _begins(block: Block, at: Integers, word: bytes) -> Booleans:
     """Mask of the tokens that equal a word."""
     found = block.end[at] - block.start[at] == len(word)
     for i, letter in enumerate(word):
@@ -226,19 +231,15 @@ def _begins(block: Block, at: Integers, word: bytes) -> NDArray[np.bool_]:
     return found
 
 
-def _order(
-    block: Block, body: Body, is_state: NDArray[np.bool_], is_action: NDArray[np.bool_]
-) -> Integers:
+def _order(block: Block, body: Body, is_state: Booleans, is_action: Booleans) -> Integers:
     """Index of the last state or action line up to each line of the block, or -1."""
     index = np.arange(is_state.size)
     last = np.maximum.accumulate(np.where(is_state | is_action, index, -1))
     within = np.where(last >= 0, is_action[last], body.after_action)
-    wrong = ~is_state & ~is_action & ~within
-    if wrong.any():
-        raise block.malformed(int(wrong.argmax()), "'state number' or 'action name' before it")
-    wrong = is_action & (body.num_states + np.cumsum(is_state) == 0)
-    if wrong.any():
-        raise block.malformed(int(wrong.argmax()), "'state 0' before it")
+    block.require_form(is_state | is_action | within, "'state number' or 'action name' before it")
+    block.require_form(
+        ~is_action | (body.num_states + np.cumsum(is_state) > 0), "'state 0' before it"
+    )
     return last
 
 
@@ -248,8 +249,7 @@ def _read_states(
     if not lines.size:
         return
     at, form = block.first[:-1][lines], "'state number [reward, reward] label label'"
-    if (block.count[lines] < 2).any():
-        raise block.malformed(int(lines[int((block.count[lines] < 2).argmax())]), form)
+    block.require_form(block.count[lines] >= 2, form, lines)
     state = block.integers(at + 1, "the number of a state", header.num_states)
     wrong = state != body.num_states + np.arange(lines.size)
     if wrong.any():
@@ -280,24 +280,22 @@ def _read_actions(
     if not lines.size:
         return
     at, form = block.first[:-1][lines], "'action name [reward, reward]'"
-    if (block.count[lines] < 2).any():
-        raise block.malformed(int(lines[int((block.count[lines] < 2).argmax())]), form)
+    block.require_form(block.count[lines] >= 2, form, lines)
     body.action.append(numbered(block.texts(at + 1), body.action_names))
     body.state.append(state[lines].astype(np.int32))
     body.line.append(block.line[lines])
     reward, after, rest = _rewards(block, body, lines, numbers, form)
     if reward is not None:
         body.choice_reward.append((body.num_rows, reward))
-    wrong = at + block.count[lines] > after
+    valid = at + block.count[lines] <= after
     for i, more in rest.items():
-        wrong[i] = bool(more)
-    if wrong.any():
-        raise block.malformed(int(lines[int(wrong.argmax())]), form)
+        valid[i] = not more
+    block.require_form(valid, form, lines)
 
 
 def _rewards(
     block: Block, body: Body, lines: Integers, numbers: Values, form: str
-) -> tuple[NDArray[Any] | None, Integers, dict[int, bytes]]:
+) -> tuple[Numbers | None, Integers, dict[int, bytes]]:
     """Rewards ``[n, rewards]`` or None, index of the next token, and the rest of irregular lines.
 
     Regular lines have rewards ``[1, 2]``, one token each with a bracket or comma. Irregular lines,
@@ -337,60 +335,37 @@ def _rewards(
         values = numbers(replace(block, start=start, end=end), token.ravel())
         reward = np.zeros((lines.size, width), values.dtype)
         reward[plain] = values.reshape(token.shape)
-    rest = {
-        int(i): _odd_line(block, int(lines[i]), width, numbers, form, reward, int(i))
-        for i in np.flatnonzero(odd)
-    }
+    rest: dict[int, bytes] = {}
+    for i in np.flatnonzero(odd).tolist():
+        part, rest[i] = _odd_line(block, int(lines[i]), width, form)
+        if part is not None and reward is not None:
+            reward[i] = numbers(part, np.arange(width))
     return reward, at + 2 + np.where(has, width, 0), rest
 
 
-def _odd_line(
-    block: Block,
-    line: int,
-    width: int,
-    numbers: Values,
-    form: str,
-    reward: NDArray[Any] | None,
-    place: int,
-) -> bytes:
+def _odd_line(block: Block, line: int, width: int, form: str) -> tuple[Block | None, bytes]:
     """Parses the rewards of one irregular line; returns them (or None) and the rest of the line."""
     found = _LINE.fullmatch(block.whole(line))
     if found is None:
         raise block.malformed(line, form)
-    if found[1] is not None:
-        texts = [x.strip() for x in found[1].split(b",")]
-        if len(texts) != width or not all(texts) or any(b" " in x for x in texts):
-            raise block.malformed(line, f"{form} with {width} rewards")
-        data = b" ".join(texts) + b" "
-        length = np.array([len(x) for x in texts])
-        end = np.cumsum(length + 1) - 1
-        part = Block(
-            block.text,
-            np.frombuffer(data, np.uint8),
-            end - length,
-            end,
-            np.array([0, width]),
-            block.line[line : line + 1],
-        )
-        if reward is not None:
-            reward[place] = numbers(part, np.arange(width))
-    return found[2]
+    if found[1] is None:
+        return None, found[2]
+    texts = [x.strip() for x in found[1].split(b",")]
+    if len(texts) != width or not all(texts) or any(b" " in x for x in texts):
+        raise block.malformed(line, f"{form} with {width} rewards")
+    data = np.frombuffer(b" ".join(texts) + b" ", np.uint8)
+    length = np.array([len(x) for x in texts])
+    end = np.cumsum(length + 1) - 1
+    first, number = np.array([0, width]), block.line[line : line + 1]
+    return Block(block.text, data, end - length, end, first, number), found[2]
 
 
 def _check_counts(header: Header, body: Body) -> None:
     name = header.body.name
     if body.num_states != header.num_states:
-        refuse(
-            name,
-            f"{header.num_states} states are announced and {body.num_states} follow; "
-            "the file is cut or changed.",
-        )
+        refuse(name, truncated(header.num_states, body.num_states, "states"))
     if header.num_choices is not None and body.num_rows != header.num_choices:
-        refuse(
-            name,
-            f"{header.num_choices} choices are announced and {body.num_rows} follow; "
-            "the file is cut or changed.",
-        )
+        refuse(name, truncated(header.num_choices, body.num_rows, "choices"))
     state = np.concatenate(body.state) if body.state else np.zeros(0, np.int32)
     count = np.bincount(state, minlength=body.num_states)
     if not count.all():
@@ -418,32 +393,31 @@ def _check_counts(header: Header, body: Body) -> None:
 # --- what the columns say -------------------------------------------------------------------
 
 
-def names_of(header: Header, body: Body) -> dict[str, Any]:
+class Names(TypedDict):
+    """Labels, action names and initial distribution, as arguments of ``make_sparse``."""
+
+    initial: Floats
+    label: Booleans
+    propositions: tuple[str, ...]
+    action: Integers | None
+    action_names: tuple[str, ...]
+
+
+def names_of(header: Header, body: Body) -> Names:
     """Labels, initial states and actions as arguments of ``make_sparse``."""
-    text, num_labels = header.body, len(body.label_names)
-    if body.num_states * num_labels > 64 * len(text.data) + 2**28:
-        refuse(
-            text.name,
-            f"{num_labels} labels of {body.num_states} states would take "
-            f"{body.num_states * num_labels / 2**30:.0f} GB.",
-        )
-    holds = np.zeros((body.num_states, num_labels), bool)
+    text = header.body
+    holds = label_matrix(text, body.num_states, len(body.label_names))
     for state, column in zip(body.labelled, body.label, strict=True):
         holds[state, column] = True
-    names = decoded(text, body.label_names)
-    if "init" not in names:
-        refuse(text.name, "no state has the label 'init'; expected at least one initial state.")
-    init = names.index("init")
-    names.pop(init)
-    initial = holds[:, init].astype(np.float64)
+    label, propositions, initial = split_init(text, holds, decoded(text, body.label_names))
     action, action_names = _actions(text, body)
-    return {
-        "initial": initial / initial.sum(),
-        "label": np.delete(holds, init, 1),
-        "propositions": tuple(names),
-        "action": action,
-        "action_names": action_names,
-    }
+    return Names(
+        initial=initial,
+        label=label,
+        propositions=propositions,
+        action=action,
+        action_names=action_names,
+    )
 
 
 def _actions(text: Text, body: Body) -> tuple[Integers | None, tuple[str, ...]]:
@@ -456,7 +430,7 @@ def _actions(text: Text, body: Body) -> tuple[Integers | None, tuple[str, ...]]:
     return action, tuple("" if name == NO_LABEL.decode() else name for name in names)
 
 
-def rewards_of(header: Header, body: Body) -> Iterator[tuple[str, NDArray[Any], NDArray[Any]]]:
+def rewards_of(header: Header, body: Body) -> Iterator[tuple[str, Numbers, Numbers]]:
     """Yields the name, state rewards ``[S]`` and choice rewards ``[R]`` (or empty arrays)."""
     text, width = header.body, body.rewards
     if width * (body.num_states + body.num_rows) > 8 * len(text.data) + 2**24:
@@ -475,7 +449,7 @@ def rewards_of(header: Header, body: Body) -> Iterator[tuple[str, NDArray[Any], 
         )
 
 
-def _gathered(parts: list[tuple[int, NDArray[Any]]], size: int, column: int) -> NDArray[Any]:
+def _gathered(parts: list[tuple[int, Numbers]], size: int, column: int) -> Numbers:
     found = np.zeros(size if parts else 0, parts[0][1].dtype if parts else None)
     for begin, part in parts:
         found[begin : begin + len(part)] = part[:, column]

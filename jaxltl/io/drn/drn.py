@@ -5,10 +5,9 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from jaxltl.core.models.interval import IntervalMDP, interval_rows
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
@@ -23,13 +22,11 @@ from jaxltl.io.drn.body import (
     rewards_of,
 )
 from jaxltl.io.files import read_bytes, write_bytes
-from jaxltl.io.init_label import labels_with_init
-from jaxltl.io.intervals import exact_part, first_without_distribution, value_texts
-from jaxltl.io.tokens import (
-    Text,
-    as_double,
-    refuse,
-)
+from jaxltl.io.intervals import first_without_distribution
+from jaxltl.io.text_output import check_name, exact_part, labels_with_init, value_texts
+from jaxltl.io.tokens import Text, as_double, refuse
+
+_Reward = tuple[ArrayLike | None, ArrayLike | None]  # of states and of choices
 
 _STEP = 2**16  # states that are written at a time
 
@@ -123,20 +120,18 @@ def _model(header: Header, body: Body) -> SparseMDP | IntervalMDP:
         )
     count = np.bincount(state, minlength=body.num_states)
     rows = np.concatenate([[0], count.cumsum()]), start, np.concatenate(body.successor)
-    options: Any = {"rewards": _rewards(header, body), **names_of(header, body)}
+    options, rewards = names_of(header, body), _rewards(header, body)
     if header.value_type in INTERVALS:
-        return interval_rows(*rows, *probability.T, **options)
-    return make_sparse(*rows, probability, **options)
+        return interval_rows(*rows, *probability.T, rewards=rewards, **options)
+    return make_sparse(*rows, probability, rewards=rewards, **options)
 
 
 def _rewards(header: Header, body: Body) -> dict[str, Rewards]:
     """Rewards by name; all-zero arrays become None."""
-    found = {}
-    for name, state, choice in rewards_of(header, body):
-        found[name] = Rewards(
-            state=state if state.any() else None, choice=choice if choice.any() else None
-        )
-    return found
+    return {
+        name: Rewards(state=state if state.any() else None, choice=choice if choice.any() else None)
+        for name, state, choice in rewards_of(header, body)
+    }
 
 
 # --- writing --------------------------------------------------------------------------------
@@ -177,7 +172,7 @@ def _written(given: SparseMDP | IntervalMDP) -> Iterator[bytes]:
     labels, actions = _label_texts(model), _action_texts(model)
     rewards = []
     for name, reward in model.rewards.items():
-        _check_name("reward", name, ' \t"')
+        check_name("reward", name, ' \t"')
         if reward.transition is not None:
             raise ValueError(
                 f"the reward {name!r} has rewards of transitions, which the format does not hold; "
@@ -211,7 +206,7 @@ def _pieces(
     values: Callable[[slice], list[str]],
     labels: list[tuple[str, NDArray[np.bool_]]],
     actions: Callable[[int], str] | None,
-    rewards: list[tuple[Any, Any]],
+    rewards: list[_Reward],
 ) -> Iterator[bytes]:
     yield head
     host = model.host
@@ -241,7 +236,7 @@ def _pieces(
 
 
 def _state_lines(
-    states: slice, labels: list[tuple[str, NDArray[np.bool_]]], rewards: list[tuple[Any, Any]]
+    states: slice, labels: list[tuple[str, NDArray[np.bool_]]], rewards: list[_Reward]
 ) -> list[str]:
     count = states.stop - states.start
     after = _bracketed([state for state, _ in rewards], states, count)
@@ -255,7 +250,7 @@ def _action_lines(
     model: SparseMDP,
     rows: slice,
     actions: Callable[[int], str] | None,
-    rewards: list[tuple[Any, Any]],
+    rewards: list[_Reward],
 ) -> list[str]:
     count = rows.stop - rows.start
     after = _bracketed([choice for _, choice in rewards], rows, count)
@@ -265,7 +260,7 @@ def _action_lines(
     return [f"\taction {actions(i)}{text}\n" for i, text in zip(numbers, after, strict=True)]
 
 
-def _bracketed(rewards: list[Any], part: slice, count: int) -> list[str]:
+def _bracketed(rewards: list[ArrayLike | None], part: slice, count: int) -> list[str]:
     """Rewards as ``[1.0, 2.0]``, one text per state or action."""
     if not rewards:
         return [""] * count
@@ -281,7 +276,9 @@ def _label_texts(model: SparseMDP) -> list[tuple[str, NDArray[np.bool_]]]:
     """Text and mask of each label, the initial states first."""
     found = []
     for name, where in labels_with_init(model).items():
-        _check_name("label", name, '"')
+        check_name("label", name, '"')
+        if not name:
+            raise ValueError("a label has the name ''; the format requires a name.")
         plain = re.fullmatch(r"[^\s\[\]]+", name)
         found.append((f" {name}" if plain else f' "{name}"', where))
     return found
@@ -294,13 +291,5 @@ def _action_texts(model: SparseMDP) -> Callable[[int], str] | None:
     if not model.action_names:
         return str
     for name in model.action_names:
-        _check_name("action", name, ' \t"')
+        check_name("action", name, ' \t"')
     return [name or NO_LABEL.decode() for name in model.action_names].__getitem__
-
-
-def _check_name(what: str, name: str, refused: str) -> None:
-    if any(c in refused or ord(c) < 32 for c in name) or (what == "label" and not name):
-        raise ValueError(
-            f"the {what} {name!r} cannot be written: its name must not hold control "
-            f"characters or any of {' '.join(refused)!r}, nor be empty."
-        )

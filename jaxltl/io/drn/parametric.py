@@ -9,12 +9,12 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property
 from hashlib import sha256
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from numpy.typing import ArrayLike
 
 from jaxltl.core.models.parametric.parametric import Ends, ParametricMDP, box_of, point_inside
 from jaxltl.core.models.parametric.ranges import Ends as Ranges
@@ -23,9 +23,10 @@ from jaxltl.core.models.parametric.rational import Rationals, make_rationals
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
 from jaxltl.core.pretty_print import brief
 from jaxltl.core import validation
-from jaxltl.io.drn.body import names_of, read_body, read_header, rewards_of
+from jaxltl.io.drn.body import Names, Numbers, names_of, read_body, read_header, rewards_of
 from jaxltl.io.files import read_bytes
-from jaxltl.io.tokens import Block, Integers, Text, as_fraction, numbered, refuse
+from jaxltl.core.array_types import Integers
+from jaxltl.io.tokens import Block, Text, as_fraction, numbered, refuse
 
 _TOKEN = re.compile(
     r"\s*(?:(\d+(?:\.\d*)?(?:[eE][+-]?\d+)?|\.\d+(?:[eE][+-]?\d+)?)"
@@ -100,7 +101,7 @@ class ParametricModel:
     successor: Integers
     probability: Integers
     rewards: dict[str, tuple[Integers, Integers]]
-    names: dict[str, Any]
+    names: Names
 
     def at(self, values: Mapping[str, float | Fraction]) -> SparseMDP:
         """Instantiates the model at a point, in exact arithmetic rounded to doubles.
@@ -212,12 +213,12 @@ class _Numbers:
     """
 
     functions: Rationals
-    function: Any
-    entry: Any
-    rewards: dict[str, tuple[Any, Any]]
+    function: Integers
+    entry: Integers | None
+    rewards: dict[str, tuple[Integers, Integers]]
     num_transitions: int = struct.field(pytree_node=False)
 
-    def __call__(self, x: Any) -> tuple[jax.Array, dict[str, jax.Array]]:
+    def __call__(self, x: ArrayLike) -> tuple[jax.Array, dict[str, jax.Array]]:
         value = self.functions(jnp.asarray(x))
         probability = value[self.function]
         if self.entry is not None:
@@ -357,7 +358,7 @@ def read_parametric(path: str | os.PathLike[str]) -> ParametricModel:
             _starts(state, body.num_states),
             _starts(row, body.num_rows),
             np.concatenate(body.successor),
-            np.concatenate(body.value),
+            np.concatenate(body.value).astype(np.int32, copy=False),
             {
                 key: (_everywhere(of_state, body.num_states), _everywhere(of_choice, body.num_rows))
                 for key, of_state, of_choice in rewards_of(header, body)
@@ -368,9 +369,9 @@ def read_parametric(path: str | os.PathLike[str]) -> ParametricModel:
         refuse(name, "it is too large for the memory.")
 
 
-def _everywhere(function: Integers, size: int) -> Integers:
+def _everywhere(function: Numbers, size: int) -> Integers:
     """Function numbers of a reward; all zero (the zero function) where the reward is absent."""
-    return function if function.size else np.zeros(size, np.int32)
+    return function.astype(np.int32, copy=False) if function.size else np.zeros(size, np.int32)
 
 
 def _starts(owner: Integers, size: int) -> Integers:

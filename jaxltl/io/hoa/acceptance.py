@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxltl.core.array_types import Integers
 from jaxltl.io.hoa.grammar import (
     FALSE,
     TRUE,
@@ -18,7 +17,7 @@ from jaxltl.io.hoa.header import Header
 MAX_COLORS = 62  # acceptance sets as bits of one int64
 
 
-def acceptance_of(header: Header, delta: NDArray[Any], priority: NDArray[Any]) -> str:
+def acceptance_of(header: Header, delta: Integers, priority: Integers) -> str:
     """Acceptance type that the priorities allow and the `write_hoa` header names."""
     own = header.tool == "jaxltl"
     if priority.max() > 1 or (own and header.acceptance_name == "parity"):

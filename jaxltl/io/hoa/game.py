@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxltl.core.array_types import Integers
 from jaxltl.core.automata.text import prime_cover
 from jaxltl.core.games.objective import Parity
 from jaxltl.core.logic.diagram import FALSE, TRUE, Diagrams, prime_cubes
@@ -23,7 +25,7 @@ from jaxltl.core.models.sparse import SparseMDP, make_sparse
 from jaxltl.core.pretty_print import brief
 from jaxltl.io.files import read_text
 from jaxltl.io.hoa.acceptance import condition_given, decisive_sets, edge_priority
-from jaxltl.io.hoa.grammar import Edge, State, error_at, parse_tokens, split_texts
+from jaxltl.io.hoa.grammar import Edge, Item, State, error_at, parse_tokens, split_texts
 from jaxltl.io.hoa.header import Header, read_header
 from jaxltl.io.hoa.table import (
     by_number,
@@ -117,7 +119,7 @@ def _read(tokens: list[Token]) -> HoaGame:
         ) from None  # fmt: skip
 
 
-def _controllable(items: list[list[Any]], header: Header) -> list[int]:
+def _controllable(items: list[Item], header: Header) -> list[int]:
     """Indices of the propositions that the system controls."""
     given = [values for values in items if values[0] == "controllable-AP:"]
     if len(given) != 1:
@@ -325,7 +327,9 @@ class _Reader:
         return self.texts[guard]
 
 
-def _model(rows: list[list[tuple[int, str]]], valuation: dict[str, Any], start: int) -> SparseMDP:
+def _model(
+    rows: list[list[tuple[int, str]]], valuation: dict[str, Integers], start: int
+) -> SparseMDP:
     """Deterministic sparse model from the moves of each state."""
     moves = [move for row in rows for move in row]
     number = {text: i for i, text in enumerate(dict.fromkeys(text for _, text in moves))}
@@ -421,17 +425,18 @@ def write_hoa_game(
 _Edges = list[list[tuple[str, int, int]]]  # of each state: label, successor, colour
 
 
-class _Arena(NamedTuple):
+@dataclass(frozen=True)
+class _Arena:
     """Deterministic game graph with labelled moves."""
 
-    row_start: NDArray[Any]
-    successor: NDArray[Any]
+    row_start: Integers
+    successor: Integers
     system: NDArray[np.bool_]
-    color: NDArray[Any]
+    color: Integers
     stays: NDArray[np.bool_]
     label: list[str]
 
-    def plain(self) -> tuple[NDArray[Any], _Edges]:
+    def plain(self) -> tuple[Integers, _Edges]:
         """One automaton state per game state; returns the state numbers and the edges."""
         number = np.arange(self.system.size)
         edges: _Edges = []
@@ -440,7 +445,7 @@ class _Arena(NamedTuple):
             edges.append([(label, w, int(self.color[v])) for label, w in moves])
         return number, edges
 
-    def paired(self, start: int) -> tuple[NDArray[Any], _Edges] | None:
+    def paired(self, start: int) -> tuple[Integers, _Edges] | None:
         """Merges each move of both players into one edge; None if players do not alternate."""
         source = np.repeat(self.system, np.diff(self.row_start))
         takes_turns = (source != self.system[self.successor]).all() and not self.system[start]
@@ -448,7 +453,7 @@ class _Arena(NamedTuple):
         if not takes_turns or self.stays.any() or system.max() > environment.min():
             return None
         number = np.full(self.system.size, -1)
-        known: dict[Any, int] = {}
+        known: dict[tuple[tuple[str, int], ...], int] = {}
         edges: list[list[tuple[str, int]]] = []
         for v in np.flatnonzero(~self.system).tolist():
             moves = self._moves(v)
@@ -474,7 +479,8 @@ def _both(left: str, right: str) -> str:
     return " & ".join(f"({x})" if "|" in x else x for x in (left, right))
 
 
-class _Labels(NamedTuple):
+@dataclass(frozen=True)
+class _Labels:
     """HOA label of each move, over the indices of propositions."""
 
     inputs: tuple[str, ...]
@@ -482,7 +488,7 @@ class _Labels(NamedTuple):
     text: list[str]
 
 
-def _numbered(row_start: NDArray[Any], system: NDArray[np.bool_]) -> _Labels:
+def _numbered(row_start: Integers, system: NDArray[np.bool_]) -> _Labels:
     """Labels that encode the moves of each state in binary."""
     count = np.diff(row_start)
     widths = [max([(int(n) - 1).bit_length() for n in np.unique(count[owned])], default=0)
@@ -500,7 +506,7 @@ def _numbered(row_start: NDArray[Any], system: NDArray[np.bool_]) -> _Labels:
 
 
 def _named(
-    game: Game, row_start: NDArray[Any], inputs: Sequence[str], outputs: Sequence[str]
+    game: Game, row_start: Integers, inputs: Sequence[str], outputs: Sequence[str]
 ) -> _Labels | None:
     """Labels from action names that are guards; None if they are not a partition."""
     model = game.mdp

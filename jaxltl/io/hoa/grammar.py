@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 # A label or an acceptance formula: an operator and its operands.
 Tree: TypeAlias = tuple[Any, ...]
+Item: TypeAlias = list[Any]  # of the header: its name and its values, tokens or trees
 TRUE: Tree = ("true",)
 FALSE: Tree = ("false",)
 
@@ -198,9 +199,9 @@ def _parser() -> Lark:
     class Ready(Lexer):
         """Lexer that passes tokens through; Lark terminals cannot match nested comments."""
 
-        def __init__(self, _: Any) -> None: ...
+        def __init__(self, _: object) -> None: ...
 
-        def lex(self, tokens: Any) -> Iterator[Token]:  # type: ignore[override]
+        def lex(self, tokens: list[Token]) -> Iterator[Token]:  # type: ignore[override]
             return iter(tokens)
 
     actions = SimpleNamespace(
@@ -225,7 +226,7 @@ def _parser() -> Lark:
     return Lark(_GRAMMAR, parser="lalr", lexer=Ready, transformer=actions)
 
 
-def parse_tokens(tokens: list[Token]) -> tuple[tuple[Token, list[Any]], list[State]]:
+def parse_tokens(tokens: list[Token]) -> tuple[tuple[Token, list[Item]], list[State]]:
     """Parses version, header items and states."""
     from lark.exceptions import UnexpectedToken
 

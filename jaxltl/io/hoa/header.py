@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from jaxltl.io.hoa.grammar import (
     KNOWN_HEADERS,
+    Item,
     Tree,
     error_at,
     unquoted,
@@ -35,11 +36,11 @@ class Header:
     line: int
 
 
-def read_header(version: Token, items: list[list[Any]]) -> Header:
+def read_header(version: Token, items: list[Item]) -> Header:
     """Validates the header items and their consistency."""
     if version not in ("v1", "v1.1"):
         raise error_at(version.line, f"version {version} is unknown. Write the automaton as v1.")
-    given: dict[str, list[Any]] = {}
+    given: dict[str, Item] = {}
     properties: list[str] = []
     aliases: list[tuple[Token, Tree]] = []
     for key, *values in items:
@@ -69,7 +70,7 @@ def read_header(version: Token, items: list[list[Any]]) -> Header:
 
 def _checked_header(
     version: Token,
-    given: dict[str, list[Any]],
+    given: dict[str, Item],
     aliases: list[tuple[Token, Tree]],
     properties: frozenset[str],
 ) -> Header:
@@ -93,7 +94,7 @@ def _checked_header(
     )
 
 
-def _proposition_names(item: list[Any] | None) -> tuple[str, ...]:
+def _proposition_names(item: Item | None) -> tuple[str, ...]:
     if item is None:
         return ()
     key, count, *texts = item

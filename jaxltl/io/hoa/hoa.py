@@ -6,11 +6,12 @@ https://adl.github.io/hoaf/ (Babiak et al. 2015, "The Hanoi omega-automata forma
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxltl.core.array_types import Integers
 from jaxltl.core.automata.automaton import Automaton, make_automaton
 from jaxltl.core.automata.emerson_lei import to_parity
 from jaxltl.core.automata.text import prime_cover
@@ -249,12 +250,12 @@ def _automaton(
     header: Header, table: Table, alphabet: NDArray[np.bool_], names: tuple[str, ...]
 ) -> Automaton:
     """Automaton with min-even priorities."""
-    delta: NDArray[Any] = table.target[table.edge_of]
+    delta: Integers = table.target[table.edge_of]
     initial = int(header.start)
-    base: NDArray[Any] = np.arange(len(delta))
+    base: Integers = np.arange(len(delta))
     condition = condition_given(header.condition, -1, True)
     order = decisive_sets(condition)
-    priority: NDArray[Any]
+    priority: Integers
     if order is not None:
         of_edge = [edge_priority(marks, header.sets, *order) for marks in table.marks]
         priority = np.array(of_edge, np.int64)[table.edge_of]
@@ -265,14 +266,15 @@ def _automaton(
     # The added state rejects, whatever the condition says of runs without marks.
     priority[base == (-1 if table.sink is None else table.sink)] = 1
     kind = acceptance_of(header, delta, priority)
-    given: dict[str, Any] = {"final": priority[:, 0] == 0, "acceptance": kind}
-    if kind in ("buchi", "parity"):
-        given = {"accepting": priority == 0} if kind == "buchi" else {"priority": priority}
+    is_final = kind in ("cosafe", "safety")
     return make_automaton(
         delta,
         initial,
         alphabet,
         names,
         state_names=[table.names[q] for q in base] if table.names else (),
-        **given,
+        final=priority[:, 0] == 0 if is_final else None,
+        acceptance=kind if is_final else None,
+        accepting=priority == 0 if kind == "buchi" else None,
+        priority=priority if kind == "parity" else None,
     )

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxltl.core.array_types import Integers
 from jaxltl.core.automata.automaton import letter_text
 from jaxltl.core.logic.ltl import Letter, as_letters
 from jaxltl.io.hoa.grammar import (
@@ -19,6 +20,8 @@ from jaxltl.io.hoa.grammar import (
     error_at,
 )
 from jaxltl.io.hoa.header import Header, only_target, set_number
+
+LetterSet = TypeVar("LetterSet")
 
 MAX_FREE_PROPOSITIONS = 12  # 2^12 letters
 
@@ -98,23 +101,23 @@ class Table:
     sink: int | None
 
 
-class Algebra(Protocol):
-    """Boolean algebra of sets of letters, with `Set` as their representation."""
+class Algebra(Protocol[LetterSet]):
+    """Boolean algebra of sets of letters, with `LetterSet` as their representation."""
 
-    def constant(self, value: bool) -> Any:
+    def constant(self, value: bool) -> LetterSet:
         """All letters, or none."""
 
-    def proposition(self, number: int) -> Any:
+    def proposition(self, number: int) -> LetterSet:
         """Letters in which a proposition is true."""
 
-    def letter(self, number: int) -> Any:
+    def letter(self, number: int) -> LetterSet:
         """A single letter, with proposition p as bit p."""
 
-    def negation(self, guard: Any) -> Any: ...
+    def negation(self, guard: LetterSet) -> LetterSet: ...
 
-    def both(self, left: Any, right: Any) -> Any: ...
+    def both(self, left: LetterSet, right: LetterSet) -> LetterSet: ...
 
-    def either(self, left: Any, right: Any) -> Any: ...
+    def either(self, left: LetterSet, right: LetterSet) -> LetterSet: ...
 
 
 @dataclass(frozen=True)
@@ -133,7 +136,7 @@ class _Letters:
         return self.columns[:, number]
 
     @cached_property
-    def _numbers(self) -> NDArray[Any]:
+    def _numbers(self) -> Integers:
         return self.columns @ (1 << np.arange(self.columns.shape[1]))
 
     def letter(self, number: int) -> NDArray[np.bool_]:
@@ -186,8 +189,8 @@ def nondeterminism(
 
 
 def guarded_edges(
-    header: Header, state: State, algebra: Algebra, truth: Callable[[Tree], Any]
-) -> Iterator[tuple[Edge, Any]]:
+    header: Header, state: State, algebra: Algebra[LetterSet], truth: Callable[[Tree], LetterSet]
+) -> Iterator[tuple[Edge, LetterSet]]:
     """Edges of a state, each with its set of letters."""
     labelled = sum(edge.label is not None for edge in state.edges)
     if state.label is not None:
@@ -220,12 +223,12 @@ def guarded_edges(
         yield from ((edge, algebra.letter(i)) for i, edge in enumerate(state.edges))
 
 
-def label_reader(header: Header, algebra: Algebra) -> Callable[[Tree], Any]:
+def label_reader(header: Header, algebra: Algebra[LetterSet]) -> Callable[[Tree], LetterSet]:
     """Evaluator of labels: maps a parse tree to its set of letters."""
-    aliases: dict[str, Any] = {}
+    aliases: dict[str, LetterSet] = {}
     width = len(header.propositions)
 
-    def truth(label: Tree) -> Any:
+    def truth(label: Tree) -> LetterSet:
         operator, *operands = label
         if operator in ("true", "false"):
             return algebra.constant(operator == "true")

@@ -7,13 +7,13 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core.models.interval import IntervalMDP, interval_rows
-from jaxltl.core.models.sparse import SparseMDP, make_sparse
+from jaxltl.core.models.sparse import Annotations, SparseMDP, make_sparse
 from jaxltl.io.files import read_bytes, write_bytes
 from jaxltl.io.intervals import (
     first_without_distribution,
@@ -23,7 +23,8 @@ from jaxltl.io.intervals import (
 )
 from jaxltl.io.prism.parts import Section, read_labels, read_rewards, read_valuation
 from jaxltl.io.prism.sections import written_sections
-from jaxltl.io.tokens import Block, Floats, Integers, Text, decoded, numbered, refuse
+from jaxltl.core.array_types import Booleans, Floats, Integers
+from jaxltl.io.tokens import Block, Text, decoded, numbered, refuse, truncated
 
 _NAME = re.compile(
     r"(?P<stem>.+)\.(?P<kind>tra|pexp)(?P<packed>\.gz|\.xz)?", re.DOTALL | re.IGNORECASE
@@ -300,8 +301,7 @@ def _read_rows(text: Text) -> _Rows:
     if sizes and sizes[-1] != state.size:
         raise text.error(
             rest.line - 1,
-            f"{sizes[-1]} transitions are announced and "
-            f"{state.size} follow; the file is cut or changed.",
+            truncated(sizes[-1], state.size, "transitions"),
         )
     num_states = sizes[0] if sizes else int(max(state.max(), target.max())) + 1
     if num_states > 16 * state.size + 10_000:
@@ -314,7 +314,7 @@ def _read_rows(text: Text) -> _Rows:
     if len(sizes) == 3 and sizes[1] != new.sum():
         raise text.error(
             rest.line - 1,
-            f"{sizes[1]} choices are announced and {new.sum()} follow; the file is cut or changed.",
+            truncated(sizes[1], int(new.sum()), "choices"),
         )
     return rows
 
@@ -341,7 +341,7 @@ def _columns(
     )
 
 
-def _new_rows(text: Text, rows: _Rows, form: str) -> NDArray[np.bool_]:
+def _new_rows(text: Text, rows: _Rows, form: str) -> Booleans:
     """Mask of the first transition of each choice, ``bool[T]``; choices must ascend."""
     state, choice = rows.state, rows.choice
     other = np.ones(state.size, bool)
@@ -400,21 +400,20 @@ def _model(text: Text, sections: list[Section]) -> SparseMDP | IntervalMDP:
     count = np.bincount(rows.state[start], minlength=rows.num_states)
     action, action_names = _actions(text, rows, start)
     label, propositions, initial = read_labels(sections, rows.num_states)
-    options: Any = {
-        "initial": initial,
-        "label": label,
-        "propositions": propositions,
-        "action": action,
-        "action_names": action_names,
-        "valuation": read_valuation(sections, rows.num_states),
-    }
+    annotations = Annotations(
+        label=label,
+        propositions=propositions,
+        action=action,
+        action_names=action_names,
+        valuation=read_valuation(sections, rows.num_states),
+    )
     starts = np.concatenate([[0], count.cumsum()]), np.append(start, rows.state.size)
     is_chain, found, probability = rows.is_chain, None, rows.probability
     if probability.ndim > 1:
-        found = interval_rows(*starts, rows.target, *probability.T, **options)
+        found = interval_rows(*starts, rows.target, *probability.T, initial=initial, **annotations)
         model = found.nominal
     else:
-        model = make_sparse(*starts, rows.target, probability, **options)
+        model = make_sparse(*starts, rows.target, probability, initial=initial, **annotations)
     del rows, new, start, total, probability, starts  # rewards take memory too
     model = replace(model, rewards=read_rewards(sections, model, is_chain))
     return model if found is None else replace(found, nominal=model)

@@ -9,16 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core.models.sparse import Rewards, SparseMDP
+from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.io.tokens import (
     Block,
-    Floats,
-    Integers,
     Text,
     as_double,
     bytes_of,
     decoded,
+    label_matrix,
     numbered,
     refuse,
+    split_init,
+    truncated,
 )
 
 _REWARD_NAME = re.compile(rb'^#[ \t]*Reward structure[ \t]+"([^"\n]*)"', re.MULTILINE)
@@ -29,36 +31,21 @@ Section = tuple[str, str, Text]  # "tra", "lab", "sta", "srew" or "trew"; of whi
 
 def read_labels(
     sections: list[Section], num_states: int
-) -> tuple[NDArray[np.bool_], list[str], Floats]:
+) -> tuple[Booleans, tuple[str, ...], Floats]:
     """Label matrix ``bool[S, P]``, label names and the initial distribution."""
     text = next((text for kind, _, text in sections if kind == "lab"), None)
     if text is None:
-        return np.zeros((num_states, 0), bool), [], np.eye(1, num_states)[0]
+        return np.zeros((num_states, 0), bool), (), np.eye(1, num_states)[0]
     if text.data.startswith(b"#DECLARATION", text.begin):
         holds, names = _storm_labels(text, num_states)
     else:
         holds, names = _prism_labels(text, num_states)
     if "init" not in names:
-        return holds, names, np.eye(1, num_states)[0]
-    column = names.index("init")
-    initial = holds[:, column].astype(np.float64)
-    if not initial.any():
-        refuse(text.name, "no state has the label 'init'; expected at least one initial state.")
-    names.pop(column)
-    return np.delete(holds, column, 1), names, initial / initial.sum()
+        return holds, tuple(names), np.eye(1, num_states)[0]
+    return split_init(text, holds, names)
 
 
-def _matrix(text: Text, num_states: int, num_labels: int) -> NDArray[np.bool_]:
-    if num_states * num_labels > 64 * (text.stop - text.begin) + 2**28:
-        refuse(
-            text.name,
-            f"{num_labels} labels of {num_states} states would take "
-            f"{num_states * num_labels / 2**30:.0f} GB.",
-        )
-    return np.zeros((num_states, num_labels), bool)
-
-
-def _prism_labels(text: Text, num_states: int) -> tuple[NDArray[np.bool_], list[str]]:
+def _prism_labels(text: Text, num_states: int) -> tuple[Booleans, list[str]]:
     first, line, rest = text.first_line(b"#")
     form = '\'0="init" 1="name"\', the labels numbered from 0'
     names: dict[bytes, int] = {}
@@ -70,13 +57,12 @@ def _prism_labels(text: Text, num_states: int) -> tuple[NDArray[np.bool_], list[
             raise text.error(line, f"{shown!r}; expected {form}.")
         names[found[2]] = len(names)
         place = found.end()
-    holds = _matrix(text, num_states, len(names))
+    holds = label_matrix(text, num_states, len(names))
     for block in rest.blocks(b"#"):
         end, at = block.end.copy(), block.first[:-1]
         end[at] -= 1  # the colon
-        wrong = (block.data[end[at]] != ord(":")) | (end[at] == block.start[at])
-        if wrong.any():
-            raise block.malformed(int(wrong.argmax()), "'state: label label', by their numbers")
+        valid = (block.data[end[at]] == ord(":")) & (end[at] > block.start[at])
+        block.require_form(valid, "'state: label label', by their numbers")
         block = replace(block, end=end)
         state = np.repeat(block.integers(at, "a state", num_states), block.count - 1)
         column = block.integers(_without(at, end.size), "the number of a label", len(names))
@@ -91,7 +77,7 @@ def _without(tokens: Integers, size: int) -> Integers:
     return np.flatnonzero(kept)
 
 
-def _storm_labels(text: Text, num_states: int) -> tuple[NDArray[np.bool_], list[str]]:
+def _storm_labels(text: Text, num_states: int) -> tuple[Booleans, list[str]]:
     stop = text.data.find(b"#END", text.begin, text.stop)
     if stop < 0:
         raise text.error(text.line, "the labels after '#DECLARATION' do not end; expected '#END'.")
@@ -99,7 +85,7 @@ def _storm_labels(text: Text, num_states: int) -> tuple[NDArray[np.bool_], list[
     names = {name: i for i, name in enumerate(given)}
     if len(names) < len(given):
         raise text.error(text.line, "a label is declared twice.")
-    holds = _matrix(text, num_states, len(names))
+    holds = label_matrix(text, num_states, len(names))
     line = text.line + text.data.count(b"\n", text.begin, stop)
     end = text.data.find(b"\n", stop, text.stop) + 1 or text.stop
     for block in Text(text.name, text.data, end, text.stop, line + 1).blocks(b"#"):
@@ -223,20 +209,8 @@ def read_rewards(sections: list[Section], model: SparseMDP, is_chain: bool) -> d
                 f"a second reward {name!r} of this kind, beside that of {before[1].name!r}.",
             )
         else:
-            parts[key] = (
-                "both",
-                text,
-                Rewards(
-                    *(
-                        b if a is None else a
-                        for a, b in zip(
-                            (part.state, part.choice, part.transition),
-                            (before[2].state, before[2].choice, before[2].transition),
-                            strict=True,
-                        )
-                    )
-                ),
-            )
+            states, moves = (part, before[2]) if kind == "srew" else (before[2], part)
+            parts[key] = "both", text, replace(moves, state=states.state)
     return {key: part for key, (_, _, part) in parts.items()}
 
 
@@ -281,11 +255,7 @@ def _state_reward(text: Text, num_states: int) -> Rewards:
 
 def _check_announced(text: Text, announced: int | None, count: int) -> None:
     if announced is not None and announced != count:
-        refuse(
-            text.name,
-            f"from line {text.line} on {announced} rewards are announced and "
-            f"{count} follow; the file is cut or changed.",
-        )
+        refuse(text.name, f"from line {text.line} on {truncated(announced, count, 'rewards')}")
 
 
 def _transition_reward(text: Text, model: SparseMDP, is_chain: bool) -> Rewards:
@@ -305,9 +275,8 @@ def _transition_reward(text: Text, model: SparseMDP, is_chain: bool) -> Rewards:
         target = block.integers(at + width - 2, "a state", host.num_states)
         sought = row * host.num_states + target
         entry = np.minimum(np.searchsorted(place, sought), place.size - 1)
-        wrong = (place[entry] != sought) | (row >= host.row_start[state + 1])
-        if wrong.any():
-            raise block.malformed(int(wrong.argmax()), f"{form} of a transition that exists")
+        valid = (place[entry] == sought) & (row < host.row_start[state + 1])
+        block.require_form(valid, f"{form} of a transition that exists")
         given[entry] = block.floats(at + width - 1, "a reward")
         count += at.size
     _check_announced(text, announced, count)

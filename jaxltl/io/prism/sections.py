@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from jaxltl.core.array_types import Integers
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.sparse import Rewards, SparseMDP
-from jaxltl.io.init_label import labels_with_init
-from jaxltl.io.intervals import exact_part, value_texts
+from jaxltl.io.text_output import check_name, exact_part, labels_with_init, value_texts
 from jaxltl.io.tokens import joined_lines
 
 _STEP = 2**17  # lines that are held at a time
@@ -61,14 +60,10 @@ def written_sections(given: SparseMDP | IntervalMDP, dialect: str) -> list[Writt
     return sections
 
 
-def _plain(names: Any, what: str, refused: str) -> list[str]:
+def _plain(names: Iterable[str], what: str, refused: str) -> list[str]:
     """Names, validated against the characters that the format reserves."""
     for name in names:
-        if any(c in refused for c in name) or any(ord(c) < 32 for c in name):
-            raise ValueError(
-                f"the {what} {name!r} cannot be written: its name must not hold "
-                f"control characters or any of {' '.join(refused)!r}."
-            )
+        check_name(what, name, refused)
     return list(names)
 
 
@@ -86,23 +81,27 @@ def _transitions(
     else:
         yield b"%d %d %d\n" % (host.num_states, host.num_rows, host.num_transitions)
     numbers = np.asarray(model.action) if model.action is not None else None
-    choice = np.arange(host.num_rows) - host.row_start[host.state]
+    columns_of = _entry_columns(model)
+    form = "%d " * (2 if model.is_chain else 3) + "%s"
     for begin in range(0, host.num_transitions, _STEP):
         part = slice(begin, begin + _STEP)
-        row = host.row[part]
-        columns: list[Any] = [
-            host.state[row].tolist(),
-            choice[row].tolist(),
-            host.successor[part].tolist(),
-            chances(part),
-        ]
-        form = "%d %d %d %s"
-        if model.is_chain:
-            form, columns = "%d %d %s", [columns[0], *columns[2:]]
+        columns: list[Sequence[object]] = [*columns_of(part), chances(part)]
         if action is not None and numbers is not None:
-            form += "%s"
-            columns.append(list(map(action, numbers[row].tolist())))
-        yield joined_lines(form + "\n", *columns)
+            columns.append([action(i) for i in numbers[host.row[part]].tolist()])
+        yield joined_lines(form + "%s" * (action is not None) + "\n", *columns)
+
+
+def _entry_columns(model: SparseMDP) -> Callable[[slice | Integers], list[list[int]]]:
+    """Function from transitions to the columns of states, choices (if not a chain), successors."""
+    host = model.host
+    choice = np.arange(host.num_rows) - host.row_start[host.state]
+
+    def columns(part: slice | Integers) -> list[list[int]]:
+        row = host.row[part]
+        choices = [] if host.is_chain else [choice[row].tolist()]
+        return [host.state[row].tolist(), *choices, host.successor[part].tolist()]
+
+    return columns
 
 
 def _action_texts(model: SparseMDP) -> Callable[[int], str] | None:
@@ -139,7 +138,7 @@ def _label_lines(names: list[str], holds: list[NDArray[np.bool_]], storm: bool) 
         yield ("".join(lines)[1:] + "\n").encode() if lines else b""
 
 
-def _value_texts(name: str, value: Any) -> Callable[[slice], list[str]]:
+def _value_texts(name: str, value: ArrayLike) -> Callable[[slice], list[str]]:
     value = np.asarray(value)
     if value.dtype == bool:
         return lambda part: np.where(value[part], "true", "false").tolist()
@@ -215,21 +214,11 @@ def _transition_rewards(
     sizes = [host.num_states] if host.is_chain else [host.num_states, host.num_rows]
     if not storm:
         yield (" ".join(map(str, [*sizes, entries.size])) + "\n").encode()
-    choice = np.arange(host.num_rows) - host.row_start[host.state]
+    columns_of = _entry_columns(model)
+    form = "%d " * (len(sizes) + 1) + "%r\n"
     for begin in range(0, entries.size, _STEP):
         part = entries[begin : begin + _STEP]
-        row = host.row[part]
-        columns = [
-            host.state[row].tolist(),
-            choice[row].tolist(),
-            host.successor[part].tolist(),
-            earned[part].tolist(),
-        ]
-        if host.is_chain:
-            lines = joined_lines("%d %d %r\n", columns[0], *columns[2:])
-        else:
-            lines = joined_lines("%d %d %d %r\n", *columns)
-        yield _infinity(lines, storm)
+        yield _infinity(joined_lines(form, *columns_of(part), earned[part].tolist()), storm)
 
 
 def _infinity(lines: bytes, storm: bool) -> bytes:

@@ -6,7 +6,6 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
 
 _SIZES = {  # of types, in bits, where none is given
     "bool": 1,
@@ -89,7 +88,8 @@ class Record:
     size: int
 
 
-class Items(NamedTuple):
+@dataclass(frozen=True)
+class Items:
     """Layout of a member.
 
     Attributes:
@@ -220,7 +220,7 @@ def parse_index(content: bytes, place: str) -> Index:
     )
 
 
-def _check_kind(system: Mapping[str, Any], counts: Mapping[str, int], place: str) -> None:
+def _check_kind(system: Mapping[str, object], counts: Mapping[str, int], place: str) -> None:
     time = _get(system, "time", place)
     if time != "discrete":
         raise ValueError(
@@ -245,7 +245,7 @@ def _check_kind(system: Mapping[str, Any], counts: Mapping[str, int], place: str
         raise ValueError(f"{place}#branches is {counts['branches']}; no file holds so many.")
 
 
-def _annotations(data: Any, place: str) -> tuple[Annotation, ...]:
+def _annotations(data: object, place: str) -> tuple[Annotation, ...]:
     """Labels, rewards and annotations specific to jaxltl; other groups are ignored."""
     found: list[Annotation] = []
     for group in ("aps", OTHER_LABELS, "rewards", INITIAL):
@@ -266,7 +266,7 @@ def _annotations(data: Any, place: str) -> tuple[Annotation, ...]:
     return tuple(found)
 
 
-def _annotation(group: str, key: str, value: Any, place: str) -> Annotation:
+def _annotation(group: str, key: str, value: object, place: str) -> Annotation:
     what = f"annotations/{group}/{key}"
     if not re.fullmatch(r"[0-9a-z_-]{1,100}", key):
         raise ValueError(
@@ -302,22 +302,23 @@ def _annotation(group: str, key: str, value: Any, place: str) -> Annotation:
     return Annotation(group, key, name, tuple(applies), kind)
 
 
-def _texts_of_ours(data: Mapping[str, Any]) -> frozenset[str]:
+def _texts_of_ours(data: object) -> frozenset[str]:
     """Integer variables that jaxltl uses as string indices; Storm refuses the type string."""
     for key in ("file-data", "parameters", TEXTS):
         data = data.get(key, {}) if isinstance(data, dict) else {}
-    names: list[Any] = data if isinstance(data, list) else []
+    names = data if isinstance(data, list) else []
     return frozenset(name for name in names if isinstance(name, str))
 
 
 def _records(
-    data: Any, texts_of_ours: frozenset[str], place: str
+    data: object, texts_of_ours: frozenset[str], place: str
 ) -> tuple[tuple[Record, ...], int]:
     """Record layouts of the classes of states, and the number of strings."""
-    states = _table(data, "valuations", place).get("states")
-    if states is None:
+    valuations = _table(data, "valuations", place)
+    if "states" not in valuations:
         return (), 0
-    classes = _get(_table(states, VALUATIONS, place), "classes", f"{place}{VALUATIONS}: ")
+    states = _table(valuations["states"], VALUATIONS, place)
+    classes = _get(states, "classes", f"{place}{VALUATIONS}: ")
     if not isinstance(classes, list) or not classes:
         raise ValueError(f"{place}{VALUATIONS}: classes is {_shown(classes)}; expected a list.")
     texts = _count(states, "#strings", f"{place}{VALUATIONS}: ") if "#strings" in states else 0
@@ -328,7 +329,7 @@ def _records(
     return tuple(_record(one, texts_of_ours, f"{place}{VALUATIONS}: ") for one in classes), texts
 
 
-def _record(data: Any, texts_of_ours: frozenset[str], place: str) -> Record:
+def _record(data: object, texts_of_ours: frozenset[str], place: str) -> Record:
     variables = _get(_table(data, "a class", place), "variables", place)
     if not isinstance(variables, list):
         raise ValueError(f"{place}variables is {_shown(variables)}; expected a list.")
@@ -371,7 +372,7 @@ def _record(data: Any, texts_of_ours: frozenset[str], place: str) -> Record:
     return Record(tuple(found.values()), start // 8)
 
 
-def _type(data: Any, what: str, place: str) -> Type:
+def _type(data: object, what: str, place: str) -> Type:
     data = _table(data, f"the type of {what}", place)
     name = _get(data, "type", f"{place}{what}: ")
     if not isinstance(name, str) or name not in _SIZES:
@@ -398,19 +399,19 @@ def _check_number(kind: Type, what: str, place: str) -> None:
         )
 
 
-def _table(data: Any, what: str, place: str) -> Mapping[str, Any]:
+def _table(data: object, what: str, place: str) -> Mapping[str, object]:
     if not isinstance(data, dict):
         raise ValueError(f"{place}{what} is {_shown(data)}; expected an object.")
     return data
 
 
-def _get(data: Mapping[str, Any], key: str, place: str) -> Any:
+def _get(data: Mapping[str, object], key: str, place: str) -> object:
     if key not in data:
         raise ValueError(f"{place}{key!r} is missing.")
     return data[key]
 
 
-def _count(data: Mapping[str, Any], key: str, place: str) -> int:
+def _count(data: Mapping[str, object], key: str, place: str) -> int:
     value = _get(data, key, place)
     if type(value) is not int or not 0 <= value < 2**64:
         raise ValueError(
@@ -419,7 +420,7 @@ def _count(data: Mapping[str, Any], key: str, place: str) -> int:
     return value
 
 
-def _shown(value: Any) -> str:
+def _shown(value: object) -> str:
     """Abbreviated value for error messages."""
     if isinstance(value, dict):
         return "an object"

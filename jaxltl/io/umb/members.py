@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxltl.core.models.sparse import Rewards
-from jaxltl.io.umb.index import ACTIONS, OTHER_LABELS, PARTS, Index, parse_index
+from jaxltl.core.models.sparse import Annotations, Rewards
+from jaxltl.io.umb.index import ACTIONS, INITIAL, OTHER_LABELS, PARTS, Index, parse_index
 from jaxltl.io.umb.tar import Stream, members
 from jaxltl.io.umb.values import (
     Bytes,
@@ -23,6 +22,7 @@ from jaxltl.io.umb.values import (
 )
 
 _LARGEST_INDEX = 2**26  # bytes
+EXACT_INITIAL = f"annotations/{INITIAL}/probability/states/values.bin"
 
 
 def read_index(stream: Stream) -> Index:
@@ -140,7 +140,22 @@ def rewards_of(found: dict[str, Bytes], index: Index, place: str) -> dict[str, R
     return rewards
 
 
-def actions_of(found: dict[str, Bytes], index: Index, place: str) -> dict[str, Any]:
+def annotations_of(found: dict[str, Bytes], index: Index, place: str) -> Annotations:
+    """Labels, rewards and actions, as arguments of ``make_sparse``."""
+    label, propositions = labels_of(found, index, place)
+    annotations = Annotations(
+        label=label, propositions=propositions, rewards=rewards_of(found, index, place)
+    )
+    return annotations | actions_of(found, index, place) if index.actions else annotations
+
+
+def exact_initial(found: dict[str, Bytes]) -> NDArray[np.float64] | None:
+    """Initial distribution that is not uniform over the initial states, if any."""
+    content = found.get(EXACT_INITIAL)
+    return None if content is None else content.view("<f8").astype(np.float64, copy=False)
+
+
+def actions_of(found: dict[str, Bytes], index: Index, place: str) -> Annotations:
     """Action numbers of choices, and action names."""
     member = f"{ACTIONS}/values.bin"
     action = np.zeros(index.choices, np.int32)
@@ -151,7 +166,7 @@ def actions_of(found: dict[str, Bytes], index: Index, place: str) -> dict[str, A
                 f"{place}{member}: a choice has the action {action.max()}; expected 0 "
                 f"to {index.actions - 1}."
             )
-    return {"action": action, "action_names": texts_of(found, ACTIONS, place)}
+    return Annotations(action=action, action_names=texts_of(found, ACTIONS, place))
 
 
 def texts_of(found: dict[str, Bytes], folder: str, place: str) -> tuple[str, ...]:

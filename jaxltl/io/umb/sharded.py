@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple, cast
+from dataclasses import dataclass
 
 import numpy as np
 from jax.sharding import Mesh
@@ -18,19 +18,18 @@ from jaxltl.core.models.construct.padded import row_actions
 from jaxltl.core.models.mdp import refuse_negative
 from jaxltl.core.models.mesh.shard import ModelPart, model_from_parts, ranges_of
 from jaxltl.core.models.mesh.sharded import ShardedMDP
-from jaxltl.core.models.sparse import Annotations, choice_reward, sparse_part
+from jaxltl.core.models.sparse import choice_reward, sparse_part
 from jaxltl.io.files import FileBytes, compression_of, opened, pieces
-from jaxltl.io.umb.index import ACTIONS, INITIAL, Index, Items
+from jaxltl.io.umb.index import ACTIONS, Index, Items
 from jaxltl.io.umb.members import (
-    actions_of,
+    annotations_of,
     check_chain,
     check_memory,
+    exact_initial,
     known_members,
-    labels_of,
     needed,
     probability_of,
     read_index,
-    rewards_of,
     starts_of,
 )
 from jaxltl.io.umb.tar import Stream
@@ -42,7 +41,6 @@ _ROWS, _ENTRIES, _IS_INITIAL = (
     "choice-to-branches.bin",
     "state-is-initial.bin",
 )
-_EXACT = f"annotations/{INITIAL}/probability/states/values.bin"
 _WHOLE = (_IS_INITIAL, f"{ACTIONS}/string-mapping.bin", f"{ACTIONS}/strings.bin")
 _AHEAD = {"states": (_ROWS, "choices"), "choices": (_ENTRIES, "branches")}
 _Span = tuple[int, int]
@@ -129,7 +127,8 @@ def _check_memory(index: Index, ranges: list[_Span], place: str) -> None:
     check_memory(size * here // index.states, place)
 
 
-class _Archive(NamedTuple):
+@dataclass(frozen=True)
+class _Archive:
     """Archive that can be read repeatedly."""
 
     data: FileBytes
@@ -154,7 +153,8 @@ class _Archive(NamedTuple):
         raise AssertionError(wanted)
 
 
-class _Runs(NamedTuple):
+@dataclass(frozen=True)
+class _Runs:
     """Disjoint byte ranges of a member, in order."""
 
     spans: list[_Span]
@@ -190,7 +190,8 @@ def _taken(stream: Stream, member: str, spans: Sequence[_Span]) -> _Runs:
 # --- what is read ---------------------------------------------------------------------------
 
 
-class _Held(NamedTuple):
+@dataclass(frozen=True)
+class _Held:
     """Data read for ranges of states.
 
     Attributes:
@@ -326,23 +327,20 @@ def _part(
     target = needed(found, "branch-to-target.bin", place).view("<u8")
     if index.players == 0:
         check_chain(row_start, place, first=index.begins[0])
-    label, names = labels_of(found, index, place)
-    options: dict[str, Any] = {"rewards": rewards_of(found, index, place)}
-    if index.actions:
-        options |= actions_of(found, index, place)
+    annotations = annotations_of(found, index, place)
     probability = probability_of(found, index, entry_start, place)
-    initial = np.full(index.states, 1 / num_states)
-    if _EXACT in found:
-        initial = found[_EXACT].view("<f8").astype(np.float64, copy=False)
-    elif some:
-        initial = read_bits(found[_IS_INITIAL], index.states) / some
+    initial = exact_initial(found)
+    if initial is None:
+        initial = np.full(index.states, 1 / num_states)
+        if some:
+            initial = read_bits(found[_IS_INITIAL], index.states) / some
     try:
         model = sparse_part(
             row_start,
             entry_start,
             target,
             probability,
-            cast(Annotations, {"label": label, "propositions": names, **options}),
+            annotations,
             index.begins,
             num_states,
         )
@@ -356,8 +354,8 @@ def _part(
         probability=model.probability,
         action=row_actions(model),
         initial=initial,
-        label=label,
+        label=np.asarray(model.label),
         rewards={name: choice_reward(model, name) for name in model.rewards},
         row=np.arange(index.choices) + index.begins[1],
     )
-    return part, names
+    return part, model.propositions

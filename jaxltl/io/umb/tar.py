@@ -9,8 +9,11 @@ from __future__ import annotations
 import re
 import zlib
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from typing import Any, BinaryIO
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
 
 from jaxltl.io.files import FileBytes
 
@@ -51,9 +54,9 @@ class Stream:
         self.position += len(some)
         return some
 
-    def fill(self, target: Any, what: str) -> None:
+    def fill(self, target: bytearray | NDArray[np.uint8], what: str) -> None:
         """Fills a uint8 array or bytearray; ValueError at a premature end."""
-        view, done = memoryview(target), 0
+        view, done = memoryview(target), 0  # type: ignore[arg-type]  # a Buffer since Python 3.12
         while done < len(view):
             some = self._some(len(view) - done)
             if not some:
@@ -206,10 +209,10 @@ def _checked_name(name: str, place: str) -> str:
 # --- writing --------------------------------------------------------------------------------
 
 
-def tar_pieces(contents: Sequence[tuple[str, Any]]) -> Iterator[memoryview]:
+def tar_pieces(contents: Sequence[tuple[str, NDArray[np.uint8] | bytes]]) -> Iterator[memoryview]:
     """Bytes of a tar archive of named contents, in pieces."""
     for name, content in contents:
-        view = memoryview(content)
+        view = memoryview(content)  # type: ignore[arg-type]  # a Buffer since Python 3.12
         yield memoryview(_header(name, len(view)))
         yield view
         yield memoryview(bytes(-len(view) % _BLOCK))
@@ -258,7 +261,7 @@ def write_gzip(file: BinaryIO, pieces: Iterator[memoryview], threads: int = 4) -
     file.write(b"\x1f\x8b\x08\0\0\0\0\0\0\xff")
     checksum = size = 0
     with ThreadPoolExecutor(threads) as pool:
-        waiting: list[Any] = []
+        waiting: list[Future[bytes]] = []
         for block in _blocks(pieces):
             waiting.append(pool.submit(_deflated, block))
             checksum, size = zlib.crc32(block, checksum), size + len(block)
@@ -270,7 +273,7 @@ def write_gzip(file: BinaryIO, pieces: Iterator[memoryview], threads: int = 4) -
     file.write(checksum.to_bytes(4, "little") + (size % 2**32).to_bytes(4, "little"))
 
 
-def _blocks(pieces: Iterator[memoryview]) -> Iterator[Any]:
+def _blocks(pieces: Iterator[memoryview]) -> Iterator[bytes | memoryview]:
     """Splits large pieces into blocks and merges small ones."""
     held = bytearray()
     for piece in pieces:
@@ -288,11 +291,11 @@ def _blocks(pieces: Iterator[memoryview]) -> Iterator[Any]:
         yield bytes(held)
 
 
-def _deflated(block: Any) -> bytes:
+def _deflated(block: bytes | memoryview) -> bytes:
     """Deflate block flushed to a byte boundary, so that blocks can be concatenated."""
 
-    def deflate(data: Any, strategy: int) -> bytes:
-        packer: Any = zlib.compressobj(1, zlib.DEFLATED, -15, 9, strategy)
+    def deflate(data: bytes | memoryview, strategy: int) -> bytes:
+        packer = zlib.compressobj(1, zlib.DEFLATED, -15, 9, strategy)
         return packer.compress(data) + packer.flush(zlib.Z_SYNC_FLUSH)
 
     # Searching for repetitions takes long where there are none, as in random probabilities.

@@ -7,17 +7,18 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.interval import IntervalMDP, interval_rows, refuse_ball
 from jaxltl.core.models.mdp import checked_initial
+from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import SparseMDP, make_sparse
 from jaxltl.io.files import Compression, compression_by_name, pieces, raw_bytes, write_bytes
 from jaxltl.io.umb.index import (
@@ -31,15 +32,14 @@ from jaxltl.io.umb.index import (
     ids_for,
 )
 from jaxltl.io.umb.members import (
-    actions_of,
+    annotations_of,
     check_chain,
     check_memory,
+    exact_initial,
     known_members,
-    labels_of,
     needed,
     probability_of,
     read_index,
-    rewards_of,
     starts_of,
     texts_of,
     uniform,
@@ -57,6 +57,8 @@ from jaxltl.io.umb.values import (
 _PLAYERS = ("system", "environment")
 _BOOL, _DOUBLE = {"type": "bool", "size": 1}, {"type": "double", "size": 64}
 _INTERVAL = {"type": "double-interval", "size": 128}
+
+Members = list[tuple[str, Bytes | bytes]]
 
 
 def read_umb(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP | Game:
@@ -113,35 +115,31 @@ def _model(found: dict[str, Bytes], index: Index, place: str) -> SparseMDP | Int
     target = needed(found, "branch-to-target.bin", place).view("<u8")
     if index.players == 0:
         check_chain(row_start, place)
-    labels, names = labels_of(found, index, place)
-    options: dict[str, Any] = {"rewards": rewards_of(found, index, place)}
-    if index.actions:
-        options |= actions_of(found, index, place)
+    annotations = annotations_of(found, index, place)
     if f"{VALUATIONS}/valuations.bin" in found:
-        options["valuation"] = _valuation(found, index, place)
+        annotations["valuation"] = _valuation(found, index, place)
     probability = probability_of(found, index, entry_start, place)
     initial = _initial(found, index)
     owner = _owners(found, index, row_start, place)
     rows = row_start, entry_start, target
-    options |= {"label": labels, "propositions": names, "initial": initial}
     interval = None
     try:
         if probability.ndim > 1:
-            interval = interval_rows(*rows, *probability.T, **options)
+            interval = interval_rows(*rows, *probability.T, initial=initial, **annotations)
             model = interval.nominal
         else:
-            model = make_sparse(*rows, probability, **options)
+            model = make_sparse(*rows, probability, initial=initial, **annotations)
     except ValueError as error:
         raise ValueError(f"{place}{error}") from None
-    exact = found.get(f"annotations/{INITIAL}/probability/states/values.bin")
-    if exact is not None:  # what was checked may have been scaled
-        model = replace(model, initial=exact.view("<f8").astype(np.float64, copy=False))
+    exact = exact_initial(found)
+    if exact is not None:  # validation may have rescaled it
+        model = replace(model, initial=exact)
     if interval is not None:
         return replace(interval, nominal=model)
     return model if owner is None else make_game(model, owner)
 
 
-def _valuation(found: dict[str, Bytes], index: Index, place: str) -> dict[str, NDArray[Any]]:
+def _valuation(found: dict[str, Bytes], index: Index, place: str) -> dict[str, NDArray[np.generic]]:
     of_class = found.get(f"{VALUATIONS}/valuation-to-class.bin")
     return read_variables(
         found.pop(f"{VALUATIONS}/valuations.bin"),
@@ -155,9 +153,9 @@ def _valuation(found: dict[str, Bytes], index: Index, place: str) -> dict[str, N
 
 def _initial(found: dict[str, Bytes], index: Index) -> NDArray[np.float64] | None:
     """Initial distribution; None for the uniform one over all states."""
-    exact = found.get(f"annotations/{INITIAL}/probability/states/values.bin")
+    exact = exact_initial(found)
     if exact is not None:
-        return exact.view("<f8").astype(np.float64, copy=False)
+        return exact
     if "state-is-initial.bin" not in found:
         return None
     return uniform(read_bits(found["state-is-initial.bin"], index.states))
@@ -194,7 +192,7 @@ def _owners(
 
 def write_umb(
     path: str | os.PathLike[str],
-    model: Any,
+    model: Model,
     *,
     compression: Compression | Literal["by name"] | None = "by name",
 ) -> None:
@@ -241,11 +239,13 @@ def write_umb(
                 file.write(piece)
 
 
-def _contents(model: Any, place: str) -> list[tuple[str, Any]]:
+def _contents(model: Model, place: str) -> Members:
     """Members of the output, the index first."""
-    system, interval = None, None
+    system: NDArray[np.bool_] | None = None
+    interval = None
     if isinstance(model, Game):
-        model, system = model.mdp, np.asarray(model.system, bool).ravel()
+        system = np.asarray(model.system, np.bool_).ravel()
+        model = model.mdp
     if isinstance(model, IntervalMDP):
         refuse_ball(model, "the format holds intervals")
         interval, model = model.host, model.nominal
@@ -264,7 +264,7 @@ def _contents(model: Any, place: str) -> list[tuple[str, Any]]:
         "#observations": 0,
         "branch-probability-type": _DOUBLE if interval is None else _INTERVAL,
     }
-    contents: list[tuple[str, Any]] = [("state-is-initial.bin", write_bits(initial > 0))]
+    contents: Members = [("state-is-initial.bin", write_bits(initial > 0))]
     if not host.is_chain:
         contents.append(("state-to-choices.bin", _packed(host.row_start, "<u8")))
     contents += [
@@ -287,39 +287,36 @@ def _contents(model: Any, place: str) -> list[tuple[str, Any]]:
         contents.append((f"{ACTIONS}/values.bin", _packed(action, "<u4")))
         contents += _written_texts(names, ACTIONS, place)
     annotations, more = _annotations(sparse, initial, interval is not None)
-    index: dict[str, Any] = {
+    metadata: dict[str, object] = {"tool": "jaxltl"}
+    index: dict[str, object] = {
         "format-version": 1,
         "format-revision": 0,
-        "file-data": {"tool": "jaxltl"},
+        "file-data": metadata,
         "transition-system": counts,
         "annotations": annotations,
     }
     contents += more
     if sparse.valuation:
-        contents += _valuations(sparse.valuation, index, place)
+        variables = write_variables(sparse.valuation, place)
+        states: dict[str, object] = {
+            "unique": False,
+            "classes": [{"variables": variables.variables}],
+        }
+        if variables.named:
+            states["#strings"] = len(variables.texts)
+            metadata["parameters"] = {TEXTS: variables.named}
+        index["valuations"] = {"states": states}
+        contents.append((f"{VALUATIONS}/valuations.bin", variables.records))
+        contents += _written_texts(variables.texts, VALUATIONS, place)
     return [("index.json", json.dumps(index, indent=1).encode()), *contents]
 
 
-def _valuations(
-    valuation: dict[str, Any], index: dict[str, Any], place: str
-) -> list[tuple[str, Any]]:
-    """Members of a valuation; adds its description to the index."""
-    written = write_variables(valuation, place)
-    states: dict[str, Any] = {"unique": False, "classes": [{"variables": written.variables}]}
-    if written.named:
-        states["#strings"] = len(written.texts)
-        index["file-data"]["parameters"] = {TEXTS: written.named}
-    index["valuations"] = {"states": states}
-    records = (f"{VALUATIONS}/valuations.bin", written.records)
-    return [records, *_written_texts(written.texts, VALUATIONS, place)]
-
-
-def _packed(array: Any, dtype: str) -> Bytes:
+def _packed(array: ArrayLike, dtype: str) -> Bytes:
     """Array as bytes."""
     return np.ascontiguousarray(array, np.dtype(dtype)).view(np.uint8)
 
 
-def _written_texts(texts: Sequence[str], folder: str, place: str) -> list[tuple[str, Any]]:
+def _written_texts(texts: Sequence[str], folder: str, place: str) -> Members:
     """Members of an array of strings; none if it is empty."""
     if not texts:
         return []
@@ -327,19 +324,21 @@ def _written_texts(texts: Sequence[str], folder: str, place: str) -> list[tuple[
     return [(f"{folder}/string-mapping.bin", start), (f"{folder}/strings.bin", content)]
 
 
-def _pairs(lower: Any, upper: Any) -> Bytes:
+def _pairs(lower: NDArray[np.float64], upper: NDArray[np.float64]) -> Bytes:
     """Intervals as bytes."""
     return _packed(np.stack([lower, upper], 1).ravel(), "<f8")
 
 
 def _annotations(
     model: SparseMDP, initial: NDArray[np.float64], points: bool
-) -> tuple[dict[str, Any], list[tuple[str, Any]]]:
+) -> tuple[dict[str, dict[str, object]], Members]:
     """Index entries and members of labels, rewards and a non-uniform initial distribution."""
-    described: dict[str, Any] = {"aps": {}, "rewards": {}}
-    contents: list[tuple[str, Any]] = []
+    described: dict[str, dict[str, object]] = {"aps": {}, "rewards": {}}
+    contents: Members = []
 
-    def add(group: str, key: str, name: str, kind: dict[str, Any], parts: dict[str, Bytes]) -> None:
+    def add(
+        group: str, key: str, name: str, kind: Mapping[str, object], parts: dict[str, Bytes]
+    ) -> None:
         described.setdefault(group, {})[key] = {
             "alias": name,
             "applies-to": list(parts),

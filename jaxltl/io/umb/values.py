@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from jaxltl.io.umb.index import Record, Type, Variable, bit_bytes
 
 Bytes = NDArray[np.uint8]
+Values = NDArray[np.generic]  # of a state variable: bool, integers, doubles or strings
 
 _EXACT = 2**53  # whole numbers up to this are doubles
 _MOST_TEXT = 2**30  # bytes of the texts of one variable
@@ -134,7 +135,7 @@ def read_variables(
     count: int,
     texts: Sequence[str],
     place: str,
-) -> dict[str, NDArray[Any]]:
+) -> dict[str, Values]:
     """State variables by name, ``[S]`` each.
 
     Integers become int32, int64 or uint64 by type, and are dropped beyond 64 bits. Variables absent
@@ -174,12 +175,12 @@ def read_variables(
     }
 
 
-_Part = tuple[NDArray[np.intp], NDArray[Any]]  # some states, and the values there
+_Part = tuple[NDArray[np.intp], Values]  # some states, and the values there
 
 
 def _read_variable(
     raw: Bytes, variable: Variable, texts: Sequence[str], what: str
-) -> NDArray[Any] | None:
+) -> Values | None:
     """Value of a variable in each record, or None if it is unsupported."""
     kind = variable.type
     if kind.name.endswith("-interval"):
@@ -206,7 +207,7 @@ def _read_variable(
     return values
 
 
-def _texts(number: NDArray[Any], texts: Sequence[str], what: str) -> NDArray[Any]:
+def _texts(number: Values, texts: Sequence[str], what: str) -> Values:
     """Strings by index."""
     used, which = np.unique(number, return_inverse=True)
     if used[0] < 0 or used[-1] >= len(texts):
@@ -231,7 +232,7 @@ def _field(raw: Bytes, start: int, size: int) -> Bytes:
     return field
 
 
-def _whole_numbers(field: Bytes, variable: Variable, what: str) -> NDArray[Any]:
+def _whole_numbers(field: Bytes, variable: Variable, what: str) -> Values:
     """Integers with offset, in the smallest of int32, int64 and uint64 that fits the type."""
     size, offset, signed = variable.type.size, variable.offset, variable.type.name == "int"
     wide = np.zeros((len(field), 8), np.uint8)
@@ -259,7 +260,7 @@ def _whole_numbers(field: Bytes, variable: Variable, what: str) -> NDArray[Any]:
     raise ValueError(f"{what}goes from {least} to {most}; expected numbers of 64 bits.")
 
 
-def _joined(parts: Sequence[_Part], count: int, what: str) -> NDArray[Any]:
+def _joined(parts: Sequence[_Part], count: int, what: str) -> Values:
     """Values of a variable, merged over all classes of states."""
     if len(parts) == 1 and parts[0][0].size == count:
         return parts[0][1]
@@ -267,7 +268,7 @@ def _joined(parts: Sequence[_Part], count: int, what: str) -> NDArray[Any]:
     if len(texts) > 1:
         raise ValueError(f"{what}is a text in some states only; expected one type.")
     dtype = np.result_type(*(values.dtype for _, values in parts))
-    found: NDArray[Any] = np.full(count, "" if True in texts else 0, dtype)
+    found: Values = np.full(count, "" if True in texts else 0, dtype)
     if sum(states.size for states, _ in parts) < count and True not in texts:
         found = np.full(count, np.nan)
     for states, values in parts:
@@ -275,7 +276,8 @@ def _joined(parts: Sequence[_Part], count: int, what: str) -> NDArray[Any]:
     return found
 
 
-class Written(NamedTuple):
+@dataclass(frozen=True)
+class Written:
     """Encoded state variables.
 
     Attributes:
@@ -285,16 +287,16 @@ class Written(NamedTuple):
       named: names of the variables that hold strings.
     """
 
-    variables: list[Any]
+    variables: list[dict[str, object]]
     records: Bytes
     texts: list[str]
     named: list[str]
 
 
-def write_variables(valuation: Mapping[str, Any], place: str) -> Written:
+def write_variables(valuation: Mapping[str, ArrayLike], place: str) -> Written:
     """Encodes state variables; each starts at a byte boundary of the record."""
-    described: list[Any] = []
-    fields: list[NDArray[Any]] = []
+    described: list[dict[str, object]] = []
+    fields: list[Values] = []
     texts: list[str] = []
     named: list[str] = []
     for name, values in valuation.items():
