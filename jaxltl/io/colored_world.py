@@ -49,8 +49,8 @@ def write_world(world: World) -> str:
         slip = 1 - float(world.mdp.probability[0, 0, 0])
     head = [f"margin: {world.margin}", f"slip: {slip:.6g}"]
     for name, counts in world.kinds:
-        shown = [f"{n} {c}" for c, n in zip(COLORS, counts, strict=True) if n]
-        head.append(f"{name}: {', '.join(shown)}")
+        counts_of_kind = [f"{n} {c}" for c, n in zip(COLORS, counts, strict=True) if n]
+        head.append(f"{name}: {', '.join(counts_of_kind)}")
     letters = np.array(list(LETTERS))[np.asarray(world.colors)]
     return "\n".join([*head, "", *("".join(row) for row in letters), ""])
 

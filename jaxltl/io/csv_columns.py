@@ -141,12 +141,12 @@ def _places(
         raise _error(name, 1, f"the header has the column {twice[0]!r} twice; rename one.")
     missing = [x for x in columns if x not in header]
     if missing:
-        shown = ", ".join(map(repr, header))[:200] or "nothing"
+        listed = ", ".join(map(repr, header))[:200] or "nothing"
         raise _error(
             name,
             1,
             f"the header has no column {missing[0]!r}; it must name {', '.join(columns)}, "
-            f"separated by commas, and has {shown}.",
+            f"separated by commas, and has {listed}.",
         )
     return tuple(header.index(x) for x in (*columns, *optional) if x in header)
 

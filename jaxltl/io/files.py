@@ -196,13 +196,13 @@ def _stream(data: bytes | FileBytes, place: int, kind: Compression) -> Iterator[
         unpack = lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=_XZ_MEMORY)
     held = b""
     while not unpack.eof:
-        given = held
+        chunk = held
         if not held and getattr(unpack, "needs_input", True):  # lzma's holds its input itself
-            given = data[place : place + _FED]
-            place += len(given)
-            if not given:
+            chunk = data[place : place + _FED]
+            place += len(chunk)
+            if not chunk:
                 raise EOFError("it ends before its end is marked")
-        part = unpack.decompress(given, _STEP)
+        part = unpack.decompress(chunk, _STEP)
         held = getattr(unpack, "unconsumed_tail", b"")
         yield part, place - len(unpack.unused_data)
 

@@ -106,18 +106,18 @@ def _numbers(block: Block, token: Integers) -> Block | None:
 def point_rewards(text: Text) -> Text:
     """Replaces point intervals in rewards, ``[[1, 1], 0]``, by numbers, ``[1, 0]``."""
 
-    def changed(found: re.Match[bytes]) -> bytes:
-        return found[1] + _POINT.sub(lambda point: _number(text, found, point), found[2]) + found[3]
+    def changed(match: re.Match[bytes]) -> bytes:
+        return match[1] + _POINT.sub(lambda point: _number(text, match, point), match[2]) + match[3]
 
     data = _REWARDS.sub(changed, text.data[text.begin : text.stop])
     return Text(text.name, data, 0, len(data), text.line)
 
 
-def _number(text: Text, found: re.Match[bytes], point: re.Match[bytes]) -> bytes:
+def _number(text: Text, match: re.Match[bytes], point: re.Match[bytes]) -> bytes:
     lower, upper = point[1].strip(), point[2].strip()
     if lower == upper or (as_double(lower) == as_double(upper) and as_double(lower) is not None):
         return lower
-    line = text.line + found.string.count(b"\n", 0, found.start())
+    line = text.line + match.string.count(b"\n", 0, match.start())
     raise text.error(
         line,
         f"the reward {point[0][:60].decode(errors='replace')} is an interval; single numbers, or "
@@ -138,5 +138,5 @@ def first_without_distribution(total: Floats) -> tuple[int, str, str] | None:
     row = int((above | below).argmax())
     if total.ndim == 1:
         return row, "the probabilities", f"sum to {total[row]:.9g}; expected 1"
-    what, side, place = ("lower", "most", 0) if above[row] else ("upper", "least", 1)
-    return row, f"the {what} ends", f"sum to {ends[row, place]:.9g}; expected at {side} 1"
+    bound, side, place = ("lower", "most", 0) if above[row] else ("upper", "least", 1)
+    return row, f"the {bound} ends", f"sum to {ends[row, place]:.9g}; expected at {side} 1"

@@ -124,10 +124,10 @@ def plan_in(learned: LearnedReward, world: MDP, observation: ArrayLike) -> tuple
     if isinstance(asked, str):
         return model, inside
     require_attainable(model, sure.best, asked, learned.over, "state {}".format)
-    found = plan()
-    mixed = reaching(model, found.policy, inside.policy, sure.best, asked, over=learned.over)
+    soft = plan()
+    mixed = reaching(model, soft.policy, inside.policy, sure.best, asked, over=learned.over)
     policy = jnp.asarray(mixed.policy, model.dtype)
-    return model, replace(found, policy=policy, status=worst(found.status, inside.status))
+    return model, replace(soft, policy=policy, status=worst(soft.status, inside.status))
 
 
 # --- files ----------------------------------------------------------------------------------
@@ -184,15 +184,15 @@ def load_reward(path: str | Path) -> LearnedReward:
         memory = from_dict(about.pop("memory"))
         for key in ("hidden", "kinds"):
             about[key] = tuple(about[key])
-        found = LearnedReward(parameters=_nested(arrays), memory=memory, **about)
-        found.parameters["params"]["kernel"]  # what any reward network has
+        learned = LearnedReward(parameters=_nested(arrays), memory=memory, **about)
+        learned.parameters["params"]["kernel"]  # what any reward network has
     except OSError as error:
         raise ValueError(f"the network cannot be read: {str(path)!r}: {error.strerror}.") from None
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(
             f"{str(path)!r} is no learned reward, as save_reward writes it: {error}"
         ) from None
-    return found
+    return learned
 
 
 def _flat(parameters: PyTree) -> dict[str, jax.Array]:

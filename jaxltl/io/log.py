@@ -80,20 +80,20 @@ def read_log(
       (('hall', 'kitchen'), [0, 1], [1, 1])
     """
     _check_columns(columns, 3)
-    known = None
+    support = None
     if model is not None:
         if states is not None or actions is not None:
             raise ValueError("model and names are both given; a model has names of its own.")
         # Successors that stand twice in a row are one, by name.
-        known = places(to_sparse(model) if isinstance(model, MDP | DenseMDP) else model)
-        states, actions = known.states, known.actions
+        support = places(to_sparse(model) if isinstance(model, MDP | DenseMDP) else model)
+        states, actions = support.states, support.actions
     if not isinstance(count, str):
         raise ValueError(f"count={validation.shorten(count)}; give the name of a column.")
     numbers = _names("states", states), _names("actions", actions)
     name, total, size = str(path), 0, 0
     held = [np.zeros((4, 0), np.int64)]
     for lines in read_columns(path, columns, (count,)):
-        part = _numbered(lines, *numbers, known)
+        part = _numbered(lines, *numbers, support)
         total += sum(part[3].tolist())
         if total > _MOST:
             raise ValueError(
@@ -141,17 +141,17 @@ def read_labels(
       {'goal': ('bay', 'hall'), 'warm': ('bay',)}
     """
     _check_columns(columns, 2)
-    known = set() if states is None else set(map(str, validation.sequence("states", states)))
-    found: dict[str, dict[str, bool]] = {}
+    allowed = set() if states is None else set(map(str, validation.sequence("states", states)))
+    states_of_label: dict[str, dict[str, bool]] = {}
     for lines in read_columns(path, columns):
         for fields in lines.times:
             state, label = fields
-            if states is not None and state not in known:
+            if states is not None and state not in allowed:
                 raise lines.error(fields, _unknown("state", state, list(states)))
-            found.setdefault(label, {})[state] = True
-    if not found:
+            states_of_label.setdefault(label, {})[state] = True
+    if not states_of_label:
         raise ValueError(f"{str(path)!r}, line 2: there is no label after the header.")
-    return {label: tuple(some) for label, some in found.items()}
+    return {label: tuple(some) for label, some in states_of_label.items()}
 
 
 def _check_columns(columns: Sequence[str], number: int) -> None:
@@ -171,8 +171,8 @@ class _Names:
     complete: bool
 
 
-def _names(what: str, names: Sequence[str] | None) -> _Names:
-    every = [] if names is None else list(map(str, validation.sequence(what, names)))
+def _names(kind: str, names: Sequence[str] | None) -> _Names:
+    every = [] if names is None else list(map(str, validation.sequence(kind, names)))
     number = {x: i for i, x in enumerate(every)}
     if len(number) < len(every):
         twice = next(x for i, x in enumerate(every) if number[x] != i)
@@ -180,12 +180,12 @@ def _names(what: str, names: Sequence[str] | None) -> _Names:
     return _Names(number, names is not None)
 
 
-def _unknown(what: str, name: str, names: Sequence[str]) -> str:
-    return f"there is no {what} {name!r}; there are {listed(names)}."
+def _unknown(kind: str, name: str, names: Sequence[str]) -> str:
+    return f"there is no {kind} {name!r}; there are {listed(names)}."
 
 
 def _numbered(
-    lines: Lines, states: _Names, actions: _Names, known: Places | None
+    lines: Lines, states: _Names, actions: _Names, support: Places | None
 ) -> NDArray[np.int64]:
     """Distinct lines as state, action and next-state indices and counts, ``[4, N]``."""
     distinct = list(lines.times)
@@ -193,8 +193,8 @@ def _numbered(
     if len(texts) > 3:
         times = [n * _count(lines, fields) for n, fields in zip(times, distinct, strict=True)]
     table = np.array([*_numbers(lines, distinct, texts, states, actions), times], np.int64)
-    if known is not None:
-        _, wrong = place_of(known, *table[:3])
+    if support is not None:
+        _, wrong = place_of(support, *table[:3])
         if wrong:
             message = f"the model does not have it: {wrong[1]}."
             raise lines.error(distinct[wrong[0]], message)
@@ -208,18 +208,18 @@ def _numbers(
     states: _Names,
     actions: _Names,
 ) -> list[list[int]]:
-    found = []
-    for what, names, column in zip(
+    columns = []
+    for kind, names, column in zip(
         ("state", "action", "state"), (states, actions, states), texts, strict=False
     ):
         new = set(column).difference(names.number)
         if new and names.complete:
             i = next(i for i, text in enumerate(column) if text in new)
-            raise lines.error(distinct[i], _unknown(what, column[i], list(names.number)))
+            raise lines.error(distinct[i], _unknown(kind, column[i], list(names.number)))
         for text in new:  # in any order; names are put in theirs at the end
             names.number[text] = len(names.number)
-        found.append([names.number[text] for text in column])
-    return found
+        columns.append([names.number[text] for text in column])
+    return columns
 
 
 def _count(lines: Lines, fields: tuple[str, ...]) -> int:

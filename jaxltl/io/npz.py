@@ -69,18 +69,18 @@ def parse_arrays(raw: bytes, name: str, more: Sequence[str] = ()) -> dict[str, A
         k: v for k, v in (_SPARSE if sparse else _PADDED).items() if k != "system" or k in more
     }
     for key, array in arrays.items():
-        known = kinds.get(key)
+        kind = kinds.get(key)
         if sparse and key.startswith(_REWARD):
-            known = _NUMBERS
+            kind = _NUMBERS
         elif sparse and key.startswith(_VARIABLE):
-            known = _VALUES
-        elif known is None and key in more:
+            kind = _VALUES
+        elif kind is None and key in more:
             continue
-        if known is None:
+        if kind is None:
             listed = ", ".join([*kinds, *(m for m in more if m not in kinds)])
             raise ValueError(f"{name!r} holds an array {key!r}; it may hold {listed}.")
-        if array.dtype.kind not in known[0]:
-            raise ValueError(f"{name!r}: {key} holds {array.dtype}; expected {known[1]}.")
+        if array.dtype.kind not in kind[0]:
+            raise ValueError(f"{name!r}: {key} holds {array.dtype}; expected {kind[1]}.")
     return arrays
 
 
@@ -184,7 +184,7 @@ def _padded_interval(arrays: Arrays) -> tuple[IntervalMDP, int]:
                     f"{'lower' if key == 'center' else 'available'}."
                 )
             ball[key] = arrays[key][kept]
-    found = interval_rows(
+    model = interval_rows(
         offsets_from_counts(available.sum(-1)),
         offsets_from_counts(used.sum(-1)[state, action]),
         successor[used],
@@ -197,7 +197,7 @@ def _padded_interval(arrays: Arrays) -> tuple[IntervalMDP, int]:
         center=ball.get("center"),
         radius=ball.get("radius"),
     )
-    return found, used.shape[1]
+    return model, used.shape[1]
 
 
 def _propositions(arrays: Arrays) -> list[str]:

@@ -83,9 +83,9 @@ def min_even(priority: Integers, neutral: NDArray[np.bool_] | None = None) -> In
     values = np.unique(priority[decides])[::-1]
     changes = np.concatenate([values[:1] % 2, (np.diff(values) % 2 != 0).astype(np.int64)])
     number = changes.cumsum()
-    found = np.full(priority.shape, number[-1] if number.size else 0, np.int32)
-    found[decides] = number[::-1][np.searchsorted(values[::-1], priority[decides])]
-    return found
+    converted = np.full(priority.shape, number[-1] if number.size else 0, np.int32)
+    converted[decides] = number[::-1][np.searchsorted(values[::-1], priority[decides])]
+    return converted
 
 
 def parity_objective(priority: Integers) -> Parity:
@@ -135,15 +135,15 @@ class _Reader:
                 "the game has no vertex; expected one such as '0 2 1 0,1 \"name\";'.",
             )
         vertex, priority = np.array(self.vertex), np.array(self.priority)
-        for values, what in ((vertex, "vertex"), (priority, "priority")):
+        for values, kind in ((vertex, "vertex"), (priority, "priority")):
             if values.max() > MAX_NUMBER:
                 i = int(np.argmax(values > MAX_NUMBER))
                 raise self.error(
-                    self.place[i], f"{what} {values[i]} is beyond {MAX_NUMBER}; number them from 0."
+                    self.place[i], f"{kind} {values[i]} is beyond {MAX_NUMBER}; number them from 0."
                 )
         order = np.argsort(vertex, kind="stable")
-        known = vertex[order]
-        if (twice := np.flatnonzero(known[1:] == known[:-1])).size:
+        ordered = vertex[order]
+        if (twice := np.flatnonzero(ordered[1:] == ordered[:-1])).size:
             first, again = order[twice[0]], order[twice[0] + 1]
             line = self.text.count("\n", 0, self.place[first]) + 1
             raise self.error(
@@ -153,8 +153,8 @@ class _Reader:
             )
         degree = np.array([text.count(",") + 1 for text in self.successors])
         target = self._targets()
-        where = np.searchsorted(known, target)
-        missing = (where == known.size) | (known[np.minimum(where, known.size - 1)] != target)
+        where = np.searchsorted(ordered, target)
+        missing = (where == ordered.size) | (ordered[np.minimum(where, ordered.size - 1)] != target)
         if missing.any():
             edge = int(np.argmax(missing))
             source = int(np.searchsorted(degree.cumsum(), edge, "right"))
@@ -209,17 +209,17 @@ class _Reader:
         if start:
             at = self._skipped(start.end())
         while at < len(text):
-            found = _VERTEX.match(text, at)
-            if found is None:
+            match = _VERTEX.match(text, at)
+            if match is None:
                 raise self._broken(at)
-            number, priority, owner, successors, name = found.groups()
+            number, priority, owner, successors, name = match.groups()
             self.place.append(at)
             self.vertex.append(int(number))
             self.priority.append(int(priority))
             self.owner.append(owner == "0")
             self.successors.append(successors)
             self.names.append(name or "")
-            at = found.end()
+            at = match.end()
             if text.startswith("/", at):
                 at = self._skipped(at)
         if start:
@@ -231,8 +231,8 @@ class _Reader:
                 )
 
     def _skipped(self, at: int) -> int:
-        found = _SPACE.match(self.text, at)
-        return at if found is None else found.end()
+        match = _SPACE.match(self.text, at)
+        return at if match is None else match.end()
 
     def _broken(self, at: int) -> ValueError:
         """ValueError for the malformed statement at an offset."""
@@ -243,12 +243,12 @@ class _Reader:
                 f"found {text[at : at + 20]!r}; expected 'parity MAX;', "
                 "'start VERTEX;', or the number of a vertex.",
             )
-        for pattern, wanted in _EXPECTED:
-            found = pattern.match(text, at)
-            if found is None:
-                shown = repr(text[at : at + 20]) if at < len(text) else "the end of the file"
-                return self.error(at, f"found {shown}; expected {wanted}.")
-            at = found.end()
+        for pattern, expected in _EXPECTED:
+            match = pattern.match(text, at)
+            if match is None:
+                actual = repr(text[at : at + 20]) if at < len(text) else "the end of the file"
+                return self.error(at, f"found {actual}; expected {expected}.")
+            at = match.end()
         return self.error(
             begin,
             f"a number of this vertex has more than 18 digits; numbers go up to {MAX_NUMBER}.",
@@ -372,18 +372,22 @@ def max_even(
 
     The priorities of the valuation are kept if they are equivalent, and are the default objective.
     """
-    given = valuation.get("priority")
+    stored = valuation.get("priority")
     if objective is None:
-        if given is None:
+        if stored is None:
             raise ValueError(
                 "the game says nothing of its objective; pass one, such as buchi(game, ...)."
             )
-        return np.asarray(given), np.zeros(len(given), bool)
+        return np.asarray(stored), np.zeros(len(stored), bool)
     priority = np.asarray(objective.priority).ravel()
     won, lost = np.asarray(objective.won).ravel(), np.asarray(objective.lost).ravel()
     decided = won | lost
-    if given is not None and not decided.any() and (min_even(np.asarray(given)) == priority).all():
-        return np.asarray(given), decided
-    most = int(priority.max(initial=0))
-    turned = most + most % 2 - priority
+    if (
+        stored is not None
+        and not decided.any()
+        and (min_even(np.asarray(stored)) == priority).all()
+    ):
+        return np.asarray(stored), decided
+    largest = int(priority.max(initial=0))
+    turned = largest + largest % 2 - priority
     return np.where(decided, np.where(won & ~lost, 0, 1), turned), decided

@@ -148,23 +148,23 @@ class _Reader:
         return initial, terminal, [self._transition(*x) for x in head]
 
     def _transition(self, line: int, text: str) -> _Transition:
-        found = _TRANSITION.fullmatch(text)
-        if found is None:
+        match = _TRANSITION.fullmatch(text)
+        if match is None:
             raise self.error(
                 line, f"found {text[:60]!r}; expected a transition such as "
                 "(0, 1, 'e & !n', ConstantRewardFunction(1))."
             )  # fmt: skip
-        source, target, single, double, kind, given = found.groups()
+        source, target, single, double, kind, number = match.groups()
         if kind != "ConstantRewardFunction":
             raise self.error(
                 line, f"the reward is {kind}(...), which depends on more than the labels; expected "
                 "ConstantRewardFunction(a number)."
             )  # fmt: skip
-        given = given.strip()  # of more than float() takes away
-        if not re.fullmatch(_NUMBER, given) or not np.isfinite(float(given)):
-            raise self.error(line, f"the reward is {given[:40]!r}; expected a finite number.")
+        number = number.strip()  # of more than float() takes away
+        if not re.fullmatch(_NUMBER, number) or not np.isfinite(float(number)):
+            raise self.error(line, f"the reward is {number[:40]!r}; expected a finite number.")
         guard = self._guard(line, single if double is None else double)
-        return _Transition(int(source), int(target), guard, float(given))
+        return _Transition(int(source), int(target), guard, float(number))
 
     def _guard(self, line: int, text: str) -> Formula:
         if text not in self.guards:

@@ -46,7 +46,7 @@ def from_stormpy(model: StormModel) -> SparseMDP | IntervalMDP | Game:
       ...     assert (from_stormpy(to_stormpy(coin)).probability == coin.probability).all()
     """
     storm = _stormpy()
-    what, options = type(model).__name__.strip("_"), storm.io.UmbExportOptions()
+    kind, options = type(model).__name__.strip("_"), storm.io.UmbExportOptions()
     options.compression = storm.io.CompressionMode.NO_COMPRESSION
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "model.umb"
@@ -54,13 +54,13 @@ def from_stormpy(model: StormModel) -> SparseMDP | IntervalMDP | Game:
             storm.io.export_to_umb(model, str(path), options=options)
         except Exception:  # of several types, none of them public
             raise ValueError(
-                f"from_stormpy: Storm does not write this {what} as UMB. Give a sparse Markov "
+                f"from_stormpy: Storm does not write this {kind} as UMB. Give a sparse Markov "
                 "chain, decision process or game, without parameters."
             ) from None
         try:
             return read_umb(path)
         except ValueError as error:
-            reason = str(error).replace(str(path), what)
+            reason = str(error).replace(str(path), kind)
             raise ValueError(f"from_stormpy: {reason}") from None
 
 

@@ -20,20 +20,20 @@ def labels_with_init(model: SparseMDP) -> dict[str, NDArray[np.bool_]]:
             "the initial states are not equally likely, and the format has a set of "
             "them; add a state whose one choice leads to them."
         )
-    found = dict(zip(model.propositions, label.T, strict=True))
-    if not np.array_equal(found.pop("init", where), where):
+    labels = dict(zip(model.propositions, label.T, strict=True))
+    if not np.array_equal(labels.pop("init", where), where):
         raise ValueError(
             "the label 'init' is that of the initial states, and the model has "
             "another of this name; rename it."
         )
-    return {"init": where, **found}
+    return {"init": where, **labels}
 
 
-def check_name(what: str, name: str, reserved: str) -> None:
+def check_name(kind: str, name: str, reserved: str) -> None:
     """Raises ValueError for a name with control characters or reserved characters."""
     if any(c in reserved or ord(c) < 32 for c in name):
         raise ValueError(
-            f"the {what} {name!r} cannot be written: its name must not hold control "
+            f"the {kind} {name!r} cannot be written: its name must not hold control "
             f"characters or any of {' '.join(reserved)!r}."
         )
 

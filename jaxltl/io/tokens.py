@@ -43,10 +43,10 @@ class Text:
         place, line = self.begin, self.line
         while place < self.stop:
             end = self.data.find(b"\n", place, self.stop) + 1 or self.stop
-            found = self.data[place:end].strip()
+            content = self.data[place:end].strip()
             place, line = end, line + 1
-            if found and not found.startswith(comment):
-                return found, line - 1, Text(self.name, self.data, place, self.stop, line)
+            if content and not content.startswith(comment):
+                return content, line - 1, Text(self.name, self.data, place, self.stop, line)
         return b"", line, Text(self.name, self.data, self.stop, self.stop, line)
 
     def blocks(self, comment: bytes) -> Iterator[Block]:
@@ -95,14 +95,14 @@ class Block:
 
     def error(self, token: int, expected: str) -> ValueError:
         """ValueError for an unexpected token."""
-        shown = (
+        actual = (
             self.data[self.start[token] : self.end[token]][:60].tobytes().decode(errors="replace")
         )
-        if shown.startswith("[") and "[" not in expected:
+        if actual.startswith("[") and "[" not in expected:
             expected = f"{expected}, no interval,"
         line = int(np.searchsorted(self.first, token, "right")) - 1
         return self.text.error(
-            int(self.line[line]), f"{shown!r} stands where {expected} is expected."
+            int(self.line[line]), f"{actual!r} stands where {expected} is expected."
         )
 
     def whole(self, line: int) -> bytes:
@@ -131,9 +131,9 @@ class Block:
             raise self.error(int(token[bad]), expected)
         expected = f"{expected} below {below}"
         self.require(length <= 18, token, expected)
-        found = np.fromiter(map(int, texts), np.int64, len(texts))
-        self.require(found < below, token, expected)
-        return found.astype(np.int32)
+        values = np.fromiter(map(int, texts), np.int64, len(texts))
+        self.require(values < below, token, expected)
+        return values.astype(np.int32)
 
     def floats(
         self, token: Integers, expected: str, other: Callable[[bytes], float | None] | None = None
@@ -144,30 +144,30 @@ class Block:
         if longest <= _LONGEST and _DECIMAL_BYTE[joined].all():
             texts = joined.tobytes().split(b" ")[:-1]
             try:
-                found: Floats = np.fromiter(map(float, texts), np.float64, len(texts))
-                if np.isfinite(found).all():
-                    return found
+                values: Floats = np.fromiter(map(float, texts), np.float64, len(texts))
+                if np.isfinite(values).all():
+                    return values
             except ValueError:
                 pass
-        found, known = np.empty(token.size), {}
+        values, value_of_text = np.empty(token.size), {}
         for i, text in enumerate(self.texts(token)):
-            if text not in known:
+            if text not in value_of_text:
                 number = as_double(text)
                 if number is None and other is not None:
                     number = other(text)
                 if number is None:
                     raise self.error(int(token[i]), expected)
-                known[text] = number
-            found[i] = known[text]
-        return found
+                value_of_text[text] = number
+            values[i] = value_of_text[text]
+        return values
 
     def probabilities(
         self, token: Integers, other: Callable[[bytes], float | None] | None = None
     ) -> Floats:
         """Tokens as probabilities."""
-        found = self.floats(token, "a probability", other)
-        self.require((found >= 0) & (found <= 1 + 1e-6), token, "a probability from 0 to 1")
-        return found
+        values = self.floats(token, "a probability", other)
+        self.require((values >= 0) & (values <= 1 + 1e-6), token, "a probability from 0 to 1")
+        return values
 
     def columns(self, width: int, more: int, form: str) -> Integers:
         """First tokens of the lines, each of which must have `width` to ``width + more`` tokens."""
@@ -187,8 +187,8 @@ class Block:
 
     def malformed(self, line: int, form: str) -> ValueError:
         """ValueError for a malformed line."""
-        shown = self.whole(line)[:60].decode(errors="replace")
-        return self.text.error(int(self.line[line]), f"{shown!r}; expected {form}.")
+        actual = self.whole(line)[:60].decode(errors="replace")
+        return self.text.error(int(self.line[line]), f"{actual!r}; expected {form}.")
 
 
 def as_double(text: bytes) -> float | None:
@@ -198,21 +198,21 @@ def as_double(text: bytes) -> float | None:
     if _DECIMAL.fullmatch(text):
         number = float(text)
         return None if number in (np.inf, -np.inf) else number
-    if found := _RATIONAL.fullmatch(text):
+    if match := _RATIONAL.fullmatch(text):
         try:
-            return int(found[1]) / int(found[2])  # correctly rounded, however long they are
+            return int(match[1]) / int(match[2])  # correctly rounded, however long they are
         except (ZeroDivisionError, OverflowError, ValueError):
             return None
-    if found := _INFINITE.fullmatch(text):
-        return -np.inf if found[1] == b"-" else np.inf
+    if match := _INFINITE.fullmatch(text):
+        return -np.inf if match[1] == b"-" else np.inf
     return None
 
 
 def as_fraction(text: bytes) -> Fraction | None:
     """Exact value of a decimal; None for other text and for exponents beyond those of doubles."""
-    found = _DECIMAL.fullmatch(text) if len(text) <= _LONGEST else None
+    match = _DECIMAL.fullmatch(text) if len(text) <= _LONGEST else None
     exponent = re.search(rb"[eE]([+-]?\d+)", text)
-    if found is None or (exponent and (len(exponent[1]) > 4 or abs(int(exponent[1])) > 400)):
+    if match is None or (exponent and (len(exponent[1]) > 4 or abs(int(exponent[1])) > 400)):
         return None
     try:
         return Fraction(text.decode())
@@ -220,10 +220,10 @@ def as_fraction(text: bytes) -> Fraction | None:
         return None
 
 
-def numbered(texts: list[bytes], known: dict[bytes, int]) -> Integers:
+def numbered(texts: list[bytes], index_of_name: dict[bytes, int]) -> Integers:
     """Indices of names, ``int32``; adds new names to `known`."""
-    found = (known.setdefault(text, len(known)) for text in texts)
-    return np.fromiter(found, np.int32, len(texts))
+    indices = (index_of_name.setdefault(text, len(index_of_name)) for text in texts)
+    return np.fromiter(indices, np.int32, len(texts))
 
 
 def decoded(text: Text, names: dict[bytes, int]) -> list[str]:
@@ -304,9 +304,9 @@ def split_init(
     return np.delete(holds, column, 1), rest, initial / initial.sum()
 
 
-def truncated(announced: int, count: int, what: str) -> str:
+def truncated(announced: int, count: int, items: str) -> str:
     """Message for a wrong number of items."""
-    return f"{announced} {what} are announced and {count} follow; the file is cut or changed."
+    return f"{announced} {items} are announced and {count} follow; the file is cut or changed."
 
 
 def refuse(name: str, message: str) -> NoReturn:

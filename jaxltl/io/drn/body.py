@@ -98,11 +98,11 @@ class Body:
 
 def read_header(text: Text) -> Header:
     """Parses the header, up to ``@model``; ValueError with the line for other model types."""
-    found = _MODEL.search(text.data)
-    if found is None:
+    model_line = _MODEL.search(text.data)
+    if model_line is None:
         refuse(text.name, "it has no line '@model'; expected a model in the DRN format.")
-    lines = text.data[: found.start()].decode(errors="replace").split("\n")[:-1]
-    given: dict[str, tuple[int, str]] = {}
+    lines = text.data[: model_line.start()].decode(errors="replace").split("\n")[:-1]
+    entries: dict[str, tuple[int, str]] = {}
     placeholders: dict[bytes, bytes] = {}
     i = 0
     while i < len(lines):
@@ -111,12 +111,12 @@ def read_header(text: Text) -> Header:
         if not line or line.startswith("//"):
             continue
         key, colon, value = line.partition(":")
-        if key in given or (key == "@placeholders" and placeholders):
+        if key in entries or (key == "@placeholders" and placeholders):
             raise text.error(number, f"{key} is given twice.")
         if key in ("@type", "@value_type") and colon:
-            given[key] = number, value.strip()
+            entries[key] = number, value.strip()
         elif line in ("@parameters", "@reward_models", "@nr_states", "@nr_choices"):
-            given[line] = number + 1, lines[i].strip("\r") if i < len(lines) else ""
+            entries[line] = number + 1, lines[i].strip("\r") if i < len(lines) else ""
             i += 1
         elif line == "@placeholders":
             while i < len(lines) and not lines[i].startswith("@"):
@@ -128,60 +128,60 @@ def read_header(text: Text) -> Header:
                 f"{line[:60]!r}; expected @type, @value_type, @parameters, "
                 "@placeholders, @reward_models, @nr_states or @nr_choices.",
             )
-    at = text.data.count(b"\n", 0, found.end()) + 1
-    stop = text.data.find(b"\n", found.end()) + 1 or text.stop
+    at = text.data.count(b"\n", 0, model_line.end()) + 1
+    stop = text.data.find(b"\n", model_line.end()) + 1 or text.stop
     body = Text(text.name, text.data, stop, text.stop, at + 1)
-    num_states = _count(text, given, "@nr_states")
+    num_states = _count(text, entries, "@nr_states")
     if num_states is None:
         raise text.error(at, "expected the number of states, '@nr_states', before '@model'.")
     return Header(
-        _kind(text, given, at),
-        _value_type(text, given),
-        tuple(given.get("@parameters", (0, ""))[1].split()),
+        _kind(text, entries, at),
+        _value_type(text, entries),
+        tuple(entries.get("@parameters", (0, ""))[1].split()),
         placeholders,
-        re.split("[ \t]", given["@reward_models"][1]) if "@reward_models" in given else [],
+        re.split("[ \t]", entries["@reward_models"][1]) if "@reward_models" in entries else [],
         num_states,
-        _count(text, given, "@nr_choices"),
+        _count(text, entries, "@nr_choices"),
         body,
     )
 
 
-def _placeholder(text: Text, line: int, given: str, placeholders: dict[bytes, bytes]) -> None:
-    if not given or given.startswith("//"):
+def _placeholder(text: Text, line: int, entry: str, placeholders: dict[bytes, bytes]) -> None:
+    if not entry or entry.startswith("//"):
         return
-    name, colon, value = (x.strip().encode() for x in given.partition(":"))
+    name, colon, value = (x.strip().encode() for x in entry.partition(":"))
     if not colon or not value or name[:1] != b"$" or name in placeholders:
-        raise text.error(line, f"{given[:60]!r}; expected '$name : value', each name once.")
+        raise text.error(line, f"{entry[:60]!r}; expected '$name : value', each name once.")
     placeholders[name] = value
 
 
-def _kind(text: Text, given: dict[str, tuple[int, str]], line: int) -> str:
-    if "@type" not in given:
+def _kind(text: Text, entries: dict[str, tuple[int, str]], line: int) -> str:
+    if "@type" not in entries:
         raise text.error(line, "expected a line '@type: MDP' or '@type: DTMC' before '@model'.")
-    line, kind = given["@type"]
+    line, kind = entries["@type"]
     if kind.upper() not in ("DTMC", "MDP"):
         raise text.error(line, f"a model of type {kind[:60]!r} is not read; DTMC and MDP are.")
     return kind.upper()
 
 
-def _value_type(text: Text, given: dict[str, tuple[int, str]]) -> str:
-    line, found = given.get("@value_type", (0, ""))
-    if found not in ("", "double", "rational", "parametric", *INTERVALS):
+def _value_type(text: Text, entries: dict[str, tuple[int, str]]) -> str:
+    line, value_type = entries.get("@value_type", (0, ""))
+    if value_type not in ("", "double", "rational", "parametric", *INTERVALS):
         raise text.error(
             line,
-            f"the value type is {found[:60]!r}; expected double, rational, {' or '.join(INTERVALS)}"
+            f"the value type is {value_type[:60]!r}; expected double, rational, {' or '.join(INTERVALS)}"
             ", or parametric.",
         )
-    return found
+    return value_type
 
 
-def _count(text: Text, given: dict[str, tuple[int, str]], key: str) -> int | None:
-    if key not in given:
+def _count(text: Text, entries: dict[str, tuple[int, str]], key: str) -> int | None:
+    if key not in entries:
         return None
-    line, found = given[key][0], given[key][1].strip()
-    if not re.fullmatch("[0-9]{1,18}", found) or not 0 < int(found) < 2**31 - 1:
-        raise text.error(line, f"{found[:60]!r}; expected a number from 1 to {2**31 - 2}.")
-    return int(found)
+    line, digits = entries[key][0], entries[key][1].strip()
+    if not re.fullmatch("[0-9]{1,18}", digits) or not 0 < int(digits) < 2**31 - 1:
+        raise text.error(line, f"{digits[:60]!r}; expected a number from 1 to {2**31 - 2}.")
+    return int(digits)
 
 
 # --- the body -------------------------------------------------------------------------------
@@ -225,10 +225,10 @@ def read_body(header: Header, probabilities: Values, numbers: Values) -> Body:
 
 def _begins(block: Block, at: Integers, word: bytes) -> Booleans:
     """Mask of the tokens that equal a word."""
-    found = block.end[at] - block.start[at] == len(word)
+    matches = block.end[at] - block.start[at] == len(word)
     for i, letter in enumerate(word):
-        found[found] = block.data[block.start[at[found]] + i] == letter
-    return found
+        matches[matches] = block.data[block.start[at[matches]] + i] == letter
+    return matches
 
 
 def _order(block: Block, body: Body, is_state: Booleans, is_action: Booleans) -> Integers:
@@ -265,11 +265,11 @@ def _read_states(
     token = np.repeat(label - np.cumsum(count) + count, count) + np.arange(int(count.sum()))
     names, owners = block.texts(token), [np.repeat(state, count)]
     for i, labels in rest.items():
-        found = _LABEL.findall(labels)
+        pairs = _LABEL.findall(labels)
         if _LABEL.sub(b"", labels).strip():
             raise block.malformed(int(lines[i]), form)
-        names += [quoted or plain for quoted, plain in found]
-        owners.append(np.full(len(found), state[i]))
+        names += [quoted or plain for quoted, plain in pairs]
+        owners.append(np.full(len(pairs), state[i]))
     body.label.append(numbered(names, body.label_names))
     body.labelled.append(np.concatenate(owners))
 
@@ -309,10 +309,10 @@ def _rewards(
     odd[np.searchsorted(block.first, quotes, "right") - 1] = True
     odd = odd[lines]
     if has.any() and not body.rewards:
-        found = _LINE.fullmatch(block.whole(int(lines[int(has.argmax())])))
-        if found is None or found[1] is None:
+        match = _LINE.fullmatch(block.whole(int(lines[int(has.argmax())])))
+        if match is None or match[1] is None:
             raise block.malformed(int(lines[int(has.argmax())]), form)
-        body.rewards = found[1].count(b",") + 1
+        body.rewards = match[1].count(b",") + 1
     if body.rewards * lines.size > 8 * len(block.text.data) + 2**24:
         raise block.text.error(
             int(block.line[lines[0]]),
@@ -345,19 +345,19 @@ def _rewards(
 
 def _odd_line(block: Block, line: int, width: int, form: str) -> tuple[Block | None, bytes]:
     """Parses the rewards of one irregular line; returns them (or None) and the rest of the line."""
-    found = _LINE.fullmatch(block.whole(line))
-    if found is None:
+    match = _LINE.fullmatch(block.whole(line))
+    if match is None:
         raise block.malformed(line, form)
-    if found[1] is None:
-        return None, found[2]
-    texts = [x.strip() for x in found[1].split(b",")]
+    if match[1] is None:
+        return None, match[2]
+    texts = [x.strip() for x in match[1].split(b",")]
     if len(texts) != width or not all(texts) or any(b" " in x for x in texts):
         raise block.malformed(line, f"{form} with {width} rewards")
     data = np.frombuffer(b" ".join(texts) + b" ", np.uint8)
     length = np.array([len(x) for x in texts])
     end = np.cumsum(length + 1) - 1
     first, number = np.array([0, width]), block.line[line : line + 1]
-    return Block(block.text, data, end - length, end, first, number), found[2]
+    return Block(block.text, data, end - length, end, first, number), match[2]
 
 
 def _check_counts(header: Header, body: Body) -> None:
@@ -435,8 +435,10 @@ def rewards_of(header: Header, body: Body) -> Iterator[tuple[str, Numbers, Numbe
     text, width = header.body, body.rewards
     if width * (body.num_states + body.num_rows) > 8 * len(text.data) + 2**24:
         refuse(text.name, f"{width} rewards of {body.num_states} states are more than it writes.")
-    given = header.rewards if width else [x for x in header.rewards if x]
-    names = [given[i] if i < len(given) else f"rew{i}" for i in range(width or len(given))]
+    announced = header.rewards if width else [x for x in header.rewards if x]
+    names = [
+        announced[i] if i < len(announced) else f"rew{i}" for i in range(width or len(announced))
+    ]
     seen: set[str] = set()
     for i, name in enumerate(names):
         if name in seen:
@@ -450,7 +452,7 @@ def rewards_of(header: Header, body: Body) -> Iterator[tuple[str, Numbers, Numbe
 
 
 def _gathered(parts: list[tuple[int, Numbers]], size: int, column: int) -> Numbers:
-    found = np.zeros(size if parts else 0, parts[0][1].dtype if parts else None)
+    column_values = np.zeros(size if parts else 0, parts[0][1].dtype if parts else None)
     for begin, part in parts:
-        found[begin : begin + len(part)] = part[:, column]
-    return found
+        column_values[begin : begin + len(part)] = part[:, column]
+    return column_values

@@ -81,12 +81,12 @@ def read_drn(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP:
             f"its probabilities have parameters, {', '.join(header.parameters)}; "
             "jaxltl.io.drn.parametric.read_parametric reads it.",
         )
-    known = _placeholders(header)
+    placeholders = _placeholders(header)
     try:
         body = read_body(
             header,
-            lambda block, token: block.probabilities(token, known.get),
-            lambda block, token: block.floats(token, "a reward", known.get),
+            lambda block, token: block.probabilities(token, placeholders.get),
+            lambda block, token: block.floats(token, "a reward", placeholders.get),
         )
         return _model(header, body)
     except MemoryError:
@@ -94,17 +94,17 @@ def read_drn(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP:
 
 
 def _placeholders(header: Header) -> dict[bytes, float]:
-    known: dict[bytes, float] = {}
+    values: dict[bytes, float] = {}
     for name, text in header.placeholders.items():
-        number = known.get(text, as_double(text))
+        number = values.get(text, as_double(text))
         if number is None:
             refuse(
                 header.body.name,
                 f"the placeholder {name.decode()} stands for "
                 f"{text[:60].decode()!r}; expected a number.",
             )
-        known[name] = number
-    return known
+        values[name] = number
+    return values
 
 
 def _model(header: Header, body: Body) -> SparseMDP | IntervalMDP:
@@ -114,9 +114,9 @@ def _model(header: Header, body: Body) -> SparseMDP | IntervalMDP:
     start = np.concatenate([[0], np.bincount(row, minlength=body.num_rows).cumsum()])
     total = np.add.reduceat(probability, start[:-1])
     if (bad := first_without_distribution(total)) is not None:
-        action, what, how = bad
+        action, subject, problem = bad
         raise text.error(
-            int(line[action]), f"{what} of this action of state {state[action]} {how}."
+            int(line[action]), f"{subject} of this action of state {state[action]} {problem}."
         )
     count = np.bincount(state, minlength=body.num_states)
     rows = np.concatenate([[0], count.cumsum()]), start, np.concatenate(body.successor)
@@ -166,9 +166,9 @@ def write_drn(path: str | os.PathLike[str], model: SparseMDP | IntervalMDP) -> N
         file.writelines(lines)
 
 
-def _written(given: SparseMDP | IntervalMDP) -> Iterator[bytes]:
+def _written(source: SparseMDP | IntervalMDP) -> Iterator[bytes]:
     """The file in pieces; validates the model before the first piece."""
-    model = exact_part(given)
+    model = exact_part(source)
     labels, actions = _label_texts(model), _action_texts(model)
     rewards = []
     for name, reward in model.rewards.items():
@@ -184,7 +184,7 @@ def _written(given: SparseMDP | IntervalMDP) -> Iterator[bytes]:
     head = [
         "// Written by jaxltl",
         f"@type: {'DTMC' if model.is_chain else 'MDP'}",
-        f"@value_type: {'double' if model is given else 'double-interval'}",
+        f"@value_type: {'double' if model is source else 'double-interval'}",
         "@parameters",
         "",
         "@reward_models",
@@ -196,7 +196,7 @@ def _written(given: SparseMDP | IntervalMDP) -> Iterator[bytes]:
         "@model",
         "",
     ]
-    values = value_texts(given, ", ")
+    values = value_texts(source, ", ")
     return _pieces("\n".join(head).encode(), model, values, labels, actions, rewards)
 
 
@@ -225,14 +225,14 @@ def _pieces(
             + (host.row_start[states] - rows.start)
             + (host.entry_start[host.row_start[states]] - entries.start)
         )
-        found = np.empty(num_entries + num_rows + end - begin, object)
-        found[at_entry] = [
+        lines = np.empty(num_entries + num_rows + end - begin, object)
+        lines[at_entry] = [
             f"\t\t{t} : {p}\n"
             for t, p in zip(host.successor[entries].tolist(), values(entries), strict=True)
         ]
-        found[at_row] = _action_lines(model, rows, actions, rewards)
-        found[at_state] = _state_lines(states, labels, rewards)
-        yield "".join(found.tolist()).encode()
+        lines[at_row] = _action_lines(model, rows, actions, rewards)
+        lines[at_state] = _state_lines(states, labels, rewards)
+        yield "".join(lines.tolist()).encode()
 
 
 def _state_lines(
@@ -274,14 +274,14 @@ def _bracketed(rewards: list[ArrayLike | None], part: slice, count: int) -> list
 
 def _label_texts(model: SparseMDP) -> list[tuple[str, NDArray[np.bool_]]]:
     """Text and mask of each label, the initial states first."""
-    found = []
+    labels = []
     for name, where in labels_with_init(model).items():
         check_name("label", name, '"')
         if not name:
             raise ValueError("a label has the name ''; the format requires a name.")
         plain = re.fullmatch(r"[^\s\[\]]+", name)
-        found.append((f" {name}" if plain else f' "{name}"', where))
-    return found
+        labels.append((f" {name}" if plain else f' "{name}"', where))
+    return labels
 
 
 def _action_texts(model: SparseMDP) -> Callable[[int], str] | None:

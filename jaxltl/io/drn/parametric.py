@@ -267,12 +267,12 @@ class _Exact:
         ).hexdigest()
 
     def __call__(self, point: np.ndarray) -> SparseMDP:
-        found = self.model.at(dict(zip(self.model.parameters, point.tolist(), strict=True)))
-        if not np.array_equal(found.successor, self.successor):
+        model = self.model.at(dict(zip(self.model.parameters, point.tolist(), strict=True)))
+        if not np.array_equal(model.successor, self.successor):
             raise ValueError(
                 "some transitions are gone; keep the box away from where probabilities become zero."
             )
-        return found
+        return model
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, _Exact) and self.digest == other.digest
@@ -323,7 +323,7 @@ def read_parametric(path: str | os.PathLike[str]) -> ParametricModel:
     header = read_header(Text(name, data, 0, len(data)))
     if len(set(header.parameters)) < len(header.parameters):
         refuse(name, "a parameter is named twice.")
-    known = {b"0": 0}
+    index_of_text = {b"0": 0}
     functions = [RationalFunction({}, _constant(header.parameters, 1))]
     placeholders: dict[str, RationalFunction] = {}
     for place, text in header.placeholders.items():
@@ -338,8 +338,8 @@ def read_parametric(path: str | os.PathLike[str]) -> ParametricModel:
 
     def values(block: Block, token: Integers) -> Integers:
         texts = block.texts(token)
-        found = numbered(texts, known)
-        for text in list(known)[len(functions) :]:
+        indices = numbered(texts, index_of_text)
+        for text in list(index_of_text)[len(functions) :]:
             try:
                 functions.append(_parsed(text, header.parameters, placeholders))
             except _Malformed as error:
@@ -347,7 +347,7 @@ def read_parametric(path: str | os.PathLike[str]) -> ParametricModel:
                 raise block.error(
                     int(token[texts.index(text)]), f"{expected} (it is {error})"
                 ) from None
-        return found
+        return indices
 
     try:
         body = read_body(header, values, values)
@@ -399,33 +399,33 @@ def _value(terms: list[Term], point: tuple[Fraction, ...]) -> Fraction:
 
 
 def _checked(polynomial: Polynomial) -> Polynomial:
-    found = {powers: c for powers, c in polynomial.items() if c}
-    if len(found) > _MOST_TERMS or any(max(powers, default=0) > _MOST_POWER for powers in found):
+    result = {powers: c for powers, c in polynomial.items() if c}
+    if len(result) > _MOST_TERMS or any(max(powers, default=0) > _MOST_POWER for powers in result):
         raise _Malformed("too large")
     if any(
         max(c.numerator.bit_length(), c.denominator.bit_length()) > _MOST_BITS
-        for c in found.values()
+        for c in result.values()
     ):
         raise _Malformed("too large")
-    return found
+    return result
 
 
 def _sum(a: Polynomial, b: Polynomial) -> Polynomial:
-    found = dict(a)
+    result = dict(a)
     for powers, c in b.items():
-        found[powers] = found.get(powers, Fraction(0)) + c
-    return _checked(found)
+        result[powers] = result.get(powers, Fraction(0)) + c
+    return _checked(result)
 
 
 def _times(a: Polynomial, b: Polynomial) -> Polynomial:
     if len(a) * len(b) > _MOST_TERMS:
         raise _Malformed("too large")
-    found: Polynomial = {}
+    result: Polynomial = {}
     for p, c in a.items():
         for q, d in b.items():
             powers = tuple(i + j for i, j in zip(p, q, strict=True))
-            found[powers] = found.get(powers, Fraction(0)) + c * d
-    return _checked(found)
+            result[powers] = result.get(powers, Fraction(0)) + c * d
+    return _checked(result)
 
 
 def _add(a: RationalFunction, b: RationalFunction) -> RationalFunction:
@@ -457,20 +457,20 @@ def _parsed(
 ) -> RationalFunction:
     """Parses a rational function."""
     try:
-        shown = text.decode()
+        string = text.decode()
     except UnicodeDecodeError:
         raise _Malformed("not UTF-8") from None
-    if shown.startswith("$"):
-        if shown not in placeholders:
+    if string.startswith("$"):
+        if string not in placeholders:
             raise _Malformed("no placeholder that is defined before")
-        return placeholders[shown]
+        return placeholders[string]
     tokens, place = [], 0
-    while place < len(shown):
-        found = _TOKEN.match(shown, place)
-        if found is None:
-            raise _Malformed(f"malformed at {shown[place : place + 20]!r}")
-        tokens.append(found[0].strip())
-        place = found.end()
+    while place < len(string):
+        match = _TOKEN.match(string, place)
+        if match is None:
+            raise _Malformed(f"malformed at {string[place : place + 20]!r}")
+        tokens.append(match[0].strip())
+        place = match.end()
     reader = _Reader(tokens, parameters)
     result = reader.sum(0)
     if reader.place < len(tokens):
@@ -499,45 +499,45 @@ class _Reader:
     def sum(self, depth: int) -> RationalFunction:
         if depth > _MOST_DEPTH:
             raise _Malformed("nested too deeply")
-        found = self.product(depth)
+        result = self.product(depth)
         while self.next() in ("+", "-"):
             sign = self.take()
             other = self.product(depth)
-            found = _add(found, other if sign == "+" else _multiply(self.number(-1), other))
-        return found
+            result = _add(result, other if sign == "+" else _multiply(self.number(-1), other))
+        return result
 
     def product(self, depth: int) -> RationalFunction:
-        found = self.power(depth)
+        result = self.power(depth)
         while self.next() in ("*", "/"):
             combine: Callable[..., RationalFunction] = _multiply if self.take() == "*" else _divide
-            found = combine(found, self.power(depth))
-        return found
+            result = combine(result, self.power(depth))
+        return result
 
     def power(self, depth: int) -> RationalFunction:
         sign = 1
         while self.next() in ("+", "-"):
             sign = -sign if self.take() == "-" else sign
-        found = self.atom(depth)
+        result = self.atom(depth)
         if self.next() in ("^", "**"):
             self.take()
             exponent = self.take()
             if not re.fullmatch(r"[0-9]{1,4}", exponent) or int(exponent) > _MOST_POWER:
                 raise _Malformed("no whole power up to 1000")
-            base, found = found, self.number(1)
+            base, result = result, self.number(1)
             terms = max(len(base.numerator), len(base.denominator))
             if (terms - 1) * int(exponent) > _MOST_POWER:
                 raise _Malformed("too large")
             for _ in range(int(exponent)):
-                found = _multiply(found, base)
-        return found if sign == 1 else _multiply(self.number(-1), found)
+                result = _multiply(result, base)
+        return result if sign == 1 else _multiply(self.number(-1), result)
 
     def atom(self, depth: int) -> RationalFunction:
         token = self.take()
         if token == "(":
-            found = self.sum(depth + 1)
+            result = self.sum(depth + 1)
             if self.take() != ")":
                 raise _Malformed("without a closing bracket")
-            return found
+            return result
         if token in self.parameters:
             powers = tuple(int(name == token) for name in self.parameters)
             return RationalFunction({powers: Fraction(1)}, _constant(self.parameters, 1))

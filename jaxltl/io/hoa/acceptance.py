@@ -54,15 +54,15 @@ def condition_given(condition: Tree, number: int, visited: bool) -> Tree:
 
 def _sets_of(condition: Tree) -> list[int]:
     """Acceptance sets of a condition, sorted."""
-    found: set[int] = set()
+    sets: set[int] = set()
     stack = [condition]
     while stack:
         node = stack.pop()
         if node[0] in ("inf", "fin"):
-            found.add(node[1])
+            sets.add(node[1])
         else:
             stack += node[1:]
-    return sorted(found)
+    return sorted(sets)
 
 
 def decisive_sets(condition: Tree) -> tuple[list[tuple[int, bool]], bool] | None:

@@ -98,10 +98,10 @@ def read_hoa_game(source: str | os.PathLike[str]) -> HoaGame:
     else:
         place, text = str(source), read_text(source, "a game in the Hanoi format")
     try:
-        found = split_texts(text)
-        if len(found) != 1:
-            raise ValueError(f"the text holds {len(found)} automata, expected exactly one.")
-        return _read(found[0])
+        automata = split_texts(text)
+        if len(automata) != 1:
+            raise ValueError(f"the text holds {len(automata)} automata, expected exactly one.")
+        return _read(automata[0])
     except ValueError as error:
         raise ValueError(f"{place}: {str(error).removeprefix('read_hoa: ')}") from None
 
@@ -121,15 +121,15 @@ def _read(tokens: list[Token]) -> HoaGame:
 
 def _controllable(items: list[Item], header: Header) -> list[int]:
     """Indices of the propositions that the system controls."""
-    given = [values for values in items if values[0] == "controllable-AP:"]
-    if len(given) != 1:
+    headers = [values for values in items if values[0] == "controllable-AP:"]
+    if len(headers) != 1:
         raise error_at(
-            given[1][0].line if given else header.line,
-            "the header controllable-AP: is given twice. Keep one of them." if given else
+            headers[1][0].line if headers else header.line,
+            "the header controllable-AP: is given twice. Keep one of them." if headers else
             "the header controllable-AP: is missing. Add it, with the numbers of the propositions "
             "that the system chooses.",
         )  # fmt: skip
-    key, *values = given[0]
+    key, *values = headers[0]
     for value in values:
         if value.type != "INT" or int(value) >= len(header.propositions):
             raise error_at(
@@ -194,12 +194,12 @@ class _Split:
         self.work += sum(map(len, sides)) * len(parts)
         if self.work > 4 * MAX_MOVES:
             raise _TooMany
-        found = {
+        classes = {
             rest: self.guards.node(top, sides[0].get(rest, FALSE), sides[1].get(rest, FALSE))
             for rest in {**sides[0], **sides[1]}
         }
-        self.known[parts] = found
-        return found
+        self.known[parts] = classes
+        return classes
 
 
 _Entry = tuple[int, int]  # a state, with the priority of the edge by which it is entered
@@ -218,13 +218,13 @@ class _Reader:
         self.guards = _Guards([order.index(p) for p in range(len(order))])
         self.texts: dict[int, str] = {}
         self.length = 0  # of all texts, in paths through their diagrams
-        found = decisive_sets(condition_given(header.condition, -1, True))
-        if found is None:
+        sets_by_importance = decisive_sets(condition_given(header.condition, -1, True))
+        if sets_by_importance is None:
             raise error_at(
                 header.line, "the acceptance formula is no parity condition. Let the tool that "
                 "wrote it turn it into one."
             )  # fmt: skip
-        self.order = found
+        self.order = sets_by_importance
 
     def game(self, states: list[State]) -> HoaGame:
         try:
@@ -239,7 +239,7 @@ class _Reader:
     def _moves(self, states: list[State]) -> tuple[list[dict[_Entry, int]], bool]:
         """Guard of each successor of each state; and True if a losing sink was appended."""
         truth = label_reader(self.header, self.guards)
-        found: list[dict[_Entry, int]] = []
+        successors: list[dict[_Entry, int]] = []
         lost = (len(states), 1)
         for q, state in enumerate(states):
             taken = FALSE
@@ -257,9 +257,9 @@ class _Reader:
                 moves[entry] = self.guards.either(moves.get(entry, FALSE), guard)
             if taken != TRUE:
                 moves[lost] = self.guards.negation(taken)
-            found.append({entry: guard for entry, guard in moves.items() if guard != FALSE})
-        incomplete = any(lost in moves for moves in found)
-        return [*found, {lost: TRUE}] if incomplete else found, incomplete
+            successors.append({entry: guard for entry, guard in moves.items() if guard != FALSE})
+        incomplete = any(lost in moves for moves in successors)
+        return [*successors, {lost: TRUE}] if incomplete else successors, incomplete
 
     def _letter(self, guard: int) -> NDArray[np.bool_]:
         """A letter that satisfies a guard, by the indices of propositions."""
@@ -302,11 +302,11 @@ class _Reader:
                 rows.append([(t, self._text(guard)) for t, guard in pairs if guard != FALSE])
         state = np.array([q for q, _ in entries] + [q for q, c in enumerate(classes) for _ in c])
         priority = np.array([p for _, p in entries])
-        most = int(priority.max())
-        neutral = np.full(len(rows) - priority.size, most)  # the system's states decide nothing
+        largest = int(priority.max())
+        neutral = np.full(len(rows) - priority.size, largest)  # the system's states decide nothing
         model = _model(rows, {
             "state": np.where(incomplete & (state == len(moves) - 1), -1, state),
-            "priority": most + most % 2 - np.append(priority, neutral),
+            "priority": largest + largest % 2 - np.append(priority, neutral),
         }, next(i for i, (q, _) in enumerate(entries) if q == start))  # fmt: skip
         game = make_game(model, np.arange(len(rows)) >= len(entries))
         return HoaGame(game, objective_of(game), self.inputs, self.outputs)
@@ -453,17 +453,17 @@ class _Arena:
         if not takes_turns or self.stays.any() or system.max() > environment.min():
             return None
         number = np.full(self.system.size, -1)
-        known: dict[tuple[tuple[str, int], ...], int] = {}
+        index: dict[tuple[tuple[str, int], ...], int] = {}
         edges: list[list[tuple[str, int]]] = []
         for v in np.flatnonzero(~self.system).tolist():
             moves = self._moves(v)
-            number[v] = known.setdefault(tuple(moves), len(known))
+            number[v] = index.setdefault(tuple(moves), len(index))
             if number[v] == len(edges):
                 edges.append(moves)
         return number, [
             [
-                (_both(given, label), int(number[t]), int(self.color[t]))
-                for given, w in moves for label, t in self._moves(w)
+                (_both(guard, label), int(number[t]), int(self.color[t]))
+                for guard, w in moves for label, t in self._moves(w)
             ]
             for moves in edges
         ]  # fmt: skip
@@ -519,10 +519,10 @@ def _named(
     system, action = np.asarray(game.system), np.asarray(model.action)
     source = np.repeat(system, np.diff(row_start))
     sides = []
-    for own, given in ((False, inputs), (True, outputs)):
+    for own, requested in ((False, inputs), (True, outputs)):
         used = [formulas[a] for a in np.unique(action[source == own])]
-        found = dict.fromkeys(p for formula in used for p in formula.propositions)
-        sides.append(tuple(dict.fromkeys([*given, *found])))
+        occurring = dict.fromkeys(p for formula in used for p in formula.propositions)
+        sides.append(tuple(dict.fromkeys([*requested, *occurring])))
     names = sides[0] + sides[1]
     if len(set(names)) < len(names):
         return None
@@ -543,23 +543,23 @@ def _named(
 
 def _read_guard(formula: Formula, place: dict[str, int], guards: _Guards) -> tuple[str, int] | None:
     """Label and diagram of a Boolean formula; None for temporal operators."""
-    found: dict[Formula, tuple[str, int]] = {}
+    translated: dict[Formula, tuple[str, int]] = {}
     for node in subformulas(formula):
-        parts = [found[x] for x in node.operands]
+        parts = [translated[x] for x in node.operands]
         if node.operator == "ap":
             p = place[node.proposition]
-            found[node] = str(p), guards.proposition(p)
+            translated[node] = str(p), guards.proposition(p)
         elif node.operator in ("true", "false"):
-            found[node] = node.operator[0], guards.constant(node.operator == "true")
+            translated[node] = node.operator[0], guards.constant(node.operator == "true")
         elif node.operator == "!":
-            found[node] = f"!({parts[0][0]})" if " " in parts[0][0] else f"!{parts[0][0]}", (
+            translated[node] = f"!({parts[0][0]})" if " " in parts[0][0] else f"!{parts[0][0]}", (
                 guards.negation(parts[0][1]))  # fmt: skip
         elif node.operator in ("&", "|"):
             combine, whole = (guards.both if node.operator == "&" else guards.either), parts[0][1]
             for _, guard in parts[1:]:
                 whole = combine(whole, guard)
             grouped = [f"({text})" if " " in text else text for text, _ in parts]
-            found[node] = f" {node.operator} ".join(grouped), whole
+            translated[node] = f" {node.operator} ".join(grouped), whole
         else:
             return None
-    return found[formula]
+    return translated[formula]

@@ -86,15 +86,15 @@ def split_texts(text: str) -> list[list[Token]]:
             f"read_hoa: expected text in the Hanoi format, got {type(text).__name__}. "
             "Pass the contents of the file."
         )
-    found: list[list[Token]] = []
+    automata: list[list[Token]] = []
     current: list[Token] = []
     for token in _tokens(text):
         current.append(token)
         if token.type == "_END":
-            found.append(current)
+            automata.append(current)
         if token.type in ("_END", "ABORT"):
             current = []
-    return [*found, current] if current else found
+    return [*automata, current] if current else automata
 
 
 def _tokens(text: str) -> Iterator[Token]:
@@ -253,7 +253,11 @@ def _syntax_error(tokens: list[Token], error: UnexpectedToken) -> ValueError:
     place = tokens[-1] if ended else token
     accepted = error.accepts or error.expected
     expected = sorted({_READABLE.get(terminal, terminal) for terminal in accepted})
-    wanted = " or ".join([", ".join(expected[:-1]), expected[-1]] if expected[1:] else expected)
-    found = "the end of the text" if ended else repr(str(token))
+    alternatives = " or ".join(
+        [", ".join(expected[:-1]), expected[-1]] if expected[1:] else expected
+    )
+    actual = "the end of the text" if ended else repr(str(token))
     hint = " Each automaton ends with --END--." if ended or token.type == "HOA" else ""
-    return error_at(place.line, f"column {place.column}: found {found}, expected {wanted}.{hint}")
+    return error_at(
+        place.line, f"column {place.column}: found {actual}, expected {alternatives}.{hint}"
+    )

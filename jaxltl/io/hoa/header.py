@@ -40,7 +40,7 @@ def read_header(version: Token, items: list[Item]) -> Header:
     """Validates the header items and their consistency."""
     if version not in ("v1", "v1.1"):
         raise error_at(version.line, f"version {version} is unknown. Write the automaton as v1.")
-    given: dict[str, Item] = {}
+    headers: dict[str, Item] = {}
     properties: list[str] = []
     aliases: list[tuple[Token, Tree]] = []
     for key, *values in items:
@@ -55,41 +55,41 @@ def read_header(version: Token, items: list[Item]) -> Header:
             properties += values
         elif key.type == "ALIAS":
             aliases.append((values[0], values[1]))
-        elif key.type in given and key.type == "START":
+        elif key.type in headers and key.type == "START":
             raise error_at(
                 key.line,
                 "there are several initial states. Only deterministic automata are read; "
                 "determinise it first.",
             )
-        elif key.type in given:
+        elif key.type in headers:
             raise error_at(key.line, f"the header {key} is given twice. Keep one of them.")
         else:
-            given[key.type] = [key, *values]
-    return _checked_header(version, given, aliases, frozenset(properties))
+            headers[key.type] = [key, *values]
+    return _checked_header(version, headers, aliases, frozenset(properties))
 
 
 def _checked_header(
     version: Token,
-    given: dict[str, Item],
+    headers: dict[str, Item],
     aliases: list[tuple[Token, Tree]],
     properties: frozenset[str],
 ) -> Header:
     for missing, fix in (("Acceptance:", "Acceptance: 0 t"), ("Start:", "Start: 0")):
-        if KNOWN_HEADERS[missing] not in given:
+        if KNOWN_HEADERS[missing] not in headers:
             raise error_at(
                 version.line, f"the header {missing} is missing. Add it, such as '{fix}'."
             )
-    _, sets, condition = given["ACCEPTANCE"]
+    _, sets, condition = headers["ACCEPTANCE"]
     return Header(
-        states=int(given["STATES"][1]) if "STATES" in given else None,
-        start=only_target(given["START"][1], "Start:"),
-        propositions=_proposition_names(given.get("AP")),
+        states=int(headers["STATES"][1]) if "STATES" in headers else None,
+        start=only_target(headers["START"][1], "Start:"),
+        propositions=_proposition_names(headers.get("AP")),
         aliases=aliases,
         sets=int(sets),
         condition=_condition(condition, int(sets)),
         properties=properties,
-        tool=unquoted(given["TOOL"][1]) if "TOOL" in given else "",
-        acceptance_name=str(given["ACC_NAME"][1]) if "ACC_NAME" in given else "",
+        tool=unquoted(headers["TOOL"][1]) if "TOOL" in headers else "",
+        acceptance_name=str(headers["ACC_NAME"][1]) if "ACC_NAME" in headers else "",
         line=version.line or 1,
     )
 

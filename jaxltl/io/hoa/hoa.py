@@ -65,13 +65,13 @@ def read_hoa(text: str, letters: Iterable[Letter] | None = None) -> Automaton:
       >>> infinitely_often_a.acceptance, infinitely_often_a.priority.tolist()
       ('buchi', [[1, 0]])
     """
-    found = split_texts(text)
-    if len(found) != 1:
+    automata = split_texts(text)
+    if len(automata) != 1:
         raise ValueError(
-            f"read_hoa: the text holds {len(found)} automata, expected exactly one. "
+            f"read_hoa: the text holds {len(automata)} automata, expected exactly one. "
             "Read several with read_hoa_stream."
         )
-    return _read(found[0], letters)
+    return _read(automata[0], letters)
 
 
 def read_hoa_stream(text: str, letters: Iterable[Letter] | None = None) -> list[Automaton]:
@@ -94,8 +94,8 @@ def read_hoa_stream(text: str, letters: Iterable[Letter] | None = None) -> list[
       >>> len(read_hoa_stream(always + always))
       2
     """
-    known = None if letters is None else as_letters(letters, "read_hoa: letters")
-    return [_read(tokens, known) for tokens in split_texts(text)]
+    alphabet = None if letters is None else as_letters(letters, "read_hoa: letters")
+    return [_read(tokens, alphabet) for tokens in split_texts(text)]
 
 
 def write_hoa(automaton: Automaton, name: str = "") -> str:

@@ -41,8 +41,8 @@ def alphabet_of(
         numbers = list(range(2 ** len(names)))
     else:
         bit = {name: 1 << p for p, name in enumerate(names)}
-        given = as_letters(letters, "read_hoa: letters")
-        numbers = sorted({sum(bit[name] for name in bit if name in letter) for letter in given})
+        sets = as_letters(letters, "read_hoa: letters")
+        numbers = sorted({sum(bit[name] for name in bit if name in letter) for letter in sets})
     if not numbers:
         raise ValueError(
             "read_hoa: letters is empty. Pass at least one letter, such as set(), or None for "

@@ -70,10 +70,10 @@ def read_prism(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP:
       >>> model.successor.tolist(), model.probability.tolist(), model.propositions
       ([1, 2, 1, 2], [0.5, 0.5, 1.0, 1.0], ('heads',))
     """
-    path, found = Path(path), _NAME.fullmatch(Path(path).name)
-    if found is None:
+    path, match = Path(path), _NAME.fullmatch(Path(path).name)
+    if match is None:
         refuse(str(path), "its name must end in .tra or .pexp, or that and .gz or .xz.")
-    sections = _in_one(path) if found["kind"].lower() == "pexp" else list(_beside(path, found))
+    sections = _in_one(path) if match["kind"].lower() == "pexp" else list(_beside(path, match))
     text = next(text for kind, _, text in sections if kind == "tra")
     try:
         return _model(text, sections)
@@ -113,13 +113,13 @@ def write_prism(
       >>> read_prism(path).probability.tolist()
       [0.5, 0.5, 1.0, 1.0]
     """
-    path, found = Path(path), _NAME.fullmatch(Path(path).name)
-    if found is None:
+    path, match = Path(path), _NAME.fullmatch(Path(path).name)
+    if match is None:
         refuse(str(path), "its name must end in .tra or .pexp, or that and .gz or .xz.")
     if dialect not in ("prism", "storm"):
         raise ValueError(f"dialect is {dialect!r}; give 'prism' or 'storm'.")
     sections = written_sections(model, dialect)
-    if found["kind"].lower() == "pexp":
+    if match["kind"].lower() == "pexp":
         if dialect == "storm":
             refuse(str(path), "Storm reads no .pexp; write a .tra.")
         with write_bytes(path) as file:
@@ -127,8 +127,8 @@ def write_prism(
                 file.writelines(section.header)
                 file.writelines(section.lines())
         return
-    names = [f"{found['stem']}{s.number}.{s.kind}{found['packed'] or ''}" for s in sections]
-    others = sorted(p.name for _, _, p in _siblings(path, found) if p.name not in names)
+    names = [f"{match['stem']}{s.number}.{s.kind}{match['packed'] or ''}" for s in sections]
+    others = sorted(p.name for _, _, p in _siblings(path, match) if p.name not in names)
     if others:
         refuse(
             str(path),
@@ -147,15 +147,15 @@ def write_prism(
 
 def files_beside(path: str | os.PathLike[str]) -> list[Path]:
     """Companion files (labels, states, rewards) of a ``.tra`` file."""
-    found = _NAME.fullmatch(Path(path).name)
-    if found is None or found["kind"].lower() != "tra":
+    match = _NAME.fullmatch(Path(path).name)
+    if match is None or match["kind"].lower() != "tra":
         return []
-    return [other for _, _, other in _siblings(Path(path), found)]
+    return [other for _, _, other in _siblings(Path(path), match)]
 
 
-def _siblings(path: Path, found: re.Match[str]) -> Iterator[tuple[str, str, Path]]:
+def _siblings(path: Path, match: re.Match[str]) -> Iterator[tuple[str, str, Path]]:
     """Companion files of a ``.tra`` file: kind, number and path."""
-    form = re.compile(re.escape(found["stem"]) + r"\.?(\d{0,9})\.(lab|sta|srew|trew)(\.gz|\.xz)?")
+    form = re.compile(re.escape(match["stem"]) + r"\.?(\d{0,9})\.(lab|sta|srew|trew)(\.gz|\.xz)?")
     try:
         names = sorted(os.listdir(path.parent))
     except (OSError, ValueError) as error:
@@ -170,10 +170,10 @@ def _siblings(path: Path, found: re.Match[str]) -> Iterator[tuple[str, str, Path
         yield other[2], other[1], path.parent / name
 
 
-def _beside(path: Path, found: re.Match[str]) -> Iterator[Section]:
+def _beside(path: Path, match: re.Match[str]) -> Iterator[Section]:
     chosen: dict[tuple[str, str], Path] = {}
-    for kind, number, other in _siblings(path, found):
-        packed = found["packed"] or ""
+    for kind, number, other in _siblings(path, match):
+        packed = match["packed"] or ""
         if (kind, number) not in chosen or other.name.endswith(f".{kind}{packed}"):
             chosen[kind, number] = other
     for (kind, number), other in [(("tra", ""), path), *chosen.items()]:
@@ -281,8 +281,8 @@ def _read_rows(text: Text) -> _Rows:
     below = sizes[0] if sizes else 2**31 - 2
     names: dict[bytes, int] = {}
     parts: list[list[NDArray]] = [[] for _ in range(6)]
-    given = _KIND.search(text.data, text.begin, min(text.stop, text.begin + 2000))
-    is_interval = given is not None and given[1].startswith(b"I")
+    kind = _KIND.search(text.data, text.begin, min(text.stop, text.begin + 2000))
+    is_interval = kind is not None and kind[1].startswith(b"I")
     for block in rest.blocks(b"#"):
         block = with_whole_brackets(block, width - 1)
         at = block.columns(width, 1, f"{form}, and an action or none")
@@ -392,10 +392,10 @@ def _model(text: Text, sections: list[Section]) -> SparseMDP | IntervalMDP:
     start = np.flatnonzero(new)
     total = np.add.reduceat(rows.probability, start)
     if (bad := first_without_distribution(total)) is not None:
-        row, what, how = bad
+        row, subject, problem = bad
         raise text.error(
             int(rows.line[start[row]]),
-            f"{what} of state {rows.state[start[row]]}, choice {rows.choice[start[row]]} {how}.",
+            f"{subject} of state {rows.state[start[row]]}, choice {rows.choice[start[row]]} {problem}.",
         )
     count = np.bincount(rows.state[start], minlength=rows.num_states)
     action, action_names = _actions(text, rows, start)
@@ -408,15 +408,17 @@ def _model(text: Text, sections: list[Section]) -> SparseMDP | IntervalMDP:
         valuation=read_valuation(sections, rows.num_states),
     )
     starts = np.concatenate([[0], count.cumsum()]), np.append(start, rows.state.size)
-    is_chain, found, probability = rows.is_chain, None, rows.probability
+    is_chain, interval, probability = rows.is_chain, None, rows.probability
     if probability.ndim > 1:
-        found = interval_rows(*starts, rows.target, *probability.T, initial=initial, **annotations)
-        model = found.nominal
+        interval = interval_rows(
+            *starts, rows.target, *probability.T, initial=initial, **annotations
+        )
+        model = interval.nominal
     else:
         model = make_sparse(*starts, rows.target, probability, initial=initial, **annotations)
     del rows, new, start, total, probability, starts  # rewards take memory too
     model = replace(model, rewards=read_rewards(sections, model, is_chain))
-    return model if found is None else replace(found, nominal=model)
+    return model if interval is None else replace(interval, nominal=model)
 
 
 def _actions(text: Text, rows: _Rows, start: Integers) -> tuple[Integers | None, tuple[str, ...]]:

@@ -51,12 +51,12 @@ def _prism_labels(text: Text, num_states: int) -> tuple[Booleans, list[str]]:
     names: dict[bytes, int] = {}
     place = 0
     while place < len(first.rstrip()):
-        found = _LABEL.match(first, place)
-        if found is None or found[1] != b"%d" % len(names) or found[2] in names:
-            shown = first[place : place + 60].strip().decode(errors="replace")
-            raise text.error(line, f"{shown!r}; expected {form}.")
-        names[found[2]] = len(names)
-        place = found.end()
+        match = _LABEL.match(first, place)
+        if match is None or match[1] != b"%d" % len(names) or match[2] in names:
+            actual = first[place : place + 60].strip().decode(errors="replace")
+            raise text.error(line, f"{actual!r}; expected {form}.")
+        names[match[2]] = len(names)
+        place = match.end()
     holds = label_matrix(text, num_states, len(names))
     for block in rest.blocks(b"#"):
         end, at = block.end.copy(), block.first[:-1]
@@ -81,9 +81,9 @@ def _storm_labels(text: Text, num_states: int) -> tuple[Booleans, list[str]]:
     stop = text.data.find(b"#END", text.begin, text.stop)
     if stop < 0:
         raise text.error(text.line, "the labels after '#DECLARATION' do not end; expected '#END'.")
-    given = text.data[text.begin : stop].split()[1:]
-    names = {name: i for i, name in enumerate(given)}
-    if len(names) < len(given):
+    declared = text.data[text.begin : stop].split()[1:]
+    names = {name: i for i, name in enumerate(declared)}
+    if len(names) < len(declared):
         raise text.error(text.line, "a label is declared twice.")
     holds = label_matrix(text, num_states, len(names))
     line = text.line + text.data.count(b"\n", text.begin, stop)
@@ -93,8 +93,8 @@ def _storm_labels(text: Text, num_states: int) -> tuple[Booleans, list[str]]:
         state = np.repeat(block.integers(at, "a state", num_states), block.count - 1)
         labels = _without(at, block.end.size)
         column = numbered(block.texts(labels), names)
-        if len(names) > len(given):
-            bad = int((column >= len(given)).argmax())
+        if len(names) > len(declared):
+            bad = int((column >= len(declared)).argmax())
             raise block.error(int(labels[bad]), "a label that is declared")
         holds[state, column] = True
     return holds, decoded(text, names)
@@ -106,15 +106,15 @@ def read_valuation(sections: list[Section], num_states: int) -> dict[str, NDArra
     if text is None:
         return {}
     first, line, rest = text.first_line(b"#")
-    given = [name.strip() for name in first[1:-1].split(b",")]
-    if first[:1] != b"(" or first[-1:] != b")" or not all(given) or len(set(given)) < len(given):
+    header = [name.strip() for name in first[1:-1].split(b",")]
+    if first[:1] != b"(" or first[-1:] != b")" or not all(header) or len(set(header)) < len(header):
         raise text.error(
             line,
             f"{first[:60].decode(errors='replace')!r}; expected the names of "
             "variables, '(x,y)', each once.",
         )
-    names = decoded(text, dict.fromkeys(given, 0))
-    found: list[list[NDArray]] = [[] for _ in names]
+    names = decoded(text, dict.fromkeys(header, 0))
+    columns_of: list[list[NDArray]] = [[] for _ in names]
     count = 0
     for block in rest.blocks(b"#"):
         columns = _fields(block, len(names))
@@ -123,14 +123,14 @@ def read_valuation(sections: list[Section], num_states: int) -> dict[str, NDArra
         if wrong.any():
             raise block.malformed(int(wrong.argmax()), f"state {count + int(wrong.argmax())}")
         count += state.size
-        for name, part, column in zip(names, found, columns[1:], strict=True):
+        for name, part, column in zip(names, columns_of, columns[1:], strict=True):
             part.append(_values(block, name, column))
     if count != num_states:
         refuse(text.name, f"it has {count} states; expected {num_states}, as in the transitions.")
-    for name, parts in zip(names, found, strict=True):
+    for name, parts in zip(names, columns_of, strict=True):
         if len({part.dtype == bool for part in parts}) > 1:
             refuse(text.name, f"the variable {name!r} has truth values and numbers.")
-    return {name: np.concatenate(parts) for name, parts in zip(names, found, strict=True)}
+    return {name: np.concatenate(parts) for name, parts in zip(names, columns_of, strict=True)}
 
 
 def _fields(block: Block, width: int) -> list[list[bytes]]:
@@ -165,13 +165,13 @@ def _values(block: Block, name: str, texts: list[bytes]) -> NDArray:
         return np.fromiter(map(_integer, texts), np.int64, len(texts))
     except (ValueError, OverflowError):
         pass
-    found = [as_double(x) for x in texts]
-    if None in found:
-        bad = found.index(None)
+    values = [as_double(x) for x in texts]
+    if None in values:
+        bad = values.index(None)
         raise block.malformed(
             bad, f"a value of {name!r}: true, false or a number, in all states alike"
         )
-    return np.array(found, np.float64)
+    return np.array(values, np.float64)
 
 
 def _integer(text: bytes) -> int:
@@ -190,9 +190,9 @@ _TO_BLANKS = bytes.maketrans(b":(),", b"    ")
 def read_rewards(sections: list[Section], model: SparseMDP, is_chain: bool) -> dict[str, Rewards]:
     """Reward structures of a model by name, from its ``srew`` and ``trew`` sections."""
     parts: dict[str, tuple[str, Text, Rewards]] = {}
-    found = [s for s in sections if s[0] in ("srew", "trew")]
-    unnamed = len({number for _, number, text in found if not _reward_name(text)})
-    for kind, number, text in found:
+    reward_sections = [s for s in sections if s[0] in ("srew", "trew")]
+    unnamed = len({number for _, number, text in reward_sections if not _reward_name(text)})
+    for kind, number, text in reward_sections:
         name = _reward_name(text)
         key = name or (number if unnamed > 1 else "")
         part = (
@@ -215,8 +215,8 @@ def read_rewards(sections: list[Section], model: SparseMDP, is_chain: bool) -> d
 
 
 def _reward_name(text: Text) -> str:
-    found = _REWARD_NAME.search(text.data, text.begin, min(text.stop, text.begin + 2000))
-    return decoded(text, {found[1]: 0})[0] if found else ""
+    match = _REWARD_NAME.search(text.data, text.begin, min(text.stop, text.begin + 2000))
+    return decoded(text, {match[1]: 0})[0] if match else ""
 
 
 def _reward_lines(text: Text, num_states: int, form: str) -> tuple[int | None, Text]:
@@ -265,7 +265,7 @@ def _transition_reward(text: Text, model: SparseMDP, is_chain: bool) -> Rewards:
     announced, rest = _reward_lines(text, model.num_states, form)
     host = model.host
     place = host.row.astype(np.int64) * host.num_states + host.successor
-    given, count = np.zeros(host.num_transitions), 0
+    rewards, count = np.zeros(host.num_transitions), 0
     for block in rest.blocks(b"#"):
         at = block.columns(width, 0, form)
         state = block.integers(at, "a state", host.num_states)
@@ -277,12 +277,12 @@ def _transition_reward(text: Text, model: SparseMDP, is_chain: bool) -> Rewards:
         entry = np.minimum(np.searchsorted(place, sought), place.size - 1)
         valid = (place[entry] == sought) & (row < host.row_start[state + 1])
         block.require_form(valid, f"{form} of a transition that exists")
-        given[entry] = block.floats(at + width - 1, "a reward")
+        rewards[entry] = block.floats(at + width - 1, "a reward")
         count += at.size
     _check_announced(text, announced, count)
     if not count:
         return Rewards()
-    choice = given[host.entry_start[:-1]]
-    if (given == choice[host.row]).all():
+    choice = rewards[host.entry_start[:-1]]
+    if (rewards == choice[host.row]).all():
         return Rewards(choice=choice)
-    return Rewards(transition=given)
+    return Rewards(transition=rewards)

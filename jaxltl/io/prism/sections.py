@@ -34,17 +34,17 @@ class Written:
     lines: Callable[[], Iterator[bytes]]
 
 
-def written_sections(given: SparseMDP | IntervalMDP, dialect: str) -> list[Written]:
+def written_sections(source: SparseMDP | IntervalMDP, dialect: str) -> list[Written]:
     """Sections of a model's files, in order; ValueError if the format cannot represent it."""
-    storm, model = dialect == "storm", exact_part(given)
-    chances = value_texts(given, ",")
-    if storm and model is not given:
+    storm, model = dialect == "storm", exact_part(source)
+    chances = value_texts(source, ",")
+    if storm and model is not source:
         raise ValueError(
             "Storm reads no intervals in explicit files; write PRISM's (dialect='prism'), or UMB "
             "or DRN."
         )
     labels, holds = _labels(model, storm)
-    title = ("" if model is given else "I") + ("DTMC" if model.is_chain else "MDP")
+    title = ("" if model is source else "I") + ("DTMC" if model.is_chain else "MDP")
     kind = f"# Transitions ({title})\n".encode()
     action = None if storm and model.is_chain else _action_texts(model)  # Storm reads none there
     sections = [Written("tra", "", [kind], lambda: _transitions(model, chances, action, storm))]
@@ -60,10 +60,10 @@ def written_sections(given: SparseMDP | IntervalMDP, dialect: str) -> list[Writt
     return sections
 
 
-def _plain(names: Iterable[str], what: str, refused: str) -> list[str]:
+def _plain(names: Iterable[str], kind: str, refused: str) -> list[str]:
     """Names, validated against the characters that the format reserves."""
     for name in names:
-        check_name(what, name, refused)
+        check_name(kind, name, refused)
     return list(names)
 
 
@@ -116,8 +116,8 @@ def _action_texts(model: SparseMDP) -> Callable[[int], str] | None:
 
 def _labels(model: SparseMDP, storm: bool) -> tuple[list[str], list[NDArray[np.bool_]]]:
     """Label names, "init" first, and their masks."""
-    found = labels_with_init(model)
-    return _plain(tuple(found), "label", ' "' if storm else '"'), list(found.values())
+    masks = labels_with_init(model)
+    return _plain(tuple(masks), "label", ' "' if storm else '"'), list(masks.values())
 
 
 def _label_lines(names: list[str], holds: list[NDArray[np.bool_]], storm: bool) -> Iterator[bytes]:
@@ -169,20 +169,20 @@ def _rewards(
     state = None if reward.state is None else np.asarray(reward.state, np.float64)
     earned = _on_entries(model, reward)
     if state is not None or earned is None:
-        given = np.zeros(model.num_states) if state is None else state
+        state_rewards = np.zeros(model.num_states) if state is None else state
         yield Written(
             "srew",
             number,
             [title.encode(), b"# State rewards\n"],
-            lambda: _state_rewards(given, storm),
+            lambda: _state_rewards(state_rewards, storm),
         )
     if earned is not None:
-        found = earned
+        entry_rewards = earned
         yield Written(
             "trew",
             number,
             [title.encode(), b"# Transition rewards\n"],
-            lambda: _transition_rewards(model, found, storm),
+            lambda: _transition_rewards(model, entry_rewards, storm),
         )
 
 

@@ -141,39 +141,39 @@ class Index:
 
     def items(self) -> dict[str, Items]:
         """Layout of each member with elements per state, choice or branch."""
-        found = {
+        layouts = {
             "state-to-choices.bin": Items("states", 64, 1),
             "state-is-initial.bin": Items("states", 1),
             "choice-to-branches.bin": Items("choices", 64, 1),
             "branch-to-target.bin": Items("branches", 64),
         }
         if self.players:
-            found["state-to-player.bin"] = Items("states", 32)
+            layouts["state-to-player.bin"] = Items("states", 32)
         if self.probability:
-            found["branch-to-probability.bin"] = Items("branches", self.probability.size)
+            layouts["branch-to-probability.bin"] = Items("branches", self.probability.size)
         if self.actions:
-            found[f"{ACTIONS}/values.bin"] = Items("choices", 32)
+            layouts[f"{ACTIONS}/values.bin"] = Items("choices", 32)
         for one in self.annotations:
             for part in one.applies_to:
                 size = 1 if one.type.name == "bool" else one.type.size
-                found[one.member(part)] = Items(part, size)
-        return found
+                layouts[one.member(part)] = Items(part, size)
+        return layouts
 
     def bounds(self) -> dict[str, tuple[int, int]]:
         """Minimal and maximal size in bytes of each known member."""
         counts = self.counts
         sizes = {name: x.size(counts[x.part]) for name, x in self.items().items()}
-        found = {name: (size, size) for name, size in sizes.items()}
+        bounds = {name: (size, size) for name, size in sizes.items()}
         if self.records:
             widths = [record.size for record in self.records]
-            most = self.states * max(widths)
-            found[f"{VALUATIONS}/valuations.bin"] = (self.states * min(widths), most)
-            found[f"{VALUATIONS}/valuation-to-class.bin"] = (4 * self.states, 4 * self.states)
+            largest = self.states * max(widths)
+            bounds[f"{VALUATIONS}/valuations.bin"] = (self.states * min(widths), largest)
+            bounds[f"{VALUATIONS}/valuation-to-class.bin"] = (4 * self.states, 4 * self.states)
         for folder, count in ((ACTIONS, self.actions), (VALUATIONS, self.texts)):
             if count:
-                found[f"{folder}/string-mapping.bin"] = (8 * (count + 1), 8 * (count + 1))
-                found[f"{folder}/strings.bin"] = (0, _STRINGS_ALLOWED + _MOST_STRING * count)
-        return found
+                bounds[f"{folder}/string-mapping.bin"] = (8 * (count + 1), 8 * (count + 1))
+                bounds[f"{folder}/strings.bin"] = (0, _STRINGS_ALLOWED + _MOST_STRING * count)
+        return bounds
 
 
 def bit_bytes(count: int) -> int:
@@ -247,14 +247,14 @@ def _check_kind(system: Mapping[str, object], counts: Mapping[str, int], place: 
 
 def _annotations(data: object, place: str) -> tuple[Annotation, ...]:
     """Labels, rewards and annotations specific to jaxltl; other groups are ignored."""
-    found: list[Annotation] = []
+    annotations: list[Annotation] = []
     for group in ("aps", OTHER_LABELS, "rewards", INITIAL):
         table = _table(
             _table(data, "annotations", place).get(group, {}), f"the group {group}", place
         )
-        found += [_annotation(group, key, value, place) for key, value in table.items()]
+        annotations += [_annotation(group, key, value, place) for key, value in table.items()]
     seen: set[tuple[bool, str]] = set()
-    for one in found:
+    for one in annotations:
         if one.group == INITIAL:
             continue
         key = (one.group == "rewards", one.name)
@@ -263,41 +263,41 @@ def _annotations(data: object, place: str) -> tuple[Annotation, ...]:
                 f"{place}two annotations are named {one.name!r}; expected distinct names."
             )
         seen.add(key)
-    return tuple(found)
+    return tuple(annotations)
 
 
 def _annotation(group: str, key: str, value: object, place: str) -> Annotation:
-    what = f"annotations/{group}/{key}"
+    path = f"annotations/{group}/{key}"
     if not re.fullmatch(r"[0-9a-z_-]{1,100}", key):
         raise ValueError(
-            f"{place}{_shown(what)}: expected an id of 0-9, a-z, _ and -, at most 100 of them."
+            f"{place}{_shown(path)}: expected an id of 0-9, a-z, _ and -, at most 100 of them."
         )
-    value = _table(value, what, place)
+    value = _table(value, path, place)
     name = value.get("alias", key)
     if not isinstance(name, str):
-        raise ValueError(f"{place}{what}: alias is {_shown(name)}; expected a text.")
-    applies = _get(value, "applies-to", f"{place}{what}: ")
-    known = ["states"] if group != "rewards" else list(PARTS)
+        raise ValueError(f"{place}{path}: alias is {_shown(name)}; expected a text.")
+    applies = _get(value, "applies-to", f"{place}{path}: ")
+    parts = ["states"] if group != "rewards" else list(PARTS)
     if (
         not isinstance(applies, list)
         or not applies
-        or any(x not in known for x in applies)
+        or any(x not in parts for x in applies)
         or len(set(applies)) < len(applies)
     ):
         raise ValueError(
-            f"{place}{what}: applies-to is {_shown(applies)}; expected a list of "
-            f"{', '.join(known)}."
+            f"{place}{path}: applies-to is {_shown(applies)}; expected a list of "
+            f"{', '.join(parts)}."
         )
     if "probability-type" in value:
-        raise ValueError(f"{place}{what}: its values are drawn at random; expected numbers.")
-    kind = _type(_get(value, "type", f"{place}{what}: "), what, place)
+        raise ValueError(f"{place}{path}: its values are drawn at random; expected numbers.")
+    kind = _type(_get(value, "type", f"{place}{path}: "), path, place)
     numbers = ("double", "rational", "int", "uint", "double-interval", "rational-interval")
-    wanted = {"rewards": numbers, INITIAL: ("double",)}.get(group, ("bool",))
+    types = {"rewards": numbers, INITIAL: ("double",)}.get(group, ("bool",))
     longer = kind.name.startswith("rational")  # than usual, it may be
-    if kind.name not in wanted or (not longer and kind.size != _SIZES[kind.name]):
+    if kind.name not in types or (not longer and kind.size != _SIZES[kind.name]):
         raise ValueError(
-            f"{place}{what}: its type is {kind.name} of {kind.size} bits; expected "
-            f"{' or '.join(wanted)} of the usual size."
+            f"{place}{path}: its type is {kind.name} of {kind.size} bits; expected "
+            f"{' or '.join(types)} of the usual size."
         )
     return Annotation(group, key, name, tuple(applies), kind)
 
@@ -333,7 +333,7 @@ def _record(data: object, texts_of_ours: frozenset[str], place: str) -> Record:
     variables = _get(_table(data, "a class", place), "variables", place)
     if not isinstance(variables, list):
         raise ValueError(f"{place}variables is {_shown(variables)}; expected a list.")
-    found: dict[str, Variable] = {}
+    variable_of_name: dict[str, Variable] = {}
     start = 0
     for one in variables:
         one = _table(one, "a variable", place)
@@ -341,7 +341,7 @@ def _record(data: object, texts_of_ours: frozenset[str], place: str) -> Record:
             start += _count(one, "padding", place)
         else:
             name = _get(one, "name", place)
-            if not isinstance(name, str) or name in found:
+            if not isinstance(name, str) or name in variable_of_name:
                 raise ValueError(
                     f"{place}a variable is named {_shown(name)}; expected distinct texts."
                 )
@@ -358,7 +358,7 @@ def _record(data: object, texts_of_ours: frozenset[str], place: str) -> Record:
                 )
             presence, start = (start, start + 1) if optional else (None, start)
             is_text = kind.name == "uint" and name in texts_of_ours
-            found[name] = Variable(name, kind, offset, start, presence, is_text)
+            variable_of_name[name] = Variable(name, kind, offset, start, presence, is_text)
             start += kind.size
         if start > 8 * _MOST_RECORD:
             raise ValueError(
@@ -369,39 +369,39 @@ def _record(data: object, texts_of_ours: frozenset[str], place: str) -> Record:
         raise ValueError(
             f"{place}a state's variables take {start} bits; expected a multiple of 8, with padding."
         )
-    return Record(tuple(found.values()), start // 8)
+    return Record(tuple(variable_of_name.values()), start // 8)
 
 
-def _type(data: object, what: str, place: str) -> Type:
-    data = _table(data, f"the type of {what}", place)
-    name = _get(data, "type", f"{place}{what}: ")
+def _type(data: object, subject: str, place: str) -> Type:
+    data = _table(data, f"the type of {subject}", place)
+    name = _get(data, "type", f"{place}{subject}: ")
     if not isinstance(name, str) or name not in _SIZES:
         raise ValueError(
-            f"{place}{what}: the type is {_shown(name)}; expected one of {', '.join(_SIZES)}."
+            f"{place}{subject}: the type is {_shown(name)}; expected one of {', '.join(_SIZES)}."
         )
-    size = _count(data, "size", f"{place}{what}: ") if "size" in data else _SIZES[name]
+    size = _count(data, "size", f"{place}{subject}: ") if "size" in data else _SIZES[name]
     if not 0 < size < 2**32 or (
         name in ("double", "double-interval", "string") and size != _SIZES[name]
     ):
-        raise ValueError(f"{place}{what}: a {name} of {size} bits; expected {_SIZES[name]}.")
+        raise ValueError(f"{place}{subject}: a {name} of {size} bits; expected {_SIZES[name]}.")
     if name == "rational" and size % 2:
-        raise ValueError(f"{place}{what}: a rational of {size} bits; expected an even number.")
+        raise ValueError(f"{place}{subject}: a rational of {size} bits; expected an even number.")
     return Type(name, size)
 
 
-def _check_number(kind: Type, what: str, place: str) -> None:
+def _check_number(kind: Type, subject: str, place: str) -> None:
     """Raises ValueError unless the type is numeric, with a size in whole words."""
-    known = ("double", "rational", "double-interval", "rational-interval")
-    if kind.name not in known or kind.size % _SIZES[kind.name]:
+    types = ("double", "rational", "double-interval", "rational-interval")
+    if kind.name not in types or kind.size % _SIZES[kind.name]:
         raise ValueError(
-            f"{place}{what} is {kind.name} of {kind.size} bits; expected double of 64, rational of "
+            f"{place}{subject} is {kind.name} of {kind.size} bits; expected double of 64, rational of "
             "a multiple of 128, double-interval of 128 or rational-interval of a multiple of 256."
         )
 
 
-def _table(data: object, what: str, place: str) -> Mapping[str, object]:
+def _table(data: object, subject: str, place: str) -> Mapping[str, object]:
     if not isinstance(data, dict):
-        raise ValueError(f"{place}{what} is {_shown(data)}; expected an object.")
+        raise ValueError(f"{place}{subject} is {_shown(data)}; expected an object.")
     return data
 
 
@@ -440,11 +440,11 @@ def _shown(value: object) -> str:
 
 def ids_for(names: Sequence[str], prefix: str) -> list[str]:
     """Distinct identifiers, equal to the names where these are valid."""
-    found: dict[str, None] = {}
+    ids: dict[str, None] = {}
     taken = set(names)
     for i, name in enumerate(names):
         one = name if re.fullmatch(r"[0-9a-z_-]{1,60}", name) else f"{prefix}{i}"
-        while one in found or (one != name and one in taken):
+        while one in ids or (one != name and one in taken):
             one += "-"
-        found[one] = None
-    return list(found)
+        ids[one] = None
+    return list(ids)

@@ -47,11 +47,11 @@ def known_members(stream: Stream, index: Index) -> Iterator[tuple[str, int]]:
             raise ValueError(f"{stream.place}two members are named {member!r}.")
         if member not in bounds:
             continue
-        least, most = bounds[member]
-        if not least <= size <= most:
-            wanted = f"{most}" if least == most else f"{least} to {most}"
+        least, largest = bounds[member]
+        if not least <= size <= largest:
+            expected = f"{largest}" if least == largest else f"{least} to {largest}"
             raise ValueError(
-                f"{stream.place}{member} has {size} bytes; expected {wanted}, by the counts "
+                f"{stream.place}{member} has {size} bytes; expected {expected}, by the counts "
                 "and types of index.json."
             )
         seen.add(member)
@@ -71,19 +71,19 @@ def check_memory(size: int, place: str) -> None:
         )
 
 
-def needed(found: dict[str, Bytes], member: str, place: str) -> Bytes:
+def needed(contents: dict[str, Bytes], member: str, place: str) -> Bytes:
     """Contents of a required member."""
-    if member not in found:
+    if member not in contents:
         raise ValueError(f"{place}{member} is missing.")
-    return found[member]
+    return contents[member]
 
 
 def starts_of(
-    found: dict[str, Bytes], member: str, count: int, total: int, place: str
+    contents: dict[str, Bytes], member: str, count: int, total: int, place: str
 ) -> NDArray[np.int64]:
     """Offsets of the spans of a member; one element per span if the member is absent."""
-    if member in found:
-        return read_starts(found.pop(member), total, f"{place}{member}: ")
+    if member in contents:
+        return read_starts(contents.pop(member), total, f"{place}{member}: ")
     if count != total:
         raise ValueError(
             f"{place}{member} is missing, so that {count} are mapped to {total} one "
@@ -104,7 +104,7 @@ def check_chain(row_start: NDArray[np.int64], place: str, *, first: int = 0) -> 
 
 
 def labels_of(
-    found: dict[str, Bytes], index: Index, place: str
+    contents: dict[str, Bytes], index: Index, place: str
 ) -> tuple[NDArray[np.bool_], tuple[str, ...]]:
     """Label matrix ``bool[S, P]`` and label names."""
     ours = {x.id: x for x in index.annotations if x.group == OTHER_LABELS}
@@ -117,70 +117,70 @@ def labels_of(
     all_of += ours.values()
     label = np.zeros((index.states, len(all_of)), bool)
     for i, one in enumerate(all_of):
-        label[:, i] = read_bits(needed(found, one.member("states"), place), index.states)
+        label[:, i] = read_bits(needed(contents, one.member("states"), place), index.states)
     return label, tuple(one.name for one in all_of)
 
 
-def rewards_of(found: dict[str, Bytes], index: Index, place: str) -> dict[str, Rewards]:
+def rewards_of(contents: dict[str, Bytes], index: Index, place: str) -> dict[str, Rewards]:
     """Reward structures by name."""
     rewards, begins = {}, dict(zip(PARTS, index.begins, strict=True))
     for one in index.annotations:
         if one.group == "rewards":
             parts = {
                 PARTS[part]: read_points(
-                    found.pop(one.member(part)),
+                    contents.pop(one.member(part)),
                     one.type,
                     f"{place}{one.member(part)}: ",
                     first=begins[part],
                 )
                 for part in one.applies_to
-                if one.member(part) in found
+                if one.member(part) in contents
             }
             rewards[one.name] = Rewards(**parts)
     return rewards
 
 
-def annotations_of(found: dict[str, Bytes], index: Index, place: str) -> Annotations:
+def annotations_of(contents: dict[str, Bytes], index: Index, place: str) -> Annotations:
     """Labels, rewards and actions, as arguments of ``make_sparse``."""
-    label, propositions = labels_of(found, index, place)
+    label, propositions = labels_of(contents, index, place)
     annotations = Annotations(
-        label=label, propositions=propositions, rewards=rewards_of(found, index, place)
+        label=label, propositions=propositions, rewards=rewards_of(contents, index, place)
     )
-    return annotations | actions_of(found, index, place) if index.actions else annotations
+    return annotations | actions_of(contents, index, place) if index.actions else annotations
 
 
-def exact_initial(found: dict[str, Bytes]) -> NDArray[np.float64] | None:
+def exact_initial(contents: dict[str, Bytes]) -> NDArray[np.float64] | None:
     """Initial distribution that is not uniform over the initial states, if any."""
-    content = found.get(EXACT_INITIAL)
+    content = contents.get(EXACT_INITIAL)
     return None if content is None else content.view("<f8").astype(np.float64, copy=False)
 
 
-def actions_of(found: dict[str, Bytes], index: Index, place: str) -> Annotations:
+def actions_of(contents: dict[str, Bytes], index: Index, place: str) -> Annotations:
     """Action numbers of choices, and action names."""
     member = f"{ACTIONS}/values.bin"
     action = np.zeros(index.choices, np.int32)
-    if member in found:
-        action = found.pop(member).view("<u4")
+    if member in contents:
+        action = contents.pop(member).view("<u4")
         if action.size and action.max() >= index.actions:
             raise ValueError(
                 f"{place}{member}: a choice has the action {action.max()}; expected 0 "
                 f"to {index.actions - 1}."
             )
-    return Annotations(action=action, action_names=texts_of(found, ACTIONS, place))
+    return Annotations(action=action, action_names=texts_of(contents, ACTIONS, place))
 
 
-def texts_of(found: dict[str, Bytes], folder: str, place: str) -> tuple[str, ...]:
+def texts_of(contents: dict[str, Bytes], folder: str, place: str) -> tuple[str, ...]:
     """Strings of a folder; empty if it has none."""
     mapping, strings = f"{folder}/string-mapping.bin", f"{folder}/strings.bin"
-    if mapping not in found:
+    if mapping not in contents:
         return ()
-    content = needed(found, strings, place)
-    start = read_starts(found[mapping], content.size, f"{place}{mapping}: ")
-    return read_texts(start, content, f"{place}{strings}: ")
+    encoded = needed(contents, strings, place)
+    start = read_starts(contents[mapping], encoded.size, f"{place}{mapping}: ")
+    return read_texts(start, encoded, f"{place}{strings}: ")
 
 
 def probability_of(
-    found: dict[str, Bytes], index: Index, entry_start: NDArray[np.int64], place: str
+    contents: dict[str, Bytes], index: Index, entry_start: NDArray[np.int64], place: str
 ) -> NDArray[np.float64]:
     """Branch probabilities ``[T]``, or lower and upper bounds ``[T, 2]``."""
     member, kind = "branch-to-probability.bin", index.probability
@@ -189,9 +189,9 @@ def probability_of(
             f"{place}the probabilities of this game are intervals; chains and decision processes "
             "are read with them."
         )
-    if kind is not None and member in found:
+    if kind is not None and member in contents:
         read = read_numbers if kind.end is None else read_ends
-        return read(found.pop(member), kind, f"{place}{member}: ")
+        return read(contents.pop(member), kind, f"{place}{member}: ")
     several = np.flatnonzero(np.diff(entry_start) > 1)
     if several.size:
         count = int(np.diff(entry_start)[several[0]])

@@ -109,14 +109,14 @@ def read_sharded(
 
 def _check_kind(index: Index, place: str) -> None:
     """Raises ValueError for games and interval models."""
-    what = None
+    problem = None
     if index.players > 1:
-        what = f"the model is a game of {index.players} players"
+        problem = f"the model is a game of {index.players} players"
     elif index.probability is not None and index.probability.end is not None:
-        what = "the probabilities are intervals"
-    if what is not None:
+        problem = "the probabilities are intervals"
+    if problem is not None:
         raise ValueError(
-            f"{place}{what}; onto a mesh go chains and decision processes whose probabilities are "
+            f"{place}{problem}; onto a mesh go chains and decision processes whose probabilities are "
             "numbers. Read it by read_model."
         )
 
@@ -144,13 +144,13 @@ class _Archive:
             return Stream(self.data, self.place)
         return Stream(pieces(self.data, self.name, _UNLIMITED), self.place)
 
-    def whole(self, index: Index, wanted: str) -> Bytes:
+    def whole(self, index: Index, name: str) -> Bytes:
         """Contents of a whole member."""
         stream = self.stream()
         for member, size in known_members(stream, index):
-            if member == wanted:
+            if member == name:
                 return _taken(stream, member, [(0, size)]).arrays[0]
-        raise AssertionError(wanted)
+        raise AssertionError(name)
 
 
 @dataclass(frozen=True)
@@ -215,7 +215,7 @@ def _read(archive: _Archive, index: Index, ranges: list[_Span]) -> _Held:
     _presume(index, held)
     goes_on = True
     while goes_on or "branches" not in held.spans:
-        goes_on, known = False, set(held.spans)
+        goes_on, previous = False, set(held.spans)
         stream = archive.stream()
         for member, size in known_members(stream, index):
             if member in held.found:
@@ -225,14 +225,16 @@ def _read(archive: _Archive, index: Index, ranges: list[_Span]) -> _Held:
             elif member in items and items[member].part not in held.spans:
                 goes_on = True
             elif member in items:
-                wanted = [items[member].span(*x) for x in held.spans[items[member].part]]
+                ranges_of_bytes = [items[member].span(*x) for x in held.spans[items[member].part]]
                 if items[member].more:
-                    wanted += [(0, 8), (size - 8, size)]
-                held.found[member] = _taken(stream, member, wanted)
+                    ranges_of_bytes += [(0, 8), (size - 8, size)]
+                held.found[member] = _taken(stream, member, ranges_of_bytes)
                 if items[member].more:
                     goes_on |= _lead_on(archive, index, held, items, member)
         for part, (member, ahead) in _AHEAD.items():
-            if part in known and member not in held.found:  # it was not there, so it is not needed
+            if (
+                part in previous and member not in held.found
+            ):  # it was not there, so it is not needed
                 starts_of({}, member, index.counts[part], index.counts[ahead], archive.place)
     return held
 
@@ -283,7 +285,7 @@ def _parts(
     for i, span in enumerate(ranges):
         spans = {part: x[i] for part, x in held.spans.items()}
         here = index.of(*(spans[part] for part in index.counts))
-        found = {
+        contents = {
             member: _of_range(runs, items[member], spans[items[member].part])
             for member, runs in held.found.items()
             if member in items and not items[member].more
@@ -294,7 +296,7 @@ def _parts(
             else np.arange(spans[part][1] - spans[part][0] + 1)
             for part, (_, ahead) in _AHEAD.items()
         ]
-        part, names = _part(found | whole, here, starts, index.states, some, place)
+        part, names = _part(contents | whole, here, starts, index.states, some, place)
         yield span, part, names
 
 
@@ -315,7 +317,7 @@ def _some_initial(held: _Held, index: Index) -> int:
 
 
 def _part(
-    found: dict[str, Bytes],
+    contents: dict[str, Bytes],
     index: Index,
     starts: list[NDArray[np.int64]],
     num_states: int,
@@ -324,16 +326,16 @@ def _part(
 ) -> tuple[ModelPart, tuple[str, ...]]:
     """Model part of one range of states, and the label names."""
     row_start, entry_start = starts
-    target = needed(found, "branch-to-target.bin", place).view("<u8")
+    target = needed(contents, "branch-to-target.bin", place).view("<u8")
     if index.players == 0:
         check_chain(row_start, place, first=index.begins[0])
-    annotations = annotations_of(found, index, place)
-    probability = probability_of(found, index, entry_start, place)
-    initial = exact_initial(found)
+    annotations = annotations_of(contents, index, place)
+    probability = probability_of(contents, index, entry_start, place)
+    initial = exact_initial(contents)
     if initial is None:
         initial = np.full(index.states, 1 / num_states)
         if some:
-            initial = read_bits(found[_IS_INITIAL], index.states) / some
+            initial = read_bits(contents[_IS_INITIAL], index.states) / some
     try:
         model = sparse_part(
             row_start,

@@ -43,38 +43,40 @@ class Stream:
             return self._source[self.position : self.position + _STEP] or None
         return next(self._source, None)
 
-    def _some(self, most: int) -> memoryview:
+    def _some(self, limit: int) -> memoryview:
         """Between 1 and `most` bytes; empty at the end."""
         while not self._held:
             piece = self._next()
             if piece is None:
                 return self._held
             self._held = memoryview(piece)
-        some, self._held = self._held[:most], self._held[most:]
+        some, self._held = self._held[:limit], self._held[limit:]
         self.position += len(some)
         return some
 
-    def fill(self, target: bytearray | NDArray[np.uint8], what: str) -> None:
+    def fill(self, target: bytearray | NDArray[np.uint8], subject: str) -> None:
         """Fills a uint8 array or bytearray; ValueError at a premature end."""
         view, done = memoryview(target), 0  # type: ignore[arg-type]  # a Buffer since Python 3.12
         while done < len(view):
             some = self._some(len(view) - done)
             if not some:
                 raise ValueError(
-                    f"{self.place}{what}: the archive ends after {done} of "
+                    f"{self.place}{subject}: the archive ends after {done} of "
                     f"{len(view)} bytes; it is cut off."
                 )
             view[done : done + len(some)] = some
             done += len(some)
 
-    def skip(self, count: int, what: str) -> None:
+    def skip(self, count: int, subject: str) -> None:
         """Skips bytes; ValueError at a premature end."""
         end = self.position + count
         if isinstance(self._source, FileBytes) and count > len(self._held):
             self._held, self.position = memoryview(b""), min(end, len(self._source))
         while self.position < end:
             if not self._some(end - self.position):
-                raise ValueError(f"{self.place}{what}: the archive ends within it; it is cut off.")
+                raise ValueError(
+                    f"{self.place}{subject}: the archive ends within it; it is cut off."
+                )
 
     def drain(self) -> None:
         """Reads to the end, which verifies the checksum of a compressed stream."""
@@ -126,24 +128,24 @@ def _read_header(header: bytes, place: str, first: bool) -> tuple[bytes, str, in
     name = header[:100].split(b"\0")[0]
     if header[257:263] == b"ustar\0" and header[345]:
         name = header[345:500].split(b"\0")[0] + b"/" + name
-    shown = _text(name, place)
-    given = _number(header[148:156], f"{place}{shown!r}: its checksum")
-    found = sum(header) - sum(header[148:156]) + 8 * 32
-    if given != found:
+    decoded = _text(name, place)
+    stored = _number(header[148:156], f"{place}{decoded!r}: its checksum")
+    checksum = sum(header) - sum(header[148:156]) + 8 * 32
+    if stored != checksum:
         raise ValueError(
-            f"{place}{shown!r}: the checksum of its header is {given}, expected "
-            f"{found}; the archive is damaged."
+            f"{place}{decoded!r}: the checksum of its header is {stored}, expected "
+            f"{checksum}; the archive is damaged."
         )
-    return header[156:157], shown, _number(header[124:136], f"{place}{shown!r}: its size")
+    return header[156:157], decoded, _number(header[124:136], f"{place}{decoded!r}: its size")
 
 
-def _number(field: bytes, what: str) -> int:
+def _number(field: bytes, subject: str) -> int:
     """Octal field, or binary if the first bit is set (GNU)."""
     if field[0] == 0x80:
         return int.from_bytes(field[1:], "big")
     digits = field.split(b"\0")[0].strip(b" ")
     if not re.fullmatch(rb"[0-7]*", digits):
-        raise ValueError(f"{what} is {digits!r}; expected octal digits.")
+        raise ValueError(f"{subject} is {digits!r}; expected octal digits.")
     return int(digits or b"0", 8)
 
 

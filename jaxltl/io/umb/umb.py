@@ -91,36 +91,38 @@ def read_umb(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP | Game:
     data = raw_bytes(path)
     try:
         index = read_index(Stream(pieces(data, name), place))
-        found = _read_members(data, index, name, place)
+        contents = _read_members(data, index, name, place)
         del data
-        return _model(found, index, place)
+        return _model(contents, index, place)
     except MemoryError:
         raise ValueError(f"{place}the model does not fit into the memory.") from None
 
 
 def _read_members(data: bytes, index: Index, name: str, place: str) -> dict[str, Bytes]:
     """Contents of all indexed members, checked for size."""
-    check_memory(sum(most for _, most in index.bounds().values()), place)
-    found: dict[str, Bytes] = {}
+    check_memory(sum(largest for _, largest in index.bounds().values()), place)
+    contents: dict[str, Bytes] = {}
     stream = Stream(pieces(data, name), place)
     for member, size in known_members(stream, index):
-        found[member] = np.empty(size, np.uint8)
-        stream.fill(found[member], member)
-    return found
+        contents[member] = np.empty(size, np.uint8)
+        stream.fill(contents[member], member)
+    return contents
 
 
-def _model(found: dict[str, Bytes], index: Index, place: str) -> SparseMDP | IntervalMDP | Game:
-    row_start = starts_of(found, "state-to-choices.bin", index.states, index.choices, place)
-    entry_start = starts_of(found, "choice-to-branches.bin", index.choices, index.branches, place)
-    target = needed(found, "branch-to-target.bin", place).view("<u8")
+def _model(contents: dict[str, Bytes], index: Index, place: str) -> SparseMDP | IntervalMDP | Game:
+    row_start = starts_of(contents, "state-to-choices.bin", index.states, index.choices, place)
+    entry_start = starts_of(
+        contents, "choice-to-branches.bin", index.choices, index.branches, place
+    )
+    target = needed(contents, "branch-to-target.bin", place).view("<u8")
     if index.players == 0:
         check_chain(row_start, place)
-    annotations = annotations_of(found, index, place)
-    if f"{VALUATIONS}/valuations.bin" in found:
-        annotations["valuation"] = _valuation(found, index, place)
-    probability = probability_of(found, index, entry_start, place)
-    initial = _initial(found, index)
-    owner = _owners(found, index, row_start, place)
+    annotations = annotations_of(contents, index, place)
+    if f"{VALUATIONS}/valuations.bin" in contents:
+        annotations["valuation"] = _valuation(contents, index, place)
+    probability = probability_of(contents, index, entry_start, place)
+    initial = _initial(contents, index)
+    owner = _owners(contents, index, row_start, place)
     rows = row_start, entry_start, target
     interval = None
     try:
@@ -131,7 +133,7 @@ def _model(found: dict[str, Bytes], index: Index, place: str) -> SparseMDP | Int
             model = make_sparse(*rows, probability, initial=initial, **annotations)
     except ValueError as error:
         raise ValueError(f"{place}{error}") from None
-    exact = exact_initial(found)
+    exact = exact_initial(contents)
     if exact is not None:  # validation may have rescaled it
         model = replace(model, initial=exact)
     if interval is not None:
@@ -139,38 +141,40 @@ def _model(found: dict[str, Bytes], index: Index, place: str) -> SparseMDP | Int
     return model if owner is None else make_game(model, owner)
 
 
-def _valuation(found: dict[str, Bytes], index: Index, place: str) -> dict[str, NDArray[np.generic]]:
-    of_class = found.get(f"{VALUATIONS}/valuation-to-class.bin")
+def _valuation(
+    contents: dict[str, Bytes], index: Index, place: str
+) -> dict[str, NDArray[np.generic]]:
+    of_class = contents.get(f"{VALUATIONS}/valuation-to-class.bin")
     return read_variables(
-        found.pop(f"{VALUATIONS}/valuations.bin"),
+        contents.pop(f"{VALUATIONS}/valuations.bin"),
         None if of_class is None else of_class.view("<u4"),
         index.records,
         index.states,
-        texts_of(found, VALUATIONS, place),
+        texts_of(contents, VALUATIONS, place),
         f"{place}{VALUATIONS}/valuations.bin: ",
     )
 
 
-def _initial(found: dict[str, Bytes], index: Index) -> NDArray[np.float64] | None:
+def _initial(contents: dict[str, Bytes], index: Index) -> NDArray[np.float64] | None:
     """Initial distribution; None for the uniform one over all states."""
-    exact = exact_initial(found)
+    exact = exact_initial(contents)
     if exact is not None:
         return exact
-    if "state-is-initial.bin" not in found:
+    if "state-is-initial.bin" not in contents:
         return None
-    return uniform(read_bits(found["state-is-initial.bin"], index.states))
+    return uniform(read_bits(contents["state-is-initial.bin"], index.states))
 
 
 def _owners(
-    found: dict[str, Bytes], index: Index, row_start: NDArray[np.int64], place: str
+    contents: dict[str, Bytes], index: Index, row_start: NDArray[np.int64], place: str
 ) -> NDArray[np.bool_] | None:
     """Mask of the system's states in a two-player game; None for other models."""
     if index.players < 2:
         return None
     member = "state-to-player.bin"
     player = np.zeros(index.states, np.uint32)
-    if member in found:
-        player = found[member].view("<u4")
+    if member in contents:
+        player = contents[member].view("<u4")
     if player.max() >= index.players:
         raise ValueError(
             f"{place}{member}: a state is of player {player.max()}; expected 0 to "
@@ -358,8 +362,8 @@ def _annotations(
         add(group, key, name, _BOOL, {"states": write_bits(label[:, i])})
     names = list(model.rewards)
     for name, key in zip(names, ids_for(names, "r"), strict=True):
-        given = {part: getattr(model.rewards[name], ours) for part, ours in PARTS.items()}
-        parts = {part: x for part, x in given.items() if x is not None}
+        reward_parts = {part: getattr(model.rewards[name], ours) for part, ours in PARTS.items()}
+        parts = {part: x for part, x in reward_parts.items() if x is not None}
         parts = parts or {"states": np.zeros(model.num_states)}
         packed = {k: _pairs(x, x) if points else _packed(x, "<f8") for k, x in parts.items()}
         add("rewards", key, name, _INTERVAL if points else _DOUBLE, packed)

@@ -25,11 +25,11 @@ def read_bits(content: Bytes, count: int) -> NDArray[np.bool_]:
 
 def count_bits(content: Bytes, count: int) -> int:
     """Number of ones among the first `count` bits."""
-    step, found = 2**20, 0
+    step, total = 2**20, 0
     for begin in range(0, count, 8 * step):
         block = content[begin // 8 : begin // 8 + step]
-        found += int(read_bits(block, min(count - begin, 8 * step)).sum())
-    return found
+        total += int(read_bits(block, min(count - begin, 8 * step)).sum())
+    return total
 
 
 def write_bits(bits: NDArray[np.bool_]) -> Bytes:
@@ -67,8 +67,8 @@ def read_numbers(content: Bytes, kind: Type, place: str) -> NDArray[np.float64]:
 def read_ends(content: Bytes, kind: Type, place: str) -> NDArray[np.float64]:
     """Interval bounds ``float64[n, 2]``; numbers become point intervals."""
     if kind.end is None:
-        found = read_numbers(content, kind, place)
-        return np.stack([found, found], 1)
+        numbers = read_numbers(content, kind, place)
+        return np.stack([numbers, numbers], 1)
     return read_numbers(content, kind.end, place).reshape(-1, 2)
 
 
@@ -90,19 +90,19 @@ def read_points(content: Bytes, kind: Type, place: str, *, first: int = 0) -> ND
 def _read_rationals(content: Bytes, place: str) -> NDArray[np.float64]:
     """Rationals (numerator and denominator, half a record each) as doubles."""
     half = content.shape[1] // 2
-    found = np.zeros(len(content))
+    doubles = np.zeros(len(content))
     hard = np.ones(len(content), bool)
     if half == 8:
         pairs = np.ascontiguousarray(content).view("<i8")
         above, below = pairs[:, 0], pairs[:, 1]
         # A quotient of two doubles is rounded once; a denominator with its first bit set is large.
         hard = (above < -_EXACT) | (above > _EXACT) | (below <= 0) | (below > _EXACT)
-        np.divide(above, below, out=found, where=~hard)
+        np.divide(above, below, out=doubles, where=~hard)
     if hard.any():
         records, which = np.unique(content[hard], axis=0, return_inverse=True)
         values = np.array([_quotient(record.tobytes(), half, place) for record in records])
-        found[hard] = values[which.ravel()]
-    return found
+        doubles[hard] = values[which.ravel()]
+    return doubles
 
 
 def _quotient(record: bytes, half: int, place: str) -> float:
@@ -161,8 +161,8 @@ def read_variables(
         else:
             raw = content[(end[chosen] - record.size)[:, None] + np.arange(record.size)]
         for variable in record.variables:
-            what = f"{place}the variable {variable.name!r} "
-            values = _read_variable(raw, variable, texts, what)
+            subject = f"{place}the variable {variable.name!r} "
+            values = _read_variable(raw, variable, texts, subject)
             if values is None:
                 continue
             if variable.presence is not None:
@@ -179,12 +179,12 @@ _Part = tuple[NDArray[np.intp], Values]  # some states, and the values there
 
 
 def _read_variable(
-    raw: Bytes, variable: Variable, texts: Sequence[str], what: str
+    raw: Bytes, variable: Variable, texts: Sequence[str], subject: str
 ) -> Values | None:
     """Value of a variable in each record, or None if it is unsupported."""
     kind = variable.type
     if kind.name.endswith("-interval"):
-        raise ValueError(f"{what}is {kind.name}; expected single values.")
+        raise ValueError(f"{subject}is {kind.name}; expected single values.")
     if kind.name in ("int", "uint") and kind.size > 64:
         return None
     field = _field(raw, variable.start, kind.size)
@@ -193,25 +193,25 @@ def _read_variable(
     if kind.name == "double":
         return np.ascontiguousarray(field).view("<f8")[:, 0].astype(np.float64, copy=False)
     if kind.name == "string":
-        return _texts(np.ascontiguousarray(field).view("<u8")[:, 0], texts, what)
+        return _texts(np.ascontiguousarray(field).view("<u8")[:, 0], texts, subject)
     if kind.name != "rational":
-        values = _whole_numbers(field, variable, what)
-        return _texts(values, texts, what) if variable.is_text else values
+        values = _whole_numbers(field, variable, subject)
+        return _texts(values, texts, subject) if variable.is_text else values
     if kind.size % 16:
-        raise ValueError(f"{what}is a rational of {kind.size} bits; expected whole bytes.")
+        raise ValueError(f"{subject}is a rational of {kind.size} bits; expected whole bytes.")
     values = np.full(len(raw), np.nan)
     there = np.ones(len(raw), bool)
     if variable.presence is not None:  # what is absent may have the denominator 0
         there = _field(raw, variable.presence, 1)[:, 0] > 0
-    values[there] = _read_rationals(field[there], what)
+    values[there] = _read_rationals(field[there], subject)
     return values
 
 
-def _texts(number: Values, texts: Sequence[str], what: str) -> Values:
+def _texts(number: Values, texts: Sequence[str], subject: str) -> Values:
     """Strings by index."""
     used, which = np.unique(number, return_inverse=True)
     if used[0] < 0 or used[-1] >= len(texts):
-        raise ValueError(f"{what}has the text {used[-1]}; there are {len(texts)}.")
+        raise ValueError(f"{subject}has the text {used[-1]}; there are {len(texts)}.")
     chosen = [texts[i] for i in used.tolist()]
     # NumPy gives every text the room of the longest one.
     dtype = object if 4 * number.size * max(map(len, chosen)) > _MOST_TEXT else str
@@ -232,7 +232,7 @@ def _field(raw: Bytes, start: int, size: int) -> Bytes:
     return field
 
 
-def _whole_numbers(field: Bytes, variable: Variable, what: str) -> Values:
+def _whole_numbers(field: Bytes, variable: Variable, subject: str) -> Values:
     """Integers with offset, in the smallest of int32, int64 and uint64 that fits the type."""
     size, offset, signed = variable.type.size, variable.offset, variable.type.name == "int"
     wide = np.zeros((len(field), 8), np.uint8)
@@ -241,39 +241,39 @@ def _whole_numbers(field: Bytes, variable: Variable, what: str) -> Values:
     if signed and size < 64:  # the sign goes into the bits above
         sign = np.uint64(1) << np.uint64(size - 1)
         bits = (bits ^ sign) - sign
-    least, most = (-(2 ** (size - 1)), 2 ** (size - 1) - 1) if signed else (0, 2**size - 1)
-    if not -(2**63) <= least + offset <= most + offset < 2**64 or (
-        least + offset < 0 and most + offset >= 2**63
+    smallest, largest = (-(2 ** (size - 1)), 2 ** (size - 1) - 1) if signed else (0, 2**size - 1)
+    if not -(2**63) <= smallest + offset <= largest + offset < 2**64 or (
+        smallest + offset < 0 and largest + offset >= 2**63
     ):
         # Only the values themselves may fit.
         seen = bits.view(np.int64) if signed else bits
-        least, most = int(seen.min(initial=0)), int(seen.max(initial=0))
-    least, most = least + offset, most + offset
+        smallest, largest = int(seen.min(initial=0)), int(seen.max(initial=0))
+    smallest, largest = smallest + offset, largest + offset
     # Sums are those of the numbers modulo 2^64, which is all there is if these fit.
     total = bits + np.uint64(offset % 2**64)
-    if least >= -(2**31) and most < 2**31:
+    if smallest >= -(2**31) and largest < 2**31:
         return total.view(np.int64).astype(np.int32)
-    if least >= -(2**63) and most < 2**63:
+    if smallest >= -(2**63) and largest < 2**63:
         return total.view(np.int64)
-    if least >= 0 and most < 2**64:
+    if smallest >= 0 and largest < 2**64:
         return total
-    raise ValueError(f"{what}goes from {least} to {most}; expected numbers of 64 bits.")
+    raise ValueError(f"{subject}goes from {smallest} to {largest}; expected numbers of 64 bits.")
 
 
-def _joined(parts: Sequence[_Part], count: int, what: str) -> Values:
+def _joined(parts: Sequence[_Part], count: int, subject: str) -> Values:
     """Values of a variable, merged over all classes of states."""
     if len(parts) == 1 and parts[0][0].size == count:
         return parts[0][1]
     texts = {values.dtype.kind in "UO" for _, values in parts}
     if len(texts) > 1:
-        raise ValueError(f"{what}is a text in some states only; expected one type.")
+        raise ValueError(f"{subject}is a text in some states only; expected one type.")
     dtype = np.result_type(*(values.dtype for _, values in parts))
-    found: Values = np.full(count, "" if True in texts else 0, dtype)
+    joined: Values = np.full(count, "" if True in texts else 0, dtype)
     if sum(states.size for states, _ in parts) < count and True not in texts:
-        found = np.full(count, np.nan)
+        joined = np.full(count, np.nan)
     for states, values in parts:
-        found[states] = values
-    return found
+        joined[states] = values
+    return joined
 
 
 @dataclass(frozen=True)
