@@ -13,7 +13,7 @@ from operator import itemgetter
 
 from jaxltl.io.files import streamed
 
-_STEP = 2**13  # bytes whose fields are held at a time; more of them cost more
+_STEP = 2**13  # bytes per batch; larger batches are slower
 _LONGEST = 2**16  # bytes of a line
 _JUNK = re.compile(rb"[\x00-\x08\x0b-\x1f\x7f]")  # of no text; a tab may stand in one
 _BOM = b"\xef\xbb\xbf"
@@ -101,14 +101,12 @@ def _rows(name: str, first: int, data: bytes) -> list[list[str]]:
         data = data.replace(b"\r\n", b"\n")
     if junk := _JUNK.search(data):
         line = first + data.count(b"\n", 0, junk.start())
-        raise _error(
-            name, line, f"byte {data[junk.start()]:#x} is of no text; a table is expected."
-        )
+        raise _error(name, line, f"byte {data[junk.start()]:#x} is not text; expected a table.")
     try:
         lines = data.decode().split("\n")
     except UnicodeDecodeError as error:
         line = first + data.count(b"\n", 0, error.start)
-        message = f"byte {data[error.start]:#x} is no UTF-8 text; a table is expected."
+        message = f"byte {data[error.start]:#x} is not UTF-8 text; expected a table."
         raise _error(name, line, message) from None
     if not lines[-1]:
         lines.pop()
@@ -117,7 +115,7 @@ def _rows(name: str, first: int, data: bytes) -> list[list[str]]:
         rows = list(reader)
     except csv.Error as error:
         raise _error(name, first + max(reader.line_num, 1) - 1, f"{error}.") from None
-    if len(rows) < len(lines):  # a quote went on over the end of its line
+    if len(rows) < len(lines):  # a quoted field contains a line end
         reader = csv.reader(lines, strict=True, skipinitialspace=True)
         whole = next(i for i, _ in enumerate(reader) if reader.line_num > i + 1)
         raise _error(name, first + whole, "a quote is not closed on its line.")
@@ -173,7 +171,7 @@ def _picked(name: str, first: int, rows: list[list[str]], place: tuple[int, ...]
 def _check_fields(lines: Lines, columns: Sequence[str]) -> None:
     header = tuple(columns)
     if header in lines.times:
-        raise lines.error(header, "the header stands here again; remove it.")
+        raise lines.error(header, "this line repeats the header; remove it.")
     if "" in chain.from_iterable(lines.times):
         fields = next(x for x in lines.times if "" in x)
         raise lines.error(fields, f"the field of column {columns[fields.index('')]!r} is empty.")

@@ -17,11 +17,11 @@ from jaxltl.core import validation
 Compression = Literal["gzip", "xz"]
 
 MAX_BYTES = 2**34  # of a file, after decompression
-MAX_RATIO = 300  # a compressed file may grow by this, after the first ALWAYS_ALLOWED bytes
+MAX_RATIO = 300  # maximal compression ratio beyond ALWAYS_ALLOWED bytes
 ALWAYS_ALLOWED = 2**28
-_XZ_MEMORY = 2**28  # what a decoder may take; `xz -9` asks for 65 MB
-_STEP = 2**20  # bytes that come out at a time
-_FED = 2**14  # bytes that go in
+_XZ_MEMORY = 2**28  # memory limit of the decoder; `xz -9` requires 65 MB
+_STEP = 2**20  # output bytes per step
+_FED = 2**14  # input bytes per step
 
 _BEGINS: dict[Compression, bytes] = {"gzip": b"\x1f\x8b", "xz": b"\xfd7zXZ\x00"}
 _SUFFIX: dict[str, Compression] = {".gz": "gzip", ".xz": "xz"}
@@ -38,7 +38,7 @@ def read_bytes(path: str | os.PathLike[str], limit: int = MAX_BYTES) -> bytes:
 
 
 def _check_path(path: object) -> None:
-    if not isinstance(path, str | os.PathLike):  # numbers would be files that are open already
+    if not isinstance(path, str | os.PathLike):  # integers would be file descriptors
         raise ValueError(f"path is {validation.shorten(path)}; give the name of a file.")
 
 
@@ -100,7 +100,7 @@ def pieces(data: bytes | FileBytes, name: str, limit: int = MAX_BYTES) -> Iterat
         yield from _decompressed(data, kind, allowed, name)
     except (zlib.error, lzma.LZMAError, EOFError, MemoryError) as error:
         raise ValueError(
-            f"{name!r} begins as {kind} does and is damaged: {error or 'out of memory'}."
+            f"{name!r} has the header of {kind} and is damaged: {error or 'out of memory'}."
         ) from None
 
 
@@ -148,7 +148,7 @@ def read_text(path: str | os.PathLike[str], expected: str) -> str:
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
         raise ValueError(
-            f"{path}, line {line}: byte {data[error.start]:#x} is no UTF-8 text; {expected} is "
+            f"{path}, line {line}: byte {data[error.start]:#x} is not UTF-8 text; {expected} is "
             "expected."
         ) from None
 
@@ -171,7 +171,7 @@ def _decompressed(
     data: bytes | FileBytes, kind: Compression, allowed: int, name: str
 ) -> Iterator[bytes]:
     size = place = 0
-    while place < len(data):  # several streams may follow one another, and zeros pad the last
+    while place < len(data):  # concatenated streams with zero padding
         if not _begins(data, place, kind):
             rest = data[place:]
             if rest.count(0) == len(rest):
@@ -181,8 +181,8 @@ def _decompressed(
             size += len(part)
             if size > allowed:
                 raise ValueError(
-                    f"{name!r}, {len(data)} bytes of {kind}, holds more than {allowed} bytes; if "
-                    "that is right, decompress it and read what comes out."
+                    f"{name!r}, {len(data)} bytes of {kind}, holds more than {allowed} bytes; decompress "
+                    "it first if this size is intended."
                 )
             yield part
 

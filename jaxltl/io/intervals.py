@@ -15,7 +15,7 @@ EXPECTED = "a probability or an interval [l, u] with 0 <= l <= u <= 1"
 _SIGN = bytes_of(b"[,]\n")
 _TO_BLANKS = bytes.maketrans(b"[,]", b"   ")
 _SHAPE = re.compile(rb"(?:\[,\]\n|\n)*+")
-# A line of a state or an action whose rewards hold brackets.
+# Line of a state or an action with bracketed rewards.
 _REWARDS = re.compile(
     rb"^([ \t]*(?:state|action)[ \t]+\S+[ \t]*\[)"
     rb"((?:[^\"\n\[\]]*\[[^\"\n\[\]]*\])+[^\"\n\[\]]*)(\])",
@@ -49,7 +49,7 @@ def with_whole_brackets(block: Block, column: int, lines: Booleans | None = None
     at, last, line = at[closes], last[closes], line[closes]
     end, first = block.end.copy(), block.first.copy()
     end[at] = block.end[last]
-    inner = np.zeros(end.size + 1, np.int64)  # 1 from behind a bracket's first token to its last
+    inner = np.zeros(end.size + 1, np.int64)  # 1 on the second to last token of a bracket
     np.add.at(inner, at + 1, 1)
     np.add.at(inner, last + 1, -1)
     kept = inner.cumsum()[:-1] == 0
@@ -63,7 +63,7 @@ def intervals(block: Block, token: Integers) -> tuple[Floats, Floats]:
     """Lower and upper bounds of tokens ``p`` or ``[l, u]``: ``float64[...]`` twice."""
     numbers = _numbers(block, token)
     if numbers is None:
-        low, high = 0, token.size  # the first wrong one is among these
+        low, high = 0, token.size  # bisection for the first malformed token
         while high - low > 1:
             middle = (low + high) // 2
             fits = _numbers(block, token[low:middle]) is not None
@@ -94,7 +94,7 @@ def _numbers(block: Block, token: Integers) -> Block | None:
     data = np.frombuffer(joined.tobytes().translate(_TO_BLANKS), np.uint8)
     start, end = edges(data)
     count = np.diff(np.searchsorted(start, np.append(begin, data.size)))
-    # One number on either side of each comma.
+    # Each comma must have one number on either side.
     of = np.searchsorted(start, np.flatnonzero(comma))
     first = np.concatenate([[0], count.cumsum()])
     if (count != 1 + opened).any() or (of != first[1:][opened] - 1).any():

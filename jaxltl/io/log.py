@@ -28,7 +28,7 @@ from jaxltl.io.csv_columns import Lines, read_columns
 
 _COUNT = re.compile(r"[0-9]{1,16}")
 _MOST = 2**53  # transitions
-_HELD = 2**16  # distinct lines that are kept before those alike are put together
+_HELD = 2**16  # distinct lines buffered before equal ones are merged
 
 
 def read_log(
@@ -83,8 +83,8 @@ def read_log(
     support = None
     if model is not None:
         if states is not None or actions is not None:
-            raise ValueError("model and names are both given; a model has names of its own.")
-        # Successors that stand twice in a row are one, by name.
+            raise ValueError("model and names are both given; pass one of them.")
+        # Duplicate successors of a row are merged.
         support = places(to_sparse(model) if isinstance(model, MDP | DenseMDP) else model)
         states, actions = support.states, support.actions
     if not isinstance(count, str):
@@ -176,7 +176,7 @@ def _names(kind: str, names: Sequence[str] | None) -> _Names:
     number = {x: i for i, x in enumerate(every)}
     if len(number) < len(every):
         twice = next(x for i, x in enumerate(every) if number[x] != i)
-        raise ValueError(f"the name {twice!r} stands twice; names tell states, or actions, apart.")
+        raise ValueError(f"the name {twice!r} stands twice; names must be distinct.")
     return _Names(number, names is not None)
 
 
@@ -216,7 +216,7 @@ def _numbers(
         if new and names.complete:
             i = next(i for i, text in enumerate(column) if text in new)
             raise lines.error(distinct[i], _unknown(kind, column[i], list(names.number)))
-        for text in new:  # in any order; names are put in theirs at the end
+        for text in new:  # in any order; sorted at the end
             names.number[text] = len(names.number)
         columns.append([names.number[text] for text in column])
     return columns

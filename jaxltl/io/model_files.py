@@ -21,7 +21,7 @@ from jaxltl.io.pgsolver import read_pgsolver, write_pgsolver
 from jaxltl.io.prism.explicit import read_prism, write_prism
 from jaxltl.io.umb.umb import read_umb, write_umb
 
-_BEGINNING = 4096  # bytes by which a format is known
+_BEGINNING = 4096  # bytes inspected to detect the format
 
 
 @dataclass(frozen=True)
@@ -117,9 +117,7 @@ def write_model(path: str | os.PathLike[str], model: Model) -> None:
     """
     form = _by_name(path)
     if form is None:
-        raise ValueError(
-            f"{str(path)!r}: the format is not known by the end of the name; known are {_known()}."
-        )
+        raise ValueError(f"{str(path)!r}: the suffix names no format; known are {_known()}.")
     is_game = isinstance(model, Game)
     if is_game and form.holds == "models":
         raise ValueError(
@@ -162,8 +160,7 @@ def _by_beginning(path: str | os.PathLike[str]) -> Format:
     if first.startswith(b"@") or b"\n@type:" in start:
         return _named("DRN")
     raise ValueError(
-        f"{name!r}: the format is known neither by the end of the name nor by how the "
-        f"file begins; known are {_known()}."
+        f"{name!r}: neither the suffix nor the contents name a known format; known are {_known()}."
     )
 
 

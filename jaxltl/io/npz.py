@@ -27,7 +27,7 @@ from jaxltl.io.text_output import exact_part
 Arrays = Mapping[str, Array]
 SparseT = TypeVar("SparseT", SparseMDP, IntervalMDP)
 
-# By name: the kinds that NumPy may have of each, and what they are called.
+# Admissible NumPy kinds of each array, and their description.
 _NUMBERS = ("biuf", "numbers")
 _TRUTH = ("biuf", "truth values")
 _WHOLE = ("iu", "whole numbers")
@@ -89,12 +89,12 @@ def _check_size(raw: bytes, name: str) -> None:
     try:
         with zipfile.ZipFile(io.BytesIO(raw)) as archive:
             size = sum(entry.file_size for entry in archive.infolist())
-    except Exception:  # damaged; told where the arrays are read
+    except Exception:  # damaged: read_arrays reports it
         return
     if size > ALWAYS_ALLOWED + MAX_RATIO * len(raw):
         raise ValueError(
             f"{name!r}, {len(raw)} bytes, would grow to {size} bytes; write it with "
-            "numpy.savez, uncompressed, if that is right."
+            "numpy.savez, uncompressed, if this size is intended."
         )
 
 
@@ -285,7 +285,7 @@ def read_npz(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP | Game:
             if set(arrays) & set(_OF_INTERVALS) and "system" in arrays:
                 raise ValueError(
                     "the probabilities of this game are intervals; chains and "
-                    "decision processes are read with them."
+                    "decision processes support them."
                 )
             model: SparseMDP | IntervalMDP
             if _is_sparse(arrays):

@@ -359,7 +359,7 @@ def edges_of(game: Game, place: str) -> tuple[Integers, Integers]:
         s = state[np.argmax(width > 1)]
         raise ValueError(
             f"{place}: state {s} has a move that leads to several states; the format "
-            "has no chance. Solve the game with chance='adversarial', or make the "
+            "has no random moves. Solve the game with chance='adversarial', or make the "
             "environment choose."
         )
     return row_start, successor
@@ -376,7 +376,7 @@ def max_even(
     if objective is None:
         if stored is None:
             raise ValueError(
-                "the game says nothing of its objective; pass one, such as buchi(game, ...)."
+                "the game has no stored objective; pass one, such as buchi(game, ...)."
             )
         return np.asarray(stored), np.zeros(len(stored), bool)
     priority = np.asarray(objective.priority).ravel()

@@ -160,7 +160,7 @@ class _Reader:
                 line, f"the reward is {kind}(...), which depends on more than the labels; expected "
                 "ConstantRewardFunction(a number)."
             )  # fmt: skip
-        number = number.strip()  # of more than float() takes away
+        number = number.strip()  # float() strips fewer kinds of whitespace
         if not re.fullmatch(_NUMBER, number) or not np.isfinite(float(number)):
             raise self.error(line, f"the reward is {number[:40]!r}; expected a finite number.")
         guard = self._guard(line, single if double is None else double)

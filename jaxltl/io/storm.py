@@ -52,7 +52,7 @@ def from_stormpy(model: StormModel) -> SparseMDP | IntervalMDP | Game:
         path = Path(folder) / "model.umb"
         try:
             storm.io.export_to_umb(model, str(path), options=options)
-        except Exception:  # of several types, none of them public
+        except Exception:  # several types, none of them public
             raise ValueError(
                 f"from_stormpy: Storm does not write this {kind} as UMB. Give a sparse Markov "
                 "chain, decision process or game, without parameters."

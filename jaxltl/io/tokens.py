@@ -200,7 +200,7 @@ def as_double(text: bytes) -> float | None:
         return None if number in (np.inf, -np.inf) else number
     if match := _RATIONAL.fullmatch(text):
         try:
-            return int(match[1]) / int(match[2])  # correctly rounded, however long they are
+            return int(match[1]) / int(match[2])  # correctly rounded for integers of any length
         except (ZeroDivisionError, OverflowError, ValueError):
             return None
     if match := _INFINITE.fullmatch(text):

@@ -101,9 +101,9 @@ def test_blocks_do_not_matter(tmp_path, monkeypatch):
 
 
 WRONG = [
-    ("@type: MDP", "@type: CTMC", r"m.drn', line 3: a model of type 'CTMC' is not read"),
-    ("@type: MDP", "@type: POMDP", "line 3: a model of type 'POMDP' is not read"),
-    ("@type: MDP", "@type: MA", "line 3: a model of type 'MA' is not read"),
+    ("@type: MDP", "@type: CTMC", r"m.drn', line 3: a model of type 'CTMC' is not supported"),
+    ("@type: MDP", "@type: POMDP", "line 3: a model of type 'POMDP' is not supported"),
+    ("@type: MDP", "@type: MA", "line 3: a model of type 'MA' is not supported"),
     ("@type: MDP", "", "line 17: expected a line '@type: MDP'"),
     ("@type: MDP", "@kind: MDP", "line 3: '@kind: MDP'; expected @type, @value_type"),
     ("@value_type: double", "@value_type: interval", "line 4: the value type is 'interval'"),

@@ -124,11 +124,11 @@ GOOD = b"a,b,c\n" * 3000
         (HEAD + GOOD + b"a,b, \n", 3002, "the field of column 'next' is empty"),
         (HEAD + GOOD + b"\n" + GOOD, 3002, "is empty; remove it"),
         (HEAD + GOOD + b" \n\n" + GOOD, 3002, "is empty; remove it"),
-        (HEAD + GOOD + HEAD + GOOD, 3002, "the header stands here again"),
-        (HEAD + GOOD + b"a,\xff,c\n", 3002, "byte 0xff is no UTF-8 text"),
-        (HEAD + b"a,b,c\n" + b"a,b\x00,c\n", 3, "byte 0x0 is of no text"),
-        (HEAD + b"a,b,c\r" * 4, 2, "byte 0xd is of no text"),
-        (HEAD.decode().encode("utf-16"), 1, "byte 0x0 is of no text"),
+        (HEAD + GOOD + HEAD + GOOD, 3002, "this line repeats the header"),
+        (HEAD + GOOD + b"a,\xff,c\n", 3002, "byte 0xff is not UTF-8 text"),
+        (HEAD + b"a,b,c\n" + b"a,b\x00,c\n", 3, "byte 0x0 is not text"),
+        (HEAD + b"a,b,c\r" * 4, 2, "byte 0xd is not text"),
+        (HEAD.decode().encode("utf-16"), 1, "byte 0x0 is not text"),
         (HEAD + b'a,b,"c\nd"\n' + GOOD, 2, "a quote is not closed on its line"),
         (HEAD + GOOD + b'a,b,"c', 3002, "unexpected end of data"),
         (HEAD + b'a,"b"x,c\n', 2, "expected after"),
@@ -139,7 +139,7 @@ GOOD = b"a,b,c\n" * 3000
         (b"state,action,next,count\na,b,c,\n", 2, "the field of column 'count' is empty"),
         (b"state,action,next,count\na,b,c,9007199254740993\n", 2, "expected an integer from 0"),
         (b"state,action,next,count\na,b,c,9007199254740992\na,b,c,1\n", 3, "add up to more than 2"),
-        (bytes(range(1, 256)) * 50, 1, "of no text"),
+        (bytes(range(1, 256)) * 50, 1, "is not text"),
     ],
 )
 def test_what_is_refused(tmp_path, data, line, message):
@@ -183,7 +183,7 @@ def test_files_that_cannot_be_read(tmp_path):
         with pytest.raises(ValueError, match="cannot read"):
             read_log(bad)
     path.write_bytes(gzip.compress(HEAD + GOOD)[:-9])
-    with pytest.raises(ValueError, match="begins as gzip does and is damaged"):
+    with pytest.raises(ValueError, match="has the header of gzip and is damaged"):
         read_log(path)
 
 

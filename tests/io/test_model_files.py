@@ -79,7 +79,7 @@ def test_a_file_is_known_by_how_it_begins(tmp_path):
         with pytest.raises(
             ValueError,
             match=(
-                r"model': the format is known neither by the end .*UMB \(\.umb\), PRISM's explicit "
+                r"model': neither the suffix nor the contents name a known format; .*UMB \(\.umb\), PRISM's explicit "
                 r"files \(\.tra, \.pexp\), DRN \(\.drn\), PGSolver .*numpy \(\.npz\)"
             ),
         ):
@@ -93,9 +93,9 @@ def test_what_a_format_cannot_hold(tmp_path):
         (".drn", game, r"DRN holds no games; write UMB \(\.umb\) or PGSolver .* or numpy"),
         (".tra", game, r"PRISM's explicit files holds no games"),
         (".pg", model, r"PGSolver holds games only, and this is no Game; write UMB"),
-        (".pg", game, r"leads to several states; the format has no chance"),
-        (".xyz", model, r"the format is not known by the end of the name; known are UMB"),
-        ("", model, r"the format is not known by the end of the name"),
+        (".pg", game, r"leads to several states; the format has no random moves"),
+        (".xyz", model, r"the suffix names no format; known are UMB"),
+        ("", model, r"the suffix names no format"),
         (".umb", 3, r"int has no transitions"),
         (".drn", full_model(np.random.default_rng(0)), r"reward"),
         (".drn", replace(model, initial=np.arange(9) / 36), r"initial"),

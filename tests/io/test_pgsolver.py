@@ -172,7 +172,7 @@ def test_chance_and_missing_objectives_are_refused(tmp_path):
     with pytest.raises(ValueError, match="state 0 has a move that leads to several states"):
         write_pgsolver(tmp_path / "x", game, buchi(game, np.array([True, False])))
     plain = make_game(make_mdp([[[0]]], [[[1.0]]]), [True])
-    with pytest.raises(ValueError, match="says nothing of its objective"):
+    with pytest.raises(ValueError, match="the game has no stored objective"):
         write_pgsolver(tmp_path / "x", plain)
 
 
@@ -197,7 +197,7 @@ def test_chance_and_missing_objectives_are_refused(tmp_path):
         ("99999999999 0 0 0;", 1, "vertex 99999999999 is beyond"),
         ("0 0 0 " + "9" * 5000 + ";", 1, "a successor is beyond"),
         ("0 " + "9" * 5000 + " 0 0;", 1, "more than 18 digits"),
-        (b"0 0 0 0;\n\xff", 2, "byte 0xff is no UTF-8"),
+        (b"0 0 0 0;\n\xff", 2, "byte 0xff is not UTF-8"),
     ],
 )  # fmt: skip
 def test_malformed_files_are_refused(tmp_path, text, line, message):

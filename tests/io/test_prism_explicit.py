@@ -198,7 +198,7 @@ WRONG = [
     (TRA, "4 4 6", "4 6", "line 2: 2 sizes; a MDP has 3"),
     (TRA, "4 4 6", "four", "line 2: 'four'; expected 'states transitions'"),
     (TRA, "(MDP)", "(CTMC)", "line 1: a model of type CTMC is not read"),
-    (TRA, MDP, "ma\n0 0 0 1\n", "line 1: a model of type ma is not read"),
+    (TRA, MDP, "ma\n0 0 0 1\n", "line 1: a model of type ma is not supported"),
     (TRA, MDP, "", "line 1: ''; expected 'states transitions'"),
     (TRA, MDP, "4 4 6\n", "the file ends without a transition"),
     (TRA, "1 0 1 1\n", "1 0 1\n", "line 7: '1 0 1'; expected 'state choice successor prob"),
@@ -287,7 +287,7 @@ def test_what_cannot_be_written_is_named(tmp_path):
     (tmp_path / "m2.srew").write_text("")
     write_prism(tmp_path / "m.tra", model)
     (tmp_path / "m7.srew").write_text("")
-    with pytest.raises(ValueError, match=r"beside it stand m7.srew, which would be read"):
+    with pytest.raises(ValueError, match=r"the companion files m7.srew exist and would be read"):
         write_prism(tmp_path / "m.tra", model)
 
 

@@ -157,7 +157,7 @@ def test_other_faults(tmp_path):
     with pytest.raises(ValueError, match="nowhere"):
         read_reward_machine(str(tmp_path / "nowhere"))
     (tmp_path / "rm").write_bytes(b"0\n\xff")
-    with pytest.raises(ValueError, match="rm, line 2: byte 0xff is no UTF-8 text; a reward mach"):
+    with pytest.raises(ValueError, match="rm, line 2: byte 0xff is not UTF-8 text; a reward mach"):
         read_reward_machine(tmp_path / "rm")
     deep = f"0\n[]\n(0,0,'{'(' * 3000}a{')' * 3000}',ConstantRewardFunction(1))\n"
     assert read_reward_machine(deep).automaton.propositions == ("a",)

@@ -130,10 +130,14 @@ def test_only_the_ranges_are_held(tmp_path, monkeypatch):
 def test_what_no_mesh_takes(tmp_path):
     rng, path = np.random.default_rng(0), tmp_path / "m.umb"
     write_model(path, make_game(full_model(rng), rng.random(9) < 0.5))
-    with pytest.raises(ValueError, match=r"m\.umb': the model is a game of 2 players; onto a mesh"):
+    with pytest.raises(
+        ValueError, match=r"m\.umb': the model is a game of 2 players; a mesh supports"
+    ):
         read_sharded(path, mesh_of(1))
     write_model(path, full_interval(rng))
-    with pytest.raises(ValueError, match=r"m\.umb': the probabilities are intervals; onto a mesh"):
+    with pytest.raises(
+        ValueError, match=r"m\.umb': the probabilities are intervals; a mesh supports"
+    ):
         read_sharded(path, mesh_of(1))
     write_model(path, finite(full_model(rng, 3)))
     with pytest.raises(ValueError, match="3 states cannot lie on 4 devices"):

@@ -160,7 +160,9 @@ def _kind(text: Text, entries: dict[str, tuple[int, str]], line: int) -> str:
         raise text.error(line, "expected a line '@type: MDP' or '@type: DTMC' before '@model'.")
     line, kind = entries["@type"]
     if kind.upper() not in ("DTMC", "MDP"):
-        raise text.error(line, f"a model of type {kind[:60]!r} is not read; DTMC and MDP are.")
+        raise text.error(
+            line, f"a model of type {kind[:60]!r} is not supported; expected DTMC or MDP."
+        )
     return kind.upper()
 
 
@@ -258,7 +260,7 @@ def _read_states(
     reward, label, rest = _rewards(block, body, lines, numbers, form)
     if reward is not None:
         body.state_reward.append((body.num_states, reward))
-    # Labels without quotation marks are tokens; the others are cut from their lines.
+    # Labels without quotation marks are tokens; quoted ones are parsed from their lines.
     count = np.maximum(block.count[lines] - (label - at), 0)
     for i in rest:
         count[i] = 0
@@ -316,7 +318,7 @@ def _rewards(
     if body.rewards * lines.size > 8 * len(block.text.data) + 2**24:
         raise block.text.error(
             int(block.line[lines[0]]),
-            f"{body.rewards} rewards are announced before, more than this holds.",
+            f"{body.rewards} rewards are announced before, more than this file can hold.",
         )
     width = body.rewards
     odd |= has & (count < 2 + width)
@@ -434,7 +436,10 @@ def rewards_of(header: Header, body: Body) -> Iterator[tuple[str, Numbers, Numbe
     """Yields the name, state rewards ``[S]`` and choice rewards ``[R]`` (or empty arrays)."""
     text, width = header.body, body.rewards
     if width * (body.num_states + body.num_rows) > 8 * len(text.data) + 2**24:
-        refuse(text.name, f"{width} rewards of {body.num_states} states are more than it writes.")
+        refuse(
+            text.name,
+            f"{width} rewards of {body.num_states} states are more than the file can hold.",
+        )
     announced = header.rewards if width else [x for x in header.rewards if x]
     names = [
         announced[i] if i < len(announced) else f"rew{i}" for i in range(width or len(announced))

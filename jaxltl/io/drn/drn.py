@@ -28,7 +28,7 @@ from jaxltl.io.tokens import Text, as_double, refuse
 
 _Reward = tuple[ArrayLike | None, ArrayLike | None]  # of states and of choices
 
-_STEP = 2**16  # states that are written at a time
+_STEP = 2**16  # states per piece
 
 
 def read_drn(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP:
@@ -215,7 +215,7 @@ def _pieces(
         rows = slice(*host.row_start[[begin, end]].tolist())
         entries = slice(*host.entry_start[[rows.start, rows.stop]].tolist())
         states = slice(begin, end)
-        # The lines of states, actions and successors, each put where it belongs.
+        # Positions of the lines of states, actions and transitions.
         of_row, of_entry = host.state[rows], host.row[entries]
         num_rows, num_entries = of_row.size, of_entry.size
         at_entry = np.arange(num_entries) + of_entry - rows.start + host.state[of_entry] - begin + 2

@@ -32,7 +32,7 @@ _TOKEN = re.compile(
     r"\s*(?:(\d+(?:\.\d*)?(?:[eE][+-]?\d+)?|\.\d+(?:[eE][+-]?\d+)?)"
     r"|([A-Za-z_][\w.\[\]]*)|(\*\*|[-+*/^()]))"
 )
-# More than any model has, and little enough that a short text cannot fill the memory.
+# Far above the needs of models; they prevent short texts from exhausting the memory.
 _MOST_TERMS, _MOST_DEPTH, _MOST_POWER, _MOST_BITS = 10_000, 50, 1_000, 20_000
 
 # The coefficient of each monomial, which is the power of each parameter: 3 p q^2 is {(1, 2): 3}.

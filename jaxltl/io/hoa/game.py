@@ -112,7 +112,7 @@ def _read(tokens: list[Token]) -> HoaGame:
         header = read_header(version, items)
         outputs = _controllable(items, header)
         return _Reader(header, outputs).game(by_number(header, states))
-    except RecursionError:  # guards are walked as deep as they nest
+    except RecursionError:  # evaluation recurses into guards
         raise error_at(
             tokens[0].line, "a label or the acceptance formula nests hundreds of levels deep, or "
             "there are hundreds of propositions. Write it flatter."
@@ -158,7 +158,7 @@ class _Guards(Diagrams):
 
     def num_paths(self, guard: int) -> int:
         """Number of paths to true, an upper bound on the length of a guard's text."""
-        for _, low, high in self.nodes[len(self.paths) :]:  # what a node leads to is older
+        for _, low, high in self.nodes[len(self.paths) :]:  # children precede their parents
             self.paths.append(min(self.paths[low] + self.paths[high], 2**40))
         return self.paths[guard]
 
@@ -217,7 +217,7 @@ class _Reader:
         self.names = self.inputs + self.outputs
         self.guards = _Guards([order.index(p) for p in range(len(order))])
         self.texts: dict[int, str] = {}
-        self.length = 0  # of all texts, in paths through their diagrams
+        self.length = 0  # total number of paths of the written guards
         sets_by_importance = decisive_sets(condition_given(header.condition, -1, True))
         if sets_by_importance is None:
             raise error_at(
@@ -277,10 +277,10 @@ class _Reader:
             new = {q for q, _ in moves[stack.pop()]} - seen
             seen |= new
             stack += new
-        # What no run comes to is left out.
+        # Remove unreachable states.
         moves = [to if q in seen else {} for q, to in enumerate(moves)]
         entries = sorted({entry for to in moves for entry in to})
-        if all(q != start for q, _ in entries):  # no run comes back to it, so any priority does
+        if all(q != start for q, _ in entries):  # visited once, so its priority is irrelevant
             entries = sorted([*entries, (start, max(p for _, p in entries))])
         split = _Split(self.guards, len(self.inputs))
         classes = [split.of(tuple(to.values())) if to else {} for to in moves]
@@ -288,7 +288,7 @@ class _Reader:
         size += sum(len(to) * len(c) for to, c in zip(moves, classes, strict=True))
         if size > MAX_MOVES:
             raise _TooMany
-        # The environment's states first, the system's behind them, in the order of the automaton's.
+        # The environment's states precede the system's, both in the order of the automaton.
         number = {entry: i for i, entry in enumerate(entries)}
         first = len(entries) + np.concatenate([[0], np.cumsum([len(c) for c in classes])])
         rows: list[list[tuple[int, str]]] = []
@@ -303,7 +303,9 @@ class _Reader:
         state = np.array([q for q, _ in entries] + [q for q, c in enumerate(classes) for _ in c])
         priority = np.array([p for _, p in entries])
         largest = int(priority.max())
-        neutral = np.full(len(rows) - priority.size, largest)  # the system's states decide nothing
+        neutral = np.full(
+            len(rows) - priority.size, largest
+        )  # neutral priority of the system's states
         model = _model(rows, {
             "state": np.where(incomplete & (state == len(moves) - 1), -1, state),
             "priority": largest + largest % 2 - np.append(priority, neutral),

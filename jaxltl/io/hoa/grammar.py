@@ -54,7 +54,7 @@ KNOWN_HEADERS = {
 }
 
 
-# Terminals whose name starts with an underscore carry nothing, and are left out of the trees.
+# Lark omits terminals with a leading underscore from the trees.
 _TERMINAL = {
     **KNOWN_HEADERS,
     "t": "BOOLEAN",
@@ -107,7 +107,7 @@ def _tokens(text: str) -> Iterator[Token]:
             problem = f"column {position - line_start + 1}: found {text[position]!r}"
             if text[position] == '"':
                 raise error_at(line, f"{problem}, a quote that is never closed. Close it.")
-            raise error_at(line, f"{problem}, which starts nothing in this format. Delete it.")
+            raise error_at(line, f"{problem}, which no token starts with. Delete it.")
         kind, value, end = match.lastgroup, match[0], match.end()
         if kind == "COMMENT":
             end = _comment_end(text, position, line)
@@ -193,7 +193,7 @@ class State:
 
 @functools.cache
 def _parser() -> Lark:
-    from lark import Lark  # Lark takes 0.1 s to import, which a program without files need not pay.
+    from lark import Lark  # deferred: importing Lark takes 0.1 s
     from lark.lexer import Lexer
 
     class Ready(Lexer):

@@ -17,7 +17,7 @@ from jaxltl.io.hoa.grammar import (
 if TYPE_CHECKING:
     from lark import Token
 
-MAX_PRIORITIES = 256  # the formula of a parity condition nests once for each
+MAX_PRIORITIES = 256  # nesting depth of the acceptance formula
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ def read_header(version: Token, items: list[Item]) -> Header:
     aliases: list[tuple[Token, Tree]] = []
     for key, *values in items:
         if key.type == "HEADERNAME":
-            if key[0].isupper():  # by the format's rule it may change what the automaton means
+            if key[0].isupper():  # capital: may change the semantics
                 raise error_at(
                     key.line,
                     f"the header {key} is unknown and, by its capital, changes what the automaton "

@@ -235,11 +235,11 @@ def _read(tokens: list[Token], letters: Iterable[Letter] | None) -> Automaton:
         header = read_header(version, items)
         names = tuple(sorted(header.propositions))
         alphabet = alphabet_of(names, letters, header.line)
-        # The column of the letters that each AP index means.
+        # Columns of the sorted alphabet in the order of AP.
         columns = alphabet[:, [names.index(name) for name in header.propositions]]
         table = read_table(header, by_number(header, states), columns)
         return _automaton(header, table, alphabet, names)
-    except RecursionError:  # labels and conditions are walked as deep as they nest
+    except RecursionError:  # evaluation recurses into labels and conditions
         raise error_at(
             tokens[0].line,
             "a label or the acceptance formula nests hundreds of levels deep. Write it flatter.",
@@ -263,7 +263,7 @@ def _automaton(
         colors, compact = colors_of(condition, table.marks, header)
         colors = colors[table.edge_of]
         delta, priority, initial, base = to_parity(delta, colors, initial, compact)
-    # The added state rejects, whatever the condition says of runs without marks.
+    # The added sink rejects, even if the condition accepts runs without marks.
     priority[base == (-1 if table.sink is None else table.sink)] = 1
     kind = acceptance_of(header, delta, priority)
     is_final = kind in ("cosafe", "safety")

@@ -132,13 +132,13 @@ def write_prism(
     if others:
         refuse(
             str(path),
-            f"beside it stand {', '.join(others)}, which would be read with it; "
+            f"the companion files {', '.join(others)} exist and would be read with it; "
             "delete them or choose another name.",
         )
     for name, section in zip(names, sections, strict=True):
         with write_bytes(path.parent / name) as file:
             if section.kind in ("srew", "trew") and dialect == "prism":
-                file.writelines(section.header)  # it has the name
+                file.writelines(section.header)  # contains the name
             file.writelines(section.lines())
 
 
@@ -166,7 +166,7 @@ def _siblings(path: Path, match: re.Match[str]) -> Iterator[tuple[str, str, Path
             continue
         stem = name.removesuffix(other[3] or "").removesuffix(f".{other[2]}")
         if other[1] and {f"{stem}.tra", f"{stem}.tra.gz", f"{stem}.tra.xz"} & set(names):
-            continue  # the reward of a model that is itself called name1
+            continue  # belongs to another model, name1
         yield other[2], other[1], path.parent / name
 
 
@@ -250,7 +250,9 @@ def _sizes(text: Text) -> tuple[bool, list[int], Text]:
     if first.lower() in (b"dtmc", b"mdp"):
         return first.lower() == b"dtmc", [], rest
     if first.lower() in (b"ctmc", b"ma", b"pomdp"):
-        raise text.error(line, f"a model of type {first.decode()} is not read; dtmc and mdp are.")
+        raise text.error(
+            line, f"a model of type {first.decode()} is not supported; expected dtmc or mdp."
+        )
     sizes = first.split()
     if len(sizes) == 4 and all(x.isdigit() for x in sizes):
         raise text.error(
@@ -293,7 +295,7 @@ def _read_rows(text: Text) -> _Rows:
             part.append(column)
     if not parts[0]:
         raise text.error(rest.line, f"the file ends without a transition; expected {form}.")
-    if is_interval:  # what was read before the first interval was numbers
+    if is_interval:  # blocks before the first interval have numbers
         parts[3] = [x if x.ndim > 1 else np.stack([x, x], 1) for x in parts[3]]
     columns = tuple(np.concatenate(x) for x in parts)
     del parts
@@ -416,7 +418,7 @@ def _model(text: Text, sections: list[Section]) -> SparseMDP | IntervalMDP:
         model = interval.nominal
     else:
         model = make_sparse(*starts, rows.target, probability, initial=initial, **annotations)
-    del rows, new, start, total, probability, starts  # rewards take memory too
+    del rows, new, start, total, probability, starts  # free memory for the rewards
     model = replace(model, rewards=read_rewards(sections, model, is_chain))
     return model if interval is None else replace(interval, nominal=model)
 
@@ -433,7 +435,7 @@ def _actions(text: Text, rows: _Rows, start: Integers) -> tuple[Integers | None,
             f"state {rows.state[i]}, choice {rows.choice[i]} has "
             "two actions; expected the same in all of its lines.",
         )
-    if other.any():  # what a chain's transitions are called has no bearing on it
+    if other.any():  # transitions of a chain may have different names
         action = np.where(np.add.reduceat(other, start) > 0, -1, action)
     texts = list(rows.names)
     if (action >= 0).all() and all(_NUMBERED.fullmatch(x) for x in texts):

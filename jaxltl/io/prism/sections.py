@@ -14,7 +14,7 @@ from jaxltl.core.models.sparse import Rewards, SparseMDP
 from jaxltl.io.text_output import check_name, exact_part, labels_with_init, value_texts
 from jaxltl.io.tokens import joined_lines
 
-_STEP = 2**17  # lines that are held at a time
+_STEP = 2**17  # lines per piece
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,9 @@ def written_sections(source: SparseMDP | IntervalMDP, dialect: str) -> list[Writ
     labels, holds = _labels(model, storm)
     title = ("" if model is source else "I") + ("DTMC" if model.is_chain else "MDP")
     kind = f"# Transitions ({title})\n".encode()
-    action = None if storm and model.is_chain else _action_texts(model)  # Storm reads none there
+    action = (
+        None if storm and model.is_chain else _action_texts(model)
+    )  # Storm reads no actions of chains
     sections = [Written("tra", "", [kind], lambda: _transitions(model, chances, action, storm))]
     if model.valuation and not storm:
         values = [_value_texts(name, x) for name, x in model.valuation.items()]

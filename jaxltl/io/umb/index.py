@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-_SIZES = {  # of types, in bits, where none is given
+_SIZES = {  # default size of each type in bits
     "bool": 1,
     "int": 64,
     "uint": 64,
@@ -20,13 +20,13 @@ _SIZES = {  # of types, in bits, where none is given
     "string": 64,
 }
 PARTS = {"states": "state", "choices": "choice", "branches": "transition"}  # as Rewards names them
-# Groups of ours. Labels that others take for their own have their place among all as their id.
+# Groups specific to jaxltl. A label reserved by other tools has its position as its id.
 OTHER_LABELS = "other-aps"
 INITIAL = "initial"  # an initial distribution that is not uniform
-TEXTS = "texts"  # the parameter of ours that names variables that are numbers of texts
+TEXTS = "texts"  # our parameter: names of the variables that are string indices
 ACTIONS, VALUATIONS = "actions/choices", "valuations/states"  # folders
 _MOST_STATES = 2**31 - 2  # states and choices are numbered with 32 bits
-_MOST_STRING = 2**10  # bytes of a text, on the average
+_MOST_STRING = 2**10  # average bytes of a string
 _STRINGS_ALLOWED = 2**20
 _MOST_RECORD = 2**16  # bytes of one state's valuation
 
@@ -123,7 +123,7 @@ class Index:
     probability: Type | None
     annotations: tuple[Annotation, ...]
     records: tuple[Record, ...]
-    texts: int  # that variables have by their numbers
+    texts: int  # number of strings of the variables
     player_names: tuple[str, ...] = ()
     begins: tuple[int, int, int] = (0, 0, 0)
 
@@ -224,12 +224,11 @@ def _check_kind(system: Mapping[str, object], counts: Mapping[str, int], place: 
     time = _get(system, "time", place)
     if time != "discrete":
         raise ValueError(
-            f"{place}time is {_shown(time)}; models in discrete time are read, none with rates."
+            f"{place}time is {_shown(time)}; expected discrete, models with rates are not supported."
         )
     if counts["observations"]:
         raise ValueError(
-            f"{place}the model has {counts['observations']} observations; models "
-            "whose states are seen are read, no POMDPs."
+            f"{place}the model has {counts['observations']} observations; POMDPs are not supported."
         )
     if not counts["states"]:
         raise ValueError(f"{place}#states is 0; a model needs at least one.")
@@ -242,7 +241,7 @@ def _check_kind(system: Mapping[str, object], counts: Mapping[str, int], place: 
             f"{_MOST_STATES} are read."
         )
     if counts["branches"] >= 2**60:
-        raise ValueError(f"{place}#branches is {counts['branches']}; no file holds so many.")
+        raise ValueError(f"{place}#branches is {counts['branches']}; expected less than 2^60.")
 
 
 def _annotations(data: object, place: str) -> tuple[Annotation, ...]:
@@ -289,7 +288,7 @@ def _annotation(group: str, key: str, value: object, place: str) -> Annotation:
             f"{', '.join(parts)}."
         )
     if "probability-type" in value:
-        raise ValueError(f"{place}{path}: its values are drawn at random; expected numbers.")
+        raise ValueError(f"{place}{path}: random values are not supported; expected numbers.")
     kind = _type(_get(value, "type", f"{place}{path}: "), path, place)
     numbers = ("double", "rational", "int", "uint", "double-interval", "rational-interval")
     types = {"rewards": numbers, INITIAL: ("double",)}.get(group, ("bool",))

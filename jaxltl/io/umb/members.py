@@ -62,11 +62,11 @@ def check_memory(size: int, place: str) -> None:
     """Raises ValueError if twice the size exceeds the physical memory."""
     try:
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, ValueError, OSError):  # another system
+    except (AttributeError, ValueError, OSError):  # not available on all systems
         return
     if 2 * size > memory:
         raise ValueError(
-            f"{place}index.json tells of a model of {size / 2**30:.3g} GB, which "
+            f"{place}index.json describes a model of {size / 2**30:.3g} GB, which "
             f"takes twice that; there are {memory / 2**30:.3g} GB."
         )
 
@@ -110,7 +110,7 @@ def labels_of(
     ours = {x.id: x for x in index.annotations if x.group == OTHER_LABELS}
     others = iter([x for x in index.annotations if x.group == "aps"])
     all_of = []
-    for i in range(len(index.annotations)):  # the ids of ours are their places
+    for i in range(len(index.annotations)):  # ids of reserved labels are their positions
         one = ours.pop(str(i), None) or next(others, None)
         if one is not None:
             all_of.append(one)
@@ -186,8 +186,8 @@ def probability_of(
     member, kind = "branch-to-probability.bin", index.probability
     if kind is not None and kind.end is not None and index.players > 1:
         raise ValueError(
-            f"{place}the probabilities of this game are intervals; chains and decision processes "
-            "are read with them."
+            f"{place}the probabilities of this game are intervals; only chains and decision "
+            "processes support them."
         )
     if kind is not None and member in contents:
         read = read_numbers if kind.end is None else read_ends

@@ -35,7 +35,7 @@ from jaxltl.io.umb.members import (
 from jaxltl.io.umb.tar import Stream
 from jaxltl.io.umb.values import Bytes, count_bits, read_bits, read_starts, write_bits
 
-_UNLIMITED = 2**62  # bytes that an archive may hold: little of it is held at a time
+_UNLIMITED = 2**62  # bytes of an archive, which is streamed
 _ROWS, _ENTRIES, _IS_INITIAL = (
     "state-to-choices.bin",
     "choice-to-branches.bin",
@@ -87,7 +87,7 @@ def read_sharded(
         _check_memory(index, ranges, place)
         try:
             parts: dict[_Span, ModelPart] = {}
-            # Of a plain archive the ranges are read one by one; a compressed one is read for all.
+            # A plain archive is read range by range, a compressed one once for all ranges.
             groups = [[x] for x in ranges] if archive.is_plain else [ranges]
             names: tuple[str, ...] = ()
             for group in groups:
@@ -116,8 +116,8 @@ def _check_kind(index: Index, place: str) -> None:
         problem = "the probabilities are intervals"
     if problem is not None:
         raise ValueError(
-            f"{place}{problem}; onto a mesh go chains and decision processes whose probabilities are "
-            "numbers. Read it by read_model."
+            f"{place}{problem}; a mesh supports Markov chains and MDPs with point probabilities. "
+            "Use read_model."
         )
 
 
@@ -234,7 +234,7 @@ def _read(archive: _Archive, index: Index, ranges: list[_Span]) -> _Held:
         for part, (member, ahead) in _AHEAD.items():
             if (
                 part in previous and member not in held.found
-            ):  # it was not there, so it is not needed
+            ):  # an absent member must be a one-to-one map
                 starts_of({}, member, index.counts[part], index.counts[ahead], archive.place)
     return held
 
@@ -255,7 +255,7 @@ def _lead_on(
     ends = [int(runs.of(x).view("<u8")[0]) for x in ((0, 8), (size - 8, size))]
     starts = [runs.of(items[member].span(*x)).view("<u8") for x in held.spans[part]]
     rises = all((x[1:] >= x[:-1]).all() and x[-1] <= total for x in starts)
-    if ends != [0, total] or not rises:  # to be told where, all of it is read
+    if ends != [0, total] or not rises:  # the error names the position
         read_starts(archive.whole(index, member), total, f"{archive.place}{member}: ")
     held.starts[part] = [x.view("<i8").astype(np.int64, copy=False) for x in starts]
     spans = [(int(x[0]), int(x[-1])) for x in starts]

@@ -300,7 +300,7 @@ def _deflated(block: bytes | memoryview) -> bytes:
         packer = zlib.compressobj(1, zlib.DEFLATED, -15, 9, strategy)
         return packer.compress(data) + packer.flush(zlib.Z_SYNC_FLUSH)
 
-    # Searching for repetitions takes long where there are none, as in random probabilities.
+    # Matching is slow on incompressible data such as random probabilities: use run lengths there.
     middle = (len(block) - _PROBED) // 2
     probe = block[max(middle, 0) : max(middle, 0) + _PROBED]
     repeats = len(deflate(probe, zlib.Z_DEFAULT_STRATEGY)) < 0.7 * len(probe)

@@ -180,7 +180,7 @@ def _owners(
             f"{place}{member}: a state is of player {player.max()}; expected 0 to "
             f"{index.players - 1}."
         )
-    # Who owns a state with one choice does not matter: Storm gives such ones to another player.
+    # Storm assigns states with one choice, whose owner is irrelevant, to a third player.
     more = np.flatnonzero((player > 1) & (np.diff(row_start) > 1))
     if more.size:
         names = ", ".join(map(repr, index.player_names[:9])) or "no names"
@@ -357,7 +357,7 @@ def _annotations(
     for i, (name, key) in enumerate(
         zip(model.propositions, ids_for(model.propositions, "ap"), strict=True)
     ):
-        # Storm and PRISM have a label init of their own, the initial states.
+        # Storm and PRISM reserve the label init for the initial states.
         group, key = (OTHER_LABELS, str(i)) if name == "init" else ("aps", key)
         add(group, key, name, _BOOL, {"states": write_bits(label[:, i])})
     names = list(model.rewards)

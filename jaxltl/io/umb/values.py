@@ -14,8 +14,8 @@ from jaxltl.io.umb.index import Record, Type, Variable, bit_bytes
 Bytes = NDArray[np.uint8]
 Values = NDArray[np.generic]  # of a state variable: bool, integers, doubles or strings
 
-_EXACT = 2**53  # whole numbers up to this are doubles
-_MOST_TEXT = 2**30  # bytes of the texts of one variable
+_EXACT = 2**53  # integers up to this are exact doubles
+_MOST_TEXT = 2**30  # bytes of the strings of one variable
 
 
 def read_bits(content: Bytes, count: int) -> NDArray[np.bool_]:
@@ -95,7 +95,7 @@ def _read_rationals(content: Bytes, place: str) -> NDArray[np.float64]:
     if half == 8:
         pairs = np.ascontiguousarray(content).view("<i8")
         above, below = pairs[:, 0], pairs[:, 1]
-        # A quotient of two doubles is rounded once; a denominator with its first bit set is large.
+        # The quotient of two exact doubles is rounded once; denominators are unsigned.
         hard = (above < -_EXACT) | (above > _EXACT) | (below <= 0) | (below > _EXACT)
         np.divide(above, below, out=doubles, where=~hard)
     if hard.any():
@@ -201,7 +201,7 @@ def _read_variable(
         raise ValueError(f"{subject}is a rational of {kind.size} bits; expected whole bytes.")
     values = np.full(len(raw), np.nan)
     there = np.ones(len(raw), bool)
-    if variable.presence is not None:  # what is absent may have the denominator 0
+    if variable.presence is not None:  # absent values may have denominator 0
         there = _field(raw, variable.presence, 1)[:, 0] > 0
     values[there] = _read_rationals(field[there], subject)
     return values
@@ -213,7 +213,7 @@ def _texts(number: Values, texts: Sequence[str], subject: str) -> Values:
     if used[0] < 0 or used[-1] >= len(texts):
         raise ValueError(f"{subject}has the text {used[-1]}; there are {len(texts)}.")
     chosen = [texts[i] for i in used.tolist()]
-    # NumPy gives every text the room of the longest one.
+    # NumPy pads every string to the longest one.
     dtype = object if 4 * number.size * max(map(len, chosen)) > _MOST_TEXT else str
     return np.array(chosen, dtype)[which.ravel()]
 
@@ -238,18 +238,18 @@ def _whole_numbers(field: Bytes, variable: Variable, subject: str) -> Values:
     wide = np.zeros((len(field), 8), np.uint8)
     wide[:, : field.shape[1]] = field
     bits = wide.view("<u8")[:, 0].astype(np.uint64, copy=False)
-    if signed and size < 64:  # the sign goes into the bits above
+    if signed and size < 64:  # sign extension
         sign = np.uint64(1) << np.uint64(size - 1)
         bits = (bits ^ sign) - sign
     smallest, largest = (-(2 ** (size - 1)), 2 ** (size - 1) - 1) if signed else (0, 2**size - 1)
     if not -(2**63) <= smallest + offset <= largest + offset < 2**64 or (
         smallest + offset < 0 and largest + offset >= 2**63
     ):
-        # Only the values themselves may fit.
+        # The type exceeds 64 bits; the values may fit.
         seen = bits.view(np.int64) if signed else bits
         smallest, largest = int(seen.min(initial=0)), int(seen.max(initial=0))
     smallest, largest = smallest + offset, largest + offset
-    # Sums are those of the numbers modulo 2^64, which is all there is if these fit.
+    # Sums modulo 2^64 are exact if the results fit.
     total = bits + np.uint64(offset % 2**64)
     if smallest >= -(2**31) and largest < 2**31:
         return total.view(np.int64).astype(np.int32)
