@@ -1,0 +1,42 @@
+"""Limits of the package's size, read from its source.
+
+A limit is lowered when the package gets smaller, and raised for no change: make room instead.
+"""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+import jaxltl
+from benchmarks import size
+
+PACKAGE = Path(jaxltl.__file__).parent
+LIMITS = {
+    "lines": 92_400,
+    "statements": 42_500,
+    "docstring lines": 20_300,
+    "functions with more than 6 parameters": 93,
+    "functions with more than 9 parameters": 8,
+    "Any in annotations": 2_030,
+    "modules of the largest folder": 20,
+    "names at the top level": 80,
+}
+MODULE_LINES, BODY_LINES = 690, 68
+MEASURED = size.measure(PACKAGE)
+
+
+@pytest.mark.parametrize("name", LIMITS)
+def test_the_package_keeps_to_its_limits(name):
+    assert MEASURED[name] <= LIMITS[name]
+
+
+def test_modules_and_functions_are_short():
+    long = []
+    for path, text in size.sources(PACKAGE).items():
+        if text.count("\n") > MODULE_LINES:
+            long.append(f"{path}: {text.count(chr(10))} lines")
+        for function in size.functions(ast.parse(text)):
+            if size.body_lines(function) > BODY_LINES:
+                long.append(f"{path}: {function.name} has {size.body_lines(function)} lines")
+    assert not long
