@@ -50,7 +50,7 @@ def float64() -> Iterator[None]:
     """
     import jax
 
-    before = jax.config.jax_enable_x64
+    before = jax.config.values["jax_enable_x64"]
     jax.config.update("jax_enable_x64", True)
     try:
         yield

@@ -266,7 +266,8 @@ class _Parser:
         text = self.text[start.start : self.tokens[self.place - 1].end]
         fields: dict[str, Any] = {"operator": operator, "objective": objective}
         fields |= {"relation": relation, "threshold": threshold, "reward": reward, "path": path}
-        return Property(text, **fields, name=name, nature=nature)
+        fields["nature"] = nature
+        return Property(text, **fields, name=name)
 
     def multi(self, start: _Token, name: str | None) -> Property:
         self.expect("(")

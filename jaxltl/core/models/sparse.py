@@ -350,10 +350,9 @@ def sparse_part(
         row_start, entry_start, successor, probability, first=first, num_states=num_states
     )
     validation.keywords("make_sparse", annotations, Annotations)
-    structures, valuation = (
-        {} if annotations.get(name) is None else annotations[name]
-        for name in ("rewards", "valuation")
-    )
+    structures, valuation = annotations.get("rewards"), annotations.get("valuation")
+    structures = {} if structures is None else structures
+    valuation = {} if valuation is None else valuation
     for of, each in (("rewards", structures), ("valuation", valuation)):
         if not isinstance(each, Mapping):
             raise ValueError(f"{of} is {validation.shorten(each)}; give a dict, by name.")
