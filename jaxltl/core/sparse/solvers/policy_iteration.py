@@ -54,6 +54,8 @@ from jaxltl.core.sparse.solvers.total_cost import (
 _EPS = float(np.finfo(np.float64).eps)
 _SHARE = 0.1  # of the tolerance that the extra cost of the steps may take
 _SHARE_CHAIN = 1e-5  # of a chain, where ties between choices do not matter
+# The least extra cost, in rounding errors of a backup; of a chain, that is tried first.
+_MARGIN, _MARGIN_CHAIN = 32, 4
 # Sweeps of value iteration for a first policy; of small cores, where a policy costs little, half.
 _FIRST_SWEEPS, _SMALL_CORE = 60, 5000
 _SWEEPS = 12  # after each linear system, which propagate improvements
@@ -246,10 +248,12 @@ class _CoreSolver:
         ones = np.ones(equation.size)
         solver: Factors | None = factorize(equation.matrix, self.label, policy)
         extra, rounds, best = None, 0, None
+        margin = _MARGIN_CHAIN if equation.is_chain else _MARGIN
         while rounds < _MAX_ROUNDS and solver is not None:
             rounds += 1
             if extra is None:
-                extra = self._extra_cost(solver.solve(ones), solver.solve(equation.cost[policy]))
+                costs = solver.solve(equation.cost[policy])
+                extra = self._extra_cost(solver.solve(ones), costs, margin)
             value = solver.solve(equation.cost[policy] + sign * extra)
             if not np.isfinite(value).all():
                 solver = solver.eliminated(policy)
@@ -260,6 +264,9 @@ class _CoreSolver:
             image = equation.backup(value)
             gain = sign * (equation.best(image) - value) + extra
             if (gain > _KEPT * extra).any():
+                if margin < _MARGIN:
+                    extra, margin = None, _MARGIN
+                    continue
                 before, strict = policy, rounds > _SWEPT_ROUNDS or equation.is_chain
                 policy = self._improved(value, policy, extra, strict)
                 if strict and (policy == before).all():
@@ -275,8 +282,8 @@ class _CoreSolver:
                 if self._is_narrow(best, self.tolerance / 2):
                     break
             else:
-                time = solver.solve(ones)
-            other = self._extra_cost(time, value)
+                time, margin = solver.solve(ones), _MARGIN
+            other = self._extra_cost(time, value, margin)
             # A better policy may have a value whose rounding needs a larger extra.
             if extra / 2 <= other <= (2 * extra if found is None else np.inf):
                 break
@@ -297,8 +304,8 @@ class _CoreSolver:
         leaves = rows.sum(1) < 1 - 1e-9  # smaller probabilities of leaving need not be counted
         return np.where(_reaches(rows, leaves), policy, self.proper)
 
-    def _extra_cost(self, time: Floats, value: Floats) -> float:
-        """The extra cost of a step: a share of the tolerance, and more than rounding."""
+    def _extra_cost(self, time: Floats, value: Floats, margin: int) -> float:
+        """The extra cost of a step: a share of the tolerance, and at least `margin` roundings."""
         largest = float(np.abs(value).max(initial=0))
         if self.relative:
             some = value > 0
@@ -307,7 +314,7 @@ class _CoreSolver:
         else:
             share = 1 / max(float(time.max(initial=1)), 1)
         aim = (_SHARE_CHAIN if self.equation.is_chain else _SHARE) * self.tolerance
-        return max(aim * share, 32 * (self.unit + self.outer_error) * max(largest, 1e-300))
+        return max(aim * share, margin * (self.unit + self.outer_error) * max(largest, 1e-300))
 
     def _certified(
         self, solver: Factors, policy: Integers, value: Floats, extra: float
