@@ -24,6 +24,7 @@ from jaxltl.core.models.mesh.sharded import is_sharded
 from jaxltl.core.models.ops import kernels, operators
 from jaxltl.core.models.ops.array_namespace import is_traced
 from jaxltl.core.models.ops.choices import choice_shape, choices
+from jaxltl.core.models.ops.host_callback import host_callback
 from jaxltl.core.models.product import Product, reads
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.sparse.graph.product_graph import HostGraph
@@ -92,13 +93,10 @@ class TracedGraph:
         )
 
         def host(model, core, allowed):
-            concrete = jax.tree.map(np.asarray, model)
-            return graph_of(concrete).components(np.asarray(core), np.asarray(allowed), closed)
+            return graph_of(model).components(core, allowed, closed)
 
         def callback():
-            return jax.pure_callback(
-                host, result, self.model, core, allowed, vmap_method="sequential"
-            )
+            return host_callback(host, result, self.model, core, allowed)
 
         def trivial():
             number = jnp.arange(flat, dtype=jnp.int32).reshape(shape)

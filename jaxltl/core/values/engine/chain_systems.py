@@ -17,6 +17,7 @@ from jax import lax
 
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.mesh.sharded import is_sharded
+from jaxltl.core.models.ops.host_callback import host_callback
 from jaxltl.core.models.protocols import ActionModel
 from jaxltl.core.sparse.linear.elimination import factorize
 from jaxltl.core.sparse.linear.topological_order import Edges, ordered_components
@@ -75,13 +76,8 @@ class ChainSystem(NamedTuple):
             inverted, right = in_turn(inverse, matrix), b.ravel()
             x = inverted @ right
             return (x + inverted @ (right - matrix @ x)).reshape(b.shape)
-        x = jax.pure_callback(
-            _eliminated(transposed),
-            jax.ShapeDtypeStruct(b.shape, b.dtype),
-            self,
-            b,
-            vmap_method="sequential",
-        )
+        result = jax.ShapeDtypeStruct(b.shape, b.dtype)
+        x = host_callback(_eliminated(transposed), result, self, b)
         return _unless(jnp.all(jnp.isfinite(x)), x, lambda: krylov_refined(matvec, b))
 
 
@@ -99,10 +95,9 @@ def _unless(done: jax.Array, x: jax.Array, otherwise: Callable[[], jax.Array]) -
 
 
 def _eliminated(transposed: bool) -> Callable[..., np.ndarray]:
-    def solve(system: ChainSystem, b: jax.Array) -> np.ndarray:
-        system, right = jax.tree.map(np.asarray, (system, b))
-        x = _solution(_transitions(system), np.asarray(right, np.float64).ravel(), transposed)
-        return x.reshape(right.shape).astype(right.dtype)
+    def solve(system: ChainSystem, b: np.ndarray) -> np.ndarray:
+        x = _solution(_transitions(system), b.astype(np.float64).ravel(), transposed)
+        return x.reshape(b.shape)
 
     return solve
 
