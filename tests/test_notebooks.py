@@ -1,4 +1,4 @@
-"""The notebooks are saved with outputs that are current, and small, and whose pictures are told."""
+"""Notebooks are saved with current, small outputs and alternative texts of pictures."""
 
 import importlib.util
 
@@ -16,23 +16,25 @@ from notebooks.execute import (
     paths,
 )
 
-EVERY = paths([])
+NOTEBOOKS = paths([])
 
 
-@pytest.mark.parametrize("path", EVERY, ids=lambda path: path.stem)
-def test_a_notebook_is_saved_with_what_it_shows(path):
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_saved_notebook_follows_the_rules(path):
     notebook = nbformat.read(path, as_version=4)
     nbformat.validate(notebook)
     assert not faults(notebook, path.stem)
     text = notebook.cells[0].source
     picture = open_with_picture(notebook, path.stem)
     assert (HERE / "pictures" / f"{path.stem}.png").read_bytes() == picture
-    assert notebook.cells[0].source == text, "the opening picture is another one"
+    assert notebook.cells[0].source == text, (
+        "the picture under the title differs from that of the tagged cell"
+    )
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("path", EVERY, ids=lambda path: path.stem)
-def test_the_outputs_of_a_notebook_are_current(path):
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_saved_outputs_are_current(path):
     notebook = nbformat.read(path, as_version=4)
     missing = [name for name in packages(notebook) if importlib.util.find_spec(name) is None]
     if missing:
@@ -53,7 +55,7 @@ def test_the_outputs_of_a_notebook_are_current(path):
         ("-1.5", "-1.6", 0),
     ],
 )
-def test_numbers_may_differ_a_little(old, new, tolerance):
+def test_small_differences_are_accepted(old, new, tolerance):
     assert not difference(old, new, tolerance)
 
 
@@ -70,5 +72,5 @@ def test_numbers_may_differ_a_little(old, new, tolerance):
         ("1,234 steps", "1,250 steps", 0.01),
     ],
 )
-def test_more_is_a_difference(old, new, tolerance):
+def test_larger_differences_are_reported(old, new, tolerance):
     assert difference(old, new, tolerance)
