@@ -29,7 +29,9 @@ def make(wind: float = 0.01, horizon: int = 80) -> jl.Environment:
         position, time = world["position"] + velocity, world["time"] + 1
         outside = jnp.abs(position).max() > LIMIT
         after = {"position": position, "velocity": velocity, "time": time}
-        return jl.environments.Timestep(after, reward=0.0, terminated=outside, truncated=time >= horizon)
+        return jl.environments.Timestep(
+            after, reward=0.0, terminated=outside, truncated=time >= horizon
+        )
 
     def observe(world):
         return jnp.concatenate([world["position"], 10 * world["velocity"]])
