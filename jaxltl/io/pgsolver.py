@@ -260,32 +260,31 @@ def write_pgsolver(
 ) -> None:
     """Writes a deterministic game as a PGSolver parity game.
 
-        Games of :func:`read_pgsolver` keep their vertex numbers, priorities and names. Others are
-        numbered from 0, with priorities converted to max-even. States decided by the objective become
-        self-loops. The start is the initial state if there is exactly one.
+    Games of :func:`read_pgsolver` keep their vertex numbers, priorities and names. Others are
+    numbered from 0, with priorities converted to max-even. States decided by the objective become
+    self-loops. The start is the initial state if there is exactly one.
 
-        Args:
-          path: the file, compressed if it ends in ``.gz`` or ``.xz``.
-          game: a Game over an MDP, a DenseMDP or a SparseMDP.
-          objective: the system's objective; default that of the file of the game.
+    Args:
+      path: the file, compressed if it ends in ``.gz`` or ``.xz``.
+      game: a Game over an MDP, a DenseMDP or a SparseMDP.
+      objective: the system's objective; default that of the file of the game.
 
-        Raises:
-          ValueError: for random moves, no objective, or names with a quotation mark.
+    Raises:
+      ValueError: for random moves, no objective, or names with a quotation mark.
 
-        Example:
-          >>> import pathlib, tempfile
-          >>> from jaxltl import from_dense, make_game
-          >>> from jaxltl.core.array_types import Integers
-    from jaxltl.core.games import parity
-          >>> world = from_dense([[[0, 1.0], [1, 0]], [[1.0, 0], [1, 0]]], initial=[1, 0])
-          >>> game = make_game(world, [True, False])
-          >>> path = pathlib.Path(tempfile.mkdtemp()) / "game.pg"
-          >>> write_pgsolver(path, game, parity(game, [0, 1]))
-          >>> print(path.read_text().strip())
-          parity 1;
-          start 0;
-          0 2 0 1,0;
-          1 1 1 0,0;
+    Example:
+      >>> import pathlib, tempfile
+      >>> from jaxltl import from_dense, make_game
+      >>> from jaxltl.core.games import parity
+      >>> world = from_dense([[[0, 1.0], [1, 0]], [[1.0, 0], [1, 0]]], initial=[1, 0])
+      >>> game = make_game(world, [True, False])
+      >>> path = pathlib.Path(tempfile.mkdtemp()) / "game.pg"
+      >>> write_pgsolver(path, game, parity(game, [0, 1]))
+      >>> print(path.read_text().strip())
+      parity 1;
+      start 0;
+      0 2 0 1,0;
+      1 1 1 0,0;
     """
     row_start, successor = edges_of(game, "write_pgsolver")
     valuation = game.mdp.valuation if isinstance(game.mdp, SparseMDP) else {}
