@@ -55,11 +55,17 @@ _kept: list[Any] = []  # so that no identity is used again
 
 def _modules(package: ModuleType) -> list[ModuleType]:
     found = pkgutil.walk_packages(package.__path__, f"{package.__name__}.")
-    return [
+    modules = [
         importlib.import_module(x.name)
         for x in found
         if not any(part.startswith("_") for part in x.name.split(".")) and not x.ispkg
     ]
+    exported = [getattr(package, name) for name in package.__all__]
+    if any(inspect.ismodule(x) for x in exported):
+        return modules
+    # A package that exports functions: the modules that define them.
+    homes = {x.__module__ for x in exported}
+    return [module for module in modules if module.__name__ in homes]
 
 
 def _own(module: ModuleType) -> list[str]:

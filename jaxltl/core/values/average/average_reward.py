@@ -36,7 +36,7 @@ def average_reward(
 
     Args:
       model: a SparseMDP, or any concrete model that :func:`to_sparse` takes.
-      reward: as for :func:`~jaxltl.core.models.sparse.row_reward`; finite.
+      reward: as for :func:`~jaxltl.core.models.sparse.choice_reward`; finite.
       objective: ``"max"`` or ``"min"``; irrelevant for chains.
       tolerance: the width of the enclosure, relative to the value; for small values relative to a
         millionth of the largest reward (a thousandth, if some are negative).

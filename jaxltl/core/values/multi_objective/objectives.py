@@ -36,7 +36,7 @@ class Objective:
       target: ``bool[S]``, or the name of a label.
       stay: with a target, ``bool[S]`` or a label that must hold until then.
       avoid: ``bool[S]``, or the name of a label.
-      reward: as for :func:`~jaxltl.core.models.sparse.row_reward`, not negative.
+      reward: as for :func:`~jaxltl.core.models.sparse.choice_reward`, not negative.
       direction: ``"max"`` or ``"min"``.
       threshold: at least that, or at most that for ``"min"``; None to optimise.
 

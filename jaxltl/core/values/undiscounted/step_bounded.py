@@ -153,7 +153,7 @@ def cumulative_reward(
 
     Args:
       model, num_steps, objective, nature, by_step: as for :func:`bounded_reachability`.
-      reward: as for :func:`~jaxltl.core.models.sparse.row_reward`; finite.
+      reward: as for :func:`~jaxltl.core.models.sparse.choice_reward`; finite.
 
     Returns:
       :class:`Solution`, as of :func:`bounded_reachability`.
@@ -246,7 +246,7 @@ def reward_bounded_reachability(
 
     Args:
       model, target, stay, objective: as for :func:`bounded_reachability`.
-      reward: as for :func:`~jaxltl.core.models.sparse.row_reward`, not negative, multiples of one
+      reward: as for :func:`~jaxltl.core.models.sparse.choice_reward`, not negative, multiples of one
         unit; numbers are read as the simplest fractions that round to them.
       bound: the largest reward.
       by_level: return the choices for all amounts left.
