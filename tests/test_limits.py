@@ -13,12 +13,12 @@ from benchmarks import size
 
 PACKAGE = Path(jaxltl.__file__).parent
 LIMITS = {
-    "lines": 92_400,
-    "statements": 42_500,
-    "docstring lines": 20_300,
+    "lines": 91_500,
+    "statements": 42_450,
+    "docstring lines": 19_400,
     "functions with more than 6 parameters": 93,
     "functions with more than 9 parameters": 8,
-    "Any in annotations": 2_030,
+    "Any in annotations": 2_040,
     "modules of the largest folder": 20,
     "names at the top level": 80,
 }

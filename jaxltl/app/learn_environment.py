@@ -428,15 +428,6 @@ def load_policy(
     the task file, and in that of the policy. Load only policies that you trust, or give
     `environment`: then nothing is imported.
 
-    Args:
-      policy_file: ``policy.npz``.
-      environment: with its labels and without the formula, in place of the task's.
-      task_file: in place of the text in the policy file.
-
-    Returns:
-      The arguments of :func:`~jaxltl.core.values.evaluation.evaluation.evaluate` and
-      :func:`~jaxltl.core.environments.episodes.run_episode`.
-
     Raises:
       ValueError: a missing file, or one that is no policy of this task; an invalid task, or
         missing functions.

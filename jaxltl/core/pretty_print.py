@@ -52,12 +52,6 @@ def brief(
 ) -> Any:
     """A class decorator for a short ``repr``.
 
-    Args:
-      cls: a dataclass or a named tuple.
-      facts: texts about an object, the most important first; default: its fields.
-      drawn: True if notebooks show :func:`picture` of the object above the text.
-      codes: the ``enum`` of the codes in a field, by field name.
-
     Example:
       >>> @brief
       ... @dataclasses.dataclass

@@ -210,15 +210,7 @@ def status_code(
     certified: chex.Array | bool = True,
     valid: chex.Array | bool = True,
 ) -> jax.Array:
-    """The :class:`Status` code of a solver that has ended, as ``int32``.
-
-    Args:
-      converged: the bounds, or the residual, meet the tolerance.
-      finite: all numbers are finite.
-      exhausted: the bounds are as narrow as rounding allows.
-      certified: `converged` refers to bounds, not only to a residual.
-      valid: the arguments are valid.
-    """
+    """The :class:`Status` code of a solver that has ended, as ``int32``."""
     code = jnp.where(exhausted, Status.PRECISION, Status.MAX_STEPS)
     code = jnp.where(converged, jnp.where(certified, Status.CONVERGED, Status.UNCERTIFIED), code)
     code = jnp.where(finite, code, Status.NONFINITE)

@@ -76,11 +76,6 @@ def require_in_range(name: str, value: Any, valid: Range | None = None) -> None:
 
     Of a traced value shape and dtype are checked; the range is checked by `contains` inside jit.
 
-    Args:
-      name: of the argument.
-      value: a number or a scalar array.
-      valid: its range; default the one that `RANGES` declares for the name.
-
     Raises:
       ValueError: with the value and the range.
 

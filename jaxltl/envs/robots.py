@@ -364,14 +364,7 @@ def _in_turns(
     names: Sequence[str],
     start: np.ndarray,
 ) -> Game:
-    """The game of two robots.
-
-    Args:
-      system, environment: the robots' moves; the system's K is at least the environment's.
-      position: ``int[C, 2]``, where the places lie.
-      mark: ``bool[C, P]``, the P propositions `names` of the places.
-      start: ``float[C, C]``, the distribution of the robots' places (environment, system).
-    """
+    """The game of two robots."""
     count, num_actions, width = system.target.shape
     shape = (count, count, 2, num_actions)
     here = np.arange(count, dtype=np.int32)

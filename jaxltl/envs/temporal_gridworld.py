@@ -336,11 +336,6 @@ def _can_finish(
     """World and memory states from which acceptance is reachable: ``bool[S, Q]``.
 
     In NumPy, for thousands of tries; a step reads the cell that it leaves.
-
-    Args:
-      successor: ``[S, A, K]``, all of them possible.
-      step: ``[S, Q]``, the memory after reading a cell.
-      final: ``[Q]``.
     """
     columns = [np.ascontiguousarray(c) for c in successor.reshape(len(successor), -1).T]
     can = np.broadcast_to(final, step.shape)

@@ -393,11 +393,7 @@ def _best_label(
 def _reachable(
     around: Points, reach: float, drawn: Points, boxes: list[Box]
 ) -> tuple[Points, Points]:
-    """Of points and boxes, all that come so near to some points, for speed, and perhaps more.
-
-    Returns:
-      ``float[N, 2]`` and, centres and halves, ``float[B, 2, 2]``.
-    """
+    """Of points and boxes, all that come so near to some points, for speed, and perhaps more."""
     low, high = around.min(axis=0) - reach, around.max(axis=0) + reach
     region = Box((low + high) / 2, (high - low) / 2)
     near = np.all(np.abs(drawn - region.center) < region.half, axis=1)

@@ -44,16 +44,7 @@ class Stored(NamedTuple):
 
 
 def write(path: Path, arrays: Mapping[str, Any], create: Write) -> dict[str, Stored]:
-    """Writes this process's part of arrays, and waits until the others have written theirs.
-
-    Args:
-      path: the file that is to tell of the parts.
-      arrays: global ones, by name; in every process the same.
-      create: opens a file that appears when it is complete.
-
-    Returns:
-      What there is, of all processes.
-    """
+    """Writes this process's part of arrays, and waits until the others have written theirs."""
     from jax.experimental.multihost_utils import process_allgather
 
     token = np.frombuffer(secrets.token_bytes(8), np.uint32)

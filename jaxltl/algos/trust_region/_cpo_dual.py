@@ -44,14 +44,6 @@ def cpo_dual(
     Where the limit cannot be kept in the trust region the dual is unbounded, and the multipliers
     returned are those of the paper's recovery, ``max -b.x``: ``x = -H^-1 b / lambda``, nu = 1.
 
-    Args:
-      q, r, s: ``g.H^-1 g``, ``g.H^-1 b`` and ``b.H^-1 b``, where ``q s >= r^2``.
-      c: by how much the limit is exceeded now.
-      delta: positive.
-
-    Returns:
-      :class:`Dual`; lambda is 0 where `g` gives no direction to spend the trust region on.
-
     Example:
       >>> dual = cpo_dual(q=1.0, r=0.0, s=1.0, c=0.6, delta=0.5)
       >>> [round(float(x), 3) for x in dual[:2]], Case(int(dual.case)).name

@@ -189,12 +189,6 @@ def off_map(shape: Sequence[int]) -> str:
 def convert(path: Path, schema: type[_Table], data: Mapping[str, Any], name: str = "") -> _Table:
     """A table of a file as an instance of its schema.
 
-    Args:
-      path: the file.
-      schema: of the table, or of the whole file.
-      data: keys and values as TOML has them.
-      name: of the table; empty for the whole file.
-
     Raises:
       ValueError: a key is unknown, with the nearest known one; has a wrong value; or is missing.
     """

@@ -243,10 +243,6 @@ def _booleans(values: ArrayLike | None, place: str, shape: tuple[int, ...]) -> N
 def letter_index(automaton: Automaton, letter: Letter) -> int:
     """The index l of a letter, so that `delta[q, l]` reads it.
 
-    Args:
-      automaton: the automaton.
-      letter: the propositions that hold; names unknown to the automaton are ignored.
-
     Raises:
       ValueError: for a combination of propositions that is not among the letters.
 
@@ -281,13 +277,6 @@ def run(automaton: Automaton, word: Iterable[Letter]) -> NDArray[np.int32]:
     """The states passed while reading a finite word, from `initial` on.
 
     `q[0] = initial` and `q[t+1] = delta[q[t], w[t]]`.
-
-    Args:
-      automaton: the automaton.
-      word: `[T]` letters, each the collection of the propositions that hold.
-
-    Returns:
-      int32 `[T+1]`.
 
     Example:
       >>> from jaxltl import to_automaton

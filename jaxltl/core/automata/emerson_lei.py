@@ -30,11 +30,6 @@ MAX_SUBSETS = 20_000  # parts examined in one decomposition before it is given u
 def holds(condition: Condition, colors: int) -> bool:
     """True if a condition holds of the set of colors that occur infinitely often.
 
-    Args:
-      condition: `("true",)`, `("false",)`, `("inf", i)`: color i occurs infinitely often,
-        `("fin", i)`: it does not, `("and", ...)` or `("or", ...)` of conditions.
-      colors: the set, as a number with color i as bit i.
-
     Example:
       >>> holds(("and", ("inf", 0), ("fin", 1)), 0b01)
       True
@@ -86,18 +81,6 @@ def to_parity(
     max_states: int = 1_000_000,
 ) -> tuple[Integers, Integers, int, Integers]:
     """A deterministic min-even parity automaton with the language of an Emerson-Lei one.
-
-    Args:
-      delta: `[Q, L]` successors.
-      colors: int64 `[Q, L]`, the set of colors of each transition, color i as bit i.
-      initial: the initial state.
-      condition: see `holds`.
-      max_states: the number of states at which to give up.
-
-    Returns:
-      `delta [Q', L]`, `priority [Q', L]`, the initial state, and `[Q']` the old state of each
-      new one. Only reachable states are kept, the initial one first. Transitions on no cycle
-      have priority 1.
 
     Raises:
       ValueError: for more than `max_states` states, too many parts to examine, or a color

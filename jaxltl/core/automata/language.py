@@ -27,12 +27,6 @@ def find_accepted(automaton: Automaton) -> Lasso | None:
     the transitions of priority p or more, with one of priority p (Baier & Katoen 2008, section
     4.4, for one priority).
 
-    Args:
-      automaton: the automaton.
-
-    Returns:
-      `(prefix, cycle)`, each a list of letters, or None if no word is accepted.
-
     Example:
       >>> from jaxltl import to_automaton
       >>> find_accepted(to_automaton("F a"))
@@ -112,13 +106,6 @@ def find_not_included(a: Task, b: Task) -> Lasso | None:
     On the runs of both, for each even p and odd r: a cycle on which the least priorities are p
     and r. Neither acceptance has to be converted.
 
-    Args:
-      a: the automaton whose words are tested.
-      b: the automaton that should accept them; both are aligned first, see `align`.
-
-    Returns:
-      `(prefix, cycle)`, or None if the language of `a` is included in that of `b`.
-
     Raises:
       ValueError: if there is no joint letter, or too many.
 
@@ -153,13 +140,6 @@ def is_included(a: Task, b: Task) -> bool:
 
 def intersection(a: Task, b: Task) -> Automaton:
     """The automaton that accepts the words that both accept.
-
-    Args:
-      a: an automaton, a formula or its text.
-      b: another; both are aligned first, see `align`.
-
-    Returns:
-      A deterministic automaton, simplified.
 
     Raises:
       ValueError: if there is no joint letter, or too many, or too many priorities.
@@ -236,13 +216,6 @@ def _colored(
 
     Neighbouring priorities of one parity share a colour, and the greatest need none: they
     decide when no other is met infinitely often.
-
-    Args:
-      priority: `[N, L]`.
-      first: the number of the first colour.
-
-    Returns:
-      int64 `[N, L]` bit masks, the condition, and the number after the last colour.
     """
     values, place = np.unique(priority, return_inverse=True)
     level_of = np.concatenate([[0], np.cumsum(np.diff(values % 2) != 0)])

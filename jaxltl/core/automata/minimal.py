@@ -28,12 +28,7 @@ def minimize(automaton: Automaton) -> Automaton:
 
 
 def quotient(automaton: Automaton, classes: NDArray[np.int32]) -> Automaton:
-    """Quotient automaton by an equivalence of states.
-
-    Args:
-      automaton: the automaton.
-      classes: int32 `[Q]`, the class of each state, -1 to drop it (see `equivalence_classes`).
-    """
+    """Quotient automaton by an equivalence of states."""
     kept = np.flatnonzero(classes >= 0)
     _, first = np.unique(classes[kept], return_index=True)
     members = kept[first]  # one state of each class, in the order of the classes
@@ -57,9 +52,6 @@ def equivalence_classes(automaton: Automaton) -> NDArray[np.int32]:
     The coarsest such partition is found by refinement, always queueing the smaller half of a
     split block (Hopcroft 1971, "An n log n algorithm for minimizing states in a finite
     automaton"), and numbered breadth first from the initial state.
-
-    Returns:
-      int32 `[Q]`.
     """
     reached = _breadth_first(automaton.delta, int(automaton.initial))
     position = np.full(len(automaton.delta), -1)

@@ -52,13 +52,6 @@ def align(a: Automaton, b: Automaton) -> tuple[Automaton, Automaton]:
     letter of `b` that agree on the shared propositions say together, by binary number: all
     2^P if both have all of theirs, and the common letters if the propositions are the same.
 
-    Args:
-      a: an automaton.
-      b: another.
-
-    Returns:
-      The two automata, that read the joint letters and are otherwise the same.
-
     Raises:
       ValueError: if there is no joint letter, or too many.
 
@@ -196,13 +189,7 @@ def some_loop(runs: Runs, wanted: Sequence[tuple[int, ...]]) -> bool:
 
 
 def _loops(runs: Runs, parities: tuple[int, ...]) -> Iterator[_Loops]:
-    """The loops on which the least priority of automaton k has parity `parities[k]`.
-
-    Yields:
-      For each choice of the least priorities that has such loops, the transitions inside of
-      strongly connected parts that read nothing less and read each of them, and for each
-      automaton those of these transitions that read its least priority.
-    """
+    """The loops on which the least priority of automaton k has parity `parities[k]`."""
     choices = [
         [value for value in np.unique(priority) if value % 2 == parity]
         for priority, parity in zip(runs.priorities, parities, strict=True)

@@ -71,11 +71,6 @@ def prime_cover(chosen: set[int], others: set[int], width: int) -> list[Cube]:
 
     Letters that are in neither set may fall on either side; see `diagram.prime_cubes`.
 
-    Args:
-      chosen: letters as numbers, with proposition p as bit p.
-      others: more letters.
-      width: the number of propositions.
-
     Example:
       >>> prime_cover({0b01, 0b11}, {0b00}, 2)
       [((0, True),)]

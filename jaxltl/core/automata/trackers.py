@@ -96,17 +96,6 @@ def track(
 ) -> tuple[NDArray[np.int32], NDArray[np.int64], Condition, NDArray[np.intp]]:
     """The trackers of a combination as one automaton with an Emerson-Lei condition.
 
-    Args:
-      parts: the combination.
-      letters: bool `[L, P]`.
-      propositions: `[P]` names.
-      max_states: the number of states at which to give up.
-      max_nodes: the number of diagrams at which to give up.
-
-    Returns:
-      `delta [Q, K]` and color sets `[Q, K]` over K classes of letters, state 0 initial; the
-      condition; and the class `[L]` of each letter.
-
     Raises:
       ValueError: for too many states.
     """

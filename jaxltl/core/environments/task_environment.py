@@ -168,14 +168,6 @@ def make_task_tables(
 ) -> TaskTables:
     """The tables of a task.
 
-    Args:
-      formula: a formula, its text, or an automaton over all subsets of its propositions.
-      propositions: the names of the environment's P labels.
-      options: see :class:`TaskOptions`.
-
-    Returns:
-      :class:`TaskTables`.
-
     Raises:
       ValueError: as :func:`task_environment`.
 

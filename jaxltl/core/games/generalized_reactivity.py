@@ -57,17 +57,7 @@ class _Arena(NamedTuple):
 
 
 def solve_gr1(graph: Graph, system: Any, objective: GR1, moves: Any = None) -> Reactive:
-    """Winning region of a GR(1) objective, and winning strategies of both players.
-
-    Args:
-      graph: the game's graph.
-      system: ``bool[S]``, the system's states.
-      objective: what the system is to achieve.
-      moves: ``bool[S, A]``, those that there are; default the available ones.
-
-    Returns:
-      :class:`Reactive`.
-    """
+    """Winning region of a GR(1) objective, and winning strategies of both players."""
     xp, arena = graph.xp, _Arena(graph, system, objective)
     num_guarantees, num_assumptions = len(objective.guarantees), len(objective.assumptions)
     moves = graph.available if moves is None else moves & graph.available
@@ -109,11 +99,7 @@ def _near(arena: _Arena, found: Any) -> Any:
 
 
 def _pursue(arena: _Arena, j: int, inside: Any, allowed: Any) -> tuple[Any, Any]:
-    """States from which the system, inside a set, meets guarantee j or an assumption fails.
-
-    Returns:
-      ``bool[S]``, and the system's moves there, ``int32[S]``.
-    """
+    """States from which the system, inside a set, meets guarantee j or an assumption fails."""
     graph, system, objective = arena
     xp = graph.xp
 
@@ -167,14 +153,6 @@ def gr1_layers(graph: Graph, system: Any, objective: GR1) -> Layers:
     In round r, with Y the states covered before, layer (r, i) is the greatest X from which the
     system, moving within the region, is at guarantee j, or comes into Y with positive
     probability, or stays in X where assumption i does not hold.
-
-    Args:
-      graph: the game's graph.
-      system: ``bool[S]``, the system's states.
-      objective: the objective.
-
-    Returns:
-      :class:`Layers`.
     """
     xp, arena = graph.xp, _Arena(graph, system, objective)
     region = solve_gr1(graph, system, objective).region

@@ -532,9 +532,6 @@ def budgets(caps: list[int], num_priorities: int) -> np.ndarray:
     most significant; in the last state they are spent. Meeting an odd priority takes one
     from the number down to its digit; meeting any priority restores all less significant ones.
 
-    Returns:
-      ``int[N, num_priorities]``, the state after meeting a priority. A run starts in N - 2.
-
     Raises:
       ValueError: more than a million states.
     """

@@ -119,14 +119,7 @@ def winning_region(
 
 
 def solve(game: Game, objective: Parity | GR1, moves: jax.Array | None = None) -> Winning:
-    """:func:`winning_region` of an objective, restricted to some moves.
-
-    Args:
-      game: the game.
-      objective: the system's objective.
-      moves: ``bool[S, A]``, on a sparse model ``bool[R]``; default the available ones. A state
-        without any is won by the opponent of its owner.
-    """
+    """:func:`winning_region` of an objective, restricted to some moves."""
     form, _ = compiled_form(game)
     graph = graph_of(form, objective, moves)
     owner, goal, moves = take(graph, (form.system, _flat(form, objective), moves))
@@ -219,14 +212,6 @@ def adversarial_chance(game: Game) -> tuple[Game, jax.Array]:
 
     The system wins this deterministic game where it wins the stochastic one surely.
 
-    Args:
-      game: a game over an MDP, or over a Product of one.
-
-    Returns:
-      A game whose first S states (a product's, numbered ``s * Q + q``) are those of
-      `game`, followed by one for each random move, where the environment chooses among
-      its successors; and ``int32[S']``, the original states.
-
     Raises:
       ValueError: the world has no successor lists.
     """
@@ -279,14 +264,7 @@ class _Arena(NamedTuple):
 
 
 def solve_parity(graph: Graph, system: Any, objective: Parity, moves: Any = None) -> _Found:
-    """Winning region of a parity game, with moves of both players.
-
-    Args:
-      graph: the game's graph.
-      system: ``bool[S]``, the system's states.
-      objective: the system's objective.
-      moves: ``bool[S, A]``; default the available ones.
-    """
+    """Winning region of a parity game, with moves of both players."""
     moves = graph.available if moves is None else moves & graph.available
     start = _Found(objective.won & ~objective.lost, graph.first(moves)[1])
     open_ = ~(objective.won | objective.lost)
@@ -294,15 +272,7 @@ def solve_parity(graph: Graph, system: Any, objective: Parity, moves: Any = None
 
 
 def _level(arena: _Arena, p: int, won: _Found, open_: Any, allowed: Any) -> _Found:
-    """The open states from which the system wins, if reaching `won` is winning too.
-
-    Args:
-      p: no open state has a priority below it.
-      won: decided already, with the moves so far.
-      open_: ``bool[S]``, undecided; all other states are lost for the system.
-      allowed: ``bool[S, A]``; the environment's other moves help the system, since each
-        brings it nearer, with positive probability, to what it seeks at a lower priority.
-    """
+    """The open states from which the system wins, if reaching `won` is winning too."""
     if p == arena.objective.num_priorities:
         return won
     solve = _even if p % 2 == 0 else _odd

@@ -19,12 +19,7 @@ def is_boolean(formula: Formula) -> bool:
 
 
 def require_known(needed: Collection[str], known: Sequence[str], place: str) -> None:
-    """Raises a ValueError that names the first proposition that is not known.
-
-    Args:
-      needed, known: names of propositions.
-      place: the subject of the message.
-    """
+    """Raises a ValueError that names the first proposition that is not known."""
     for name in needed:
         if name not in known:
             guess = difflib.get_close_matches(name, known, n=1)
@@ -39,15 +34,6 @@ def satisfying(
     label: NDArray[np.bool_], propositions: Sequence[str], condition: Formula | str, place: str
 ) -> NDArray[np.bool_]:
     """The rows of labels that satisfy a Boolean formula.
-
-    Args:
-      label: ``bool[S, P]``.
-      propositions: the P names.
-      condition: a formula without temporal operators.
-      place: the subject of error messages.
-
-    Returns:
-      ``bool[S]``.
 
     Raises:
       ValueError: an unknown proposition or a temporal operator.
@@ -76,14 +62,7 @@ _COUNTED = 16  # columns up to which every combination has a counter
 
 
 def distinct_rows(rows: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
-    """The different rows of a Boolean array, and the number of each row among them.
-
-    Args:
-      rows: ``bool[S, P]``.
-
-    Returns:
-      ``bool[L, P]`` and ``int64[S]``. Without sorting where P is small.
-    """
+    """The different rows of a Boolean array, and the number of each row among them."""
     width = rows.shape[1]
     if width > _COUNTED:
         found, number = np.unique(rows, axis=0, return_inverse=True)

@@ -275,14 +275,7 @@ def _syntax_error(text: str, error: UnexpectedInput) -> str:
 
 
 def pointed(place: str, text: str, position: int, found: str, wanted: str) -> str:
-    """Error message for a position of a text, with a caret under it.
-
-    Args:
-      place: the subject of the message.
-      text: all of it.
-      position: of the error.
-      found, wanted: in words.
-    """
+    """Error message for a position of a text, with a caret under it."""
     line_start = text.rfind("\n", 0, position) + 1
     line = text[line_start:].split("\n")[0]
     column = position - line_start
@@ -374,11 +367,6 @@ def negation_normal_form(formula: Formula) -> Formula:
 
 def offending_subformula(formula: Formula, fragment: Fragment) -> Formula | None:
     """The outermost subformula of the normal form that leaves a fragment, or None.
-
-    Args:
-      formula: any formula; its negation normal form is examined.
-      fragment: `"cosafe"` allows `X F U M`, `"safety"` allows `X G R W`; both allow
-        literals, `&` and `|` (Kupferman & Vardi 2001, "Model checking of safety properties").
 
     Example:
       >>> print(offending_subformula(parse_ltl("a & G F b"), "safety"))

@@ -249,12 +249,6 @@ def combination(
 ) -> Combination:
     """A positive combination of Sigma-2 and Pi-2 formulas and limits.
 
-    Args:
-      formula: a simplified formula.
-      grouped: leave conjuncts, and disjuncts, of one class together in one part.
-      dual: normalise negations, which gives Pi-2 where Sigma-2 comes else.
-      steps: the work at which to give up.
-
     Raises:
       ValueError: for too many steps or parts.
     """

@@ -49,16 +49,7 @@ def identity(mdp: HostMDP, cost: Floats | None = None) -> Contraction:
 
 
 def contract_chains(mdp: HostMDP, fixed: Booleans, cost: Floats | None) -> Contraction | None:
-    """Identifies states that have one row with one successor with that successor.
-
-    Args:
-      mdp: the model.
-      fixed: ``bool[S]``, states to keep.
-      cost: ``float64[R]``, rewards, or None for zero.
-
-    Returns:
-      The contraction, with nodes in the order of their states; None where it does not pay.
-    """
+    """Identifies states that have one row with one successor with that successor."""
     size = mdp.num_states
     width = mdp.entry_start[mdp.row_start[1:]] - mdp.entry_start[mdp.row_start[:-1]]
     alias = (width == 1) & ~fixed
@@ -122,15 +113,7 @@ def _renamed(
 
 
 def quotient(mdp: HostMDP, component: Integers, inside: Booleans, cost: Floats) -> Contraction:
-    """The quotient by end components: one state each, with the rows that leave it.
-
-    Args:
-      mdp: the model.
-      component: ``int[S]``, the least state of each state's component.
-      inside: ``bool[R]``, the rows to leave out. A node all of whose rows are left out keeps one of
-        them, and its value is meaningless.
-      cost: ``float64[R]``.
-    """
+    """The quotient by end components: one state each, with the rows that leave it."""
     size = mdp.num_states
     leader = component[mdp.state]
     kept = ~inside

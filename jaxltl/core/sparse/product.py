@@ -64,14 +64,6 @@ def sparse_product(
     A step leads from ``(s, q)`` to ``(t, delta[q, letter[t]])``, or to ``(t, delta[q, letter[s]])``
     where letters are read on exit.
 
-    Args:
-      host: the model.
-      delta: ``int[Q, L]``.
-      letter: ``int[S]``, of each state.
-      state, memory: ``int[I]``, the starts.
-      on_entry: whether the letter of the state that is entered is read.
-      still: ``bool[Q]``, automaton states whose verdict is known; their states become absorbing.
-
     Raises:
       ValueError: there are more than 2^31 pairs.
 

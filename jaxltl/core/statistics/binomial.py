@@ -28,14 +28,6 @@ def clopper_pearson(count: Integers, total: Integers, failure: float) -> Ends:
     ``P(Bin(n, lower) >= k) = P(Bin(n, upper) <= k) = failure / 2``. Each side misses with a chance
     of at most ``failure / 2``, whatever the probability, if n does not depend on what came.
 
-    Args:
-      count: ``int[N]``, k, from 0 to n.
-      total: ``int[N]``, n, below 2^53.
-      failure: in (0, 1).
-
-    Returns:
-      ``float64[N]`` each; 0 and 1 where nothing was tried.
-
     Example:
       >>> lower, upper = clopper_pearson(np.array([0, 5]), np.array([10, 10]), 0.05)
       >>> lower.round(4).tolist(), upper.round(4).tolist()
@@ -157,11 +149,6 @@ def _climbed(
 
     Newton's steps end left of the zero, where the function is below its tangents; so they climb to
     it, and what is found does not depend on what else is looked for.
-
-    Args:
-      gap: the function and its derivative, at some x and their numbers.
-      k, n: the zero is left of ``k / n``.
-      deviance: how far the function rises until there, nearly.
     """
     # The lower end of Wilson's interval.
     share, half = k / n, deviance / n

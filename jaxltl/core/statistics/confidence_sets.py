@@ -197,14 +197,6 @@ def l1_radius(total: Integers, num_outcomes: Integers, failure: float) -> Floats
 
     ``sqrt(2 / n log((2^J - 2) / failure))`` (Weissman et al. 2003, theorem 2.1), at most 2.
 
-    Args:
-      total: ``int[R]``, n.
-      num_outcomes: ``int[R]``, J.
-      failure: in (0, 1).
-
-    Returns:
-      ``float64[R]``, rounded up; 0 where J is at most 1.
-
     Example:
       >>> l1_radius(np.array([100, 0]), np.array([3, 3]), 0.1).round(4).tolist()
       [0.2862, 2.0]
@@ -228,13 +220,6 @@ def samples_needed(
     """Number of samples of a row after which every interval has at most a given width.
 
     The widest interval is that of an outcome which comes half of the time.
-
-    Args:
-      width: of an interval, in (0, 1).
-      confidence: in (0, 1), of all claims together.
-      method: as for :func:`intervals_from_counts`.
-      num_claims: M, that share ``1 - confidence``.
-      num_outcomes: J, which only ``"weissman"`` asks for.
 
     Raises:
       ValueError: `width` or `confidence` is not in (0, 1), `num_claims` is below 1 or

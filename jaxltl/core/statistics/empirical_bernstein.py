@@ -27,12 +27,6 @@ def bounded_mean(
 ) -> tuple[float, float]:
     """Confidence interval of the mean of numbers in [0, 1].
 
-    Args:
-      numbers: ``float64[N]`` in the order in which they came; those outside are clipped.
-      failure: the chance of a miss, in (0, 1).
-      planned: how many there were to be from the start, if that is known: the interval is then
-        narrowest. It holds without, too, however it was decided how many there are.
-
     Raises:
       ValueError: what are no numbers, or a chance outside of its range.
 

@@ -34,12 +34,6 @@ def register_annotated_pytree(
 ) -> type[ClassT]:
     """Registers a dataclass as a pytree with text.
 
-    Args:
-      cls: the dataclass.
-      arrays: names of the fields that hold arrays, or None.
-      static: names of the fields that are part of the structure and compared by value.
-      text: for each text field its value in trees of traced arrays.
-
     Example:
       >>> from dataclasses import dataclass
       >>> @dataclass

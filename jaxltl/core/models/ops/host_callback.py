@@ -17,11 +17,6 @@ def host_callback(function: Callable[..., Any], result: Any, *arguments: Any) ->
     JAX rounds the arrays of a callback to single precision if double precision is enabled for the
     calling thread only. 64-bit numbers are therefore passed as pairs of 32-bit words.
 
-    Args:
-      function: of trees of NumPy arrays, without side effects.
-      result: the shapes and dtypes of what it returns; numbers are converted to these dtypes.
-      arguments: trees of arrays.
-
     Example:
       >>> import numpy as np
       >>> host_callback(np.sum, jax.ShapeDtypeStruct((), float), jnp.arange(4)).item()

@@ -31,10 +31,6 @@ def accepting_region(mdp: HostMDP, priority: Integers) -> AcceptingRegion:
     row that reads p (Baier and Katoen 2008, section 10.6.4, for Rabin pairs). The largest
     probability of acceptance is that of reaching them.
 
-    Args:
-      mdp: the product.
-      priority: ``int[T]``, read by each entry.
-
     Example:
       >>> from jaxltl import make_sparse
       >>> ring = make_sparse(None, [0, 1, 2, 3], [1, 0, 2], [1.0, 1.0, 1.0]).host

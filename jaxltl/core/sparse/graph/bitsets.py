@@ -80,15 +80,7 @@ class BitGraph:
         kept: list[Words] | None = None,
         action: Integers | None = None,
     ) -> Words | None:
-        """The attractor ``word[S]`` of a goal; None if it takes too many sweeps.
-
-        Args:
-          goal: ``word[S]``.
-          among: ``word[S]``, the pairs that may join.
-          forced: whether all actions must lead to the region, else some.
-          kept: for each action the pairs in which it counts; default where it is permitted.
-          action: ``int[S, Q]``, filled with an action that leads nearer, for each pair that joins.
-        """
+        """The attractor ``word[S]`` of a goal; None if it takes too many sweeps."""
         region, kept = goal.copy(), self.permitted if kept is None else kept
         seen = self.seen(region)
         for _ in range(_SWEEPS):

@@ -24,13 +24,7 @@ _MANY = 64  # transitions into one of them from which it does not
 
 
 def backward_reachable(mdp: HostMDP, goal: Booleans, rows: Booleans | None = None) -> Booleans:
-    """States from which some path leads to a goal: the largest probability is positive.
-
-    Args:
-      mdp: the model.
-      goal: ``bool[S]``.
-      rows: ``bool[R]``, the rows that may be taken; default all.
-    """
+    """States from which some path leads to a goal: the largest probability is positive."""
     start, row = mdp.predecessors
     source = mdp.state[row]
     if rows is not None:
@@ -74,12 +68,6 @@ def positive_under_all_policies(
 
     The least set with the goal and all states each of whose rows has a successor in it (the
     complement of Prob0E). From all other states some policy avoids the goal.
-
-    Args:
-      mdp: the model.
-      goal: ``bool[S]``.
-      rows: ``bool[R]``, the rows that count; a state without any joins. Default all.
-      among: ``bool[S]``, the states that may join; default all.
     """
     if mdp.is_chain and rows is None and among is None:
         return backward_reachable(mdp, goal)

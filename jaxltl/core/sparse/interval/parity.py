@@ -36,16 +36,7 @@ _ROUNDS = 200
 def parity_against_nature(
     model: UncertainMDP, priority: Integers, *, tolerance: float = 1e-6
 ) -> RobustValues:
-    """Maximal probability that the least priority seen infinitely often is even, for any nature.
-
-    Args:
-      model: the product.
-      priority: ``int[S]``, read as a state is left.
-      tolerance: requested width of the enclosure.
-
-    Returns:
-      Values, a policy, and nature's distributions against which no policy does better.
-    """
+    """Maximal probability that the least priority seen infinitely often is even, for any nature."""
     mdp = model.mdp
     row: Integers = mdp.row_start[:-1].astype(np.int64)
     zero = np.zeros(mdp.num_rows)
@@ -224,11 +215,6 @@ def almost_sure_parity(game: ClassGame, priority: Integers, *, leader: str) -> R
     either all successors are in Yi and some in Xi, for some i < j (i <= j where the priority is
     odd), or, where it is even, all are in Yj (de Alfaro and Henzinger 2000, with sides that move
     one after the other). Leaving a class is lost for the policy and won for nature.
-
-    Args:
-      game: the choices of both.
-      priority: ``int[S]``.
-      leader: ``"policy"`` or ``"nature"``.
     """
     model = game.model
     possible = (model.upper > 0) & (

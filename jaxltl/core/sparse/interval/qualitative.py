@@ -118,14 +118,6 @@ def almost_sure_states(
     The greatest set that can be kept and in which the goal is reached with positive probability, by
     the players that maximise against those that minimise (de Alfaro, Henzinger and Kupferman
     2007); not for two that minimise.
-
-    Args:
-      model, goal, query: as for :func:`zero_one_states`.
-      inside: ``bool[S]``, a superset of the result.
-
-    Returns:
-      ``bool[S]``, and ``bool[R]``: rows that nature can keep inside if it maximises, else rows that
-      stay inside whatever it does.
     """
     mdp, helps = model.mdp, query.nature_maximizes
     while True:
@@ -155,16 +147,7 @@ def almost_sure_states(
 def joint_end_components(
     model: UncertainMDP, states: Booleans | None = None, entries: Booleans | None = None
 ) -> tuple[EndComponents, Booleans]:
-    """Maximal end components of policy and nature together.
-
-    Args:
-      model: the model.
-      states: ``bool[S]``, states to search; default all.
-      entries: ``bool[T]``, entries that may be used; default all.
-
-    Returns:
-      The components, and ``bool[T]``, the entries used inside.
-    """
+    """Maximal end components of policy and nature together."""
     mdp = model.mdp
     used = np.ones(mdp.num_transitions, bool) if entries is None else entries.copy()
     source = mdp.state[mdp.row]

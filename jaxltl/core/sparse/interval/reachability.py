@@ -190,14 +190,7 @@ def move_to_exits(
     inside: Booleans,
     used: Booleans,
 ) -> tuple[Integers, Floats]:
-    """A pair that moves inside each end component to the state whose row leaves it.
-
-    Args:
-      model: the model.
-      pair: ``int[S]``, of each component the row that leaves it, and nature's distributions.
-      component: ``int[S]``.
-      inside, used: ``bool[R]``, ``bool[T]``, rows and entries inside the components.
-    """
+    """A pair that moves inside each end component to the state whose row leaves it."""
     (row, chance), mdp = pair, model.mdp
     exits = mdp.state[row] == np.arange(mdp.num_states)
     inner = np.zeros(mdp.num_states, bool)

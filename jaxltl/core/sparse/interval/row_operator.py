@@ -246,15 +246,7 @@ class RowOperator:
         *,
         all_fine: bool = False,
     ) -> tuple[PolicyPair, float]:
-        """The pair improved at some values, and the largest gain.
-
-        Args:
-          pair, z: the pair and ``float64[M]``.
-          step_reward: reward of every step that leaves its node, or ``float64[M]``.
-          least: gain to exceed, for values of the pair with an error: a policy that follows their
-            noise may never leave.
-          all_fine: whether gains of all rows count relative to their own size.
-        """
+        """The pair improved at some values, and the largest gain."""
         values, chosen, p = self.values(z), pair.chosen, []
         all_fine |= isinstance(z, TwoFloats)
         gain, now, noise = (np.empty(self.row.size) for _ in range(3))

@@ -87,15 +87,7 @@ def next_step(model: UncertainMDP, target: Booleans, query: Query) -> StepBounde
 def total(
     model: UncertainMDP, earned: Floats, start: Floats, num_steps: int, query: Query
 ) -> StepBoundedValues:
-    """Expected reward of `num_steps` steps plus a final reward.
-
-    Args:
-      model: the model.
-      earned: ``float64[T]``, reward of each entry.
-      start: ``float64[S]``, final reward.
-      num_steps: the number of steps.
-      query: directions of policy and nature.
-    """
+    """Expected reward of `num_steps` steps plus a final reward."""
     mdp, one = model.mdp, backup_error(model)
     value, error, done = start, 0.0, 0
     row: Integers = mdp.row_start[:-1].astype(np.int64)

@@ -281,16 +281,6 @@ def l1_expectation(
     Half of the radius is moved from the worst successors to the best one (Strehl and Littman 2008,
     section 3.2).
 
-    Args:
-      value: ``float64[T]``, finite, ``v[successor]`` of each entry.
-      center: ``float64[T]``, distributions; entries of zero can gain.
-      radius: ``float64[R]``, at least 0.
-      entry_start: ``int[R + 1]``, the first entry of each row; no row is empty.
-      maximize: whether the expectation is maximised.
-
-    Returns:
-      The expectations ``float64[R]``, and distributions ``float64[T]`` that attain them.
-
     Raises:
       ValueError: shapes do not match, a row is empty, or a radius is negative.
 

@@ -133,13 +133,7 @@ class Factors(NamedTuple):
 
 
 def factorize(rows: Any, label: Integers, chosen: Integers) -> Factors | None:
-    """Factors of a policy's system; None if it is singular.
-
-    Args:
-      rows: SciPy's ``float64[R, M]``.
-      label: ``int[M]``, numbers of components; no row leads to a greater one.
-      chosen: ``int[M]``, the row of each state.
-    """
+    """Factors of a policy's system; None if it is singular."""
     matrix, size = rows[chosen], np.bincount(label)
     if min(_between(matrix, label, size)) <= _MOST_BETWEEN:
         order = elimination_order(matrix, label, _WORK)
@@ -178,13 +172,7 @@ def _between(matrix: Any, label: Integers, size: Integers) -> tuple[int, int]:
 
 
 def elimination_order(matrix: Any, label: Integers, work: float = np.inf) -> Integers | None:
-    """Order by component, and within each by reverse Cuthill-McKee; None where that would not help.
-
-    Args:
-      matrix: SciPy's ``float64[M, M]``.
-      label: ``int[M]``, the components.
-      work: multiplications, for a band matrix, that a component may cost.
-    """
+    """Order by component, and within each by reverse Cuthill-McKee; None where that would not help."""
     from scipy.sparse import csgraph
 
     size = np.bincount(label)
@@ -281,10 +269,6 @@ def _too_much(matrix: Any, label: Integers) -> bool:
 
     Factors fill nothing before the first entry of a row and of a column (George and Liu 1981). In
     components where that bound is too large, rows are counted along the elimination tree.
-
-    Args:
-      matrix: ``float64[B, B]``.
-      label: ``int[B]``, contiguous components.
     """
     size = label.size
     if size * (size + 1) <= _MOST:

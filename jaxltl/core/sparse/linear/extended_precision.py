@@ -84,15 +84,7 @@ def refined_optimum(
     solver_of: Callable[[Integers], Solver | None],
     tolerance: float,
 ) -> RefinedOptimum | None:
-    """Optimum by policy iteration on two-float values; None if it is not found.
-
-    Args:
-      equation: the optimality equation.
-      unit: the relative error of its numbers and of the sums of a row.
-      policy: ``int[M]``, a policy that leaves almost surely.
-      solver_of: approximate solver of ``(I - P) x = b`` for a policy's rows P, or None.
-      tolerance: the relative error that suffices.
-    """
+    """Optimum by policy iteration on two-float values; None if it is not found."""
     rows = _Rows(equation)
     for round_ in range(1, _POLICIES + 1):
         solve = solver_of(policy)
@@ -210,13 +202,7 @@ def _with_ties(pair: _Pair, level: float) -> tuple[Floats, Floats]:
 def exact_optimum(
     equation: OptimalityEquation, policy: Integers, order: Integers
 ) -> tuple[Floats, Integers] | None:
-    """Optimum in fractions by policy iteration, rounded to floats; None if it takes too long.
-
-    Args:
-      equation: of at most `MAX_FRACTIONS` unknowns, with its floats read as exact numbers.
-      policy: ``int[M]``, a policy that leaves almost surely.
-      order: ``int[M]``, in which unknowns are eliminated, the last first.
-    """
+    """Optimum in fractions by policy iteration, rounded to floats; None if it takes too long."""
     rows = [_fraction_row(equation, r) for r in range(equation.owner.size)]
     owner, policy = equation.owner.tolist(), np.array(policy)
     for _ in range(_FRACTION_POLICIES):

@@ -155,14 +155,7 @@ def solve_by_sweeps(
     start: Floats | None = None,
     time: float | None = None,
 ) -> SweptBounds | None:
-    """Certified optimum by sweeps; None where they would take long, or prove too little.
-
-    Args:
-      problem: of a minimum, staying forever must cost infinitely much.
-      settings: sign, accuracy and limits.
-      start: ``float[N]``, a first guess of the values.
-      time: a first guess of how long a policy stays, for an absolute tolerance.
-    """
+    """Certified optimum by sweeps; None where they would take long, or prove too little."""
     cost = 0 if problem.cost is None else problem.cost.max()
     if max(problem.outer.max(initial=0), cost) > _LARGEST:
         return None

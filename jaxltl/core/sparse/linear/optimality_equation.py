@@ -77,12 +77,6 @@ def propagate_improvements(
     alone, takes the news all the way (Bertsekas and Tsitsiklis 1989, section 2.6). Values improve
     monotonically, so no row that was chosen gets worse, and the new policy is better than the old
     one wherever it differs.
-
-    Args:
-      equation: the optimality equation.
-      value: ``float64[M]``, of the policy.
-      policy: ``int[M]``, rows.
-      threshold: the smallest gain that counts.
     """
     matrix, owner, sign = equation.matrix, equation.owner, equation.sign
     back = matrix.tocsc()

@@ -51,16 +51,7 @@ class Levels(NamedTuple):
 
 
 def topological_levels(back: Edges, number: Integers, among: Booleans) -> Levels:
-    """Levels of the nodes that reach no cycle, by Kahn's algorithm (1962).
-
-    Args:
-      back: the reversed graph.
-      number: ``int[N]``, the number of edges to remaining nodes; decremented in place.
-      among: ``bool[N]``, the remaining nodes; nodes that are found are removed in place.
-
-    Returns:
-      The levels; not all nodes where levels are too narrow to be solved one by one.
-    """
+    """Levels of the nodes that reach no cycle, by Kahn's algorithm (1962)."""
     found: list[Integers] = []
     start = [0]
     frontier: Integers = np.flatnonzero(among & (number == 0))

@@ -101,11 +101,6 @@ def mixture(lower: Floats, share: Floats) -> Floats:
 def meets(lower: Floats, share: Floats, wanted: Floats) -> bool:
     """True if a mixture certainly attains a vector, in exact arithmetic.
 
-    Args:
-      lower: ``float64[N, n]``.
-      share: ``float64[N]``, not negative; relative to its sum.
-      wanted: ``float64[n]``, minus infinity for objectives without a threshold.
-
     Example:
       >>> meets(np.eye(2), np.array([0.5, 0.5]), np.array([0.5, 0.5]))
       True
@@ -163,16 +158,7 @@ def largest(
     scale: Floats,
     known: Floats | None = None,
 ) -> Largest:
-    """Bounds of the largest value of an objective under thresholds on the others.
-
-    Args:
-      points: ``float64[N, n]``, lower bounds of attained vectors.
-      half_spaces: their normals ``float64[K, n]`` and bounds ``float64[K]``.
-      index: the objective.
-      least: ``float64[n]``, the thresholds; minus infinity for objectives without one.
-      scale: ``float64[n]``.
-      known: a mixture of the first points, to be tried too.
-    """
+    """Bounds of the largest value of an objective under thresholds on the others."""
     count = len(points)
     asked = np.flatnonzero(np.isfinite(least))
     lower, share = -np.inf, np.full(count, 1 / count)

@@ -127,13 +127,7 @@ def weighted_optimum(
     cost: Floats,
     tolerance: float,
 ) -> WeightedOptimum:
-    """The largest weighted sum over all policies that end almost surely.
-
-    Args:
-      sums, where: the objectives, and where runs may end.
-      sure, gain, cost: ``float64[B]``, ``[K]``, ``[C]``, weights of at least 0.
-      tolerance: the width of the bound.
-    """
+    """The largest weighted sum over all policies that end almost surely."""
     mdp = sums.mdp
     earned, spent = gain @ sums.gain, cost @ sums.cost
     worth = where.sets @ sure

@@ -82,13 +82,7 @@ class Schedule(NamedTuple):
 
 
 def schedule(nodes: Nodes, one: int, nothing: int) -> Schedule:
-    """The block schedule of a system.
-
-    Args:
-      nodes: the system.
-      one: the source that is the number 1.
-      nothing: the source that is 0.
-    """
+    """The block schedule of a system."""
     count, most, width = nodes.number, *_shape(nodes)
     nodes = _narrow_rows(nodes, width, one)
     nodes, choices = _narrow_nodes(nodes, most, one)

@@ -88,12 +88,7 @@ class _Entries(NamedTuple):
 
 
 def plan_optimum(reduced: ReducedProblem, cost: Floats | None) -> Plan:
-    """Plan of an optimum, or of a Markov chain.
-
-    Args:
-      reduced: what the graph leaves.
-      cost: ``float[R]``, the rewards of the rows of the model; None for probabilities.
-    """
+    """Plan of an optimum, or of a Markov chain."""
     mdp, whole, part = reduced.mdp, reduced.contraction, reduced.quotient
     small = whole.mdp if part is None else part.mdp
     origin = whole.row if part is None else whole.row[part.row]
@@ -237,14 +232,7 @@ def _circles(reduced: ReducedProblem) -> Cycles | None:
 
 
 def plan_policy(mdp: HostMDP, target: Booleans, stay: Booleans | None, cost: Floats | None) -> Plan:
-    """Plan of policy evaluation, for policies given later.
-
-    Args:
-      mdp: the model.
-      target: ``bool[S]``.
-      stay: ``bool[S]``, the states that may be passed; default all.
-      cost: ``float[R]``, the rewards of the rows; None for probabilities.
-    """
+    """Plan of policy evaluation, for policies given later."""
     blocked = np.zeros(mdp.num_states, bool) if stay is None else ~stay & ~target
     fixed = target | blocked
     if cost is not None:

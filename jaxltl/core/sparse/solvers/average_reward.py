@@ -83,16 +83,7 @@ def average(
     max_steps: int,
     sign: int = 1,
 ) -> AverageReward:
-    """Largest long-run average reward per step.
-
-    Args:
-      mdp: the model.
-      reward: ``float64[R]``.
-      magnitude: ``float64[R]``, the sum of absolute values behind each reward.
-      tolerance: the width, relative to the value.
-      max_steps: sweeps at most.
-      sign: -1 if the rewards are negated ones, for a smallest average.
-    """
+    """Largest long-run average reward per step."""
     found = end_components(mdp)
     states = np.flatnonzero(found.region(mdp))
     states = states[np.argsort(found.component[states], kind="stable")]

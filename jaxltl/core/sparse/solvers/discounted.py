@@ -24,16 +24,7 @@ def discounted_value(
     tolerance: float,
     depth: int = 0,
 ) -> Enclosure:
-    """Certified largest solution of ``V = max_r (reward_r + discount * P_r V)``.
-
-    Args:
-      mdp: the model.
-      reward: ``float64[R]``, of any sign.
-      magnitude: ``float64[R]``, the sum of absolute values behind each reward.
-      discount: in ``[0, 1)``.
-      tolerance: the width of the enclosure.
-      depth: the number of roundings behind each number of the model.
-    """
+    """Certified largest solution of ``V = max_r (reward_r + discount * P_r V)``."""
     least = float(reward.min())
     ending = _with_final_state(mdp, discount)
     interior = np.ones(ending.num_states, bool)

@@ -68,15 +68,7 @@ _USEFUL = 0.1  # width of bounds whose policy is a start for extended precision
 def policy_iteration(
     problem: ShortestPathProblem, *, maximize: bool, tolerance: float, relative: bool
 ) -> Enclosure:
-    """Certified optimum of a stochastic shortest path problem.
-
-    Args:
-      problem: the problem.
-      maximize: for a maximum every policy must leave the interior almost surely; for a minimum
-        those that do not must have infinite cost.
-      tolerance: the width of the enclosure.
-      relative: whether that is a share of the value.
-    """
+    """Certified optimum of a stochastic shortest path problem."""
     rows, sign = interior_rows(problem), 1 if maximize else -1
     n = rows.num_nodes
     # A product and a sum for each successor of a row, twice for its normalisation, and the bounds.

@@ -79,16 +79,7 @@ def reachability(
     tolerance: float = 1e-6,
     depth: int = 0,
 ) -> Enclosure:
-    """Optimal probability of reaching a target through states where one may stay.
-
-    Args:
-      mdp: the model.
-      target: ``bool[S]``.
-      maximize: the largest or the smallest probability; irrelevant for a Markov chain.
-      stay: ``bool[S]``, the states that may be passed; default all.
-      tolerance: the width of the enclosure.
-      depth: the number of roundings behind each probability of the model.
-    """
+    """Optimal probability of reaching a target through states where one may stay."""
     reduced = reduce_reachability(mdp, target, maximize=maximize, stay=stay, depth=depth)
     return _solve(reduced, tolerance)
 
@@ -417,15 +408,7 @@ def expands_fast(
     met: int | None = None,
     steps: int = _STEPS,
 ) -> bool:
-    """True if few steps from a state lead to many others.
-
-    Args:
-      follow: the successors of some states ``int[M]``, maybe repeated.
-      start: ``int[1]``.
-      num_states: S.
-      met: the number of states to be met; default 4096.
-      steps: in that many steps.
-    """
+    """True if few steps from a state lead to many others."""
     left = (_MET if met is None else met) - 1
     seen: Any = np.zeros(num_states, bool)
     seen[start] = True

@@ -53,13 +53,6 @@ def in_units(cost: Floats, bound: float) -> tuple[Integers, int]:
 
     Each number is read as the simplest fraction that rounds to it.
 
-    Args:
-      cost: ``float64[T]``, not negative.
-      bound: not negative.
-
-    Returns:
-      ``int64[T]`` and an integer.
-
     Raises:
       ValueError: the bound has more than 10^7 units.
 
@@ -104,16 +97,7 @@ def bounded_cost(
     maximal: bool,
     by_level: bool = False,
 ) -> Level:
-    """Optimal probability of a target through states where one may stay, within a budget.
-
-    Args:
-      mdp: the model.
-      target, stay: ``bool[S]``.
-      cost: ``int64[T]``, of each entry.
-      most: the budget.
-      maximal: whether to maximise.
-      by_level: whether the choices of all levels are returned.
-    """
+    """Optimal probability of a target through states where one may stay, within a budget."""
     open_ = stay & ~target
     shape = _shape(mdp, target, open_, cost, maximal)
     parts = _parts(mdp, shape, target, cost, most)

@@ -20,13 +20,6 @@ def fastest_rows(mdp: HostMDP, rows: Booleans, goal: Booleans, row: Integers) ->
     """The rows ``int[S]`` that reach a goal in the least expected number of steps.
 
     Of equally fast rows the first one.
-
-    Args:
-      mdp: the model.
-      rows: ``bool[R]``, the rows to choose from.
-      goal: ``bool[S]``.
-      row: ``int[S]``, the rows to take in the goal, and everywhere if some state does not reach it
-        almost surely or the times could not be certified.
     """
     if goal.all():
         return row

@@ -101,15 +101,7 @@ class Backup(NamedTuple):
         enough: Callable[[Iterate], bool],
         every: list[Integers] | None = None,
     ) -> Iterate:
-        """Backups from a start: all of them, or up to a fixed point or a bounded remainder.
-
-        Args:
-          cost: ``float64[R']``, of the rows.
-          value: ``float64[N]``, the start.
-          num_steps: how many.
-          enough: whether what further backups change is bounded closely.
-          every: receives the choices of each backup; these are then not cut short by `enough`.
-        """
+        """Backups from a start: all of them, or up to a fixed point or a bounded remainder."""
         most = _LONG if self.small_chain else int(_WORK / (self.matrix.nnz + _OVERHEAD))
         last, done, check = num_steps if every is not None else min(num_steps, most), 0, _LONG
         before = value
@@ -204,15 +196,7 @@ def until(
     operation: np.ufunc,
     by_step: bool = False,
 ) -> Steps:
-    """Optimal probability of a target within n steps, through states where one may stay.
-
-    Args:
-      mdp: the model.
-      target, stay: ``bool[S]``.
-      num_steps: n.
-      operation: ``np.maximum`` or ``np.minimum``.
-      by_step: whether the choices of all steps are returned.
-    """
+    """Optimal probability of a target within n steps, through states where one may stay."""
     _require_memory(mdp, num_steps, by_step)
     open_ = stay & ~target
     if num_steps >= _MANY:
@@ -366,15 +350,7 @@ def total(
     operation: np.ufunc,
     by_step: bool = False,
 ) -> Steps:
-    """Optimal expected reward of n steps, plus a terminal reward.
-
-    Args:
-      mdp: the model.
-      reward: ``float64[R]``, of each step.
-      magnitude: ``float64[R]``, the sum of absolute values behind each reward.
-      start: ``float64[S]``, the terminal reward.
-      num_steps, operation, by_step: as for :func:`until`.
-    """
+    """Optimal expected reward of n steps, plus a terminal reward."""
     _require_memory(mdp, num_steps, by_step)
     backup = backup_on(mdp, np.arange(mdp.num_states), operation)
     every: list[Integers] | None = [] if by_step else None

@@ -211,15 +211,7 @@ def _with_known_values(
 def solve_levels(
     rows: InteriorRows, levels: Levels, bounds: Floats, policy: Integers, sign: int
 ) -> None:
-    """Backward induction over levels, in place; the caller accounts for its rounding.
-
-    Args:
-      rows: the rows of all nodes.
-      levels: nodes in an order in which each depends only on earlier ones.
-      bounds: ``float64[3, N + 1]``: the bound that the policy attains, the other bound, the value.
-      policy: ``int[N]``, rows.
-      sign: 1 to maximise, -1 to minimise.
-    """
+    """Backward induction over levels, in place; the caller accounts for its rounding."""
     if not levels.node.size:
         return
     part = rows.take(levels.node)

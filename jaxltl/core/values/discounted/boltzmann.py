@@ -37,12 +37,6 @@ def boltzmann_expansion(num_actions: Any) -> Any:
     attained where one action stands above the rest, which are equal: by g, of which it is half,
     the root of ``g tanh((g - log(n - 1)) / 2) = 2``.
 
-    Args:
-      num_actions: n, a number or traced.
-
-    Returns:
-      A float of at least 1, or an array of `num_actions`' shape; not differentiable.
-
     Example:
       >>> [round(boltzmann_expansion(n), 2) for n in (1, 2, 3, 4)]
       [1.0, 1.2, 1.33, 1.42]

@@ -55,17 +55,7 @@ _METHODS = ("auto", "policy_iteration", "modified_policy_iteration", "value_iter
 def action_value(
     model: Any, reward: jax.Array, discount: jax.Array | float, value: jax.Array
 ) -> jax.Array:
-    """``Q(s, a) = R(s, a) + discount * sum_t P(t | s, a) V(t)``; zero at unavailable actions.
-
-    Args:
-      model: the model.
-      reward: ``float[S, A]``, of a sparse model ``float[R]``, as below.
-      discount: scalar.
-      value: ``float[S]``.
-
-    Returns:
-      ``float[S, A]``.
-    """
+    """``Q(s, a) = R(s, a) + discount * sum_t P(t | s, a) V(t)``; zero at unavailable actions."""
     q = reward + discount * expectation(model, value)
     return jnp.where(choices(model).available, q, 0)
 
@@ -157,15 +147,7 @@ def solution_of(
     policy: jax.Array,
     num_steps: jax.Array,
 ) -> Solution:
-    """The solution certified by a value and its image, without derivatives.
-
-    Args:
-      model: the model.
-      given: the problem's parameters.
-      value, image: ``float[N]``.
-      policy: of the solution.
-      num_steps: applications of the operator.
-    """
+    """The solution certified by a value and its image, without derivatives."""
     found = _enclosed(value, image, given)
     middle = (image + found.shift).reshape(model.state_shape)
     # With a certificate the whole image is finite.
@@ -184,13 +166,7 @@ def solution_of(
 def differentiable(
     solution: Solution, backup: Callable[[jax.Array], jax.Array], system: Callable[[], System]
 ) -> Solution:
-    """The solution with the implicit derivatives of ``v = backup(v)`` on its value.
-
-    Args:
-      solution: without derivatives.
-      backup: closes over the differentiable arguments.
-      system: makes ``I - J``, with J the derivative of `backup` in v at the solution.
-    """
+    """The solution with the implicit derivatives of ``v = backup(v)`` on its value."""
 
     def solve(b: jax.Array) -> jax.Array:
         return solver(system()).solve(b)

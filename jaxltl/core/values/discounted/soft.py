@@ -174,17 +174,6 @@ def soft_policy_adjoint(
     ``g + pi x``: the transpose of the sensitivity (3.6), one linear system for any number of
     parameters. Solved by sweeps, as the series ``sum_k (discount * P_pi')^k b``: the remainder
     is known exactly and shrinks at the rate of the discount or faster.
-
-    Args:
-      model: the model.
-      policy: ``float[S, A]`` or ``float[R]``, of :func:`soft_value`.
-      discount: scalar in [0, 1).
-      cotangent: ``float[S, A]`` or ``float[R]``, the weights c; zero at unavailable actions.
-      predecessors: of the model (without their leading axis), which make it faster.
-      max_steps: sweeps at most.
-
-    Returns:
-      As `cotangent`.
     """
     over = choices(model)
     g = cotangent - policy * over.spread(over.sum(cotangent))

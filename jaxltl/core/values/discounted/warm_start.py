@@ -58,21 +58,6 @@ def span_iteration(
     environment moves), where c is the middle of MacQueen's (1966) bounds ``discount / (1 -
     discount) * [min, max](T v - v)``. A constant changes no choice, so that it is the width of
     the bounds that counts, which shrinks faster than their distance from zero.
-
-    Args:
-      game: explicit; its graph and whose turn it is are used, not its probabilities.
-      allowed: ``bool[S, A]``, the moves that exist; states without any stay as they are, and
-        must not be led to.
-      gain: ``float[S, A]``, expected rewards.
-      probability: ``float[S, A, K]``, of the listed successors.
-      value: ``float[S]``, the first guess.
-      discount: of every move.
-      enough: the error at which to stop.
-      active: ``bool[]``, False to return the guess.
-
-    Returns:
-      The value ``float[S]``, its error at most (infinite if not active), up to rounding; and
-      ``gain + discount * P v`` for it, ``float[S, A]``.
     """
     dtype = game.dtype
     graph = _Graph(game.mdp.successor, allowed, jnp.where(game.system, 1, -1).astype(dtype))

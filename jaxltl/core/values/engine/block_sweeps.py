@@ -109,13 +109,7 @@ def images(blocks: Blocks, x: jax.Array) -> jax.Array:
 
 
 def chosen_names(names: jax.Array, rank: jax.Array, rounds: int) -> jax.Array:
-    """Names of the rows chosen by the nodes, ``int32[N]``.
-
-    Args:
-      names: ``int32[C, A, B]`` of all blocks.
-      rank: ``int32[C, B]``.
-      rounds: how often a choice may be what another node chose.
-    """
+    """Names of the rows chosen by the nodes, ``int32[N]``."""
     found = jnp.take_along_axis(names, rank[:, None], 1).ravel()
     for _ in range(rounds):
         found = jnp.where(found < 0, _look(found, jnp.maximum(-1 - found, 0)), found)
@@ -125,14 +119,7 @@ def chosen_names(names: jax.Array, rank: jax.Array, rounds: int) -> jax.Array:
 def meets(
     segments: tuple[Blocks, ...], support: tuple[jax.Array, ...], x: jax.Array, cyclic: bool
 ) -> jax.Array:
-    """Backward reachability over entries with positive weight.
-
-    Args:
-      segments: of a system of one row a node.
-      support: ``bool[C, 1, W, B]`` for each of them.
-      x: ``bool[N + 3]``, where to get.
-      cyclic: whether the second segment has cycles.
-    """
+    """Backward reachability over entries with positive weight."""
 
     def once(blocks: Blocks, has: jax.Array, x: jax.Array) -> jax.Array:
         count, _, _, size = blocks.target.shape

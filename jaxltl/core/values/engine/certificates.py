@@ -88,12 +88,6 @@ def enclose(
     """MacQueen's (1966) bounds on the fixed point of a monotone T with ``T(v + c) = T(v) + g c``.
 
     ``T v + g / (1 - g) * [min, max](T v - v)`` for the discount g.
-
-    Args:
-      value, image: ``[N, ...]``, v and ``T v``.
-      discount: g < 1; else there are no bounds.
-      rounding: error of one backup.
-      tolerance: width of the enclosure; None: what the dtype allows.
     """
     change = image - value
     gap = jnp.where(discount < 1, 1 - discount, jnp.nan)
@@ -133,17 +127,6 @@ def m_matrix_error(
     If e >= 0 satisfies ``e - P e >= |r|`` there, where r is the residual of y and decided states
     are absorbing, then ``|y - y*| <= e``, because ``I - P`` is an M-matrix. A second solve gives e,
     and a check of the inequality, rounding included, proves it.
-
-    Args:
-      model: the model of P.
-      solve: approximately ``(I - P) x = b``.
-      onward: ``x -> P x``, zero where decided.
-      value: ``float[S]`` in [0, 1], exact where decided.
-      undecided: ``bool[S]``.
-
-    Returns:
-      The error ``float[S]``, zero where decided, and 1 elsewhere if the check fails; the largest
-      residual; and whether the check holds.
     """
     unit = rounding_unit(model)
     residual = jnp.where(undecided, jnp.abs(onward(value) - value), 0)

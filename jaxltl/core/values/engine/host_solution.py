@@ -42,15 +42,7 @@ def status_between(
 def solution_from_enclosure(
     model: Model, sparse: SparseMDP | None, found: Enclosure, tolerance: float, *, relative: bool
 ) -> Solution:
-    """A solution in the shapes and precision of a model, with bounds rounded outwards.
-
-    Args:
-      model: the model of the question.
-      sparse: the same as sparse rows; None if the policy is one of actions already.
-      found: the enclosure.
-      tolerance: the requested width.
-      relative: whether that is a share of the value.
-    """
+    """A solution in the shapes and precision of a model, with bounds rounded outwards."""
     low, high = found.lower, found.upper
     status = status_between(low, high, tolerance, relative=relative)
     policy, shape = found.row, model.state_shape
@@ -139,12 +131,6 @@ class Chain(NamedTuple):
 
 def induced_chain(model: Model, sparse: SparseMDP, policy: Array) -> Chain:
     """Markov chain induced by a policy.
-
-    Args:
-      model: the model of the policy.
-      sparse: the same as sparse rows.
-      policy: rows ``int32[S]`` or their weights ``float[R]``; for a padded model actions
-        ``int32[S]`` or ``float[S, A]``.
 
     Raises:
       ValueError: a shape is wrong, or a state's weights are not a distribution.

@@ -51,15 +51,6 @@ def implicit(
     ``dv = (I - J)^-1 d(operator)`` with J the Jacobian in v (implicit function theorem). No
     iteration is unrolled; each derivative solves one linear system, or its transpose.
 
-    Args:
-      operator: a differentiable map from values to values of the same shape.
-      fixed_point: a value that satisfies the equation, however it was found.
-      solve, transpose_solve: x with ``(I - J) x = b``, or for the transpose; both or neither.
-      system: the solvers if these are not given.
-
-    Returns:
-      `fixed_point`.
-
     Example:
       >>> slope = jax.grad(lambda a: implicit(lambda v: 1 + a * v, jax.numpy.array(2.0)))(0.5)
       >>> round(slope.item(), 3)

@@ -34,20 +34,6 @@ def iterate(
     """Repeats ``carry = step(table, carry, given)`` until ``finished(carry, given)``, at least once.
 
     Not differentiable: solvers attach implicit derivatives to the result.
-
-    Args:
-      step: one step; unless `lanes` is ``"mapped"``, it closes over no batched array.
-      finished: ``bool[]``, or ``bool[lanes]``.
-      table: arrays that lanes can share, such as a model's successors.
-      carry: the loop variables.
-      given: constants, maybe batched.
-      max_steps: maximal number of steps.
-      lanes: the batching: ``"in turn"`` (sequential), ``"side by side"`` (a last axis of lanes), or
-        ``"mapped"`` as any other loop.
-      every: number of steps between two tests of `finished`.
-
-    Returns:
-      The last carry, and the number of steps, ``int32[]``.
     """
 
     def loop(table: Any, carry: Any, given: Any, most: jax.Array) -> tuple[Any, jax.Array]:

@@ -318,15 +318,6 @@ def solve_linear(
     1992), restarted from the true residual at regular intervals. If BiCGSTAB does not halve it,
     Richardson steps follow, which converge whenever the operator is a contraction in some norm;
     they end when their rate shows that `max_steps` would not be enough.
-
-    Args:
-      matvec: a linear map on arrays of the shape of `b`; applied once in each step.
-      b: the right-hand side.
-      tolerance: relative residual in the Euclidean norm; default ``eps ** 0.8``.
-      max_steps: maximal number of steps.
-
-    Returns:
-      The iterate with the least residual, which may be above the tolerance.
     """
 
     def flat(table: None, given: tuple[()], x: jax.Array) -> jax.Array:

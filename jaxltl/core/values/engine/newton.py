@@ -93,22 +93,6 @@ def solve(
     are solved to a hundredth by BiCGSTAB, or where that fails, on small models with a monotone
     backup, by elimination. A step is kept if it halves the error, and where the backup is monotone
     and convex also if its system was solved; if not, ever more sweeps come before the next.
-
-    Args:
-      table: the model's, see :func:`~jaxltl.core.models.ops.successor_tables.sweep_operator`.
-      combine: from the table's choices, the action values, columns ``[N, ...]`` or
-        ``[R, ...]``, and ``backup.extra``, the image and the weights.
-      judge: from value, image and ``backup.extra``, whether to end, and the error.
-      backup: its numbers.
-      value: ``float[N]``, where to start.
-      newton: False for sweeps alone.
-      monotone: whether the backup is monotone and convex, so that Newton's method converges.
-      first_sweeps: sweeps before the first step of Newton's method.
-      max_steps: applications of P at most.
-      weights: of Newton's method, whether to return the weights at the value too.
-
-    Returns:
-      The value, its image, and the applications of P; and the weights, packed.
     """
     # Elsewhere an exact step is no better than another.
     small = monotone and is_small(table, value.shape[0])

@@ -102,18 +102,7 @@ def solution_from_error(
     least: float = 1.0,
     residual: float = 0.0,
 ) -> Solution:
-    """A :class:`Solution` from a value and its error.
-
-    Args:
-      value: ``float64[S]``.
-      error: broadcastable to it.
-      policy: rows.
-      num_steps: steps taken.
-      highest: 1 for probabilities.
-      tolerance: the error up to which it has converged, relative to the value,
-      least: or to this, if that is larger.
-      residual: of the solution.
-    """
+    """A :class:`Solution` from a value and its error."""
     error = np.broadcast_to(np.asarray(error, np.float64), value.shape)
     out = error > 0
     lower = np.where(out, np.nextafter(value - error, -np.inf), value)

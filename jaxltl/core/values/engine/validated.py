@@ -26,9 +26,6 @@ def validated(**words: tuple[str, ...]) -> Callable[[Callable[P, R]], Callable[P
     solution has the status :func:`argument_status`, NaN for its value, and infinite bounds.
     (An array instead of a solution becomes NaN.)
 
-    Args:
-      words: the valid strings of arguments such as `method`.
-
     Example:
       >>> from jaxltl.core.values.discounted.discounted import policy_value
       >>> policy_value(None, None, None, discount=-0.5)

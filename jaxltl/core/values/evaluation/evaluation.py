@@ -88,12 +88,6 @@ def episode_totals(
 
     For ``jit`` and ``vmap``. Nothing is kept of a step, and it ends with the episode; side by side
     with others, with the longest.
-
-    Args:
-      key: of everything that is drawn.
-      environment, agent: what is run.
-      num_steps: after which it is cut off; static.
-      discount: of rewards and of accepting visits.
     """
     begin, path = begin_episode(key, environment, agent)
     task, number = task_world(begin.world), jnp.result_type(float)

@@ -162,12 +162,7 @@ def _left(lower: jax.Array, upper: jax.Array, key: jax.Array) -> tuple[jax.Array
 
 
 def system(target: jax.Array, weight: jax.Array) -> tuple[Any, Any]:
-    """Solvers of ``x - P x = b`` and of its transpose.
-
-    Args:
-      target: ``int32[N, W]``; from N on, what is known.
-      weight: ``float[N, W]``; rows of more than one in all are not allowed.
-    """
+    """Solvers of ``x - P x = b`` and of its transpose."""
     size = target.shape[0]
     weight = jnp.where(target < size, weight, 0)
     place = jnp.minimum(target, size - 1)
@@ -220,13 +215,7 @@ class _Play(NamedTuple):
 
 
 def enclose(contest: Contest, tolerance: jax.Array, max_rounds: jax.Array) -> Bounds:
-    """Certified lower and upper bounds.
-
-    Args:
-      contest: who plays what.
-      tolerance: the width asked for.
-      max_rounds: systems at most, for each bound.
-    """
+    """Certified lower and upper bounds."""
     every = jnp.sum(contest.upper - contest.lower, axis=1, keepdims=True)
     rest = jnp.maximum(1 - jnp.sum(contest.lower, axis=1, keepdims=True), 0)
     share = jnp.where(every > 0, jnp.minimum(rest / jnp.where(every > 0, every, 1), 1), 0)

@@ -377,13 +377,7 @@ class Sides(NamedTuple):
 
 
 def sides_of(model: Any, policy: Any, objective: str, nature: str | None) -> Sides:
-    """Directions of policy and nature, games and given policies encoded.
-
-    Args:
-      model: an IntervalMDP, or a game on one or on a sparse model.
-      policy: rows ``int[S]``, or weights ``float[R]``, or None.
-      objective, nature: directions; of a game, the system's and nature's.
-    """
+    """Directions of policy and nature, games and given policies encoded."""
     world, system = world_of(model)
     if policy is None:
         return host_sides(world.host, system, objective, nature)._replace(model=world)

@@ -166,16 +166,6 @@ def robust_product_satisfaction(
 ) -> Solution:
     """Robust satisfaction probability from all states of a product of an interval MDP.
 
-    Args:
-      model: a product of an :class:`~jaxltl.core.models.interval.IntervalMDP`.
-      policy: to be evaluated: the world's rows ``int32[S, Q]``, or their weights ``float[R, Q]``;
-        default: optimise.
-      objective, nature, tolerance: as of :func:`robust_satisfaction`.
-
-    Returns:
-      :class:`Solution`; `value` is ``float64[S, Q]``, `policy` rows of the world, ``int32[S, Q]``.
-      Its `nature` has a distribution for each choice in each pair, pairs in order ``s * Q + q``.
-
     Raises:
       ValueError: the product's actions are restricted, or a policy is none.
 
@@ -223,17 +213,7 @@ def robust_product_satisfaction(
 
 
 def _reading(host: UncertainMDP, priority: Integers) -> tuple[UncertainMDP, Integers, Integers]:
-    """The model in which auxiliary states with one choice carry the priorities of entries.
-
-    Args:
-      host: the model.
-      priority: ``int[T]``, what each entry reads.
-
-    Returns:
-      The model, whose first states, rows and entries are those that there were; what each state
-      reads, ``int[N]``, which of those that were there is never the least met for ever; and which
-      one each is or leads to, ``int[N]``.
-    """
+    """The model in which auxiliary states with one choice carry the priorities of entries."""
     mdp, most = host.mdp, int(priority.max()) + 1
     place, number = np.unique(mdp.successor.astype(np.int64) * most + priority, return_inverse=True)
     target, read = np.divmod(place, most)

@@ -143,11 +143,7 @@ def _visits(chain: HostMDP, goal: Booleans, stay: Booleans, weight: Floats) -> F
 
 
 def _against_the_rest(host: Any, ahead: Floats, maximize: bool) -> tuple[Floats, Booleans]:
-    """Gain of each entry over the entry that receives the remaining mass of its row.
-
-    Returns:
-      ``float64[T]``, and ``bool[T]``: whether its upper end binds, else the lower one.
-    """
+    """Gain of each entry over the entry that receives the remaining mass of its row."""
     mdp = host.mdp
     start, far = mdp.entry_start[:-1], np.inf
     key = -ahead if maximize else ahead

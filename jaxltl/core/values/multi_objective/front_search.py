@@ -321,14 +321,7 @@ class FrontSearch:
 def nearest_mixture(
     front: Front, share: np.ndarray, thresholds: np.ndarray, signs: np.ndarray
 ) -> NearestMixture:
-    """Bounds of a mixture of a front's policies, and of its misses of thresholds.
-
-    Args:
-      front: the front.
-      share: ``float64[N]``, the mixture.
-      thresholds: ``float64[n]``, infinite for objectives without one.
-      signs: ``int[n]``, 1 of maximised objectives, -1 of others.
-    """
+    """Bounds of a mixture of a front's policies, and of its misses of thresholds."""
     used = share > 0
     lower = frontier.mixture(front.lower[used], share[used])
     upper = -frontier.mixture(-front.upper[used], share[used])

@@ -75,16 +75,7 @@ class State(NamedTuple):
 def enclose_cycles(
     problem: Problem, low: jax.Array, high: jax.Array, max_steps: jax.Array
 ) -> State:
-    """Encloses the values of the cyclic blocks.
-
-    Args:
-      problem: the blocks.
-      low, high: ``float[N + 3]``, bounds before the cycles, and zero on them.
-      max_steps: passes at most.
-
-    Returns:
-      Bounds; where nothing is proven, the upper one is the largest value there is.
-    """
+    """Encloses the values of the cyclic blocks."""
     none, zero = jnp.asarray(False), jnp.asarray(0, jnp.int32)
     tolerance = problem.tolerance
     state = State(

@@ -40,14 +40,6 @@ def evaluate_prepared(
     One linear system ``x = r + P x``: a pass where there are no cycles, elimination up to
     `ELIMINATED` nodes, and Krylov steps on passes beyond.
 
-    Args:
-      prepared: a question about a chain, prepared for ``"max"`` or ``"min"``.
-      probability, reward: as for :func:`~jaxltl.core.values.prepared.prepared.solve_prepared`.
-
-    Returns:
-      The values, ``float[S]``, and a status: ``UNCERTIFIED``, or ``INVALID`` and ``NONFINITE``
-      as there.
-
     Raises:
       ValueError: a shape is wrong, or the question is of another kind.
 

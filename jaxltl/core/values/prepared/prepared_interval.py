@@ -123,20 +123,6 @@ def prepare_interval(
 ) -> PreparedInterval:
     """Prepares a question about an interval model for solves with other intervals.
 
-    Args:
-      model: concrete.
-      target: ``bool[S]``, or the name of a label.
-      stay: ``bool[S]``, the states that may be passed before; default all. Not with a reward.
-      reward: asks for the expected total reward until the target; as of
-        :func:`~jaxltl.core.values.interval.robust.robust_total_reward`.
-      policy: ``int32[S]``, rows to be evaluated; default: optimise.
-      objective: ``"max"`` or ``"min"``, what the policy makes of the value.
-      nature: ``"adversarial"`` (default), against the objective, or ``"cooperative"``.
-
-    Returns:
-      A pytree of arrays. Where ends and rewards are positive is settled, and so is which successors
-      nature may drop wherever that decides what is worth 0, 1 or infinity.
-
     Raises:
       ValueError: a shape or a direction is wrong, the model has a radius, a reward is negative, not
         finite or depends on nature, there is `stay` with a reward, or something is traced.
@@ -196,11 +182,7 @@ def _prepared(
     policy: Any,
     directions: tuple[str, str, bool],
 ) -> PreparedInterval:
-    """The arrays.
-
-    Args:
-      entry: ``int[T']``, which entry of the model each entry of `host` is.
-    """
+    """The arrays."""
     mdp, whole = host.mdp, model.nominal.host
     dtype = jnp.zeros(()).dtype
     open_ = np.isnan(plan.known)
@@ -274,22 +256,6 @@ def solve_prepared_interval(
     its ends (Nilim and El Ghaoui 2005, Iyengar 2005), enclosed from both contest, see
     :mod:`jaxltl.core.values.interval.contest`. Under ``vmap`` lanes are solved one after the other, each in
     its own number of rounds.
-
-    Args:
-      prepared: the question.
-      lower, upper: ``float[T]``, positive exactly where they were, with a distribution between
-        them in each row.
-      reward: ``float[R]``, at least 0, and positive exactly where it was. Only if one was prepared.
-      tolerance: the width of the enclosure asked for, for rewards as a share of the value; default
-        1e-6 in double precision, 1e-3 in single.
-      max_steps: systems at most, for each side of the enclosure; no more than 100 are solved.
-
-    Returns:
-      :class:`~jaxltl.core.types.Solution`; what the graph decides is exact. Rows are
-      shown for all states but those of infinite value, and nature's distributions for all rows.
-      ``INVALID`` where ends or rewards are not as they must be, or let nature drop other successors
-      than before where that could decide what is worth 0, 1 or infinity; ``UNCERTIFIED`` where a
-      bound could not be proven.
 
     Raises:
       ValueError: a shape is wrong, or a reward is given and none was prepared.

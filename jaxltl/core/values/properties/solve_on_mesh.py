@@ -76,11 +76,6 @@ class Question:
 def question_on_mesh(model: ShardedMDP, prop: Property) -> Question:
     """Solver of a property of a model on a mesh of devices.
 
-    Args:
-      model: the model.
-      prop: a probability of a formula without bounds on steps or rewards, or an expected reward, or
-        number of steps, until a state is reached.
-
     Raises:
       ValueError: an unknown label, a missing direction, or a property that is not answered there.
     """

@@ -125,14 +125,6 @@ def reaching(
     `inside` takes long, so that the smallest share of suboptimal actions matters), the mixture with
     the fastest optimal policy is tried too.
 
-    Args:
-      model: the product.
-      policy: ``float[S, Q, A]``, the preferred policy.
-      inside: ``float[S, Q, A]``, the preferred policy among those of optimal actions.
-      best: of :func:`~jaxltl.core.values.undiscounted.satisfaction.optimal_satisfaction`.
-      probability: the required probability, at most the optimal one.
-      over: ``"mean"`` of the initial states, or the ``"worst"``.
-
     Example:
       >>> from jaxltl import from_dense, optimal_actions, product
       >>> world = from_dense([[[0, 1.0, 0], [0, 0, 1.0]], [[0, 1.0, 0]] * 2, [[0, 0, 1.0]] * 2],
@@ -153,12 +145,6 @@ def reaching(
 
 def safe_mean(share: np.ndarray, bound: np.ndarray, *, up: bool, highest: float = np.inf) -> float:
     """The weighted mean of nonnegative bounds, rounded up or down.
-
-    Args:
-      share: ``float64[I]``, positive weights of any sum.
-      bound: ``float64[I]``, maybe infinite.
-      up: whether they are upper bounds.
-      highest: an upper bound of all values.
 
     Example:
       >>> safe_mean(np.array([0.5, 0.5]), np.array([1.0, 1.0]), up=False)

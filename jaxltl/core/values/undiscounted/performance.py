@@ -507,15 +507,6 @@ def summarize(
 ) -> Summary:
     """Mean, standard deviation and worst case over worlds, on the host.
 
-    Args:
-      models: stacked products.
-      performance: of :func:`task_performances`.
-      names: W names of the worlds; default ``"world 0"`` and so on.
-      leave_out: names of worlds to exclude.
-
-    Returns:
-      :class:`Summary` of Python numbers.
-
     Raises:
       ValueError: names are missing, repeated or unknown, or all worlds are excluded.
 

@@ -201,16 +201,6 @@ def product_satisfaction(
 ) -> Solution:
     """Optimal probability of acceptance on every state of a lazy product of a sparse model.
 
-    Args:
-      model: a product of a concrete sparse model.
-      policy: rows of the model ``int32[S, Q]``, or their weights ``float[R, Q]``, to be evaluated;
-        default: optimise.
-      objective: ``"max"`` or ``"min"``; ignored when a policy is given.
-      tolerance: of :func:`~jaxltl.core.values.undiscounted.reachability.reachability_probability`.
-
-    Returns:
-      :class:`Solution`; `value` is ``float64[S, Q]``, `policy` rows of the model, ``int32[S, Q]``.
-
     Raises:
       ValueError: the product's actions are restricted, or the policy is invalid.
 
