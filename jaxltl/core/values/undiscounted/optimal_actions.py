@@ -31,6 +31,7 @@ from jaxltl.core.values.engine.host_solution import complement_event
 from jaxltl.core.values.undiscounted.reachability import (
     QUICK_LIMIT,
     Question,
+    attained_by_ties,
     conserving_rows,
     on_actions,
     rows_of_model,
@@ -191,9 +192,14 @@ def _attaining(problem: Reaching) -> tuple[Booleans, Solution] | None:
         return None
     sparse = rows_of_model(problem.model)
     host = sparse.host
-    found = Question.of(problem.target, None, problem.objective).solve(host, 1e-11)
+    found = Question.of(problem.target, None, problem.objective).solve(host, 1e-12)
     keeps = conserving_rows(host, problem.objective, found)
     decided = found.lower == found.upper
+    slower = attained_by_ties(host, problem.objective, found)
+    if slower is not None:
+        more = conserving_rows(host, problem.objective, slower)
+        if more.sum() >= keeps.sum() and backward_reachable(host, decided, more).all():
+            keeps, found = more, slower
     if not backward_reachable(host, decided, keeps).all():
         return None
     bounds = solution_from_enclosure(problem.model, sparse, found, np.inf, relative=False)

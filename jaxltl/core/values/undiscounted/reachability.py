@@ -22,6 +22,7 @@ from jaxltl.core.models.protocols import ActionModel, Array, Model
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.sparse.graph.qualitative import end_components
 from jaxltl.core.sparse.mdp import HostMDP
+from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
 from jaxltl.core.sparse.solvers import reachability as solver
 from jaxltl.core.sparse.solvers.layered_reachability import PaddedProduct, layered_reachability
 from jaxltl.core.sparse.solvers.total_cost import Enclosure
@@ -40,6 +41,7 @@ from jaxltl.core.values.undiscounted import optimum
 
 _FINE_LIMIT = 4096  # states up to which bounds are as narrow as the dtype allows; it costs a round
 QUICK_LIMIT = 100_000  # states up to which ties are broken by the expected time
+_TIE_ROUNDINGS = 4  # that a bound gives up for each step, for ties to attain it
 
 
 @validated()
@@ -239,13 +241,54 @@ def conserving_rows(mdp: HostMDP, objective: str, found: Enclosure) -> Booleans:
     the upper bound of a minimum.
     """
     undecided = found.lower != found.upper
-    unit = (int(np.diff(mdp.entry_start).max(initial=1)) + 8) * float(np.finfo(np.float64).eps)
+    unit = _backup_unit(mdp)
     if objective == "max":
         keeps = mdp.expectation(found.lower) * (1 - unit) >= found.lower[mdp.state]
         keeps |= end_components(mdp, undecided).inside
     else:
         keeps = mdp.expectation(found.upper) * (1 + unit) <= found.upper[mdp.state]
     return keeps & undecided[mdp.state]
+
+
+def attained_by_ties(mdp: HostMDP, objective: str, found: Enclosure) -> Enclosure | None:
+    """The enclosure with a bound that tied rows may attain, whatever policy takes them.
+
+    The value less a few roundings for each step that the slowest policy of tied rows takes; it is
+    not proven, except by :func:`conserving_rows`. None if such policies may never decide.
+    """
+    largest, undecided = objective == "max", found.lower != found.upper
+    sign, near, far = 1, found.lower, found.upper
+    if not largest:
+        sign, near, far = -1, far, near
+    unit = _backup_unit(mdp)
+    ahead = mdp.expectation(far)
+    ties = sign * ahead + unit * ahead >= sign * near[mdp.state]
+    ties[found.row] = True
+    free = ~undecided[mdp.state]
+    if largest:
+        free |= end_components(mdp, undecided).inside
+    rows = np.flatnonzero(ties | free)
+    count = np.bincount(mdp.state[rows], minlength=mdp.num_states)
+    width = np.diff(mdp.entry_start)[rows]
+    entry = concatenated_ranges(mdp.entry_start[rows], width)
+    tied = HostMDP(
+        offsets_from_counts(count),
+        offsets_from_counts(width),
+        mdp.successor[entry],
+        mdp.probability[entry],
+    )
+    cost = np.where(free[rows], 0.0, 1.0)
+    time = solver.reward_forever(tied, cost, maximize=True).value
+    if not np.isfinite(time).all():
+        return None
+    bound = np.clip(found.value - sign * _TIE_ROUNDINGS * unit * time, 0, 1)
+    bound = np.where(undecided, bound, near)
+    return replace(found, lower=bound) if largest else replace(found, upper=bound)
+
+
+def _backup_unit(mdp: HostMDP) -> float:
+    """The relative rounding of a backup."""
+    return (int(np.diff(mdp.entry_start).max(initial=1)) + 8) * float(np.finfo(np.float64).eps)
 
 
 def _fastest(mdp: HostMDP, question: Question, found: Enclosure) -> Integers:
