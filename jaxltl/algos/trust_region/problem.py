@@ -58,7 +58,7 @@ def make_problem(
 
     Example:
       >>> from jaxltl import make_environment
-      >>> from jaxltl.core.environments.environment import make_box
+      >>> from jaxltl.core.environments.environment import Timestep, make_box
       >>> def reset(key):
       ...     return jax.random.uniform(key, (1,))
       >>> def move(place, action, key):

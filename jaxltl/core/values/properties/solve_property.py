@@ -178,7 +178,7 @@ def solve_property(
       [0.5]
       >>> solve_property(coin, 'P>0.4 [ X "a" ]').holds
       [True]
-      >>> solve_property(coin, 'multi(P>=0.5 [ F "a" ], P<=0.5 [ X "a" ])').holds
+      >>> solve_property(coin, 'multi(P>=0.4 [ F "a" ], P<=0.6 [ X "a" ])').holds
       True
     """
     prop = parse_property(prop) if isinstance(prop, str) else prop
