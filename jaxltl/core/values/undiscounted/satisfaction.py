@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
@@ -178,7 +179,7 @@ def optimal_satisfaction(
 def _optimal(
     model: Product, tolerance: Any, max_steps: Any, start: Any, *, objective: str
 ) -> Solution:
-    problem = as_reachability(model, objective)
+    problem, given = as_reachability(model, objective), start
     if start is not None and problem.opposite:  # rounded outwards
         eps = np.finfo(model.dtype).eps
         start = 1 - start[1] - eps, 1 - start[0] + eps
@@ -195,7 +196,17 @@ def _optimal(
             problem.accepting.region, _visiting(problem, found), found.policy
         )
         found = replace(found, policy=to_jax(xp.where(region, action, chosen).astype(xp.int32)))
-    return complement_event(found) if problem.opposite else found
+    if not problem.opposite:
+        return found
+    found = complement_event(found)
+    return found if given is None else _within(found, given)
+
+
+def _within(found: Solution, bounds: tuple[Any, Any]) -> Solution:
+    """A solution with bounds no wider than given ones, despite rounding outwards."""
+    lower = jnp.maximum(found.lower, bounds[0])
+    upper = jnp.minimum(found.upper, bounds[1])
+    return replace(found, value=jnp.clip(found.value, lower, upper), lower=lower, upper=upper)
 
 
 # One program for a model over a mesh, instead of one for each operation.
