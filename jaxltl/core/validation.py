@@ -41,7 +41,10 @@ class Range:
         """Membership, elementwise; works on NumPy arrays, JAX arrays and tracers alike."""
         above = value > self.low if self.open_below else value >= self.low
         below = value < self.high if self.open_above else value <= self.high
-        return above & below & (value == value // 1) if self.integer else above & below
+        if not self.integer:
+            return above & below
+        with np.errstate(invalid="ignore"):  # inf // 1 is NaN, so that infinity is in no range
+            return above & below & (value == value // 1)
 
     def __str__(self) -> str:
         ends = [f"{'above' if self.open_below else 'at least'} {self.low:g}"]

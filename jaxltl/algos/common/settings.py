@@ -118,13 +118,16 @@ def require_hparams(hparams: object, *, batched: bool = False) -> None:
       Traceback (most recent call last):
       ValueError: discount=1.5; it must be at least 0 and at most 1.
     """
+    fields = dataclasses.fields(hparams) if dataclasses.is_dataclass(hparams) else ()
+    tuples = {field.name for field in fields if isinstance(field.default, tuple)}
     for name, value, (valid, is_static, may_be_schedule) in _declared(hparams):
         if valid is bool:
             validation.boolean(name, value)
         elif isinstance(valid, tuple):
             validation.choice(name, value, valid)
         elif is_static:
-            for one in value if isinstance(value, tuple | list) else [value]:
+            several = isinstance(value, tuple | list) and name in tuples
+            for one in value if several else [value]:
                 validation.require_in_range(name, one, valid)
         elif may_be_schedule and is_schedule(value):
             continue  # its values are checked step by step

@@ -281,6 +281,8 @@ def make_environment(
     if isinstance(actions, Finite) and actions.num < 1:
         raise ValueError(f"actions: Finite({actions.num}); there must be at least one.")
     functions: dict[str, Any] = {"reset": reset, "step": step, "observe": observe}
+    for name, function in functions.items():
+        validation.function(name, function)
     functions |= {n: options.get(n) for n in ("labels", "allowed", "starts", "outcomes")}
     if functions["labels"] is None:
         if names:
