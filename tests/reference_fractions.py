@@ -76,7 +76,7 @@ def actions(host):
                 every = ball(
                     *ends,
                     [Fraction(float(x)) for x in host.ball.center[of]],
-                    Fraction(float(host.ball.most[r])),
+                    Fraction(float(host.ball.gain[r])),
                 )
             assert every
             found[-1].append(

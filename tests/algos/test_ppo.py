@@ -409,7 +409,7 @@ def test_a_policy_that_does_not_change_has_ratios_of_one(name):
     *_, (state, metrics) = two_steps(name)
     np.testing.assert_allclose(metrics.kl, 0, atol=1e-12)
     assert (metrics.clip_fraction == 0).all() and (metrics.updates == 2).all()
-    assert (metrics.gradient_norm > 0).all() and (metrics.status == 0).all()
+    assert (metrics.gradient_norm > 0).all() and (metrics.status == Status.COMPLETED).all()
     assert (metrics.episodes > 0).all(), "memories were reset on the way"
     assert metrics.transitions.tolist() == [64, 128]
     assert state.moments["place"].count == 128

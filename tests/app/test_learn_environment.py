@@ -219,7 +219,7 @@ def test_a_written_policy_is_used_without_its_task_file(learned, tmp_path):
 def test_what_is_done_is_not_done_again(learned, monkeypatch):
     path, out, _ = learned
     monkeypatch.setattr(job, "learn", None)
-    assert "done before" in run("learn", path, "--seeds", 2, "--out", out).stdout
+    assert "finished before" in run("learn", path, "--seeds", 2, "--out", out).stdout
 
 
 @pytest.mark.slow

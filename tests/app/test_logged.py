@@ -1,5 +1,6 @@
 """Worlds of task files that are known from a log: what is read, learned, guaranteed and refused."""
 
+import html
 import json
 
 import numpy as np
@@ -222,7 +223,7 @@ def test_what_is_learned_is_told_with_its_guarantee(write, tmp_path):
     assert 0 < data["guaranteed"] < data["best_guaranteed"] + 1e-6
     assert data["best_guaranteed"] < found["satisfaction"]["mean"]["value"] < data["optimistic"]
     told = "with confidence 0.9, from 1103 logged transitions"
-    page = (out / "report.html").read_text()
+    page = html.unescape((out / "report.html").read_text())
     assert told in result.stdout and told in page
     for text in (result.stdout, page):
         assert "by the log's frequencies" in text and "By the transition graph:" not in text

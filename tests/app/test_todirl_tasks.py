@@ -290,8 +290,8 @@ def test_a_probability_is_reached_in_every_world(write, tmp_path):
     (text,) = (text for kind, text in remarks(result) if kind == "good")
     least = min(world["attained"] for world in counted)
     assert text.startswith(
-        "Asked for 0.8500 in every world, new ones too, on average over its starts; certified at "
-        f"least {least:.4f} here: the task is weighed by mu = "
+        "Asked for 0.8500 in every world, also in new ones, on average over initial states; certified "
+        f"at least {least:.4f} here: "
     )
     assert result["test"]["worlds"][2]["share"] == 1  # where it cannot be had
     # What is written plans the same in worlds that it is given.

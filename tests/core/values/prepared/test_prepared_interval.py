@@ -153,7 +153,7 @@ def test_given_policies_are_evaluated():
     successor, lower, upper, cost = _cases(4, 1)
     model = _model(successor, lower[0], upper[0])
     policy = np.array([0, 1, 3, 4, 7], np.int32)
-    for nature in ("min", "max"):
+    for nature in ("adversarial", "cooperative"):
         question = {"policy": policy, "nature": nature}
         found = solve_prepared_interval(prepare_interval(model, GOAL, **question))
         host = robust_reachability(model, GOAL, **question)
