@@ -13,8 +13,8 @@ from benchmarks import size
 
 PACKAGE = Path(jaxltl.__file__).parent
 LIMITS = {
-    "lines": 91_500,
-    "statements": 42_450,
+    "lines": 91_550,
+    "statements": 42_500,
     "docstring lines": 19_400,
     "functions with more than 6 parameters": 93,
     "functions with more than 9 parameters": 8,

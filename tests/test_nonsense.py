@@ -622,7 +622,7 @@ def test_nonsense_given_to_adapters_is_told(name):
         pytest.importorskip(package)
         with jax.enable_x64(False):
             given = make() | {"labels": None, "propositions": ()} | others
-            adapter = getattr(jl, f"from_{name}")
+            adapter = getattr(jl.envs, f"from_{name}")
             adapter(**given)
             for argument, (kind, value) in product(given, (NONSENSE | SEVERAL).items()):
                 try:
