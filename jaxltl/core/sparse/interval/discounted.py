@@ -17,17 +17,11 @@ _ROUNDS = 300
 
 @dataclass(frozen=True)
 class DiscountedModel:
-    """``V = opt_r opt_p sum_t p_t (reward_t + discount_r V_t)``.
-
-    Attributes:
-      model: the rows.
-      reward: ``float64[T]``, of any sign.
-      discount: ``float64[R]``, below 1 in every second step at least.
-    """
+    """``V = opt_r opt_p sum_t p_t (reward_t + discount_r V_t)``."""
 
     model: UncertainMDP
-    reward: Floats
-    discount: Floats
+    reward: Floats  # float64[T], of any sign
+    discount: Floats  # float64[R], below 1 in every second step at least
 
     def ahead(self, value: Floats) -> Floats:
         """``reward_t + discount_r V_t``, ``float64[T]``."""

@@ -20,21 +20,13 @@ from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
 
 @dataclass(frozen=True)
 class EncodedChoices:
-    """A model in which nature chooses the rows of some states.
+    """A model in which nature chooses the rows of some states."""
 
-    Attributes:
-      model: original states first; each auxiliary state has one row.
-      source: ``int[S']``, original state of each state.
-      row: ``int[R']``, original row, -1 for rows by which nature chooses.
-      entry: ``int[T']``, original entry, -1 in those rows.
-      chosen: ``int[T']``, original row that an entry of those rows stands for; -1 elsewhere.
-    """
-
-    model: UncertainMDP
-    source: Integers
-    row: Integers
-    entry: Integers
-    chosen: Integers
+    model: UncertainMDP  # original states first; each auxiliary state has one row
+    source: Integers  # int[S'], original state of each state
+    row: Integers  # int[R'], original row, -1 for rows by which nature chooses
+    entry: Integers  # int[T'], original entry, -1 in those rows
+    chosen: Integers  # int[T'], original row that an entry of those rows stands for; -1 elsewhere
 
     def policy(self, row: Integers, probability: Floats) -> Integers:
         """Original rows of a policy; nature's most likely one where it chooses."""

@@ -20,15 +20,10 @@ from jaxltl.core.array_types import Booleans, Floats, Integers
 
 @dataclass(frozen=True)
 class Ball:
-    """L1 balls of all rows.
+    """L1 balls of all rows."""
 
-    Attributes:
-      center: ``float64[T]``, between the ends.
-      gain: ``float64[R]``, mass that may be gained over the center: half of the radius.
-    """
-
-    center: Floats
-    gain: Floats
+    center: Floats  # float64[T], between the ends
+    gain: Floats  # float64[R], mass that may be gained over the center: half of the radius
 
     def select(self, entry: Integers, row: Integers) -> Ball:
         """The balls of some rows."""
@@ -37,17 +32,11 @@ class Ball:
 
 @dataclass(frozen=True)
 class BallLimits:
-    """Limits of some rows, ``float64[N, 1]``; what exceeds one by rounding alone meets it.
+    """Limits of some rows, ``float64[N, 1]``; what exceeds one by rounding alone meets it."""
 
-    Attributes:
-      gain: as of :class:`Ball`.
-      deficit: one minus the sum of the center.
-      rounding: bound on the rounding error of a sum over the row.
-    """
-
-    gain: Floats
-    deficit: Floats
-    rounding: Floats
+    gain: Floats  # as of `Ball`
+    deficit: Floats  # one minus the sum of the center
+    rounding: Floats  # bound on the rounding error of a sum over the row
 
 
 def narrow_intervals(

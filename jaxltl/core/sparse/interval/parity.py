@@ -105,17 +105,11 @@ def _losing_probability(
 
 @dataclass(frozen=True)
 class ClassGame:
-    """Choices of both players that keep the value.
+    """Choices of both players that keep the value."""
 
-    Attributes:
-      model: nature's optimal distributions.
-      rows: ``bool[R]``, the policy's optimal rows.
-      inside: ``bool[T]``, entries that stay in their class.
-    """
-
-    model: UncertainMDP
-    rows: Booleans
-    inside: Booleans
+    model: UncertainMDP  # nature's optimal distributions
+    rows: Booleans  # bool[R], the policy's optimal rows
+    inside: Booleans  # bool[T], entries that stay in their class
 
 
 def _class_game(model: UncertainMDP, value: Floats, gain: Floats) -> ClassGame:
@@ -173,15 +167,10 @@ def optimal_face(model: UncertainMDP, rank: Integers) -> UncertainMDP:
 
 @dataclass(frozen=True, kw_only=True)
 class SplitMDP(UncertainMDP):
-    """Uncertainty sets in which some entries have a given total mass.
+    """Uncertainty sets in which some entries have a given total mass."""
 
-    Attributes:
-      gains: ``bool[T]``, those entries.
-      mass: ``float64[R]``.
-    """
-
-    gains: Booleans
-    mass: Floats
+    gains: Booleans  # bool[T], those entries
+    mass: Floats  # float64[R]
 
     @property
     def _parts(self) -> tuple[tuple[Booleans, Floats], tuple[Booleans, Floats]]:
@@ -262,18 +251,13 @@ def _nature_step(
 
 @dataclass(frozen=True)
 class _Fixpoint:
-    """The nested fixed point.
+    """The nested fixed point."""
 
-    Attributes:
-      game, priority: the game.
-      inside, outside: ``bool[T]``, possible entries that stay in their class and that leave it.
-      step: one application of the controllable predecessor to the sets of all levels.
-    """
-
-    game: ClassGame
+    game: ClassGame  # the game (game, priority)
     priority: Integers
-    inside: Booleans
+    inside: Booleans  # bool[T], possible entries that stay in their class and that leave it
     outside: Booleans
+    # one application of the controllable predecessor to the sets of all levels
     step: Callable[..., tuple[Booleans, Integers, Floats]]
 
     def some(self, entries: Booleans) -> Booleans:

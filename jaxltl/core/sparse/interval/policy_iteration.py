@@ -56,31 +56,19 @@ class Accuracy:
 
 @dataclass(frozen=True)
 class PathProblem:
-    """Sums until a set of states is left, by every pair of policy and nature that counts.
-
-    Attributes:
-      model: the model.
-      open: ``bool[S]``, the states to solve for.
-      known: ``float64[S]``, finite and at least 0, the values of the others.
-      cost: ``float64[R]``, at least 0; NaN in rows that must not be taken.
-      component: ``int[S]``, number of the end component that is one node.
-      maximize: whether the policy maximises.
-      adversarial: whether nature wants the opposite; then no two states are in one component.
-      first: ``int[S]``, rows to begin with, by which all open states are left.
-      depth: roundings behind each number.
-      may_stay: whether some pairs never leave, at infinite cost.
-    """
+    """Sums until a set of states is left, by every pair of policy and nature that counts."""
 
     model: UncertainMDP
-    open: Booleans
-    known: Floats
-    cost: Floats
-    component: Integers
-    maximize: bool
+    open: Booleans  # bool[S], the states to solve for
+    known: Floats  # float64[S], finite and at least 0, the values of the others
+    cost: Floats  # float64[R], at least 0; NaN in rows that must not be taken
+    component: Integers  # int[S], number of the end component that is one node
+    maximize: bool  # whether the policy maximises
+    # whether nature wants the opposite; then no two states are in one component
     adversarial: bool = False
-    first: Integers | None = None
-    depth: int = 0
-    may_stay: bool = False
+    first: Integers | None = None  # int[S], rows to begin with, by which all open states are left
+    depth: int = 0  # roundings behind each number
+    may_stay: bool = False  # whether some pairs never leave, at infinite cost
 
     def operator(self) -> RowOperator:
         """The optimality operator on the open components."""
@@ -108,23 +96,14 @@ class PathProblem:
 
 @dataclass(frozen=True)
 class PathBounds:
-    """Bounds of the optimum, and a pair that nearly attains it.
+    """Bounds of the optimum, and a pair that nearly attains it."""
 
-    Attributes:
-      beyond: ``float64[S]``, the bound that no pair exceeds: above a maximum, below a minimum.
-      attained: ``float64[S]``, proven for `row` (and nature), or None.
-      value: ``float64[S]``, of the pair, not proven.
-      row: ``int[S]``, the row by which a component is left; a state's first one elsewhere.
-      probability: ``float64[T]``, nature's distributions.
-      rounds: systems solved.
-    """
-
-    beyond: Floats
-    attained: Floats | None
-    value: Floats
-    row: Integers
-    probability: Floats
-    rounds: int
+    beyond: Floats  # float64[S], the bound that no pair exceeds: above a maximum, below a minimum
+    attained: Floats | None  # float64[S], proven for `row` (and nature), or None
+    value: Floats  # float64[S], of the pair, not proven
+    row: Integers  # int[S], the row by which a component is left; a state's first one elsewhere
+    probability: Floats  # float64[T], nature's distributions
+    rounds: int  # systems solved
 
     def enclosed(self, problem: PathProblem, accuracy: Accuracy) -> Enclosure | None:
         """The optimum, if it is enclosed as narrowly as requested."""
@@ -186,20 +165,16 @@ def _path_bounds(
 
 @dataclass
 class _Search:
-    """State of a policy iteration.
-
-    Attributes:
-      extra: reward or cost of each step. It never grows for long: a pair that lingers for it
-        would come and go with it.
-      rounds: systems solved; last: the last pair evaluated.
-    """
+    """State of a policy iteration."""
 
     operator: RowOperator
     accuracy: Accuracy
     may_stay: bool
+    # reward or cost of each step. It never grows for long: a pair that lingers for it would come
+    # and go with it
     extra: float = np.inf
-    rounds: int = 0
-    last: PolicyPair | None = None
+    rounds: int = 0  # systems solved
+    last: PolicyPair | None = None  # the last pair evaluated
 
     @cached_property
     def systems(self) -> SystemSequence:

@@ -172,17 +172,11 @@ def joint_end_components(
 
 
 class RobustRegion(NamedTuple):
-    """States from which policy and nature together accept for ever, with their choices.
+    """States from which policy and nature together accept for ever, with their choices."""
 
-    Attributes:
-      region: ``bool[S]``.
-      row: ``int[S]``, accepting rows inside the region.
-      probability: ``float64[T]``, nature's distributions.
-    """
-
-    region: Booleans
-    row: Integers
-    probability: Floats
+    region: Booleans  # bool[S]
+    row: Integers  # int[S], accepting rows inside the region
+    probability: Floats  # float64[T], nature's distributions
 
 
 def joint_accepting_region(model: UncertainMDP, priority: Integers) -> RobustRegion:

@@ -36,15 +36,10 @@ Solver = Callable[[Any, Floats], Floats | None]
 
 @dataclass(frozen=True)
 class Refinement:
-    """Settings of a refinement.
+    """Settings of a refinement."""
 
-    Attributes:
-      solve: solves ``x = P x + b`` in double precision.
-      tolerance: absolute distance that a bound may have from the other one.
-    """
-
-    solve: Solver
-    tolerance: float
+    solve: Solver  # solves x = P x + b in double precision
+    tolerance: float  # absolute distance that a bound may have from the other one
 
     def bound(self, operator: RowOperator, pair: PolicyPair, side: int) -> PolicyPair | None:
         """A pair with an upper bound of all pairs (side 1), or with one that it attains (-1)."""

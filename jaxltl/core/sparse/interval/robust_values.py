@@ -15,19 +15,13 @@ _EPS = float(np.finfo(np.float64).eps)
 
 @dataclass(frozen=True)
 class Query:
-    """Who makes the value large, and how accurately it is enclosed.
+    """Who makes the value large, and how accurately it is enclosed."""
 
-    Attributes:
-      maximize: whether the policy maximises the value, else it minimises it.
-      nature_maximizes: whether nature does.
-      tolerance: requested width of the enclosure, of expected rewards relative to the value.
-      depth: roundings behind each number of the model.
-    """
-
-    maximize: bool
-    nature_maximizes: bool
+    maximize: bool  # whether the policy maximises the value, else it minimises it
+    nature_maximizes: bool  # whether nature does
+    # requested width of the enclosure, of expected rewards relative to the value
     tolerance: float = 1e-6
-    depth: int = 0
+    depth: int = 0  # roundings behind each number of the model
 
     @property
     def cooperative(self) -> bool:
@@ -41,25 +35,16 @@ class Query:
 
 @dataclass(frozen=True)
 class RobustValues:
-    """Certified values of an uncertain MDP, with choices of both sides.
+    """Certified values of an uncertain MDP, with choices of both sides."""
 
-    Attributes:
-      value, lower, upper: ``float64[S]``.
-      row: ``int64[S]``, a policy.
-      probability: ``float64[T]``, nature's distributions.
-      rounds: linear systems solved.
-      residual: by how much the value violates its optimality equation.
-      method: name of the algorithm.
-    """
-
-    value: Floats
+    value: Floats  # float64[S] (value, lower, upper)
     lower: Floats
     upper: Floats
-    row: Integers
-    probability: Floats
-    rounds: int
-    residual: float
-    method: str
+    row: Integers  # int64[S], a policy
+    probability: Floats  # float64[T], nature's distributions
+    rounds: int  # linear systems solved
+    residual: float  # by how much the value violates its optimality equation
+    method: str  # name of the algorithm
 
     def hull(self, other: RobustValues) -> RobustValues:
         """The same values with bounds that enclose both enclosures."""

@@ -33,21 +33,13 @@ Distributions = list[Floats]  # one array for each block
 
 @dataclass(frozen=True)
 class PolicyPair:
-    """A policy and nature's distributions, with approximate values.
+    """A policy and nature's distributions, with approximate values."""
 
-    Attributes:
-      chosen: ``int[M]``, the row of each node.
-      p: nature's distributions.
-      value: ``float64[M]``, of the pair.
-      steps: ``float64[M]``, expected number of steps.
-      bound: ``float64[M]``, a proven bound of the optimum.
-    """
-
-    chosen: Integers
-    p: Distributions
-    value: Floats
-    steps: Floats
-    bound: Floats | None = None
+    chosen: Integers  # int[M], the row of each node
+    p: Distributions  # nature's distributions
+    value: Floats  # float64[M], of the pair
+    steps: Floats  # float64[M], expected number of steps
+    bound: Floats | None = None  # float64[M], a proven bound of the optimum
 
 
 class PairSystem(NamedTuple):
@@ -73,19 +65,12 @@ class TargetValues(NamedTuple):
 
 @dataclass(frozen=True)
 class Block:
-    """A table of rows.
-
-    Attributes:
-      table: the rows.
-      target: ``int[W, N]``, successors: nodes, and M plus the state where the value is known.
-      owner: ``int[N]``, the node of each row.
-      leaves: ``bool[W, N]``, entries that leave their node; None if all do.
-    """
+    """A table of rows."""
 
     table: RowTable
-    target: Integers
-    owner: Integers
-    leaves: Booleans | None
+    target: Integers  # int[W, N], successors: nodes, and M plus the state where the value is known
+    owner: Integers  # int[N], the node of each row
+    leaves: Booleans | None  # bool[W, N], entries that leave their node; None if all do
 
     def differences(self, values: TargetValues, step_reward: float | Floats = 0.0) -> Floats:
         """``x_t - x_s`` of each entry, plus a reward for leaving the node, ``float64[W, N]``."""
@@ -109,28 +94,17 @@ class Block:
 
 @dataclass(frozen=True)
 class RowOperator:
-    """The operator on M nodes.
+    """The operator on M nodes."""
 
-    Attributes:
-      part: the rows by node; successors are states.
-      row, entry: ``int[R']``, ``int[T']``, the rows and entries of the original model.
-      node: ``int[S]``, -1 where the value is known.
-      sign: 1 if the policy maximises, -1 if it minimises the values without sign.
-      known: ``float64[S]``, with sign.
-      cost: ``float64[R']``, reward of each row, with sign.
-      depth: roundings behind each number of the model.
-      adversarial: whether nature minimises.
-    """
-
-    part: UncertainMDP
-    row: Integers
+    part: UncertainMDP  # the rows by node; successors are states
+    row: Integers  # int[R'], int[T'], the rows and entries of the original model
     entry: Integers
-    node: Integers
-    sign: int
-    known: Floats
-    cost: Floats
-    depth: int
-    adversarial: bool
+    node: Integers  # int[S], -1 where the value is known
+    sign: int  # 1 if the policy maximises, -1 if it minimises the values without sign
+    known: Floats  # float64[S], with sign
+    cost: Floats  # float64[R'], reward of each row, with sign
+    depth: int  # roundings behind each number of the model
+    adversarial: bool  # whether nature minimises
 
     @property
     def size(self) -> int:

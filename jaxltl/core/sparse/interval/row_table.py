@@ -30,30 +30,18 @@ _LENGTH = 2**13
 
 @dataclass(frozen=True)
 class RowTable:
-    """Rows of about equal width, one column per row.
+    """Rows of about equal width, one column per row."""
 
-    Attributes:
-      row: ``int[N]``.
-      entry: ``int[W, N]``; padding repeats the first entry of the row.
-      used: ``bool[W, N]``, False in padding; None if there is none.
-      lower, upper: ``float64[W, N]``, 0 in padding.
-      free_mass: ``float64[N]``, one minus the sum of the lower ends.
-      rounding: ``float64[N]``, bound on the rounding error of a sum over the row.
-      center: ``float64[W, N]``, center of the L1 ball, or None.
-      gain: ``float64[N]``, mass that a distribution may gain over the center.
-      deficit: ``float64[N]``, one minus the sum of the center.
-    """
-
-    row: Integers
-    entry: Integers
-    used: Booleans | None
-    lower: Floats
+    row: Integers  # int[N]
+    entry: Integers  # int[W, N]; padding repeats the first entry of the row
+    used: Booleans | None  # bool[W, N], False in padding; None if there is none
+    lower: Floats  # float64[W, N], 0 in padding
     upper: Floats
-    free_mass: Floats
-    rounding: Floats
-    center: Floats | None = None
-    gain: Floats | None = None
-    deficit: Floats | None = None
+    free_mass: Floats  # float64[N], one minus the sum of the lower ends
+    rounding: Floats  # float64[N], bound on the rounding error of a sum over the row
+    center: Floats | None = None  # float64[W, N], center of the L1 ball, or None
+    gain: Floats | None = None  # float64[N], mass that a distribution may gain over the center
+    deficit: Floats | None = None  # float64[N], one minus the sum of the center
 
     @cached_property
     def fine(self) -> Integers:

@@ -16,21 +16,13 @@ _EPS = float(np.finfo(np.float64).eps)
 
 @dataclass(frozen=True)
 class StepBoundedValues:
-    """Values after a number of steps.
+    """Values after a number of steps."""
 
-    Attributes:
-      value: ``float64[S]``.
-      error: ``float64[S]``, bound of the rounding error.
-      row: ``int64[S]``, the policy of the first step.
-      probability: ``float64[T]``, nature's distributions in the first step.
-      num_steps: backups until a fixed point.
-    """
-
-    value: Floats
-    error: Floats
-    row: Integers
-    probability: Floats
-    num_steps: int
+    value: Floats  # float64[S]
+    error: Floats  # float64[S], bound of the rounding error
+    row: Integers  # int64[S], the policy of the first step
+    probability: Floats  # float64[T], nature's distributions in the first step
+    num_steps: int  # backups until a fixed point
 
 
 def backup_error(model: UncertainMDP) -> float:

@@ -32,19 +32,12 @@ JointSolver = Callable[[UncertainMDP, Floats, bool], RobustValues]
 
 @dataclass(frozen=True)
 class Subproblems:
-    """Solvers of the problems in which one side is fixed.
+    """Solvers of the problems in which one side is fixed."""
 
-    Attributes:
-      fixed_nature: the optimum of an MDP, from rewards of rows and whether it is maximal.
-      joint: the joint optimum of an uncertain MDP.
-      cost: ``float64[R]``, rewards of the rows.
-      accuracy: requested width.
-    """
-
-    fixed_nature: MDPSolver
-    joint: JointSolver
-    cost: Floats
-    accuracy: Accuracy
+    fixed_nature: MDPSolver  # the optimum of an MDP, from rewards of rows and whether it is maximal
+    joint: JointSolver  # the joint optimum of an uncertain MDP
+    cost: Floats  # float64[R], rewards of the rows
+    accuracy: Accuracy  # requested width
 
 
 def under_nature(

@@ -33,20 +33,14 @@ _DECIMALS = 2 * _EPS  # by how much a sum of decimals may miss one through round
 @brief
 @dataclass(frozen=True)
 class UncertainMDP:
-    """An MDP with an uncertainty set in each row, as NumPy arrays.
+    """An MDP with an uncertainty set in each row, as NumPy arrays."""
 
-    Attributes:
-      mdp: its rows; the probabilities are one distribution of each set, positive where upper is.
-      lower, upper: ``float64[T]``; each end is attained by some distribution of the row.
-      ball: L1 balls, or None.
-      tolerant: whether sums that miss one by rounding count as one, for computed ends.
-    """
-
+    # its rows; the probabilities are one distribution of each set, positive where upper is
     mdp: HostMDP
-    lower: Floats
+    lower: Floats  # float64[T]; each end is attained by some distribution of the row (lower, upper)
     upper: Floats
-    ball: Ball | None = None
-    tolerant: bool = False
+    ball: Ball | None = None  # L1 balls, or None
+    tolerant: bool = False  # whether sums that miss one by rounding count as one, for computed ends
 
     @cached_property
     def rounding(self) -> Floats:

@@ -22,17 +22,11 @@ _EXACT = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1
 
 
 class Separation(NamedTuple):
-    """Distance of a vector beyond the attained values.
+    """Distance of a vector beyond the attained values."""
 
-    Attributes:
-      distance: the least t for which the vector less t times the scale is attained.
-      normal: ``float64[n]``, of the separating hyperplane; sums to one in units of the scale.
-      share: ``float64[N]``, the nearest mixture of points.
-    """
-
-    distance: float
-    normal: Floats
-    share: Floats
+    distance: float  # the least t for which the vector less t times the scale is attained
+    normal: Floats  # float64[n], of the separating hyperplane; sums to one in units of the scale
+    share: Floats  # float64[N], the nearest mixture of points
 
 
 def separation(points: Floats, vector: Floats, scale: Floats) -> Separation:
@@ -135,19 +129,12 @@ def exceeds(normal: Floats, bound: float, vector: Floats) -> bool:
 
 
 class Largest(NamedTuple):
-    """Largest value of one objective under thresholds on the others.
+    """Largest value of one objective under thresholds on the others."""
 
-    Attributes:
-      lower: attained by the mixture; minus infinity without any.
-      share: ``float64[N]``.
-      upper: not exceeded.
-      vector: ``float64[n]``, the extreme vector within the half-spaces; None without any.
-    """
-
-    lower: float
-    share: Floats
-    upper: float
-    vector: Floats | None
+    lower: float  # attained by the mixture; minus infinity without any
+    share: Floats  # float64[N]
+    upper: float  # not exceeded
+    vector: Floats | None  # float64[n], the extreme vector within the half-spaces; None without any
 
 
 def largest(

@@ -32,38 +32,24 @@ _ROUNDS = 100
 
 
 class WeightedProblem(NamedTuple):
-    """A model with several objectives, all to be maximised.
+    """A model with several objectives, all to be maximised."""
 
-    Attributes:
-      mdp: the model, N reachable states.
-      start: ``float64[N]``, the initial distribution.
-      priority: ``int[B, R]``, for each probability objective the least priority that a row reads;
-        it is satisfied where the least recurring one is even.
-      gain: ``float64[K, R]``, at least 0: rewards to maximise.
-      cost: ``float64[C, R]``, at least 0: rewards to minimise.
-      ended: ``bool[N]``, where all rewards with a target have reached it.
-    """
-
-    mdp: HostMDP
-    start: Floats
+    mdp: HostMDP  # the model, N reachable states
+    start: Floats  # float64[N], the initial distribution
+    # int[B, R], for each probability objective the least priority that a row reads; it is satisfied
+    # where the least recurring one is even
     priority: NDArray[Any]
-    gain: Floats
-    cost: Floats
-    ended: Booleans
+    gain: Floats  # float64[K, R], at least 0: rewards to maximise
+    cost: Floats  # float64[C, R], at least 0: rewards to minimise
+    ended: Booleans  # bool[N], where all rewards with a target have reached it
 
 
 class FinalComponents(NamedTuple):
-    """End components without cost in which runs may end, by sets of satisfied objectives.
+    """End components without cost in which runs may end, by sets of satisfied objectives."""
 
-    Attributes:
-      rows: ``bool[R]``, the rows that may be taken.
-      sets: ``bool[M, B]``, sets of objectives.
-      inside: for each set, the rows of end components in which it can be satisfied.
-    """
-
-    rows: Booleans
-    sets: Booleans
-    inside: list[Booleans]
+    rows: Booleans  # bool[R], the rows that may be taken
+    sets: Booleans  # bool[M, B], sets of objectives
+    inside: list[Booleans]  # for each set, the rows of end components in which it can be satisfied
 
 
 def final_components(sums: WeightedProblem) -> FinalComponents | None:
@@ -106,17 +92,11 @@ def _satisfying(mdp: HostMDP, priority: NDArray[Any], rows: Booleans) -> Boolean
 
 
 class WeightedOptimum(NamedTuple):
-    """The optimum of a weighted sum.
+    """The optimum of a weighted sum."""
 
-    Attributes:
-      bound: not exceeded by any policy.
-      weight: ``float64[R]``, a policy: the weights of each state's rows, one or uniform ones.
-      home: ``bool[N]``, the states in which it ends.
-    """
-
-    bound: float
-    weight: Floats
-    home: Booleans
+    bound: float  # not exceeded by any policy
+    weight: Floats  # float64[R], a policy: the weights of each state's rows, one or uniform ones
+    home: Booleans  # bool[N], the states in which it ends
 
 
 def weighted_optimum(
@@ -151,21 +131,13 @@ def weighted_optimum(
 
 
 class _Quotient(NamedTuple):
-    """End components as one node each, and a last node where runs stop.
-
-    Attributes:
-      mdp: the model.
-      node: ``int[N]``, the node of each state.
-      row: ``int[R']``, the row of each row; -1 for stopping.
-      known: ``float64[R']``, the value of stopping.
-      stop: ``int[nodes]``, the state in which a node stops, or -1.
-    """
+    """End components as one node each, and a last node where runs stop."""
 
     mdp: HostMDP
-    node: Integers
-    row: Integers
-    known: Floats
-    stop: Integers
+    node: Integers  # int[N], the node of each state
+    row: Integers  # int[R'], the row of each row; -1 for stopping
+    known: Floats  # float64[R'], the value of stopping
+    stop: Integers  # int[nodes], the state in which a node stops, or -1
 
 
 def _quotient(

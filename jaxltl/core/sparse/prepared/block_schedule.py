@@ -30,55 +30,32 @@ _ENTRY_COST = 1.5
 
 
 class Nodes(NamedTuple):
-    """Optimality equations: a node is the optimum of its rows, a row a weighted sum of entries.
+    """Optimality equations: a node is the optimum of its rows, a row a weighted sum of entries."""
 
-    Attributes:
-      number: how many nodes there are.
-      owner: ``int[R]``, the node of each row, ascending.
-      name: ``int[R]``, what a row is called, at least 0.
-      row: ``int[T]``, the row of each entry, ascending.
-      target: ``int[T]``, a node, ONE, GOAL or LOST.
-      source: ``int[T]``, which number weighs the entry.
-    """
-
-    number: int
-    owner: Integers
-    name: Integers
-    row: Integers
-    target: Integers
-    source: Integers
+    number: int  # how many nodes there are
+    owner: Integers  # int[R], the node of each row, ascending
+    name: Integers  # int[R], what a row is called, at least 0
+    row: Integers  # int[T], the row of each entry, ascending
+    target: Integers  # int[T], a node, ONE, GOAL or LOST
+    source: Integers  # int[T], which number weighs the entry
 
 
 class Segment(NamedTuple):
-    """Consecutive blocks of a schedule.
+    """Consecutive blocks of a schedule."""
 
-    Attributes:
-      target: ``int32[C, A, W, B]``, places of nodes, or N, N + 1, N + 2 for ONE, GOAL, LOST.
-      source: ``int32[C, A, W, B]``.
-      name: ``int32[C, A, B]``, of rows; ``-1 - p`` of those that are what node p chose.
-    """
-
-    target: Integers
-    source: Integers
-    name: Integers
+    target: Integers  # int32[C, A, W, B], places of nodes, or N, N + 1, N + 2 for ONE, GOAL, LOST
+    source: Integers  # int32[C, A, W, B]
+    name: Integers  # int32[C, A, B], of rows; -1 - p of those that are what node p chose
 
 
 class Schedule(NamedTuple):
-    """Three segments: nodes before, on (or between) and after cycles.
+    """Three segments: nodes before, on (or between) and after cycles."""
 
-    Attributes:
-      segments: three of them, maybe empty.
-      place: ``int[M]``, where each of the M nodes stands among the N.
-      size: N.
-      levels: what depends on what goes so far, where there are no cycles.
-      choices: how often a choice may be split.
-    """
-
-    segments: tuple[Segment, Segment, Segment]
-    place: Integers
-    size: int
-    levels: int
-    choices: int
+    segments: tuple[Segment, Segment, Segment]  # three of them, maybe empty
+    place: Integers  # int[M], where each of the M nodes stands among the N
+    size: int  # N
+    levels: int  # what depends on what goes so far, where there are no cycles
+    choices: int  # how often a choice may be split
 
 
 def schedule(nodes: Nodes, one: int, nothing: int) -> Schedule:

@@ -30,41 +30,27 @@ from jaxltl.core.sparse.rows import offsets_from_counts
 
 
 class RoomQueries(NamedTuple):
-    """Whether the upper ends of some entries of a row sum to at least one.
+    """Whether the upper ends of some entries of a row sum to at least one."""
 
-    Attributes:
-      entry, group: ``int[E]``, the entries and their query, ascending.
-      row: ``int[G]``, the row of each query.
-      room: ``bool[G]``, the answers.
-    """
-
-    entry: Integers
+    entry: Integers  # int[E], the entries and their query, ascending
     group: Integers
-    row: Integers
-    room: Booleans
+    row: Integers  # int[G], the row of each query
+    room: Booleans  # bool[G], the answers
 
 
 @dataclass(frozen=True)
 class IntervalPlan:
-    """Residual problem after qualitative preprocessing.
+    """Residual problem after qualitative preprocessing."""
 
-    Attributes:
-      known: ``float64[S]``, 0, 1 or infinity; NaN in open states.
-      row: ``int[S]``, the policy's row in known states; in open ones a row by which they are left,
-        if the policy must leave.
-      within: ``bool[T]``, entries to which nature keeps in known states.
-      rows: ``int[R']``, available rows of open states.
-      used: ``bool[T]``, entries of these that nature may use.
-      has_free_cycles: whether the side that must leave may also stay for ever at no cost.
-      queries: assumptions on the intervals, besides which ends and rewards are positive.
-    """
-
-    known: Floats
+    known: Floats  # float64[S], 0, 1 or infinity; NaN in open states
+    # int[S], the policy's row in known states; in open ones a row by which they are left, if the
+    # policy must leave
     row: Integers
-    within: Booleans
-    rows: Integers
-    used: Booleans
-    has_free_cycles: bool
+    within: Booleans  # bool[T], entries to which nature keeps in known states
+    rows: Integers  # int[R'], available rows of open states
+    used: Booleans  # bool[T], entries of these that nature may use
+    has_free_cycles: bool  # whether the side that must leave may also stay for ever at no cost
+    # assumptions on the intervals, besides which ends and rewards are positive
     queries: RoomQueries
 
 
@@ -195,15 +181,10 @@ class _Query(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class _RecordingMDP(UncertainMDP):
-    """An uncertain MDP that records queries which positive ends alone do not answer.
+    """An uncertain MDP that records queries which positive ends alone do not answer."""
 
-    Attributes:
-      log: the queries.
-      origin: ``int[T]``, entries of the model that the queries refer to.
-    """
-
-    log: list[_Query]
-    origin: Integers
+    log: list[_Query]  # the queries
+    origin: Integers  # int[T], entries of the model that the queries refer to
 
     def can_stay_on(self, entries: Booleans) -> Booleans:
         self._record(np.arange(self.mdp.num_rows), entries)
@@ -262,22 +243,16 @@ def _unique_queries(model: UncertainMDP, log: list[_Query], entries: Integers) -
 
 @dataclass(frozen=True)
 class _Residual:
-    """The plan of a model with absorbing states, in the rows and entries of that model.
-
-    Attributes:
-      model: that model; `origin`, ``int[R]``, the original rows.
-      known, row, within, used: as in the plan; `rows`, ``bool[R]``, likewise.
-      free: ``bool[R]``, rows without reward.
-    """
+    """The plan of a model with absorbing states, in the rows and entries of that model."""
 
     model: UncertainMDP
     origin: Integers
-    known: Floats
+    known: Floats  # as in the plan; `rows`, bool[R], likewise (known, row, within, used)
     row: Integers
     within: Booleans
     rows: Booleans
     used: Booleans
-    free: Booleans
+    free: Booleans  # bool[R], rows without reward
 
     def plan(self, model: UncertainMDP, absorbing: Booleans, log: list[_Query]) -> IntervalPlan:
         """The plan in the rows and entries of the original model."""

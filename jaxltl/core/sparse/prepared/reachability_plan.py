@@ -24,59 +24,35 @@ from jaxltl.core.sparse.solvers.reachability import ReducedProblem, quotient_pol
 
 
 class Loops(NamedTuple):
-    """Self-loops to eliminate: groups of rows whose other entries are normalised.
+    """Self-loops to eliminate: groups of rows whose other entries are normalised."""
 
-    Attributes:
-      entry: ``int[E]``, the entries that lead elsewhere.
-      group: ``int[E]``, their groups, ascending.
-      row: ``int[L]``, the rows.
-      row_group: ``int[L]``.
-      groups: how many there are.
-    """
-
-    entry: Integers
-    group: Integers
-    row: Integers
-    row_group: Integers
-    groups: int
+    entry: Integers  # int[E], the entries that lead elsewhere
+    group: Integers  # int[E], their groups, ascending
+    row: Integers  # int[L], the rows
+    row_group: Integers  # int[L]
+    groups: int  # how many there are
 
 
 class Cycles(NamedTuple):
-    """Collapsed end components, in which the policy moves to the exit of the component.
+    """Collapsed end components, in which the policy moves to the exit of the component."""
 
-    Attributes:
-      state: ``int[M]``, their states.
-      row, row_state: ``int[K]``, the rows that stay inside, and their states by rank in `state`.
-      entry_row, entry_state: ``int[E]``, what these rows lead to, by ranks in `row` and `state`.
-    """
-
-    state: Integers
-    row: Integers
+    state: Integers  # int[M], their states
+    row: Integers  # int[K], the rows that stay inside, and their states by rank in `state`
     row_state: Integers
-    entry_row: Integers
+    entry_row: Integers  # int[E], what these rows lead to, by ranks in `row` and `state`
     entry_state: Integers
 
 
 class Plan(NamedTuple):
-    """Plan of a question for solves with other numbers.
+    """Plan of a question for solves with other numbers."""
 
-    Attributes:
-      schedule: the order of the nodes.
-      place: ``int32[S]``, where the value of a state is, see :class:`Schedule`.
-      own: ``int32[S]``, the place of the node whose row a state takes, or -1.
-      row: ``int32[S]``, the row that it takes else.
-      loops: rows that lead to where they are.
-      cycles: end components that are one node.
-      terms: how many roundings stand behind a weight.
-    """
-
-    schedule: Schedule
-    place: Integers
-    own: Integers
-    row: Integers
-    loops: Loops | None
-    cycles: Cycles | None
-    terms: int
+    schedule: Schedule  # the order of the nodes
+    place: Integers  # int32[S], where the value of a state is, see `Schedule`
+    own: Integers  # int32[S], the place of the node whose row a state takes, or -1
+    row: Integers  # int32[S], the row that it takes else
+    loops: Loops | None  # rows that lead to where they are
+    cycles: Cycles | None  # end components that are one node
+    terms: int  # how many roundings stand behind a weight
 
 
 class _Entries(NamedTuple):

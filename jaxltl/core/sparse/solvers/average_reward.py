@@ -57,21 +57,14 @@ _FLOOR = 1e-6  # relative to the largest reward: gains near zero are not resolve
 
 @dataclass(frozen=True)
 class AverageReward:
-    """Enclosed long-run averages.
+    """Enclosed long-run averages."""
 
-    Attributes:
-      value, lower, upper: ``float64[S]``.
-      row: ``int64[S]``, a policy that attains the bound on the safe side.
-      residual: half the width of the widest gain's enclosure.
-      rounds: sweeps, and linear systems.
-    """
-
-    value: Floats
+    value: Floats  # float64[S] (value, lower, upper)
     lower: Floats
     upper: Floats
-    row: Integers
-    residual: float
-    rounds: int
+    row: Integers  # int64[S], a policy that attains the bound on the safe side
+    residual: float  # half the width of the widest gain's enclosure
+    rounds: int  # sweeps, and linear systems
 
 
 def average(
@@ -136,17 +129,11 @@ def _row_of_states(mdp: HostMDP, found: EndComponents, taken: Integers, row: Int
 
 @dataclass(frozen=True)
 class _Stopping:
-    """End components as one node each, with a row that leads to a terminal node of each.
+    """End components as one node each, with a row that leads to a terminal node of each."""
 
-    Attributes:
-      node: ``int[S]``, the node of each state.
-      mdp: the model; its last nodes are terminal.
-      origin: ``int[R']``, the model's row of each row; -1 for stopping.
-    """
-
-    node: Integers
-    mdp: HostMDP
-    origin: Integers
+    node: Integers  # int[S], the node of each state
+    mdp: HostMDP  # the model; its last nodes are terminal
+    origin: Integers  # int[R'], the model's row of each row; -1 for stopping
 
     def solve(
         self, gain: Floats, tolerance: float, width: float, sign: int
@@ -204,23 +191,15 @@ def _stopping_problem(mdp: HostMDP, found: EndComponents, leaders: Integers) -> 
 
 @dataclass(frozen=True)
 class _Submodel:
-    """Some components as a separate model, without the rows that leave them.
+    """Some components as a separate model, without the rows that leave them."""
 
-    Attributes:
-      mdp: its states are those of the components, one component after the other.
-      start, size: ``int[C]``, the first state and the number of states of each.
-      row: ``int[R']``, the rows of the model.
-      reward, magnitude: ``float64[R']``.
-      unit: the rounding of one backup.
-    """
-
-    mdp: HostMDP
-    start: Integers
+    mdp: HostMDP  # its states are those of the components, one component after the other
+    start: Integers  # int[C], the first state and the number of states of each
     size: Integers
-    row: Integers
-    reward: Floats
+    row: Integers  # int[R'], the rows of the model
+    reward: Floats  # float64[R'] (reward, magnitude)
     magnitude: Floats
-    unit: float
+    unit: float  # the rounding of one backup
 
     def change(self, v: Floats) -> Floats:
         """``T v - v``."""
@@ -294,18 +273,12 @@ class _Bias:
 
 @dataclass
 class _Gains:
-    """Bounds of the gains of C components.
+    """Bounds of the gains of C components."""
 
-    Attributes:
-      lower, upper: ``float64[C]``.
-      row: ``int64[S']``, rows of their states that attain the lower bound.
-      rounds: sweeps, and linear systems.
-    """
-
-    lower: Floats
+    lower: Floats  # float64[C] (lower, upper)
     upper: Floats
-    row: Integers
-    rounds: int = 0
+    row: Integers  # int64[S'], rows of their states that attain the lower bound
+    rounds: int = 0  # sweeps, and linear systems
 
     def update(self, rest: _Unsettled) -> None:
         """Applies the span bound of a value."""

@@ -40,40 +40,24 @@ _MOST = 2**27  # transitions of a component that is written out, at most
 
 
 class PaddedProduct(NamedTuple):
-    """A padded MDP and an automaton, whose letters are read where states are entered.
+    """A padded MDP and an automaton, whose letters are read where states are entered."""
 
-    Attributes:
-      successor: ``int[S, A, K]``.
-      used: ``bool[S, A, K]``.
-      probability: ``float[S, A, K]``.
-      available: ``bool[S, A]``.
-      delta: ``int[Q, L]``.
-      letter: ``int[S]``.
-      allowed: ``bool[S, Q, A]``, or None for all.
-    """
-
-    successor: Integers
-    used: Booleans
-    probability: Floats
-    available: Booleans
-    delta: Integers
-    letter: Integers
-    allowed: Booleans | None = None
+    successor: Integers  # int[S, A, K]
+    used: Booleans  # bool[S, A, K]
+    probability: Floats  # float[S, A, K]
+    available: Booleans  # bool[S, A]
+    delta: Integers  # int[Q, L]
+    letter: Integers  # int[S]
+    allowed: Booleans | None = None  # bool[S, Q, A], or None for all
 
 
 class LayeredBounds(NamedTuple):
-    """Bounds of a reachability probability.
+    """Bounds of a reachability probability."""
 
-    Attributes:
-      lower, upper: ``float64[S, Q]``, exactly 0 or 1 where the graph decides.
-      action: ``int32[S, Q]``, a policy that attains the bound on the safe side.
-      sweeps: over the model.
-    """
-
-    lower: Floats
+    lower: Floats  # float64[S, Q], exactly 0 or 1 where the graph decides
     upper: Floats
-    action: Integers
-    sweeps: int
+    action: Integers  # int32[S, Q], a policy that attains the bound on the safe side
+    sweeps: int  # over the model
 
 
 class _Rows:
@@ -234,26 +218,17 @@ class _Search:
 
 
 class _Problem(NamedTuple):
-    """Problem of a component: :class:`BlockProblem`, and where end components may be.
+    """Problem of a component: :class:`BlockProblem`, and where end components may be."""
 
-    Attributes:
-      host: as many states as columns; the first ones are nodes.
-      cut: the blocks of its rows, if known.
-      open, live, attained, outer: as of BlockProblem, for all columns.
-      rows: ``bool[R]``, or None.
-      stays: ``bool[M]``, where end components are searched.
-      inner: ``bool[M]``, the columns that are read as nodes.
-    """
-
-    host: HostMDP
-    cut: RowBlocks | None
-    open: Booleans
+    host: HostMDP  # as many states as columns; the first ones are nodes
+    cut: RowBlocks | None  # the blocks of its rows, if known
+    open: Booleans  # as of BlockProblem, for all columns (open, live, attained, outer)
     live: Booleans
     attained: Floats
     outer: Floats
-    rows: Booleans | None
-    stays: Booleans
-    inner: Booleans
+    rows: Booleans | None  # bool[R], or None
+    stays: Booleans  # bool[M], where end components are searched
+    inner: Booleans  # bool[M], the columns that are read as nodes
 
 
 def _alone(search: _Search, q: int) -> _Problem:

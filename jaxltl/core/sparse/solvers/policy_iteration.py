@@ -193,25 +193,16 @@ def _core_solver(
 
 @dataclass(frozen=True)
 class _CoreSolver:
-    """Policy iteration on the core.
+    """Policy iteration on the core."""
 
-    Attributes:
-      equation: its optimality equation.
-      node, row: ``int[M]``, ``int[R]``, nodes and rows of the interior.
-      label: ``int[M]``, strongly connected components in topological order.
-      proper: ``int[M]``, a policy that leaves almost surely, if some do not.
-      unit: the relative rounding of a backup; outer_error: of the known values.
-      tolerance, relative: the accuracy.
-    """
-
-    equation: OptimalityEquation
-    node: Integers
+    equation: OptimalityEquation  # its optimality equation
+    node: Integers  # int[M], int[R], nodes and rows of the interior
     row: Integers
-    label: Integers
-    proper: Integers | None
-    unit: float = 0.0
-    outer_error: float = 0.0
-    tolerance: float = 0.0
+    label: Integers  # int[M], strongly connected components in topological order
+    proper: Integers | None  # int[M], a policy that leaves almost surely, if some do not
+    unit: float = 0.0  # the relative rounding of a backup
+    outer_error: float = 0.0  # of the known values
+    tolerance: float = 0.0  # the accuracy (tolerance, relative)
     relative: bool = False
 
     def solve(self) -> _CoreValues:

@@ -43,31 +43,22 @@ _SOME, _FEW = 400, 5  # of fewer states: half of them
 
 @dataclass(frozen=True)
 class ReducedProblem:
-    """Residual problem after qualitative preprocessing.
+    """Residual problem after qualitative preprocessing."""
 
-    Attributes:
-      known_value: ``float64[N]``, of the nodes outside the problem's interior.
-      known_row: ``int[N]``, their policy.
-      problem: on the nodes of `quotient`, or else of `contraction`; None if nothing is left.
-      quotient: of `contraction.mdp`, the model whose end components are states; None without any.
-      components: these end components.
-      fixed, fixed_row: nodes of `contraction` whose rows are known in advance.
-      mdp: the model; contraction: the model without chains.
-      highest: a bound on all values.
-      maximize: whether to maximise.
-    """
-
-    known_value: Floats
-    known_row: Integers
+    known_value: Floats  # float64[N], of the nodes outside the problem's interior
+    known_row: Integers  # int[N], their policy
+    # on the nodes of `quotient`, or else of `contraction`; None if nothing is left
     problem: ShortestPathProblem | None = None
+    # of `contraction.mdp`, the model whose end components are states; None without any
     quotient: Contraction | None = None
     components: EndComponents | None = None
+    # nodes of `contraction` whose rows are known in advance (fixed, fixed_row)
     fixed: Booleans | None = None
     fixed_row: Integers | None = None
     mdp: Any = None
-    contraction: Any = None
-    highest: float = 1.0
-    maximize: bool = False
+    contraction: Any = None  # the model without chains
+    highest: float = 1.0  # a bound on all values
+    maximize: bool = False  # whether to maximise
 
 
 def reachability(

@@ -33,18 +33,12 @@ _ROUNDS = 100
 
 
 class Level(NamedTuple):
-    """Probabilities with the whole budget left.
+    """Probabilities with the whole budget left."""
 
-    Attributes:
-      value: ``float64[S]``.
-      open: ``bool[S]``, where the value is not exact.
-      error: of the value there.
-      row: ``int32[S]``, the choices with the whole budget left; ``int32[L + 1, S]`` with `by_level`.
-    """
-
-    value: Floats
-    open: Booleans
-    error: float
+    value: Floats  # float64[S]
+    open: Booleans  # bool[S], where the value is not exact
+    error: float  # of the value there
+    # int32[S], the choices with the whole budget left; int32[L + 1, S] with `by_level`
     row: Integers
 
 
@@ -128,21 +122,13 @@ def bounded_cost(
 
 
 class _Shape(NamedTuple):
-    """Nodes of the linear system: undecided states, those of an end component as one.
+    """Nodes of the linear system: undecided states, those of an end component as one."""
 
-    Attributes:
-      member: ``bool[S]``, the undecided states.
-      node: ``int[S]``, the node of a member.
-      row: ``int[R']``, the rows of the nodes, in order.
-      starts: ``int[N]``, where those of each node begin.
-      inside: ``bool[R]``, rows without cost that stay in their end component.
-    """
-
-    member: Booleans
-    node: Integers
-    row: Integers
-    starts: Integers
-    inside: Booleans
+    member: Booleans  # bool[S], the undecided states
+    node: Integers  # int[S], the node of a member
+    row: Integers  # int[R'], the rows of the nodes, in order
+    starts: Integers  # int[N], where those of each node begin
+    inside: Booleans  # bool[R], rows without cost that stay in their end component
 
 
 def _shape(

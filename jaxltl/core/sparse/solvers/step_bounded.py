@@ -34,19 +34,12 @@ _MANY = 32  # steps from which states that cannot reach the target in time are l
 
 
 class Steps(NamedTuple):
-    """Result of backward induction.
+    """Result of backward induction."""
 
-    Attributes:
-      value: ``float64[S]``.
-      error: ``float64[S]``, a bound.
-      row: ``int32[S]``, the first choices; ``int32[n, S]`` if all are returned.
-      num_steps: the number of backups.
-    """
-
-    value: Floats
-    error: Floats
-    row: Integers
-    num_steps: int
+    value: Floats  # float64[S]
+    error: Floats  # float64[S], a bound
+    row: Integers  # int32[S], the first choices; int32[n, S] if all are returned
+    num_steps: int  # the number of backups
 
 
 def backup_unit(mdp: HostMDP) -> float:
@@ -62,23 +55,14 @@ def relative_error(unit: float, num_steps: int) -> float:
 
 
 class Backup(NamedTuple):
-    """``x -> opt (cost + P x)`` over the choices of N states, with zero on all other states.
+    """``x -> opt (cost + P x)`` over the choices of N states, with zero on all other states."""
 
-    Attributes:
-      matrix: SciPy's ``float64[R', N]``.
-      taken: the same with the columns of all states, ``float64[R', S]``.
-      choices: the order of the states and of their choices.
-      row: ``int[R']``, the model's rows, in that order.
-      places: ``int[N]``, the states.
-      operation: ``np.maximum`` or ``np.minimum``.
-    """
-
-    matrix: Any
-    taken: Any
-    choices: Choices
-    row: Integers
-    places: Integers
-    operation: np.ufunc
+    matrix: Any  # SciPy's float64[R', N]
+    taken: Any  # the same with the columns of all states, float64[R', S]
+    choices: Choices  # the order of the states and of their choices
+    row: Integers  # int[R'], the model's rows, in that order
+    places: Integers  # int[N], the states
+    operation: np.ufunc  # np.maximum or np.minimum
 
     @property
     def small_chain(self) -> bool:

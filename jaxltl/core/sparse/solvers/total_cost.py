@@ -22,69 +22,45 @@ class ShortestPathProblem:
 
     Self-loops are eliminated: the other successors of a row are taken to be all of them, in these
     proportions.
-
-    Attributes:
-      mdp: the model; its rows may be unsorted and repeat successors.
-      interior: ``bool[S]``, the states to solve for.
-      terminal_value: ``float64[S]``, at least 0: the value of the other states.
-      cost: ``float64[R]``, at least 0.
-      allowed: ``bool[R]``, the rows that may be taken; None for all.
-      proper_policy: ``int[S]``, rows by which the interior is left almost surely; needed only where
-        some policies never leave it.
-      depth: the number of roundings behind each number.
     """
 
-    mdp: HostMDP
-    interior: Booleans
-    terminal_value: Floats
-    cost: Floats
-    allowed: Booleans | None = None
+    mdp: HostMDP  # the model; its rows may be unsorted and repeat successors
+    interior: Booleans  # bool[S], the states to solve for
+    terminal_value: Floats  # float64[S], at least 0: the value of the other states
+    cost: Floats  # float64[R], at least 0
+    allowed: Booleans | None = None  # bool[R], the rows that may be taken; None for all
+    # int[S], rows by which the interior is left almost surely; needed only where some policies
+    # never leave it
     proper_policy: Integers | None = None
-    depth: int = 0
+    depth: int = 0  # the number of roundings behind each number
 
 
 @dataclass(frozen=True)
 class Enclosure:
-    """Certified bounds of an optimum, or of the value of a chain.
+    """Certified bounds of an optimum, or of the value of a chain."""
 
-    Attributes:
-      value, lower, upper: ``float64[S]``; 0 and infinity where nothing could be certified.
-      row: ``int[S]``, a policy that attains the bound on the safe side, `lower` of a maximum.
-      rounds: linear systems solved, or sweeps.
-      residual: of the optimality equation, relative where the value exceeds one.
-      method: the algorithm, in words.
-    """
-
+    # float64[S]; 0 and infinity where nothing could be certified (value, lower, upper)
     value: Floats
     lower: Floats
     upper: Floats
-    row: Integers
-    rounds: int
-    residual: float
-    method: str
+    row: Integers  # int[S], a policy that attains the bound on the safe side, `lower` of a maximum
+    rounds: int  # linear systems solved, or sweeps
+    residual: float  # of the optimality equation, relative where the value exceeds one
+    method: str  # the algorithm, in words
 
 
 @dataclass(frozen=True)
 class InteriorRows:
-    """Rows of the interior states without self-loops, and a last node of value 1 for known values.
+    """Rows of the interior states without self-loops, and a last node of value 1 for known values."""
 
-    Attributes:
-      row_start: ``int[N + 1]``; `entry_start`: ``int[R + 1]``.
-      target: ``int32[T]``, nodes; N for the last one, whose weight is cost and known value.
-      weight: ``float64[T]``.
-      row, node: ``int[R]``, ``int[N]``, rows and states of the model.
-      leaving: ``float64[R]``, the probability of leaving the interior.
-      widest: the largest number of successors of a row in the model, over which sums go.
-    """
-
-    row_start: Integers
-    entry_start: Integers
-    target: Integers
-    weight: Floats
-    row: Integers
+    row_start: Integers  # int[N + 1]
+    entry_start: Integers  # int[R + 1]
+    target: Integers  # int32[T], nodes; N for the last one, whose weight is cost and known value
+    weight: Floats  # float64[T]
+    row: Integers  # int[R], int[N], rows and states of the model
     node: Integers
-    leaving: Floats
-    widest: int
+    leaving: Floats  # float64[R], the probability of leaving the interior
+    widest: int  # the largest number of successors of a row in the model, over which sums go
 
     @property
     def num_nodes(self) -> int:
