@@ -38,54 +38,35 @@ PICTURES = (".svg", ".png", ".pdf")
 
 @dataclass(frozen=True)
 class Evidence:
-    """A model and its transition counts.
+    """A model and its transition counts."""
 
-    Attributes:
-      model: its probabilities are frequencies, or those of a given model.
-      counts: ``int64[T]``, of the model's entries.
-      states, actions: names of states, and of each choice's action.
-      graph: assumption on transitions that the log does not contain.
-    """
-
-    model: SparseMDP
-    counts: np.ndarray
-    states: tuple[str, ...]
+    model: SparseMDP  # its probabilities are frequencies, or those of a given model
+    counts: np.ndarray  # int64[T], of the model's entries
+    states: tuple[str, ...]  # S names, and the action of each choice
     actions: tuple[str, ...]
-    graph: Graph
+    graph: Graph  # assumption on transitions that the log does not contain
 
 
 @dataclass(frozen=True)
 class Query:
-    """A question: the formula, and the confidence of the answer.
+    """A question: the formula, and the confidence of the answer."""
 
-    Attributes:
-      formula: of linear temporal logic.
-      confidence, method: of the confidence sets.
-      objective: ``"max"`` or ``"min"``.
-    """
-
-    formula: str
-    confidence: float
+    formula: str  # of linear temporal logic
+    confidence: float  # confidence, method: of the confidence sets
     method: Literal["anytime", "clopper-pearson", "hoeffding", "weissman"]
-    objective: Literal["max", "min"]
+    objective: Literal["max", "min"]  # "max" or "min"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Source:
-    """What is known of a log's world.
+    """Labels, model and assumptions that accompany a log."""
 
-    Attributes:
-      labels: table of labels, or None.
-      model: model file with the transition graph, or None.
-      initial, terminal: names of states.
-      graph: assumption on possible transitions; default ``"complete"``, or ``"given"`` with a
-        model; see :func:`~jaxltl.core.models.construct.counts.model_from_counts`.
-    """
-
-    labels: Path | None = None
-    model: Path | None = None
-    initial: Sequence[str] = ()
+    labels: Path | None = None  # table of labels, or None
+    model: Path | None = None  # model file with the transition graph, or None
+    initial: Sequence[str] = ()  # initial, terminal: names of states
     terminal: Sequence[str] = ()
+    # assumption on possible transitions; default "complete", or "given" with a model; see
+    # :func:`~jaxltl.core.models.construct.counts.model_from_counts`
     graph: Graph | None = None
 
 

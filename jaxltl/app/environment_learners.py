@@ -27,26 +27,16 @@ from jaxltl.envs.networks import make_network, network_agent
 
 @dataclasses.dataclass(frozen=True)
 class Method:
-    """A learner with its problem and hyperparameters.
+    """A learner with its problem and hyperparameters."""
 
-    Attributes:
-      algorithm: its module.
-      problem, hparams: arguments of its functions.
-      agent: ``(state, likeliest) -> Agent``, the policy of a state.
-      figures: names of the metrics that are drawn.
-      kept: names of the state's fields that determine a policy.
-      transitions: bound of the environment's steps in a step of the learner.
-      description: of the policy.
-    """
-
-    algorithm: Any
-    problem: Any
+    algorithm: Any  # its module
+    problem: Any  # with `hparams`, arguments of its functions
     hparams: Any
-    agent: Callable[[Any, bool], Agent]
-    figures: tuple[str, ...]
-    kept: tuple[str, ...]
-    transitions: int
-    description: str
+    agent: Callable[[Any, bool], Agent]  # (state, likeliest) -> Agent, the policy of a state
+    figures: tuple[str, ...]  # names of the metrics that are drawn
+    kept: tuple[str, ...]  # names of the state's fields that determine a policy
+    transitions: int  # bound of the environment's steps in a step of the learner
+    description: str  # of the policy
 
 
 def make_method(task: EnvironmentTask, environment: Environment, num_steps: int) -> Method:

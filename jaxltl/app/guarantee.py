@@ -32,25 +32,16 @@ _HALVINGS = 30
 
 @dataclass(frozen=True)
 class Guarantee:
-    """An asked guarantee, and the optimal actions.
+    """An asked guarantee, and the optimal actions."""
 
-    Attributes:
-      asked: ``"best"``, ``"none"`` or a probability.
-      over: initial states of an asked probability, their ``"mean"`` or the ``"worst"``.
-      best: the maximal satisfaction probability.
-      actions: the optimal actions; None without a guarantee.
-      forbidden: ``bool[N, T]``, demonstrated steps that are not optimal, and are left out.
-      cost: maximal satisfaction probability before and after the first of them.
-      usable: whether each demonstration has an optimal step.
-    """
-
-    asked: str | float
-    over: str
-    best: Solution
-    actions: OptimalActions | None
-    forbidden: np.ndarray
+    asked: str | float  # "best", "none" or a probability
+    over: str  # initial states of an asked probability, their "mean" or the "worst"
+    best: Solution  # the maximal satisfaction probability
+    actions: OptimalActions | None  # the optimal actions; None without a guarantee
+    forbidden: np.ndarray  # bool[N, T], demonstrated steps that are not optimal, and are left out
+    # maximal satisfaction probability before and after the first of them
     cost: tuple[float, float] | None
-    usable: bool = True
+    usable: bool = True  # whether each demonstration has an optimal step
 
     @property
     def allowed(self) -> np.ndarray | None:
@@ -176,23 +167,14 @@ def kept(
 
 @dataclass(frozen=True)
 class Attempt:
-    """A policy that was learned or mixed.
+    """A policy that was learned or mixed."""
 
-    Attributes:
-      policy: ``float[S, Q, A]``.
-      neg_log_likelihood: of the demonstrations.
-      attained: certified probability, of the mean or the worst initial state.
-      weight: mu, if it was learned with one.
-      share: of optimal actions, if they were mixed in.
-      learned: the underlying result of learning.
-    """
-
-    policy: np.ndarray
-    neg_log_likelihood: float
-    attained: float
-    weight: float | None
-    share: float
-    learned: Any
+    policy: np.ndarray  # float[S, Q, A]
+    neg_log_likelihood: float  # of the demonstrations
+    attained: float  # certified probability, of the mean or the worst initial state
+    weight: float | None  # mu, if it was learned with one
+    share: float  # of optimal actions, if they were mixed in
+    learned: Any  # the underlying result of learning
 
 
 Learned = TypeVar("Learned")
@@ -201,22 +183,15 @@ Train = Callable[[float, Learned], Learned]
 
 @dataclass(frozen=True)
 class Search(Generic[Learned]):
-    """Search for the most likely policy whose certified probability is at least a given one.
+    """Search for the most likely policy whose certified probability is at least a given one."""
 
-    Attributes:
-      model: the product.
-      guarantee: the probability.
-      counts: ``float[S, Q, A]``, the number of demonstrations of each pair.
-      train: learns with a weight mu of the satisfaction probability (2.6), starting from what was
-        learned before.
-      policy_of: the policy ``float[S, Q, A]`` of what was learned.
-    """
-
-    model: Product
-    guarantee: Guarantee
-    counts: np.ndarray
+    model: Product  # the product
+    guarantee: Guarantee  # the probability
+    counts: np.ndarray  # float[S, Q, A], the number of demonstrations of each pair
+    # learns with a weight mu of the satisfaction probability (2.6), starting from what was learned
+    # before
     train: Train[Learned]
-    policy_of: Callable[[Learned], np.ndarray]
+    policy_of: Callable[[Learned], np.ndarray]  # the policy float[S, Q, A] of what was learned
 
     def at_least(self, free: Learned, inside: Callable[[], tuple[np.ndarray, Learned]]) -> Attempt:
         """The most likely policy found.

@@ -68,28 +68,18 @@ DOUBLE = True
 
 @dataclass(frozen=True)
 class Learned:
-    """Weights and policies of N seeds.
+    """Weights and policies of N seeds."""
 
-    Attributes:
-      policy: ``float[N, S, Q, A]``, policies of the product.
-      weights: ``float[N, F]``, and the features' names.
-      loss, neg_log_likelihood, gradient_norm: ``float[N]``.
-      status: ``int32[N]``, of the policies' solver.
-      num_steps: ``int[N]``, until convergence, or all.
-      converged: ``bool[N]``: the gradient is below the tolerance and the solver converged.
-      history: metrics ``[T, N]`` and ``step [T]``.
-    """
-
-    policy: np.ndarray
-    weights: np.ndarray
+    policy: np.ndarray  # float[N, S, Q, A], policies of the product
+    weights: np.ndarray  # float[N, F], and the features' names
     names: tuple[str, ...]
-    loss: np.ndarray
+    loss: np.ndarray  # loss, neg_log_likelihood, gradient_norm: float[N]
     neg_log_likelihood: np.ndarray
     gradient_norm: np.ndarray
-    status: np.ndarray
-    num_steps: np.ndarray
-    converged: np.ndarray
-    history: Mapping[str, np.ndarray]
+    status: np.ndarray  # int32[N], of the policies' solver
+    num_steps: np.ndarray  # int[N], until convergence, or all
+    converged: np.ndarray  # bool[N]: the gradient is below the tolerance and the solver converged
+    history: Mapping[str, np.ndarray]  # metrics [T, N] and step [T]
 
 
 def _features(setup: Setup) -> mlirl.Features:
@@ -281,30 +271,21 @@ class Setup:
 
 @dataclass
 class Outcome:
-    """A finished job.
+    """A finished job."""
 
-    Attributes:
-      setup, learned: the task, and the results of learning.
-      chosen: index of the kept seed, that of least loss.
-      solution: satisfaction probability of the kept policy, with bounds.
-      attempt: how an asked probability was attained, if any.
-      expected_steps: of the learned and the quickest policy; None for formulas without end.
-      satisfaction: ``float[N, S]``, satisfaction probability of every seed from initial states.
-      data: guarantee of the kept policy from a log, if the world is estimated from one.
-      seed: the first seed.
-      seconds: wall time.
-    """
-
-    setup: Setup
+    setup: Setup  # setup, learned: the task, and the results of learning
     learned: Learned
-    chosen: int
-    solution: Solution
-    attempt: Attempt | None
+    chosen: int  # index of the kept seed, that of least loss
+    solution: Solution  # satisfaction probability of the kept policy, with bounds
+    attempt: Attempt | None  # how an asked probability was attained, if any
+    # of the learned and the quickest policy; None for formulas without end
     expected_steps: dict[str, Any] | None
+    # float[N, S], satisfaction probability of every seed from initial states
     satisfaction: np.ndarray
+    # guarantee of the kept policy from a log, if the world is estimated from one
     data: dict[str, Any] | None
-    seed: int
-    seconds: float = 0.0
+    seed: int  # the first seed
+    seconds: float = 0.0  # wall time
 
 
 def prepare(task: MlirlTask, seed: int) -> Setup:

@@ -60,48 +60,28 @@ _DRAWN = 4  # trajectories
 
 @dataclass(frozen=True)
 class Setup:
-    """A task file's contents as the library's objects; see :func:`prepare`.
+    """A task file's contents as the library's objects; see :func:`prepare`."""
 
-    Attributes:
-      task: the file.
-      automaton: of the formula.
-      environment: the world with the task.
-      method: the learner.
-      num_steps: limit of an episode in the evaluation.
-      trivial: remark on a formula that is always true.
-    """
-
-    task: EnvironmentTask
-    automaton: Automaton
-    environment: Environment
-    method: Method
-    num_steps: int
-    trivial: str | None
+    task: EnvironmentTask  # the file
+    automaton: Automaton  # of the formula
+    environment: Environment  # the world with the task
+    method: Method  # the learner
+    num_steps: int  # limit of an episode in the evaluation
+    trivial: str | None  # remark on a formula that is always true
 
 
 @dataclass
 class Outcome:
-    """A finished job.
+    """A finished job."""
 
-    Attributes:
-      setup: the task.
-      states: of the learner, with a first axis of N seeds.
-      history: metrics ``[T, N]`` and ``step [T]``.
-      chosen: index of the kept seed.
-      evaluations: of every seed, from fresh episodes.
-      episodes: some of the kept policy, for pictures.
-      seed: the first seed.
-      seconds: wall time.
-    """
-
-    setup: Setup
-    states: Any
-    history: Mapping[str, np.ndarray]
-    chosen: int
-    evaluations: list[Evaluation]
-    episodes: list[Episode]
-    seed: int
-    seconds: float = 0.0
+    setup: Setup  # the task
+    states: Any  # of the learner, with a first axis of N seeds
+    history: Mapping[str, np.ndarray]  # metrics [T, N] and step [T]
+    chosen: int  # index of the kept seed
+    evaluations: list[Evaluation]  # of every seed, from fresh episodes
+    episodes: list[Episode]  # some of the kept policy, for pictures
+    seed: int  # the first seed
+    seconds: float = 0.0  # wall time
 
 
 def prepare(task: EnvironmentTask, seed: int, world: Environment | None = None) -> Setup:

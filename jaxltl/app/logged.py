@@ -28,17 +28,11 @@ from jaxltl.core.values.undiscounted.satisfaction import satisfaction_probabilit
 
 @dataclass(frozen=True)
 class Logged:
-    """The log from which a world was estimated.
+    """The log from which a world was estimated."""
 
-    Attributes:
-      evidence: the world with its frequencies, and the counts.
-      column: ``int[R]``, the action of each choice in the padded world.
-      confidence, method: of the confidence sets.
-    """
-
-    evidence: Evidence
-    column: np.ndarray
-    confidence: float
+    evidence: Evidence  # the world with its frequencies, and the counts
+    column: np.ndarray  # int[R], the action of each choice in the padded world
+    confidence: float  # confidence, method: of the confidence sets
     method: Literal["anytime", "clopper-pearson", "hoeffding", "weissman"]
 
     @property

@@ -47,20 +47,14 @@ _LAUNCHERS = {
 
 @dataclass(frozen=True)
 class DeviceOptions:
-    """Options of devices and processes.
+    """Options of devices and processes."""
 
-    Attributes:
-      mesh: number of devices; 0 for all of them; None for no mesh.
-      coordinator: ``HOST:PORT`` of process 0, or None.
-      process, processes: number of this process, and of processes, or None.
-      wait: seconds after which a silent process is reported, at the start and later.
-    """
-
-    mesh: int | None = None
-    coordinator: str | None = None
+    mesh: int | None = None  # number of devices; 0 for all of them; None for no mesh
+    coordinator: str | None = None  # HOST:PORT of process 0, or None
+    # process, processes: number of this process, and of processes, or None
     process: int | None = None
     processes: int | None = None
-    wait: float = WAIT
+    wait: float = WAIT  # seconds after which a silent process is reported, at the start and later
 
 
 @dataclass(frozen=True)
@@ -143,16 +137,11 @@ def _host_and_port(address: str) -> tuple[str, int]:
 
 @dataclass(frozen=True)
 class ProcessGroup:
-    """The processes and devices of a run.
+    """The processes and devices of a run."""
 
-    Attributes:
-      process, processes: number of this process, and of processes.
-      mesh: of devices, on one axis; None for JAX's default device.
-    """
-
-    process: int = 0
+    process: int = 0  # process, processes: number of this process, and of processes
     processes: int = 1
-    mesh: Mesh | None = None
+    mesh: Mesh | None = None  # of devices, on one axis; None for JAX's default device
 
     @property
     def is_first(self) -> bool:

@@ -55,22 +55,15 @@ class Outcome(Protocol):
 
 @dataclass(frozen=True)
 class Training:
-    """How a job is run.
+    """How a job is run."""
 
-    Attributes:
-      seed, num_seeds: the first seed, and the number of seeds, which learn in parallel.
-      report: called with the steps made and the newest metrics.
-      stage: called with the name of each stage after learning.
-      checkpoint: file from which an interrupted run resumes.
-      mesh: devices over which several seeds are distributed.
-    """
-
-    seed: int
+    seed: int  # seed, num_seeds: the first seed, and the number of seeds, which learn in parallel
     num_seeds: int
-    report: Progress | None = None
+    report: Progress | None = None  # called with the steps made and the newest metrics
+    # called with the name of each stage after learning
     stage: Callable[[str], None] = lambda name: None
-    checkpoint: Path | None = None
-    mesh: Mesh | None = None
+    checkpoint: Path | None = None  # file from which an interrupted run resumes
+    mesh: Mesh | None = None  # devices over which several seeds are distributed
 
 
 class Report(Protocol):

@@ -28,18 +28,12 @@ Drawn = Callable[[], bytes]  # waits for a picture
 
 @dataclass(frozen=True)
 class Request:
-    """A run of a job.
+    """A run of a job."""
 
-    Attributes:
-      out: directory of results, in which an interrupted job leaves its checkpoint.
-      seed, num_seeds: the first seed, and the number of seeds.
-      mark: the job's fingerprint, which the checkpoint must have.
-    """
-
-    out: Path
-    seed: int
+    out: Path  # directory of results, in which an interrupted job leaves its checkpoint
+    seed: int  # seed, num_seeds: the first seed, and the number of seeds
     num_seeds: int
-    mark: str
+    mark: str  # the job's fingerprint, which the checkpoint must have
 
     @property
     def checkpoint(self) -> Path:

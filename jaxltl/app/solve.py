@@ -37,36 +37,22 @@ SOLVED, NOT_CONVERGED, INVALID = 0, 1, 2  # exit statuses
 
 @dataclass(frozen=True)
 class Query:
-    """A property of the command or of a file.
+    """A property of the command or of a file."""
 
-    Attributes:
-      text: as given.
-      parsed: the property; None for a malformed one.
-      error: of parsing, or None.
-    """
-
-    text: str
-    parsed: Property | None = None
-    error: str | None = None
+    text: str  # as given
+    parsed: Property | None = None  # the property; None for a malformed one
+    error: str | None = None  # of parsing, or None
 
 
 @dataclass(frozen=True)
 class Result:
-    """The answer to a property.
+    """The answer to a property."""
 
-    Attributes:
-      query: the property.
-      answer: its answer, or None.
-      seconds: wall time.
-      error: why there is no answer, or None.
-      fault: NOT_CONVERGED for the solver, INVALID for the property.
-    """
-
-    query: Query
-    answer: Found | None
-    seconds: float
-    error: str | None = None
-    fault: int = SOLVED
+    query: Query  # the property
+    answer: Found | None  # its answer, or None
+    seconds: float  # wall time
+    error: str | None = None  # why there is no answer, or None
+    fault: int = SOLVED  # NOT_CONVERGED for the solver, INVALID for the property
 
     @property
     def exit_status(self) -> int:

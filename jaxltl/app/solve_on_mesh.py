@@ -100,21 +100,13 @@ def _entry(model: ShardedMDP, seconds: float) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class MeshSolver:
-    """Solver of properties over the devices of a mesh, with checkpoints.
+    """Solver of properties over the devices of a mesh, with checkpoints."""
 
-    Attributes:
-      group: the processes and devices.
-      model: distributed over the devices.
-      fingerprint: of the model.
-      tolerance: width of the bounds, absolute for probabilities and relative otherwise.
-      directory: of checkpoints, or None.
-    """
-
-    group: ProcessGroup
-    model: ShardedMDP
-    fingerprint: Mapping[str, str]
-    tolerance: float
-    directory: Path | None = None
+    group: ProcessGroup  # the processes and devices
+    model: ShardedMDP  # distributed over the devices
+    fingerprint: Mapping[str, str]  # of the model
+    tolerance: float  # width of the bounds, absolute for probabilities and relative otherwise
+    directory: Path | None = None  # of checkpoints, or None
 
     def agree(self, properties: list[str]) -> None:
         """Checks that all processes have the same arguments, files and versions."""

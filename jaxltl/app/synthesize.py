@@ -25,83 +25,53 @@ STAGES = ("reading", "solving", "checking", "strategy", "writing")
 
 @dataclass(frozen=True)
 class Nodes:
-    """The product game that is solved, with its reachable states numbered.
+    """The product game that is solved, with its reachable states numbered."""
 
-    Attributes:
-      game: ``N`` nodes, reachable from any state of the world; the initial distribution is that of
-        the game file.
-      objective: of the system.
-      world_state, automaton_state: ``int[N]``.
-      by_chance: ``bool[N]``, nodes where the environment resolves a random move.
-      start: ``int[S]``, the initial node of each state of the world.
-      automaton: of the formula, or None.
-    """
-
+    # N nodes, reachable from any state of the world; the initial distribution is that of the game
+    # file
     game: Game
-    objective: Parity | GR1
-    world_state: np.ndarray
+    objective: Parity | GR1  # of the system
+    world_state: np.ndarray  # world_state, automaton_state: int[N]
     automaton_state: np.ndarray
-    by_chance: np.ndarray
-    start: np.ndarray
-    automaton: Automaton | None
+    by_chance: np.ndarray  # bool[N], nodes where the environment resolves a random move
+    start: np.ndarray  # int[S], the initial node of each state of the world
+    automaton: Automaton | None  # of the formula, or None
 
 
 @dataclass(frozen=True)
 class Step:
-    """A position of a play, and the move that leads there.
+    """A position of a play, and the move that leads there."""
 
-    Attributes:
-      node: the position.
-      mover: ``"system"``, ``"environment"``, ``"chance"`` for a random move that the environment
-        resolves, or ``"start"``.
-      action: the name of the move.
-    """
-
-    node: int
+    node: int  # the position
+    # "system", "environment", "chance" for a random move that the environment resolves, or "start"
     mover: str
-    action: str
+    action: str  # the name of the move
 
 
 @dataclass(frozen=True)
 class Play:
-    """A play that the environment wins.
+    """A play that the environment wins."""
 
-    Attributes:
-      steps: its positions in order.
-      repeats_from: the step from which it repeats for ever, or None.
-      failed: whether it ends in a violation that no continuation can undo.
-      by_chance: whether a random move was resolved against the system.
-    """
-
-    steps: list[Step]
-    repeats_from: int | None
-    failed: bool
-    by_chance: bool
+    steps: list[Step]  # its positions in order
+    repeats_from: int | None  # the step from which it repeats for ever, or None
+    failed: bool  # whether it ends in a violation that no continuation can undo
+    by_chance: bool  # whether a random move was resolved against the system
 
 
 @dataclass(frozen=True)
 class Synthesis:
-    """The result of a synthesis.
+    """The result of a synthesis."""
 
-    Attributes:
-      file, world, nodes: the game.
-      winning: the region and both players' strategies, on the nodes.
-      verdict: of the independent check of both strategies.
-      strategy: a permissive strategy, or None if the system wins from no initial state.
-      restricted: the game under that strategy.
-      strategy_verdict: of the independent check of that game.
-      play: one that the environment wins from an initial state, or None.
-    """
-
-    file: GameFile
+    file: GameFile  # file, world, nodes: the game
     world: World
     nodes: Nodes
-    winning: Winning
-    verdict: Verification
+    winning: Winning  # the region and both players' strategies, on the nodes
+    verdict: Verification  # of the independent check of both strategies
+    # a permissive strategy, or None if the system wins from no initial state
     strategy: Permissive | None
-    restricted: Restriction | None
-    strategy_verdict: Verification | None
-    play: Play | None
+    restricted: Restriction | None  # the game under that strategy
+    strategy_verdict: Verification | None  # of the independent check of that game
+    play: Play | None  # one that the environment wins from an initial state, or None
 
     @property
     def wins(self) -> np.ndarray:

@@ -21,19 +21,12 @@ _BOM = b"\xef\xbb\xbf"
 
 @dataclass(frozen=True)
 class Lines:
-    """Consecutive lines of a CSV table, restricted to the requested columns.
+    """Consecutive lines of a CSV table, restricted to the requested columns."""
 
-    Attributes:
-      name: file name.
-      first: number of the first line.
-      fields: requested fields of each line.
-      times: number of lines with the same fields.
-    """
-
-    name: str
-    first: int
-    fields: list[tuple[str, ...]]
-    times: Counter[tuple[str, ...]]
+    name: str  # file name
+    first: int  # number of the first line
+    fields: list[tuple[str, ...]]  # requested fields of each line
+    times: Counter[tuple[str, ...]]  # number of lines with the same fields
 
     def error(self, fields: tuple[str, ...], message: str) -> ValueError:
         """ValueError for the first line with the given fields."""

@@ -67,22 +67,14 @@ class Text:
 
 @dataclass(frozen=True)
 class Block:
-    """Tokens of consecutive lines.
+    """Tokens of consecutive lines."""
 
-    Attributes:
-      text: their source.
-      data: bytes, ``uint8[B]``, the last of which is blank.
-      start, end: offsets of the tokens, ``int[N]``.
-      first: first token of each line, ``int[L + 1]``.
-      line: line numbers in the file, ``int[L]``.
-    """
-
-    text: Text
-    data: NDArray[np.uint8]
-    start: Integers
+    text: Text  # their source
+    data: NDArray[np.uint8]  # bytes, uint8[B], the last of which is blank
+    start: Integers  # start, end: offsets of the tokens, int[N]
     end: Integers
-    first: Integers
-    line: Integers
+    first: Integers  # first token of each line, int[L + 1]
+    line: Integers  # line numbers in the file, int[L]
 
     @property
     def num_lines(self) -> int:

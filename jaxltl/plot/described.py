@@ -15,17 +15,12 @@ _DPI, _SCREEN = 144, 96  # of saved images, and of widths in pages
 
 
 class Described(NamedTuple):
-    """A figure with a text alternative, as a notebook displays it.
+    """A figure with a text alternative, as a notebook displays it."""
 
-    Attributes:
-      figure: the figure.
-      text: a description in one or two sentences.
-      page: HTML that shows the same and moves, or None. Notebooks show it in a frame where they
-        run; where it was not saved, or is not trusted, the picture stands in its place.
-    """
-
-    figure: Figure
-    text: str
+    figure: Figure  # the figure
+    text: str  # a description in one or two sentences
+    # HTML that shows the same and moves, or None. Notebooks show it in a frame where they run;
+    # where it was not saved, or is not trusted, the picture stands in its place
     page: str | None = None
 
     def __repr__(self) -> str:

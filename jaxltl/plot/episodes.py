@@ -48,27 +48,16 @@ _PIXELS = 440.0
 
 
 class Scene(NamedTuple):
-    """The geometry of an episode in image coordinates: y points down, origin at the upper left.
+    """The geometry of an episode in image coordinates: y points down, origin at the upper left."""
 
-    Attributes:
-      size: of the square.
-      cells: the number per side; 0 for continuous worlds.
-      letters: (column, row, name) of cells.
-      discs: (x, y, radius, name) of round objects.
-      track: ``float[T + 1, 2]``, where the agent was.
-      heading: ``float[T + 1]``, where it looked, radians, or None.
-      shown: the propositions that held, for each of the T + 1 worlds.
-      joined: whether opposite sides are.
-    """
-
-    size: float
-    cells: int
-    letters: list[tuple[int, int, str]]
-    discs: list[tuple[float, float, float, str]]
-    track: NDArray[np.float64]
-    heading: NDArray[np.float64] | None
-    shown: list[str]
-    joined: bool
+    size: float  # of the square
+    cells: int  # the number per side; 0 for continuous worlds
+    letters: list[tuple[int, int, str]]  # (column, row, name) of cells
+    discs: list[tuple[float, float, float, str]]  # (x, y, radius, name) of round objects
+    track: NDArray[np.float64]  # float[T + 1, 2], where the agent was
+    heading: NDArray[np.float64] | None  # float[T + 1], where it looked, radians, or None
+    shown: list[str]  # the propositions that held, for each of the T + 1 worlds
+    joined: bool  # whether opposite sides are
 
 
 def draw_episode(environment: Any, episode: Any, *, title: str | None = None) -> Figure:

@@ -33,28 +33,19 @@ LQR_SEEDS, SEEDS = 50, 5
 
 @dataclass(frozen=True)
 class Plan:
-    """Sizes of the experiment; the defaults are those of the command line.
+    """Sizes of the experiment; the defaults are those of the command line."""
 
-    Attributes:
-      networks: of the regulator.
-      tasks, methods: of the robot.
-      feasible_starts: for some tasks, the methods that also start from feasible policies.
-      lqr_steps: search steps for the regulator.
-      steps: search steps for the robot, 1,000 trajectories each.
-      trust_steps: of TRPO and CPO, 200 trajectories each.
-      feasible_steps: search steps, and TRPO and CPO steps, from feasible policies.
-      fresh: trajectories that evaluate a returned policy.
-    """
-
-    networks: tuple[str, ...] = NETWORKS
-    tasks: tuple[int, ...] = nav.TASKS
+    networks: tuple[str, ...] = NETWORKS  # of the regulator
+    tasks: tuple[int, ...] = nav.TASKS  # tasks, methods: of the robot
     methods: tuple[str, ...] = METHODS
+    # for some tasks, the methods that also start from feasible policies
     feasible_starts: tuple[tuple[int, tuple[str, ...]], ...] = FEASIBLE_STARTS
-    lqr_steps: int = 400
-    steps: int = 60
-    trust_steps: int = 120
+    lqr_steps: int = 400  # search steps for the regulator
+    steps: int = 60  # search steps for the robot, 1,000 trajectories each
+    trust_steps: int = 120  # of TRPO and CPO, 200 trajectories each
+    # search steps, and TRPO and CPO steps, from feasible policies
     feasible_steps: tuple[int, int] = (20, 50)
-    fresh: int = 1000
+    fresh: int = 1000  # trajectories that evaluate a returned policy
 
 
 def figures(

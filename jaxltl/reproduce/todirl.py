@@ -34,24 +34,15 @@ _DISCOUNT = 0.95
 
 @dataclass(frozen=True)
 class Plan:
-    """Sizes of the experiment; the defaults are those of the command line.
+    """Sizes of the experiment; the defaults are those of the command line."""
 
-    Attributes:
-      methods: the learners.
-      demonstrations: numbers of demonstrations.
-      curves: the number of demonstrations of the learning curves (figure 6).
-      steps, cloning_steps: of learning, at most; early stopping may end it.
-      points: of a learning curve.
-      test_worlds: number of unseen worlds.
-    """
-
-    methods: tuple[str, ...] = METHODS
-    demonstrations: tuple[int, ...] = (10, 30, 100, 300)
-    curves: int = 100
-    steps: int = 300
+    methods: tuple[str, ...] = METHODS  # the learners
+    demonstrations: tuple[int, ...] = (10, 30, 100, 300)  # numbers of demonstrations
+    curves: int = 100  # the number of demonstrations of the learning curves (figure 6)
+    steps: int = 300  # steps, cloning_steps: of learning, at most; early stopping may end it
     cloning_steps: int = 1500
-    points: int = 10
-    test_worlds: int = 20
+    points: int = 10  # of a learning curve
+    test_worlds: int = 20  # number of unseen worlds
 
 
 def figures(
@@ -104,17 +95,12 @@ def figures(
 
 
 class Setting(NamedTuple):
-    """Training worlds, one for each of N seeds, and M test worlds.
+    """Training worlds, one for each of N seeds, and M test worlds."""
 
-    Attributes:
-      train, test: the worlds.
-      task: the automaton of the whole task.
-      shown: demonstrations in each training world, the largest number of the plan.
-    """
-
-    train: list[grid.World]
+    train: list[grid.World]  # train, test: the worlds
     test: list[grid.World]
-    task: Automaton
+    task: Automaton  # the automaton of the whole task
+    # demonstrations in each training world, the largest number of the plan
     shown: list[Trajectories]
 
 

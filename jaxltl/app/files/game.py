@@ -133,41 +133,28 @@ class GameFileSchema(File):
 
 @dataclass(frozen=True)
 class GameFile:
-    """A checked game file.
+    """A checked game file."""
 
-    Attributes:
-      path: the file; `name` is its stem, unless the file gives one.
-      game, task, strategy: the tables.
-      demanded: whether the file has a table ``[strategy]``.
-    """
-
-    path: Path
+    path: Path  # the file; `name` is its stem, unless the file gives one
     name: str
-    game: GameTable
+    game: GameTable  # game, task, strategy: the tables
     task: TaskTable
     strategy: StrategyTable
-    demanded: bool
+    demanded: bool  # whether the file has a table [strategy]
 
 
 @dataclass(frozen=True)
 class World:
-    """A game, with its map if it has one.
+    """A game, with its map if it has one."""
 
-    Attributes:
-      game: the game, with successor lists.
-      actions: A names.
-      text: the map; None for a game from a model file.
-      wall: the kind of cell that cannot be entered.
-      places: ``int[C, 2]``, row and column of each other cell from 0; None without a map.
-      objective: the parity condition of the game's own file, or None.
-    """
-
-    game: Game
-    actions: tuple[str, ...]
-    text: str | None = None
+    game: Game  # the game, with successor lists
+    actions: tuple[str, ...]  # A names
+    text: str | None = None  # the map; None for a game from a model file
+    # the kind of cell that cannot be entered
     wall: str = "#"
+    # int[C, 2], row and column of each other cell from 0; None without a map
     places: np.ndarray | None = None
-    objective: Parity | None = None
+    objective: Parity | None = None  # the parity condition of the game's own file, or None
 
     def where(self, state: int) -> dict[str, Any]:
         """Both robots' rows and columns from 1, or the state's number from 0."""

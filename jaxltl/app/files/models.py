@@ -25,19 +25,12 @@ _MOST_NAMES = 100  # each is a column of the padded model
 
 @dataclass(frozen=True)
 class ReadModel:
-    """A model with padded successor lists, and the other contents of its file.
+    """A model with padded successor lists, and the other contents of its file."""
 
-    Attributes:
-      mdp: the model.
-      actions: A names.
-      more: other arrays by name; ``"system"`` of a game.
-      objective: the parity objective of a parity game's file, or None.
-    """
-
-    mdp: MDP
-    actions: tuple[str, ...]
-    more: dict[str, np.ndarray]
-    objective: Parity | None = None
+    mdp: MDP  # the model
+    actions: tuple[str, ...]  # A names
+    more: dict[str, np.ndarray]  # other arrays by name; "system" of a game
+    objective: Parity | None = None  # the parity objective of a parity game's file, or None
 
 
 def read_padded(path: Path, more: Sequence[str] = ()) -> ReadModel:

@@ -29,23 +29,14 @@ from jaxltl.io.colored_world import read_world
 
 @dataclass(frozen=True)
 class Scene:
-    """A world and its observations.
+    """A world and its observations."""
 
-    Attributes:
-      name: for people.
-      mdp: the world.
-      observation: ``float[S, O]``.
-      shape: rows and columns.
-      colored: the coloured world, or None for a text map.
-      cells: ``str[rows, columns]``, or None for a coloured world.
-    """
-
-    name: str
-    mdp: MDP
-    observation: jax.Array
-    shape: tuple[int, int]
-    colored: temporal_gridworld.World | None
-    cells: np.ndarray | None
+    name: str  # for people
+    mdp: MDP  # the world
+    observation: jax.Array  # float[S, O]
+    shape: tuple[int, int]  # rows and columns
+    colored: temporal_gridworld.World | None  # the coloured world, or None for a text map
+    cells: np.ndarray | None  # str[rows, columns], or None for a coloured world
 
     def place(self, state: int) -> dict[str, int]:
         """A state with its row and column, from 1."""

@@ -93,24 +93,15 @@ class TaskFile(File):
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """A checked task file of learning from demonstrations.
+    """A checked task file of learning from demonstrations."""
 
-    Attributes:
-      path: the file; `name` is its stem, unless the file gives one.
-      formula: of linear temporal logic.
-      label_on: which label a step of the product reads, ``"entry"`` or ``"exit"``.
-      guarantee: ``"best"``, ``"none"`` or a probability to certify.
-      over: initial states of a probability to certify, ``"mean"`` or ``"worst"``.
-      digest: SHA-256 of the file and of every file that it names.
-    """
-
-    path: Path
+    path: Path  # the file; `name` is its stem, unless the file gives one
     name: str
-    formula: str
-    label_on: str
-    guarantee: str | float
-    over: str
-    digest: str
+    formula: str  # of linear temporal logic
+    label_on: str  # which label a step of the product reads, "entry" or "exit"
+    guarantee: str | float  # "best", "none" or a probability to certify
+    over: str  # initial states of a probability to certify, "mean" or "worst"
+    digest: str  # SHA-256 of the file and of every file that it names
 
 
 def common_fields(

@@ -210,27 +210,18 @@ class EnvironmentFile(File):
 
 @dataclass(frozen=True)
 class EnvironmentTask:
-    """A checked task file of a simulated world.
+    """A checked task file of a simulated world."""
 
-    Attributes:
-      path: the file; `name` is its stem, unless the file gives one.
-      world, task, learner, evaluation: the tables.
-      settings: the table of the method's name.
-      given: the keys of `settings` that the file has.
-      digest: SHA-256 of the file and of every file that it names.
-      text: of the file when it was read.
-    """
-
-    path: Path
+    path: Path  # the file; `name` is its stem, unless the file gives one
     name: str
-    world: WorldTable
+    world: WorldTable  # world, task, learner, evaluation: the tables
     task: TaskTable
     learner: LearnerTable
-    settings: PpoTable | CceTable | CpoTable
+    settings: PpoTable | CceTable | CpoTable  # the table of the method's name
     evaluation: EvaluationTable
-    given: dict[str, Any]
-    digest: str
-    text: str
+    given: dict[str, Any]  # the keys of `settings` that the file has
+    digest: str  # SHA-256 of the file and of every file that it names
+    text: str  # of the file when it was read
 
     @property
     def formula(self) -> str:

@@ -25,19 +25,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class World:
-    """A model, with its map if it has one.
+    """A model, with its map if it has one."""
 
-    Attributes:
-      mdp: the model.
-      cells: ``str[rows, columns]``, or None for a model without a map.
-      actions: A names.
-      logged: the log that the model was estimated from, or None.
-    """
-
-    mdp: MDP
-    cells: np.ndarray | None
-    actions: tuple[str, ...]
-    logged: Logged | None = None
+    mdp: MDP  # the model
+    cells: np.ndarray | None  # str[rows, columns], or None for a model without a map
+    actions: tuple[str, ...]  # A names
+    logged: Logged | None = None  # the log that the model was estimated from, or None
 
     def where(self, state: int) -> dict[str, Any]:
         """A state's number from 0 and, on a map, its row and column from 1; of a log, its name."""

@@ -46,66 +46,46 @@ class Run:
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """Text and layout of an explorer.
+    """Text and layout of an explorer."""
 
-    Attributes:
-      name: prefix of its HTML ids; pictures with this ``live`` are replaced by it.
-      title, caption: for people.
-      size: S, the number of states or cells.
-      place: cells of a text map, a coloured world, or None without a map.
-      actions: A names.
-      label: of values.
-      wall: the kind of cell that cannot be entered.
-      goal: what the automaton's verdicts are about.
-      marked, marks: (state, memory state, action) that are highlighted, and their title.
-      cells: cells of the pieces in some states; other states have one piece in their own cell.
-      places: names of some states.
-    """
-
-    name: str
-    title: str
+    name: str  # prefix of its HTML ids; pictures with this live are replaced by it
+    title: str  # title, caption: for people
     caption: str
-    size: int
-    place: Any = None
-    actions: Sequence[str] = ()
-    label: str = ""
+    size: int  # S, the number of states or cells
+    place: Any = None  # cells of a text map, a coloured world, or None without a map
+    actions: Sequence[str] = ()  # A names
+    label: str = ""  # of values
+    # the kind of cell that cannot be entered
     wall: str = "#"
-    goal: str = "the formula"
+    goal: str = "the formula"  # what the automaton's verdicts are about
+    # marked, marks: (state, memory state, action) that are highlighted, and their title
     marked: Iterable[tuple[int, int, int]] = ()
     marks: str = ""
+    # cells of the pieces in some states; other states have one piece in their own cell
     cells: Mapping[int, Sequence[int]] = field(default_factory=dict)
-    places: Mapping[int, str] = field(default_factory=dict)
+    places: Mapping[int, str] = field(default_factory=dict)  # names of some states
 
 
 @dataclass(frozen=True, kw_only=True)
 class Explorer:
-    """A policy in a world, for a page; the other attributes are those of :class:`View`.
-
-    Attributes:
-      automaton: the policy's memory, or None.
-      shape: rows and columns of the map, or None.
-      names: S texts, the content of each cell.
-      layers: maps by memory state or :data:`START`.
-      runs: trajectories.
-      drawings: ``"automaton"`` and, if there is one, ``"map"``.
-    """
+    """A policy in a world, for a page; the other attributes are those of :class:`View`."""
 
     name: str
     title: str
     caption: str
     label: str
-    automaton: Automaton | None
+    automaton: Automaton | None  # the policy's memory, or None
     goal: str
-    shape: tuple[int, int] | None
-    names: list[str]
+    shape: tuple[int, int] | None  # rows and columns of the map, or None
+    names: list[str]  # S texts, the content of each cell
     actions: tuple[str, ...]
-    layers: Mapping[str, Layer]
-    runs: list[Run]
+    layers: Mapping[str, Layer]  # maps by memory state or :data:`START`
+    runs: list[Run]  # trajectories
     marked: list[tuple[int, int, int]]
     marks: str
     cells: Mapping[int, Sequence[int]]
     places: Mapping[int, str]
-    drawings: Mapping[str, Drawing]
+    drawings: Mapping[str, Drawing]  # "automaton" and, if there is one, "map"
 
 
 @dataclass(frozen=True)

@@ -25,17 +25,11 @@ _HALVINGS = 5  # few bisections of the weight, since the mixture closes the gap
 
 @dataclass(frozen=True)
 class Held:
-    """Policies with the asked probability.
+    """Policies with the asked probability."""
 
-    Attributes:
-      policy: ``float[W, S, Q, A]``.
-      share: ``float[W]``, of optimal actions.
-      attained: ``float[W]``, certified, of the mean or the worst initial state.
-    """
-
-    policy: np.ndarray
-    share: np.ndarray
-    attained: np.ndarray
+    policy: np.ndarray  # float[W, S, Q, A]
+    share: np.ndarray  # float[W], of optimal actions
+    attained: np.ndarray  # float[W], certified, of the mean or the worst initial state
 
 
 def check_attainable(setup: Setup) -> None:
@@ -83,18 +77,12 @@ def hold(setup: Setup, policy: Any, inside: Any) -> Held:
 
 @dataclass(frozen=True)
 class _Tried:
-    """An attempt with a weight.
+    """An attempt with a weight."""
 
-    Attributes:
-      learned, weight: the network, and mu.
-      attained: least certified probability over the training worlds, before mixing.
-      neg_log_likelihood: of the demonstrations, after mixing.
-    """
-
-    learned: Learned
+    learned: Learned  # learned, weight: the network, and mu
     weight: float
-    attained: float
-    neg_log_likelihood: float
+    attained: float  # least certified probability over the training worlds, before mixing
+    neg_log_likelihood: float  # of the demonstrations, after mixing
 
 
 def is_weighable(setup: Setup) -> bool:

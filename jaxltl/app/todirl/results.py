@@ -22,20 +22,14 @@ LENGTH = 100  # limit of a demonstration of a soft-optimal expert
 
 @dataclass(frozen=True)
 class Worlds:
-    """Worlds, and their products with the learner's memory and with the formula.
+    """Worlds, and their products with the learner's memory and with the formula."""
 
-    Attributes:
-      scenes: W worlds.
-      model: their products with the learner's memory, stacked; with a guarantee, restricted to
-        optimal actions.
-      judged: their products with memory and formula, stacked.
-      observation: ``float[W, S, O]``.
-    """
-
-    scenes: list[Scene]
+    scenes: list[Scene]  # W worlds
+    # their products with the learner's memory, stacked; with a guarantee, restricted to optimal
+    # actions
     model: Product
-    judged: Product
-    observation: jax.Array
+    judged: Product  # their products with memory and formula, stacked
+    observation: jax.Array  # float[W, S, O]
 
     @property
     def names(self) -> list[str]:
@@ -55,36 +49,22 @@ def part_of(tree: Any, chosen: Any) -> Any:
 
 @dataclass(frozen=True)
 class Setup:
-    """A task file's contents as the library's objects; see :func:`prepare`.
+    """A task file's contents as the library's objects; see :func:`prepare`."""
 
-    Attributes:
-      task: the file.
-      judge, memory: the automata of the formula and of the learner's memory.
-      worlds: training worlds, then test worlds.
-      num_training: number of training worlds.
-      expert: ``float[W, S, Q, A]``, the expert's policy in the judged products.
-      soft: whether the expert is soft-optimal for a reward, not the quickest optimal policy.
-      demonstrations: in each of the training worlds.
-      dropped: number of simulated demonstrations that do not satisfy the formula.
-      asked: the guarantee; a probability of 1 is ``"best"``.
-      sure: optimal actions in each world; None without a guarantee.
-      left_out: number of demonstrated steps that are not optimal.
-      trivial: remark on a formula that is always true.
-    """
-
-    task: TodirlTask
-    judge: Automaton
+    task: TodirlTask  # the file
+    judge: Automaton  # judge, memory: the automata of the formula and of the learner's memory
     memory: Automaton
-    worlds: Worlds
-    num_training: int
-    expert: jax.Array
-    soft: bool
-    demonstrations: list[Trajectories]
-    dropped: int
-    asked: str | float
+    worlds: Worlds  # training worlds, then test worlds
+    num_training: int  # number of training worlds
+    expert: jax.Array  # float[W, S, Q, A], the expert's policy in the judged products
+    soft: bool  # whether the expert is soft-optimal for a reward, not the quickest optimal policy
+    demonstrations: list[Trajectories]  # in each of the training worlds
+    dropped: int  # number of simulated demonstrations that do not satisfy the formula
+    asked: str | float  # the guarantee; a probability of 1 is "best"
+    # optimal actions in each world; None without a guarantee
     sure: list[OptimalActions] | None = None
-    left_out: int = 0
-    trivial: str | None = None
+    left_out: int = 0  # number of demonstrated steps that are not optimal
+    trivial: str | None = None  # remark on a formula that is always true
 
     @property
     def loss(self) -> float:
@@ -111,44 +91,27 @@ class Setup:
 
 @dataclass(frozen=True)
 class Learned:
-    """Reward networks of N seeds.
+    """Reward networks of N seeds."""
 
-    Attributes:
-      parameters: of the network, leading axis N.
-      held_out: ``float[N]``, negative log-likelihood of the average held-out pair.
-      best_step: ``int[N]``, after which the parameters were reached.
-      stopped: ``bool[N]``, whether learning ended by patience.
-      num_steps: until all seeds ended.
-      history: metrics ``[T, N]`` and ``step [T]``.
-      weight: mu, if a probability is asked.
-    """
-
-    parameters: Any
-    held_out: np.ndarray
-    best_step: np.ndarray
-    stopped: np.ndarray
-    num_steps: int
-    history: Mapping[str, np.ndarray]
-    weight: float | None = None
+    parameters: Any  # of the network, leading axis N
+    held_out: np.ndarray  # float[N], negative log-likelihood of the average held-out pair
+    best_step: np.ndarray  # int[N], after which the parameters were reached
+    stopped: np.ndarray  # bool[N], whether learning ended by patience
+    num_steps: int  # until all seeds ended
+    history: Mapping[str, np.ndarray]  # metrics [T, N] and step [T]
+    weight: float | None = None  # mu, if a probability is asked
 
 
 @dataclass(frozen=True)
 class Judged:
-    """Policies in some worlds, and their satisfaction probabilities.
+    """Policies in some worlds, and their satisfaction probabilities."""
 
-    Attributes:
-      policy: ``float[W, S, Q, A]`` with the learner's memory, of the kept seed.
-      status: ``int32[W]``, of its solver.
-      performance: of the learned, expert and random policies; leading axis W.
-      seeds: ``float[N, W]``, mean satisfaction probability of each seed.
-      share, attained: ``float[W]``, share of optimal actions and certified probability, if one is
-        asked.
-    """
-
-    policy: np.ndarray
-    status: np.ndarray
+    policy: np.ndarray  # float[W, S, Q, A] with the learner's memory, of the kept seed
+    status: np.ndarray  # int32[W], of its solver
+    # of the learned, expert and random policies; leading axis W
     performance: dict[str, Performance]
-    seeds: np.ndarray
+    seeds: np.ndarray  # float[N, W], mean satisfaction probability of each seed
+    # share, attained: float[W], share of optimal actions and certified probability, if one is asked
     share: np.ndarray | None = None
     attained: np.ndarray | None = None
 
@@ -161,23 +124,15 @@ class Judged:
 
 @dataclass
 class Outcome:
-    """A finished job.
+    """A finished job."""
 
-    Attributes:
-      setup, learned: the task, and the results of learning.
-      chosen: index of the kept seed, by held-out likelihood or loss.
-      training, test: evaluations; test is None without test worlds.
-      seed: the first seed.
-      seconds: wall time.
-    """
-
-    setup: Setup
+    setup: Setup  # setup, learned: the task, and the results of learning
     learned: Learned
-    chosen: int
-    training: Judged
+    chosen: int  # index of the kept seed, by held-out likelihood or loss
+    training: Judged  # training, test: evaluations; test is None without test worlds
     test: Judged | None
-    seed: int
-    seconds: float = 0.0
+    seed: int  # the first seed
+    seconds: float = 0.0  # wall time
 
 
 def counted_worlds(setup: Setup) -> np.ndarray:

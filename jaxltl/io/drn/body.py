@@ -38,59 +38,43 @@ _LABEL = re.compile(rb'"([^"]+)"|([^\s"]+)')
 
 @dataclass(frozen=True)
 class Header:
-    """Header of a DRN file, up to ``@model``.
+    """Header of a DRN file, up to ``@model``."""
 
-    Attributes:
-      kind: "DTMC" or "MDP".
-      value_type: ``@value_type``, or "".
-      parameters: names of the parameters.
-      placeholders: value of each ``$name``.
-      rewards: names of the rewards; some may be empty.
-      num_states, num_choices: announced counts, or None.
-      body: the text after the header.
-    """
-
-    kind: str
-    value_type: str
-    parameters: tuple[str, ...]
-    placeholders: dict[bytes, bytes]
-    rewards: list[str]
-    num_states: int
+    kind: str  # "DTMC" or "MDP"
+    value_type: str  # @value_type, or ""
+    parameters: tuple[str, ...]  # names of the parameters
+    placeholders: dict[bytes, bytes]  # value of each $name
+    rewards: list[str]  # names of the rewards; some may be empty
+    num_states: int  # num_states, num_choices: announced counts, or None
     num_choices: int | None
-    body: Text
+    body: Text  # the text after the header
 
 
 @dataclass
 class Body:
-    """States, actions and transitions of a DRN file as columns, collected block by block.
+    """States, actions and transitions of a DRN file as columns, collected block by block."""
 
-    Attributes:
-      state, line: state and line number of each action, ``int32[R]`` and ``int64[R]``.
-      row, successor, value: row, successor and probability (or its two bounds) of each transition.
-      action: index into `action_names` of each action, ``int32[R]``.
-      labelled, label: pairs of states and indices into `label_names`.
-      rewards: number of rewards per state or action; 0 until the first one is read.
-      state_reward, choice_reward: pairs of a first state or action and rewards ``[n, rewards]``.
-      num_states, num_rows: counts so far.
-      after_action: True if the last line other than a transition was an action.
-    """
-
+    # state, line: state and line number of each action, int32[R] and int64[R]
     state: list[Integers] = field(default_factory=list)
     line: list[Integers] = field(default_factory=list)
+    # row, successor, value: row, successor and probability (or its two bounds) of each transition
     row: list[Integers] = field(default_factory=list)
     successor: list[Integers] = field(default_factory=list)
     value: list[Numbers] = field(default_factory=list)
+    # index into `action_names` of each action, int32[R]
     action: list[Integers] = field(default_factory=list)
     action_names: dict[bytes, int] = field(default_factory=dict)
     label_names: dict[bytes, int] = field(default_factory=dict)
+    # labelled, label: pairs of states and indices into `label_names`
     labelled: list[Integers] = field(default_factory=list)
     label: list[Integers] = field(default_factory=list)
-    rewards: int = 0
+    rewards: int = 0  # number of rewards per state or action; 0 until the first one is read
+    # state_reward, choice_reward: pairs of a first state or action and rewards [n, rewards]
     state_reward: list[tuple[int, Numbers]] = field(default_factory=list)
     choice_reward: list[tuple[int, Numbers]] = field(default_factory=list)
-    num_states: int = 0
+    num_states: int = 0  # num_states, num_rows: counts so far
     num_rows: int = 0
-    after_action: bool = False
+    after_action: bool = False  # True if the last line other than a transition was an action
 
 
 # --- the header -----------------------------------------------------------------------------

@@ -202,21 +202,15 @@ class ParametricModel:
 
 @struct.dataclass
 class _Numbers:
-    """Probabilities and rewards as functions of the parameters.
+    """Probabilities and rewards as functions of the parameters."""
 
-    Attributes:
-      functions: all functions.
-      function: function of each nonzero entry, ``int32[E]``.
-      entry: transition to which each entry contributes, ``int32[E]``; None for one entry each.
-      rewards: functions on the state of each choice and on the choice, ``int32[R]`` both.
-      num_transitions: static.
-    """
-
-    functions: Rationals
-    function: Integers
+    functions: Rationals  # all functions
+    function: Integers  # function of each nonzero entry, int32[E]
+    # transition to which each entry contributes, int32[E]; None for one entry each
     entry: Integers | None
+    # functions on the state of each choice and on the choice, int32[R] both
     rewards: dict[str, tuple[Integers, Integers]]
-    num_transitions: int = struct.field(pytree_node=False)
+    num_transitions: int = struct.field(pytree_node=False)  # static
 
     def __call__(self, x: ArrayLike) -> tuple[jax.Array, dict[str, jax.Array]]:
         value = self.functions(jnp.asarray(x))

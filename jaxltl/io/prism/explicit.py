@@ -215,26 +215,17 @@ def _in_one(path: Path) -> list[Section]:
 
 @dataclass(frozen=True)
 class _Rows:
-    """Transitions as columns.
+    """Transitions as columns."""
 
-    Attributes:
-      num_states: S.
-      is_chain: True if transitions have no choice numbers.
-      state, choice, target, action: ``int32[T]``; action -1 for none.
-      probability: ``float64[T]``, or bounds ``float64[T, 2]``.
-      line: ``int32[T]``, 0 for added self-loops.
-      names: action names.
-    """
-
-    num_states: int
-    is_chain: bool
-    state: Integers
+    num_states: int  # S
+    is_chain: bool  # True if transitions have no choice numbers
+    state: Integers  # state, choice, target, action: int32[T]; action -1 for none
     choice: Integers
     target: Integers
-    probability: Floats
+    probability: Floats  # float64[T], or bounds float64[T, 2]
     action: Integers
-    line: Integers
-    names: dict[bytes, int]
+    line: Integers  # int32[T], 0 for added self-loops
+    names: dict[bytes, int]  # action names
 
 
 def _sizes(text: Text) -> tuple[bool, list[int], Text]:

@@ -19,19 +19,12 @@ _STEP = 2**17  # lines per piece
 
 @dataclass(frozen=True)
 class Written:
-    """Section of the output.
+    """Section of the output."""
 
-    Attributes:
-      kind: "tra", "lab", "sta", "srew" or "trew".
-      number: number of the reward if there are several.
-      header: lines that introduce the section in a single file.
-      lines: generator of the lines, in pieces.
-    """
-
-    kind: str
-    number: str
-    header: list[bytes]
-    lines: Callable[[], Iterator[bytes]]
+    kind: str  # "tra", "lab", "sta", "srew" or "trew"
+    number: str  # number of the reward if there are several
+    header: list[bytes]  # lines that introduce the section in a single file
+    lines: Callable[[], Iterator[bytes]]  # generator of the lines, in pieces
 
 
 def written_sections(source: SparseMDP | IntervalMDP, dialect: str) -> list[Written]:

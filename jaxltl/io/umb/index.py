@@ -62,22 +62,14 @@ class Annotation:
 
 @dataclass(frozen=True)
 class Variable:
-    """State variable.
+    """State variable."""
 
-    Attributes:
-      name, type: as in the file.
-      offset: added to the encoded value.
-      start: first bit in the record.
-      presence: bit that is set if the value is present; None if it always is.
-      is_text: True if the value is a string index.
-    """
-
-    name: str
+    name: str  # name, type: as in the file
     type: Type
-    offset: int
-    start: int
-    presence: int | None
-    is_text: bool = False
+    offset: int  # added to the encoded value
+    start: int  # first bit in the record
+    presence: int | None  # bit that is set if the value is present; None if it always is
+    is_text: bool = False  # True if the value is a string index
 
 
 @dataclass(frozen=True)
@@ -90,17 +82,11 @@ class Record:
 
 @dataclass(frozen=True)
 class Items:
-    """Layout of a member.
+    """Layout of a member."""
 
-    Attributes:
-      part: "states", "choices" or "branches".
-      bits: bits per element.
-      more: additional elements.
-    """
-
-    part: str
-    bits: int
-    more: int = 0
+    part: str  # "states", "choices" or "branches"
+    bits: int  # bits per element
+    more: int = 0  # additional elements
 
     def size(self, count: int) -> int:
         """Size of the member in bytes."""

@@ -192,17 +192,11 @@ def _taken(stream: Stream, member: str, spans: Sequence[_Span]) -> _Runs:
 
 @dataclass(frozen=True)
 class _Held:
-    """Data read for ranges of states.
+    """Data read for ranges of states."""
 
-    Attributes:
-      spans: ranges of states, choices and branches.
-      starts: offsets of choices and branches for each range.
-      found: bytes of the other members.
-    """
-
-    spans: dict[str, list[_Span]]
-    starts: dict[str, list[NDArray[np.int64]]]
-    found: dict[str, _Runs]
+    spans: dict[str, list[_Span]]  # ranges of states, choices and branches
+    starts: dict[str, list[NDArray[np.int64]]]  # offsets of choices and branches for each range
+    found: dict[str, _Runs]  # bytes of the other members
 
 
 def _read(archive: _Archive, index: Index, ranges: list[_Span]) -> _Held:

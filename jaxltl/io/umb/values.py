@@ -278,19 +278,12 @@ def _joined(parts: Sequence[_Part], count: int, subject: str) -> Values:
 
 @dataclass(frozen=True)
 class Written:
-    """Encoded state variables.
+    """Encoded state variables."""
 
-    Attributes:
-      variables: their descriptions in the index.
-      records: records of all states.
-      texts: strings by index.
-      named: names of the variables that hold strings.
-    """
-
-    variables: list[dict[str, object]]
-    records: Bytes
-    texts: list[str]
-    named: list[str]
+    variables: list[dict[str, object]]  # their descriptions in the index
+    records: Bytes  # records of all states
+    texts: list[str]  # strings by index
+    named: list[str]  # names of the variables that hold strings
 
 
 def write_variables(valuation: Mapping[str, ArrayLike], place: str) -> Written:
