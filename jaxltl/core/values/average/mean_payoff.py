@@ -111,11 +111,10 @@ class _Graph(NamedTuple):
 
 
 class _Biases(NamedTuple):
-    """``T(v + t g) = v + (t + 1) g`` for large t, exactly.
+    """``T(v + t g) = v + (t + 1) g`` for large t, exactly."""
 
-    g is ``numerator / denominator`` in lowest terms, `rank` orders the gains, and `bias` is
-    the denominator times v.
-    """
+    # g is ``numerator / denominator`` in lowest terms, `rank` orders the gains, and `bias` is the
+    # denominator times v.
 
     numerator: NDArray[Any]
     denominator: NDArray[Any]
@@ -181,10 +180,8 @@ def _mean_iteration(graph: _Graph, max_steps: int):
 
 
 def _evaluate(successor: NDArray[Any], weight: NDArray[Any], old: _Biases) -> _Biases:
-    """Gains and biases of fixed choices, whose paths all end in cycles, by doubling of steps.
-
-    On each cycle the bias of its first state is the old one where the gain is, and else zero.
-    """
+    """Gains and biases of fixed choices, whose paths all end in cycles, by doubling of steps."""
+    # On each cycle the bias of its first state is the old one where the gain is, and else zero.
     states = np.arange(len(successor))
     doublings = len(states).bit_length()
     first, ahead = states, successor
@@ -236,11 +233,9 @@ def _improve(graph: _Graph, v: _Biases, policy, chooser: NDArray[np.bool_]) -> N
 
 
 def _taken_over(graph: _Graph, policy, v: _Biases, old: _Biases) -> _Biases:
-    """Biases of the environment's best answer that agree with old ones where these fit.
-
-    They fit if no gain has changed. Then, on cycles of moves without slack, the bias is the old
-    one; elsewhere it exceeds v by the least sum of slack and excess on the way to such states.
-    """
+    """Biases of the environment's best answer that agree with old ones where these fit."""
+    # They fit if no gain has changed. Then, on cycles of moves without slack, the bias is the old
+    # one; elsewhere it exceeds v by the least sum of slack and excess on the way to such states.
     changed = (v.numerator != old.numerator) | (v.denominator != old.denominator)
     if changed.any():
         return v

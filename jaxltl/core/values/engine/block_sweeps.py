@@ -14,21 +14,13 @@ from jaxltl.core.values.engine.linear import solve_linear
 
 @struct.dataclass
 class Blocks:
-    """A segment of a :class:`~jaxltl.core.sparse.prepared.block_schedule.Schedule` with its weights.
+    """A segment of a :class:`~jaxltl.core.sparse.prepared.block_schedule.Schedule` with its weights."""
 
-    Attributes:
-      target: ``int32[C, A, W, B]``, places.
-      source: ``int32[C, A, W, B]``, which numbers the weights are.
-      weight: ``float[C, A, W, B]``.
-      name: ``int32[C, A, B]``, of the rows.
-      first: the place of the first node, static.
-    """
-
-    target: Any
-    source: Any
-    weight: Any
-    name: Any
-    first: int = struct.field(pytree_node=False)
+    target: Any  # ``int32[C, A, W, B]``, places
+    source: Any  # ``int32[C, A, W, B]``, which numbers the weights are
+    weight: Any  # ``float[C, A, W, B]``
+    name: Any  # ``int32[C, A, B]``, of the rows
+    first: int = struct.field(pytree_node=False)  # the place of the first node, static
 
     @property
     def size(self) -> int:
@@ -64,19 +56,7 @@ def sweep(
     put: jax.Array | None = None,
     choose: bool = False,
 ) -> tuple[jax.Array, jax.Array | None]:
-    """One pass: ``x = opt_a sum_w weight * x`` from the first block on, in place.
-
-    Args:
-      blocks: what to pass over.
-      x: ``float[N + 3]``.
-      maximize: which optimum.
-      factor, shift: what an image is multiplied by, and what is then added; not below 0.
-      keep, put: ``float[N]``, multiplied by and added to that.
-      choose: whether the choices are asked for too.
-
-    Returns:
-      x, and ``int32[C, B]``, the ranks of the optimal rows, or None.
-    """
+    """One pass: ``x = opt_a sum_w weight * x`` from the first block on, in place."""
     count, _, _, size = blocks.target.shape
     if not count:
         return x, jnp.zeros((0, size), jnp.int32) if choose else None
@@ -153,17 +133,11 @@ def meets(
 
 @struct.dataclass
 class Chosen:
-    """The rows of a policy: ``x = sum_w weight * x[target]``.
+    """The rows of a policy: ``x = sum_w weight * x[target]``."""
 
-    Attributes:
-      target: ``int32[C, W, B]`` of all blocks.
-      weight: ``float[C, W, B]``.
-      cyclic: static.
-    """
-
-    target: Any
-    weight: Any
-    cyclic: bool = struct.field(pytree_node=False)
+    target: Any  # ``int32[C, W, B]`` of all blocks
+    weight: Any  # ``float[C, W, B]``
+    cyclic: bool = struct.field(pytree_node=False)  # static
 
     def image(self, x: jax.Array) -> jax.Array:
         """``sum_w weight * x[target]``, ``float[N]`` from ``float[N + 3]``."""

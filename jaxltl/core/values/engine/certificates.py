@@ -14,11 +14,9 @@ from jaxltl.core.types import Solution, Status
 
 
 def rounding_unit(model: Any) -> Any:
-    """Rounding error of one backup, relative to the magnitude of its terms.
-
-    A backup adds at most K products and takes a maximum or a mean over A actions. The sum of a row
-    may miss 1 by a rounding for each entry, since a model means its normalised rows.
-    """
+    """Rounding error of one backup, relative to the magnitude of its terms."""
+    # A backup adds at most K products and takes a maximum or a mean over A actions. The sum of a
+    # row may miss 1 by a rounding for each entry, since a model means its normalised rows.
     terms = widest_row(model) + most_choices(model) + 4
     return terms * float(jnp.finfo(model.dtype).eps)
 
@@ -45,32 +43,23 @@ def widest_row(model: Any) -> Any:
 
 
 def backup_error(unit: Any, *sizes: Any) -> jax.Array:
-    """Absolute error of one backup: rounding relative to the magnitudes, and underflow.
-
-    XLA flushes results below the least normal number to zero. A backup has ``unit / epsilon``
-    roundings, each of which may flush a product and a sum, hence the least magnitude
-    ``2 tiny / epsilon``.
-    """
+    """Absolute error of one backup: rounding relative to the magnitudes, and underflow."""
+    # XLA flushes results below the least normal number to zero. A backup has ``unit / epsilon``
+    # roundings, each of which may flush a product and a sum, hence the least magnitude ``2 tiny /
+    # epsilon``.
     info = jnp.finfo(jnp.asarray(sizes[0]).dtype)
     return unit * (sum(sizes) + 2 * float(info.tiny) / float(info.eps))
 
 
 class Enclosure(NamedTuple):
-    """An enclosure relative to an image; a field may have a last axis of lanes.
+    """An enclosure relative to an image; a field may have a last axis of lanes."""
 
-    Attributes:
-      shift: the middle of the enclosure minus the image.
-      half: half of the width; infinite without a certificate.
-      converged: whether the width is at most the tolerance.
-      exhausted: whether the width is mostly rounding, so that further sweeps would not help.
-      finite: whether there is a certificate.
-    """
-
-    shift: jax.Array
-    half: jax.Array
-    converged: jax.Array
+    shift: jax.Array  # the middle of the enclosure minus the image
+    half: jax.Array  # half of the width; infinite without a certificate
+    converged: jax.Array  # whether the width is at most the tolerance
+    # whether the width is mostly rounding, so that further sweeps would not help
     exhausted: jax.Array
-    finite: jax.Array
+    finite: jax.Array  # whether there is a certificate
 
     @property
     def ended(self) -> jax.Array:
@@ -85,10 +74,8 @@ def enclose(
     rounding: jax.Array,
     tolerance: jax.Array | None,
 ) -> Enclosure:
-    """MacQueen's (1966) bounds on the fixed point of a monotone T with ``T(v + c) = T(v) + g c``.
-
-    ``T v + g / (1 - g) * [min, max](T v - v)`` for the discount g.
-    """
+    """MacQueen's (1966) bounds on the fixed point of a monotone T with ``T(v + c) = T(v) + g c``."""
+    # ``T v + g / (1 - g) * [min, max](T v - v)`` for the discount g.
     change = image - value
     gap = jnp.where(discount < 1, 1 - discount, jnp.nan)
     rounding = rounding / gap
@@ -98,11 +85,9 @@ def enclose(
 
 
 def judged(down: Any, up: Any, rounding: Any, tolerance: Any) -> Enclosure:
-    """The enclosure between two ends, relative to the image; `rounding` is included in both.
-
-    A quarter of `rounding` on each side pays for rounding in ``middle - half`` and
-    ``middle + half``, so that the width is at most the tolerance as computed.
-    """
+    """The enclosure between two ends, relative to the image; `rounding` is included in both."""
+    # A quarter of `rounding` on each side pays for rounding in ``middle - half`` and ``middle +
+    # half``, so that the width is at most the tolerance as computed.
     half = (up - down) / 2
     finite = jnp.isfinite(half)
     goal = 4 * rounding if tolerance is None else tolerance / 2 - rounding / 4
@@ -122,12 +107,10 @@ def m_matrix_error(
     value: jax.Array,
     undecided: jax.Array,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Certified error of an approximate solution of ``y = P y`` on the undecided states.
-
-    If e >= 0 satisfies ``e - P e >= |r|`` there, where r is the residual of y and decided states
-    are absorbing, then ``|y - y*| <= e``, because ``I - P`` is an M-matrix. A second solve gives e,
-    and a check of the inequality, rounding included, proves it.
-    """
+    """Certified error of an approximate solution of ``y = P y`` on the undecided states."""
+    # If e >= 0 satisfies ``e - P e >= |r|`` there, where r is the residual of y and decided states
+    # are absorbing, then ``|y - y*| <= e``, because ``I - P`` is an M-matrix. A second solve gives
+    # e, and a check of the inequality, rounding included, proves it.
     unit = rounding_unit(model)
     residual = jnp.where(undecided, jnp.abs(onward(value) - value), 0)
     claim = jnp.where(undecided, 2 * residual + 4 * unit * (value + 1e-3), 0)
@@ -141,11 +124,9 @@ def m_matrix_error(
 def refuse(
     solution: Solution, policy: jax.Array, valid: jax.Array, representable: jax.Array
 ) -> Solution:
-    """The solution, without value and bounds if the policy or the model is invalid.
-
-    `policy` is the argument of the solver, NaN at unavailable actions. The status is INVALID_POLICY,
-    or INVALID for a model whose probabilities are not representable.
-    """
+    """The solution, without value and bounds if the policy or the model is invalid."""
+    # `policy` is the argument of the solver, NaN at unavailable actions. The status is
+    # INVALID_POLICY, or INVALID for a model whose probabilities are not representable.
     code = jnp.where(representable, Status.INVALID_POLICY, Status.INVALID)
     valid = valid & representable
 

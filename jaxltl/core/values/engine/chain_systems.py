@@ -36,18 +36,12 @@ _FAST_STEPS = 256  # of a Krylov method, which suffice for chains that mix well
 
 
 class ChainSystem(NamedTuple):
-    """The system ``x - mask * (P_pi x)[row_of]``.
+    """The system ``x - mask * (P_pi x)[row_of]``."""
 
-    Attributes:
-      model: a padded model or a product of one.
-      policy: ``float[S, A]`` or ``int32[S]``.
-      mask: ``bool[S]``, the transient states.
-      row_of: ``int32[S]``, the flat state whose row a state takes; None for its own.
-    """
-
-    model: ActionModel
-    policy: jax.Array
-    mask: jax.Array
+    model: ActionModel  # a padded model or a product of one
+    policy: jax.Array  # ``float[S, A]`` or ``int32[S]``
+    mask: jax.Array  # ``bool[S]``, the transient states
+    # ``int32[S]``, the flat state whose row a state takes; None for its own
     row_of: jax.Array | None = None
 
     def solve(self, matvec: Operator, b: jax.Array) -> jax.Array:
@@ -82,11 +76,9 @@ class ChainSystem(NamedTuple):
 
 
 def _unless(done: jax.Array, x: jax.Array, otherwise: Callable[[], jax.Array]) -> jax.Array:
-    """x if `done`, else ``otherwise()``, which a batch evaluates only if some lane needs it.
-
-    A loop of at most one step: ``lax.cond`` with a batched predicate evaluates both branches, and
-    batches all that they close over.
-    """
+    """x if `done`, else ``otherwise()``, which a batch evaluates only if some lane needs it."""
+    # A loop of at most one step: ``lax.cond`` with a batched predicate evaluates both branches, and
+    # batches all that they close over.
 
     def body(_: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         return jnp.ones_like(done), otherwise()

@@ -84,11 +84,9 @@ def solution_from_enclosure(
 
 
 def complement_event(solution: Solution) -> Solution:
-    """The solution of the complementary event, with bounds rounded outwards.
-
-    Bounds that are 0 or 1 stay exact, and NumPy arrays stay NumPy arrays. Differentiable in the
-    value.
-    """
+    """The solution of the complementary event, with bounds rounded outwards."""
+    # Bounds that are 0 or 1 stay exact, and NumPy arrays stay NumPy arrays. Differentiable in the
+    # value.
     parts = solution.value, solution.upper, solution.lower
     if is_traced(parts):
         parts = parts[0], *lax.stop_gradient(parts[1:])
@@ -111,17 +109,11 @@ def complement_event(solution: Solution) -> Solution:
 
 @brief
 class Chain(NamedTuple):
-    """Markov chain of a policy.
+    """Markov chain of a policy."""
 
-    Attributes:
-      mdp: the chain.
-      weight: ``float64[R]``, the weight of each row; those of a state sum to one.
-      depth: the number of roundings behind each probability.
-    """
-
-    mdp: HostMDP
-    weight: np.ndarray
-    depth: int
+    mdp: HostMDP  # the chain
+    weight: np.ndarray  # ``float64[R]``, the weight of each row; those of a state sum to one
+    depth: int  # the number of roundings behind each probability
 
     def mean(self, quantity: np.ndarray, row_start: np.ndarray) -> np.ndarray:
         """The mean of a quantity on rows in each state, ``float64[S]``."""
@@ -130,11 +122,7 @@ class Chain(NamedTuple):
 
 
 def induced_chain(model: Model, sparse: SparseMDP, policy: Array) -> Chain:
-    """Markov chain induced by a policy.
-
-    Raises:
-      ValueError: a shape is wrong, or a state's weights are not a distribution.
-    """
+    """Markov chain induced by a policy."""
     host = sparse.host
     if is_sparse(model):
         weight = row_weights(sparse, flatten_policy(model, policy))
@@ -189,11 +177,7 @@ def discounted(
     policy: Array | None = None,
     tolerance: Array | None = None,
 ) -> Solution:
-    """Discounted values of a sparse model; arguments as of the functions for padded ones.
-
-    Rewards are named, or arrays on states, choices or transitions, see
-    :func:`~jaxltl.core.models.sparse.choice_reward`; they are finite.
-    """
+    """Discounted values of a sparse model; arguments as of the functions for padded ones."""
     sparse = to_sparse(model)
     earned, magnitude = finite_reward(sparse, reward)
     host, depth = sparse.host, 0

@@ -45,17 +45,10 @@ def implicit(
     transpose_solve: LinearSolver | None = None,
     system: LinearSystem = Krylov(),  # noqa: B008
 ) -> jax.Array:
-    """A fixed point ``v = operator(v)`` with its implicit derivative.
-
-    The result is differentiable, forward and reverse, in everything that `operator` closes over:
-    ``dv = (I - J)^-1 d(operator)`` with J the Jacobian in v (implicit function theorem). No
-    iteration is unrolled; each derivative solves one linear system, or its transpose.
-
-    Example:
-      >>> slope = jax.grad(lambda a: implicit(lambda v: 1 + a * v, jax.numpy.array(2.0)))(0.5)
-      >>> round(slope.item(), 3)
-      4.0
-    """
+    """A fixed point ``v = operator(v)`` with its implicit derivative."""
+    # The result is differentiable, forward and reverse, in everything that `operator` closes over:
+    # ``dv = (I - J)^-1 d(operator)`` with J the Jacobian in v (implicit function theorem). No
+    # iteration is unrolled; each derivative solves one linear system, or its transpose.
     if solve is None or transpose_solve is None:
         return _traced_when_differentiated(operator, lax.stop_gradient(fixed_point), system)
 
@@ -78,10 +71,8 @@ def implicit(
 def _traced_when_differentiated(
     operator: Operator, fixed_point: jax.Array, system: LinearSystem
 ) -> jax.Array:
-    """The same, whose system is traced only where a derivative is taken.
-
-    ``lax.custom_root`` traces it in any case, which is half of a solver's trace.
-    """
+    """The same, whose system is traced only where a derivative is taken."""
+    # ``lax.custom_root`` traces it in any case, which is half of a solver's trace.
     closed = jax.make_jaxpr(operator)(fixed_point)
 
     def image(constants: list[Any], v: jax.Array) -> jax.Array:

@@ -31,10 +31,7 @@ def iterate(
     lanes: str = "in turn",
     every: int = 1,
 ) -> tuple[Any, jax.Array]:
-    """Repeats ``carry = step(table, carry, given)`` until ``finished(carry, given)``, at least once.
-
-    Not differentiable: solvers attach implicit derivatives to the result.
-    """
+    """Repeats ``carry = step(table, carry, given)`` until ``finished(carry, given)``, at least once."""
 
     def loop(table: Any, carry: Any, given: Any, most: jax.Array) -> tuple[Any, jax.Array]:
         def one(carry: Any, n: jax.Array, active: jax.Array) -> tuple[Any, jax.Array]:
@@ -66,11 +63,9 @@ def _mapped(function: Callable[..., Any], *arguments: Any) -> Any:
 
 
 def in_turn(function: Callable[..., Any], *arguments: Any) -> Any:
-    """``function(*arguments)``, batched sequentially under ``vmap``; not differentiable.
-
-    For work whose amount depends on the data, or that is slower in a batch. The function takes
-    trees of arrays and closes over no batched array.
-    """
+    """``function(*arguments)``, batched sequentially under ``vmap``; not differentiable."""
+    # For work whose amount depends on the data, or that is slower in a batch. The function takes
+    # trees of arrays and closes over no batched array.
 
     @jax.custom_batching.sequential_vmap
     def one(arguments: tuple[Any, ...]) -> Any:
@@ -80,11 +75,9 @@ def in_turn(function: Callable[..., Any], *arguments: Any) -> Any:
 
 
 def side_by_side(function: Callable[..., Any], table: Any, *arguments: Any) -> Any:
-    """``function(table, *arguments)``, batched under ``vmap`` with a last axis of lanes.
-
-    The function takes arrays with and without that axis, and closes over no traced array. A batched
-    `table` is mapped as usual.
-    """
+    """``function(table, *arguments)``, batched under ``vmap`` with a last axis of lanes."""
+    # The function takes arrays with and without that axis, and closes over no traced array. A
+    # batched `table` is mapped as usual.
 
     @jax.custom_batching.custom_vmap
     def one(table: Any, arguments: tuple[Any, ...]) -> Any:
@@ -111,11 +104,9 @@ def side_by_side(function: Callable[..., Any], table: Any, *arguments: Any) -> A
 
 
 def fill_row(x: jax.Array) -> jax.Array:
-    """Pads the last axis to a multiple of the vector width by repeating the last lane.
-
-    XLA vectorises rows of other lengths badly: 16 exponentials in a row take a quarter of the time
-    of 10. Fewer than half a vector is not padded.
-    """
+    """Pads the last axis to a multiple of the vector width by repeating the last lane."""
+    # XLA vectorises rows of other lengths badly: 16 exponentials in a row take a quarter of the
+    # time of 10. Fewer than half a vector is not padded.
     size = x.shape[-1]
     room = size if size < _ROW / 2 else -(-size // _ROW) * _ROW
     again = jnp.broadcast_to(x[..., -1:], (*x.shape[:-1], room - size))

@@ -38,18 +38,13 @@ _STRETCH = 64  # steps between two looks at the true residual
 
 
 class System(NamedTuple):
-    """``x - scale * sum_a w(s, a) (P x)(s, a)`` over numbered states.
+    """``x - scale * sum_a w(s, a) (P x)(s, a)`` over numbered states."""
 
-    Attributes:
-      table: the model's successors, see :func:`~jaxltl.core.models.ops.successor_tables.sweep_operator`.
-      weight: ``float[N]`` for each action, such as a policy's columns; of a sparse model
-        ``float[R]``.
-      scale: ``float[N]`` or a scalar, such as the discount; zero where a value is fixed.
-    """
-
+    # the model's successors, see :func:`~jaxltl.core.models.ops.successor_tables.sweep_operator`
     table: Any
+    # ``float[N]`` for each action, such as a policy's columns; of a sparse model ``float[R]``
     weight: Any
-    scale: jax.Array
+    scale: jax.Array  # ``float[N]`` or a scalar, such as the discount; zero where a value is fixed
 
     @property
     def num_states(self) -> int:
@@ -115,17 +110,12 @@ class Inverse(NamedTuple):
 
 
 class Krylov(NamedTuple):
-    """A system solved by :func:`solve_linear`, with the interface of :class:`Inverse`.
+    """A system solved by :func:`solve_linear`, with the interface of :class:`Inverse`."""
 
-    Attributes:
-      system: the system.
-      tolerance: relative residual; default as of :func:`solve_linear`.
-      max_steps: maximal number of products with the system.
-    """
-
-    system: System
+    system: System  # the system
+    # relative residual; default as of :func:`solve_linear`
     tolerance: jax.Array | float | None = None
-    max_steps: jax.Array | int = 100_000
+    max_steps: jax.Array | int = 100_000  # maximal number of products with the system
 
     def solve(self, b: jax.Array) -> jax.Array:
         """The solution of the system."""
@@ -163,10 +153,7 @@ class Krylov(NamedTuple):
 def solver(
     system: System, method: str = "auto", *, max_steps: jax.Array | int = 100_000
 ) -> Inverse | Krylov:
-    """The solver of a system by method: direct (inversion), iterative, or auto by size.
-
-    Not differentiable. `max_steps` is the maximal number of products of an iterative solver.
-    """
+    """The solver of a system by method: direct (inversion), iterative, or auto by size."""
     if method not in ("auto", "direct", "iterative"):
         raise ValueError(f"method={method!r}; choose auto, direct or iterative.")
     system = lax.stop_gradient(system)
@@ -191,16 +178,10 @@ def _refined(inverse_: jax.Array, matvec: Any, b: jax.Array) -> jax.Array:
 
 
 def inverse(matrix: jax.Array) -> jax.Array:
-    """The inverse of ``float[N, N]`` by Gauss-Jordan elimination without pivoting, in blocks.
-
-    Stable for ``I - c P`` with a stochastic P and ``c <= 1``: elimination without pivoting does not
-    let the entries of a diagonally dominant matrix grow (Higham 2002, section 9.5). A singular
-    matrix gives NaN or infinity.
-
-    Example:
-      >>> inverse(jnp.array([[1.0, -0.5], [-0.5, 0.75]])).tolist()
-      [[1.5, 1.0], [1.0, 2.0]]
-    """
+    """The inverse of ``float[N, N]`` by Gauss-Jordan elimination without pivoting, in blocks."""
+    # Stable for ``I - c P`` with a stochastic P and ``c <= 1``: elimination without pivoting does
+    # not let the entries of a diagonally dominant matrix grow (Higham 2002, section 9.5). A
+    # singular matrix gives NaN or infinity.
     n = matrix.shape[-1]
     block = min(_BLOCK, n)
     padded = -(-n // block) * block
@@ -239,10 +220,9 @@ def _small_inverse(matrix: jax.Array) -> jax.Array:
 
 
 class Bicgstab(NamedTuple):
-    """State of BiCGSTAB in the notation of van der Vorst (1992), arrays ``[N]``.
+    """State of BiCGSTAB in the notation of van der Vorst (1992), arrays ``[N]``."""
 
-    One iteration has two products with the system. `r` is the residual of x by recurrence.
-    """
+    # One iteration has two products with the system. `r` is the residual of x by recurrence.
 
     x: jax.Array
     r: jax.Array
@@ -312,13 +292,11 @@ def solve_linear(
     tolerance: jax.Array | float | None = None,
     max_steps: jax.Array | int = 100_000,
 ) -> jax.Array:
-    """Solves ``matvec(x) = b`` where matvec is the identity minus an operator.
-
-    Richardson steps ``x + (b - matvec(x))`` while they contract well, then BiCGSTAB (van der Vorst
-    1992), restarted from the true residual at regular intervals. If BiCGSTAB does not halve it,
-    Richardson steps follow, which converge whenever the operator is a contraction in some norm;
-    they end when their rate shows that `max_steps` would not be enough.
-    """
+    """Solves ``matvec(x) = b`` where matvec is the identity minus an operator."""
+    # Richardson steps ``x + (b - matvec(x))`` while they contract well, then BiCGSTAB (van der
+    # Vorst 1992), restarted from the true residual at regular intervals. If BiCGSTAB does not halve
+    # it, Richardson steps follow, which converge whenever the operator is a contraction in some
+    # norm; they end when their rate shows that `max_steps` would not be enough.
 
     def flat(table: None, given: tuple[()], x: jax.Array) -> jax.Array:
         return matvec(x.reshape(b.shape)).ravel()

@@ -37,19 +37,12 @@ _EXACT = 1e-2  # relative residual asked of it
 
 
 class Backup(NamedTuple):
-    """A backup at some numbers; lanes may differ in all of it.
+    """A backup at some numbers; lanes may differ in all of it."""
 
-    Attributes:
-      reward: ``float[N]`` for each action, of a sparse model ``float[R]``.
-      scale: the discount, a scalar or ``float[N]``.
-      damping: how much of the old value a sweep keeps.
-      extra: what `combine` and `judge` read besides.
-    """
-
-    reward: Quantity
-    scale: jax.Array
-    damping: jax.Array
-    extra: Any
+    reward: Quantity  # ``float[N]`` for each action, of a sparse model ``float[R]``
+    scale: jax.Array  # the discount, a scalar or ``float[N]``
+    damping: jax.Array  # how much of the old value a sweep keeps
+    extra: Any  # what `combine` and `judge` read besides
 
 
 class _Search(NamedTuple):
@@ -87,13 +80,12 @@ def solve(
     max_steps: jax.Array | int,
     weights: bool = False,
 ) -> tuple[jax.Array, ...]:
-    """A value near the fixed point of a backup; nothing is proven here.
-
-    Sweeps ``v <- v + (1 - damping) (T v - v)`` and steps of Newton's method, whose linear systems
-    are solved to a hundredth by BiCGSTAB, or where that fails, on small models with a monotone
-    backup, by elimination. A step is kept if it halves the error, and where the backup is monotone
-    and convex also if its system was solved; if not, ever more sweeps come before the next.
-    """
+    """A value near the fixed point of a backup; nothing is proven here."""
+    # Sweeps ``v <- v + (1 - damping) (T v - v)`` and steps of Newton's method, whose linear systems
+    # are solved to a hundredth by BiCGSTAB, or where that fails, on small models with a monotone
+    # backup, by elimination. A step is kept if it halves the error, and where the backup is
+    # monotone and convex also if its system was solved; if not, ever more sweeps come before the
+    # next.
     # Elsewhere an exact step is no better than another.
     small = monotone and is_small(table, value.shape[0])
     over = table.choices

@@ -19,19 +19,11 @@ R = TypeVar("R")
 
 
 def validated(**words: tuple[str, ...]) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorator of solvers that checks the arguments named in :data:`validation.RANGES`.
-
-    Concrete arguments out of range, complex arrays and unknown words raise ValueError. A traced
-    argument out of range is replaced by the least valid number, so that the solver ends, and the
-    solution has the status :func:`argument_status`, NaN for its value, and infinite bounds.
-    (An array instead of a solution becomes NaN.)
-
-    Example:
-      >>> from jaxltl.core.values.discounted.discounted import policy_value
-      >>> policy_value(None, None, None, discount=-0.5)
-      Traceback (most recent call last):
-      ValueError: discount=-0.5; it must be at least 0 and below 1.
-    """
+    """Decorator of solvers that checks the arguments named in :data:`validation.RANGES`."""
+    # Concrete arguments out of range, complex arrays and unknown words raise ValueError. A traced
+    # argument out of range is replaced by the least valid number, so that the solver ends, and the
+    # solution has the status :func:`argument_status`, NaN for its value, and infinite bounds. (An
+    # array instead of a solution becomes NaN.)
 
     def decorate(solve: Callable[P, R]) -> Callable[P, R]:
         signature = inspect.signature(solve)

@@ -23,17 +23,11 @@ _HALVINGS = 30
 
 @brief
 class Mixture(NamedTuple):
-    """A mixture with its certified satisfaction probability.
+    """A mixture with its certified satisfaction probability."""
 
-    Attributes:
-      policy: ``float[S, Q, A]``.
-      share: of the second policy, in [0, 1].
-      attained: lower bound of the probability, of the mean or the worst initial state.
-    """
-
-    policy: np.ndarray
-    share: float
-    attained: float
+    policy: np.ndarray  # ``float[S, Q, A]``
+    share: float  # of the second policy, in [0, 1]
+    attained: float  # lower bound of the probability, of the mean or the worst initial state
 
 
 def at_starts(model: Product, value: Any, over: str) -> tuple[float, int]:
@@ -64,10 +58,7 @@ def attained(model: Product, policy: Any, over: str) -> float:
 def require_attainable(
     model: Product, best: Solution, probability: float, over: str, place: Callable[[int], str]
 ) -> None:
-    """Raises a ValueError if the required probability exceeds the optimal one.
-
-    `place` gives the name of a world state for the message.
-    """
+    """Raises a ValueError if the required probability exceeds the optimal one."""
     possible, where = at_starts(model, best.lower, over)
     if possible < probability:
         raise ValueError(
@@ -86,10 +77,8 @@ def require_attainable(
 def least_mixture(
     model: Product, policy: Any, sure: Any, probability: float, *, over: str = "mean"
 ) -> Mixture:
-    """The mixture with the least share of `sure` that has a certified probability, by bisection.
-
-    The share is below 1 if possible, so that no action of `policy` gets probability 0.
-    """
+    """The mixture with the least share of `sure` that has a certified probability, by bisection."""
+    # The share is below 1 if possible, so that no action of `policy` gets probability 0.
     policy, sure = np.asarray(policy), np.asarray(sure)
     found = Mixture(policy, 0.0, attained(model, policy, over))
     if found.attained >= probability:
@@ -119,22 +108,10 @@ def reaching(
     *,
     over: str = "mean",
 ) -> Mixture:
-    """The mixture with the least share of an optimal policy that has a required probability.
-
-    If the mixture with `inside` exceeds the required probability by more than a window (because
-    `inside` takes long, so that the smallest share of suboptimal actions matters), the mixture with
-    the fastest optimal policy is tried too.
-
-    Example:
-      >>> from jaxltl import from_dense, optimal_actions, product
-      >>> world = from_dense([[[0, 1.0, 0], [0, 0, 1.0]], [[0, 1.0, 0]] * 2, [[0, 0, 1.0]] * 2],
-      ...                    label=[[0], [1], [0]], propositions=["goal"], initial=[1, 0, 0])
-      >>> model = product(world, "F goal")
-      >>> sure, alike = optimal_actions(model), np.full((3, 2, 2), 0.5)
-      >>> found = reaching(model, alike, sure.policy, sure.best, 0.75)
-      >>> 0.75 <= found.attained < 0.76, 0.5 <= found.share < 0.52
-      (True, True)
-    """
+    """The mixture with the least share of an optimal policy that has a required probability."""
+    # If the mixture with `inside` exceeds the required probability by more than a window (because
+    # `inside` takes long, so that the smallest share of suboptimal actions matters), the mixture
+    # with the fastest optimal policy is tried too.
     found = least_mixture(model, policy, inside, probability, over=over)
     if found.share and found.attained > probability + WINDOW:
         quickest = np.eye(model.num_actions)[np.asarray(best.policy)]
@@ -144,12 +121,7 @@ def reaching(
 
 
 def safe_mean(share: np.ndarray, bound: np.ndarray, *, up: bool, highest: float = np.inf) -> float:
-    """The weighted mean of nonnegative bounds, rounded up or down.
-
-    Example:
-      >>> safe_mean(np.array([0.5, 0.5]), np.array([1.0, 1.0]), up=False)
-      1.0
-    """
+    """The weighted mean of nonnegative bounds, rounded up or down."""
     bound = np.asarray(bound, np.float64)
     if (bound == bound[0]).all():
         return float(bound[0])

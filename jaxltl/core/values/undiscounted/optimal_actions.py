@@ -184,10 +184,8 @@ def _by_bounds(model: Product, solution: Solution, objective: str) -> Booleans:
 
 
 def _attaining(problem: Reaching) -> tuple[Booleans, Solution] | None:
-    """Actions by which every policy that takes them all attains a bound, and that bound.
-
-    None if such a policy may stay undecided for ever.
-    """
+    """Actions by which every policy that takes them all attains a bound, and that bound."""
+    # None if such a policy may stay undecided for ever.
     if problem.model.num_states > QUICK_LIMIT:
         return None
     sparse = rows_of_model(problem.model)

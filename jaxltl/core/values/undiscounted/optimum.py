@@ -163,12 +163,11 @@ def _qualitative(
 
 
 class _Search(NamedTuple):
-    """An optimal reachability problem; `sign` times probabilities are maximised.
+    """An optimal reachability problem; `sign` times probabilities are maximised."""
 
-    `near` is the bound that a policy attains, the lower one of a maximum, and `far` the other. Both
-    are rounded outwards: sums of nonnegative terms err by a share `slack` of them, and by `least`
-    where products underflow.
-    """
+    # `near` is the bound that a policy attains, the lower one of a maximum, and `far` the other.
+    # Both are rounded outwards: sums of nonnegative terms err by a share `slack` of them, and by
+    # `least` where products underflow.
 
     model: Any
     undecided: jax.Array
@@ -223,13 +222,11 @@ class _Bounds(NamedTuple):
 
 
 def _tighter(sign: int, finest: bool, table: None, carry: _Bounds, search: _Search) -> _Bounds:
-    """One round: a sweep and some under the greedy policy for `near`, a guess or sweeps for `far`.
-
-    A value that the operator does not carry away from the optimum is a bound, because the fixed
-    point is unique where end components are collapsed; so `far` is guessed, and where the guess
-    fails, plain interval iteration goes on. Where the bounds are to be the finest, this goes on
-    beyond the goal: a guess is then a bound of the same shape that is `_FINER` times as near.
-    """
+    """One round: a sweep and some under the greedy policy for `near`, a guess or sweeps for `far`."""
+    # A value that the operator does not carry away from the optimum is a bound, because the fixed
+    # point is unique where end components are collapsed; so `far` is guessed, and where the guess
+    # fails, plain interval iteration goes on. Where the bounds are to be the finest, this goes on
+    # beyond the goal: a guess is then a bound of the same shape that is `_FINER` times as near.
     near, far, failed, *_ = carry
     image, action = search.best(sign, near)
     close = jnp.bool_(finest) & (carry.half <= search.goal)
@@ -284,11 +281,9 @@ def _ended(finest: bool, carry: _Bounds, search: _Search) -> jax.Array:
 
 @partial(jax.jit, static_argnames=("objective",))
 def _optimize(model, sets: Sets, components, tolerance, max_steps, start, *, objective) -> Solution:
-    """Encloses an optimum between a bound that a policy attains and one that is proven.
-
-    The attained bound ("near") is the lower one of a maximum and the upper one of a
-    minimum. Sweeps under its own greedy policy move it soundly and cheaply.
-    """
+    """Encloses an optimum between a bound that a policy attains and one that is proven."""
+    # The attained bound ("near") is the lower one of a maximum and the upper one of a minimum.
+    # Sweeps under its own greedy policy move it soundly and cheaply.
     sign = 1 if objective == "max" else -1
     undecided = ~(sets.one | sets.zero)
     one = sets.one.astype(model.dtype)

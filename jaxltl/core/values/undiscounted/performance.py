@@ -201,12 +201,10 @@ def _summarize(model: Product, value, lower, upper, tolerance) -> Performance:
 
 
 def _reach(model: Product, target: jax.Array, policy: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Reachability probabilities ``float[S, Q]``, and a certified bound on the error.
-
-    ``(I - P) y = b`` on the undecided states is solved by block Jacobi over memory states, exactly
-    if the automaton's only cycles are self-loops, and certified by
-    :func:`~jaxltl.core.values.engine.certificates.m_matrix_error`.
-    """
+    """Reachability probabilities ``float[S, Q]``, and a certified bound on the error."""
+    # ``(I - P) y = b`` on the undecided states is solved by block Jacobi over memory states,
+    # exactly if the automaton's only cycles are self-loops, and certified by
+    # :func:`~jaxltl.core.values.engine.certificates.m_matrix_error`.
     sets = policy_sets(TracedGraph(model), target, policy)
     undecided = ~(sets.one | sets.zero)
     one = sets.one.astype(model.dtype)
@@ -222,11 +220,9 @@ def _reach(model: Product, target: jax.Array, policy: jax.Array) -> tuple[jax.Ar
 
 
 def _block_solver(model: Product, policy: jax.Array, undecided: jax.Array):
-    """Solves ``x - P x = b`` on the undecided states, ``x = b`` elsewhere, for ``[S, Q]``.
-
-    Block Jacobi with a block for each memory state. If the automaton's only cycles are self-loops,
-    it ends after as many sweeps as its longest path has states.
-    """
+    """Solves ``x - P x = b`` on the undecided states, ``x = b`` elsewhere, for ``[S, Q]``."""
+    # Block Jacobi with a block for each memory state. If the automaton's only cycles are
+    # self-loops, it ends after as many sweeps as its longest path has states.
     stays = model.next_memory == jnp.arange(model.num_memory)  # [S, Q]
     inside = jnp.where(undecided.T[:, :, None], _within(model, policy, stays), 0)
     inverses = jax.vmap(inverse)(jnp.eye(inside.shape[-1], dtype=inside.dtype) - inside)
@@ -366,10 +362,8 @@ def _together(models: Product, policies: jax.Array, tolerance) -> Performance:
 
 
 def _by_elimination(model: Product, policy: jax.Array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Satisfaction probabilities and their bounds, ``float64[S, Q]``, by GTH elimination.
-
-    Weights stay sums of products of weights, so that their relative errors are small.
-    """
+    """Satisfaction probabilities and their bounds, ``float64[S, Q]``, by GTH elimination."""
+    # Weights stay sums of products of weights, so that their relative errors are small.
     kind = model.automaton.acceptance
     safety = kind == "safety"
     if kind in ("cosafe", "safety"):
@@ -447,16 +441,7 @@ def _reaching(weight: np.ndarray, goal: np.ndarray) -> np.ndarray:
 
 
 def infeasible_starts(model: Product) -> jax.Array:
-    """Initial states ``bool[S]`` with maximal satisfaction probability 0, decided on the graph.
-
-    Works on concrete and on traced products; not differentiable.
-
-    Example:
-      >>> from jaxltl import from_dense, product
-      >>> world = from_dense([[[0, 1.0]], [[0, 1.0]]], label=[[0], [1]], propositions=["g"])
-      >>> [infeasible_starts(product(world, task)).tolist() for task in ("G F g", "G !g")]
-      [[False, False], [True, True]]
-    """
+    """Initial states ``bool[S]`` with maximal satisfaction probability 0, decided on the graph."""
     problem = as_reachability(model, "max")
     graph = graph_of(problem.model)
     target = take(graph, problem.target)
@@ -471,31 +456,22 @@ def infeasible_starts(model: Product) -> jax.Array:
 
 @brief
 class Summary(NamedTuple):
-    """Performance over worlds.
+    """Performance over worlds."""
 
-    Attributes:
-      mean, std: of L_phi over the worlds (sample standard deviation; 0 for one world).
-      lower, upper: certified bounds on the mean.
-      worst_world, worst: the name of the world with the least L_phi, and its value.
-      worst_start: the least probability from any initial state of any world.
-      num_worlds: number of worlds in these figures.
-      infeasible: names of the worlds with initial states from which no policy satisfies the task;
-        they count in the figures unless they are excluded.
-      left_out: names of the excluded worlds.
-      uncertain: names of the worlds whose enclosures are wider than the tolerance.
-    """
-
-    mean: float
+    mean: float  # mean, std: of L_phi over the worlds (sample standard deviation; 0 for one world)
     std: float
-    lower: float
+    lower: float  # lower, upper: certified bounds on the mean
     upper: float
+    # worst_world, worst: the name of the world with the least L_phi, and its value
     worst_world: str
     worst: float
-    worst_start: float
-    num_worlds: int
+    worst_start: float  # the least probability from any initial state of any world
+    num_worlds: int  # number of worlds in these figures
+    # names of the worlds with initial states from which no policy satisfies the task; they count in
+    # the figures unless they are excluded
     infeasible: tuple[str, ...]
-    left_out: tuple[str, ...]
-    uncertain: tuple[str, ...]
+    left_out: tuple[str, ...]  # names of the excluded worlds
+    uncertain: tuple[str, ...]  # names of the worlds whose enclosures are wider than the tolerance
 
 
 def summarize(
@@ -505,22 +481,7 @@ def summarize(
     names: Sequence[str] | None = None,
     leave_out: Collection[str] = (),
 ) -> Summary:
-    """Mean, standard deviation and worst case over worlds, on the host.
-
-    Raises:
-      ValueError: names are missing, repeated or unknown, or all worlds are excluded.
-
-    Example:
-      >>> from jaxltl import from_dense, stack_products
-      >>> def world(p):
-      ...     return from_dense([[[0, p, 1 - p]], [[0, 1.0, 0]], [[0, 0, 1.0]]], initial=[1, 0, 0],
-      ...                       label=[[0], [1], [0]], propositions=["a"])
-      >>> both = stack_products([world(0.25), world(0.75)], "G F a", label_on="exit")
-      >>> shares = task_performances(both, jnp.ones((3, 1, 1)))
-      >>> found = summarize(both, shares, names=["rough", "fair"])
-      >>> round(found.mean, 6), found.worst_world, found.infeasible
-      (0.5, 'rough', ())
-    """
+    """Mean, standard deviation and worst case over worlds, on the host."""
     count = num_worlds(models)
     names = [f"world {w}" for w in range(count)] if names is None else list(names)
     if len(names) != count or len(set(names)) != count:

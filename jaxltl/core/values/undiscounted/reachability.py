@@ -234,12 +234,10 @@ class Question(NamedTuple):
 
 
 def conserving_rows(mdp: HostMDP, objective: str, found: Enclosure) -> Booleans:
-    """Rows in undecided states by which every policy that decides almost surely attains the bound.
-
-    ``P l >= l`` for the lower bound l of a maximum makes l a submartingale, and bounds the value
-    of a policy of such rows from below by its limit, which is 0 or 1; likewise ``P u <= u`` for
-    the upper bound of a minimum.
-    """
+    """Rows in undecided states by which every policy that decides almost surely attains the bound."""
+    # ``P l >= l`` for the lower bound l of a maximum makes l a submartingale, and bounds the value
+    # of a policy of such rows from below by its limit, which is 0 or 1; likewise ``P u <= u`` for
+    # the upper bound of a minimum.
     undecided = found.lower != found.upper
     unit = _backup_unit(mdp)
     if objective == "max":
@@ -251,11 +249,9 @@ def conserving_rows(mdp: HostMDP, objective: str, found: Enclosure) -> Booleans:
 
 
 def attained_by_ties(mdp: HostMDP, objective: str, found: Enclosure) -> Enclosure | None:
-    """The enclosure with a bound that tied rows may attain, whatever policy takes them.
-
-    The value less a few roundings for each step that the slowest policy of tied rows takes; it is
-    not proven, except by :func:`conserving_rows`. None if such policies may never decide.
-    """
+    """The enclosure with a bound that tied rows may attain, whatever policy takes them."""
+    # The value less a few roundings for each step that the slowest policy of tied rows takes; it is
+    # not proven, except by :func:`conserving_rows`. None if such policies may never decide.
     largest, undecided = objective == "max", found.lower != found.upper
     sign, near, far = 1, found.lower, found.upper
     if not largest:

@@ -215,20 +215,13 @@ _over_mesh = jax.jit(_optimal, static_argnames=("objective",))
 
 @brief
 class Reaching(NamedTuple):
-    """An optimal satisfaction problem as an optimal reachability problem.
+    """An optimal satisfaction problem as an optimal reachability problem."""
 
-    Attributes:
-      model: the product, or that of the task's negation.
-      target: ``bool[S, Q]``.
-      objective: ``"max"`` or ``"min"``.
-      opposite: whether the satisfaction probability is one minus that of the target.
-      accepting: for Buchi and parity, the accepting end components of the target.
-    """
-
-    model: Product
-    target: Any
-    objective: str
-    opposite: bool
+    model: Product  # the product, or that of the task's negation
+    target: Any  # ``bool[S, Q]``
+    objective: str  # ``"max"`` or ``"min"``
+    opposite: bool  # whether the satisfaction probability is one minus that of the target
+    # for Buchi and parity, the accepting end components of the target
     accepting: Accepting | None = None
 
 
@@ -248,10 +241,7 @@ def as_reachability(model: Product, objective: str) -> Reaching:
 
 
 def _visiting(problem: Reaching, found: Solution) -> Any:
-    """A policy that reads the least priority of accepting end components infinitely often.
-
-    On a concrete model, the fastest one.
-    """
+    """A policy that reads the least priority of accepting end components infinitely often."""
     model, accepting = problem.model, problem.accepting
     assert accepting is not None
     if is_traced((model, found)) or model.num_states > QUICK_LIMIT:
@@ -271,10 +261,8 @@ def _visiting(problem: Reaching, found: Solution) -> Any:
 
 
 def until_visit(problem: Reaching, mdp: HostMDP) -> HostMDP:
-    """The product's rows, in which accepting visits lead to a further, absorbing state.
-
-    An accepting visit reads the least priority of the accepting end component.
-    """
+    """The product's rows, in which accepting visits lead to a further, absorbing state."""
+    # An accepting visit reads the least priority of the accepting end component.
     model, accepting = problem.model, problem.accepting
     assert accepting is not None
     automaton, letter = jax.tree.map(np.asarray, (model.automaton, model.letter))

@@ -199,20 +199,7 @@ def product_satisfaction(
     objective: str = "max",
     tolerance: Array | None = None,
 ) -> Solution:
-    """Optimal probability of acceptance on every state of a lazy product of a sparse model.
-
-    Raises:
-      ValueError: the product's actions are restricted, or the policy is invalid.
-
-    Concrete arrays only, on the host; not differentiable.
-
-    Example:
-      >>> from jaxltl import make_sparse, product
-      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1],
-      ...                    initial=[1, 0, 0], label={"a": [1]})
-      >>> product_satisfaction(product(coin, "F a")).value[:, 0].tolist()
-      [0.5, 1.0, 0.0]
-    """
+    """Optimal probability of acceptance on every state of a lazy product of a sparse model."""
     if model.allowed is not None:
         raise ValueError(
             "a product of a sparse model takes no mask of actions; restrict the world "

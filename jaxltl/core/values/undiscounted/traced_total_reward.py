@@ -61,32 +61,19 @@ _MOST_STEPS = 1_000_000
 
 
 class _Problem(NamedTuple):
-    """Residual problem after qualitative preprocessing.
+    """Residual problem after qualitative preprocessing."""
 
-    Attributes:
-      model: the model.
-      sign: 1 for a maximum, -1 for a minimum; static.
-      reward: ``float[S, A]``.
-      policy: ``float[S, A]``, the policy to evaluate, or None.
-      open: ``bool[S]``, where the value is finite and not 0.
-      finite: ``bool[S]``.
-      allowed: ``bool[S, A]``, the actions to choose from; in collapsed end components those that
-        leave.
-      start: ``int32[S]``, actions that leave the open states almost surely.
-      decided: ``int32[S]``, actions for the states that are not open.
-      circles: for a minimum, the end components of zero reward.
-    """
-
-    model: Any
-    sign: int
-    reward: jax.Array
-    policy: jax.Array | None
-    open: jax.Array
-    finite: jax.Array
+    model: Any  # the model
+    sign: int  # 1 for a maximum, -1 for a minimum; static
+    reward: jax.Array  # ``float[S, A]``
+    policy: jax.Array | None  # ``float[S, A]``, the policy to evaluate, or None
+    open: jax.Array  # ``bool[S]``, where the value is finite and not 0
+    finite: jax.Array  # ``bool[S]``
+    # ``bool[S, A]``, the actions to choose from; in collapsed end components those that leave
     allowed: jax.Array
-    start: jax.Array
-    decided: jax.Array
-    circles: EndComponents | None
+    start: jax.Array  # ``int32[S]``, actions that leave the open states almost surely
+    decided: jax.Array  # ``int32[S]``, actions for the states that are not open
+    circles: EndComponents | None  # for a minimum, the end components of zero reward
 
 
 class _Point(NamedTuple):
@@ -99,24 +86,16 @@ class _Point(NamedTuple):
 
 
 class Found(NamedTuple):
-    """Result of :func:`total_reward_by_sweeps` without derivatives.
+    """Result of :func:`total_reward_by_sweeps` without derivatives."""
 
-    Attributes:
-      value, lower, upper: ``float[S]``, 0 where it is infinite.
-      policy: ``int32[S]``, attains the bound on the safe side.
-      leaves: ``int32[S]``, the state whose action gives a state's value.
-      open, finite: as in the problem.
-      residual, num_steps, status: as in a Solution.
-    """
-
-    value: jax.Array
+    value: jax.Array  # value, lower, upper: ``float[S]``, 0 where it is infinite
     lower: jax.Array
     upper: jax.Array
-    policy: jax.Array
-    leaves: jax.Array
-    open: jax.Array
+    policy: jax.Array  # ``int32[S]``, attains the bound on the safe side
+    leaves: jax.Array  # ``int32[S]``, the state whose action gives a state's value
+    open: jax.Array  # open, finite: as in the problem
     finite: jax.Array
-    residual: jax.Array
+    residual: jax.Array  # residual, num_steps, status: as in a Solution
     num_steps: jax.Array
     status: jax.Array
 
@@ -131,11 +110,9 @@ def total_reward_by_sweeps(
     *,
     objective: str,
 ) -> Solution:
-    """Traced :func:`~jaxltl.core.values.undiscounted.total_reward.total_reward`, with its arguments.
-
-    Bounds are 0 and infinity where nothing is proven. If a reward is negative or not finite, the
-    value is NaN and the status ``NONFINITE``.
-    """
+    """Traced :func:`~jaxltl.core.values.undiscounted.total_reward.total_reward`, with its arguments."""
+    # Bounds are 0 and infinity where nothing is proven. If a reward is negative or not finite, the
+    # value is NaN and the status ``NONFINITE``.
     target, reward = jnp.asarray(target, bool), jnp.asarray(reward, model.dtype)
     earns = jnp.all(jnp.where(model.available, (reward >= 0) & jnp.isfinite(reward), True))
     reward = jnp.where(model.available & earns, reward, 0)
@@ -320,10 +297,8 @@ def _onward(problem: _Problem, at: _Point) -> Callable[[jax.Array], jax.Array]:
 
 
 def _improved(problem: _Problem, factor: jax.Array, at: _Point) -> tuple[jax.Array, jax.Array]:
-    """A step of policy iteration for ``v = factor * T v``, and its number of applications of P.
-
-    If the linear system is not solved, sweeps under its policy.
-    """
+    """A step of policy iteration for ``v = factor * T v``, and its number of applications of P."""
+    # If the linear system is not solved, sweeps under its policy.
     model, onward = problem.model, _onward(problem, at)
     swept = factor * at.image
     change = swept - at.value
@@ -398,26 +373,16 @@ def _solved(
 
 
 class _Search(NamedTuple):
-    """State of the search for bounds; pairs are lower and upper.
+    """State of the search for bounds; pairs are lower and upper."""
 
-    Attributes:
-      at: the current point.
-      share: e.
-      bounds: the proven bounds.
-      shares: the e of each proven bound, else infinity.
-      safe: the point whose policy attains the bound on the safe side.
-      tries, num_steps: numbers of trials, and of applications of P.
-      ended: whether other shares would not help.
-    """
-
-    at: _Point
-    share: jax.Array
-    bounds: tuple[jax.Array, jax.Array]
-    shares: tuple[jax.Array, jax.Array]
-    safe: _Point
-    tries: jax.Array
+    at: _Point  # the current point
+    share: jax.Array  # e
+    bounds: tuple[jax.Array, jax.Array]  # the proven bounds
+    shares: tuple[jax.Array, jax.Array]  # the e of each proven bound, else infinity
+    safe: _Point  # the point whose policy attains the bound on the safe side
+    tries: jax.Array  # tries, num_steps: numbers of trials, and of applications of P
     num_steps: jax.Array
-    ended: jax.Array
+    ended: jax.Array  # whether other shares would not help
 
 
 def _width(problem: _Problem, bounds: tuple[jax.Array, jax.Array]) -> jax.Array:
