@@ -21,8 +21,7 @@ import click
 
 import jaxltl
 from jaxltl.app.command_options import Failure, compiling, float64, over_devices, plain_errors
-from jaxltl.app import processes
-from jaxltl.app import compilation, run_job
+from jaxltl.app import compilation, processes, run_job
 from jaxltl.app.reports.drawing import artist
 
 if TYPE_CHECKING:

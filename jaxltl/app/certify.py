@@ -25,6 +25,7 @@ from jaxltl.core.values.evaluation.data_guarantee import (
     guarantee_curve,
     learn_guarantee,
 )
+from jaxltl.app.wording import Record
 
 SHOWN = 5  # choices for which more samples are recommended
 DIGITS = 5  # of printed bounds, which solvers compute to 1e-6
@@ -223,7 +224,7 @@ def _state(evidence: Evidence, row: int) -> str:
     return evidence.states[int(evidence.model.host.state[row])]
 
 
-def entry(evidence: Evidence, query: Query, found: DataGuarantee, seconds: float) -> dict[str, Any]:
+def entry(evidence: Evidence, query: Query, found: DataGuarantee, seconds: float) -> Record:
     """The guarantee as a JSON object."""
     return {
         "formula": query.formula,
@@ -243,7 +244,7 @@ def entry(evidence: Evidence, query: Query, found: DataGuarantee, seconds: float
     }
 
 
-def sample_next(evidence: Evidence, found: DataGuarantee) -> list[dict[str, Any]]:
+def sample_next(evidence: Evidence, found: DataGuarantee) -> list[Record]:
     """:func:`most_helpful` as JSON objects."""
     return [
         {

@@ -23,6 +23,7 @@ from jaxltl.core.environments.episodes import Agent
 from jaxltl.core.environments.monitor import Verdict
 from jaxltl.core.values.evaluation.episode_scores import episode_evaluator
 from jaxltl.envs.networks import make_network, network_agent
+from jaxltl.app.wording import Record
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,7 +59,7 @@ def make_method(task: EnvironmentTask, environment: Environment, num_steps: int)
 _LARGEST_COUNT = 2**31 - 1  # int32 counters of the learners
 
 
-def _settings(task: EnvironmentTask) -> dict[str, Any]:
+def _settings(task: EnvironmentTask) -> Record:
     """The method's keys, with pairs of numbers as schedules and lists as tuples."""
     steps = task.learner.steps
     found = task.settings.given()

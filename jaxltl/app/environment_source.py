@@ -10,6 +10,7 @@ import sys
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from jaxltl.app.files.schema import errors_in
@@ -49,7 +50,7 @@ def load_environment(task: EnvironmentTask, world: Environment | None = None) ->
 
 def _made(
     name: str,
-    arguments: Mapping[str, Any],
+    arguments: Mapping[str, object],
     folder: Path,
     labels: Callable[..., Any] | None,
     propositions: list[str],
@@ -88,7 +89,11 @@ def _made(
 
 
 def _of_package(
-    root: str, name: str, arguments: Mapping[str, Any], labels: Any, propositions: Any
+    root: str,
+    name: str,
+    arguments: Mapping[str, object],
+    labels: Callable[..., Any] | None,
+    propositions: list[str],
 ) -> Environment:
     """An environment of another package, by its adapter."""
     adapters = importlib.import_module(f"jaxltl.envs.adapters.{root}")
@@ -134,7 +139,7 @@ def _function(name: str, folder: Path) -> Callable[..., Any]:
     return found
 
 
-def _module(name: str) -> Any:
+def _module(name: str) -> ModuleType:
     if not all(part.isidentifier() for part in name.split(".")):
         raise ValueError(
             f"{name!r} is neither the name of a module, package.module, nor that of a file, "
@@ -154,7 +159,7 @@ def _module(name: str) -> Any:
         raise ValueError(_error_line(name, problem)) from problem
 
 
-def _module_of_file(path: Path) -> Any:
+def _module_of_file(path: Path) -> ModuleType:
     """Imports a file, with its directory on the module path."""
     if not path.is_file():
         raise ValueError(f"there is no file {str(path)!r}.")

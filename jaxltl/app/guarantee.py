@@ -24,6 +24,7 @@ from jaxltl.core.values.undiscounted.mixture import (
 )
 from jaxltl.core.values.undiscounted.optimal_actions import OptimalActions, optimal_actions
 from jaxltl.core.values.undiscounted.reachability import rows_of_model
+from jaxltl.app.wording import Record
 
 _AIM = WINDOW / 4  # margin of the certified probability over the asked one
 _WEIGHTS = 10.0 ** np.arange(-1, 5.5, 0.5)  # of the satisfaction probability, in this order
@@ -135,9 +136,9 @@ def kept(
     world: World,
     shown: Trajectories,
     solution: Solution,
-) -> dict[str, Any]:
+) -> Record:
     """The guarantee and how it was attained, for ``result.json``."""
-    found: dict[str, Any] = {"asked": guarantee.asked, "over": guarantee.over}
+    found: Record = {"asked": guarantee.asked, "over": guarantee.over}
     if guarantee.asked == "best" and guarantee.actions is not None:
         found["loss"] = guarantee.actions.loss
     if attempt is not None:

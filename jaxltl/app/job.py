@@ -25,11 +25,12 @@ from jaxltl.app.reports.drawing import Picture, drawing
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.models.mesh.lanes import on_host, vmap_over_mesh
 from jaxltl.core.models.product import Product
+from jaxltl.app.wording import Record, Result
 
 Hparams = TypeVar("Hparams")
 
 
-def settings(kind: Callable[..., Hparams], given: Mapping[str, Any]) -> Hparams:
+def settings(kind: Callable[..., Hparams], given: Result) -> Hparams:
     """A learner's Hparams with the given keys that it has; ``method`` names the learner."""
     names = inspect.signature(kind).parameters.keys() - {"method"}
     return kind(**{name: value for name, value in given.items() if name in names})
@@ -145,12 +146,12 @@ def fingerprint(task: LearningTask, seed: int, num_seeds: int) -> str:
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:12]
 
 
-def about(task: LearningTask) -> dict[str, Any]:
+def about(task: LearningTask) -> Record:
     """The first entries of a result."""
     return {"task": task.name, "formula": task.formula, "method": task.learner.method}
 
 
-def took(seconds: float) -> dict[str, Any]:
+def took(seconds: float) -> Record:
     """The last entries of a result."""
     versions = {"jaxltl": jaxltl.__version__, "jax": jax.__version__}
     return {"seconds": round(seconds, 2), "versions": versions}
@@ -167,7 +168,7 @@ def plain(value: Any) -> Any:
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
-def memory_arrays(model: Product, size: int | None = None) -> dict[str, Any]:
+def memory_arrays(model: Product, size: int | None = None) -> Record:
     """The memory update of a policy in the first states of a product."""
     return {
         "initial_memory": model.initial_memory[:size],
@@ -176,7 +177,7 @@ def memory_arrays(model: Product, size: int | None = None) -> dict[str, Any]:
     }
 
 
-def save_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
+def save_arrays(path: Path, arrays: Result) -> None:
     """Writes arrays as an ``.npz``, atomically."""
     with atomic_write(path) as file:
         np.savez(file, allow_pickle=False, **{k: np.asarray(v) for k, v in arrays.items()})

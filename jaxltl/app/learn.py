@@ -17,13 +17,14 @@ from jaxltl.algos import mlirl
 from jaxltl.algos.common import learner
 from jaxltl.app.protocols import Training
 from jaxltl.app.reports import learn as report  # noqa: F401 - part of the job
-from jaxltl.app.reports.learn_pictures import live as live
-from jaxltl.app.reports.learn_pictures import pictures as pictures
-from jaxltl.app.reports.learn_pictures import task_pictures as task_pictures
+from jaxltl.app.reports.learn_pictures import (
+    live as live,
+    pictures as pictures,
+    task_pictures as task_pictures,
+)
 from jaxltl.app.files.demonstrations import load_demonstrations, synthetic_demonstrations
 from jaxltl.app.files.schema import errors_in
-from jaxltl.app.files.task_mlirl import MlirlTask
-from jaxltl.app.files.task_mlirl import read_task as read_task
+from jaxltl.app.files.task_mlirl import MlirlTask, read_task as read_task
 from jaxltl.app.files.worlds import World, load_world
 from jaxltl.app.guarantee import (
     Attempt,
@@ -36,17 +37,16 @@ from jaxltl.app.guarantee import (
 from jaxltl.app.job import (
     about,
     compile_in_background,
+    fingerprint as fingerprint,
     memory_arrays,
     one_seed,
     plain,
+    postfix as postfix,
     run_seeds,
     save_arrays,
     settings,
     took,
 )
-from jaxltl.app.job import fingerprint as fingerprint
-from jaxltl.app.job import postfix as postfix
-from jaxltl.app.wording import many
 from jaxltl.core.models.construct.lifting import lift_policy
 from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.models.product import Product, product
@@ -59,6 +59,7 @@ from jaxltl.core.values.undiscounted.satisfaction import (
     satisfaction_probability,
 )
 from jaxltl.core.values.undiscounted.total_reward import hitting_time
+from jaxltl.app.wording import Record, many
 
 DOUBLE = True
 
@@ -279,11 +280,11 @@ class Outcome:
     solution: Solution  # satisfaction probability of the kept policy, with bounds
     attempt: Attempt | None  # how an asked probability was attained, if any
     # of the learned and the quickest policy; None for formulas without end
-    expected_steps: dict[str, Any] | None
+    expected_steps: Record | None
     # float[N, S], satisfaction probability of every seed from initial states
     satisfaction: np.ndarray
     # guarantee of the kept policy from a log, if the world is estimated from one
-    data: dict[str, Any] | None
+    data: Record | None
     seed: int  # the first seed
     seconds: float = 0.0  # wall time
 
@@ -351,7 +352,7 @@ def learn(setup: Setup, training: Training) -> Outcome:
     )
 
 
-def summary(outcome: Outcome) -> dict[str, Any]:
+def summary(outcome: Outcome) -> Record:
     """The outcome for ``result.json``; NaN becomes None."""
     setup, learned, i = outcome.setup, outcome.learned, outcome.chosen
     task, world, model = setup.task, setup.world, setup.model
@@ -407,7 +408,7 @@ def summary(outcome: Outcome) -> dict[str, Any]:
     return plain(result)
 
 
-def _expected_steps(setup: Setup, learned: np.ndarray) -> dict[str, Any] | None:
+def _expected_steps(setup: Setup, learned: np.ndarray) -> Record | None:
     """Expected steps until a co-safe formula is decided: learned and quickest optimal policy."""
     model, best = setup.model, setup.guarantee.best
     if model.automaton.acceptance != "cosafe":
@@ -423,9 +424,7 @@ def _expected_steps(setup: Setup, learned: np.ndarray) -> dict[str, Any] | None:
         }
 
 
-def _evidence(
-    solution: Solution, model: Product, world: World, starts: np.ndarray
-) -> dict[str, Any]:
+def _evidence(solution: Solution, model: Product, world: World, starts: np.ndarray) -> Record:
     value, lower, upper = (
         from_starts(model, x) for x in (solution.value, solution.lower, solution.upper)
     )

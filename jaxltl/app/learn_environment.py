@@ -24,20 +24,18 @@ from jaxltl.app.protocols import Training
 from jaxltl.app.reports import learn_environment as report  # noqa: F401 - part of the job
 from jaxltl.app.reports.explorer import Curves, curves
 from jaxltl.app.files.schema import errors_in, read_bytes
-from jaxltl.app.files.task_environment import EnvironmentTask
-from jaxltl.app.files.task_environment import read_task as read_task
+from jaxltl.app.files.task_environment import EnvironmentTask, read_task as read_task
 from jaxltl.app.guarantee import check_formula
 from jaxltl.app.job import (
     about,
     automaton_picture,
+    fingerprint as fingerprint,
     over_seeds,
     plain,
     run_seeds,
     save_arrays,
     took,
 )
-from jaxltl.app.job import fingerprint as fingerprint
-from jaxltl.app.wording import many
 from jaxltl.core.types import Status
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.translate import to_automaton
@@ -53,6 +51,7 @@ from jaxltl.core.values.evaluation.evaluation import (
     checked_steps,
     evaluate,
 )
+from jaxltl.app.wording import Record, many
 
 DOUBLE = False  # environments are written for single precision
 _DRAWN = 4  # trajectories
@@ -233,7 +232,7 @@ def _merit(setup: Setup, found: Evaluation) -> tuple[float, float, float]:
 # --- results ----------------------------------------------------------------------------------
 
 
-def summary(outcome: Outcome) -> dict[str, Any]:
+def summary(outcome: Outcome) -> Record:
     """The outcome for ``result.json``; NaN becomes None."""
     setup, history = outcome.setup, outcome.history
     task, made, kept = setup.task, setup.environment, outcome.evaluations[outcome.chosen]
@@ -285,8 +284,8 @@ def _transitions(outcome: Outcome) -> int:
     return int(counted[-1, 0]) if counted is not None else most
 
 
-def _as_numbers(found: Evaluation) -> dict[str, Any]:
-    numbers: dict[str, Any] = {}
+def _as_numbers(found: Evaluation) -> Record:
+    numbers: Record = {}
     for name, value in vars(found).items():
         numbers[name] = vars(value) if isinstance(value, Estimate) else value
     return {

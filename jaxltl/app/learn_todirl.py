@@ -33,9 +33,11 @@ from jaxltl.app.todirl.results import (
 )
 from jaxltl.app.protocols import Training
 from jaxltl.app.reports import learn_todirl as report  # noqa: F401 - part of the job
-from jaxltl.app.reports.todirl_pictures import live as live
-from jaxltl.app.reports.todirl_pictures import pictures as pictures
-from jaxltl.app.reports.todirl_pictures import task_pictures as task_pictures
+from jaxltl.app.reports.todirl_pictures import (
+    live as live,
+    pictures as pictures,
+    task_pictures as task_pictures,
+)
 from jaxltl.app.files.demonstrations import require_cosafe, synthetic_demonstrations
 from jaxltl.app.files.scenes import (
     Scene,
@@ -45,18 +47,17 @@ from jaxltl.app.files.scenes import (
     load_scenes,
 )
 from jaxltl.app.files.schema import errors_in
-from jaxltl.app.files.task_todirl import TodirlTask
-from jaxltl.app.files.task_todirl import read_task as read_task
+from jaxltl.app.files.task_todirl import TodirlTask, read_task as read_task
 from jaxltl.app.guarantee import check_formula
 from jaxltl.app.job import (
+    fingerprint as fingerprint,
     memory_arrays,
     one_seed,
+    postfix as postfix,
     run_seeds,
     save_arrays,
     settings,
 )
-from jaxltl.app.job import fingerprint as fingerprint
-from jaxltl.app.job import postfix as postfix
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.synchronize import synchronize
 from jaxltl.core.models.construct.batch import (

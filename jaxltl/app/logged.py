@@ -24,6 +24,7 @@ from jaxltl.core.models.product import Product, product
 from jaxltl.core.types import Status
 from jaxltl.core.values.undiscounted.mixture import from_starts, safe_mean
 from jaxltl.core.values.undiscounted.satisfaction import satisfaction_probability
+from jaxltl.app.wording import Record
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,7 @@ def load_logged(folder: Path, table: WorldTable) -> tuple[MDP, tuple[str, ...], 
     )
 
 
-def guaranteed(logged: Logged, model: Product, formula: str, policy: Any) -> dict[str, Any]:
+def guaranteed(logged: Logged, model: Product, formula: str, policy: Any) -> Record:
     """Guaranteed satisfaction probability of a policy, from the log alone.
 
     The policy may depend on the log: with the given confidence all sets hold the true

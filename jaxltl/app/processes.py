@@ -21,9 +21,10 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from jaxltl.app import exit_message
+from jaxltl.app.wording import Record
 
 if TYPE_CHECKING:
     from jax.sharding import Mesh
@@ -182,7 +183,7 @@ class ProcessGroup:
             raise SystemExit(2)
         raise ValueError(message if len(set(every)) == 1 else f"process {self.process}: {message}")
 
-    def agree(self, given: Mapping[str, Any]) -> None:
+    def agree(self, given: Mapping[str, object]) -> None:
         """Checks that all processes have the same values by name."""
         every = [json.loads(x) for x in self.exchanged(json.dumps(dict(given), default=str))]
         for process, other in enumerate(every):
@@ -352,7 +353,7 @@ def _join(launch: Launch, wait: float) -> None:
     address, bind = launch.coordinator, None
     if address is not None and _host_and_port(address)[0] in ("127.0.0.1", "localhost"):
         bind = address  # local, so not open to other machines
-    later: dict[str, Any] = {
+    later: Record = {
         "heartbeat_timeout_seconds": seconds,
         "shutdown_timeout_seconds": _TO_THE_END,
     }

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Protocol, TypeVar
+
+from jaxltl.app.wording import Result
 
 if TYPE_CHECKING:
     import numpy as np
@@ -15,7 +17,6 @@ if TYPE_CHECKING:
     from jaxltl.app.reports.explorer import Curves, Explorer, TooLarge
     from jaxltl.app.reports.page import Part
 
-Result = Mapping[str, Any]  # the contents of result.json
 Progress = Callable[[int, Mapping[str, "np.ndarray"]], None]  # steps, and metrics ``[T, N]``
 
 T = TypeVar("T", bound="LearningTask")

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from jaxltl.app.protocols import Job, LearningTask, O, Result, S, T, Training
+from jaxltl.app.protocols import Job, LearningTask, O, S, T, Training
+from jaxltl.app.wording import Result
 
 if TYPE_CHECKING:
     import numpy as np

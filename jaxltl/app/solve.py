@@ -25,6 +25,7 @@ from jaxltl.core.values.multi_objective.multi_objective import (
     Pareto,
 )
 from jaxltl.core.values.properties.solve_property import Answer, PropertyStrategy, solve_property
+from jaxltl.app.wording import Record
 
 Found = Answer | Achievable | ConstrainedOptimum | Pareto
 
@@ -146,7 +147,7 @@ def solve(
 # --- what is shown ----------------------------------------------------------------------------
 
 
-def model_entry(model: SparseMDP | IntervalMDP, seconds: float) -> dict[str, Any]:
+def model_entry(model: SparseMDP | IntervalMDP, seconds: float) -> Record:
     """The model as its JSON object."""
     kinds = ("idtmc", "imdp") if isinstance(model, IntervalMDP) else ("chain", "mdp")
     return {
@@ -158,10 +159,10 @@ def model_entry(model: SparseMDP | IntervalMDP, seconds: float) -> dict[str, Any
     }
 
 
-def result_entry(result: Result) -> dict[str, Any]:
+def result_entry(result: Result) -> Record:
     """A result as its JSON object."""
     found = result.answer
-    entry: dict[str, Any] = {
+    entry: Record = {
         "property": result.query.text,
         "value": None,
         "lower": None,
@@ -189,9 +190,9 @@ def result_entry(result: Result) -> dict[str, Any]:
     return entry | {"seconds": result.seconds}
 
 
-def _several_entry(found: Achievable | ConstrainedOptimum | Pareto) -> dict[str, Any]:
+def _several_entry(found: Achievable | ConstrainedOptimum | Pareto) -> Record:
     """A multi-objective answer: achievability, optimum, or points of the Pareto curve."""
-    entry: dict[str, Any] = {"status": Status(found.status).name}
+    entry: Record = {"status": Status(found.status).name}
     if isinstance(found, Pareto):
         points = found.points.tolist()
         return entry | {"value": points, "gap": _number(float(found.gap))}
@@ -294,13 +295,13 @@ def strategies(model: SparseMDP | IntervalMDP, results: Sequence[Result], source
     return (json.dumps(table, allow_nan=False) + "\n").encode()
 
 
-def _strategy(given: SparseMDP | IntervalMDP, strategy: PropertyStrategy) -> dict[str, Any]:
+def _strategy(given: SparseMDP | IntervalMDP, strategy: PropertyStrategy) -> Record:
     model = given.nominal if isinstance(given, IntervalMDP) else given
     host = model.host
     row = np.asarray(strategy.row)
     choice = (row - host.row_start[host.state[row]]).tolist()
     names = _names(model)
-    entry: dict[str, Any] = {"kind": "memoryless", "choice": choice}
+    entry: Record = {"kind": "memoryless", "choice": choice}
     if strategy.by:
         entry["kind"] = f"first choice, then by the {strategy.by} left"
     if names is not None:

@@ -8,7 +8,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -35,6 +34,7 @@ from jaxltl.core.values.properties.solve_on_mesh import (
 )
 from jaxltl.core.values.properties.solve_property import FINER, Answer
 from jaxltl.io.umb.sharded import read_sharded
+from jaxltl.app.wording import Record
 
 _WORK = 1e9  # transition updates between checkpoints
 _ROUND = 24  # approximate sweeps of a step of interval iteration
@@ -56,7 +56,7 @@ def on_mesh(model: SparseMDP | IntervalMDP, group: ProcessGroup) -> ShardedMDP:
 
 def read(
     path: Path, queries: Sequence[Query], group: ProcessGroup
-) -> tuple[ShardedMDP, dict[str, str], dict[str, Any]]:
+) -> tuple[ShardedMDP, dict[str, str], Record]:
     """Reads a model file over the devices; of a UMB file each process reads its own states.
 
     If a property has built-in labels, each process reads the whole file.
@@ -80,7 +80,7 @@ def _digest(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _entry(model: ShardedMDP, seconds: float) -> dict[str, Any]:
+def _entry(model: ShardedMDP, seconds: float) -> Record:
     def count(x: jax.Array) -> int:
         return int(on_host(jax.jit(lambda x: (x > 0).sum())(x)))
 
@@ -181,7 +181,7 @@ def _digest_text(mark: Mapping[str, str]) -> str:
     return hashlib.sha256(repr(sorted(mark.items())).encode()).hexdigest()
 
 
-def _state(model: ShardedMDP, bounds: Bounds, part: int, made: int) -> dict[str, Any]:
+def _state(model: ShardedMDP, bounds: Bounds, part: int, made: int) -> Record:
     return {
         "bounds": bounds,
         "devices": np.int32(model.num_devices),

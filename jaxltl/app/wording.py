@@ -1,12 +1,15 @@
-"""Wording of counts and of positions of states."""
+"""Types of results, and the wording of counts and of positions of states."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+Result = Mapping[str, Any]  # contents of result.json
+Record = dict[str, Any]  # values by name: JSON objects, keyword arguments
 
-def where(state: int, shape: Sequence[int] | None) -> dict[str, Any]:
+
+def where(state: int, shape: Sequence[int] | None) -> Record:
     """A state's number from 0 and, on a map of a shape, its row and column from 1."""
     if shape is None:
         return {"state": int(state)}
@@ -14,7 +17,7 @@ def where(state: int, shape: Sequence[int] | None) -> dict[str, Any]:
     return {"state": int(state), "row": row + 1, "column": column + 1}
 
 
-def place(where: Mapping[str, Any]) -> str:
+def place(where: Result) -> str:
     """Text of a position: row and column on a map, else the state's name or number."""
     if "row" in where:
         return f"row {where['row']}, column {where['column']}"

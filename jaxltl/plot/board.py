@@ -149,7 +149,7 @@ def draw_arrows(
     actions: Sequence[str],
 ) -> None:
     """Draws a policy: triangles whose length is the probability of the action."""
-    shapes: list[Any] = []
+    shapes: list[list[NDArray[np.float64]]] = []
     colors: list[str] = []
     for state, chances in enumerate(policy):
         row, column = divmod(state, shape[1])
@@ -177,7 +177,7 @@ def cell_size(shape: tuple[int, ...]) -> float:
     return float(np.clip(5.2 / max(shape), 0.3, 0.6))
 
 
-def rows_of_maps(shape: tuple[int, ...], count: int, across: int) -> tuple[Figure, NDArray[Any]]:
+def rows_of_maps(shape: tuple[int, ...], count: int, across: int) -> tuple[Figure, np.ndarray]:
     """A figure with `count` axes for maps, `across` per row."""
     (rows, columns), size = shape, cell_size(shape)
     down = -(-count // across)

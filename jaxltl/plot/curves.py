@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -28,8 +29,12 @@ from jaxltl.plot.style import (
 )
 
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+
 def curves(
-    metrics: Mapping[str, ArrayLike] | Any,
+    metrics: Mapping[str, ArrayLike] | DataclassInstance,
     *,
     steps: ArrayLike | None = None,
     show: Sequence[str] | None = None,
@@ -63,7 +68,7 @@ def curves(
 
 
 def _shown(
-    what: str, metrics: Mapping[str, ArrayLike] | Any, show: Sequence[str] | None
+    what: str, metrics: Mapping[str, ArrayLike] | DataclassInstance, show: Sequence[str] | None
 ) -> dict[str, NDArray[np.float64]]:
     """The chosen metrics by name, without those that are NaN everywhere."""
     if not isinstance(metrics, Mapping):
@@ -146,7 +151,7 @@ def bands(
 
 
 def sweep(
-    metrics: Mapping[str, ArrayLike] | Any,
+    metrics: Mapping[str, ArrayLike] | DataclassInstance,
     settings: Sequence[str],
     *,
     steps: ArrayLike | None = None,
@@ -328,7 +333,7 @@ def paths(
     )
     every = figure.subplots(count, columns, squeeze=False).ravel()
     low, high = np.asarray(bounds, float)
-    handles: list[Any] = []
+    handles: list[Artist] = []
     for i, axes in enumerate(every):
         axes.set_axis_off()
         if i >= len(maps):

@@ -38,6 +38,8 @@ from matplotlib.patches import Circle, Rectangle
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
+from jaxltl.core.environments.environment import Environment
+from jaxltl.core.environments.episodes import Episode
 from jaxltl.envs.flat_world import Discs, FlatState
 from jaxltl.envs.letter_world import LetterState
 from jaxltl.envs.zone_world import ZoneState
@@ -60,7 +62,7 @@ class Scene(NamedTuple):
     joined: bool  # whether opposite sides are
 
 
-def draw_episode(environment: Any, episode: Any, *, title: str | None = None) -> Figure:
+def draw_episode(environment: Environment, episode: Episode, *, title: str | None = None) -> Figure:
     """One episode in a letter world, a flat world or a zone world, as a line on its map.
 
     Of another world the line alone, with a mark where a proposition begins to hold, if its worlds
@@ -86,7 +88,7 @@ def draw_episode(environment: Any, episode: Any, *, title: str | None = None) ->
 
 
 def draw_episodes(
-    environment: Any, episodes: Sequence[Any], *, titles: Sequence[str] | None = None
+    environment: Environment, episodes: Sequence[Episode], *, titles: Sequence[str] | None = None
 ) -> Figure:
     """Several episodes as :func:`draw_episode` draws one, side by side.
 
@@ -124,7 +126,7 @@ def _draw_scene(axes: Axes, scene: Scene, title: str | None) -> None:
     head(axes, _met(scene) if title is None else title)
 
 
-def scene_of(environment: Any, episode: Any) -> Scene:
+def scene_of(environment: Environment, episode: Episode) -> Scene:
     """The scene that :func:`draw_episode` and :func:`play_episode` draw."""
     valid = np.asarray(episode.valid)
     if valid.ndim != 1:
@@ -344,7 +346,7 @@ show(0);
 """
 
 
-def play_episode(environment: Any, episode: Any, *, title: str | None = None) -> str:
+def play_episode(environment: Environment, episode: Episode, *, title: str | None = None) -> str:
     """A self-contained HTML page that plays an episode, with a pause button and a slider.
 
     Args:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Circle
 from numpy.typing import ArrayLike, NDArray
@@ -93,7 +93,7 @@ def game_values(
         allowed = _of_turns(as_mask(policy, len(actions)), world, "policy")
     limits = value_limits(table, limits)
     figure, maps, size = _small_multiples(world, environment, bar=0.75)
-    image: Any = None
+    image: AxesImage | None = None
     for place, axes in maps.items():
         image = _shade(axes, world, table[place], limits)
         draw_robot(axes, world, place)
@@ -233,7 +233,7 @@ def _require_place(world: Board, number: int) -> int:
     return int(number)
 
 
-def _of_turns(array: NDArray[Any], world: Board, name: str) -> NDArray[Any]:
+def _of_turns(array: np.ndarray, world: Board, name: str) -> np.ndarray:
     """An array over states as ``[environment, system, ...]``, where the system moves."""
     count = len(world.places)
     if array.ndim < 1 or len(array) != 2 * count**2:
@@ -285,7 +285,7 @@ def _on_board(world: Board, values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _shade(
     axes: Axes, world: Board, values: NDArray[np.float64], limits: tuple[float, float]
-) -> Any:
+) -> AxesImage:
     rows, columns = world.cells.shape
     image = axes.imshow(
         np.ma.masked_invalid(_on_board(world, values)),

@@ -137,19 +137,19 @@ def solution(solution: Solution, model: Any = None, *, memories: Any = None) -> 
     )
 
 
-def _limits(values: NDArray[Any]) -> tuple[float, float] | None:
+def _limits(values: np.ndarray) -> tuple[float, float] | None:
     """The limits [0, 1] for probabilities, else None."""
     return (0.0, 1.0) if values.size and values.min() >= 0 and values.max() <= 1 else None
 
 
-def _arrows(policy: NDArray[Any] | None, inside: NDArray[np.bool_]) -> NDArray[np.float64] | None:
+def _arrows(policy: np.ndarray | None, inside: NDArray[np.bool_]) -> NDArray[np.float64] | None:
     if policy is None:
         return None
     chance = np.eye(4)[policy] if policy.dtype.kind in "iu" else policy.astype(float)
     return np.where(inside[:, None], chance, np.nan)
 
 
-def _open_memories(values: NDArray[Any], inside: NDArray[np.bool_]) -> list[int]:
+def _open_memories(values: np.ndarray, inside: NDArray[np.bool_]) -> list[int]:
     spread = [q for q in range(values.shape[1]) if np.ptp(values[inside, q]) > 0]
     return (spread or [0])[:_MOST_PANELS]
 
@@ -319,7 +319,7 @@ def _arrows_of(world: Any) -> Iterator[_Arrow]:
 def _graph(
     world: Any,
     system: NDArray[np.bool_] | None,
-    values: NDArray[Any] | None,
+    values: np.ndarray | None,
     policy: NDArray[np.int64] | None,
     region: NDArray[np.bool_] | None = None,
 ) -> Figure:
@@ -388,7 +388,7 @@ def _square(axes: Axes, center: NDArray[np.float64], text: str, good: bool) -> N
     )
 
 
-def _notes(world: Any, values: NDArray[Any] | None) -> list[str]:
+def _notes(world: Any, values: np.ndarray | None) -> list[str]:
     """Labels and values by state, as text."""
     label = np.asarray(world.label)
     lines = []

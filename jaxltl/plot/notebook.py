@@ -76,7 +76,7 @@ def _(value: Automaton) -> str | None:
 @picture.register(DenseMDP)
 @picture.register(SparseMDP)
 @picture.register(Game)
-def _model(value: Any) -> str | None:
+def _model(value: object) -> str | None:
     try:
         return svg(model, value, text=repr(value))
     except ValueError:  # too large
@@ -99,7 +99,7 @@ def _(value: Solution) -> str | None:
 
 @picture.register(Winning)
 @picture.register(Permissive)
-def _region(value: Any) -> str | None:
+def _region(value: Winning | Permissive) -> str | None:
     """Winning region on the system's turns in the initial memory state, for games of two robots."""
     game, region = value.game, np.asarray(value.region)
     if isinstance(game.mdp, Product):

@@ -152,7 +152,7 @@ def plain_axes(axes: Axes) -> None:
 
 
 def panel_rows(
-    rows: Mapping[str, Mapping[str, Any]], name: str, size: tuple[float, float]
+    rows: Mapping[str, Mapping[str, object]], name: str, size: tuple[float, float]
 ) -> tuple[Figure, dict[tuple[str, str], Axes]]:
     """Empty panels by the titles of row and column."""
     columns = list(dict.fromkeys(column for row in rows.values() for column in row))

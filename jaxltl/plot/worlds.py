@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
@@ -25,6 +26,7 @@ from jaxltl.plot.board import (
 from jaxltl.plot.style import ACCENT, INK, PAPER, SCALE, SERIES, head, note, scale_bar, value_limits
 
 if TYPE_CHECKING:
+    from jaxltl.core.models.trajectories import Trajectories
     from jaxltl.envs.temporal_gridworld import World
 
 # Pale versions of cell_kinds.COLORS, for contrast with drawings on top.
@@ -36,7 +38,7 @@ def temporal_gridworld(
     world: World,
     policy: ArrayLike | None = None,
     memory: int | Sequence[int] = 0,
-    trajectories: Any = None,
+    trajectories: Trajectories | None = None,
     value: ArrayLike | None = None,
     *,
     title: str | Sequence[str] = "",
@@ -194,7 +196,7 @@ def _name_kinds(axes: Axes, world: World) -> None:
             )
 
 
-def _walks(trajectories: Any, world: World) -> list[NDArray[np.float64]]:
+def _walks(trajectories: Trajectories | None, world: World) -> list[NDArray[np.float64]]:
     """Points ``[T, 2]``, column and row, of each trajectory."""
     if trajectories is None:
         return []
@@ -245,7 +247,7 @@ def _value_panels(
 ) -> None:
     limits = value_limits(values, limits)
     rows, columns = world.shape
-    image: Any = None
+    image: AxesImage | None = None
     for i, axes in enumerate(every):
         image = axes.imshow(
             np.ma.masked_invalid(values[i].reshape(rows, columns)),

@@ -13,13 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from jaxltl.algos import cce
-from jaxltl.algos import trust_region as tr
+from jaxltl.algos import cce, trust_region as tr
 from jaxltl.algos.cce import exponential_family as families
 from jaxltl.app.job import plain
 from jaxltl.core.environments.environment import Environment, Timestep
-from jaxltl.envs import lqr
-from jaxltl.envs import navigation as nav
+from jaxltl.envs import lqr, navigation as nav
 from jaxltl.envs.navigation_steps import as_environment
 from jaxltl.envs.networks import apply, make_network
 from jaxltl.reproduce.experiment import Figures, svg_files

@@ -13,8 +13,7 @@ import numpy as np
 from jax.tree_util import Partial
 
 from jaxltl.algos import rmax
-from jaxltl.algos.common import pac
-from jaxltl.algos.common import loops
+from jaxltl.algos.common import loops, pac
 from jaxltl.app.job import plain
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.games.winning import almost_sure_buchi

@@ -12,8 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxltl.algos import behavioral_cloning as cloning
-from jaxltl.algos import todirl
+from jaxltl.algos import behavioral_cloning as cloning, todirl
 from jaxltl.app.job import plain
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.synchronize import synchronize

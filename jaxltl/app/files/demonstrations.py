@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import jax
 import numpy as np
@@ -97,7 +97,9 @@ def _check_steps(states: list[int], actions: list[int], world: World) -> None:
             )
 
 
-def _each_step(read: Callable[[Any, World], int], values: list[Any], world: World) -> list[int]:
+def _each_step(
+    read: Callable[[object, World], int], values: list[object], world: World
+) -> list[int]:
     found = []
     for step, value in enumerate(values, start=1):
         with errors_in(f", step {step}: "):
@@ -105,11 +107,11 @@ def _each_step(read: Callable[[Any, World], int], values: list[Any], world: Worl
     return found
 
 
-def _is_int(value: Any) -> bool:
+def _is_int(value: object) -> TypeGuard[int]:
     return isinstance(value, int) and not isinstance(value, bool)
 
 
-def _read_cell(value: Any, world: World) -> int:
+def _read_cell(value: object, world: World) -> int:
     if world.cells is None:
         raise ValueError('the model has no map, so give "states" instead of "cells".')
     if not (isinstance(value, list) and len(value) == 2 and all(map(_is_int, value))):
@@ -121,7 +123,7 @@ def _read_cell(value: Any, world: World) -> int:
     return (row - 1) * columns + column - 1
 
 
-def _read_state(value: Any, world: World) -> int:
+def _read_state(value: object, world: World) -> int:
     if world.logged is not None:
         return _read_name("state", value, world.logged.states)
     last = world.mdp.num_states - 1
@@ -130,7 +132,7 @@ def _read_state(value: Any, world: World) -> int:
     return int(value)
 
 
-def _read_name(kind: str, value: Any, names: tuple[str, ...]) -> int:
+def _read_name(kind: str, value: object, names: tuple[str, ...]) -> int:
     """The index of a name of a log; a name that is a number may be given as one."""
     name = str(value) if _is_int(value) else value
     if name in names:
@@ -138,7 +140,7 @@ def _read_name(kind: str, value: Any, names: tuple[str, ...]) -> int:
     raise ValueError(f"the {kind} {value!r} is not in the log, which has {listed(names)}.")
 
 
-def _read_action(value: Any, world: World) -> int:
+def _read_action(value: object, world: World) -> int:
     if world.logged is not None:
         return _read_name("action", value, world.actions)
     if value in world.actions:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 from typing import Annotated as Key
 
 import numpy as np
@@ -38,6 +38,7 @@ from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.product import Product
 from jaxltl.envs.robots import ACTIONS, grid_game, places
 from jaxltl.envs.text_map import parse_map
+from jaxltl.app.wording import Record
 
 Start = Annotated[
     Text | tuple[int, int],
@@ -156,7 +157,7 @@ class World:
     places: np.ndarray | None = None
     objective: Parity | None = None  # the parity condition of the game's own file, or None
 
-    def where(self, state: int) -> dict[str, Any]:
+    def where(self, state: int) -> Record:
         """Both robots' rows and columns from 1, or the state's number from 0."""
         if self.places is None:
             return {"state": int(state)}

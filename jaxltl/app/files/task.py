@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 from typing import Annotated as Key
 
 
@@ -22,6 +22,7 @@ from jaxltl.app.files.schema import (
     table,
     read_toml,
 )
+from jaxltl.app.wording import Record
 
 Probability = Annotated[float, Meta("a probability in (0, 1]", lambda v: 0 < v <= 1)]
 GuaranteeKey = Annotated[
@@ -78,7 +79,7 @@ class OptimizerTable(Table):
     l2: Key[NonNegative | None, "Precision of the Gaussian prior on the parameters."] = None
     learning_rate: Key[NonNegative | None, "Step size of the optimizer."] = None
 
-    def hyperparameters(self) -> dict[str, Any]:
+    def hyperparameters(self) -> Record:
         """The keys that have a value, but the method."""
         return {key: value for key, value in self.given().items() if key != "method"}
 
@@ -106,7 +107,7 @@ class Task:
 
 def common_fields(
     path: Path, file: TaskFile, hidden: str | None, digest: str, label_on: str
-) -> dict[str, Any]:
+) -> Record:
     """The fields of :class:`Task`."""
     task = file.task
     guarantee = task.guarantee or ("none" if hidden else "best")
@@ -129,7 +130,7 @@ def common_fields(
     }
 
 
-def method_of(path: str | Path) -> Any:
+def method_of(path: str | Path) -> object:
     """``[learner] method`` of a task file, unchecked; None if there is none."""
     learner = read_toml(Path(path), TaskFile.KIND)[0].get("learner")
     return learner.get("method") if isinstance(learner, dict) else None

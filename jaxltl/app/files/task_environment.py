@@ -31,6 +31,7 @@ from jaxltl.app.files.schema import (
     Meta,
     table,
 )
+from jaxltl.app.wording import Record
 
 Schedule = Annotated[
     NonNegative | tuple[NonNegative, NonNegative],
@@ -56,7 +57,7 @@ class WorldTable(Table):
     """``[world]``: the environment."""
 
     environment: Key[Text, "Name of an environment, or of the function that makes one."]
-    arguments: Key[dict[str, Any], "Arguments of that function."] = attrs.field(factory=dict)
+    arguments: Key[Record, "Arguments of that function."] = attrs.field(factory=dict)
     labels: Key[Text | None, "Function of the labels of an observation."] = None
     propositions: Key[Labels | None, "Names of the labels."] = None
     horizon: Key[Count | None, "Steps after which an episode is truncated."] = None
@@ -219,7 +220,7 @@ class EnvironmentTask:
     learner: LearnerTable
     settings: PpoTable | CceTable | CpoTable  # the table of the method's name
     evaluation: EvaluationTable
-    given: dict[str, Any]  # the keys of `settings` that the file has
+    given: Record  # the keys of `settings` that the file has
     digest: str  # SHA-256 of the file and of every file that it names
     text: str  # of the file when it was read
 

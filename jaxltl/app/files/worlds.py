@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -13,11 +13,11 @@ import numpy as np
 from jaxltl.app.files.schema import errors_in, read_map
 from jaxltl.app.files.task import GridTable
 from jaxltl.app.files.task_mlirl import MlirlTask
-from jaxltl.app.wording import place, where
 from jaxltl.core.logic.labels import satisfying
 from jaxltl.core.models.mdp import MDP
 from jaxltl.envs.gridworld import ACTIONS, gridworld
 from jaxltl.envs.text_map import parse_map
+from jaxltl.app.wording import Record, place, where
 
 if TYPE_CHECKING:
     from jaxltl.app.logged import Logged
@@ -32,7 +32,7 @@ class World:
     actions: tuple[str, ...]  # A names
     logged: Logged | None = None  # the log that the model was estimated from, or None
 
-    def where(self, state: int) -> dict[str, Any]:
+    def where(self, state: int) -> Record:
         """A state's number from 0 and, on a map, its row and column from 1; of a log, its name."""
         found = where(state, None if self.cells is None else self.cells.shape)
         return found if self.logged is None else {**found, "name": self.logged.states[state]}
@@ -42,7 +42,7 @@ class World:
         return place(self.where(state))
 
 
-def grid_options(table: GridTable) -> dict[str, Any]:
+def grid_options(table: GridTable) -> Record:
     """The arguments of :func:`~jaxltl.envs.gridworld.gridworld` that a table gives."""
     names = ("legend", "wall", "slip", "absorbing", "initial")
     return {name: value for name, value in table.given().items() if name in names}

@@ -24,7 +24,7 @@ class Drawing:
 
     function: str
     arguments: tuple[Any, ...]
-    options: Mapping[str, Any]
+    options: Mapping[str, object]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -67,24 +67,14 @@ class View:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Explorer:
-    """A policy in a world, for a page; the other attributes are those of :class:`View`."""
+class Explorer(View):
+    """A policy in a world, for a page."""
 
-    name: str
-    title: str
-    caption: str
-    label: str
     automaton: Automaton | None  # the policy's memory, or None
-    goal: str
     shape: tuple[int, int] | None  # rows and columns of the map, or None
     names: list[str]  # S texts, the content of each cell
-    actions: tuple[str, ...]
     layers: Mapping[str, Layer]  # maps by memory state or :data:`START`
     runs: list[Run]  # trajectories
-    marked: list[tuple[int, int, int]]
-    marks: str
-    cells: Mapping[int, Sequence[int]]
-    places: Mapping[int, str]
     drawings: Mapping[str, Drawing]  # "automaton" and, if there is one, "map"
 
 
@@ -140,21 +130,12 @@ def explorer(
             pieces=max((len(each) for each in cells.values()), default=1),
         )
     return Explorer(
-        name=view.name,
-        title=view.title,
-        caption=view.caption,
-        label=view.label,
+        **{**vars(view), "marked": marked},
         automaton=automaton,
-        goal=view.goal,
         shape=None if place is None else (int(place.shape[0]), int(place.shape[1])),
         names=_cell_names(place, view.size),
-        actions=tuple(view.actions),
         layers=layers,
         runs=runs,
-        marked=marked,
-        marks=view.marks,
-        cells=cells,
-        places=view.places,
         drawings=drawn,
     )
 

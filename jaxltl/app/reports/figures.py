@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
-from typing import Any
+from collections.abc import Iterable
 
 import click
+from jaxltl.app.wording import Result
 
 Remark = tuple[str, str]  # kind, "warning" (red), "note" or "good", and text
 
@@ -41,7 +41,7 @@ def rounded_down(value: float) -> str:
     return f"{math.floor(value * 1e4) / 1e4:.4f}"
 
 
-def certified(entry: Mapping[str, Any]) -> str:
+def certified(entry: Result) -> str:
     """The certificate of a value: exact, an error bound, or the interval if it is wide."""
     value, lower, upper = entry["value"], entry["lower"], entry["upper"]
     if value is None or lower is None or upper is None:

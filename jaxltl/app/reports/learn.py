@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 from markupsafe import Markup
 
@@ -19,9 +18,8 @@ from jaxltl.app.reports.figures import (
     rounded_down,
 )
 from jaxltl.app.reports.page import Part, render_page
-from jaxltl.app.wording import many, place
+from jaxltl.app.wording import Result, many, place
 
-Result = Mapping[str, Any]
 
 _SHORTFALL = 0.01  # relative loss of satisfaction probability that is reported
 _OPTIMAL = 1e-6  # certified loss up to which a policy is reported as optimal

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 from jaxltl.app.reports.drawing import Picture
 from jaxltl.app.reports.figures import Remark, number, probability, remark_lines
 from jaxltl.app.reports.page import Part, render_page
-from jaxltl.app.wording import many
+from jaxltl.app.wording import Result, many
 
-Result = Mapping[str, Any]
 
 _PROBABILITIES = ("success", "violation", "undecided")
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
 
 from jaxltl.app.reports.drawing import Picture
 from jaxltl.app.reports.figures import (
@@ -15,9 +14,8 @@ from jaxltl.app.reports.figures import (
     remark_lines,
 )
 from jaxltl.app.reports.page import Part, render_page
-from jaxltl.app.wording import many
+from jaxltl.app.wording import Result, many
 
-Result = Mapping[str, Any]
 
 _POLICIES = {
     "learned": "learned reward",

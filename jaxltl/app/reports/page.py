@@ -15,10 +15,10 @@ from markupsafe import Markup
 from jaxltl.app.reports import figures
 from jaxltl.app.reports.drawing import Picture
 from jaxltl.app.reports.explorer import START, Curves, Explorer, Layer, TooLarge
-from jaxltl.app.wording import many, place, where
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.text import edge_guards
 from jaxltl.core.environments.monitor import Verdict, verdicts
+from jaxltl.app.wording import Record, Result, many, place, where
 
 Part = tuple[Explorer | Curves | TooLarge, Mapping[str, str]]  # with its drawings as SVG
 
@@ -33,7 +33,7 @@ _MARKS = {
 
 def render_page(
     template: str,
-    result: Mapping[str, Any],
+    result: Result,
     parts: Sequence[Part],
     pictures: Iterable[tuple[Picture, bytes]],
     file_text: str,
@@ -93,7 +93,7 @@ def _static(name: str) -> Markup:
 # --- explorers ------------------------------------------------------------------------------
 
 
-def explorer_data(part: Explorer) -> dict[str, Any]:
+def explorer_data(part: Explorer) -> Record:
     """The data of an explorer that the page's script reads."""
 
     def listed(array: np.ndarray | None) -> Any:
@@ -142,7 +142,7 @@ def _memory_texts(part: Explorer) -> dict[str, str]:
     return {**found, START: f"Initial states: {part.label} from there"}
 
 
-def _explorer_view(part: Explorer, drawn: Mapping[str, str]) -> dict[str, Any]:
+def _explorer_view(part: Explorer, drawn: Mapping[str, str]) -> Record:
     """The values that the template of an explorer reads."""
     hint = "Choose a state of the automaton, or play a trajectory."
     if part.shape is not None:
@@ -183,7 +183,7 @@ def _position(part: Explorer, state: int) -> str:
     return part.places.get(state) or place(where(state, part.shape))
 
 
-def _layer_table(part: Explorer, key: str, layer: Layer) -> dict[str, Any]:
+def _layer_table(part: Explorer, key: str, layer: Layer) -> Record:
     """The values and likeliest actions of a layer, as a map or state by state."""
     texts = []
     for state, name in enumerate(part.names):
@@ -197,7 +197,7 @@ def _layer_table(part: Explorer, key: str, layer: Layer) -> dict[str, Any]:
             text.append(_ARROWS.get(best, best))
         texts.append(" ".join(text))
     meaning = "the likeliest action" if layer.policy is not None else part.label
-    table: dict[str, Any] = {"key": key, "caption": f"{layer.name}: {meaning}"}
+    table: Record = {"key": key, "caption": f"{layer.name}: {meaning}"}
     if part.shape is None:
         return table | {"header": ("state", "values"), "rows": list(enumerate(texts))}
     down, across = part.shape
@@ -207,7 +207,7 @@ def _layer_table(part: Explorer, key: str, layer: Layer) -> dict[str, Any]:
     }
 
 
-def _automaton_rows(automaton: Automaton, goal: str) -> list[dict[str, Any]]:
+def _automaton_rows(automaton: Automaton, goal: str) -> list[Record]:
     names = automaton.state_names or ("",) * len(automaton.delta)
     moves: dict[int, list[tuple[str, int]]] = {}
     for (q, target, _), guard in edge_guards(automaton).items():
@@ -229,7 +229,7 @@ def _automaton_rows(automaton: Automaton, goal: str) -> list[dict[str, Any]]:
 # --- curves ---------------------------------------------------------------------------------
 
 
-def _curves_view(part: Curves, drawn: Mapping[str, str]) -> dict[str, Any]:
+def _curves_view(part: Curves, drawn: Mapping[str, str]) -> Record:
     """The values that the template of learning curves reads."""
     count = len(part.steps)
     shown = sorted({int(t) for t in np.linspace(0, count - 1, min(count, _CURVE_ROWS))})

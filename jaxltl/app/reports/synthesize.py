@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,11 +15,12 @@ from jaxltl.app.job import plain, save_arrays, took
 from jaxltl.app.synthesize import Play, Synthesis
 from jaxltl.core.games.objective import GR1
 from jaxltl.core.models.game import Game, is_deterministic
+from jaxltl.app.wording import Record, Result
 
 # --- results --------------------------------------------------------------------------------
 
 
-def summary(found: Synthesis, seconds: float) -> dict[str, Any]:
+def summary(found: Synthesis, seconds: float) -> Record:
     """The results for ``result.json``."""
     file, world = found.file, found.world
     wins, starts = found.wins, found.starts
@@ -49,7 +49,7 @@ def summary(found: Synthesis, seconds: float) -> dict[str, Any]:
     return dict(plain(result))
 
 
-def _about_strategy(found: Synthesis) -> dict[str, Any] | None:
+def _about_strategy(found: Synthesis) -> Record | None:
     if found.strategy is None or found.restricted is None or found.strategy_verdict is None:
         return None
     game = found.restricted.model
@@ -68,7 +68,7 @@ def _about_strategy(found: Synthesis) -> dict[str, Any] | None:
     }
 
 
-def _about_play(found: Synthesis) -> dict[str, Any] | None:
+def _about_play(found: Synthesis) -> Record | None:
     if found.play is None:
         return None
     return {
@@ -86,7 +86,7 @@ def _about_play(found: Synthesis) -> dict[str, Any] | None:
     }
 
 
-def is_confirmed(result: Mapping[str, Any]) -> bool:
+def is_confirmed(result: Result) -> bool:
     """Whether the independent check confirms a :func:`summary`."""
     strategy = result["strategy"]
     claims = result["verdict"]
@@ -94,7 +94,7 @@ def is_confirmed(result: Mapping[str, Any]) -> bool:
     return bool(claims["system"] and claims["environment"] and sound)
 
 
-def table(result: Mapping[str, Any], found: Synthesis) -> str:
+def table(result: Result, found: Synthesis) -> str:
     """A :func:`summary` as text."""
     region, strategy = result["region"], result["strategy"]
     sure = result["deterministic"] or result["chance"] == "adversarial"
@@ -134,7 +134,7 @@ def table(result: Mapping[str, Any], found: Synthesis) -> str:
     return "\n".join(lines)
 
 
-def verdict(result: Mapping[str, Any]) -> str:
+def verdict(result: Result) -> str:
     """The result of the independent check."""
     if is_confirmed(result):
         what = "both players' strategies" + (
@@ -237,7 +237,7 @@ def save(out: Path, found: Synthesis) -> None:
         save_arrays(out / "counter_strategy.npz", arrays)
 
 
-def _arrays(found: Synthesis, game: Game, node: np.ndarray) -> dict[str, Any]:
+def _arrays(found: Synthesis, game: Game, node: np.ndarray) -> Record:
     return {
         "successor": game.mdp.successor,
         "probability": game.mdp.probability,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from jaxltl.app.reports.page import render_page
 from jaxltl.app.reports.synthesize import describe_play, is_confirmed, verdict
 from jaxltl.app.synthesize import Synthesis
 from jaxltl.envs.text_map import parse_map
+from jaxltl.app.wording import Result
 
 _PLAY_STEPS = 40  # of a play of the strategy
 _PLAYERS = ("system", "environment")
@@ -29,7 +30,7 @@ _TITLES = {
 
 
 def page(
-    result: Mapping[str, Any],
+    result: Result,
     found: Synthesis,
     pictures: Iterable[tuple[str, bytes]],
     file_text: str,
@@ -55,7 +56,7 @@ def page(
     )
 
 
-def _tiles(result: Mapping[str, Any]) -> list[tuple[str, str]]:
+def _tiles(result: Result) -> list[tuple[str, str]]:
     region, strategy = result["region"], result["strategy"]
     tiles = [
         (
@@ -72,7 +73,7 @@ def _tiles(result: Mapping[str, Any]) -> list[tuple[str, str]]:
     return tiles
 
 
-def remarks(result: Mapping[str, Any]) -> list[Remark]:
+def remarks(result: Result) -> list[Remark]:
     """The remarks at the beginning of the page."""
     kinds = {"realizable": "good", "partly realizable": "note", "unrealizable": "warning"}
     return [

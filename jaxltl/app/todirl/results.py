@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from types import EllipsisType
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -16,6 +17,8 @@ from jaxltl.core.models.product import Product
 from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.values.undiscounted.optimal_actions import OptimalActions
 from jaxltl.core.values.undiscounted.performance import Performance
+
+TreeT = TypeVar("TreeT")
 
 LENGTH = 100  # limit of a demonstration of a soft-optimal expert
 
@@ -42,7 +45,7 @@ class Worlds:
         return Worlds(self.scenes[chosen], *arrays)
 
 
-def part_of(tree: Any, chosen: Any) -> Any:
+def part_of(tree: TreeT, chosen: int | slice | EllipsisType) -> TreeT:
     """Part of arrays along their first axis, as NumPy arrays, which need no compilation."""
     return jax.tree.map(lambda x: np.asarray(x)[chosen], tree)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -12,9 +11,10 @@ from jaxltl.app.job import about, plain, took
 from jaxltl.app.todirl.results import Judged, Learned, Outcome, Worlds, counted_worlds, part_of
 from jaxltl.core.types import Status
 from jaxltl.core.values.undiscounted.performance import infeasible_starts, summarize
+from jaxltl.app.wording import Record
 
 
-def summary(outcome: Outcome) -> dict[str, Any]:
+def summary(outcome: Outcome) -> Record:
     """The outcome for ``result.json``; NaN becomes None."""
     setup, learned, i = outcome.setup, outcome.learned, outcome.chosen
     task, history, count = setup.task, learned.history, setup.num_training
@@ -80,7 +80,7 @@ def summary(outcome: Outcome) -> dict[str, Any]:
     return plain(result)
 
 
-def _about_learning(learned: Learned, i: int) -> dict[str, Any]:
+def _about_learning(learned: Learned, i: int) -> Record:
     """The final figures of one seed."""
     history = learned.history
     return {
@@ -98,8 +98,8 @@ def _about_learning(learned: Learned, i: int) -> dict[str, Any]:
 
 def _about_worlds(
     worlds: Worlds, judged: Judged, infeasible: np.ndarray, leave_out: Sequence[str]
-) -> dict[str, Any]:
-    found: dict[str, Any] = {"num_worlds": len(worlds.scenes)}
+) -> Record:
+    found: Record = {"num_worlds": len(worlds.scenes)}
     for who, performance in judged.performance.items():
         mean = summarize(worlds.judged, performance, names=worlds.names, leave_out=leave_out)
         found[who] = {
@@ -118,7 +118,7 @@ def _about_worlds(
     return found
 
 
-def _about_world(scene: Scene, judged: Judged, w: int, infeasible: int) -> dict[str, Any]:
+def _about_world(scene: Scene, judged: Judged, w: int, infeasible: int) -> Record:
     one = part_of(judged.performance["learned"], w)
     return {
         "name": scene.name,
@@ -127,7 +127,7 @@ def _about_world(scene: Scene, judged: Judged, w: int, infeasible: int) -> dict[
             "value": one.worst,
             "lower": one.worst_lower,
             "upper": one.worst_upper,
-            **scene.place(one.worst_state),
+            **scene.place(int(one.worst_state)),
         },
         "status": Status(int(one.status)).name,
         "expert": judged.performance["expert"].mean[w],
