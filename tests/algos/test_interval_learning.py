@@ -15,7 +15,6 @@ from jaxltl.core.models.game import make_game
 from jaxltl.core.models.interval import make_interval
 from jaxltl.core.statistics.confidence_sets import intervals_from_counts
 from jaxltl.core.types import Status
-from jaxltl.core.values.interval.satisfaction import robust_satisfaction
 from jaxltl.core.values.undiscounted.satisfaction import (
     optimal_satisfaction,
     satisfaction_probability,
@@ -285,7 +284,7 @@ def test_settled_values_are_the_robust_values_of_the_intervals(task):
             state = lane(states, number)
             intervals = make_interval(model.mdp, state.lower, state.upper)
             for nature, value in (("min", state.pessimistic), ("max", state.optimistic)):
-                exact = robust_satisfaction(
+                exact = optimal_satisfaction(
                     intervals,
                     model.automaton,
                     nature=nature_word("max", nature),

@@ -99,7 +99,7 @@ def made():
         propositions=(),
         horizon=7,
     )
-    satisfaction = jl.values.sparse_satisfaction(coin, "F lost")
+    satisfaction = jl.optimal_satisfaction(coin, "F lost")
     sure = jl.statistics.ConfidenceSets(
         np.zeros(3),
         np.array([0.5, 0.25, 1]),

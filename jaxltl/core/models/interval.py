@@ -172,7 +172,7 @@ def refuse_ball(model: IntervalMDP, why: str) -> None:
             f"the model has a radius, and {why}; give its smallest intervals, "
             "model.box, or ask the solvers that take a radius "
             "(reachability_probability, total_reward, robust_discounted_value, "
-            "robust_satisfaction)."
+            "optimal_satisfaction)."
         )
 
 

@@ -34,10 +34,6 @@ from .interval.robust import (
     robust_reachability as robust_reachability,
     robust_total_reward as robust_total_reward,
 )
-from .interval.satisfaction import (
-    RobustSatisfaction as RobustSatisfaction,
-    robust_satisfaction as robust_satisfaction,
-)
 from .interval.sensitivity import (
     Sensitivity as Sensitivity,
     robust_sensitivity as robust_sensitivity,
@@ -89,7 +85,6 @@ from .undiscounted.satisfaction import (
 )
 from .undiscounted.sparse_satisfaction import (
     Satisfaction as Satisfaction,
-    sparse_satisfaction as sparse_satisfaction,
 )
 from .undiscounted.step_bounded import (
     bounded_reachability as bounded_reachability,

@@ -18,7 +18,6 @@ from jaxltl.core.values.interval.robust import (
     robust_expectation,
     robust_reachability,
 )
-from jaxltl.core.values.interval.satisfaction import robust_satisfaction
 from jaxltl.core.values.interval.sensitivity import robust_sensitivity
 from jaxltl.core.values.prepared.prepared_interval import prepare_interval
 from jaxltl.core.values.undiscounted.satisfaction import (
@@ -129,7 +128,7 @@ def test_a_full_radius_is_a_box():
         ball = make_interval(model, low, high, center=p, radius=np.full(model.num_rows, 2.0))
         for objective, nature in DIRECTIONS:
             one, other = (
-                robust_satisfaction(
+                optimal_satisfaction(
                     x, task, objective=objective, nature=nature_word(objective, nature)
                 )
                 for x in (box, ball)
@@ -147,7 +146,7 @@ def test_products_policies_and_games():
         )
         world = make_interval(model, ball.lower, ball.upper, center=ball.center, radius=ball.radius)
         for nature in ("min", "max"):
-            found = robust_satisfaction(world, task, nature=nature_word("max", nature))
+            found = optimal_satisfaction(world, task, nature=nature_word("max", nature))
             assert found.solution.status == 0
             both = product(world, found.automaton)
             whole = optimal_satisfaction(both, nature=nature_word("max", nature))
@@ -280,7 +279,7 @@ def test_the_ball_guarantees_more_than_its_box():
             method="weissman",
         )
         assert found.model.radius is not None
-        box = robust_satisfaction(found.model.box, task, nature="adversarial").solution
+        box = optimal_satisfaction(found.model.box, task, nature="adversarial").solution
         assert box.lower[0] <= found.satisfaction.solution.upper[0] + 1e-9
         more += found.bound - box.lower[0]
     assert more > 0.1

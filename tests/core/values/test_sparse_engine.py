@@ -17,7 +17,6 @@ from jaxltl.core.values.undiscounted.satisfaction import (
     optimal_satisfaction,
     satisfaction_probability,
 )
-from jaxltl.core.values.undiscounted.sparse_satisfaction import sparse_satisfaction
 from jaxltl.core.values.undiscounted.total_reward import total_reward
 from tests.core.models.test_sparse import random_padded
 from tests.support import counts
@@ -74,7 +73,7 @@ def test_until_is_the_formula():
         sparse = sparse.replace(label=np.stack([stay, goal], -1), propositions=("a", "b"))
         for objective in ("max", "min"):
             until = reachability_probability(sparse, goal, stay=stay, objective=objective)
-            formula = sparse_satisfaction(
+            formula = optimal_satisfaction(
                 sparse, "a U b", objective=objective, states=np.arange(sparse.num_states)
             )
             overlap(until, formula.solution, 1e-12)
@@ -100,7 +99,7 @@ def test_formulas(formula):
         lazy = product(padded, formula)
         states = np.arange(sparse.num_states)
         for objective in ("max", "min"):
-            ours = sparse_satisfaction(sparse, formula, objective=objective, states=states)
+            ours = optimal_satisfaction(sparse, formula, objective=objective, states=states)
             theirs = optimal_satisfaction(lazy, objective=objective)
             automaton, letter = lazy.automaton, np.asarray(lazy.letter)
             memory = np.asarray(automaton.delta)[int(automaton.initial), letter]

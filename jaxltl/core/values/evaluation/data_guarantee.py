@@ -24,8 +24,9 @@ from jaxltl.core.statistics.confidence_sets import ConfidenceSets, Method, inter
 from jaxltl.core import validation
 from jaxltl.core.values import facts
 from jaxltl.core.values.interval.robust import require_objective
-from jaxltl.core.values.interval.satisfaction import RobustSatisfaction, robust_satisfaction
+from jaxltl.core.values.interval.satisfaction import robust_satisfaction
 from jaxltl.core.values.undiscounted.mixture import safe_mean
+from jaxltl.core.values.undiscounted.sparse_satisfaction import Satisfaction
 
 
 @brief(facts=facts.guarantee)
@@ -61,7 +62,7 @@ class DataGuarantee:
     bound: float
     confidence: float
     optimistic: float
-    satisfaction: RobustSatisfaction
+    satisfaction: Satisfaction
     model: IntervalMDP
     sets: ConfidenceSets
     gain: np.ndarray
@@ -197,7 +198,7 @@ def _with_sets(model: SparseMDP, sets: ConfidenceSets) -> tuple[IntervalMDP, np.
 
 
 def _gain(
-    model: IntervalMDP, found: RobustSatisfaction, center: np.ndarray, share: np.ndarray
+    model: IntervalMDP, found: Satisfaction, center: np.ndarray, share: np.ndarray
 ) -> np.ndarray:
     """Expected visits of each row times the loss to nature there: ``float64[R]``."""
     from scipy.sparse import csr_array, eye_array

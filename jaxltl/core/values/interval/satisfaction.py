@@ -9,13 +9,11 @@ import numpy as np
 
 from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.array_types import Booleans, Floats, Integers
-from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.runs import live_states, universal_states
 from jaxltl.core.automata.translate import Task
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.ops.operators import is_deterministic, require_weights
 from jaxltl.core.models.product import Product
-from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.interval.game_encoding import let_nature_choose
 from jaxltl.core.sparse.interval.l1_ball import Ball
 from jaxltl.core.sparse.interval.parity import parity_against_nature
@@ -26,44 +24,27 @@ from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.product import SparseProduct, sparse_product
 from jaxltl.core.types import Solution, Status, require_shape, row_tolerance
-from jaxltl.core.values import facts
 from jaxltl.core.values.interval.robust import Sides, host_sides, width_asked, world_of
 from jaxltl.core.values.undiscounted.sparse_satisfaction import (
+    Satisfaction,
     automaton_and_letters,
     starting_states,
 )
 
 
-@brief(facts=facts.satisfaction)
-class RobustSatisfaction(NamedTuple):
-    """Robust satisfaction probability, with a finite-memory policy and nature's choices.
+class _Verdicts(NamedTuple):
+    """Accepting and rejecting states of a product, and priorities of the others."""
 
-    Attributes:
-      solution: value, lower and upper are ``float64[I]``, one for each state that was asked for;
-        `policy` is ``int32[N]``, the world's row in each state of the product, and `nature`
-        ``float64[T']``, its distributions.
-      automaton: the task, over the letters that occur; letters are read as a state is left.
-      letter: ``int[S]``, the letter that each state shows.
-      product: what is reached of the model beside the automaton, N states.
-      value: ``float64[N]``, in each of them.
+    accepting: Booleans
+    rejecting: Booleans
+    priority: Integers | None = None  # of Buchi and parity acceptance
+    safety: bool = False
 
-    Example:
-      >>> from jaxltl.core.models import interval_rows
-      >>> model = interval_rows(None, [0, 2, 3, 4], [1, 2, 1, 2], [.4, .3, 1, 1], [.7, .6, 1, 1],
-      ...                       initial=[1, 0, 0], label=[[0], [1], [0]], propositions=["a"])
-      >>> found = robust_satisfaction(model, "F a")
-      >>> found.solution.value.round(6).tolist(), found.product.base_state.tolist()
-      ([0.4], [0, 1, 1, 2])
-    """
-
-    solution: Solution
-    automaton: Automaton
-    letter: np.ndarray
-    product: SparseProduct
-    value: np.ndarray
+    def of(self, state: Integers) -> _Verdicts:
+        priority = None if self.priority is None else self.priority[state]
+        return _Verdicts(self.accepting[state], self.rejecting[state], priority, self.safety)
 
 
-@validated()
 def robust_satisfaction(
     model: Any,
     task: Task,
@@ -72,68 +53,30 @@ def robust_satisfaction(
     nature: str | None = None,
     states: Any = None,
     tolerance: float | None = None,
-) -> RobustSatisfaction:
-    """Robust satisfaction probability of an LTL formula in an interval MDP.
-
-    In the product with the formula's automaton: where policy and nature want the same, they reach
-    the end components that both can keep to (Baier and Katoen 2008, section 10.6.4, with nature's
-    choices as actions). Where they want the opposite it is a stochastic parity game; with lower
-    ends of 0 nature may cut edges, so that neither the graph nor its end components are fixed.
-
-    Args:
-      model: an IntervalMDP, or a game on one (or on a sparse model).
-      task: a formula, its text, or an automaton over the letters that occur in the model.
-      objective: ``"max"`` or ``"min"``, what the policy (the system) makes of the probability.
-      nature: ``"adversarial"`` (default), against the objective, or ``"cooperative"``.
-      states: ``int[I]``, where runs start; default the initial states.
-      tolerance: the width of the enclosure asked for, 1e-6.
-
-    Returns:
-      :class:`RobustSatisfaction`.
-
-    Raises:
-      ValueError: an unknown label, state or direction, or a product beyond 2^31 states.
-
-    Concrete arrays only, on the host; not differentiable.
-
-    Example:
-      >>> from jaxltl.core.models import interval_rows
-      >>> model = interval_rows(None, [0, 2, 3, 4], [1, 2, 1, 2], [.4, .3, 1, 1], [.7, .6, 1, 1],
-      ...                       initial=[1, 0, 0], label=[[0], [1], [0]], propositions=["a"])
-      >>> robust_satisfaction(model, "F G a").solution.value.tolist()
-      [0.4]
-    """
+) -> Satisfaction:
+    """Robust satisfaction probability of a task in an interval MDP; labels are read on exit."""
     model, system = world_of(model)
     asked = width_asked(tolerance)
     automaton, letter = automaton_and_letters(model.nominal, task)
     states = starting_states(model, states)
     yes, no = universal_states(automaton), ~live_states(automaton)
     initial = np.broadcast_to(automaton.initial, states.shape)
-    product, host = _pairs(
-        model, np.asarray(automaton.delta), letter, states, initial, yes | no, False
+    numbered, delta = _numbered(model), np.asarray(automaton.delta)
+    product, host = _uncertain(
+        model,
+        sparse_product(numbered, delta, letter, states, initial, on_entry=False, still=yes | no),
     )
     priority = None
     if automaton.acceptance in ("buchi", "parity"):
         source = product.memory, letter[product.base_state]
         priority = np.asarray(automaton.priority)[source]
     moves = None if system is None else system[product.base_state]
-    found = _solved(
-        host_sides(host, moves, objective, nature),
-        host,
-        yes[product.memory],
-        no[product.memory],
-        priority,
-        automaton.acceptance == "safety",
-        asked,
-    )
-    solution = _solution(
-        found,
-        asked,
-        product.start.shape,
-        product.start,
-        policy=product.base_row[found.row].astype(np.int32),
-    )
-    return RobustSatisfaction(solution, automaton, letter, product, found.value)
+    q = product.memory
+    verdicts = _Verdicts(yes[q], no[q], priority, automaton.acceptance == "safety")
+    found = _solved(host_sides(host, moves, objective, nature), host, verdicts, asked)
+    row = product.base_row[found.row].astype(np.int32)
+    solution = _solution(found, asked, product.start.shape, product.start, row)
+    return Satisfaction(solution, automaton, letter, product, row, found.value)
 
 
 def _solution(
@@ -188,7 +131,9 @@ def robust_product_satisfaction(
     yes, no = universal_states(task), ~live_states(task)
     state, memory = (x.ravel() for x in np.indices(shape))
     on_entry = model.label_on == "entry"
-    product, host = _pairs(world, delta, letter, state, memory, yes & False, on_entry)
+    product, host = _uncertain(
+        world, sparse_product(_numbered(world), delta, letter, state, memory, on_entry=on_entry)
+    )
     pair: Integers = np.arange(product.memory.size)
     level = None
     if task.acceptance in ("buchi", "parity"):
@@ -203,7 +148,8 @@ def robust_product_satisfaction(
     if policy is not None:
         sides = _fixed(model, product, host, np.asarray(policy), sides.helpful)
     q = product.memory[pair]
-    found = _solved(sides, host, yes[q], no[q], level, task.acceptance == "safety", asked)
+    verdicts = _Verdicts(yes[q], no[q], level, task.acceptance == "safety")
+    found = _solved(sides, host, verdicts, asked)
     if policy is not None:
         solution = _solution(found, asked, shape, product.start, np.asarray(policy))
         return solution.replace(nature=None)  # type: ignore[attr-defined]
@@ -235,22 +181,17 @@ def _reading(host: UncertainMDP, priority: Integers) -> tuple[UncertainMDP, Inte
     )
 
 
-def _pairs(
-    model: IntervalMDP,
-    delta: np.ndarray,
-    letter: np.ndarray,
-    state: Integers,
-    memory: Integers,
-    still: Booleans,
-    on_entry: bool,
-) -> tuple[SparseProduct, UncertainMDP]:
-    """The reachable product, with its intervals."""
+def _numbered(model: IntervalMDP) -> HostMDP:
+    """The model with the numbers of entries, from 1, in place of probabilities."""
     mdp = model.nominal.host
-    # Entries travel by number, from 1; a loop of what stands still has 1 too.
-    numbered = HostMDP(
-        mdp.row_start, mdp.entry_start, mdp.successor, np.arange(1.0, mdp.num_transitions + 1)
-    )
-    found = sparse_product(numbered, delta, letter, state, memory, on_entry=on_entry, still=still)
+    number = np.arange(1.0, mdp.num_transitions + 1)
+    return HostMDP(mdp.row_start, mdp.entry_start, mdp.successor, number)
+
+
+def _uncertain(model: IntervalMDP, found: SparseProduct) -> tuple[SparseProduct, UncertainMDP]:
+    """The product of a numbered model, with its probabilities and its intervals."""
+    mdp = model.nominal.host
+    # The loop of an absorbing state has the number 1, too.
     entry = found.host.probability.astype(np.int64) - 1
     loop = found.still[found.host.state[found.host.row]]
     chance, lower, upper = (
@@ -287,29 +228,12 @@ def _fixed(
 
 
 def _solved(
-    sides: Sides,
-    host: UncertainMDP,
-    yes: Booleans,
-    no: Booleans,
-    priority: Integers | None,
-    safety: bool,
-    tolerance: float,
+    sides: Sides, host: UncertainMDP, verdicts: _Verdicts, tolerance: float
 ) -> RobustValues:
     """Robust satisfaction probability from all states of the product."""
-    maximize, helpful = sides.maximize, sides.helpful
     if sides.spread is None:
-        return _of_sides(host, yes, no, priority, maximize, helpful, safety, tolerance)
-    source = sides.spread.source
-    found = _of_sides(
-        sides.host,
-        yes[source],
-        no[source],
-        None if priority is None else priority[source],
-        maximize,
-        helpful,
-        safety,
-        tolerance,
-    )
+        return _of_sides(host, verdicts, sides.query(tolerance))
+    found = _of_sides(sides.host, verdicts.of(sides.spread.source), sides.query(tolerance))
     size = host.mdp.num_states
     return replace(
         found,
@@ -321,50 +245,33 @@ def _solved(
     )
 
 
-def _of_sides(
-    host: UncertainMDP,
-    yes: Booleans,
-    no: Booleans,
-    priority: Integers | None,
-    maximize: bool,
-    helpful: bool,
-    safety: bool,
-    tolerance: float,
-) -> RobustValues:
+def _of_sides(host: UncertainMDP, verdicts: _Verdicts, query: Query) -> RobustValues:
     """Robust satisfaction probability for one policy and nature."""
+    yes, no, priority, safety = verdicts
     if priority is None:
-        goal = no if safety else yes
         if safety:
-            return reachability(
-                host, goal, Query(not maximize, not helpful, tolerance)
-            ).complement()
-        return reachability(host, goal, Query(maximize, helpful, tolerance))
-    if not maximize:
+            return reachability(host, no, query.opposite).complement()
+        return reachability(host, yes, query)
+    if not query.maximize:
         # The least probability is one minus the largest of the opposite.
         priority = np.where(no, 0, np.where(yes, 1, priority + 1))
-        return _largest(host, priority, not helpful, tolerance).complement()
+        return _largest(host, priority, query.opposite).complement()
     priority = np.where(yes, 0, np.where(no, 1, priority))
-    return _largest(host, priority, helpful, tolerance)
+    return _largest(host, priority, query)
 
 
-def _largest(
-    host: UncertainMDP, priority: Integers, helpful: bool, tolerance: float
-) -> RobustValues:
+def _largest(host: UncertainMDP, priority: Integers, query: Query) -> RobustValues:
     """Maximal parity probability, for both readings of sums within rounding of one."""
-    found = _as_read(host, priority, helpful, tolerance)
+    found = _as_read(host, priority, query)
     wide = host.enlarged
-    if wide is None:
-        return found
-    return found.hull(_as_read(wide, priority, helpful, tolerance))
+    return found if wide is None else found.hull(_as_read(wide, priority, query))
 
 
-def _as_read(
-    host: UncertainMDP, priority: Integers, helpful: bool, tolerance: float
-) -> RobustValues:
-    if not helpful:
-        return parity_against_nature(host, priority, tolerance=tolerance)
+def _as_read(host: UncertainMDP, priority: Integers, query: Query) -> RobustValues:
+    if not query.nature_maximizes:
+        return parity_against_nature(host, priority, tolerance=query.tolerance)
     mdp = host.mdp
     good = joint_accepting_region(host, priority[mdp.state[mdp.row]])
-    found = reachability(host, good.region, Query(True, True, tolerance))
+    found = reachability(host, good.region, query)
     inside: Floats = np.where(good.region[mdp.state[mdp.row]], good.probability, found.probability)
     return replace(found, row=np.where(good.region, good.row, found.row), probability=inside)

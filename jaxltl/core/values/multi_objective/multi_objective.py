@@ -140,7 +140,7 @@ def _require(model: Model, objectives: Sequence[Objective]) -> None:
     if hasattr(model, "nominal"):
         raise ValueError(
             "several objectives at once are not solved for where probabilities are "
-            "intervals; ask for one at a time, by robust_satisfaction or "
+            "intervals; ask for one at a time, by optimal_satisfaction or "
             "total_reward, or give model.nominal, which is one choice of "
             "nature."
         )

@@ -23,6 +23,7 @@ from jaxltl.core.logic.ltl import TRUE, Formula
 from jaxltl.core.logic.properties import MAX_UNFOLDED_STEPS, Property, parse_property
 from jaxltl.core.models.construct.state_formulas import states_satisfying
 from jaxltl.core.models.interval import IntervalMDP
+from jaxltl.core.models.protocols import Array
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.types import Solution, Status
@@ -30,7 +31,6 @@ from jaxltl.core import validation
 from jaxltl.core.values import facts
 from jaxltl.core.values.average.average_reward import average_reward
 from jaxltl.core.values.interval.robust import width_asked
-from jaxltl.core.values.interval.satisfaction import RobustSatisfaction, robust_satisfaction
 from jaxltl.core.values.interval.step_bounded import (
     robust_bounded_reachability,
     robust_cumulative_reward,
@@ -40,10 +40,10 @@ from jaxltl.core.values.interval.step_bounded import (
 from jaxltl.core.values.undiscounted import step_bounded as bounded
 from jaxltl.core.values.engine.host_solution import complement_event
 from jaxltl.core.values.undiscounted.reachability import reachability_probability
+from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction
 from jaxltl.core.values.undiscounted.sparse_satisfaction import (
     Satisfaction,
     at_states,
-    sparse_satisfaction,
     starting_states,
 )
 from jaxltl.core.values.undiscounted.total_reward import total_reward
@@ -77,8 +77,8 @@ class PropertyStrategy(NamedTuple):
 
     row: np.ndarray
     by: str = ""
-    memory: Satisfaction | RobustSatisfaction | None = None
-    nature: np.ndarray | None = None
+    memory: Satisfaction | None = None
+    nature: Array | None = None
 
 
 @brief(facts=facts.answer)
@@ -519,26 +519,15 @@ class _Probability(NamedTuple):
 
     def automaton(self, path: Formula, aim: _Aim) -> Callable[[float], _Found]:
         def found(tolerance: float) -> _Found:
-            result: Satisfaction | RobustSatisfaction
-            nature = None
-            if isinstance(self.model, IntervalMDP):
-                result = robust_satisfaction(
-                    self.model, path, states=self.states, tolerance=tolerance, **aim.directions
-                )
-                row, nature = (
-                    np.asarray(x) for x in (result.solution.policy, result.solution.nature)
-                )
-            else:
-                result = sparse_satisfaction(
-                    self.model, path, objective=aim.policy, states=self.states, tolerance=tolerance
-                )
-                row = result.row
+            result = optimal_satisfaction(
+                self.model, path, states=self.states, tolerance=tolerance, **aim.directions
+            )
             method = result.solution.method
             size = f"product of {result.product.host.num_states} states"
             return _Found(
                 result.solution,
                 f"{size}, {method}" if method else size,
-                PropertyStrategy(row, memory=result, nature=nature),
+                PropertyStrategy(result.row, memory=result, nature=result.solution.nature),
             )
 
         return found

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, overload
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpy.typing as npt
 from jax import lax
 
 from jaxltl.core.values.engine.validated import validated
@@ -17,18 +18,25 @@ from jaxltl.core.graphs.acceptance import (
     accepting_bottom_components,
     accepting_end_components,
 )
+from jaxltl.core.automata.translate import Task
+from jaxltl.core.models.construct.convert import to_sparse
+from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.mesh.sharded import is_sharded
 from jaxltl.core.models.ops.array_namespace import is_traced, namespace, to_jax
 from jaxltl.core.models.ops.operators import is_deterministic, require_policy
 from jaxltl.core.models.product import Product
+from jaxltl.core.models.protocols import Model
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.solvers.shortest_path import fastest_rows, with_exits
 from jaxltl.core.types import Solution
 from jaxltl.core.values.engine.host_solution import is_sparse
 from jaxltl.core.values.interval.robust import refuse_nature
-from jaxltl.core.values.interval.satisfaction import robust_product_satisfaction
+from jaxltl.core.values.interval.satisfaction import (
+    robust_product_satisfaction,
+    robust_satisfaction,
+)
 from jaxltl.core.values.engine.host_solution import complement_event
 from jaxltl.core.values.undiscounted.reachability import (
     QUICK_LIMIT,
@@ -37,7 +45,11 @@ from jaxltl.core.values.undiscounted.reachability import (
     row_of_action,
     rows_of_model,
 )
-from jaxltl.core.values.undiscounted.sparse_satisfaction import product_satisfaction
+from jaxltl.core.values.undiscounted.sparse_satisfaction import (
+    Satisfaction,
+    product_satisfaction,
+    sparse_satisfaction,
+)
 
 
 @validated()
@@ -83,7 +95,7 @@ def satisfaction_probability(
       >>> round(float(np.sum(model.initial * found.value)), 6)
       0.75
     """
-    _require_product(model)
+    model = _as_product(model)
     if isinstance(model.mdp, IntervalMDP):
         return robust_product_satisfaction(model, policy=policy, nature=nature, tolerance=tolerance)
     refuse_nature(nature)
@@ -104,17 +116,46 @@ def satisfaction_probability(
     return complement_event(reach) if kind == "safety" else reach
 
 
-@validated()
+@overload
 def optimal_satisfaction(
     model: Product,
+    task: None = None,
     *,
     objective: str = "max",
     nature: str | None = None,
     tolerance: jax.Array | float | None = None,
     max_steps: jax.Array | int | None = None,
     start: tuple[jax.Array, jax.Array] | None = None,
-) -> Solution:
-    """Maximal or minimal satisfaction probability of a product, with an optimal policy.
+) -> Solution: ...
+
+
+@overload
+def optimal_satisfaction(
+    model: Model | IntervalMDP | Game,
+    task: Task,
+    *,
+    objective: str = "max",
+    nature: str | None = None,
+    states: npt.ArrayLike | None = None,
+    label_on: str | None = None,
+    tolerance: float | None = None,
+) -> Satisfaction: ...
+
+
+@validated()
+def optimal_satisfaction(
+    model: Product | Model | IntervalMDP | Game,
+    task: Task | None = None,
+    *,
+    objective: str = "max",
+    nature: str | None = None,
+    states: npt.ArrayLike | None = None,
+    label_on: str | None = None,
+    tolerance: Any = None,
+    max_steps: jax.Array | int | None = None,
+    start: tuple[jax.Array, jax.Array] | None = None,
+) -> Solution | Satisfaction:
+    """Maximal or minimal satisfaction probability of a product, or of a model and a task.
 
     For a co-safe task, the probability of reaching a final state; for a safety task, of never
     leaving them; for Buchi and parity, of reaching an accepting end component, in which the policy
@@ -136,23 +177,34 @@ def optimal_satisfaction(
     ``jit`` and ``vmap``, and beyond 10^5 states, the policy attains the same optimum but may take
     longer.
 
+    A model with a `task` is solved on the host, on the reachable part of its product. In interval
+    models, policy and nature that want the same reach the end components that both can keep to;
+    where they want the opposite, it is a stochastic parity game, in which nature may cut edges with
+    lower ends of 0.
+
     Args:
-      model: the product.
+      model: a product; or with `task` a concrete model, an interval model or a game on one.
+      task: a formula, its text, or an automaton over the letters that occur in the model.
       objective: ``"max"`` or ``"min"``.
-      nature: for products of interval models only, see
-        :func:`~jaxltl.core.values.interval.satisfaction.robust_satisfaction`.
-      tolerance, max_steps, start: as for :func:`reachability_probability`.
+      nature: for interval models only: ``"adversarial"`` (default), against the objective, or
+        ``"cooperative"``.
+      states: with `task`, ``int[I]``, the states asked for; default the initial ones.
+      label_on: with `task`, ``"entry"`` (default) or ``"exit"``, when the policy's memory reads a
+        state's label; the probability is the same. Interval models read on exit.
+      tolerance: as for :func:`reachability_probability`.
+      max_steps, start: of a product, as for :func:`reachability_probability`.
 
     Returns:
-      :class:`Solution`; `value` is ``float[S, Q]``, `policy` ``int32[S, Q]``, memoryless in the
-      product: its memory is the automaton's state. For a sparse world it consists of rows.
+      Of a product, a :class:`Solution`; `value` is ``float[S, Q]``, `policy` ``int32[S, Q]``,
+      memoryless in the product: its memory is the automaton's state. For a sparse world it consists
+      of rows. With a task, a :class:`Satisfaction`, a finite-memory policy of rows.
 
     Raises:
-      ValueError: the model is not a product, the objective is unknown, `nature` is given for a
-        model without intervals, or the world is sparse and its actions are restricted.
+      ValueError: neither a product nor a task, an unknown label, state or objective, an option that
+        is not for this model, or a product of a sparse world with restricted actions.
 
-    Differentiable in the world's transition probabilities, with the support and the optimal policy
-    held fixed; not for products of sparse and of interval models, which are solved on the host.
+    Differentiable in a product's transition probabilities, with the support and the optimal policy
+    held fixed; not for sparse and interval models, which are solved on the host.
 
     Example:
       >>> from jaxltl import from_dense, product
@@ -161,10 +213,30 @@ def optimal_satisfaction(
       >>> best = optimal_satisfaction(product(world, "F goal"))
       >>> best.value[0, 0].item(), best.policy[0, 0].item()
       (0.75, 1)
-      >>> optimal_satisfaction(product(world, "G F goal"), objective="min").value[0, 0].item()
-      0.5
+      >>> optimal_satisfaction(world, "G F goal", objective="min").solution.value.tolist()
+      [0.5]
     """
-    _require_product(model)
+    if task is not None:
+        if max_steps is not None or start is not None:
+            raise ValueError("max_steps and start are options of products; leave task out.")
+        if isinstance(model, IntervalMDP | Game):
+            if label_on not in (None, "exit"):
+                raise ValueError(f'label_on={label_on!r}; interval models read labels on "exit".')
+            return robust_satisfaction(
+                model, task, objective=objective, nature=nature, states=states, tolerance=tolerance
+            )
+        refuse_nature(nature)
+        return sparse_satisfaction(
+            to_sparse(model),
+            task,
+            objective=objective,
+            states=states,
+            label_on=label_on or "entry",
+            tolerance=tolerance,
+        )
+    if states is not None or label_on is not None:
+        raise ValueError("states and label_on are for a model and a task, not for a product.")
+    model = _as_product(model)
     if isinstance(model.mdp, IntervalMDP):
         return robust_product_satisfaction(
             model, objective=objective, nature=nature, tolerance=tolerance
@@ -294,9 +366,10 @@ def _one_hot(policy: Any, num_actions: int) -> Any:
     return table[..., None] == xp.arange(num_actions)
 
 
-def _require_product(model: Any) -> None:
-    if not hasattr(model, "automaton"):
+def _as_product(model: object) -> Product:
+    if not isinstance(model, Product):
         raise ValueError(
             f"{type(model).__name__} is no product of a world and a task; give "
-            "product(world, formula)."
+            "product(world, formula), or the task to optimal_satisfaction."
         )
+    return model

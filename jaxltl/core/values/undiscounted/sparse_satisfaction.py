@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.automata.automaton import Automaton, letter_index
 from jaxltl.core.automata.runs import live_states, universal_states
 from jaxltl.core.automata.translate import Task, to_automaton
@@ -43,12 +42,13 @@ class Satisfaction(NamedTuple):
       letter: ``int[S]``, the letter of each state.
       product: the reachable product of the model and the automaton, N states.
       row: ``int32[N]``, the policy's row of the model in each of them.
+      value: ``float64[N]``, the probability in each of them.
 
     Example:
-      >>> from jaxltl import make_sparse
-      >>> two_ways = make_sparse([0, 2, 3, 4], [0, 1, 2, 3, 4], [1, 2, 1, 2], [1, 1, 1, 1],
+      >>> import jaxltl as jl
+      >>> two_ways = jl.make_sparse([0, 2, 3, 4], [0, 1, 2, 3, 4], [1, 2, 1, 2], [1, 1, 1, 1],
       ...                        initial=[1, 0, 0], label={"a": [1]})
-      >>> found = sparse_satisfaction(two_ways, "F a")
+      >>> found = jl.optimal_satisfaction(two_ways, "F a")
       >>> found.solution.value.tolist(), found.row[found.product.start].tolist()
       ([1.0], [0])
     """
@@ -58,9 +58,9 @@ class Satisfaction(NamedTuple):
     letter: np.ndarray
     product: SparseProduct
     row: np.ndarray
+    value: np.ndarray
 
 
-@validated()
 def sparse_satisfaction(
     model: SparseMDP,
     task: Task,
@@ -70,38 +70,7 @@ def sparse_satisfaction(
     label_on: str = "entry",
     tolerance: float | None = None,
 ) -> Satisfaction:
-    """Optimal probability of satisfying an LTL formula from some states of a sparse model.
-
-    Computed on the reachable product with the formula's automaton, up to states whose verdict is
-    known. It is the probability of reaching accepting states and, under Buchi and parity
-    acceptance, accepting end components (Baier and Katoen 2008, section 10.6.4); for a safety
-    formula, of avoiding rejecting states. Minima under Buchi and parity acceptance are one minus
-    maxima for the negation.
-
-    Args:
-      model: the model.
-      task: a formula, its text, or an automaton over the letters that occur in the model.
-      objective: ``"max"`` or ``"min"``.
-      states: ``int[I]``, where runs start; default the initial states.
-      label_on: ``"entry"``, reads the label of the first state at once; ``"exit"``, as it is left.
-        The probabilities are equal, as the run has the same word.
-      tolerance: of :func:`~jaxltl.core.values.undiscounted.reachability.reachability_probability`.
-
-    Returns:
-      :class:`Satisfaction`.
-
-    Raises:
-      ValueError: an unknown label, state, objective or reading, or a product beyond 2^31 states.
-
-    Concrete arrays only, on the host; not differentiable.
-
-    Example:
-      >>> from jaxltl import make_sparse
-      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1],
-      ...                    initial=[1, 0, 0], label=[[0], [1], [0]], propositions=["a"])
-      >>> sparse_satisfaction(coin, "F G a").solution.value.tolist()
-      [0.5]
-    """
+    """Optimal satisfaction probability on the reachable product, up to states with a verdict."""
     if objective not in ("max", "min"):
         raise ValueError(f'objective={objective!r}; it must be "max" or "min".')
     if label_on not in ("entry", "exit"):
@@ -112,7 +81,12 @@ def sparse_satisfaction(
     product = _product(model, reader, states)
     found, row = _best(product, reader, objective, tolerance)
     return Satisfaction(
-        at_states(found, product.start), automaton, letter, product, product.base_row[row]
+        at_states(found, product.start),
+        automaton,
+        letter,
+        product,
+        product.base_row[row],
+        np.asarray(found.value),
     )
 
 

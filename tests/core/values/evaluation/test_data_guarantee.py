@@ -10,8 +10,7 @@ from jaxltl.core.models.interval import make_interval
 from jaxltl.core.models.sparse import make_sparse
 from jaxltl.core.statistics.graph_assumption import LeastProbability, describe_graph
 from jaxltl.core.values.evaluation.data_guarantee import guarantee_curve, learn_guarantee, safe_mean
-from jaxltl.core.values.interval.satisfaction import robust_satisfaction
-from jaxltl.core.values.undiscounted.sparse_satisfaction import sparse_satisfaction
+from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction
 from tests.reference_intervals import random_model
 
 METHODS = ["clopper-pearson", "hoeffding", "weissman", "anytime"]
@@ -58,7 +57,7 @@ def test_guarantees_hold(method, count):
             graph="given",
             method=method,
         )
-        true = sparse_satisfaction(model, task).solution.value[0]
+        true = optimal_satisfaction(model, task).solution.value[0]
         own = under(model, found)
         failed += found.bound > own + 1e-9 or found.optimistic < true - 1e-9
         assert own <= true + 1e-9
@@ -71,7 +70,7 @@ def under(model, found):
     """The true probability under the policy, whose memory is the automaton's state."""
     product = found.satisfaction.product
     points = make_interval(model, model.probability, model.probability)
-    whole = robust_satisfaction(points, found.satisfaction.automaton, nature="cooperative")
+    whole = optimal_satisfaction(points, found.satisfaction.automaton, nature="cooperative")
     np.testing.assert_array_equal(whole.product.base_state, product.base_state)
     host = whole.product.host
     taken = whole.product.base_row == np.asarray(found.satisfaction.solution.policy)[host.state]
@@ -110,19 +109,19 @@ def under(model, found):
         label=label,
         propositions=names,
     )
-    return sparse_satisfaction(chain, task).solution.value[0]
+    return optimal_satisfaction(chain, task).solution.value[0]
 
 
 def test_more_data_guarantee_more():
     rng = np.random.default_rng(5)
     model = labelled(np.random.default_rng(12))
-    true = sparse_satisfaction(model, "!b U a").solution.value[0]
+    true = optimal_satisfaction(model, "!b U a").solution.value[0]
     counts = drawn(rng, model, 10**6)
     for method in METHODS:
         found = learn_guarantee(model, counts, "!b U a", 0.99, graph="given", method=method)
         assert true - 0.02 < found.bound <= true <= found.optimistic < true + 0.02
     worst = learn_guarantee(model, counts, "!b U a", 0.99, graph="given", objective="min")
-    least = sparse_satisfaction(model, "!b U a", objective="min").solution.value[0]
+    least = optimal_satisfaction(model, "!b U a", objective="min").solution.value[0]
     assert worst.optimistic <= least + 1e-9
     assert least <= worst.bound < least + 0.02
 
@@ -151,7 +150,7 @@ def test_where_more_samples_help():
     for row, of in ((0, slice(0, 2)), (1, slice(2, 4))):
         lower, upper = sets.lower.copy(), sets.upper.copy()
         lower[of] = upper[of] = sets.center[of]
-        known = robust_satisfaction(make_interval(model, lower, upper), "F a").solution.value[0]
+        known = optimal_satisfaction(make_interval(model, lower, upper), "F a").solution.value[0]
         assert known - found.bound == pytest.approx(found.gain[row], rel=0.05)
 
 

@@ -19,7 +19,7 @@ from jaxltl.core.values.interval.robust import (
     robust_reachability,
     robust_total_reward,
 )
-from jaxltl.core.values.interval.satisfaction import _solved, robust_satisfaction
+from jaxltl.core.values.interval.satisfaction import _solved, _Verdicts
 from jaxltl.core.values.interval.step_bounded import (
     robust_bounded_reachability,
     robust_cumulative_reward,
@@ -31,7 +31,6 @@ from jaxltl.core.values.undiscounted.satisfaction import (
     optimal_satisfaction,
     satisfaction_probability,
 )
-from jaxltl.core.values.undiscounted.sparse_satisfaction import sparse_satisfaction
 from jaxltl.core.values.undiscounted.step_bounded import (
     bounded_reachability,
     cumulative_reward,
@@ -85,8 +84,8 @@ def test_points_are_the_exact_model():
         np.testing.assert_array_equal(model.nominal.probability, given.probability)
         task = TASKS[i % len(TASKS)]
         for objective, nature in DIRECTIONS:
-            exact = sparse_satisfaction(given, task, objective=objective).solution
-            found = robust_satisfaction(
+            exact = optimal_satisfaction(given, task, objective=objective).solution
+            found = optimal_satisfaction(
                 model, task, objective=objective, nature=nature_word(objective, nature)
             ).solution
             assert int(found.status) == Status.CONVERGED
@@ -101,12 +100,12 @@ def test_wider_intervals_give_nature_more():
         given = labelled(rng).nominal
         task = TASKS[i % len(TASKS)]
         for objective in ("max", "min"):
-            exact = sparse_satisfaction(given, task, objective=objective).solution
+            exact = optimal_satisfaction(given, task, objective=objective).solution
             low = high = exact.value
             for width in (0.05, 0.2, 1.0):
                 model = around(given, width)
                 least, most = (
-                    robust_satisfaction(
+                    optimal_satisfaction(
                         model, task, objective=objective, nature=nature_word(objective, nature)
                     ).solution
                     for nature in ("min", "max")
@@ -132,7 +131,7 @@ def test_products(label_on):
             found = optimal_satisfaction(
                 pairs, objective=objective, nature=nature_word(objective, nature)
             )
-            alone = robust_satisfaction(
+            alone = optimal_satisfaction(
                 model,
                 task,
                 objective=objective,
@@ -304,7 +303,7 @@ def test_games(count):
                 )
             yes = np.zeros(4, bool)
             sides = host_sides(host, system, "max", nature_word("max", nature))
-            found = _solved(sides, host, yes, yes, priority, False, 1e-6)
+            found = _solved(sides, host, _Verdicts(yes, yes, priority), 1e-6)
             held(
                 found,
                 played(host, yes, system, worth[2], objective="max", nature=nature),
@@ -357,7 +356,7 @@ def test_exact_games_have_values():
     for system, best in ((True, 0.5), (False, 0.25)):
         game = Game(coins, np.array([system] * 3))
         assert robust_reachability(game, "a").value[0] == pytest.approx(best)
-        found = robust_satisfaction(game, "F G a", states=[0]).solution
+        found = optimal_satisfaction(game, "F G a", states=[0]).solution
         assert found.value[0] == pytest.approx(best)
 
 
@@ -476,9 +475,9 @@ def test_states_that_are_none(states, message):
         None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1], initial=[1, 0, 0], label={"a": [1]}
     )
     model = make_interval(coin, coin.probability, coin.probability)
-    for solve, of in ((robust_satisfaction, model), (sparse_satisfaction, coin)):
+    for of in (model, coin):
         with pytest.raises(ValueError, match=message):
-            solve(of, "F a", states=states)
+            optimal_satisfaction(of, "F a", states=states)
 
 
 def test_general_functions_answer_for_intervals():

@@ -12,7 +12,7 @@ from jaxltl.core.values.multi_objective.multi_objective import (
     pareto,
 )
 from jaxltl.core.values.undiscounted.reachability import reachability_probability
-from jaxltl.core.values.undiscounted.sparse_satisfaction import sparse_satisfaction
+from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction
 from tests.sparse_models import random_sparse, storm_model, storm_values
 
 
@@ -157,11 +157,11 @@ def test_one_objective_is_what_its_own_solver_finds(seed):
     for formula in ("G F a", "F G b", "a U b", "G (a -> F b)"):
         for direction in ("max", "min"):
             alone = multi_objective(model, [Objective(formula=formula, direction=direction)])
-            expected = sparse_satisfaction(model, formula, objective=direction).solution
+            expected = optimal_satisfaction(model, formula, objective=direction).solution
             assert alone.lower - 1e-6 <= expected.value[0] <= alone.upper + 1e-6
             assert alone.status == Status.CONVERGED
     both = achievable(model, [Objective(formula="G F a"), Objective(formula="G F !b")], [1.0, 1.0])
-    most = sparse_satisfaction(model, "G F a & G F !b").solution
+    most = optimal_satisfaction(model, "G F a & G F !b").solution
     assert both.holds == (most.lower[0] == 1)
     # How often both can be had is at least the sum less one, and one alone is no more.
     share = 0.5 * float(most.lower[0])

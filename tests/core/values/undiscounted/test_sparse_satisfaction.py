@@ -9,7 +9,6 @@ from jaxltl.core.models.sparse import SparseMDP, make_sparse
 from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction
 from jaxltl.core.values.undiscounted.sparse_satisfaction import (
     Satisfaction,
-    sparse_satisfaction,
 )
 
 FORMULAS = (
@@ -87,7 +86,7 @@ def test_values_are_those_of_the_padded_product(formula):
             wanted = optimal_satisfaction(lazy, objective=objective)
             at = states, np.asarray(lazy.initial_memory)
             for label_on in ("entry", "exit"):
-                found = sparse_satisfaction(
+                found = optimal_satisfaction(
                     model, formula, objective=objective, states=states, label_on=label_on
                 )
                 solution = found.solution
@@ -103,17 +102,29 @@ def test_strategies_attain_what_they_are_said_to(formula):
     for seed in range(3, 6):
         model = random_sparse(seed)
         for objective in ("max", "min"):
-            found = sparse_satisfaction(model, formula, objective=objective)
+            found = optimal_satisfaction(model, formula, objective=objective)
             chain = chain_of(model, found)
-            attained = sparse_satisfaction(chain, formula, states=found.product.start).solution
+            attained = optimal_satisfaction(chain, formula, states=found.product.start).solution
             np.testing.assert_allclose(attained.value, found.solution.value, atol=1e-6)
 
 
 def test_bad_arguments_are_named():
     model = random_sparse(0)
     with pytest.raises(ValueError, match="objective='most'"):
-        sparse_satisfaction(model, "F a", objective="most")
+        optimal_satisfaction(model, "F a", objective="most")
     with pytest.raises(ValueError, match="label_on='left'"):
-        sparse_satisfaction(model, "F a", label_on="left")
+        optimal_satisfaction(model, "F a", label_on="left")
     with pytest.raises(ValueError, match="'goal', which the world does not have"):
-        sparse_satisfaction(model, "F goal")
+        optimal_satisfaction(model, "F goal")
+
+
+def test_options_of_other_models_are_refused():
+    model = random_sparse(np.random.default_rng(0), 4)
+    for option in ({"max_steps": 3}, {"start": (0, 1)}, {"nature": "adversarial"}):
+        with pytest.raises(ValueError, match="options of products|is for models with intervals"):
+            optimal_satisfaction(model, "F a", **option)
+    for option in ({"states": [0]}, {"label_on": "exit"}):
+        with pytest.raises(ValueError, match="for a model and a task"):
+            optimal_satisfaction(product(model, "F a"), **option)
+    with pytest.raises(ValueError, match="is no product of a world and a task"):
+        optimal_satisfaction(model)
