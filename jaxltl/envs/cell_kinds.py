@@ -23,12 +23,9 @@ FREE = -1  # a cell without a colour yet
 
 
 def many_objects(num: int) -> dict[str, dict[str, int]]:
-    """Distinct colour counts for objects ``o1``, ``o2``, ...
+    """Distinct colour counts for `num` objects ``o1``, ``o2``, ..., at most 16.
 
     The first three are those of the dissertation. Each has an X of one colour on another.
-
-    Args:
-      num: how many, at most 16.
 
     Example:
       >>> many_objects(4)["o4"]
@@ -92,19 +89,11 @@ def categories(
     obstacles: Counts = OBSTACLES,
     margin: int = 1,
 ) -> NDArray[np.int32]:
-    """Category of each cell by the colours of its 3 x 3 patch, in NumPy.
+    """Category of each cell by the colours of its 3 x 3 patch: ``int32[rows, columns]``.
 
-    Args:
-      colors: ``int[rows + 2 * margin, columns + 2 * margin]``, indices into ``COLORS``.
-      objects, obstacles: the number of cells of each colour in the patch of each kind.
-      margin: rings of cells around the grid, at least one.
-
-    Returns:
-      ``int32[rows, columns]``: the place among the objects and then the obstacles, -1 for a
-      distractor.
-
-    Raises:
-      ValueError: no whole grid, a colour that does not exist, or ambiguous kinds.
+    The category is the place among the objects and then the obstacles, -1 for a distractor. `colors`
+    is ``int[rows + 2 * margin, columns + 2 * margin]``, indices into ``COLORS``; ValueError for another
+    shape, an unknown colour, or ambiguous kinds.
 
     Example:
       >>> x = [[0, 4, 0], [4, 0, 4], [0, 4, 0]]  # red where an X is, black elsewhere

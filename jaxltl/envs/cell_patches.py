@@ -18,11 +18,7 @@ _ROUNDS = 10_000
 def plan_map(
     plan: Mapping[str, Sequence[tuple[int, int]]], kinds: Kinds, shape: tuple[int, int]
 ) -> NDArray[np.int32]:
-    """Kind of each cell from a plan with cells numbered from 1; -1 for none.
-
-    Raises:
-      ValueError: an unknown kind, or a cell that is outside or used twice.
-    """
+    """Kind of each cell from a plan with cells numbered from 1; -1 for none."""
     names = [name for name, _ in kinds]
     kind = np.full(shape, -1, np.int32)
     for name, cells in plan.items():
@@ -53,11 +49,7 @@ def stamps_of(kinds: Kinds) -> list[NDArray[np.int64]]:
 
 
 def planned(kind: NDArray[np.int32], kinds: Kinds) -> NDArray[np.int64]:
-    """Colours of a map of kinds: patches, and free cells elsewhere.
-
-    Raises:
-      ValueError: patches overlap with different colours, or make what the plan does not say.
-    """
+    """Colours of a map of kinds: patches, and free cells elsewhere; ValueError if patches conflict."""
     patches = stamps_of(kinds)
     colors = np.full((kind.shape[0] + 2, kind.shape[1] + 2), FREE)
     for row, column in np.argwhere(kind >= 0).tolist():
@@ -125,16 +117,7 @@ def placed(
     stamps: list[NDArray[np.int64]],
     codes: NDArray[np.int64],
 ) -> tuple[NDArray[np.int64], NDArray[np.int32]] | None:
-    """Patches in random cells with their kinds, or None if they do not fit.
-
-    Args:
-      random: draws the cells.
-      shape: of the map.
-      counts: how many cells of each kind.
-      distances: of each kind from objects.
-      num_objects: which are the first kinds.
-      stamps, codes: of the kinds.
-    """
+    """Patches in random cells with their kinds, or None if they do not fit."""
     rows, columns = shape
     colors = np.full((rows + 2, columns + 2), FREE)
     kind = np.full(shape, -1, np.int32)

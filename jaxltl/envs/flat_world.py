@@ -1,11 +1,9 @@
 """FlatWorld: a point among coloured discs on a square (Voloshin, Verma and Yue 2023).
 
-As the authors' program and that of Jackermeier and Abate (2025) have it: nine discs of seven
-colours in ``[-2, 2]^2``, some of which overlap, so that several colours may hold at once; a
-velocity in ``[-1, 1]^2`` moves the point by .08 of it; leaving the square ends the
-episode, with a reward of -1. The observation is the position, which determines the position of the discs,
-since they never move. Episodes begin anywhere outside of all discs, at one of very many places that
-were drawn so beforehand.
+As in the authors' program and in Jackermeier and Abate (2025): nine discs of seven colours in
+``[-2, 2]^2``, which may overlap; a velocity in ``[-1, 1]^2`` moves the point by .08 of it; leaving
+the square ends the episode with a reward of -1. The observation is the position. Initial positions
+are uniform outside of all discs, from a precomputed table.
 """
 
 from __future__ import annotations
@@ -55,12 +53,7 @@ _MOVES = (
 
 @brief
 class FlatState(NamedTuple):
-    """State of a flat world: `place` is ``float32[2]``.
-
-    Example:
-      >>> FlatState(np.zeros(2)).place.tolist()
-      [0.0, 0.0]
-    """
+    """State of a flat world: `place` is ``float32[2]``."""
 
     place: Any
 
@@ -73,7 +66,7 @@ class Discs:
     Attributes:
       center: ``float32[D, 2]``.
       radius: ``float32[D]``.
-      color: ``bool[D, P]``, the colour of each, as one of the propositions.
+      color: ``bool[D, P]``, the proposition of each disc, one-hot.
       extent: half a side of the square.
     """
 
@@ -99,20 +92,20 @@ def flat_world(
     Args:
       discs: ``(colour, x, y, radius)`` of each; the colours, sorted, are the propositions.
       extent: half a side of the square.
-      time_step: how far a velocity of one goes.
-      horizon: after how many steps an episode is truncated; None: never.
-      discrete: nine actions: up, right, down, left, the four diagonals, each with velocity one,
-        and rest; instead of a box.
-      start: where episodes begin; default uniform outside of all discs.
-      num_starts, seed: how many places are drawn for that, and from what.
+      time_step: distance of a step at velocity one.
+      horizon: number of steps after which an episode is truncated; None: never.
+      discrete: nine actions (up, right, down, left, the four diagonals, each with velocity one, and
+        rest) instead of a box.
+      start: the initial position; default: uniform outside of all discs.
+      num_starts, seed: size of the table of initial positions, and the seed of its drawing.
 
     Returns:
-      :class:`~jaxltl.core.environments.environment.Environment`, whose worlds are :class:`FlatState`,
-      or with a horizon pairs of one and the time. Observations are ``float32[2]``.
+      :class:`~jaxltl.core.environments.environment.Environment` with states :class:`FlatState`, or with
+      a horizon pairs of one and the time. Observations are ``float32[2]``.
 
     Raises:
-      ValueError: no disc, or one without a radius; numbers that are not positive; a start outside
-        of the square; or discs that hardly leave a place to begin.
+      ValueError: no disc, a number that is not positive, a start outside of the square, or discs that
+        leave hardly any initial position.
 
     Example:
       >>> world = flat_world()
@@ -172,13 +165,7 @@ def flat_world(
 
 
 def discs_of(environment: Environment) -> Discs:
-    """The discs of a flat world.
-
-    Args:
-      environment: of :func:`flat_world`.
-
-    Returns:
-      :class:`Discs`.
+    """The discs of an environment made by :func:`flat_world`.
 
     Example:
       >>> discs_of(flat_world(discs=[("red", 0.5, 0.0, 0.25)], start=[0, 0])).center.tolist()
@@ -190,15 +177,7 @@ def discs_of(environment: Environment) -> Discs:
 @brief
 @dataclass(frozen=True)
 class EventsAround:
-    """Observation encoder by events around the agent; made by :func:`events_around`.
-
-    Attributes:
-      events: of each its propositions, as Booleans.
-      discs: ``(x, y, radius, number of the colour)`` of each.
-      extent: half a side of the square.
-      radii: how far away one looks.
-      directions: into how many directions.
-    """
+    """Observation encoder by events around the agent; made by :func:`events_around`."""
 
     events: tuple[tuple[bool, ...], ...]
     discs: tuple[tuple[float, float, float, int], ...]
@@ -231,20 +210,15 @@ def events_around(
 ) -> EventsAround:
     """Egocentric event encoding from known discs: ``observation -> float[X, E]``.
 
-    It is a function of the place alone, since the discs never move, and contains the agent's own
-    place and of some around it which event holds there; outside of the square none does. For
+    It states which of the `events` ``bool[E, P]`` holds at the position and at distances `radii` in
+    evenly spaced `directions`; outside of the square none does. For
     :class:`~jaxltl.algos.many_tasks.SequenceNetwork`'s `events_seen`.
-
-    Args:
-      environment: a flat world.
-      events: ``bool[E, P]``, as the sequences have them.
-      radii, directions: how far away and into how many directions it looks.
 
     Returns:
       :class:`EventsAround`, a hashable function.
 
     Raises:
-      ValueError: events that do not fit the world, distances that are not positive, no direction.
+      ValueError: events of another shape, distances that are not positive, or no direction.
 
     Example:
       >>> world = flat_world()

@@ -25,28 +25,27 @@ def gridworld(
     wall: str = "#",
     initial: str | chex.Array | None = None,
 ) -> MDP:
-    """A labelled gridworld MDP with the actions up, down, left, right.
+    """Gridworld MDP with labels and the actions up, down, left, right.
 
-    State ``row * columns + column``, both from 0 at the top left. A move off the map or
-    into a wall stays. With probability `slip` a move goes to one of the two sides
-    instead, half each.
+    State ``row * columns + column``, both from 0 at the top left. A move off the map or into a wall
+    stays. With probability `slip` a move goes to one of the two sides instead, half each.
 
     Args:
       text: the map, see :func:`parse_map`.
       slip: probability in [0, 1] of moving sideways.
-      absorbing: propositions; cells where one holds are never left.
-      legend: the propositions of each kind of cell. Without one, ``.`` has none and
-        any other cell has the proposition of its name.
-      wall: the kind of cell that is not a place.
-      initial: where runs start, uniformly: a propositional formula over the labels
-        (``"!r & !y"``), or a distribution ``float[S]``; default every cell.
+      absorbing: propositions; cells where one holds are absorbing.
+      legend: the propositions of each kind of cell; default: ``.`` has none and any other cell has the
+        proposition of its name.
+      wall: the kind of cell that is a wall.
+      initial: a propositional formula over the labels (``"!r & !y"``), whose cells are equally likely,
+        or a distribution ``float[S]``; default: uniform over all cells.
 
     Returns:
       :class:`MDP` with ``rows * columns`` states and four actions.
 
     Raises:
-      ValueError: a malformed map, a cell that the legend lacks, a probability outside
-        [0, 1], an unknown proposition, or no initial cell.
+      ValueError: a malformed map, a cell that is missing in the legend, a probability outside [0, 1],
+        an unknown proposition, or no initial cell.
 
     Example:
       >>> world = gridworld("b . y", absorbing=["y"])

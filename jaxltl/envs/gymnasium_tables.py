@@ -19,25 +19,21 @@ def from_gymnasium(
     labels: Mapping[str, Sequence[int]] | None = None,
     initial: ArrayLike | None = None,
 ) -> SparseMDP:
-    """The MDP of an environment's transition table.
+    """The MDP of the transition table of a Gymnasium environment.
 
-    `env.unwrapped.P[s][a]` lists branches ``(probability, next state, reward, terminated)``. A
-    branch that terminates goes to a separate absorbing state, so that nothing is earned or
-    visited after the end: states from S on, one for each state in which an episode can end,
-    labelled ``"terminated"`` and with the labels of that state. Branches of a row to one state
-    become one, with their probabilities' sum and their rewards' mean. A limit on the number of
-    steps is not in the table, and is left out.
+    `env.unwrapped.P[s][a]` lists branches ``(probability, next state, reward, terminated)``. A branch
+    that terminates leads to an added absorbing state without reward: states from S on, one for each
+    state in which an episode can end, labelled ``"terminated"`` and with the labels of that state.
+    Limits on the number of steps are not in the table.
 
     Args:
-      env: an environment, or the id of one, which takes the package gymnasium.
+      env: an environment, or its id, for which the package gymnasium is needed.
       labels: propositions, each with the states where it holds.
-      initial: ``float[S]``; default the environment's `initial_state_distrib`, or uniform if it has
-        none.
+      initial: ``float[S]``; default: the environment's `initial_state_distrib`, or uniform.
 
     Returns:
       A :class:`~jaxltl.core.models.sparse.SparseMDP` with the reward ``"reward"`` on transitions,
-      the environment's actions by number, and `valuation` ``"state"``, the environment's state (the
-      one in which the episode ended, of the added states).
+      the environment's actions by number, and the variable ``"state"``, the environment's state.
 
     Raises:
       ValueError: the environment has no table, or the table is malformed: naming state and action.

@@ -1,15 +1,12 @@
 """LetterWorld: letters on a torus of cells (Vaezipoor et al. 2021, section 5.1).
 
-As published there and used by Jackermeier and Abate (2025, appendix): 7 x 7 cells whose opposite
-sides are joined, each of 12 letters on two of them, four moves that always succeed, and 75 steps.
-Each episode has a new map. The agent starts on an empty cell from which every cell is reachable
-across empty ones, so that no task has to step on a letter that it does not name. What is seen is
-the map with the agent in its middle: one plane for each letter, and one for the agent.
+As used by Jackermeier and Abate (2025, appendix): 7 x 7 cells on a torus, each of 12 letters on two
+of them, four moves that always succeed, and 75 steps. Each episode has a new map, with an initial
+empty cell from which every cell is reachable across empty ones.
 
-Two readings. There the agent starts in the upper left corner; here in any empty cell, which on a
-torus that is seen from the agent is the same. And which cells of a map have letters is drawn from a
-table that was drawn once, with all its turns and reflections, while which letters they have is
-drawn anew: the published drawing tries 73 maps for each that it takes.
+Two readings. The agent starts in any empty cell instead of the upper left one, which on a torus
+seen from the agent is the same. And the cells with letters come from a precomputed table with its
+symmetries, while their letters are drawn anew: the published drawing rejects 72 of 73 maps.
 """
 
 from __future__ import annotations
@@ -42,17 +39,12 @@ _NAMES = "abcdefghijklmnopqrstuvwxyz"
 
 @brief
 class LetterState(NamedTuple):
-    """State of a letter world: a map and a place.
+    """State of a letter world.
 
     Attributes:
-      letter: ``int8[C]``, the number of each cell's letter, or that of the letters for none; cells
+      letter: ``int8[C]``, the number of each cell's letter, or the number of letters for none; cells
         are counted row by row from the upper left.
       place: ``int32[]``, the agent's cell.
-
-    Example:
-      >>> here = LetterState(np.array([0, 1, 1, 1], np.int8), 3)
-      >>> int(here.letter[here.place])  # of one letter: none
-      1
     """
 
     letter: Any
@@ -75,31 +67,29 @@ def letter_world(
     """LetterWorld with a random map per episode, or with a given map.
 
     Actions are up, down, left and right; there is no reward. Observations are ``float32[size, size,
-    letters + 1]`` of zeros and ones, rolled so that the agent is in the middle, which is what the
-    last plane says.
+    letters + 1]``: a plane for each letter, centred at the agent, and one for the agent.
 
     Args:
-      size: cells a side.
-      letters: how many there are, named a, b, c, ...; or their names.
-      copies: how many cells each letter has.
-      horizon: after how many steps an episode is truncated; None: never.
+      size: cells along a side.
+      letters: the number of letters, named a, b, c, ...; or their names.
+      copies: the number of cells of each letter.
+      horizon: number of steps after which an episode is truncated; None: never.
       layout: the map of every episode: a text (see :func:`~jaxltl.envs.text_map.parse_map`) with
-        ``.`` for empty cells, or ``int[size, size]``, numbers of letters, -1 for none. It decides
-        the size, and by the letters in it what `letters` must at least have.
-      start: the cell in which a given layout is begun; default any that is empty.
-      connected: draw maps whose cells are all reachable across empty ones.
-      flat: observations as one axis.
-      num_maps: how many sets of cells are drawn, for connected maps; each has eight turns and
-        reflections, and ``(letters * copies)! / copies!^letters`` ways to be lettered.
-      seed: of that drawing.
+        ``.`` for empty cells, or ``int[size, size]``, numbers of letters, -1 for none. It determines
+        the size.
+      start: the initial cell in a given layout; default: any empty one.
+      connected: draw maps in which all cells are reachable across empty ones.
+      flat: flatten the observations.
+      num_maps: the number of sets of cells in the table of connected maps, before symmetries.
+      seed: of the drawing of the table.
 
     Returns:
-      :class:`~jaxltl.core.environments.environment.Environment`, whose worlds are :class:`LetterState`,
-      or with a horizon pairs of one and the time.
+      :class:`~jaxltl.core.environments.environment.Environment` with states :class:`LetterState`, or
+      with a horizon pairs of one and the time.
 
     Raises:
-      ValueError: letters that do not fit on the map, a malformed layout, a start that is no cell,
-        or too few connected maps of such a size.
+      ValueError: letters that do not fit on the map, a malformed layout, an invalid start, or too few
+        connected maps of this size.
 
     Example:
       >>> world = letter_world()
@@ -199,19 +189,9 @@ def _given(
 
 
 def connected_cells(size: int, used: int, count: int, seed: int = 0) -> np.ndarray:
-    """``bool[count, C]``: uniform sets of `used` cells whose complement is connected.
+    """Uniform sets of `used` cells of the torus whose complement is connected, ``bool[count, C]``.
 
-    From any cell that is not in the set every cell of the torus is reached through such cells;
-    those of the set are where ways may end.
-
-    Args:
-      size: cells a side.
-      used: how many cells are in a set.
-      count: how many sets.
-      seed: of the drawing.
-
-    Raises:
-      ValueError: such sets are so rare that they are not found.
+    Every cell is reachable through cells outside of the set; ValueError if such sets are too rare.
 
     Example:
       >>> sets = connected_cells(4, 3, 2)
@@ -231,10 +211,7 @@ def connected_cells(size: int, used: int, count: int, seed: int = 0) -> np.ndarr
 
 
 def is_connected(used: np.ndarray) -> np.ndarray:
-    """``bool[N]`` of sets of cells ``bool[N, size, size]``, see :func:`connected_cells`.
-
-    Args:
-      used: the sets.
+    """``bool[N]``, the condition of :func:`connected_cells` for sets ``bool[N, size, size]``.
 
     Example:
       >>> is_connected(np.array([[[1, 0], [0, 0]], [[0, 1], [1, 0]]], bool)).tolist()
@@ -255,8 +232,7 @@ def is_connected(used: np.ndarray) -> np.ndarray:
 
 
 def _orders(maps: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Symmetries of the torus: letter of each cell (the last number: none), and all empty
-    cells."""
+    """Letter slots of the cells (the last number: none) and empty cells, of all symmetric maps."""
     grids = maps.reshape(-1, size, size)
     turned = [np.rot90(grids, k, (1, 2)) for k in range(4)]
     every = np.concatenate(turned + [x.transpose(0, 2, 1) for x in turned]).reshape(-1, size * size)
@@ -342,8 +318,10 @@ def _labels(numbers: chex.Array, world: LetterState) -> jax.Array:
 
 
 def events_seen(observation: jax.Array) -> jax.Array:
-    """``float[size, size, letters + 1]``: one-hot events of the cells of an observation, the one without
-    a letter first, as :func:`~jaxltl.core.environments.sequence_task.make_events` numbers them.
+    """One-hot events of the cells of an observation, ``float32[size, size, letters + 1]``.
+
+    The event without a letter is first, as in
+    :func:`~jaxltl.core.environments.sequence_task.make_events`.
 
     Example:
       >>> world = letter_world(size=2, letters=["x"], copies=1, connected=False)

@@ -1,11 +1,11 @@
 """The linear-quadratic regulator with bounded controls (dissertation, section 4.5.1).
 
-``x_(t+1) = A x_t + B u_t`` from a given state; the cost ``J = sum_t x_(t+1)' Q x_(t+1) + u_t' R
-u_t`` is to be small while ``low <= u_t <= high``. The policy is a network that reads the state.
+``x_(t+1) = A x_t + B u_t``; the cost ``J = sum_t x_(t+1)' Q x_(t+1) + u_t' R u_t`` is minimised
+subject to ``low <= u_t <= high``. The policy is a network that reads the state.
 
-Two readings. The dissertation minimises J in a method that maximises a positive number G: here
-``G = exp(-J / scale)``, of which the logarithm is returned. And its constraint, written ``1 -
-max_t max(low - u_t, u_t - high, 0) >= 1``, is here that the largest violation is at most 0.
+Two readings: the dissertation maximises a positive number G, here ``G = exp(-J / scale)``, of which
+the logarithm is returned; and the constraint, there ``1 - max_t max(low - u_t, u_t - high, 0) >=
+1``, is here that the largest violation is at most 0.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class LQR:
       state_cost, control_cost: Q ``float[n, n]`` and R ``float[m, m]``.
       low, high: ``float[m]``, bounds of the controls.
       start: ``float[n]``.
-      scale: what J is divided by in the objective.
+      scale: the unit of J in the objective.
       horizon: N, the number of controls; static.
     """
 
@@ -52,7 +52,7 @@ class LQR:
 
 @brief
 class Run(NamedTuple):
-    """A trajectory of a policy, with lanes of parameters as last axes.
+    """A trajectory of a policy; axes of lanes of parameters are last.
 
     Attributes:
       state: ``float[N + 1, n]``.
@@ -104,14 +104,10 @@ def lqr(
       low, high: ``[m]``, or one bound for all controls.
       start: ``[n]``.
       horizon: N.
-      scale: what J is divided by in the objective; default J without any control, if that is
-        positive, else 1.
-
-    Returns:
-      :class:`LQR`.
+      scale: the unit of J in the objective; default: J of zero controls if positive, else 1.
 
     Raises:
-      ValueError: shapes that do not fit, costs that are not definite, or bounds the wrong way.
+      ValueError: incompatible shapes, costs that are not definite, or low above high.
 
     Example:
       >>> world = lqr()
@@ -156,22 +152,14 @@ def _check_definite(q: np.ndarray, r: np.ndarray) -> None:
 
 
 def evaluator(world: LQR, network: Network | str = "2-2-1") -> jax.tree_util.Partial:
-    """``evaluate(parameters, key) -> (objective, cost)`` of a policy.
+    """The function ``evaluate(parameters, key) -> (objective, cost)`` of policies of a `network`.
 
-    The objective is ``log G = -J / scale``, and the cost the largest violation of the bounds:
-    feasible is a cost of at most 0. Nothing is random; the key is not read. A run that leaves
-    the range of its numbers has the objective ``-inf`` and the cost ``inf``.
-
-    Args:
-      world: from :func:`lqr`, which travels as an argument.
-      network: from the n states to the m controls; or its sizes, then with biases.
-
-    Returns:
-      A pytree. ``evaluate(float[D], key)`` gives two scalars; under any number of ``vmap`` over
-      parameters, all of them become one last axis of every array.
+    The objective is ``log G = -J / scale``, the cost the largest violation of the bounds. Nothing is
+    random. After an overflow they are ``-inf`` and ``inf``. Under any number of ``vmap`` over
+    parameters ``float[D]``, all of them become one last axis of every array.
 
     Raises:
-      ValueError: a network with other inputs or outputs.
+      ValueError: a network whose inputs and outputs are not those of `world`.
 
     Example:
       >>> evaluate = evaluator(lqr(), "2-2-1")
@@ -202,18 +190,12 @@ def _evaluate(
 
 
 def simulate(world: LQR, network: Network | str, parameters: jax.Array) -> Run:
-    """Trajectories of one or many policies.
+    """The trajectories of one or many policies.
 
     Args:
       world: from :func:`lqr`.
       network: from the n states to the m controls; or its sizes, then with biases.
       parameters: ``float[D]``, or ``float[D, lanes]`` with any number of axes of lanes.
-
-    Returns:
-      :class:`Run`, with the lanes as last axes. Under ``jit`` and ``vmap``; differentiable.
-
-    Raises:
-      ValueError: a network with other inputs or outputs.
 
     Example:
       >>> run = simulate(lqr(), "2-2-1", jnp.zeros(9))
@@ -237,8 +219,7 @@ def _simulate(network: Network, world: LQR, parameters: jax.Array) -> Run:
 
 
 def _plain(network: Network, world: LQR, parameters: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """J and the violation only. The loop is not unrolled: unrolling was up to a hundred times slower,
-    since whole chains of steps were then computed again for every number that they lead to."""
+    """J and the violation. Unrolled loops were up to a hundred times slower (steps are recomputed)."""
     world = _as(world, parameters)
     _, total, violation = lax.fori_loop(
         0,
@@ -325,7 +306,7 @@ class Plant(NamedTuple):
     Attributes:
       state: ``float[n]``.
       violation: the largest so far.
-      time: ``int32[]``, steps made.
+      time: ``int32[]``, the number of steps made.
 
     Example:
       >>> begun = as_environment(lqr()).reset(None)
@@ -339,17 +320,10 @@ class Plant(NamedTuple):
 
 
 def as_environment(world: LQR, dtype: Any = None) -> Environment:
-    """The regulator as an environment, whose episodes terminate after N controls.
+    """The regulator `world` as an environment with numbers of a `dtype`, terminated after N controls.
 
-    Rewards add up to -J, and costs, by how much each step raises the largest violation of the
-    bounds, to the largest violation. Controls are not bounded otherwise, and states are observed.
-
-    Args:
-      world: from :func:`lqr`, which travels as an argument.
-      dtype: of all numbers; default JAX's.
-
-    Returns:
-      The environment.
+    Rewards add up to -J, and costs, the increments of the largest violation, to the violation. States
+    are observed; controls are unbounded.
 
     Example:
       >>> plant = as_environment(lqr())
@@ -392,17 +366,10 @@ def _controlled(world: LQR, plant: Plant, control: jax.Array, key: Any) -> Times
 
 
 def optimum(world: LQR) -> Optimum:
-    """Optimal control sequence over all policies, and its cost.
+    """The optimal control sequence of a `world` over all policies, and its cost, in float64.
 
     With the states written in terms of the controls, J is a sum of squares ``|M u + c|^2`` under
-    bounds: a strictly convex problem, solved by an active-set method (Stark and Parker 1995)
-    that ends exactly up to rounding. On the host, in float64.
-
-    Args:
-      world: from :func:`lqr`.
-
-    Returns:
-      :class:`Optimum`.
+    bounds: a strictly convex problem, solved by an active-set method (Stark and Parker 1995).
 
     Raises:
       ValueError: the method did not finish.

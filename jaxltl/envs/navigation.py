@@ -1,14 +1,12 @@
 """Navigation of a robot with local sensors to a goal (dissertation, section 4.5.2).
 
-The robot has a position and a heading ``(x, y, heading)``; an action is a speed and a turn.
-In a step it goes ``speed * time_step`` along its heading, stopped by the bounds of the map, and
-then turns. Obstacles do not stop it: to stay clear of them is a matter of the task. What the
-robot reads are the labels of points on circles around it (1 in the goal, -1 in the obstacle, 0
-elsewhere), seen from its heading, and the direction of the goal's centre.
+The state is ``(x, y, heading)``, the action a speed and a turn: a step moves by
+``speed * time_step`` along the heading, up to the bounds of the map, and then turns. Obstacles do
+not stop the robot. Observations are labels of points on circles around it (1 in the goal, -1 in the
+obstacle, else 0), in its own frame, and the direction of the goal's centre.
 
-A trajectory has N states, of which the first is the start, and N actions, of which the last
-has no effect. The four tasks of table 4 are functions of its states; objectives J are to be
-large on average, costs Z at most the task's limit:
+A trajectory has N states, of which the first is the initial one, and N actions, of which the last
+has no effect. Table 4 has four tasks with objectives J, to be maximised, and costs Z:
 
 ====  =========================================  ==================================  =====
 task  J                                          Z                                   limit
@@ -58,9 +56,9 @@ class Navigation:
 
     Attributes:
       goal, obstacle, bounds: boxes.
-      start: the box of the first positions; headings are anything.
+      start: the box of the initial positions; headings are uniform.
       speed, turn: the largest speed, and the largest turn in one step, in radians.
-      time_step: of a step.
+      time_step: duration of a step.
       offset: ``float[M, 2]``, the sensor's points, ahead being (1, 0).
       strip: ``float[2]``, the least and largest y that earn ``2 |y|``.
       weight: of the distance in tasks 2 and 3.
@@ -138,17 +136,12 @@ def navigation(
 
     Args:
       goal, obstacle, bounds, start: boxes, each the lower left and the upper right corner.
-      speed, turn, time_step: see :class:`Navigation`.
       radii: of the sensor's circles.
       num_directions: points on each circle, evenly spaced, the first ahead.
-      strip, weight: of the tasks, see :class:`Navigation`.
-      horizon: N.
-
-    Returns:
-      :class:`Navigation`.
+      speed, turn, time_step, strip, weight, horizon: see :class:`Navigation`.
 
     Raises:
-      ValueError: a box or range the wrong way round, or a size that is not positive.
+      ValueError: an empty box or range, or a size that is not positive.
 
     Example:
       >>> world = navigation()
@@ -190,14 +183,9 @@ def _box(name: str, corners: ArrayLike) -> np.ndarray:
 
 
 def policy_network(world: Navigation, hidden: Sequence[int] = (30, 30)) -> Network:
-    """The dissertation's policy network: ReLU layers with biases, tanh to speed and turn.
+    """The policy network of the dissertation for a `world`: ReLU layers, tanh to speed and turn.
 
-    Args:
-      world: from :func:`navigation`.
-      hidden: the widths of the hidden layers.
-
-    Returns:
-      :class:`~jaxltl.envs.networks.Network`.
+    `hidden` are the widths of the hidden layers.
 
     Example:
       >>> policy_network(navigation()).sizes
@@ -212,16 +200,9 @@ def policy_network(world: Navigation, hidden: Sequence[int] = (30, 30)) -> Netwo
 def start_states(
     world: Navigation, key: chex.PRNGKey, shape: tuple[int, ...] = (), dtype: Any = None
 ) -> State:
-    """Initial states, uniform in the start box and in the heading.
+    """The initial states: uniform in the start box of `world` and in the heading.
 
-    Args:
-      world: from :func:`navigation`.
-      key: a PRNG key, consumed.
-      shape: of the arrays.
-      dtype: of the numbers; default JAX's.
-
-    Returns:
-      :class:`State`, arrays of that shape.
+    They are drawn from `key`, as arrays of a `shape` and a `dtype` (default: JAX's).
 
     Example:
       >>> drawn = jax.eval_shape(
@@ -237,15 +218,9 @@ def start_states(
 
 
 def move(world: Navigation, state: State, action: jax.Array) -> State:
-    """The next state: forward along the heading, then the turn.
+    """The next `state` in a `world`: forward along the heading, then the turn.
 
-    Args:
-      world: from :func:`navigation`.
-      state: arrays ``float[...]``.
-      action: ``float[..., 2]``, speed and turn as shares of the largest; limited to [-1, 1].
-
-    Returns:
-      The next state, of the same shape.
+    The `action` is ``float[..., 2]``, speed and turn as shares of the largest, clipped to [-1, 1].
 
     Example:
       >>> state = move(navigation(), State(*jnp.array([3.75, 0.0, 0.0])), jnp.array([1.0, -3.0]))
@@ -272,18 +247,10 @@ def _wrapped(angle: jax.Array) -> jax.Array:
 
 
 def observe(world: Navigation, state: State) -> jax.Array:
-    """Sensor readings of the robot.
+    """The sensor readings of the robot in a `state` of a `world`, ``float[..., M + 2]``.
 
-
-    The labels of the M points, circle by circle, and then the direction of the goal's centre as
-    ahead and to the left, a vector of length 1 (of zeros in the centre itself).
-
-    Args:
-      world: from :func:`navigation`.
-      state: arrays ``float[...]``.
-
-    Returns:
-      ``float[..., M + 2]``. Differentiable in the directions.
+    The labels of the M points, circle by circle, and then the direction of the goal's centre (ahead, to
+    the left) as a unit vector, or zeros in the centre. Differentiable in the direction.
 
     Example:
       >>> seen = observe(navigation(), State(*jnp.array([1.0, 1.5, 0.0])))
@@ -321,14 +288,7 @@ def _as(world: Navigation, like: jax.Array) -> Navigation:
 
 
 def labels(world: Navigation, state: State) -> jax.Array:
-    """Truth of :data:`PROPOSITIONS`; boxes are closed.
-
-    Args:
-      world: from :func:`navigation`.
-      state: arrays ``float[...]``.
-
-    Returns:
-      ``bool[..., 2]``.
+    """The labels :data:`PROPOSITIONS` of a `state` of a `world`, ``bool[..., 2]``; boxes are closed.
 
     Example:
       >>> labels(navigation(), State(*jnp.array([2.0, 1.5, 0.0]))).tolist()
@@ -341,14 +301,7 @@ def labels(world: Navigation, state: State) -> jax.Array:
 
 
 def obstacle_distance(world: Navigation, state: State) -> jax.Array:
-    """The signed distance from the obstacle, negative inside.
-
-    Args:
-      world: from :func:`navigation`.
-      state: arrays ``float[...]``.
-
-    Returns:
-      ``float[...]``. Differentiable.
+    """The signed distance of a `state` from the obstacle of a `world`, negative inside; differentiable.
 
     Example:
       >>> x, y = jnp.array([4.0, -3.0, 0.5]), jnp.array([6.0, 1.0, 1.0])
@@ -366,14 +319,7 @@ def obstacle_distance(world: Navigation, state: State) -> jax.Array:
 
 
 def reward(world: Navigation, state: State) -> jax.Array:
-    """Contribution of one state to J in tasks 1 and 4.
-
-    Args:
-      world: from :func:`navigation`.
-      state: arrays ``float[...]``.
-
-    Returns:
-      ``float[...]``.
+    """The contribution of a `state` to J in tasks 1 and 4 of a `world`, ``float[...]``.
 
     Example:
       >>> x = jnp.array([2.0, 0.0, 0.0])
@@ -386,15 +332,12 @@ def reward(world: Navigation, state: State) -> jax.Array:
 
 
 def scores(world: Navigation, state: State, task: int) -> tuple[jax.Array, jax.Array]:
-    """Objective J and cost Z of trajectories in one of the four tasks.
+    """The objective J and cost Z of trajectories in one of the four tasks, ``float[...]`` each.
 
     Args:
       world: from :func:`navigation`.
-      state: arrays ``float[..., N]``.
-      task: static; what differs in task 1, that the goal is not left, is up to the states.
-
-    Returns:
-      Two arrays ``float[...]``.
+      state: arrays ``float[..., N]``; of task 1 with the goal absorbing.
+      task: static.
 
     Raises:
       ValueError: an unknown task.
@@ -430,21 +373,16 @@ def simulate(
     num_trajectories: int = 10,
     absorbing: bool = False,
 ) -> Run:
-    """Trajectories of a policy.
+    """The trajectories of a policy; differentiable in its parameters.
 
     Args:
       world: from :func:`navigation`.
-      network: from the observations to two shares, see :func:`policy_network`.
-      parameters: ``float[D]``; they decide the precision.
-      key: decides the first states, the only chance there is.
+      network: from the observations to two shares, see :func:`policy_network`; ValueError for other
+        sizes.
+      parameters: ``float[D]``, in the precision of the simulation.
+      key: of the initial states; nothing else is random.
       num_trajectories: M, static.
-      absorbing: whether the robot stays for ever where it enters the goal; static.
-
-    Returns:
-      :class:`Run`. Under ``jit`` and ``vmap``; differentiable in the parameters.
-
-    Raises:
-      ValueError: a network that does not fit.
+      absorbing: make the goal absorbing; static.
 
     Example:
       >>> world = navigation()
@@ -492,25 +430,21 @@ def evaluator(
     num_trajectories: int = 10,
     absorbing: bool | None = None,
 ) -> jax.tree_util.Partial:
-    """``evaluate(parameters, key) -> (objective, cost)`` of a policy, means over trajectories.
+    """The function ``evaluate(parameters, key) -> (objective, cost)``, means over trajectories.
 
-    The objective is the mean of J, as a logarithm of G to be divided by a temperature (such as
-    the horizon): J reaches 120, where ``exp(J)`` overflows in float32.
+    The objective is the mean of J, as a logarithm of G to be divided by a temperature such as the
+    horizon, since ``exp(J)`` overflows in float32.
 
     Args:
-      world: from :func:`navigation`, which travels as an argument.
-      task: 1 to 4; or a function ``(world, run) -> (J float[M], Z float[M] or [M, C])`` of the M
-        trajectories, which may be a ``jax.tree_util.Partial`` with arrays.
+      world: from :func:`navigation`.
+      task: 1 to 4; or a function ``(world, run) -> (J float[M], Z float[M] or [M, C])``, which may be a
+        ``jax.tree_util.Partial`` with arrays.
       network: default :func:`policy_network`.
       num_trajectories: M.
-      absorbing: whether the goal is never left; default only in task 1.
-
-    Returns:
-      A pytree. ``evaluate(float[D], key)`` gives a scalar and a scalar or ``float[C]``. Under
-      ``vmap`` over policies, a step is one product of matrices for each policy and layer.
+      absorbing: make the goal absorbing; default: only in task 1.
 
     Raises:
-      ValueError: an unknown task, a network that does not fit, or no trajectories.
+      ValueError: an unknown task, a network of other sizes, or no trajectories.
 
     Example:
       >>> world = navigation()

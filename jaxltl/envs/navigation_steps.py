@@ -1,9 +1,8 @@
 """The navigation tasks as environments with a reward in every step.
 
-:mod:`~jaxltl.envs.navigation` scores whole trajectories. Here each step pays what its state adds:
-rewards and costs are the increments of J and Z along the trajectory, so that their sums are J and
-Z exactly, for all four tasks. Where J or Z is not Markovian, what the increment depends on (the
-least distance so far, what was visited) is carried along, but the robot does not read it.
+Rewards and costs are the increments of J and Z of :mod:`~jaxltl.envs.navigation` along the
+trajectory, so that their sums are J and Z for all four tasks. The state includes the quantities on
+which increments depend (least distance so far, visits); observations do not.
 """
 
 from __future__ import annotations
@@ -26,11 +25,11 @@ class Place(NamedTuple):
     """State of the environment, in scalars.
 
     Attributes:
-      state: where the robot is; it has not been paid for this yet.
-      first: whether it is the first state.
+      state: of the robot; its increments are paid in the next step.
+      first: True in the first state.
       nearest: the least distance from the obstacle before it.
-      goal, obstacle: whether they were visited before it.
-      time: steps made.
+      goal, obstacle: True if visited before it.
+      time: the number of steps made.
 
     Example:
       >>> task = as_environment(nav.navigation(), 1)
@@ -58,22 +57,17 @@ class _Settings:
 def as_environment(
     world: Navigation, task: int, *, absorbing: bool | None = None, dtype: Any = None
 ) -> Environment:
-    """One of the four tasks as an environment; an episode takes ``world.horizon`` steps.
+    """An environment of one of the four tasks, with episodes of ``world.horizon`` steps.
 
-    A step pays for the state that it leaves, so that N steps pay for the N states that
-    :func:`~jaxltl.envs.navigation.scores` counts, the first included; the last action has no
-    effect. Nothing comes after: an episode is terminated then, and never before. What is read is
-    as for :func:`~jaxltl.envs.navigation.observe`, actions are speed and turn as shares of the
-    largest, and the propositions are goal and obstacle.
+    A step pays for the state that it leaves, so that N steps pay for the N states of
+    :func:`~jaxltl.envs.navigation.scores`; the last action has no effect, and the episode is then
+    terminated. Observations are those of :func:`~jaxltl.envs.navigation.observe`.
 
     Args:
-      world: from :func:`~jaxltl.envs.navigation.navigation`, which travels as an argument.
+      world: from :func:`~jaxltl.envs.navigation.navigation`.
       task: 1 to 4; another one does not recompile.
-      absorbing: whether the robot stays for ever where it enters the goal; default only in task 1.
-      dtype: of all numbers; default JAX's.
-
-    Returns:
-      The environment; its worlds are :class:`Place`.
+      absorbing: make the goal absorbing; default: only in task 1.
+      dtype: of all numbers; default: JAX's.
 
     Raises:
       ValueError: an unknown task.

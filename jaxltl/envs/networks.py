@@ -1,9 +1,8 @@
 """Small fully connected networks on flat parameter vectors, for populations of policies.
 
-A policy is a vector ``float[D]``, as a search that samples policies needs it. Two ways to apply
-it: :func:`apply` for one policy and many inputs, as products of matrices, to be mapped over
-policies by ``vmap``; and :func:`apply_lanes`, whose arrays all have the policies, the *lanes*,
-last, for networks of a few nodes, where whole rows of lanes are far faster than tiny products.
+A policy is a vector ``float[D]``. :func:`apply` evaluates one policy on many inputs, and is mapped
+over policies by ``vmap``; :func:`apply_lanes` has the policies, the *lanes*, as last axes, which
+is far faster for networks of a few nodes.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ class Network:
     Attributes:
       sizes: the inputs, the nodes of each hidden layer, and the outputs.
       hidden, output: names of activations, see :data:`ACTIVATIONS`.
-      biases: whether the layers have biases.
+      biases: True if the layers have biases.
     """
 
     sizes: tuple[int, ...] = struct.field(pytree_node=False)
@@ -70,12 +69,8 @@ def make_network(
 
     Args:
       sizes: such as ``"2-10-10-1"`` or ``(2, 10, 10, 1)``: inputs, hidden layers, outputs.
-      hidden: the activation of the hidden layers, ``"relu"``, ``"tanh"`` or ``"identity"``.
-      output: that of the last layer.
-      biases: whether each layer adds a bias to each of its nodes.
-
-    Returns:
-      :class:`Network`.
+      hidden, output: the activations, ``"relu"``, ``"tanh"`` or ``"identity"``.
+      biases: add a bias to each node.
 
     Raises:
       ValueError: fewer than two sizes, a size below 1, or an unknown activation.
@@ -100,14 +95,7 @@ def make_network(
 
 
 def num_parameters(sizes: Sequence[int], biases: bool = True) -> int:
-    """``sum_l (n_l + [biases]) * n_(l+1)``, the number of parameters.
-
-    Args:
-      sizes: of the layers, from the inputs on.
-      biases: whether the layers have them.
-
-    Returns:
-      D.
+    """The number of parameters of layers of `sizes`, ``sum_l (n_l + [biases]) * n_(l+1)``.
 
     Example:
       >>> num_parameters((62, 30, 30, 2))
@@ -122,12 +110,10 @@ Layers = list[tuple[jax.Array, jax.Array | None]]
 def layers(network: Network, parameters: jax.Array) -> Layers:
     """The weights ``[inputs, outputs, lanes]`` and biases ``[outputs, lanes]`` of each layer.
 
-    A parameter vector is, layer by layer, the weights row by row (a row for each input) and
-    then the biases.
-
     Args:
       network: from :func:`make_network`.
-      parameters: ``float[D, lanes]``, with any number of axes of lanes.
+      parameters: ``float[D, lanes]``, with any number of axes of lanes: layer by layer, the weights row
+        by row (a row for each input) and then the biases.
 
     Returns:
       A pair for each layer; without biases the second is None.
@@ -157,18 +143,10 @@ def layers(network: Network, parameters: jax.Array) -> Layers:
 
 
 def apply(network: Network, parameters: jax.Array, inputs: jax.Array) -> jax.Array:
-    """Output of one network, ``a(h(x W_1 + b_1) ... W_n + b_n)``.
+    """The output of one `network`, ``a(h(x W_1 + b_1) ... W_n + b_n)``: ``float[..., O]``.
 
-    Args:
-      network: from :func:`make_network`.
-      parameters: ``float[D]``, see :func:`layers`.
-      inputs: ``float[..., I]``.
-
-    Returns:
-      ``float[..., O]``. Under ``jit`` and ``vmap``; differentiable in the arrays.
-
-    Raises:
-      ValueError: shapes that do not fit the network.
+    `parameters` are ``float[D]``, see :func:`layers`, and `inputs` ``float[..., I]``; differentiable in
+    both.
 
     Example:
       >>> clip = make_network("1-2-1")  # relu(x + 1) - relu(x - 1) - 1
@@ -180,20 +158,12 @@ def apply(network: Network, parameters: jax.Array, inputs: jax.Array) -> jax.Arr
 
 
 def apply_layers(network: Network, parts: Layers, inputs: jax.Array) -> jax.Array:
-    """:func:`apply` with parameters split by :func:`layers`.
+    """The :func:`apply` of a `network` to `inputs`, with parameters split by :func:`layers` into `parts`.
 
-    For loops: inside of one the parameters of many policies would be copied in every pass.
-
-    Args:
-      network: from :func:`make_network`.
-      parts: from :func:`layers`, without lanes.
-      inputs: ``float[..., I]``.
-
-    Returns:
-      ``float[..., O]``.
+    For loops: inside of one, the parameters of many policies would be copied in every pass.
 
     Raises:
-      ValueError: inputs or parts that do not fit the network.
+      ValueError: inputs or parts of another shape.
 
     Example:
       >>> double = make_network("1-1", biases=False)
@@ -213,17 +183,10 @@ def apply_layers(network: Network, parts: Layers, inputs: jax.Array) -> jax.Arra
 
 
 def padded(parts: Layers, multiple: int = 16) -> Layers:
-    """An equivalent network with hidden layers padded to multiples of the vector width.
+    """The network of `parts` with hidden layers padded to a `multiple` of the vector width.
 
-    The new nodes are zero, and so is what the next layer makes of them, with any activation that
-    is 0 at 0. For loops over small products of matrices.
-
-    Args:
-      parts: from :func:`layers`, without lanes.
-      multiple: of which the hidden layers' widths become multiples.
-
-    Returns:
-      A pair for each layer.
+    The new nodes are zero and have no effect, for activations that are 0 at 0. For loops over small
+    products of matrices.
 
     Example:
       >>> parts = layers(make_network("3-5-1"), jnp.ones(26))
@@ -241,18 +204,17 @@ def padded(parts: Layers, multiple: int = 16) -> Layers:
 
 
 def apply_lanes(network: Network, parameters: jax.Array, inputs: jax.Array) -> jax.Array:
-    """:func:`apply` with the axis of inputs first, and any axes of lanes last.
+    """The :func:`apply` of a `network` with the axis of inputs first, and any axes of lanes last.
 
     Args:
-      network: from :func:`make_network`.
       parameters: ``float[D, lanes]``, see :func:`layers`.
       inputs: ``float[I, ..., lanes]``: each lane's policy reads all inputs of its lane.
 
     Returns:
-      ``float[O, ..., lanes]``. Under ``jit`` and ``vmap``; differentiable in the arrays.
+      ``float[O, ..., lanes]``; differentiable in both.
 
     Raises:
-      ValueError: shapes that do not fit the network or one another.
+      ValueError: incompatible shapes.
 
     Example:
       >>> doubles_and_negates = jnp.array([[2.0, -1.0], [0.0, 0.0]])
@@ -283,17 +245,10 @@ def _activations(network: Network) -> list[Callable[[jax.Array], jax.Array]]:
 
 
 def weighted(weight: jax.Array, inputs: jax.Array) -> jax.Array:
-    """``sum_i w(i, o) x(i)`` in each lane, by an unrolled sum over i.
+    """The sums ``sum_i w(i, o) x(i)`` in each lane, unrolled over i.
 
-    A reduction over a leading axis would be compiled to a loop that jumps through memory; a sum
-    of rows is read in the order of memory, several lanes at once.
-
-    Args:
-      weight: ``float[I, O, lanes]``, its lanes as those of the inputs or 1.
-      inputs: ``float[I, lanes]``.
-
-    Returns:
-      ``float[O, lanes]``.
+    A reduction over a leading axis would be compiled to a loop with strided memory access. `weight` is
+    ``float[I, O, lanes]``, with the lanes of the `inputs` ``float[I, lanes]`` or 1.
 
     Example:
       >>> weighted(jnp.array([[1.0, 2.0], [3.0, 4.0]]), jnp.array([1.0, 10.0])).tolist()
@@ -309,22 +264,13 @@ def weighted(weight: jax.Array, inputs: jax.Array) -> jax.Array:
 
 
 def network_agent(network: Network, environment: Environment) -> Partial:
-    """``parameters float[D] -> Agent``: the policies of a network in an environment.
+    """The policies of a `network` in an `environment`: ``parameters float[D] -> Agent``, a pytree.
 
-    A network reads the observation as one vector. Its outputs are the action where that is a box,
-    the nearest one in it; else one number for each action, of which the largest of those that are
-    allowed is taken.
-
-    Args:
-      network: from :func:`make_network`.
-      environment: the environment of the agent.
-
-    Returns:
-      A function of parameters, a pytree, that gives an
-      :class:`~jaxltl.core.environments.episodes.Agent`.
+    The network reads the flattened observation. Its outputs are the action, clipped to the box, or one
+    number for each action, of which the largest allowed one is chosen.
 
     Raises:
-      ValueError: other inputs than the environment observes, or outputs than it has actions.
+      ValueError: sizes that do not fit the observations or the actions.
 
     Example:
       >>> from jaxltl import make_environment

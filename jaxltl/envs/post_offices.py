@@ -2,7 +2,7 @@
 
 The example of the dissertation's section 6.7. State ``(cell * 2 + light) * 2 + turn``: cells
 are numbered in rows from the upper left, 0 to 8; `light` is 1 where the light is on, and
-`turn` 1 where the system moves; so ``np.unravel_index(state, (9, 2, 2))`` takes a state apart.
+`turn` 1 where the system moves: the inverse of ``np.unravel_index(state, (9, 2, 2))``.
 """
 
 from __future__ import annotations
@@ -36,18 +36,12 @@ _ROUND = ((4, 5, 8, 7), (0, 3, 4, 1))
 
 
 def post_offices() -> Game:
-    """A robot on a 3 by 3 grid and a light, strictly in turns (dissertation, section 6.7).
+    """A game of a robot on a 3 by 3 grid against a light, in turns (dissertation, section 6.7).
 
-    The system moves to an adjacent cell; moves off the grid are not available, and neither
-    is staying. The environment then switches the light off or on, whichever it was. Where
-    the light is on, the upper left block of four cells is dangerous, else the lower right
-    one, see :func:`patrol_reward`. Runs start anywhere, the system to move.
-
-    Propositions: ``p1`` in the upper right cell and ``p2`` in the lower left, at both turns.
-
-    Returns:
-      A deterministic game with 36 states, numbered as this module says, and the actions
-      :data:`ACTIONS`.
+    The system moves to an adjacent cell; the environment then switches the light off or on. Where the
+    light is on, the upper left block of four cells is dangerous, else the lower right one, see
+    :func:`patrol_reward`. Initial states are uniform, the system to move. Propositions: ``p1`` in the
+    upper right cell and ``p2`` in the lower left, at both turns. The game is deterministic.
 
     Example:
       >>> game = post_offices()
@@ -82,15 +76,11 @@ def post_offices() -> Game:
 
 
 def surveillance() -> Automaton:
-    """Visit both post offices infinitely often: ``G F p1 & G F p2`` (dissertation, figure 17a).
+    """The deterministic Buchi automaton of ``G F p1 & G F p2`` in figure 17a of the dissertation.
 
-    A deterministic Buchi automaton that first waits in ``q1``; ``q2`` has seen p1 and waits
-    for p2, ``q3`` has seen p2 and waits for p1; ``q4``, in which both have been seen, is
-    accepting, and goes on like ``q1``. It differs from the translation of the formula in that
-    it takes the visits in either order.
-
-    Returns:
-      The automaton, of four states over p1 and p2.
+    ``q1`` waits for either visit, ``q2`` has seen p1, ``q3`` has seen p2, and ``q4``, in which both have
+    been seen, is accepting and continues like ``q1``. Unlike the translation of the formula, it takes
+    the visits in either order.
 
     Example:
       >>> automaton = surveillance()
@@ -108,21 +98,12 @@ def surveillance() -> Automaton:
 
 
 def patrol_reward(game: Any) -> jax.Array:
-    """Reward of the system for patrolling the dangerous block.
+    """The reward of the system for patrolling the dangerous block, ``float[S, A]``.
 
-
-    1 for a move into the block that the light marks as dangerous, and for a move inside it
-    that goes round it counterclockwise where the light is on, clockwise where it is off; else
-    0. The light is that of the state in which the system moves. (Dissertation, section 6.7,
-    which leaves open what a move inside the block against that sense is paid: here nothing,
-    since it does not enter.)
-
-    Args:
-      game: :func:`post_offices`, or a product of it, for which the reward has shape
-        ``[S, Q, A]``. Of ``restrict(game)`` it is the reward of `game` at ``base_state``.
-
-    Returns:
-      ``float[S, A]``.
+    1 for a move into the dangerous block, and for a move inside it that goes round it counterclockwise
+    where the light is on, clockwise where it is off; else 0, also for the moves inside in the other
+    sense, which the dissertation leaves open. `game` is :func:`post_offices`, or a product of it, for
+    which the reward is ``[S, Q, A]``; of ``restrict(game)`` take the rows at ``base_state``.
 
     Raises:
       ValueError: the game has other states.
@@ -167,7 +148,7 @@ class Patrol(NamedTuple):
     Attributes:
       game: an explicit game of all 144 states; runs start in any cell under any light, the
         system to move and the memory in q1. 108 states are reachable.
-      accepting: ``bool[144]``, to be met infinitely often: the memory is in q4.
+      accepting: ``bool[144]``, to be visited infinitely often: the memory is in q4.
       reward: ``float[144, 6]``.
       cell, light, memory: ``int32[144]``, see this module and :func:`surveillance`.
     """
@@ -183,11 +164,8 @@ class Patrol(NamedTuple):
 def patrol() -> Patrol:
     """The product of the post office game with the automaton of its task (dissertation, 6.7).
 
-    The automaton reads the label of the state that is left, at both turns. The system can
-    visit both post offices for ever from every state; the best patrol visits neither.
-
-    Returns:
-      :class:`Patrol`.
+    The automaton reads the label of the state that is left, at both turns. The task is won from every
+    state; the reward-optimal patrol visits neither post office.
 
     Example:
       >>> model = patrol()

@@ -1,8 +1,8 @@
 """Turn-based games of two robots on a grid, and a game whose reward conflicts with its task.
 
 State ``(environment * C + system) * 2 + turn``, where `environment` and `system` are the
-numbers of the robots' places, 0 to C - 1, and `turn` is 1 where the system moves; so
-``np.unravel_index(state, (C, C, 2))`` takes a state apart.
+robots' places, 0 to C - 1, and `turn` is 1 where the system moves: the inverse of
+``np.unravel_index(state, (C, C, 2))``.
 """
 
 from __future__ import annotations
@@ -32,27 +32,16 @@ _MOST = 181  # cells a side, so that 32 bits number the states
 
 
 def robots(size: int) -> Game:
-    """Two robots on a square grid, strictly in turns (dissertation, section 5.5).
+    """The game of two robots on a square grid, in turns (dissertation, section 5.5).
 
-    The system's robot goes to an adjacent cell or stays; the environment's goes to an
-    adjacent cell. A move off the grid is not available. Runs start in any two different
-    cells, the system to move. The robots can run into each other, so that there is
-    something to avoid, and move on from there.
-
-    Cells are numbered in rows from the lower left, so that `size` is the upward
-    neighbour of cell 0. Propositions: ``collision``; ``diagonal``, where the cells share
-    a corner alone; ``system_turn``; and each robot in each corner, such as
-    ``system_lower_left`` and ``environment_upper_right``.
-
-    Args:
-      size: cells along a side, at least 2.
-
-    Returns:
-      A deterministic game with ``2 * size**4`` states, numbered as this module says, and
-      the actions :data:`ACTIONS`.
+    The system's robot goes to an adjacent cell or stays; the environment's goes to an adjacent cell.
+    Initial states are uniform over pairs of different cells, the system to move. Cells are numbered in
+    rows from the lower left. Propositions: ``collision``; ``diagonal``, where the cells share a corner
+    alone; ``system_turn``; and each robot in each corner, such as ``system_lower_left``. The game is
+    deterministic, with ``2 * size**4`` states and the actions :data:`ACTIONS`.
 
     Raises:
-      ValueError: the size is not an integer of at least 2, or more than 32 bits number.
+      ValueError: `size` is not an integer of at least 2, or exceeds the range of 32 bits.
 
     Example:
       >>> game = robots(3)
@@ -95,34 +84,28 @@ def grid_game(
     legend: Mapping[str, Collection[str]] | None = None,
     wall: str = "#",
 ) -> Game:
-    """Two robots on a text map, strictly in turns.
+    """The game of two robots on a text map, in turns.
 
-    A robot moves up, down, left or right to a cell that is not a wall, or stays where that
-    is permitted; other moves are not available. With probability `slip` a move of the
-    system goes to one of the two sides instead, half each, and stays where that is blocked;
-    staying never slips, and neither does the environment.
-
-    Places, the cells that are not walls, are numbered in reading order, see :func:`places`.
-    Propositions: ``collision``; ``diagonal``, where the robots' cells share a corner alone;
-    ``system_turn``; and ``system_p`` and ``environment_p`` for each proposition p of the map.
+    A robot moves up, down, left or right to a cell that is not a wall, or stays where that is permitted;
+    other moves are unavailable. With probability `slip` a move of the system goes to one of the two
+    sides instead, half each, or stays if that is blocked. Places are the cells that are not walls, see
+    :func:`places`. Propositions: ``collision``, ``diagonal`` and ``system_turn`` as in :func:`robots`,
+    and ``system_p`` and ``environment_p`` for each proposition p of the map.
 
     Args:
       text: the map, see :func:`~jaxltl.envs.text_map.parse_map`.
-      system_start, environment_start: where the robots start: a propositional formula over
-        the map's propositions, or one cell's row and column, from 0 at the top left; default
-        anywhere. Runs start uniformly in the pairs of two different cells, the system to move.
+      system_start, environment_start: a propositional formula over the map's propositions, or a cell's
+        row and column, from 0 at the top left; default: any place. Initial states are uniform over
+        pairs of different cells, the system to move.
       slip: probability in [0, 1] of moving sideways.
-      system_stays, environment_stays: whether the robot may stay.
+      system_stays, environment_stays: permit the robot to stay.
       legend, wall: as in :func:`~jaxltl.envs.gridworld.gridworld`.
 
     Returns:
-      A game with ``2 * C**2`` states for C places, numbered as this module says, and the
-      actions :data:`ACTIONS`; deterministic without slip.
+      A game with ``2 * C**2`` states and the actions :data:`ACTIONS`; deterministic without slip.
 
     Raises:
-      ValueError: a bad map, legend or probability, a start in a wall, off the map or nowhere,
-        robots that can only start in one cell, or a place that a robot can neither leave nor
-        stay in.
+      ValueError: an invalid map, legend, probability or start, or a place without moves.
 
     Example:
       >>> game = grid_game('''
@@ -171,15 +154,7 @@ def grid_game(
 
 
 def places(text: str, *, wall: str = "#") -> np.ndarray:
-    """Row and column of each place of a map, in the order of their numbers.
-
-
-    Args:
-      text: the map, see :func:`~jaxltl.envs.text_map.parse_map`.
-      wall: the kind of cell that is not a place.
-
-    Returns:
-      ``int[C, 2]``, NumPy's.
+    """The row and column ``int[C, 2]`` of each place of the map `text`, all cells but `wall`.
 
     Example:
       >>> places("a#\\n.b").tolist()
@@ -189,20 +164,10 @@ def places(text: str, *, wall: str = "#") -> np.ndarray:
 
 
 def arrival_reward(game: Any, condition: States) -> jax.Array:
-    """Probability that the system's move leads to a state of a set: ``float[S, A]``.
+    """The probability that a move of the system leads to a state of a set: ``float[S, A]``.
 
-    ``R(s, a) = sum_t P(t | s, a) [t satisfies the condition]`` where the system moves, and 0
-    where the environment does and for unavailable actions.
-
-    Args:
-      game: the game, whole or restricted; of a product the reward has shape ``[S, Q, A]``.
-      condition: ``bool[S]``, or a Boolean formula over the game's propositions.
-
-    Returns:
-      ``float[S, A]``. Under ``jit`` if the condition is an array.
-
-    Raises:
-      ValueError: the condition mentions an unknown proposition, or has the wrong shape.
+    ``R(s, a) = sum_t P(t | s, a) [t satisfies the condition]`` in the system's states of the `game`,
+    else 0. The `condition` is ``bool[S]``, or a Boolean formula over the game's propositions.
 
     Example:
       >>> game = robots(2)
@@ -216,16 +181,9 @@ def arrival_reward(game: Any, condition: States) -> jax.Array:
 
 
 def diagonal_reward(game: Any) -> jax.Array:
-    """Reward 1 for moves of the system to a cell diagonal to the environment.
-
+    """The reward of a `game` of robots for moves of the system to a cell diagonal to the environment.
 
     The instantaneous reward of the dissertation, section 5.5; see :func:`arrival_reward`.
-
-    Args:
-      game: a game of robots, whole or restricted.
-
-    Returns:
-      ``float[S, A]``.
 
     Example:
       >>> game = robots(3)
@@ -237,15 +195,12 @@ def diagonal_reward(game: Any) -> jax.Array:
 
 
 def reward_against_task() -> tuple[Game, jax.Array]:
-    """A game whose reward is maximal when the task is never satisfied (dissertation, figure 12).
+    """A game, with its reward, whose optimal policies violate the task (dissertation, figure 12).
 
-    The system alone moves. In state 0 the action 0 stays and the action 1 goes to state 1,
-    each for a reward of 10; in state 1, where ``b2`` holds, the action 2 stays for nothing.
-    The task ``F b2`` is won from state 0 by leaving after n moves, for every n; the values
+    The system alone moves. In state 0 the action 0 stays and the action 1 goes to state 1, each for a
+    reward of 10; in state 1, where ``b2`` holds, the action 2 stays for nothing. The task ``F b2`` is
+    satisfied by leaving after n moves, for every n; the values
     ``10 * (1 - discount**(n + 1)) / (1 - discount)`` have a supremum that none attains.
-
-    Returns:
-      The game and its reward, ``float[2, 3]``.
 
     Example:
       >>> game, reward = reward_against_task()

@@ -1,12 +1,9 @@
-"""Coloured gridworlds with objects to visit in a given order.
+"""Coloured gridworlds with objects to visit in a given order (dissertation, section 3.5).
 
-The temporal grid-world of the dissertation, section 3.5. Each cell has one of five colours, and
-what a cell *is* follows from the colours of the 3 x 3 patch around it: an object, an obstacle, or
-a distractor. A reward that reads patches therefore carries over to worlds never seen.
-
-Cells are given as ``(row, column)`` from 1 at the top left, as in the dissertation and in
-pictures; the state of a cell is ``(row - 1) * columns + column - 1``, as in
-:func:`jaxltl.envs.gridworld.gridworld`, whose actions these worlds have.
+Each cell has one of five colours, and the colours of the 3 x 3 patch around a cell determine its
+kind: an object, an obstacle, or a distractor. A reward on patches therefore generalises to new
+worlds. Cells are ``(row, column)`` from 1 at the top left, as in the dissertation; the state of a
+cell is ``(row - 1) * columns + column - 1``.
 """
 
 from __future__ import annotations
@@ -60,12 +57,12 @@ class World:
     """A coloured gridworld; made by :func:`make_world` and similar functions.
 
     Attributes:
-      mdp: the world as an MDP, its labels the kinds of cells, and starting uniformly in cells
-        that are of no kind.
+      mdp: the world as an MDP, labelled with the kinds of cells, with an initial distribution that is
+        uniform over distractors.
       colors: ``int32[rows + 2 * margin, columns + 2 * margin]``, indices into ``COLORS``.
-      margin: rings of coloured cells around the grid, which the patches at the border show.
+      margin: rings of coloured cells around the grid.
       shape: ``(rows, columns)``.
-      kinds: the name of each kind of cell, and how many of each colour its 3 x 3 patch has.
+      kinds: the name of each kind of cell, and its number of cells of each colour in a patch.
     """
 
     mdp: MDP
@@ -83,17 +80,10 @@ def colored_world(
     margin: int = 1,
     slip: float = 0.0,
 ) -> World:
-    """A world from an array of colours.
+    """A world from an array of `colors`.
 
-    Args:
-      colors, objects, obstacles, margin: see :func:`categories`.
-      slip: probability of moving sideways, see :func:`jaxltl.envs.gridworld.gridworld`.
-
-    Returns:
-      :class:`World`.
-
-    Raises:
-      ValueError: see :func:`categories`; or no cell is a distractor, so that no run can start.
+    `objects`, `obstacles` and `margin` are as for :func:`~jaxltl.envs.cell_kinds.categories`; `slip`
+    is the probability of moving sideways. ValueError if no cell is a distractor.
 
     Example:
       >>> world = make_world({"o1": [(1, 2)]}, seed=0, shape=(4, 4))
@@ -140,21 +130,15 @@ def make_world(
     """A world with objects and obstacles in given cells and random colours elsewhere.
 
     The most frequent colours of a kind come first on the cross of its patch, centre and corners,
-    so that 5 and 4 cells make the pattern X. Other cells are drawn uniformly, and again where they
-    happen to make an object or an obstacle, until exactly the planned cells are of their kind.
+    so that 5 and 4 cells make the pattern X. Other cells are drawn uniformly, and redrawn until exactly
+    the planned cells are of their kind. ValueError for an unknown name, a cell outside the grid or used
+    twice, or patches that conflict.
 
     Args:
       plan: cells ``(row, column)``, from 1, of each kind by its name.
       seed: of the random colours. The inner rings do not depend on the margin.
       shape: rows and columns.
       objects, obstacles, margin, slip: see :func:`colored_world`.
-
-    Returns:
-      :class:`World`.
-
-    Raises:
-      ValueError: an unknown name, a cell outside the grid or used twice, patches that overlap
-        with different colours, or obstacles between which another one would arise.
 
     Example:
       >>> world = make_world({"o1": [(1, 2)], "ob": [(4, 3)]}, seed=0, shape=(4, 4))
@@ -172,15 +156,9 @@ def make_world(
 
 
 def training_world(seed: int = 0, *, margin: int = 1, slip: float = 0.0) -> World:
-    """The training world of the dissertation, Figure 5a; its free cells have random colours.
+    """The training world of figure 5a, with random colours of free cells from `seed`.
 
-    Args:
-      seed: of the colours of free cells.
-      margin: rings of coloured cells around the grid.
-      slip: probability of moving sideways.
-
-    Returns:
-      :class:`World`, of 10 by 10 cells.
+    `margin` and `slip` are as for :func:`make_world`.
 
     Example:
       >>> training_world().mdp.label.sum(0).tolist()
@@ -201,7 +179,7 @@ def _check_shape(shape: Sequence[int]) -> None:
 
 
 class _Family(NamedTuple):
-    """Parameters shared by a family of random worlds."""
+    """Quantities shared by a family of random worlds."""
 
     blank: MDP
     successor: NDArray[Any]  # [S, A, K]
@@ -224,26 +202,19 @@ def random_worlds(
     slip: float = 0.0,
     max_tries: int = 1000,
 ) -> list[World]:
-    """Random worlds with one of each object and several obstacles, in each of which the
-    task can be done from every distractor cell.
+    """The random worlds of some seeds in which the task is satisfiable from every distractor cell.
 
     Args:
-      seeds: one for each world. A world depends on its own seed alone.
-      task: an automaton, a formula, or a formula's text over the kinds of cells. A cell's label
-        is read when it is left.
+      seeds: one for each world, which depends on its own seed alone.
+      task: an automaton, or a formula over the kinds of cells. A cell's label is read on exit.
       shape, objects, obstacles, margin, slip: see :func:`make_world`.
-      num_obstacles: cells of each kind of obstacle. Obstacles may touch.
-      min_distance: of objects from one another, the larger of the differences of their rows and
-        columns.
-      obstacle_distance: of obstacles from objects, likewise.
+      num_obstacles: cells of each kind of obstacle, which may touch; each object has one.
+      min_distance, obstacle_distance: of objects from objects, and of obstacles from objects, in the
+        maximum norm.
       max_tries: placements to try for each world.
 
-    Returns:
-      A :class:`World` for each seed.
-
     Raises:
-      ValueError: an unknown proposition, or no placement found in which the objects have room and
-        the task can be done from everywhere.
+      ValueError: an unknown proposition, or no placement found.
 
     Example:
       >>> worlds = random_worlds([3, 4], shape=(6, 8), num_obstacles=2)
@@ -280,18 +251,7 @@ def random_worlds(
 
 
 def random_world(seed: int, task: Task = COMPLETE, **options: Any) -> World:
-    """One world of :func:`random_worlds`, with the same options.
-
-    Args:
-      seed: of the world.
-      task: as for :func:`random_worlds`.
-      **options: as for :func:`random_worlds`.
-
-    Returns:
-      :class:`World`.
-
-    Raises:
-      ValueError: as :func:`random_worlds`.
+    """The world of :func:`random_worlds` of one `seed` and `task`, with the same `options`.
 
     Example:
       >>> world = random_world(3, shape=(6, 8), num_obstacles=2)
@@ -333,10 +293,7 @@ def _is_feasible(family: _Family, kind: NDArray[np.int32]) -> bool:
 def _can_finish(
     successor: NDArray[Any], step: NDArray[Any], final: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """World and memory states from which acceptance is reachable: ``bool[S, Q]``.
-
-    In NumPy, for thousands of tries; a step reads the cell that it leaves.
-    """
+    """World and memory states from which acceptance is reachable, ``bool[S, Q]``, in NumPy for speed."""
     columns = [np.ascontiguousarray(c) for c in successor.reshape(len(successor), -1).T]
     can = np.broadcast_to(final, step.shape)
     while True:
@@ -350,17 +307,10 @@ def _can_finish(
 
 
 def patches(world: World, radius: int = 1) -> jax.Array:
-    """Colours of the patch around each cell.
-
-    Args:
-      world: the world.
-      radius: how far around; 1 sees 3 x 3 cells. At most the world's margin. Static.
-
-    Returns:
-      ``int32[S, 2 * radius + 1, 2 * radius + 1]``, indices into ``COLORS``.
+    """The colours of the patch around each cell of a `world`, ``int32[S, 2 * radius + 1, 2 * radius + 1]``.
 
     Raises:
-      ValueError: the radius is negative or larger than the margin.
+      ValueError: `radius` is negative or larger than the margin.
 
     Example:
       >>> patches(training_world())[6].tolist()  # o1 in cell (1, 7)
@@ -383,21 +333,10 @@ def _patches(colors: jax.Array, rows: int, columns: int, margin: int, radius: in
 
 
 def observations(world: World, radius: int = 1) -> jax.Array:
-    """One-hot colours of the patch around each cell.
+    """The one-hot colours of the patch of a `radius` around each cell of a `world`, ``float[S, O]``.
 
-
-    ``O = (2 * radius + 1)**2 * 5``: row by row, for each cell one number for each colour. Reshaped
-    to ``[S, 2 * radius + 1, 2 * radius + 1, 5]`` it is an image.
-
-    Args:
-      world: the world.
-      radius: how far around, at most the world's margin; static.
-
-    Returns:
-      ``float[S, O]``.
-
-    Raises:
-      ValueError: see :func:`patches`.
+    ``O = (2 * radius + 1)**2 * 5``; reshaped to ``[S, 2 * radius + 1, 2 * radius + 1, 5]`` it is an
+    image.
 
     Example:
       >>> world = make_world({"o1": [(1, 2)]}, seed=0, shape=(4, 4))
@@ -420,13 +359,7 @@ def _distance(automaton: Any) -> jax.Array:
 
 
 def is_over(model: Product) -> jax.Array:
-    """Memory states in which the task is satisfied or violated.
-
-    Args:
-      model: the product of a world and a co-safe task.
-
-    Returns:
-      ``bool[S, Q]``.
+    """The memory states of a `model` in which a co-safe task is satisfied or violated, ``bool[S, Q]``.
 
     Example:
       >>> world = make_world({"o1": [(1, 2)]}, seed=0, shape=(4, 4))
@@ -448,23 +381,11 @@ def expert_reward(
     won: jax.Array | float = 3.0,
     lost: jax.Array | float = -3.0,
 ) -> jax.Array:
-    """Reward of an expert, from the distance to acceptance.
+    """The reward of an expert, from the distance to acceptance in letters: ``float[S, Q, A]``.
 
-
-    Each step has one of five rewards. While the task is open: `progress` if the automaton moves
-    to a state from which fewer letters lead to a final one, `failure` if it moves to one from
-    which none do, else `step`. After that, `won` in a final state and `lost` in a failed one.
-
-    Args:
-      model: the product of a world and a co-safe task; expected over successors where it reads
-        the label of the state that is entered.
-      progress, failure, step, won, lost: scalars.
-
-    Returns:
-      ``float[S, Q, A]``. Differentiable in the five rewards.
-
-    Raises:
-      ValueError: the task has no final states.
+    While the task is open, a step earns `progress` if the distance decreases, `failure` if it becomes
+    infinite, else `step`; afterwards `won` or `lost`. `model` is the product of a world and a co-safe
+    task. Differentiable in the five rewards.
 
     Example:
       >>> world = make_world({"o1": [(1, 2)]}, seed=0, shape=(4, 4))
@@ -493,18 +414,10 @@ def expert_policy(
     method: str = "value_iteration",
     tolerance: jax.Array | float | None = None,
 ) -> jax.Array:
-    """The soft-optimal policy (3.4), (3.5) for a reward.
+    """The soft-optimal policy (3.4), (3.5) of a `model` for a `reward`: ``float[S, Q, A]``.
 
-
-    Args:
-      model: the product.
-      discount: scalar in [0, 1).
-      reward: ``float[S, Q, A]``; default :func:`expert_reward`.
-      method, tolerance: see :func:`jaxltl.core.values.discounted.soft.soft_value`. Sweeps suit the discount of
-        the dissertation, and many worlds at once under ``vmap``; nearer to 1, use ``"newton"``.
-
-    Returns:
-      ``float[S, Q, A]``.
+    The default reward is :func:`expert_reward`. `discount`, `method` and `tolerance` are those of
+    :func:`~jaxltl.core.values.discounted.soft.soft_value`; use ``"newton"`` for discounts near 1.
 
     Example:
       >>> world = make_world({"o1": [(1, 2)]}, seed=0, shape=(4, 4))
@@ -521,18 +434,14 @@ def expert_policy(
 def demonstrations(
     key: chex.PRNGKey, model: Product, policy: jax.Array, num: int, horizon: int = 100
 ) -> Trajectories:
-    """Trajectories of a policy, cut where the task is satisfied or violated.
+    """The trajectories of a policy in the world, cut where the task is satisfied or violated.
 
     Args:
       key: a PRNG key, consumed.
       model: the product.
       policy: ``float[S, Q, A]``.
-      num: how many runs; static.
+      num: the number of trajectories; static.
       horizon: T, the longest; static.
-
-    Returns:
-      Trajectories of the world, states ``int32[num, horizon]``. The last pair of a run is the one
-      that enters a final or failed state of the automaton.
 
     Example:
       >>> world = make_world({"o1": [(1, 2)]}, seed=0, shape=(4, 4))

@@ -6,13 +6,10 @@ import numpy as np
 
 
 def parse_map(text: str) -> np.ndarray:
-    """The cells of a text map, ``str[rows, columns]``.
+    """The cells of a text map, ``str[rows, columns]``; ValueError if it is empty or not rectangular.
 
     One line per row. If any line has spaces inside, cells are words between spaces;
     otherwise each character is a cell. Blank lines are ignored.
-
-    Raises:
-      ValueError: the map is empty or its rows differ in length.
 
     Example:
       >>> parse_map('''

@@ -1,16 +1,16 @@
 """A point robot among coloured zones (Vaezipoor et al. 2021, section 5.1, "ZoneEnv").
 
 Two zones of each of four colours lie in a walled square of 5 x 5; the robot accelerates and turns,
-and sees how near the zones are in each of 16 directions. Zones and robot are placed anew for each
-episode, apart from one another. Sizes, sensors and colours are those of Jackermeier and Abate
-(2025), whose robot, like the first one, is the point of Safety Gym, simulated by MuJoCo.
+and observes the proximity of the zones in each of 16 directions. Zones and robot are placed anew for
+each episode. Sizes, sensors and colours are those of Jackermeier and Abate (2025), whose robot is
+the point of Safety Gym, simulated by MuJoCo.
 
-The robot here is that point as a formula. Its thrust is limited to ``.3 * .05``, against a
-damping of .01 and its mass, ``4/3 pi .1^3 + .1^3`` at a density of one: it tends to 1.5 units a
-second with a time constant of .52 seconds. Its turning adapts within 6 milliseconds, which is taken
-for at once: ``3.16 * turn`` radians a second, at most 3. A step is .02 seconds, integrated exactly
-but for the turn, whose middle is taken. Readings: walls stop the robot, without
-bouncing; their four sensors read how near they are; and sensors that never change are left out.
+The robot here is a formula for that point. Its thrust is limited to ``.3 * .05``, against a damping
+of .01 and its mass, ``4/3 pi .1^3 + .1^3`` at density one: it tends to 1.5 units a second with a
+time constant of .52 seconds. Its turning adapts within 6 milliseconds, here at once:
+``3.16 * turn`` radians a second, at most 3. A step is .02 seconds, integrated exactly but for the
+turn (midpoint rule). Readings: walls stop the robot without bouncing; their four sensors give
+proximities; and constant sensors are omitted.
 """
 
 from __future__ import annotations
@@ -44,14 +44,9 @@ class ZoneState(NamedTuple):
     Attributes:
       place, velocity: ``float32[2]``, in the frame of the walls.
       heading: ``float32[]``, radians.
-      acceleration: ``float32[2]``, that of the last step.
+      acceleration: ``float32[2]``, of the last step.
       turning: ``float32[]``, radians a second, of the last step.
       zone: ``float32[P, N, 2]``, the places of each colour's zones.
-
-    Example:
-      >>> world = zone_world(num_maps=8, horizon=None)
-      >>> jax.eval_shape(world.reset, jax.random.key(0)).zone.shape
-      (4, 2, 2)
     """
 
     place: Any
@@ -88,31 +83,28 @@ def zone_world(
 ) -> Environment:
     """ZoneEnv as an environment.
 
-    Actions are ``float32[2]`` in [-1, 1], thrust and turn. Observations are ``float32[16 P + 11]``:
-    for each colour how near the nearest zone is in each direction, ``exp(-d / 2)``, counted from
-    the robot's front and shared between neighbouring directions; then acceleration and velocity in
-    the robot's frame, its turning, its heading as cosine and sine, and how near the walls are, in
-    the order east, north, west, south.
+    Actions are ``float32[2]`` in [-1, 1], thrust and turn. Observations are ``float32[16 P + 11]``: for
+    each colour the proximity ``exp(-d / 2)`` of the nearest zone in each direction, counted from the
+    robot's front and shared between neighbouring directions; then acceleration and velocity in the
+    robot's frame, its turning, its heading as cosine and sine, and the proximity of the walls in the
+    order east, north, west, south.
 
     Args:
       colors: the propositions, each true in the zones of its colour.
-      zones: how many of each colour.
+      zones: the number of zones of each colour.
       radius: of a zone.
       extent: half a side.
-      horizon: after how many steps an episode is truncated; None: never.
-      saturation: the thrust from which on more has no effect; as published, .05, a thrust is
-        nearly always full, forwards or backwards.
-      num_maps: how many placements are drawn beforehand. Each has eight turns and reflections, and
-        its zones get their colours anew.
-      seed: of that drawing.
+      horizon: number of steps after which an episode is truncated; None: never.
+      saturation: the action from which on the thrust is full; as published, .05.
+      num_maps: the number of placements in a precomputed table, before symmetries and colours.
+      seed: of that table.
 
     Returns:
-      :class:`~jaxltl.core.environments.environment.Environment`, whose worlds are :class:`ZoneState`, or
+      :class:`~jaxltl.core.environments.environment.Environment` with states :class:`ZoneState`, or
       with a horizon pairs of one and the time.
 
     Raises:
-      ValueError: numbers that are not positive, a colour twice, or zones that do not fit apart from
-        one another.
+      ValueError: numbers that are not positive, a repeated colour, or zones that do not fit.
 
     Example:
       >>> world = zone_world(num_maps=8)
@@ -169,20 +161,10 @@ def zone_world(
 
 
 def draw_places(count: int, extent: float, num_maps: int, seed: int = 0) -> np.ndarray:
-    """``float64[M, count + 1, 2]``: random places of zones, and of the robot last.
+    """Random places of zones, and of the robot last, ``float64[M, count + 1, 2]``.
 
-    Each is uniform in the square but for its keepout (.55 of a zone, .4 of the robot), and tried
-    again where it is nearer to an earlier one than both keepouts; a map on which something finds no
-    place is given up.
-
-    Args:
-      count: the zones of a map.
-      extent: half a side of the square.
-      num_maps: M.
-      seed: of the drawing.
-
-    Raises:
-      ValueError: hardly any map is completed.
+    Each is uniform in the square except for its keepout (.55 of a zone, .4 of the robot), and redrawn
+    where it is nearer to an earlier one than both keepouts; maps without a place for all are dropped.
 
     Example:
       >>> draw_places(2, 2.5, 3).shape

@@ -32,13 +32,11 @@ def from_brax(
 ) -> Environment:
     """A Brax environment without its auto-reset and batch wrappers.
 
-    Its ``done`` terminates. Brax limits the length of episodes by its ``EpisodeWrapper`` alone:
-    ``with_time_limit(from_brax(env), 1000)`` does, or that wrapper, whose ``info["truncation"]``
-    is what is truncated then. A world is Brax's ``State``; all that is drawn is drawn at the reset.
+    Its ``done`` terminates. Limit episodes by ``with_time_limit(from_brax(env), 1000)``, or by Brax's
+    ``EpisodeWrapper``, whose ``info["truncation"]`` truncates. States are Brax's ``State``.
 
     Args:
-      env: as ``brax.envs.get_environment(name)`` returns it. Actions are in [-1, 1], as Brax's
-        environments scale them.
+      env: as ``brax.envs.get_environment(name)`` returns it. Actions are in [-1, 1].
       labels: ``state -> bool[P]``, of Brax's ``State`` (`obs`, `pipeline_state`).
       propositions: the names of the labels.
 
@@ -46,8 +44,8 @@ def from_brax(
       :class:`~jaxltl.core.environments.environment.Environment`.
 
     Raises:
-      ValueError: no environment of Brax, one that starts anew by itself, or a batch; labels that
-        are not ``bool[P]``.
+      ValueError: not a Brax environment, an auto-reset or batch wrapper, or labels that are not
+        ``bool[P]``.
       ImportError: brax is not installed.
 
     Example:

@@ -20,11 +20,7 @@ from jaxltl.core.pretty_print import brief
 
 @jax.tree_util.register_static
 class Held:
-    """A static pytree leaf that holds an object of a package, compared by identity.
-
-    Attributes:
-      it: the object; many are not hashable, or compare by arrays.
-    """
+    """A static pytree leaf `it`: an object of a package, compared by identity."""
 
     def __init__(self, it: Any) -> None:
         self.it = it
@@ -38,23 +34,14 @@ class Held:
 
 @brief
 class Seen(NamedTuple):
-    """The state of an environment together with its last observation.
-
-    Attributes:
-      state: the package's.
-      observation: the observation returned with it.
-    """
+    """The package's state of an environment together with its last observation."""
 
     state: Any
     observation: Any
 
 
 def package(name: str) -> Any:
-    """Imports a module of another package.
-
-    Raises:
-      ImportError: it cannot be; with the command that installs it.
-    """
+    """Imports a module of another package; ImportError with the command that installs it."""
     root = name.partition(".")[0]
     try:
         with warnings.catch_warnings():  # of what it imports itself
@@ -128,10 +115,7 @@ def copied(tree: Any) -> Any:
 
 
 def arrays(tree: Any, like: Any = None) -> Any:
-    """Leaves as arrays with strong dtypes, those of a reference tree if given.
-
-    A tree of another structure is returned as it is, for the checks to tell.
-    """
+    """Leaves as arrays with strong dtypes, those of a reference tree of the same structure if given."""
     like = tree if like is None else like
     kind: Any = jax.tree.structure(like)
     if kind != jax.tree.structure(tree):

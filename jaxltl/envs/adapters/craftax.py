@@ -33,12 +33,11 @@ def from_craftax(
     """A Craftax environment, through its ``step_env``, which does not reset.
 
     Craftax has one ``done`` for both ends of an episode. Here it is truncated at
-    ``params.max_timesteps``, and terminated if it would be over without that limit. A world is
-    Craftax's state.
+    ``params.max_timesteps``, and terminated if it would end without that limit. States are Craftax's.
 
     Args:
       env: as ``make_craftax_env_from_name(name, auto_reset=False)`` returns it.
-      params: default the environment's own; arrays of the result.
+      params: default: the environment's own; arrays of the result.
       labels: ``state -> bool[P]``, of Craftax's state.
       propositions: the names of the labels.
 
@@ -46,8 +45,7 @@ def from_craftax(
       :class:`~jaxltl.core.environments.environment.Environment`.
 
     Raises:
-      ValueError: no environment of Craftax, or one that starts anew by itself; labels that are not
-        ``bool[P]``.
+      ValueError: not a Craftax environment, one with auto-reset, or labels that are not ``bool[P]``.
       ImportError: craftax is not installed.
 
     Example:

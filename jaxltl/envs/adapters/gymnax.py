@@ -40,12 +40,12 @@ def from_gymnax(
 ) -> Environment:
     """A gymnax environment, through its ``step_env``, which does not reset.
 
-    An episode is terminated where ``step_env`` says so, and truncated where ``is_truncated`` does.
-    A world is a pair of gymnax's ``state`` and ``observation``.
+    An episode is terminated by ``step_env``, and truncated by ``is_truncated``. States are pairs of
+    gymnax's ``state`` and ``observation``.
 
     Args:
-      env, params: as ``gymnax.make(name)`` returns them; `params` (default the environment's own)
-        are arrays of the result: other ones do not recompile, and many are a ``vmap``.
+      env, params: as ``gymnax.make(name)`` returns them; `params` (default: the environment's own)
+        are arrays of the result: other ones do not recompile.
       labels: ``state -> bool[P]``, of gymnax's state.
       propositions: the names of the labels.
 
@@ -53,8 +53,8 @@ def from_gymnax(
       :class:`~jaxltl.core.environments.environment.Environment`.
 
     Raises:
-      ValueError: no environment of gymnax, or one in a wrapper; actions that are neither finite
-        nor in a box; labels that are not ``bool[P]``.
+      ValueError: not a gymnax environment, or a wrapper; actions that are neither finite nor in a box;
+        labels that are not ``bool[P]``.
       ImportError: gymnax is not installed.
 
     Example:

@@ -1,7 +1,7 @@
 """Factored actions whose components are chosen sequentially.
 
-Where N parts have many values each, their combinations are too many to be numbered. A step of the
-package's world is then N steps here: each chooses one part, and the last one moves the world.
+For N components with too many combinations to be numbered: a step of the package's environment is N
+steps here, each of which chooses one component; the last one moves the environment.
 """
 
 from __future__ import annotations
@@ -22,13 +22,7 @@ from jaxltl.envs.adapters.common import Held
 
 @brief
 class PartWorld(NamedTuple):
-    """The inner state and the components of the next action chosen so far.
-
-    Attributes:
-      world: the inner one.
-      parts: ``int32[N]``; 0 where it is still to be chosen.
-      turn: ``int32[]``, the part that is chosen now.
-    """
+    """The inner state, the components ``int32[N]`` chosen so far (else 0), and the current one."""
 
     world: Any
     parts: jax.Array
@@ -37,13 +31,7 @@ class PartWorld(NamedTuple):
 
 @brief
 class PartObservation(NamedTuple):
-    """The inner observation, the components chosen so far, and the index of the current one.
-
-    Attributes:
-      world: as it is observed.
-      parts: ``bool[N, M]``, a row for each part, with its value where it has been chosen.
-      turn: ``bool[N]``, one of them.
-    """
+    """The inner observation, the chosen components ``bool[N, M]``, and the current one ``bool[N]``."""
 
     world: Any
     parts: jax.Array
@@ -61,20 +49,7 @@ def in_turn(
     mask: Callable[..., jax.Array] | None,
     horizon: int | None,
 ) -> Environment:
-    """Environment in which the N components of an action are chosen sequentially.
-
-    Args:
-      counts: values of each part; the actions are the most of them, M.
-      reset, observe: of the inner world.
-      step: ``(world, int32[N], key) -> Timestep`` of the inner world.
-      labels: of the inner world, which does not change but with the last part.
-      propositions: their names.
-      mask: ``world -> bool``, of all combinations or ``bool[N, M]``; None: everything is allowed.
-      horizon: of the inner world.
-
-    Returns:
-      :class:`~jaxltl.core.environments.environment.Environment`.
-    """
+    """Environment in which the N components of an action are chosen sequentially."""
     held = Held(tuple(counts))
     return make_environment(
         Partial(_begin, held, reset),

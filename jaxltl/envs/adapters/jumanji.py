@@ -51,19 +51,15 @@ def from_jumanji(
 ) -> Environment:
     """A Jumanji environment.
 
-    Most of Jumanji's environments say at their limit of steps that the episode is terminated (a
-    discount of 0). Here it is terminated if it would be over without the limit (`env.time_limit`),
-    and truncated otherwise, as it is where Jumanji's discount is not 0. A world is a pair of
-    Jumanji's ``state`` and ``observation``; the state has the key that it draws from, and the key
-    of a step is not used.
+    An episode is terminated if it would end (with a discount of 0) without the time limit
+    `env.time_limit`, and truncated otherwise. States are pairs of Jumanji's ``state``, which contains
+    its key, and ``observation``; the key of a step is not used.
 
     Args:
-      env: as ``jumanji.make(name)`` returns it. Where an action has several parts, the actions here
-        are all combinations, numbered with the last part fastest. An `action_mask` in what is
-        observed is what is `allowed`; of parts, where all of them are.
-      in_turn: whether parts of an action are chosen one after the other instead, each in a step of
-        its own; the last of them moves the world, in which nothing happens before. What has been
-        chosen is seen beside the observation. For parts that have too many combinations.
+      env: as ``jumanji.make(name)`` returns it. An action of several components is numbered, with the
+        last component fastest. An `action_mask` in the observation determines `allowed`.
+      in_turn: choose the components one after the other, each in a step; the last of them moves the
+        environment. For components with too many combinations.
       labels: ``state -> bool[P]``, of Jumanji's state.
       propositions: the names of the labels.
 
@@ -71,9 +67,9 @@ def from_jumanji(
       :class:`~jaxltl.core.environments.environment.Environment`.
 
     Raises:
-      ValueError: no environment of Jumanji, one that starts anew by itself, or a batch; a reward
-        for each of several agents; actions that are neither finite nor in a box, have too many
-        combinations, or no components to choose sequentially; labels that are not ``bool[P]``.
+      ValueError: not a Jumanji environment, an auto-reset or batch wrapper, or a reward for each of
+        several agents; actions that are neither finite nor in a box, have too many combinations, or
+        no components to choose sequentially; labels that are not ``bool[P]``.
       ImportError: jumanji is not installed.
 
     Example:
@@ -139,11 +135,7 @@ def _without_limit(env: Any) -> Any:
 
 
 def _parts(env: Any) -> tuple[int, ...] | None:
-    """Numbers of values of the components of an action; () for a scalar action.
-
-    Whole numbers within bounds are such parts too; what a mask of fewer columns leaves out is not
-    to be taken.
-    """
+    """Numbers of values of the integer components of an action; () for a scalar action."""
     spec = env.action_spec
     if hasattr(spec, "num_values"):
         return tuple(np.ravel(spec.num_values).tolist()) if spec.shape else ()

@@ -32,21 +32,18 @@ def from_navix(
     """A Navix environment.
 
     Its step types distinguish termination and truncation; where both hold, the episode is terminated.
-    Its own ``step`` starts anew from the last timestep of an episode; here that is never so. A
-    world is Navix's timestep, whose state has the key that it draws from; the key of a step is not
-    used.
+    States are Navix's timesteps, whose state contains its key; the key of a step is not used.
 
     Args:
       env: as ``navix.make(name)`` returns it.
-      labels: ``state -> bool[P]``, of Navix's state; its events, like ``goal_reached``, are those
-        of the step that led to it.
+      labels: ``state -> bool[P]``, of Navix's state with the events of the last step.
       propositions: the names of the labels.
 
     Returns:
       :class:`~jaxltl.core.environments.environment.Environment`.
 
     Raises:
-      ValueError: no environment of Navix; labels that are not ``bool[P]``.
+      ValueError: not a Navix environment, or labels that are not ``bool[P]``.
       ImportError: navix is not installed.
 
     Example:

@@ -28,12 +28,7 @@ from jaxltl.envs.adapters.common import (
 
 @brief
 class Turn(NamedTuple):
-    """A game state at which the player moves, or the game is over.
-
-    Attributes:
-      state: Pgx's.
-      owed: the player's reward from moves of others before the player's first move.
-    """
+    """Pgx's state at a turn of the player or at the end, and the reward `owed` for earlier moves."""
 
     state: Any
     owed: jax.Array
@@ -49,26 +44,25 @@ def from_pgx(
 ) -> Environment:
     """A Pgx game as a single-agent environment; the other players follow a fixed policy.
 
-    A step is a move of the player and those of the others until it is the player's turn again, or
-    the game is over; its reward is what the player earns by all of them. Legal actions are
-    `allowed`; one that is not ends the game with the package's penalty. What is observed is the
-    player's view, also of a game that another one's turn was next in when it ended.
+    A step is a move of the player and those of the others until the player's next turn or the end; its
+    reward is the sum over these moves. Legal actions are `allowed`; an illegal one ends the game with
+    the package's penalty. The player's view is observed, also at the end of a game.
 
     Args:
       env: as ``pgx.make(name)`` returns it.
-      opponent: ``(state, key) -> action``, of Pgx's state, which holds the view (`observation`) and
-        the `legal_action_mask` of whose turn it is; a function, or a ``Partial`` that hands over
-        arrays, such as weights: new ones do not recompile. None for games of one player.
+      opponent: ``(state, key) -> action``, of Pgx's state, with the `observation` and the
+        `legal_action_mask` of the current player; a function, or a ``Partial`` with arrays such as
+        weights. None for games of one player.
       player: the index of the learning player. The first player may be random.
-      labels: ``state -> bool[P]``, of Pgx's state when it is the player's turn.
+      labels: ``state -> bool[P]``, of Pgx's state at the player's turn.
       propositions: the names of the labels.
 
     Returns:
-      :class:`~jaxltl.core.environments.environment.Environment`; its worlds are pairs of Pgx's ``state``
-      and the reward ``owed`` for moves before the player's first.
+      :class:`~jaxltl.core.environments.environment.Environment`; its states are pairs of Pgx's
+      ``state`` and the reward ``owed`` for moves before the player's first.
 
     Raises:
-      ValueError: no environment of Pgx; no opponent, or no such player; labels that are not
+      ValueError: not a Pgx environment; no opponent, or no such player; labels that are not
         ``bool[P]``.
       ImportError: pgx is not installed.
 

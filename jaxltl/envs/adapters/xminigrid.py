@@ -33,8 +33,8 @@ def from_xminigrid(
 ) -> Environment:
     """An XLand-MiniGrid environment.
 
-    The last timestep of an episode is terminated if its discount is 0, truncated otherwise. A world
-    is the package's timestep; all that is drawn is drawn at the reset.
+    The last timestep of an episode is terminated if its discount is 0, truncated otherwise. States are
+    the package's timesteps.
 
     Args:
       env, params: as ``xminigrid.make(name)`` returns them; a ruleset in `params` is arrays of the
@@ -46,7 +46,7 @@ def from_xminigrid(
       :class:`~jaxltl.core.environments.environment.Environment`.
 
     Raises:
-      ValueError: no environment of xminigrid, or one that starts anew by itself; no limit of steps
+      ValueError: not an xminigrid environment, or one with auto-reset; no limit of steps
         in `params`; labels that are not ``bool[P]``.
       ImportError: xminigrid is not installed.
 
