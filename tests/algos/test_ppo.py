@@ -425,15 +425,15 @@ def test_scales_are_those_of_all_that_was_seen():
         key, _ = jax.random.split(learner.step_key(given))
         walkers, path = collecting._walked(key, given, problem, hparams)
         state = state.replace(walkers=walkers)
-        seen.append(np.asarray(path.observation["place"]).reshape(-1, 2))
-        over = np.asarray(path.terminated | path.truncated)
-        for reward, ended in zip(np.asarray(path.reward), over, strict=True):
+        seen.append(np.asarray(path.of.observation["place"]).reshape(-1, 2))
+        over = np.asarray(path.of.terminated | path.of.truncated)
+        for reward, ended in zip(np.asarray(path.of.reward), over, strict=True):
             running = running + reward
             sums.append(running)
             running = np.where(ended, 0, 0.9 * running)
         if i == 0:  # the second step's policy reads scaled observations, so it differs
             first = jax.tree.map(
-                lambda x, m: updated_moments(m, x), path.observation, state.moments
+                lambda x, m: updated_moments(m, x), path.of.observation, state.moments
             )
             returns = updated_moments(state.return_moments, jnp.asarray(np.stack(sums)))
             state = state.replace(moments=first, return_moments=returns)

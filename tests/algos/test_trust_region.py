@@ -14,12 +14,12 @@ from jax.flatten_util import ravel_pytree
 from jax.tree_util import Partial
 
 from jaxltl.algos import trust_region
+from jaxltl.algos.common.collection import masked_advantages
 from jaxltl.algos.common.moments import Moments, scale_of, updated_moments
 from jaxltl.algos.trust_region import Hparams
 from jaxltl.algos.trust_region import _policy_networks as nets
 from jaxltl.algos.trust_region._cpo_dual import Case, Dual, cpo_dual, cpo_weights
 from jaxltl.algos.trust_region._step import fisher_product, surrogate
-from jaxltl.algos.trust_region._value_fit import advantages
 from jaxltl.core.environments.environment import Timestep, make_box, make_environment
 from jaxltl.core.environments.episodes import run_episode
 from jaxltl.core.environments.time_limit import with_time_limit
@@ -490,7 +490,9 @@ def test_advantages_are_their_sums(discount, gae_lambda):
     lengths, after = [6, 1, 3, 0], np.array([2.0, 0.0, -3.0, 5.0])
     valid = np.arange(6)[:, None] < np.array(lengths)
     one, several = (
-        advantages(jnp.where(valid, signal, 0), jnp.asarray(value), jnp.asarray(valid), *given)
+        masked_advantages(
+            jnp.where(valid, signal, 0), jnp.asarray(value), jnp.asarray(valid), *given
+        )
         for given in ((discount, gae_lambda), (own, gae_lambda, after))
     )
     for i, length in enumerate(lengths):

@@ -40,10 +40,12 @@ def drawn(actions: Actions, parameters: Any, allowed: Any, noise: jax.Array | No
     return mean if noise is None else mean + jnp.exp(log_deviation) * noise
 
 
-def as_action(actions: Actions, raw: jax.Array, squash: str) -> jax.Array:
-    """The action of a raw action."""
+def as_action(actions: Actions, raw: jax.Array, squash: str | None) -> jax.Array:
+    """The action of a raw action; with `squash` None clipped in the environment's own units."""
     if isinstance(actions, Finite):
         return raw
+    if squash is None:
+        return clipped_action(actions, raw.reshape(actions.shape).astype(actions.dtype))
     low, high = (jnp.broadcast_to(x, actions.shape) for x in (actions.low, actions.high))
     bounded = jnp.isfinite(low) & jnp.isfinite(high)
     middle, half = jnp.where(bounded, (low + high) / 2, 0), jnp.where(bounded, (high - low) / 2, 1)

@@ -18,9 +18,8 @@ from jaxltl.algos.common import trees
 
 from jaxltl.algos.common import loops
 from jaxltl.algos.common.actor_critic import Output, evaluated
-from jaxltl.algos.common.advantages import generalized_advantages
+from jaxltl.algos.common.collection import Transition, generalized_advantages, transition
 from jaxltl.algos.common.moments import Moments, normalized, scale_of, updated_moments
-from jaxltl.core.environments.environment import Timestep, allowed_in
 from jaxltl.core.models.mesh import lanes
 from jaxltl.core.pretty_print import brief
 
@@ -86,21 +85,11 @@ def _unless_nonfinite(moments: Moments, numbers: jax.Array) -> Moments:
     return trees.choose(fine, new, moments)
 
 
-class _Path(NamedTuple):
-    """Records of the transitions, ``[T, N, ...]``."""
+class _Record(NamedTuple):
+    """Records of the transitions, ``[T, N, ...]``, and figures of their episodes so far."""
 
-    observation: Any
-    memory: Any
+    of: Transition
     start: jax.Array
-    allowed: Any
-    raw: jax.Array
-    log_density: jax.Array
-    reward: jax.Array
-    cost: jax.Array
-    discount: jax.Array
-    terminated: jax.Array
-    truncated: jax.Array
-    last: Any
     episode_return: jax.Array
     episode_length: jax.Array
 
@@ -109,7 +98,8 @@ def collected(
     key: chex.PRNGKey, state: Any, problem: Any, hparams: Any
 ) -> tuple[Any, Any, Rows, Told]:
     """T transitions of N environments: the next state, initial memories, transitions and figures."""
-    walkers, path = _walked(key, state, problem, hparams)
+    walkers, record = _walked(key, state, problem, hparams)
+    path = record.of
     dtype = walkers.discounted.dtype
     seen = normalized(state.moments, path.observation)
     every = _evaluated_all(problem, state.parameters, path.memory, seen, 2)
@@ -135,7 +125,7 @@ def collected(
     if moments is not None:
         moments = jax.tree.map(lambda x, m: _unless_nonfinite(m, x), path.observation, moments)
     found = generalized_advantages(reward, value, following, discount, hparams.gae_lambda, ended)
-    rows = Rows(seen, path.start, path.allowed, path.raw, path.log_density, value, found)
+    rows = Rows(seen, record.start, path.allowed, path.raw, path.log_density, value, found)
     number = ended.sum()
     mean_of = jnp.where(number > 0, 1 / jnp.maximum(number, 1), jnp.nan).astype(dtype)
     target = found + value
@@ -144,8 +134,8 @@ def collected(
         reward=path.reward.astype(dtype).mean(),
         cost=path.cost.astype(dtype).mean(),
         episodes=number.astype(jnp.int32),
-        episode_return=jnp.sum(jnp.where(ended, path.episode_return, 0)) * mean_of,
-        episode_length=jnp.sum(jnp.where(ended, path.episode_length, 0)) * mean_of,
+        episode_return=jnp.sum(jnp.where(ended, record.episode_return, 0)) * mean_of,
+        episode_length=jnp.sum(jnp.where(ended, record.episode_length, 0)) * mean_of,
         explained_variance=jnp.where(
             spread > 0, 1 - jnp.var(found) / jnp.where(spread > 0, spread, 1), jnp.nan
         ),
@@ -170,7 +160,7 @@ def _discounted_sums(
     return sums, replace(walkers, discounted=last)
 
 
-def _walked(key: chex.PRNGKey, state: Any, problem: Any, hparams: Any) -> tuple[Walkers, _Path]:
+def _walked(key: chex.PRNGKey, state: Any, problem: Any, hparams: Any) -> tuple[Walkers, _Record]:
     environment, size = problem.environment, (hparams.num_steps, hparams.num_envs)
     noise_key, move_key, reset_key = jax.random.split(key, 3)
     dtype = state.walkers.discounted.dtype
@@ -197,43 +187,23 @@ def _walk(
     given: Any,
     *,
     sharding: Any,
-) -> tuple[Walkers, _Path]:
+) -> tuple[Walkers, _Record]:
     """Transitions of all environments, or of one device's."""
     parameters, moments, problem, hparams, pool = given
     environment = problem.environment
 
-    def one(walker: Walkers, noise: jax.Array, key: chex.PRNGKey) -> Any:
-        observation = environment.observe(walker.world)
-        allowed = allowed_in(environment, walker.world)
-        seen = normalized(moments, observation)
-        said = evaluated(problem, parameters, walker.memory, seen)
-        raw = actions_of.drawn(environment.actions, said.action, allowed, noise)
-        density = actions_of.log_density(environment.actions, said.action, allowed, raw)
-        action = actions_of.as_action(environment.actions, raw, hparams.squash)
-        found = Timestep(*environment.step(walker.world, action, key))
-        terminated, truncated = (jnp.asarray(x, bool) for x in (found.terminated, found.truncated))
-        total = walker.episode_return + found.reward
-        length = walker.episode_length + 1
-        row = _Path(
-            observation,
-            walker.memory,
-            walker.episode_length == 0,
-            allowed,
-            raw,
-            density,
-            jnp.asarray(found.reward),
-            jnp.asarray(found.cost),
-            jnp.asarray(found.discount),
-            terminated,
-            truncated,
-            environment.observe(found.world),
-            total,
-            length,
-        )
-        return replace(walker, world=found.world, memory=said.memory), row
+    def evaluate(memory: chex.ArrayTree, observation: chex.ArrayTree) -> Output:
+        return evaluated(problem, parameters, memory, normalized(moments, observation))
 
-    def restarted(walker: Walkers, fresh: Any, row: _Path) -> Walkers:
-        ended = row.terminated | row.truncated
+    def one(walker: Walkers, noise: jax.Array, key: chex.PRNGKey) -> tuple[Walkers, _Record]:
+        before = (walker.world, walker.memory)
+        world, memory, made = transition(environment, evaluate, hparams.squash, before, noise, key)
+        total, length = walker.episode_return + made.reward, walker.episode_length + 1
+        row = _Record(made, walker.episode_length == 0, total, length)
+        return replace(walker, world=world, memory=memory), row
+
+    def restarted(walker: Walkers, fresh: Any, row: _Record) -> Walkers:
+        ended = row.of.terminated | row.of.truncated
         world, memory = jax.tree.map(
             lambda x, y: jnp.where(ended, x, y),
             (fresh, problem.memory),
@@ -251,7 +221,7 @@ def _walk(
         walkers, used = carry
         start, *chance = given
         walkers, row = jax.vmap(one)(walkers, *chance)
-        ended = row.terminated | row.truncated
+        ended = row.of.terminated | row.of.truncated
         if pool is not None:
             number, last = lanes.running_sum(ended, rank, sharding)
             start = jax.tree.map(lambda x: x[(used + number - 1) % hparams.num_resets], pool)

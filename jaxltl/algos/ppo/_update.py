@@ -15,6 +15,7 @@ from jaxltl.algos.common import action_distributions as actions_of
 
 from jaxltl.algos.common import trees
 from jaxltl.algos.common.actor_critic import Output, evaluated, has_memory
+from jaxltl.algos.common.collection import minibatch_epochs
 from jaxltl.algos.common.schedules import at
 from jaxltl.algos.ppo._collect import Rows
 from jaxltl.core.models.mesh import lanes
@@ -119,8 +120,6 @@ def improved(
     rows, begun = lanes.replicate((rows, begun), over)  # any device may be asked for any of them
     if not recurrent:
         rows = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rows)
-    size = hparams.num_envs if recurrent else len(rows.value)
-    count = hparams.num_minibatches
 
     def update(going: _Going, chosen: jax.Array) -> tuple[_Going, Any]:
         some = jax.tree.map(lambda x: jnp.take(x, chosen, axis=int(recurrent)), rows)
@@ -147,14 +146,13 @@ def improved(
         new = trees.choose(made, (parameters, optimizer), (going.parameters, going.optimizer))
         return _Going(new[0], new[1], stopped), (told, made, ~finite & ~stopped)
 
-    def epoch(going: _Going, key: chex.PRNGKey) -> tuple[_Going, Any]:
-        order = jax.random.permutation(key, size)
-        return lax.scan(update, going, order.reshape(count, -1))
-
-    going, (told, made, lost) = lax.scan(
-        epoch,
+    going, (told, made, lost) = minibatch_epochs(
+        key,
+        update,
         _Going(state.parameters, state.optimizer, jnp.bool_(False)),
-        jax.random.split(key, hparams.num_epochs),
+        hparams.num_envs if recurrent else len(rows.value),
+        num_epochs=hparams.num_epochs,
+        num_minibatches=hparams.num_minibatches,
     )
     number = made.sum()
     mean = jax.tree.map(

@@ -1,4 +1,4 @@
-"""Advantages of finite trajectories, and regression of value networks on their targets."""
+"""Regression of value networks on their targets."""
 
 from __future__ import annotations
 
@@ -8,38 +8,11 @@ import chex
 import jax
 import jax.numpy as jnp
 import optax
-from jax import lax
 
-from jaxltl.algos.common.advantages import generalized_advantages
+from jaxltl.algos.common.collection import minibatch_epochs
 from jaxltl.algos.trust_region._policy_networks import (
     values_at,
 )
-
-
-def advantages(
-    signal: jax.Array,
-    value: jax.Array,
-    valid: jax.Array,
-    discount: chex.Numeric,
-    gae_lambda: chex.Numeric,
-    after: chex.Numeric = 0.0,
-) -> jax.Array:
-    """Generalised advantages (Schulman et al. 2016, equation 16) of finite trajectories.
-
-    ``A_t = d_t + discount_t lambda A_{t+1}`` with ``d_t = r_t + discount_t V_{t+1} - V_t``; after the
-    last valid step ``A = 0`` and ``V = after``. Zero where `valid` is false.
-
-    >>> ones, zeros = jnp.ones(3), jnp.zeros(3)
-    >>> advantages(ones, zeros, jnp.array([True, True, False]), 0.5, 1.0).tolist()
-    [1.5, 1.0, 0.0]
-    """
-    value = jnp.where(valid, value, 0)
-    following = jnp.concatenate([value[1:], jnp.zeros_like(value[:1])])
-    goes_on = jnp.concatenate([valid[1:], jnp.zeros_like(valid[:1])])
-    following = jnp.where(valid, jnp.where(goes_on, following, after), 0)
-    return generalized_advantages(
-        jnp.where(valid, signal, 0), value, following, discount, gae_lambda
-    )
 
 
 def fitted(
@@ -60,7 +33,6 @@ def fitted(
     moments = jnp.where(valid.any(), moments, state.value_moments)
     inputs, target = inputs.reshape(-1, inputs.shape[-1]), target.reshape(len(target), -1)
     weight = valid.reshape(-1).astype(inputs.dtype)
-    size = weight.shape[0] // hparams.value_batches
     optimizer = optax.adam(hparams.value_rate)
 
     def loss(values: Any, chosen: jax.Array) -> jax.Array:
@@ -72,13 +44,14 @@ def fitted(
         updates, memory = optimizer.update(jax.grad(loss)(values, chosen), memory)
         return (optax.apply_updates(values, updates), memory), None
 
-    def epoch(carry: Any, key: chex.PRNGKey) -> Any:
-        order = jax.random.permutation(key, weight.shape[0])
-        batches = order[: size * hparams.value_batches].reshape(hparams.value_batches, size)
-        return lax.scan(descend, carry, batches)
-
-    keys = jax.random.split(key, hparams.value_epochs)
-    (values, memory), _ = lax.scan(epoch, (state.values, state.optimizer), keys)
+    (values, memory), _ = minibatch_epochs(
+        key,
+        descend,
+        (state.values, state.optimizer),
+        len(weight),
+        num_epochs=hparams.value_epochs,
+        num_minibatches=hparams.value_batches,
+    )
     return values, memory, moments
 
 

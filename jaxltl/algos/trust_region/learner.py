@@ -62,6 +62,7 @@ import optax
 from jax.flatten_util import ravel_pytree
 
 from jaxltl.algos.common import learner
+from jaxltl.algos.common.collection import masked_advantages
 from jaxltl.algos.common.moments import no_moments, updated_moments
 from jaxltl.algos.trust_region._policy_networks import (
     gaussian,
@@ -81,7 +82,7 @@ from jaxltl.algos.trust_region._step import (
     line_search,
     surrogate,
 )
-from jaxltl.algos.trust_region._value_fit import advantages, fitted, positive, weighted_variance
+from jaxltl.algos.trust_region._value_fit import fitted, positive, weighted_variance
 from jaxltl.core.environments.environment import (
     require_key,
 )
@@ -227,10 +228,10 @@ def _estimated(
     if hparams.penalty is not None:
         reward = reward - hparams.penalty * batch.cost
     discount = hparams.discount * batch.discount
-    parts = [advantages(reward, value[0], batch.valid, discount, hparams.gae_lambda, after)]
+    parts = [masked_advantages(reward, value[0], batch.valid, discount, hparams.gae_lambda, after)]
     if hparams.method == "cpo":
         parts.append(
-            advantages(
+            masked_advantages(
                 batch.cost, value[1], batch.valid, hparams.cost_discount, hparams.cost_gae_lambda
             )
         )

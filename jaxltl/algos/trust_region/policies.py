@@ -12,13 +12,15 @@ import jax.numpy as jnp
 from jax import lax
 from jax.tree_util import Partial
 
+from jaxltl.algos.common import action_distributions as actions_of
+from jaxltl.algos.common.actor_critic import Output
+from jaxltl.algos.common.collection import Transition, transition
 from jaxltl.algos.trust_region._policy_networks import (
     gaussian,
     normalized,
 )
 from jaxltl.core import validation
 from jaxltl.core.environments.environment import (
-    Timestep,
     flat_observation,
     require_key,
 )
@@ -179,35 +181,42 @@ def _rollout(
     num_trajectories: int,
     sampled: bool,
 ) -> Batch:
-    start, path = jax.random.split(key)
-    worlds = jax.vmap(problem.environment.reset)(jax.random.split(start, num_trajectories))
+    environment, size = problem.environment, (problem.horizon, num_trajectories)
+    start, noise_key, step_key = jax.random.split(key, 3)
+    worlds = jax.vmap(environment.reset)(jax.random.split(start, num_trajectories))
 
-    def taken(world: Any, action: jax.Array, key: chex.PRNGKey) -> Timestep:
-        return Timestep(*problem.environment.step(world, as_action(problem, action), key))
+    def evaluate(memory: chex.ArrayTree, observation: chex.ArrayTree) -> Output:
+        mean, deviation = act(state, hparams, flat_observation(observation))
+        shape = environment.actions.shape
+        action = (mean.reshape(shape), jnp.log(deviation).reshape(shape))
+        return Output(memory, action, jnp.zeros((), mean.dtype))
 
-    def move(carry: Any, key: chex.PRNGKey) -> Any:
+    def one(world: chex.ArrayTree, *chance: jax.Array) -> tuple[chex.ArrayTree, Transition]:
+        after, _, record = transition(environment, evaluate, None, (world, ()), *chance)
+        return after, record
+
+    def move(carry: Any, chance: Any) -> Any:
         worlds, active, cut = carry
-        action_key, world_key = jax.random.split(key)
-        observation = jax.vmap(partial(observed_vector, problem))(worlds)
-        mean, deviation = act(state, hparams, observation)
-        action = mean
-        if sampled:
-            action += deviation * jax.random.normal(action_key, mean.shape, mean.dtype)
-        found = jax.vmap(taken)(worlds, action, jax.random.split(world_key, num_trajectories))
+        after, made = jax.vmap(one)(worlds, *chance)
 
         def held(x: jax.Array, y: jax.Array) -> jax.Array:
             return jnp.where(active.reshape(-1, *[1] * (x.ndim - 1)), x, y)
 
-        row = (observation, action, found.reward, found.cost, found.discount, active)
-        after = jax.tree.map(held, found.world, worlds)
-        cut |= active & found.truncated & ~found.terminated
-        return (after, active & ~(found.terminated | found.truncated), cut), row
+        worlds = jax.tree.map(held, after, worlds)
+        vectors = jax.vmap(flat_observation)(made.observation), made.raw.reshape(size[1], -1)
+        row = (*vectors, made.reward, made.cost, made.discount, active)
+        cut |= active & made.truncated & ~made.terminated
+        active &= ~(made.terminated | made.truncated)
+        return (worlds, active, cut), row
 
+    dtype, noise = state.parameters["log_deviation"].dtype, None
+    if sampled:
+        noise = actions_of.noise(noise_key, size, environment.actions, dtype)
     active = jnp.ones(num_trajectories, bool)
     (worlds, _, truncated), (observation, action, reward, cost, discount, valid) = lax.scan(
-        move, (worlds, active, ~active), jax.random.split(path, problem.horizon)
+        move, (worlds, active, ~active), (noise, jax.random.split(step_key, size))
     )
-    last, dtype = jax.vmap(partial(observed_vector, problem))(worlds), observation.dtype
+    last = jax.vmap(partial(observed_vector, problem))(worlds)
     parts = (observation, action, reward[..., None], cost[..., None], discount[..., None])
     finite = jnp.array([jnp.all(jnp.all(jnp.isfinite(x), -1) | ~valid, 0) for x in parts]).all(
         0

@@ -1,0 +1,142 @@
+"""Actor-critic collection and update: transitions, generalised advantages, minibatch epochs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple, TypeVar
+
+import chex
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxltl.algos.common import action_distributions as actions_of
+from jaxltl.algos.common.actor_critic import Output
+from jaxltl.core.environments.environment import Environment, Timestep, allowed_in
+
+CarryT = TypeVar("CarryT")
+FiguresT = TypeVar("FiguresT")
+Evaluate = Callable[[chex.ArrayTree, chex.ArrayTree], Output]
+
+
+class Transition(NamedTuple):
+    """Record of a transition.
+
+    Attributes:
+      observation, memory, allowed: before it; the memory is the network's, the mask ``bool[A]`` or None.
+      raw: the sampled action before squashing.
+      log_density: of `raw` under the collecting policy.
+      reward, cost, discount, terminated, truncated: of the environment.
+      last: the observation after it.
+    """
+
+    observation: chex.ArrayTree
+    memory: chex.ArrayTree
+    allowed: jax.Array | None
+    raw: jax.Array
+    log_density: jax.Array
+    reward: jax.Array
+    cost: jax.Array
+    discount: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    last: chex.ArrayTree
+
+
+def transition(
+    environment: Environment,
+    evaluate: Evaluate,
+    squash: str | None,
+    before: tuple[chex.ArrayTree, chex.ArrayTree],
+    noise: jax.Array | None,
+    key: chex.PRNGKey,
+) -> tuple[chex.ArrayTree, chex.ArrayTree, Transition]:
+    """World and memory after one transition of one environment, and its record."""
+    world, memory = before
+    observation, allowed = environment.observe(world), allowed_in(environment, world)
+    output, actions = evaluate(memory, observation), environment.actions
+    raw = actions_of.drawn(actions, output.action, allowed, noise)
+    density = actions_of.log_density(actions, output.action, allowed, raw)
+    action = actions_of.as_action(actions, raw, squash)
+    after = Timestep(*environment.step(world, action, key))
+    reward, cost, discount = map(jnp.asarray, (after.reward, after.cost, after.discount))
+    ends = (jnp.asarray(x, bool) for x in (after.terminated, after.truncated))
+    record = Transition(
+        *(observation, memory, allowed, raw, density, reward, cost, discount),
+        *ends,
+        environment.observe(after.world),
+    )
+    return after.world, output.memory, record
+
+
+def generalized_advantages(
+    reward: jax.Array,
+    value: jax.Array,
+    following: jax.Array,
+    discount: chex.Numeric,
+    gae_lambda: chex.Numeric,
+    ended: chex.Numeric = False,
+) -> jax.Array:
+    """Generalised advantages (Schulman et al. 2016, equation 16) of consecutive episodes.
+
+    ``A_t = d_t + discount_t lambda A_{t+1}`` with ``d_t = r_t + discount_t V'_t - V_t``, and A = 0 after
+    the last of T steps and after the end of an episode. V' is the value after each step, also where
+    an episode is truncated; zero after a termination. All arrays are ``[T, ...]``.
+
+    >>> ones, zeros = jnp.ones(3), jnp.zeros(3)
+    >>> ended = jnp.array([False, True, False])
+    >>> generalized_advantages(ones, zeros, zeros, 0.5, 1.0, ended).tolist()
+    [1.5, 1.0, 1.0]
+    """
+    error = reward + discount * following - value
+    kept = jnp.broadcast_to(jnp.where(ended, 0, discount * gae_lambda), error.shape)
+
+    def back(later: jax.Array, row: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        error, kept = row
+        now = error + kept * later
+        return now, now
+
+    return lax.scan(back, jnp.zeros_like(error[0]), (error, kept), reverse=True)[1]
+
+
+def masked_advantages(
+    signal: jax.Array,
+    value: jax.Array,
+    valid: jax.Array,
+    discount: chex.Numeric,
+    gae_lambda: chex.Numeric,
+    last: chex.Numeric = 0.0,
+) -> jax.Array:
+    """Generalised advantages of one trajectory for each column; zero where `valid` is false.
+
+    The value after the last valid step is `last`.
+
+    >>> ones, zeros = jnp.ones(3), jnp.zeros(3)
+    >>> masked_advantages(ones, zeros, jnp.array([True, True, False]), 0.5, 1.0).tolist()
+    [1.5, 1.0, 0.0]
+    """
+    value = jnp.where(valid, value, 0)
+    following = jnp.concatenate([value[1:], jnp.zeros_like(value[:1])])
+    continues = jnp.concatenate([valid[1:], jnp.zeros_like(valid[:1])])
+    following = jnp.where(valid, jnp.where(continues, following, last), 0)
+    signal = jnp.where(valid, signal, 0)
+    return generalized_advantages(signal, value, following, discount, gae_lambda)
+
+
+def minibatch_epochs(
+    key: chex.PRNGKey,
+    update: Callable[[CarryT, jax.Array], tuple[CarryT, FiguresT]],
+    carry: CarryT,
+    size: int,
+    *,
+    num_epochs: int,
+    num_minibatches: int,
+) -> tuple[CarryT, FiguresT]:
+    """The carry after epochs of updates on shuffled minibatches of `size` indices, and figures."""
+    used = size - size % num_minibatches
+
+    def epoch(carry: CarryT, key: chex.PRNGKey) -> tuple[CarryT, FiguresT]:
+        order = jax.random.permutation(key, size)[:used]
+        return lax.scan(update, carry, order.reshape(num_minibatches, -1))
+
+    return lax.scan(epoch, carry, jax.random.split(key, num_epochs))
