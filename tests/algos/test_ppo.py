@@ -122,9 +122,9 @@ def test_advantages_bootstrap_where_an_episode_is_cut_off_and_not_where_it_is_ov
     np.testing.assert_allclose(rows.value, value, rtol=1e-9)
     expected = slow_advantages(reward, value, following, discount, ended, 0.8)
     np.testing.assert_allclose(rows.advantage, expected, rtol=1e-9)
-    assert told.episodes == len(sums)
+    assert told["episodes"] == len(sums)
     np.testing.assert_allclose(
-        [told.episode_return, told.episode_length, told.reward],
+        [told["episode_return"], told["episode_length"], told["reward"]],
         [np.mean(sums), np.mean(lengths), reward.mean()],
         rtol=1e-9,
     )
@@ -144,7 +144,7 @@ def test_many_episodes_cut_off_at_once_are_all_bootstrapped():
     problem = ppo.make_problem(once, network=Table(2))
     hparams = ppo.Hparams(discount=0.5, **{**SIZES, "num_steps": 64})
     state, (_, _, rows, told) = collected(problem, hparams)
-    assert told.episodes == 256
+    assert told["episodes"] == 256
     worth = np.asarray(state.parameters["worth"])
     seen = np.asarray(rows.observation)
     np.testing.assert_allclose(rows.advantage, 0.5 * (seen + 1) @ worth - seen @ worth, rtol=1e-9)
@@ -182,7 +182,7 @@ def test_episodes_begin_in_worlds_drawn_for_them(resets, most):
     place, start = np.asarray(rows.observation)[..., 0], np.asarray(rows.start)
     assert start[0].all() and (place[1:] == place[:-1])[~start[1:]].all()
     begun = place[1:][start[1:]]
-    assert told.episodes == len(begun) + (np.asarray(after.walkers.episode_length) == 0).sum()
+    assert told["episodes"] == len(begun) + (np.asarray(after.walkers.episode_length) == 0).sum()
     if most is None:
         assert np.unique(begun).size == begun.size > 10
     else:  # handed out in turn, in the order of time and then of environments
@@ -233,7 +233,7 @@ def test_what_is_forbidden_is_never_done():
     problem = ppo.make_problem(wild, network=Wild())
     hparams = ppo.Hparams(discount=0.9, **{**SIZES, "num_steps": 250})
     state, (_, _, rows, told) = collected(problem, hparams)
-    assert told.reward == 1.0 and np.unique(rows.raw).size == 4
+    assert told["reward"] == 1.0 and np.unique(rows.raw).size == 4
     assert np.isfinite(rows.log_density).all()
     for agent in (ppo.policy, ppo.greedy):
         episode = run_episode(jax.random.key(3), wild, agent(state, problem, hparams), num_steps=60)

@@ -59,14 +59,23 @@ def transition(
     density = actions_of.log_density(actions, output.action, allowed, raw)
     action = actions_of.as_action(actions, raw, squash)
     after = Timestep(*environment.step(world, action, key))
-    reward, cost, discount = map(jnp.asarray, (after.reward, after.cost, after.discount))
-    ends = (jnp.asarray(x, bool) for x in (after.terminated, after.truncated))
-    record = Transition(
-        *(observation, memory, allowed, raw, density, reward, cost, discount),
-        *ends,
-        environment.observe(after.world),
+    return (
+        after.world,
+        output.memory,
+        Transition(
+            observation=observation,
+            memory=memory,
+            allowed=allowed,
+            raw=raw,
+            log_density=density,
+            reward=jnp.asarray(after.reward),
+            cost=jnp.asarray(after.cost),
+            discount=jnp.asarray(after.discount),
+            terminated=jnp.asarray(after.terminated, bool),
+            truncated=jnp.asarray(after.truncated, bool),
+            last=environment.observe(after.world),
+        ),
     )
-    return after.world, output.memory, record
 
 
 def generalized_advantages(

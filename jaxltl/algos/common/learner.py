@@ -49,6 +49,7 @@ Example: a learner of the fixed point of ``x -> (1 - rate) x + rate * target``.
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
@@ -292,130 +293,53 @@ def bind(
     Returns:
       :class:`Bound`.
     """
-    checked_init, checked_step = _checked_init(init), _checked_step(step)
-    early = checked_step if step_if is None else _checked_step_if(step_if)
-    functions = Bound(
-        checked_init,
-        checked_step,
-        *_full_runs(checked_init, checked_step),
-        *_early_runs(checked_init, early, keep, idle=step_if is not None),
-    )
+
+    def checked(made: Callable[..., tuple[StateT, MetricsT]]) -> Callable[..., Any]:
+        def call(
+            state: StateT, problem: ProblemT, hparams: HparamsT, *going: jax.Array
+        ) -> tuple[StateT, MetricsT]:
+            require_hparams(hparams)
+            after, metrics = made(state, problem, hparams, *going)
+            return after, flag_invalid(metrics, hparams, state.step)
+
+        return call
+
+    checked_step = checked(step)
+    early = checked_step if step_if is None else checked(step_if)
+
+    def checked_init(key: chex.PRNGKey, problem: ProblemT, hparams: HparamsT) -> StateT:
+        require_hparams(hparams)
+        return init(key, problem, hparams)
+
+    def run(
+        state: StateT, problem: ProblemT, hparams: HparamsT, **options: Any
+    ) -> tuple[StateT, MetricsT]:
+        return loops.run(checked_step, state, problem, hparams, **options)
+
+    def train(
+        key: chex.PRNGKey, problem: ProblemT, hparams: HparamsT, **options: Any
+    ) -> tuple[StateT, MetricsT]:
+        return run(checked_init(key, problem, hparams), problem, hparams, **options)
+
+    def run_until(state: StateT, problem: ProblemT, hparams: HparamsT, **options: Any) -> Learned:
+        options = {"keep": keep, "idle": step_if is not None, **options}
+        return loops.run_until(early, state, problem, hparams, **options)
+
+    def train_until(
+        key: chex.PRNGKey, problem: ProblemT, hparams: HparamsT, **options: Any
+    ) -> Learned:
+        return run_until(checked_init(key, problem, hparams), problem, hparams, **options)
+
+    functions = Bound(checked_init, checked_step, run, train, run_until, train_until)
     for name, function in functions._asdict().items():
         function.__name__ = function.__qualname__ = name
         function.__module__ = step.__module__
         function.__doc__ = getattr(Learner, name).__doc__
+        signature = inspect.signature(getattr(Learner, name))
+        _, *parameters = signature.parameters.values()
+        parameters = [x.replace(default=keep) if x.name == "keep" else x for x in parameters]
+        function.__signature__ = signature.replace(parameters=parameters)
     return functions
-
-
-def _checked_init(init: Callable[..., StateT]) -> Callable[..., StateT]:
-    def checked(key: chex.PRNGKey, problem: ProblemT, hparams: HparamsT) -> StateT:
-        require_hparams(hparams)
-        return init(key, problem, hparams)
-
-    return checked
-
-
-def _checked_step(
-    step: Callable[..., tuple[StateT, MetricsT]],
-) -> Callable[..., tuple[StateT, MetricsT]]:
-    def checked(state: StateT, problem: ProblemT, hparams: HparamsT) -> tuple[StateT, MetricsT]:
-        require_hparams(hparams)
-        after, metrics = step(state, problem, hparams)
-        return after, flag_invalid(metrics, hparams, state.step)
-
-    return checked
-
-
-def _checked_step_if(
-    step_if: Callable[..., tuple[StateT, MetricsT]],
-) -> Callable[..., tuple[StateT, MetricsT]]:
-    def checked(
-        state: StateT, problem: ProblemT, hparams: HparamsT, going: jax.Array
-    ) -> tuple[StateT, MetricsT]:
-        after, metrics = step_if(state, problem, hparams, going)
-        return after, flag_invalid(metrics, hparams, state.step)
-
-    return checked
-
-
-def _full_runs(
-    init: Callable[..., StateT], step: Callable[..., tuple[StateT, MetricsT]]
-) -> tuple[Callable[..., tuple[StateT, MetricsT]], Callable[..., tuple[StateT, MetricsT]]]:
-    def run(
-        state: StateT,
-        problem: ProblemT,
-        hparams: HparamsT,
-        *,
-        num_steps: int,
-        max_rows: int = 1000,
-    ) -> tuple[StateT, MetricsT]:
-        return loops.run(step, state, problem, hparams, num_steps=num_steps, max_rows=max_rows)
-
-    def train(
-        key: chex.PRNGKey,
-        problem: ProblemT,
-        hparams: HparamsT,
-        *,
-        num_steps: int,
-        max_rows: int = 1000,
-    ) -> tuple[StateT, MetricsT]:
-        state = init(key, problem, hparams)
-        return run(state, problem, hparams, num_steps=num_steps, max_rows=max_rows)
-
-    return run, train
-
-
-def _early_runs(
-    init: Callable[..., StateT],
-    step: Callable[..., tuple[StateT, MetricsT]],
-    default_keep: str,
-    *,
-    idle: bool,
-) -> tuple[Callable[..., Learned], Callable[..., Learned]]:
-    def run_until(
-        state: StateT,
-        problem: ProblemT,
-        hparams: HparamsT,
-        *,
-        until: Until[StateT, MetricsT],
-        num_steps: chex.Numeric,
-        check_every: int = 1,
-        keep: str = default_keep,
-    ) -> Learned:
-        return loops.run_until(
-            step,
-            state,
-            problem,
-            hparams,
-            until=until,
-            num_steps=num_steps,
-            check_every=check_every,
-            keep=keep,
-            idle=idle,
-        )
-
-    def train_until(
-        key: chex.PRNGKey,
-        problem: ProblemT,
-        hparams: HparamsT,
-        *,
-        until: Until[StateT, MetricsT],
-        num_steps: chex.Numeric,
-        check_every: int = 1,
-        keep: str = default_keep,
-    ) -> Learned:
-        state = init(key, problem, hparams)
-        return run_until(
-            state,
-            problem,
-            hparams,
-            until=until,
-            num_steps=num_steps,
-            check_every=check_every,
-            keep=keep,
-        )
-
-    return run_until, train_until
 
 
 # --- statuses, random keys and counters ---------------------------------------------------------------

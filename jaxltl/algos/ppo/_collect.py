@@ -65,19 +65,6 @@ class Rows(NamedTuple):
     advantage: jax.Array
 
 
-class Told(NamedTuple):
-    """Figures of a collection, as in ``Metrics``."""
-
-    reward: jax.Array
-    cost: jax.Array
-    episodes: jax.Array
-    episode_return: jax.Array
-    episode_length: jax.Array
-    explained_variance: jax.Array
-    permitted: jax.Array
-    finite: jax.Array
-
-
 def _unless_nonfinite(moments: Moments, numbers: jax.Array) -> Moments:
     """Moments with a batch added, or unchanged if a number of it is not finite."""
     new = updated_moments(moments, numbers)
@@ -96,8 +83,12 @@ class _Record(NamedTuple):
 
 def collected(
     key: chex.PRNGKey, state: Any, problem: Any, hparams: Any
-) -> tuple[Any, Any, Rows, Told]:
-    """T transitions of N environments: the next state, initial memories, transitions and figures."""
+) -> tuple[Any, Any, Rows, dict[str, jax.Array]]:
+    """T transitions of N environments: the next state, initial memories, transitions, and figures.
+
+    Figures are those of ``Metrics``, whether every mask allows an action, ``permitted``, and whether all
+    advantages are finite, ``finite``.
+    """
     walkers, record = _walked(key, state, problem, hparams)
     path = record.of
     dtype = walkers.discounted.dtype
@@ -130,20 +121,20 @@ def collected(
     mean_of = jnp.where(number > 0, 1 / jnp.maximum(number, 1), jnp.nan).astype(dtype)
     target = found + value
     spread = jnp.var(target)
-    told = Told(
-        reward=path.reward.astype(dtype).mean(),
-        cost=path.cost.astype(dtype).mean(),
-        episodes=number.astype(jnp.int32),
-        episode_return=jnp.sum(jnp.where(ended, record.episode_return, 0)) * mean_of,
-        episode_length=jnp.sum(jnp.where(ended, record.episode_length, 0)) * mean_of,
-        explained_variance=jnp.where(
+    figures = {
+        "reward": path.reward.astype(dtype).mean(),
+        "cost": path.cost.astype(dtype).mean(),
+        "episodes": number.astype(jnp.int32),
+        "episode_return": jnp.sum(jnp.where(ended, record.episode_return, 0)) * mean_of,
+        "episode_length": jnp.sum(jnp.where(ended, record.episode_length, 0)) * mean_of,
+        "explained_variance": jnp.where(
             spread > 0, 1 - jnp.var(found) / jnp.where(spread > 0, spread, 1), jnp.nan
         ),
-        permitted=jnp.bool_(True) if path.allowed is None else path.allowed.any(-1).all(),
-        finite=jnp.all(jnp.isfinite(found)),
-    )
+        "permitted": jnp.bool_(True) if path.allowed is None else path.allowed.any(-1).all(),
+        "finite": jnp.all(jnp.isfinite(found)),
+    }
     after = replace(state, walkers=walkers, moments=moments, return_moments=returns)
-    return after, state.walkers.memory, rows, told
+    return after, state.walkers.memory, rows, figures
 
 
 def _discounted_sums(

@@ -21,15 +21,7 @@ from jaxltl.algos.ppo._collect import Rows
 from jaxltl.core.models.mesh import lanes
 
 
-class Figures(NamedTuple):
-    """Parts of the loss of a minibatch before its update, or means over updates."""
-
-    policy_loss: jax.Array
-    value_loss: jax.Array
-    entropy: jax.Array
-    kl: jax.Array
-    clipped: jax.Array
-    gradient_norm: jax.Array
+Figures = dict[str, jax.Array]  # of Metrics: of a minibatch before its update, or means
 
 
 class Limits(NamedTuple):
@@ -76,14 +68,13 @@ def loss(
         error = jnp.maximum(error, (rows.value + shift - target) ** 2)
     error = error.mean() / 2
     total = -gain + hparams.value_weight * error - hparams.entropy_weight * entropy
-    return total, Figures(
-        policy_loss=-gain,
-        value_loss=error,
-        entropy=entropy,
-        kl=jnp.mean(ratio - 1 - change),
-        clipped=jnp.mean(jnp.abs(ratio - 1) > limits.clip, dtype=ratio.dtype),
-        gradient_norm=jnp.zeros_like(gain),
-    )
+    return total, {
+        "policy_loss": -gain,
+        "value_loss": error,
+        "entropy": entropy,
+        "kl": jnp.mean(ratio - 1 - change),
+        "clip_fraction": jnp.mean(jnp.abs(ratio - 1) > limits.clip, dtype=ratio.dtype),
+    }
 
 
 def _said(parameters: Any, rows: Rows, begun: Any, problem: Any) -> Output:
@@ -108,8 +99,8 @@ class _Going(NamedTuple):
 
 def improved(
     key: chex.PRNGKey, state: Any, rows: Rows, begun: Any, problem: Any, hparams: Any
-) -> tuple[Any, Any, Figures, jax.Array, jax.Array]:
-    """Parameters and the optimiser's state after the epochs, mean figures, and numbers of updates.
+) -> tuple[Any, Any, Figures]:
+    """Parameters and the optimiser's state after the epochs, and mean figures.
 
     Updates with a gradient that is not finite are skipped and counted, as are all after the first
     minibatch whose divergence exceeds `target_kl`.
@@ -130,10 +121,10 @@ def improved(
         )
         slope, told = lanes.replicate((slope, told), over)
         norm = jnp.sqrt(sum(jnp.sum(x**2) for x in jax.tree.leaves(slope)))
-        told = told._replace(gradient_norm=norm)
+        told = told | {"gradient_norm": norm}
         stopped = going.stopped
         if hparams.target_kl is not None:
-            stopped |= told.kl > hparams.target_kl
+            stopped |= told["kl"] > hparams.target_kl
         finite = jnp.isfinite(norm)
         if hparams.max_gradient_norm is not None:
             shorter = jnp.minimum(1, hparams.max_gradient_norm / jnp.maximum(norm, 1e-38))
@@ -154,17 +145,13 @@ def improved(
         num_epochs=hparams.num_epochs,
         num_minibatches=hparams.num_minibatches,
     )
-    number = made.sum()
-    mean = jax.tree.map(
-        lambda x: jnp.sum(jnp.where(made, x, 0)) / jnp.where(number > 0, number, jnp.nan), told
-    )
-    return (
-        going.parameters,
-        going.optimizer,
-        mean,
-        number.astype(jnp.int32),
-        lost.sum().astype(jnp.int32),
-    )
+    number, lost = made.sum(), lost.sum()
+    figures = {
+        name: jnp.sum(jnp.where(made, x, 0)) / jnp.where(number > 0, number, jnp.nan)
+        for name, x in told.items()
+    }
+    figures |= {"updates": number.astype(jnp.int32), "nonfinite": lost.astype(jnp.int32)}
+    return going.parameters, going.optimizer, figures
 
 
 def _at(schedule: Any, step: jax.Array) -> Any:

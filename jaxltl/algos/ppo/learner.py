@@ -89,6 +89,7 @@ from jaxltl.core.environments.environment import (
 )
 from jaxltl.core.environments.episodes import Agent
 from jaxltl.core.models.mesh import lanes
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.pretty_print import brief, history
 from jaxltl.core.types import Status
 
@@ -365,31 +366,26 @@ def greedy(state: State, problem: Problem, hparams: Hparams) -> Agent:
 def _agent(state: State, problem: Problem, hparams: Hparams, sampled: bool) -> Agent:
     validation.instance("state", state, State, "one of ppo.init or ppo.train")
     _require_ours(problem, hparams)
-    act = Partial(_actor(sampled, hparams.squash), problem, state.parameters, state.moments)
-    return Agent(act, problem.memory)
+    run = (problem, state.parameters, state.moments)
+    return Agent(Partial(_actor(sampled, hparams.squash), run), problem.memory)
 
 
 @cache  # the same function each time, so that what runs an agent is compiled once
-def _actor(sampled: bool, squash: str) -> Callable[..., Any]:
-    return partial(_act, sampled=sampled, squash=squash)
+def _actor(sampled: bool, squash: str) -> Callable[..., tuple[jax.Array, chex.ArrayTree]]:
+    def act(
+        run: tuple[Problem, PyTree, PyTree],
+        memory: PyTree,
+        observation: PyTree,
+        allowed: jax.Array | None,
+        key: chex.PRNGKey,
+    ) -> tuple[jax.Array, PyTree]:
+        problem, parameters, moments = run
+        output = evaluated(problem, parameters, memory, normalized(moments, observation))
+        mode = {"sampled": sampled, "squash": squash}
+        action = actions_of.chosen(key, problem.environment.actions, output.action, allowed, **mode)
+        return action, output.memory
 
-
-def _act(
-    problem: Problem,
-    parameters: Any,
-    moments: Any,
-    memory: Any,
-    observation: Any,
-    allowed: Any,
-    key: chex.PRNGKey,
-    *,
-    sampled: bool,
-    squash: str,
-) -> tuple[jax.Array, Any]:
-    actions = problem.environment.actions
-    said = evaluated(problem, parameters, memory, normalized(moments, observation))
-    action = actions_of.chosen(key, actions, said.action, allowed, sampled=sampled, squash=squash)
-    return action, said.memory
+    return act
 
 
 # --- learning -------------------------------------------------------------------------------------
@@ -440,40 +436,27 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
     _check(problem, hparams)
     validation.instance("state", state, State, "one of ppo.init or ppo.train")
     collect_key, update_key = jax.random.split(learner.step_key(state))
-    after, begun, rows, told = collected(collect_key, state, problem, hparams)
-    parameters, optimizer, figures, updates, nonfinite = improved(
-        update_key, state, rows, begun, problem, hparams
-    )
+    after, begun, rows, figures = collected(collect_key, state, problem, hparams)
+    permitted, finite = figures.pop("permitted"), figures.pop("finite")
+    parameters, optimizer, losses = improved(update_key, state, rows, begun, problem, hparams)
     parameters, optimizer = trees.choose(
-        told.permitted, (parameters, optimizer), (state.parameters, state.optimizer)
+        permitted, (parameters, optimizer), (state.parameters, state.optimizer)
     )
-    status = jnp.where((nonfinite > 0) | ~told.finite, Status.NONFINITE, Status.COMPLETED)
-    status = jnp.where(told.permitted, status, Status.INVALID).astype(jnp.int32)
+    status = jnp.where((losses["nonfinite"] > 0) | ~finite, Status.NONFINITE, Status.COMPLETED)
+    made = learner.saturating_add(state.transitions, hparams.num_envs * hparams.num_steps)
     new = replace(
         after,
         step=state.step + 1,
         parameters=parameters,
         optimizer=optimizer,
-        transitions=learner.saturating_add(state.transitions, hparams.num_envs * hparams.num_steps),
+        transitions=made,
     )
     return new, Metrics(
-        transitions=new.transitions,
-        reward=told.reward,
-        cost=told.cost,
-        episodes=told.episodes,
-        episode_return=told.episode_return,
-        episode_length=told.episode_length,
-        policy_loss=figures.policy_loss,
-        value_loss=figures.value_loss,
-        entropy=figures.entropy,
-        kl=figures.kl,
-        clip_fraction=figures.clipped,
-        gradient_norm=figures.gradient_norm,
-        explained_variance=told.explained_variance,
-        learning_rate=jnp.asarray(_at(hparams.learning_rate, state.step), figures.kl.dtype),
-        updates=updates,
-        nonfinite=nonfinite,
-        status=status,
+        **figures,
+        **losses,
+        transitions=made,
+        learning_rate=jnp.asarray(_at(hparams.learning_rate, state.step), losses["kl"].dtype),
+        status=jnp.where(permitted, status, Status.INVALID).astype(jnp.int32),
     )
 
 
