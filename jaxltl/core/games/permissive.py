@@ -29,7 +29,7 @@ from jaxltl.core.models.ops import operators
 from jaxltl.core.models.ops.array_namespace import namespace, to_jax
 from jaxltl.core.models.product import Product
 from jaxltl.core.pretty_print import brief
-from jaxltl.core.sparse.graph.product_graph import HostGraph
+from jaxltl.core.sparse.graph.row_graph import RowGraph
 from jaxltl.core.sparse.rows import first_action
 
 METHODS = ("auto", "stay", "rank", "counter", "parity")
@@ -120,7 +120,7 @@ def permissive_strategy(
     if bound is not None and bound < 1:
         raise ValueError(f"bound={bound}; it must be at least 1.")
     game, goal = on_states(as_padded_game(game), spec)
-    graph = _concrete_graph(game, goal)
+    graph = concrete_graph(game, goal)
     objective: Any
     game, objective = jax.tree.map(np.asarray, (game, goal))
     if isinstance(objective, Parity) and not _closed(graph, objective.won):
@@ -239,14 +239,15 @@ class _Arena(NamedTuple):
     """A game in NumPy arrays, its graph, and the system's objective."""
 
     game: Any
-    graph: HostGraph
+    graph: RowGraph
     objective: Any
 
 
-def _concrete_graph(game: Game, objective: Any = None) -> HostGraph:
+def concrete_graph(game: Game, objective: Any = None) -> RowGraph:
+    """The graph of a concrete padded game; ValueError for others."""
     refuse_sharded(game)
     graph = graph_of(game, objective)
-    if not isinstance(graph, HostGraph):
+    if not isinstance(graph, RowGraph) or not graph.is_padded:
         raise ValueError(
             "permissive strategies are built on the host: call permissive_strategy "
             "outside of jit and vmap, on an MDP, a DenseMDP or a Product."
@@ -259,7 +260,7 @@ def _region(arena: _Arena) -> np.ndarray:
     return solve(arena.graph, arena.game.system, arena.objective).region
 
 
-def staying(graph: HostGraph, region: np.ndarray) -> np.ndarray:
+def staying(graph: RowGraph, region: np.ndarray) -> np.ndarray:
     """``bool[S, A]``: the moves that surely stay in a region."""
     return graph.available & region[..., None] & graph.forall(region)
 
@@ -325,7 +326,7 @@ def _explicit(
     found = jax.tree.map(np.asarray, restrict(game, start / start.sum(), allowed=mask))
     origin = found.base_state * game.state_shape[1] + found.memory
     model = found.model
-    return _Arena(model, _concrete_graph(model), _at(objective, origin)), found
+    return _Arena(model, concrete_graph(model), _at(objective, origin)), found
 
 
 def _at(objective: Any, origin: np.ndarray) -> Any:
@@ -348,7 +349,7 @@ def _beside(game: Game, delta: np.ndarray, initial: int, letter: chex.Array, lab
     return Game(joint, system)
 
 
-def _closed(graph: HostGraph, region: Any) -> bool:
+def _closed(graph: RowGraph, region: Any) -> bool:
     return bool(np.all(~region[..., None] | ~graph.available | graph.forall(region)))
 
 
@@ -412,7 +413,7 @@ def _by_rank(arena: _Arena, region, stay, bound) -> Permissive:
     )
 
 
-def _some_nearer(graph: HostGraph, rank: np.ndarray, region: np.ndarray) -> np.ndarray:
+def _some_nearer(graph: RowGraph, rank: np.ndarray, region: np.ndarray) -> np.ndarray:
     """Moves with a successor in the region that has a smaller rank: ``bool[S, A]``."""
     rank = np.where(region, rank, NEVER)
     return graph.least(rank) < rank[..., None]
@@ -571,7 +572,7 @@ def _safe_beside(
         lost=spent | objective.lost[:, None],
         num_priorities=objective.num_priorities,
     )
-    graph = _concrete_graph(joint)
+    graph = concrete_graph(joint)
     region = _region(_Arena(joint, graph, kept))
     if not _wins_somewhere(joint, region):
         if bound is None:

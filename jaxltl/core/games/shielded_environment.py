@@ -27,12 +27,10 @@ from jaxltl.core.environments.environment import (
     make_environment,
     require_environment,
 )
-from jaxltl.core.games.permissive import Permissive, apply_strategy, staying
+from jaxltl.core.games.permissive import Permissive, apply_strategy, concrete_graph, staying
 from jaxltl.core.games.winning import Winning
-from jaxltl.core.graphs.graph import graph_of
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.pretty_print import brief
-from jaxltl.core.sparse.graph.product_graph import HostGraph
 
 
 @brief
@@ -181,8 +179,7 @@ def _require_places(environment: Environment, place: Callable[..., Any], count: 
 def _guide(strategy: Permissive | Winning) -> _Guide:
     """The strategy on its reachable states, with all moves of both players."""
     if isinstance(strategy, Winning):
-        graph = graph_of(strategy.game)
-        assert isinstance(graph, HostGraph)
+        graph = concrete_graph(strategy.game)
         region = np.asarray(strategy.region)
         every: Any = np.arange(strategy.game.state_shape[0], dtype=np.int32)
         allowed: Any = staying(graph, region)

@@ -22,7 +22,7 @@ def components_by_sweeps(
 ) -> tuple[jax.Array, jax.Array]:
     """Components among some states, and the actions inside: ``int32[S]``, ``bool[S, A]``.
 
-    Arguments as of ``HostGraph.components``; unless `closed`, allowed actions stay in `core`.
+    Arguments as of ``RowGraph.components``; unless `closed`, allowed actions stay in `core`.
     """
     stay = allowed & graph.available & core[..., None]
 

@@ -10,6 +10,7 @@ from jaxltl.core.graphs.attractor import avoid
 from jaxltl.core.graphs.graph import Graph, graph_of, take
 from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.pretty_print import brief
+from jaxltl.core.sparse.graph.row_graph import RowGraph
 
 
 @brief
@@ -68,6 +69,8 @@ def end_components(
 def components_within(graph: Graph, region: Any, allowed: Any = None) -> EndComponents:
     """:func:`end_components` of a graph."""
     allowed = graph.available if allowed is None else allowed & graph.available
+    if isinstance(graph, RowGraph):
+        return EndComponents(*graph.components(region, allowed, closed=False))
     # Few states can stay in the region, as a rule.
     core = region & avoid(graph, ~region, allowed)
     allowed = allowed & graph.forall(core) & graph.on_choices(core)

@@ -1,8 +1,8 @@
 """Graph operations of models, with NumPy on the host or with JAX inside ``jit``.
 
-Graph algorithms are written once, for both. On concrete arrays the graph is a
-:class:`~jaxltl.core.sparse.graph.product_graph.HostGraph`, which compiles nothing; where anything is traced it
-is a :class:`TracedGraph`, made of the primitives. Both give the same answers, bit for bit.
+Graph algorithms are written once, for both. On concrete arrays the graph consists of sparse rows
+(:class:`~jaxltl.core.sparse.graph.row_graph.RowGraph`), and nothing is compiled; where anything is
+traced it is a :class:`TracedGraph`, made of the primitives. Both give the same answers, bit for bit.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from jaxltl.core.models.ops.choices import choice_shape, choices
 from jaxltl.core.models.ops.host_callback import host_callback
 from jaxltl.core.models.product import Product, reads
 from jaxltl.core.models.sparse import SparseMDP
-from jaxltl.core.sparse.graph.product_graph import HostGraph
-from jaxltl.core.sparse.graph.row_graph import RowGraph
-from jaxltl.core.sparse.rows import rows_from_padded, rows_from_dense
+from jaxltl.core.sparse.graph.row_graph import RowGraph, product_graph
+from jaxltl.core.sparse.mdp import HostGraph
+from jaxltl.core.sparse.rows import rows_from_dense, rows_from_padded
 
 
 @dataclass(frozen=True)
 class TracedGraph:
-    """The operations of a HostGraph by the operators of a model, inside ``jit`` and ``vmap``."""
+    """The operations of a RowGraph by the operators of a model, inside ``jit`` and ``vmap``."""
 
     model: Any
 
@@ -43,10 +43,6 @@ class TracedGraph:
     @property
     def state_shape(self) -> tuple[int, ...]:
         return self.model.state_shape
-
-    @property
-    def num_actions(self) -> int:
-        return self.model.num_actions
 
     @property
     def available(self) -> jax.Array:
@@ -83,7 +79,7 @@ class TracedGraph:
         return _sweeps(self, goal, allowed & self.available, rule, among, chance=chance)
 
     def components(self, core, allowed, closed: bool):
-        """The components of a HostGraph, by a callback; by sweeps for a model over a mesh."""
+        """The components of a RowGraph, by a callback; by sweeps for a model over a mesh."""
         if is_sharded(self.model):
             return components_by_sweeps(self, core, allowed, closed)
         shape, flat = self.state_shape, int(np.prod(self.state_shape))
@@ -120,7 +116,7 @@ class TracedGraph:
 
 jax.tree_util.register_dataclass(TracedGraph, data_fields=["model"], meta_fields=[])
 
-Graph: TypeAlias = Any  # a HostGraph or RowGraph with NumPy's arrays, or a TracedGraph with JAX's
+Graph: TypeAlias = Any  # a RowGraph with NumPy's arrays, or a TracedGraph with JAX's
 
 
 @partial(jax.jit, static_argnames=("chance",))
@@ -147,7 +143,7 @@ def graph_of(model: Any, *arguments: Any) -> Graph:
     world = model.mdp if isinstance(model, Game) else model
     if isinstance(world, SparseMDP):
         if not is_traced((model, arguments)):
-            return RowGraph(world.host)
+            return RowGraph(world.host, world.state_shape, np.ones(world.num_rows, bool))
         model = compiled_form(model)[0]
     if is_traced((model, arguments)) or not is_table(model):
         return TracedGraph(lax.stop_gradient(model))  # supports have no derivative
@@ -161,7 +157,7 @@ def is_table(model: Any) -> bool:
     return isinstance(world, MDP | DenseMDP)
 
 
-def host_graph(model: Any) -> HostGraph:
+def host_graph(model: MDP | DenseMDP | Product | Game) -> RowGraph:
     """The graph of a concrete padded model; unavailable actions are not read."""
     lazy = model.mdp if isinstance(model, Game) else model
     world = lazy.mdp if isinstance(lazy, Product) else lazy
@@ -170,19 +166,18 @@ def host_graph(model: Any) -> HostGraph:
         rows = rows_from_dense(used)
     else:
         rows = rows_from_padded(np.asarray(world.successor), used, world.num_states)
+    row_start = np.arange(0, available.size + 1, available.shape[1])
+    host = HostGraph(row_start, rows.entry_start, rows.successor)
     if world is lazy:
-        letter = np.zeros(world.num_states, np.int32)
-        return HostGraph(rows, available, letter[:, None], letter, True, world.state_shape)
+        return RowGraph(host, world.state_shape, available)
     letter = np.asarray(lazy.letter)
-    memory = np.ascontiguousarray(np.asarray(lazy.automaton.delta)[:, letter].T)
-    return HostGraph(
-        rows,
+    return product_graph(
+        host,
         available,
-        memory,
+        np.asarray(lazy.automaton.delta)[:, letter].T,
         letter,
-        lazy.label_on == "entry",
-        lazy.state_shape,
-        None if lazy.allowed is None else np.asarray(lazy.allowed),
+        on_entry=lazy.label_on == "entry",
+        allowed=None if lazy.allowed is None else np.asarray(lazy.allowed),
     )
 
 

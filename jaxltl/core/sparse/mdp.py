@@ -14,25 +14,22 @@ from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.rows import Rows, concatenated_ranges, offsets_from_counts
 
 
-@brief
 @dataclass(frozen=True)
-class HostMDP:
-    """Transitions of a Markov decision process, without padding.
+class HostGraph:
+    """Successors of the choices of a Markov decision process, without padding.
 
     The choices of state s are the rows ``row_start[s]`` to ``row_start[s + 1] - 1``, and the
     successors of row r the entries ``entry_start[r]`` to ``entry_start[r + 1] - 1``.
 
     Attributes:
       row_start: ``int32[S + 1]``, strictly ascending: every state has a choice.
-      entry_start: ``int[R + 1]``, strictly ascending.
-      successor: ``int32[T]``, ascending and without repetition within a row.
-      probability: ``float64[T]``, positive; a row sums to one up to rounding.
+      entry_start: ``int[R + 1]``; an unavailable action of a padded model is a row without entries.
+      successor: ``int32[T]``.
     """
 
     row_start: Integers
     entry_start: Integers
     successor: Integers
-    probability: Floats
 
     @property
     def num_states(self) -> int:
@@ -66,8 +63,9 @@ class HostMDP:
     @cached_property
     def is_self_loop(self) -> NDArray[np.bool_]:
         """Rows whose only successor is their own state, ``bool[R]``."""
-        found: NDArray[np.bool_] = self.successor[self.entry_start[:-1]] == self.state
         count = np.diff(self.entry_start)
+        found: NDArray[np.bool_] = count > 0
+        found[found] = self.successor[self.entry_start[:-1][found]] == self.state[found]
         several = np.flatnonzero(found & (count > 1))
         entry = concatenated_ranges(self.entry_start[several], count[several])
         of = several.repeat(count[several])
@@ -83,6 +81,31 @@ class HostMDP:
     def support(self) -> Rows:
         """The successors of each row."""
         return Rows(self.entry_start, self.successor, self.num_states)
+
+    def first_choice(self, mask: Booleans) -> tuple[Booleans, Integers]:
+        """States with a marked row, and the first marked row of each (or its first row)."""
+        row = np.flatnonzero(mask)
+        first = self.row_start[:-1].astype(np.int32)
+        some = np.zeros(self.num_states, bool)
+        state = self.state[row]
+        some[state] = True
+        first[state[::-1]] = row[::-1]  # the first one is written last
+        return some, first
+
+
+@brief
+@dataclass(frozen=True)
+class HostMDP(HostGraph):
+    """Transitions of a Markov decision process: a graph without empty rows, and probabilities.
+
+    Attributes:
+      row_start: ``int32[S + 1]``, strictly ascending.
+      entry_start: ``int[R + 1]``, strictly ascending.
+      successor: ``int32[T]``, ascending and without repetition within a row.
+      probability: ``float64[T]``, positive; a row sums to one up to rounding.
+    """
+
+    probability: Floats
 
     @cached_property
     def matrix(self) -> Any:
@@ -109,13 +132,3 @@ class HostMDP:
         states = np.arange(self.num_states + 1)
         start = offsets_from_counts(width)
         return HostMDP(states, start, self.successor[entry], self.probability[entry])
-
-    def first_choice(self, mask: Booleans) -> tuple[Booleans, Integers]:
-        """States with a marked row, and the first marked row of each (or its first row)."""
-        row = np.flatnonzero(mask)
-        first = self.row_start[:-1].astype(np.int32)
-        some = np.zeros(self.num_states, bool)
-        state = self.state[row]
-        some[state] = True
-        first[state[::-1]] = row[::-1]  # the first one is written last
-        return some, first

@@ -52,44 +52,26 @@ class Rows:
         return sparse.csr_array((data, self.successor, self.entry_start), shape=shape)
 
     def some_successor_in(self, region: Booleans) -> Booleans:
-        """Marks rows with a successor in a region: ``bool[R, ...]`` from ``bool[S, ...]``."""
+        """Marks rows with a successor in a region: ``bool[R]``."""
         if not region.any():
-            return np.zeros((self.num_rows, *region.shape[1:]), bool)
+            return np.zeros(self.num_rows, bool)
         if region.all():
-            full = (self.count > 0).reshape(-1, *(1,) * (region.ndim - 1))
-            return np.broadcast_to(full, (self.num_rows, *region.shape[1:])).copy()
+            return self.count > 0
         if self.successor.size > SCIPY_SIZE:
             return self.matrix @ region.astype(self.matrix.dtype) > 0
-        return self._reduce(np.logical_or, region, False)
+        return self.reduce(np.logical_or, region[self.successor], False)
 
     def least(self, value: NDArray[Any], default: Any) -> NDArray[Any]:
-        """The smallest value among the successors, ``[R, ...]``; the default for empty rows."""
-        return self._reduce(np.minimum, value, default)
+        """The smallest value among the successors, ``[R]``; the default for empty rows."""
+        return self.reduce(np.minimum, value[self.successor], default)
 
-    def number_in(self, region: Booleans) -> Integers:
-        """The number of entries in a region, ``int32[R, ...]``."""
-        return self._reduce(np.add, region.astype(np.int32), 0)
-
-    def _reduce(self, operation: np.ufunc, value: NDArray[Any], default: Any) -> NDArray[Any]:
-        found = np.full((self.num_rows, *value.shape[1:]), default, value.dtype)
+    def reduce(self, operation: np.ufunc, entries: NDArray[Any], default: Any) -> NDArray[Any]:
+        """A reduction over the entries of each row, ``[R]``; the default for empty rows."""
+        found = np.full(self.num_rows, default, entries.dtype)
         full = self.count > 0
         if full.any():
-            start = self.entry_start[:-1][full]
-            found[full] = operation.reduceat(value[self.successor], start, axis=0)
+            found[full] = operation.reduceat(entries, self.entry_start[:-1][full])
         return found
-
-    def take(self, rows: Integers) -> Rows:
-        """The given rows, in the given order."""
-        if self.successor.size > SCIPY_SIZE:
-            part = self.matrix[rows]
-            return Rows(part.indptr, part.indices, self.num_states)
-        count = self.count[rows]
-        start: Integers = np.concatenate([[0], count.cumsum()])
-        return Rows(
-            start,
-            self.successor[concatenated_ranges(self.entry_start[rows], count)],
-            self.num_states,
-        )
 
     @cached_property
     def predecessors(self) -> tuple[Integers, Integers]:

@@ -128,14 +128,14 @@ def test_regions_with_memory_equal_parity_in_a_thousand_games(kind):
 
 
 def check_paths(rng, play, kind, monkeypatch):
-    """Sweeps, worklists and compiled code agree, and their strategies win."""
+    """Plain loops, array operations and compiled code agree, and their strategies win."""
     game = as_game(play)
     objective = OBJECTIVES[kind](game, draw(rng, play.model.num_states))
-    monkeypatch.setattr(host_attract, "SWEEPS", 12)
+    monkeypatch.setattr(host_attract, "FEW", 24)
     found = winning_region(game, objective)
     verdict = verify(found)
     assert verdict, verdict.reason
-    monkeypatch.setattr(host_attract, "SWEEPS", 0)
+    monkeypatch.setattr(host_attract, "FEW", 0)
     others = [winning_region(game, objective)]
     if kind in ("parity", "gr1"):  # the others are cases of these
         others.append(compiled(game, objective))
@@ -189,7 +189,7 @@ def test_products_and_dense_worlds(kind, label_on, monkeypatch):
             game = Game(model, jnp.asarray(system.reshape(shape)))
             x = {k: v.reshape(*v.shape[:-1], *shape) for k, v in sets.items()}
             objective = OBJECTIVES[kind](game, x)
-            monkeypatch.setattr(host_attract, "SWEEPS", 0)
+            monkeypatch.setattr(host_attract, "FEW", 0)
             found = winning_region(game, objective)
             assert found.region.shape == shape
             region = np.ravel(found.region)
@@ -538,7 +538,7 @@ def test_a_very_long_chain(length):
 
 def test_nested_depth_on_the_host(monkeypatch):
     """A chain of coins: each state falls back to the start or goes on, and the end is a trap."""
-    monkeypatch.setattr(host_attract, "SWEEPS", 0)
+    monkeypatch.setattr(host_attract, "FEW", 0)
     length = 400
     states = np.arange(length)
     successor = np.stack([np.minimum(states + 1, length - 1), 0 * states], axis=1)

@@ -95,7 +95,7 @@ def test_end_components_equal_all_subsets(cases, mdps):
     [("sparse", None), ("dense", None), ("product", "entry"), ("product", "exit")],
 )
 def test_representations_agree(kind, label_on, monkeypatch):
-    """Sweeps and worklists give one answer on any model."""
+    """Plain loops and array operations give one answer on any model."""
     rng = np.random.default_rng(1)
     options = {"num_memory": 4, "label_on": label_on} if kind == "product" else {"num_states": 6}
     for _ in range(6):
@@ -106,8 +106,8 @@ def test_representations_agree(kind, label_on, monkeypatch):
         goal_, allowed_ = goal.reshape(shape), allowed.reshape(*shape, -1)
         for rule in ("exists", "forall"):
             expected = reference.attractor(explicit, goal, allowed, rule)
-            for sweeps in (48, 0):
-                monkeypatch.setattr(host_attract, "SWEEPS", sweeps)
+            for few in (24, 0):
+                monkeypatch.setattr(host_attract, "FEW", few)
                 found = jl.graphs.attractor(model, goal_, allowed_, rule=rule)
                 np.testing.assert_array_equal(found.region.ravel(), expected)
                 if rule == "exists":
@@ -115,8 +115,8 @@ def test_representations_agree(kind, label_on, monkeypatch):
                     check_progress(explicit, goal, allowed, flat)
         small = kind != "product"  # brute force tries every policy and every set of states
         expected = reference.almost_surely_reaching(explicit, goal, allowed) if small else None
-        for sweeps in (48, 0):
-            monkeypatch.setattr(host_attract, "SWEEPS", sweeps)
+        for few in (24, 0):
+            monkeypatch.setattr(host_attract, "FEW", few)
             found = jl.graphs.almost_surely_reaching(model, goal_, allowed_)
             if small:
                 np.testing.assert_array_equal(found.region, expected)

@@ -62,7 +62,7 @@ def test_rules_by_state_equal_naive_sweeps(chance):
 
 @pytest.mark.parametrize("kind", ["sparse", "dense", "entry", "exit"])
 @pytest.mark.parametrize("chance", CHANCE)
-def test_sweeps_and_worklists_agree(kind, chance, monkeypatch):
+def test_plain_loops_and_array_operations_agree(kind, chance, monkeypatch):
     """On every representation, products with their states in two axes among them."""
     rng = np.random.default_rng(1)
     deeper = 0
@@ -78,8 +78,8 @@ def test_sweeps_and_worklists_agree(kind, chance, monkeypatch):
         expected = expected_attractor(explicit, *case, chance)
         answers = []
         # A game is seen through to its model.
-        for world, sweeps in ((model, 12), (Game(model, rule), 0)):
-            monkeypatch.setattr(host_attract, "SWEEPS", sweeps)
+        for world, few in ((model, 24), (Game(model, rule), 0)):
+            monkeypatch.setattr(host_attract, "FEW", few)
             answers.append(attractor(world, goal, allowed, rule=rule, chance=chance, among=among))
         for found in answers:
             np.testing.assert_array_equal(np.ravel(found.region), expected)
@@ -93,7 +93,6 @@ def test_wide_frontiers_of_a_worklist(monkeypatch):
     rng = np.random.default_rng(2)
     for limit in (0, 24, 10_000):
         monkeypatch.setattr(host_attract, "FEW", limit)
-        monkeypatch.setattr(host_attract, "SWEEPS", 0)
         for chance in CHANCE:
             for _ in range(5):
                 model = reference_games.random_game(rng, 40, 2, 3, local=6).model
@@ -107,10 +106,10 @@ def test_wide_frontiers_of_a_worklist(monkeypatch):
                 check_moves(model, case, found, chance)
 
 
-@pytest.mark.parametrize("sweeps", [0, 12])
-def test_parallel_edges_count_once_each(sweeps, monkeypatch):
+@pytest.mark.parametrize("few", [0, 24])
+def test_parallel_edges_count_once_each(few, monkeypatch):
     """A move with two entries for one successor surely leads there when that one joins."""
-    monkeypatch.setattr(host_attract, "SWEEPS", sweeps)
+    monkeypatch.setattr(host_attract, "FEW", few)
     model = reference.Model(
         np.array([[[1, 1]], [[2, 2]], [[2, 2]], [[2, 3]]]),
         np.full((4, 1, 2), 0.5),

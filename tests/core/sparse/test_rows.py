@@ -33,20 +33,13 @@ def test_reductions_equal_loops(large, wide, monkeypatch):
         rows = rows_from_padded(successor, used, NUM_STATES)
         lists = [s[u] for s, u in zip(successor, used, strict=True)]
         assert rows.count.tolist() == [len(x) for x in lists]
-        for shape in ((), (3,)):
-            region = rng.random((NUM_STATES, *shape)) < rng.choice([0.0, 0.3, 1.0])
-            np.testing.assert_array_equal(
-                rows.some_successor_in(region), [region[x].any(0) for x in lists]
-            )
-            np.testing.assert_array_equal(rows.number_in(region), [region[x].sum(0) for x in lists])
-            value = rng.integers(50, size=(NUM_STATES, *shape))
-            least = [value[x].min(0) if len(x) else np.full(shape, 99) for x in lists]
-            np.testing.assert_array_equal(rows.least(value, 99), least)
-        some = rng.permutation(12)[:5]
-        part = rows.take(some)
-        assert np.split(part.successor, part.entry_start[1:-1])[2].tolist() == (
-            lists[some[2]].tolist()
+        region = rng.random(NUM_STATES) < rng.choice([0.0, 0.3, 1.0])
+        np.testing.assert_array_equal(
+            rows.some_successor_in(region), [region[x].any() for x in lists]
         )
+        value = rng.integers(50, size=NUM_STATES)
+        least = [value[x].min() if len(x) else 99 for x in lists]
+        np.testing.assert_array_equal(rows.least(value, 99), least)
         start, row = rows.predecessors
         for t in range(NUM_STATES):
             into = np.repeat(np.arange(12), [np.sum(x == t) for x in lists])

@@ -1,250 +1,157 @@
-"""Attractors on the host: sweeps over open states, then a worklist, linear in the transitions."""
+"""Attractors on sparse rows: a worklist, linear in the transitions."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Integers
-from jaxltl.core.sparse.rows import (
-    group_starts,
-    decrement,
-    sorted_unique,
-    first_action,
-    some_action,
-    concatenated_ranges,
-)
+from jaxltl.core.sparse.mdp import HostGraph
+from jaxltl.core.sparse.rows import concatenated_ranges, decrement, group_starts, sorted_unique
 
-SWEEPS = 12  # times the size of the graph that sweeps may cost, before a worklist takes over
-ALL: Any = slice(None)
-FEW = 24  # transitions into a frontier up to which Python's own loop beats NumPy's overhead
+FEW = 24  # states of a frontier up to which Python's own loop beats NumPy's overhead
+_MANY = 64  # transitions into one of them from which it does not
 
 
-@dataclass
-class Search:
-    """An attractor that grows in place; states ``[S, Q]``, pairs ``[S, Q, A]``.
+class Attraction(NamedTuple):
+    """An attractor.
 
     Attributes:
-      graph: the :class:`~jaxltl.core.sparse.graph.product_graph.HostGraph`.
-      chance: ``"some"`` successor in the region makes an action lead there, or ``"all"``.
-      region: what has joined, at first the goal.
-      action, rank: as of an attractor.
-      allowed: the actions that count.
-      rule: True where one allowed action suffices, False where all must lead there.
-      open: the states that may still join.
-      round: how many rounds were made.
+      region: ``bool[S]``.
+      row: ``int32[S]``: where one row suffices, the first that led nearer when the state joined;
+        elsewhere the first of the state.
+      rank: ``int32[S]``, the round in which a state joined; 0 in the goal.
     """
 
-    graph: Any
-    chance: str
     region: Booleans
-    action: Integers
+    row: Integers
     rank: Integers
-    allowed: Booleans
-    rule: Booleans
-    open: Booleans
-    round: int = 0
 
 
-def attract(search: Search) -> None:
-    """Grows the region until nothing joins."""
-    goal = search.region.copy()
-    if not _sweep(search):
-        _work(search)
-    # Where every action leads nearer none is better than the first.
-    forced = search.region & ~goal & ~search.rule
-    search.action[forced] = first_action(search.allowed[forced])[1]
-
-
-def _sweep(search: Search) -> bool:
-    """Rounds over the states that are open; whether nothing joins any more."""
-    graph, num_memory = search.graph, search.graph.num_memory
-    forced = not search.rule.all()
-    rows, part = graph.rows, ALL
-    size, left = graph.rows.num_states, SWEEPS * (rows.successor.size + search.open.size)
-    while True:
-        world = np.flatnonzero(search.open.any(-1) if num_memory > 1 else search.open)
-        if not world.size:
-            return True
-        if 4 * world.size < size:  # look at the open states alone
-            pairs = world[:, None] * graph.num_actions + np.arange(graph.num_actions)
-            rows, part, size = graph.rows.take(pairs.ravel()), world, world.size
-        left -= rows.successor.size * num_memory + search.open.size
-        hit = search.allowed[part] & _leads(search, rows, part)
-        some, first = first_action(hit)
-        new = some & search.rule[part] & search.open[part]
-        if forced:
-            rest = some_action(search.allowed[part] & ~hit)
-            new |= ~rest & ~search.rule[part] & search.open[part]
-        if not new.any():
-            return True
-        _join(search, part, new, first)
-        if left <= 0:
-            return False
-
-
-def _leads(search: Search, rows: Any, part: Any) -> Booleans:
-    """The pairs of some world states that lead to the region: ``bool[N, Q, A]``."""
-    graph = search.graph
-    if search.chance == "some":
-        return graph.through(search.region, rows.some_successor_in, part)
-    return ~graph.through(~search.region, rows.some_successor_in, part)
-
-
-def _join(search: Search, part: Any, new: Booleans, first: Integers) -> None:
-    search.round += 1
-    found = np.flatnonzero(new)
-    state = found
-    if not isinstance(part, slice):
-        row, q = np.divmod(found, search.graph.num_memory)
-        state = part[row] * search.graph.num_memory + q
-    search.region.reshape(-1)[state] = True
-    search.open.reshape(-1)[state] = False
-    search.rank.reshape(-1)[state] = search.round
-    search.action.reshape(-1)[state] = first.reshape(-1)[found]
-
-
-def _work(search: Search) -> None:
-    """Finishes by a worklist: each transition is touched once more."""
-    worklist = _worklist(search)
-    frontier: Integers = np.flatnonzero(search.region & (search.rank == search.round))
+def attracted(
+    graph: HostGraph,
+    goal: Booleans,
+    rows: Booleans | None = None,
+    *,
+    exists: bool | Booleans = True,
+    chance: str = "some",
+    among: Booleans | None = None,
+) -> Attraction:
+    """States that a goal attracts by some row (`exists`) or by all of `rows`, the rows that count."""
+    waiting = np.ones(graph.num_rows, bool) if rows is None else rows.copy()
+    left = (
+        np.diff(graph.row_start)
+        if rows is None
+        else np.bincount(graph.state[rows], minlength=graph.num_states)
+    ).astype(np.int32)
+    open_ = ~goal if among is None else among & ~goal
+    rule = np.broadcast_to(exists, goal.shape)
+    lacking = None if chance == "some" else np.diff(graph.entry_start).astype(np.int32)
+    first = graph.row_start[:-1].astype(np.int32)
+    search = _Search(
+        graph,
+        waiting,
+        lacking,
+        left,
+        open_,
+        rule,
+        goal.copy(),
+        first,
+        np.zeros(goal.size, np.int32),
+    )
+    # In the first round also states without a row join that need all, and empty rows lead anywhere.
+    alone: Integers = np.flatnonzero(~rule & (left == 0) & open_)
+    empty = np.flatnonzero(waiting & (lacking == 0)) if lacking is not None else None
+    frontier, count = search.many(np.flatnonzero(goal), 1, empty), 1
+    if alone.size:
+        alone = alone[open_[alone]]
+        open_[alone], search.region[alone], search.rank[alone] = False, True, 1
+        frontier = np.concatenate([frontier, alone])
+    start = graph.predecessors[0]
     while frontier.size:
-        frontier = _join_few(worklist, frontier)
-        search.round += 1
-        frontier = _join_pairs(worklist, _into(worklist, frontier))
+        if frontier.size <= FEW and (start[frontier + 1] - start[frontier]).max() <= _MANY:
+            frontier, count = search.few(frontier, count)
+        else:
+            count += 1
+            frontier = search.many(frontier, count)
+    return Attraction(search.region, search.row, search.rank)
 
 
-class _Worklist(NamedTuple):
-    """What each pair ``(s * Q + q) * A + a`` still lacks before it leads to the region.
+class _Search(NamedTuple):
+    """A growing region.
 
     Attributes:
-      search: what is grown.
-      missing: ``int[S * Q * A]``, the successors of a pair that must still join.
-      waiting: ``bool[S * Q * A]``, pairs that count and do not lead to the region yet.
-      remaining: ``int[S * Q]``, how many pairs of a state are waiting.
-      view: the same and parts of the search as memory views, which plain loops read faster.
+      waiting: ``bool[R]``, rows that count and do not lead to the region yet.
+      lacking: ``int32[R]``, entries outside of the region if all must be inside, else None.
+      left: ``int32[S]``, waiting rows of a state.
+      open: ``bool[S]``, states that may still join.
+      rule: ``bool[S]``, True where one row suffices.
+      region, row, rank: as of :class:`Attraction`.
     """
 
-    search: Search
-    missing: Integers
+    graph: HostGraph
     waiting: Booleans
-    remaining: Integers
-    view: dict[str, memoryview]
+    lacking: Integers | None
+    left: Integers
+    open: Booleans
+    rule: Booleans
+    region: Booleans
+    row: Integers
+    rank: Integers
 
+    def many(self, frontier: Integers, rank: int, empty: Integers | None = None) -> Integers:
+        """The states that join after a frontier."""
+        start, pred = self.graph.predecessors
+        row = pred[concatenated_ranges(start[frontier], start[frontier + 1] - start[frontier])]
+        if self.lacking is not None:
+            decrement(self.lacking, row)
+            row = row[self.lacking[row] <= 0]
+            if empty is not None and empty.size:
+                row = np.concatenate([row, empty])
+        row = row[self.waiting[row]]
+        if not row.size:
+            return row
+        row = sorted_unique(row, self.graph.num_rows)
+        self.waiting[row] = False
+        state = self.graph.state[row]
+        decrement(self.left, state)
+        joins = (self.rule[state] | (self.left[state] == 0)) & self.open[state]
+        state, row = state[joins], row[joins]
+        first = group_starts(state)  # rows are in order, so those of one state are contiguous
+        state, row = state[first], row[first]
+        self.open[state], self.region[state], self.rank[state] = False, True, rank
+        one = self.rule[state]
+        self.row[state[one]] = row[one]
+        return state
 
-def _worklist(search: Search) -> _Worklist:
-    graph = search.graph
-    before = search.region & (search.rank < search.round)  # the last round is the frontier
-    if search.chance == "some":
-        lacking = ~graph.through(before, graph.rows.some_successor_in)
-        missing = np.ones(lacking.size, np.int32)
-    else:
-        missing = graph.through(~before, graph.rows.number_in).reshape(-1)
-        lacking = missing.reshape(search.allowed.shape) > 0
-    waiting = (search.allowed & lacking).reshape(-1)
-    remaining = waiting.reshape(-1, graph.num_actions).sum(-1)
-    start, pair = graph.rows.predecessors
-    arrays = {
-        "missing": missing,
-        "waiting": waiting,
-        "remaining": remaining,
-        "start": start,
-        "pair": pair,
-        "memory": graph.next_memory,
-        "open": search.open,
-        "rule": search.rule,
-        "region": search.region,
-        "rank": search.rank,
-        "action": search.action,
-    }
-    view = {name: memoryview(x.reshape(-1)) for name, x in arrays.items()}
-    return _Worklist(search, missing, waiting, remaining, view)
-
-
-def _into(worklist: _Worklist, frontier: Integers) -> Integers:
-    """The pairs with a successor in the frontier, one a transition."""
-    graph = worklist.search.graph
-    start, row = graph.rows.predecessors
-    target, memory = np.divmod(frontier, graph.num_memory)
-    count = start[target + 1] - start[target]
-    row = row[concatenated_ranges(start[target], count)]
-    if graph.num_memory == 1:
-        return row
-    s, a = np.divmod(row, graph.num_actions)
-    read = np.repeat(target, count) if graph.on_entry else s
-    start, before = graph.memory_before
-    code = graph.letter[read].astype(np.int64) * graph.num_memory + np.repeat(memory, count)
-    count = start[code + 1] - start[code]
-    q = before[concatenated_ranges(start[code], count)]
-    return (
-        np.repeat(s.astype(np.int64) * (graph.num_memory * graph.num_actions) + a, count)
-        + q * graph.num_actions
-    )
-
-
-def _join_pairs(worklist: _Worklist, pairs: Integers) -> Integers:
-    """The states that join by pairs of which some more successors are in the region."""
-    search, missing, waiting, remaining, _ = worklist
-    decrement(missing, pairs)
-    pair = sorted_unique(pairs[waiting[pairs] & (missing[pairs] <= 0)], waiting.size)
-    waiting[pair] = False
-    state, a = np.divmod(pair, search.graph.num_actions)
-    decrement(remaining, state)
-    flat = [
-        x.reshape(-1) for x in (search.rule, search.open, search.action, search.region, search.rank)
-    ]
-    rule, open_, action, region, rank = flat
-    joins = (rule[state] | (remaining[state] == 0)) & open_[state]
-    state, a = state[joins], a[joins]
-    first = group_starts(state)  # pairs are in order, so one state's stand together
-    frontier = state[first]
-    action[frontier] = a[first]
-    open_[frontier], region[frontier], rank[frontier] = False, True, search.round
-    return frontier
-
-
-def _join_few(worklist: _Worklist, frontier: Integers) -> Integers:
-    """Rounds by plain loops while frontiers are small; the first one that is not.
-
-    Along a chain every frontier is small, and there are very many.
-    """
-    search, view = worklist.search, worklist.view
-    graph, few = search.graph, frontier.tolist() if frontier.size <= FEW else []
-    num_actions, num_memory, on_entry = graph.num_actions, graph.num_memory, graph.on_entry
-    start, row, memory = view["start"], view["pair"], view["memory"]
-    missing, waiting, remaining = view["missing"], view["waiting"], view["remaining"]
-    rule, open_, region = view["rule"], view["open"], view["region"]
-    while few:
-        pairs: list[int] = []
-        for state in few:
-            target, after = divmod(state, num_memory)
-            first, last = start[target], start[target + 1]
-            if len(pairs) + (last - first) * num_memory > FEW:
-                return np.array(few)
-            if num_memory == 1:
-                pairs += row[first:last]
-                continue
-            for pair in row[first:last]:
-                s, a = divmod(pair, num_actions)
-                read = (target if on_entry else s) * num_memory
-                pairs += [
-                    (s * num_memory + q) * num_actions + a
-                    for q in range(num_memory)
-                    if memory[read + q] == after
-                ]
-        search.round += 1
-        few = []
-        for pair in sorted(pairs):
-            missing[pair] -= 1
-            if missing[pair] > 0 or not waiting[pair]:
-                continue
-            waiting[pair] = False
-            state, a = divmod(pair, num_actions)
-            remaining[state] -= 1
-            if (rule[state] or not remaining[state]) and open_[state]:
-                open_[state], region[state] = False, True
-                view["action"][state], view["rank"][state] = a, search.round
-                few.append(state)
-    return frontier if frontier.size > FEW else np.array([], int)
+    def few(self, frontier: Integers, rank: int) -> tuple[Integers, int]:
+        """Rounds by plain loops while few states join, as along a chain; the next frontier."""
+        arrays: tuple[Any, ...] = (*self.graph.predecessors, self.graph.state, *self[1:])
+        start, pred, owner, waiting, lacking, left, open_, rule, region, first, joined = (
+            None if x is None else memoryview(x) for x in arrays
+        )
+        todo = frontier.tolist()
+        while todo and len(todo) <= FEW:
+            rows: list[int] = []
+            for target in todo:
+                rows += pred[start[target] : start[target + 1]]
+                if len(rows) > FEW * _MANY:
+                    return np.array(todo), rank
+            rank += 1
+            todo = []
+            for row in sorted(rows):
+                if lacking is not None:
+                    lacking[row] -= 1
+                    if lacking[row] > 0:
+                        continue
+                if waiting[row]:
+                    waiting[row] = False
+                    state = owner[row]
+                    left[state] -= 1
+                    if (rule[state] or not left[state]) and open_[state]:
+                        open_[state], region[state], joined[state] = False, True, rank
+                        if rule[state]:
+                            first[state] = row
+                        todo.append(state)
+        return np.array(todo, np.int64), rank

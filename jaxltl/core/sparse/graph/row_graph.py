@@ -1,111 +1,181 @@
-"""Graph of a model with sparse rows; masks of rows take the place of masks of actions."""
+"""Graph operations of models on sparse rows, with NumPy."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Integers
+from jaxltl.core.sparse.graph.attractor import attracted
 from jaxltl.core.sparse.graph.components import strong_components
-from jaxltl.core.sparse.graph.product_graph import HostGraph
 from jaxltl.core.sparse.graph.qualitative import end_components
-from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import group_starts, decrement, sorted_unique, concatenated_ranges
+from jaxltl.core.sparse.mdp import HostGraph
+from jaxltl.core.sparse.rows import concatenated_ranges, first_action, offsets_from_counts
 
 
 @dataclass(frozen=True)
 class RowGraph:
-    """The operations of a HostGraph for sparse rows: a mask is ``bool[R]``, an action is a row."""
+    """Graph operations on rows; ``TracedGraph`` is their JAX form.
 
-    host: HostMDP
+    A mask of choices has the shape of `available`. Rows of a padded model are numbered
+    ``s * A + a``; of a sparse one an action is a row.
+
+    Attributes:
+      host: the rows, without entries where an action is unavailable.
+      state_shape: ``(S,)``, or ``(S, Q)`` of a product.
+      available: ``bool[S, A]``, or ``bool[R]`` of a sparse model.
+      letter: ``int[S]`` of a product, the letter of each world state.
+      on_entry: whether the automaton reads the label of the state that is entered.
+    """
+
+    host: HostGraph
+    state_shape: tuple[int, ...]
+    available: Booleans
+    letter: Integers | None = None
+    on_entry: bool = True
 
     xp = np
 
     @property
-    def state_shape(self) -> tuple[int, ...]:
-        return (self.host.num_states,)
-
-    @cached_property
-    def available(self) -> Booleans:
-        """``bool[R]``."""
-        return np.ones(self.host.num_rows, bool)
+    def is_padded(self) -> bool:
+        """Whether choices are actions."""
+        return self.available.ndim > len(self.state_shape)
 
     def on_choices(self, states: Booleans) -> Booleans:
-        """A set of states as a mask of rows: ``bool[R]``."""
-        return states[self.host.state]
+        """A set of states as a mask of choices: ``bool[S, 1]`` or ``bool[R]``."""
+        return states[..., None] if self.is_padded else states[self.host.state]
 
     def exists(self, region: Booleans) -> Booleans:
-        """Whether some successor lies in a region: ``bool[R]``."""
-        return self.host.support.some_successor_in(region)
+        """Whether some successor lies in a region; False where unavailable."""
+        found = self.host.support.some_successor_in(region.reshape(-1))
+        return found.reshape(self.available.shape)
 
     def forall(self, region: Booleans) -> Booleans:
-        """Whether all successors lie in a region: ``bool[R]``."""
+        """Whether all successors lie in a region; True where unavailable."""
         return ~self.exists(~region)
 
+    def least(self, value: Integers) -> Integers:
+        """The smallest value among the successors; the dtype's largest without any."""
+        found = self.host.support.least(value.reshape(-1), np.iinfo(value.dtype).max)
+        return found.reshape(self.available.shape)
+
+    def reads(self, marked: Booleans) -> Booleans:
+        """Whether an action can read a marked transition ``bool[Q, L]``: ``bool[S, Q, A]``."""
+        assert self.letter is not None
+        here = marked[:, self.letter].T  # [S, Q]
+        if not self.on_entry:
+            return here[:, :, None] & self.available
+        support, num_memory = self.host.support, self.state_shape[1]
+        row = np.arange(support.num_rows) // self.available.shape[-1] % num_memory
+        entry = self.host.successor // num_memory * num_memory + np.repeat(row, support.count)
+        found = support.reduce(np.logical_or, here.reshape(-1)[entry], False)
+        return found.reshape(self.available.shape)
+
     def first(self, mask: Booleans) -> tuple[Booleans, Integers]:
-        """Whether a mask holds for some row of a state, and the first one (or its first row)."""
-        return self.host.first_choice(mask)
+        """Whether a mask holds for some choice of a state, and the first one (or the first of all)."""
+        return first_action(mask) if self.is_padded else self.host.first_choice(mask)
 
     def attract(
         self, goal: Booleans, allowed: Booleans, rule: Booleans, among: Booleans, chance: str
     ) -> tuple[Booleans, Integers, Integers]:
-        """Region, row and rank of an attractor."""
-        host = self.host
-        start, pred = host.predecessors
-        lacking = np.ones(host.num_rows, np.int32)
-        if chance == "all":
-            lacking = np.diff(host.entry_start).astype(np.int32)
-        waiting = allowed.copy()
-        left = np.bincount(host.state[allowed], minlength=host.num_states).astype(np.int32)
-        region, open_ = goal.copy(), among & ~goal
-        rank = np.zeros(host.num_states, np.int32)
-        row = self.first(self.available)[1]
-        frontier: Integers = np.flatnonzero(goal)
-        alone: Integers = np.flatnonzero(~rule & (left == 0) & open_)
-        round_ = 0
-        while frontier.size or (round_ == 0 and alone.size):
-            round_ += 1
-            hit = pred[concatenated_ranges(start[frontier], start[frontier + 1] - start[frontier])]
-            decrement(lacking, hit)
-            hit = sorted_unique(hit[waiting[hit] & (lacking[hit] <= 0)], host.num_rows)
-            waiting[hit] = False
-            state = host.state[hit]
-            decrement(left, state)
-            joins = (rule[state] | (left[state] == 0)) & open_[state]
-            state, hit = state[joins], hit[joins]
-            # Rows are in order, so those of one state are contiguous.
-            first = group_starts(state)
-            frontier = state[first]
-            row[frontier] = hit[first]
-            if round_ == 1:
-                frontier = np.concatenate([frontier, alone])
-            open_[frontier], region[frontier], rank[frontier] = False, True, round_
-        forced = region & ~goal & ~rule
-        row[forced] = self.first(allowed)[1][forced]
-        return region, row, rank
+        """Region, choice and rank of an attractor."""
+        allowed, shape = allowed & self.available, self.state_shape
+        found = attracted(
+            self.host,
+            goal.reshape(-1),
+            allowed.reshape(-1),
+            exists=rule.reshape(-1),
+            chance=chance,
+            among=among.reshape(-1),
+        )
+        region, rank = found.region.reshape(shape), found.rank.reshape(shape)
+        row = found.row - self.host.row_start[:-1] if self.is_padded else found.row
+        joined = region & ~goal
+        # Where every choice leads nearer none is better than the first.
+        action = np.where(rule, row.reshape(shape), self.first(allowed)[1])
+        action = np.where(joined, action, self.first(self.available)[1])
+        return region, action.astype(np.int32), rank
 
     def components(
         self, core: Booleans, allowed: Booleans, closed: bool
     ) -> tuple[Integers, Booleans]:
-        """The components of a HostGraph: ``int32[S]``, and the rows inside, ``bool[R]``."""
-        host = self.host
-        if not closed:
-            found = end_components(host, core, allowed)
-            return found.component.astype(np.int32), found.inside
-        used = allowed[host.row]
-        source, target = host.state[host.row[used]], host.successor[used]
-        label = strong_components(source, target, host.num_states)
-        crossing = label[source] != label[target]
-        left = np.zeros(host.num_states, bool)
-        left[label[source[crossing]]] = True
-        inside = allowed & ~left[label][host.state]
-        alive = np.zeros(host.num_states, bool)
-        alive[host.state[inside]] = True
-        own = np.arange(host.num_states)
-        return np.where(alive, label, own).astype(np.int32), inside
+        """Components among some states, ``int32[S]``, and the choices inside.
 
-    anywhere = HostGraph.anywhere
-    repeat = HostGraph.repeat
-    times = HostGraph.times
+        Maximal end components; or, if `closed`, bottom strongly connected components.
+        """
+        host = self.host
+        rows = (allowed & self.available).reshape(-1)
+        if not closed:
+            component, inside = end_components(host, core.reshape(-1), rows)
+        else:
+            used = rows[host.row]
+            source, target = host.state[host.row[used]], host.successor[used]
+            label = strong_components(source, target, host.num_states)
+            crossing = label[source] != label[target]
+            left = np.zeros(host.num_states, bool)
+            left[label[source[crossing]]] = True
+            inside = rows & ~left[label][host.state]
+            alive = host.first_choice(inside)[0]
+            component = np.where(alive, label, np.arange(host.num_states))
+        return (
+            component.astype(np.int32).reshape(self.state_shape),
+            inside.reshape(self.available.shape),
+        )
+
+    def anywhere(self, mark: Booleans, component: Integers) -> Booleans:
+        """Whether a state of the same component is marked: ``bool[S]``."""
+        found = np.zeros(component.size, bool)
+        found[component[mark]] = True
+        return found[component]
+
+    # --- loops --------------------------------------------------------------------------------
+
+    def repeat(self, body: Callable[[Any], Any], start: tuple[Any, ...]) -> tuple[Any, ...]:
+        """Repeats `body` while the last entry of the carry is true."""
+        while start[-1]:
+            start = body(start)
+        return start
+
+    def times(self, count: int, body: Callable[[int, Any], Any], start: Any) -> Any:
+        """``body(i, carry)`` for i below a count."""
+        for i in range(int(count)):
+            start = body(i, start)
+        return start
+
+
+def product_graph(
+    world: HostGraph,
+    available: Booleans,
+    memory: Integers,
+    letter: Integers,
+    *,
+    on_entry: bool,
+    allowed: Booleans | None,
+) -> RowGraph:
+    """The graph of a padded world with a memory, ``int[S, Q]`` after a state's label is read.
+
+    `allowed` is a mask ``bool[S, Q, A]`` of actions, or None.
+    """
+    (num_states, num_memory), num_actions = memory.shape, available.shape[-1]
+    shape = (num_states, num_memory, num_actions)
+    count = np.broadcast_to(np.diff(world.entry_start).reshape(num_states, 1, -1), shape)
+    lazy = np.broadcast_to(available[:, None], shape)
+    if allowed is not None:
+        count, lazy = count * allowed, lazy & allowed
+    entry_start = offsets_from_counts(count.ravel())
+    start = np.broadcast_to(world.entry_start[:-1].reshape(num_states, 1, -1), shape)
+    target = world.successor[concatenated_ranges(start.ravel(), count.ravel())]
+    width = count.sum(-1).ravel()
+    target = target * entry_start.dtype.type(num_memory)
+    if on_entry:
+        target += np.tile(np.arange(num_memory, dtype=target.dtype), num_states).repeat(width)
+        after = np.arange(num_states)[:, None] * num_memory + memory
+        target = after.astype(np.int32).ravel()[target]
+    else:
+        target += memory.astype(target.dtype).ravel().repeat(width)
+    row_start = np.arange(0, lazy.size + 1, num_actions)
+    host = HostGraph(row_start, entry_start, target)
+    return RowGraph(host, shape[:2], lazy, letter, on_entry)

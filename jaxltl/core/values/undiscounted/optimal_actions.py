@@ -143,8 +143,7 @@ def optimal_actions(
         narrower = _bounded(problem, keeps, bounds, objective, goal)
         if int(narrower.status) == Status.CONVERGED:
             return narrower
-    graph = graph_of(problem.model)
-    chosen = np.asarray(solution.policy)[..., None] == np.arange(graph.num_actions)
+    chosen = np.asarray(solution.policy)[..., None] == np.arange(problem.model.num_actions)
     return _bounded(problem, chosen, solution, objective, goal)
 
 

@@ -20,6 +20,7 @@ from jaxltl.core.graphs.end_components import (
 from jaxltl.core.graphs.graph import host_graph
 from jaxltl.core.models.construct.convert import to_padded, to_sparse
 from jaxltl.core.sparse import rows
+from jaxltl.core.sparse.graph import attractor as host_attract
 from jaxltl.core.sparse.graph import qualitative as sparse_graph
 from jaxltl.core.sparse.mdp import HostMDP
 from tests.core.models.test_sparse import random_padded
@@ -47,7 +48,7 @@ def on_host(tree):
 @pytest.fixture(params=["python", "numpy", "scipy"])
 def way(request, monkeypatch):
     """The same by each way of searching, which sizes choose."""
-    monkeypatch.setattr(sparse_graph, "_FEW", 0 if request.param == "numpy" else 1000)
+    monkeypatch.setattr(host_attract, "FEW", 0 if request.param == "numpy" else 1000)
     if request.param == "scipy":
         monkeypatch.setattr(rows, "SCIPY_SIZE", 0)
         monkeypatch.setattr(sparse_graph, "SCIPY_SIZE", 0)
@@ -71,13 +72,33 @@ def test_searches():
             sparse_graph.positive_under_all_policies(host, goal), ~avoid(graph, goal)
         )
         among = rng.random(host.num_states) < 0.8
-        slow = goal.copy()
-        for _ in range(host.num_states):
-            hit = host.support.some_successor_in(slow) | ~kept
-            slow |= among & host.over_choices(np.logical_and, hit)
-        np.testing.assert_array_equal(
-            sparse_graph.positive_under_all_policies(host, goal, kept, among), slow
-        )
+        for mask, joins in ((None, None), (kept, among)):
+            slow = goal.copy()
+            for _ in range(host.num_states):
+                hit = host.support.some_successor_in(slow)
+                hit = hit if mask is None else hit | ~mask
+                more = host.over_choices(np.logical_and, hit)
+                slow |= more if joins is None else more & joins
+            np.testing.assert_array_equal(
+                sparse_graph.positive_under_all_policies(host, goal, mask, joins), slow
+            )
+
+
+def naive_end_components(host, kept):
+    """Rows are removed that leave the component of their state, until none does."""
+    kept = kept.copy()
+    while True:
+        edge = np.eye(host.num_states, dtype=bool)
+        used = kept[host.row]
+        edge[host.state[host.row[used]], host.successor[used]] = True
+        for _ in range(host.num_states.bit_length()):
+            edge = edge @ edge
+        label = (edge & edge.T).argmax(1)
+        leaves = np.zeros(host.num_rows, bool)
+        leaves[host.row[label[host.successor] != label[host.state[host.row]]]] = True
+        if not (kept & leaves).any():
+            return np.where(host.first_choice(kept)[0], label, np.arange(host.num_states)), kept
+        kept &= ~leaves
 
 
 @pytest.mark.usefixtures("way")
@@ -88,7 +109,11 @@ def test_end_components():
         states = rng.random(host.num_states) < 0.9
         allowed = graph.available & (rng.random(graph.available.shape) < 0.8)
         theirs = components_within(graph, states, allowed)
-        ours = sparse_graph.end_components(host, states, on_rows(sparse, allowed))
+        rows_ = on_rows(sparse, allowed)
+        ours = sparse_graph.end_components(host, states, rows_)
+        component, inside = naive_end_components(host, rows_ & states[host.state])
+        np.testing.assert_array_equal(ours.component, component)
+        np.testing.assert_array_equal(ours.inside, inside)
         np.testing.assert_array_equal(ours.component, theirs.component)
         np.testing.assert_array_equal(ours.inside, on_rows(sparse, theirs.inside))
         np.testing.assert_array_equal(ours.region(host), np.asarray(theirs.inside).any(-1))
