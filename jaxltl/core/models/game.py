@@ -28,7 +28,7 @@ from jaxltl.core import validation
 @brief(facts=facts.game, drawn=True)
 @struct.dataclass
 class Game:
-    """A turn-based game of the system against the environment, stochastic or deterministic.
+    """Turn-based stochastic game of the system against the environment; see :func:`make_game`.
 
     Attributes:
       mdp: the model: an MDP, a DenseMDP, a SparseMDP, an IntervalMDP or a Product.
@@ -96,7 +96,7 @@ class Game:
 
 
 def make_game(model: Model, system: Sequence[bool] | chex.Array) -> Game:
-    """A checked :class:`Game`.
+    """Validated :class:`Game` on a model.
 
     Args:
       model: an MDP, a DenseMDP, a SparseMDP, an IntervalMDP or a Product.

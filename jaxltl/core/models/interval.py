@@ -38,20 +38,19 @@ _RADIUS = "\0radius"
 @brief(facts=facts.interval)
 @struct.dataclass
 class IntervalMDP:
-    """A labelled MDP with an interval for each transition probability.
+    """Labelled MDP with uncertain transition probabilities: intervals, and optional L1 balls.
 
     A row stands for all distributions p with ``lower <= p <= upper`` and, where there is a radius,
-    ``sum_t |p_t - center_t| <= radius``. Each time that it is taken, nature picks one of them,
-    against the policy (`nature="adversarial"`) or with it (`"cooperative"`). Build one with
-    :func:`make_interval` or :func:`interval_rows`, which check it.
+    ``sum_t |p_t - center_t| <= radius``. In each step nature picks one of them, against the policy
+    (`nature="adversarial"`) or with it (`"cooperative"`). :func:`make_interval` and
+    :func:`interval_rows` build validated models.
 
     Attributes:
       nominal: the graph, labels, rewards and names; its probabilities are one distribution of
         each row, positive wherever nature may put any mass.
       lower, upper: ``float64[T]``, one for each entry of `nominal`.
       center: ``float64[T]``, a distribution between them in each row; None without a radius.
-      radius: ``float64[R]``, how far from it a row may be in the L1 norm; None: as far as the ends
-        allow.
+      radius: ``float64[R]``, the largest L1 distance from it; None: bounded by the intervals only.
 
     Example:
       >>> import jaxltl as jl
@@ -60,8 +59,9 @@ class IntervalMDP:
       >>> rough = jl.make_interval(coin, [0.4, 0.3, 1, 1], [0.7, 0.6, 1, 1])
       >>> rough.num_transitions, rough.lower.tolist(), rough.is_chain
       (4, [0.4, 0.3, 1.0, 1.0], True)
-      >>> round(float(jl.reachability_probability(rough, rough.states_with_label("heads"), nature="adversarial")
-      ...             .value[0]), 6)
+      >>> heads = rough.states_with_label("heads")
+      >>> found = jl.reachability_probability(rough, heads, nature="adversarial")
+      >>> round(float(found.value[0]), 6)
       0.4
     """
 
@@ -88,7 +88,7 @@ class IntervalMDP:
 
     @property
     def is_chain(self) -> bool:
-        """Whether every state has one choice."""
+        """True if every state has one choice."""
         return self.nominal.is_chain
 
     @property
@@ -98,7 +98,7 @@ class IntervalMDP:
 
     @property
     def dtype(self) -> Any:
-        """Of the nominal probabilities."""
+        """The dtype of the nominal probabilities."""
         return self.nominal.dtype
 
     @property
@@ -108,7 +108,7 @@ class IntervalMDP:
 
     @property
     def label(self) -> Array:
-        """``bool[S, P]``, which propositions hold in a state."""
+        """``bool[S, P]``, the propositions that hold in each state."""
         return self.nominal.label
 
     @property
@@ -123,7 +123,7 @@ class IntervalMDP:
 
     @cached_property
     def host(self) -> UncertainMDP:
-        """The transitions as the host engine takes them."""
+        """The transitions for the sparse engine."""
         lower, upper = (np.asarray(x, np.float64) for x in (self.lower, self.upper))
         ball = (
             None
@@ -138,11 +138,7 @@ class IntervalMDP:
         return replace(self, center=None, radius=None)
 
     def states_with_label(self, proposition: str) -> Array:
-        """``bool[S]``, where a proposition holds.
-
-        Raises:
-          ValueError: there is no such proposition.
-        """
+        """``bool[S]``, the states in which a proposition holds; ValueError for an unknown one."""
         return self.nominal.states_with_label(proposition)
 
     def changed(self, change: Callable[[SparseMDP], SparseMDP]) -> IntervalMDP:
@@ -152,11 +148,7 @@ class IntervalMDP:
 
 
 def require_interval(model: Model) -> IntervalMDP:
-    """The model.
-
-    Raises:
-      ValueError: it is of another kind.
-    """
+    """The model; ValueError for one of another kind."""
     if not isinstance(model, IntervalMDP):
         raise ValueError(
             f"{type(model).__name__} has no intervals; give an IntervalMDP, as "
@@ -210,23 +202,21 @@ def make_interval(
     """Interval MDP on the graph of a model, with optional L1 balls.
 
     Args:
-      model: its graph, labels, rewards, names and initial distribution count, its probabilities
-        do not. A successor in the padding of an MDP, with an upper end above 0, counts.
+      model: its graph, labels, rewards, names and initial distribution are used, its probabilities
+        are not. A successor in the padding of an MDP, with an upper end above 0, counts.
       lower, upper: shaped as ``model.probability``: ``float[T]``, or ``float[S, A, K]``.
       center: of the same shape, a distribution between them in each row.
-      radius: ``float[R]``, or ``float[S, A]``: nature's distribution is no farther from `center`
-        than that, in the L1 norm (``sum_t |p_t - center_t|``, at most 2). Default: as far as the
-        ends allow. Of a ball alone the ends are 0 and 1.
+      radius: ``float[R]``, or ``float[S, A]``, at most 2: the largest L1 distance
+        ``sum_t |p_t - center_t|``; default: bounded by the intervals only. For a ball alone give the
+        ends 0 and 1.
 
     Returns:
-      :class:`IntervalMDP`. Entries to which nature cannot give any mass, up to the rounding of a
-      row's sum (4e-16 times its successors), are left out. A padded
-      model's row i of a state is the i-th of its available actions.
+      :class:`IntervalMDP`, without entries that have probability 0 up to rounding (4e-16 times the
+      successors of the row). Row i of a padded state is the i-th of its available actions.
 
     Raises:
       ValueError: naming the state and the choice: ends that are crossed, negative or above 1, or
-        between which there is no distribution; a center that is none, or not between the ends; a
-        radius that is negative or no number; only one of center and radius.
+        between which there is no distribution; an invalid center or radius; only one of both.
 
     Example:
       >>> from jaxltl import make_sparse
@@ -305,16 +295,15 @@ def interval_rows(
     rewards: Mapping[str, Rewards] | None = None,
     **rest: Any,
 ) -> IntervalMDP:
-    """Interval MDP from arrays of sparse rows, checked.
+    """Validated interval MDP from arrays of sparse rows.
 
-    Successors that stand twice in a row become one, whose ends are the sums. Ends that miss a
-    distribution by less than 1e-6 are scaled to one.
+    Repeated successors of a row are merged by summing their ends. Ends that miss a distribution by less
+    than 1e-6 are scaled.
 
     Args:
       row_start, entry_start, successor: as of :func:`~jaxltl.core.models.sparse.make_sparse`.
       lower, upper: ``float[T]``.
-      center, radius: ``float[T]`` and ``float[R]``, a ball in each row, as of
-        :func:`make_interval`.
+      center, radius: ``float[T]`` and ``float[R]``, as of :func:`make_interval`.
       rewards: named structures.
       rest: `initial`, `label`, `propositions`, `action`, `action_names` and `valuation` of
         :func:`~jaxltl.core.models.sparse.make_sparse`.

@@ -23,10 +23,10 @@ from jaxltl.core import validation
 @brief(facts=facts.padded, drawn=True)
 @struct.dataclass
 class MDP:
-    """A labelled Markov decision process with padded successor lists.
+    """Labelled Markov decision process with padded successor lists; :func:`make_mdp` builds one.
 
     Action ``a`` in state ``s`` leads to ``successor[s, a, k]`` with ``probability[s, a, k]``. Padding and
-    unavailable actions have successor 0 and probability 0. :func:`make_mdp` builds a checked model.
+    unavailable actions have successor 0 and probability 0.
 
     Attributes:
       successor: ``int32[S, A, K]``.
@@ -167,29 +167,26 @@ def make_mdp(
     label: chex.Array | Mapping[str, Sequence[int]] | None = None,
     propositions: Sequence[str] = (),
 ) -> MDP:
-    """A checked :class:`MDP` from arrays, on the host.
+    """Validated :class:`MDP` from arrays, in JAX's current default dtype.
 
-    Rows that sum to one within 1e-6 are scaled to do so as nearly as the dtype
-    allows; any other row is refused. The floating dtype is JAX's current default.
+    Rows that sum to one within 1e-6 are scaled to do so; any other row is refused.
 
     Args:
-      successor: ``int[S, A, K]``, entries in ``[0, S)`` wherever the probability is
-        positive.
+      successor: ``int[S, A, K]``, in ``[0, S)`` wherever the probability is positive.
       probability: ``float[S, A, K]``.
       available: ``bool[S, A]``; default: the actions with a positive probability.
       initial: ``float[S]``, a distribution; default: uniform.
-      label: ``bool[S, P]``, or the states where each proposition holds, by its name, such as
+      label: ``bool[S, P]``, or the states of each proposition by its name, such as
         ``{"goal": [15]}``; default: no propositions.
-      propositions: P distinct names; default: those of a label by names, in its order.
+      propositions: P distinct names; default: the keys of `label`.
 
     Returns:
-      :class:`MDP`, in JAX's current default dtype.
+      :class:`MDP`.
 
     Raises:
-      ValueError: an array has the wrong shape, a probability is negative or not
-        finite, a row does not sum to one, a successor is out of range, a state
-        has no action, or there are propositions without labels. The message names the state,
-        the action and the value.
+      ValueError: naming the state, the action and the value: a wrong shape, a probability that is
+        negative or not finite, a row that does not sum to one, a successor out of range, a state
+        without actions, or propositions without labels.
 
     Example:
       >>> mdp = make_mdp([[[0, 1]], [[1, 0]]], [[[0.5, 0.5]], [[1.0, 0.0]]])
@@ -249,19 +246,17 @@ def from_dense(
     label: chex.Array | Mapping[str, Sequence[int]] | None = None,
     propositions: Sequence[str] = (),
 ) -> MDP:
-    """The :class:`MDP` of a full matrix ``transition[s, a, t]``, checked as by :func:`make_mdp`.
-
-    K is the largest number of successors of any state and action.
+    """Validated :class:`MDP` of a full matrix ``transition[s, a, t]``.
 
     Args:
-      transition: ``float[S, A, S]``.
+      transition: ``float[S, A, S]``; K is the largest number of successors of a row.
       available, initial, label, propositions: as for :func:`make_mdp`.
 
     Returns:
       :class:`MDP`.
 
     Raises:
-      ValueError: as :func:`make_mdp`, and when the matrix is not ``[S, A, S]``.
+      ValueError: as :func:`make_mdp`.
 
     Example:
       >>> mdp = from_dense([[[0.5, 0.5]], [[0.0, 1.0]]], label={"goal": [1]})
@@ -290,15 +285,13 @@ def to_dense(mdp: MDP) -> DenseMDP:
     """The same process as a :class:`DenseMDP`; memory grows with S squared.
 
     Args:
-      mdp: concrete or traced.
-
-    Differentiable in the transition probabilities.
+      mdp: concrete or traced; differentiable in the probabilities.
 
     Returns:
       :class:`DenseMDP`.
 
     Raises:
-      ValueError: the model is sparse or of intervals, or none.
+      ValueError: a sparse or an interval model.
 
     Example:
       >>> mdp = from_dense([[[0.5, 0.5]], [[0.0, 1.0]]])
@@ -364,12 +357,7 @@ def _checked_available(available: chex.Array, shape: tuple[int, int]) -> np.ndar
 def checked_initial(
     initial: chex.Array | None, num_states: int, dtype: DTypeLike = np.float64
 ) -> np.ndarray:
-    """A checked initial distribution ``float64[S]`` that sums to 1; None: the uniform one.
-
-    Raises:
-      ValueError: a wrong shape, a probability that is negative, NaN or too small for `dtype`, or a
-        sum that is not 1 within 1e-6.
-    """
+    """Validated initial distribution ``float64[S]`` that sums to 1; None: the uniform one."""
     if initial is None:
         return np.full(num_states, 1 / num_states)
     initial = validation.float_array("initial", initial)

@@ -42,7 +42,7 @@ register_annotated_pytree(
 @brief(facts=facts.product, drawn=True)
 @struct.dataclass
 class Product:
-    """The product of a model and an automaton that tracks the progress of a task.
+    """Product of a model and an automaton that tracks the progress of a task.
 
     With ``label_on="entry"``, ``(s, q) -> (t, delta(q, L(t)))``, starting in ``delta(q_I, L(s0))``: the
     automaton reads the label of the successor. With ``label_on="exit"``,
@@ -147,7 +147,7 @@ class Product:
 def occurring_letters(
     world: LabelledModel, propositions: Collection[str] | None = None
 ) -> list[frozenset]:
-    """The letters that occur in a model, each once, for ``to_automaton``.
+    """The distinct letters of a model, for ``to_automaton``.
 
     Args:
       world: the model.

@@ -58,13 +58,12 @@ class Rewards:
 @brief(facts=facts.sparse, drawn=True)
 @struct.dataclass
 class SparseMDP:
-    """A labelled Markov decision process in compressed sparse rows.
+    """Labelled Markov decision process in compressed sparse rows; :func:`make_sparse` builds one.
 
     The choices of state s are the rows ``row_start[s]`` to ``row_start[s + 1] - 1``, and row r leads
     to ``successor[e]`` with ``probability[e]`` for the entries e from ``entry_start[r]`` to
     ``entry_start[r + 1] - 1``. Quantities on choices have the shape ``[R]``, and an action of a
-    policy is a row. A Markov chain has one row in each state. :func:`make_sparse` builds a checked
-    model; its arrays are NumPy's, in double precision.
+    policy is a row. A Markov chain has one row in each state.
 
     Attributes:
       row_start: ``int32[S + 1]``.
@@ -173,7 +172,7 @@ def choice_reward(model: SparseMDP, reward: str | Rewards | chex.Array | None = 
       rewards and the probabilities.
 
     Raises:
-      ValueError: an unknown reward, or a shape that fits nothing.
+      ValueError: an unknown reward, or another shape.
 
     Example:
       >>> model = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
@@ -282,7 +281,7 @@ def make_sparse(
     initial: chex.Array | None = None,
     **annotations: Unpack[Annotations],
 ) -> SparseMDP:
-    """A checked :class:`SparseMDP` from arrays.
+    """Validated :class:`SparseMDP` from arrays, as NumPy arrays in double precision.
 
     Successors of a row are sorted; repeated ones are merged, with the sum of their probabilities and
     the mean of their rewards; entries of probability zero are dropped. Rows that sum to one up to
@@ -297,7 +296,7 @@ def make_sparse(
       annotations: labels, rewards and names, see :class:`Annotations`.
 
     Returns:
-      :class:`SparseMDP` with NumPy arrays in double precision.
+      :class:`SparseMDP`.
 
     Raises:
       ValueError: naming the state, the choice and the value: a wrong shape, starts that do not
@@ -322,10 +321,9 @@ def sparse_part(
     begins: tuple[int, int, int] = (0, 0, 0),
     num_states: int | None = None,
 ) -> SparseMDP:
-    """The checked states of a range of a larger model, without initial probabilities.
+    """The validated states of a range of a larger model, without initial probabilities.
 
-    `begins` are the numbers of its first state, choice and transition in the whole model, and
-    `num_states` the states of the whole model; error messages use these numbers.
+    `begins` are the numbers of its first state, choice and transition in the whole model.
     """
     successor, probability = (
         np.asarray(successor),
@@ -425,10 +423,7 @@ def check_entries(
     num_states: int | None = None,
     dtype: DTypeLike = np.float64,
 ) -> None:
-    """Raises ValueError if a state, a row or an entry is invalid.
-
-    For a range of a larger model, `first` is its first state and `num_states` the size of the whole.
-    """
+    """Raises ValueError if a state, a row or an entry is invalid, by numbers of the whole model."""
     num_states = row_start.size - 1 if num_states is None else num_states
     if (np.diff(row_start) == 0).any():
         raise ValueError(

@@ -25,11 +25,9 @@ class Trajectories:
     """N sequences of state-action pairs, padded with zeros to length T.
 
     Attributes:
-      state: ``int32[N, T]``.
-      action: ``int32[N, T]``, the action taken in that state.
-      length: ``int32[N]``, the number of pairs that count.
-      state_shape: of the model whose states they number, ``(S,)`` or in a product ``(S, Q)``;
-        None: not known. Static.
+      state, action: ``int32[N, T]``.
+      length: ``int32[N]``, the number of pairs of each.
+      state_shape: of the model, ``(S,)`` or in a product ``(S, Q)``; None: unknown. Static.
 
     Example:
       >>> import jaxltl as jl
@@ -46,7 +44,7 @@ class Trajectories:
 
     @property
     def mask(self) -> jax.Array:
-        """``bool[N, T]``: which pairs count."""
+        """``bool[N, T]``, False in padding."""
         xp, length = namespace(self.length)
         return to_jax(xp.arange(self.state.shape[-1]) < length[..., None])
 
@@ -54,7 +52,7 @@ class Trajectories:
 def make_trajectories(
     model: MDP | DenseMDP, sequences: Sequence[Sequence[tuple[int, int]]]
 ) -> Trajectories:
-    """Checked trajectories of a model from sequences of ``(state, action)`` pairs.
+    """Validated trajectories of a model from sequences of ``(state, action)`` pairs.
 
     Args:
       model: the model in which they were recorded.
@@ -64,9 +62,8 @@ def make_trajectories(
       :class:`Trajectories` with N rows.
 
     Raises:
-      ValueError: a state or action does not exist, an action is not available, or a
-        step leads where the model cannot go. The message names the trajectory, the
-        step and the values (all counted from 0).
+      ValueError: naming the trajectory, the step and the values (from 0): an unknown state or action,
+        an unavailable action, or an impossible transition.
 
     Example:
       >>> from jaxltl import from_dense
@@ -156,17 +153,16 @@ def rollout(
       model: an MDP, a DenseMDP or a Product (states then numbered ``s * Q + q``).
       policy: ``float[S, A]`` or ``int32[S]``; ``[S, Q, A]`` or ``[S, Q]`` in a product.
       key: a PRNG key, consumed.
-      num_trajectories: N.
-      num_steps: T, the longest.
-      stop: ``bool[S]`` (or ``bool[S, Q]``); a trajectory's last pair is the one that
-        enters such a state. A start in one has length 0.
+      num_trajectories: N, static under ``jit``.
+      num_steps: T, the longest; static under ``jit``.
+      stop: ``bool[S]`` (or ``bool[S, Q]``): a trajectory ends with the pair that enters such a state,
+        and has length 0 if it starts in one.
 
     Returns:
-      :class:`Trajectories` with N rows. Jit-compiled callers pass the counts statically. States and
-      actions are drawn: there is no derivative.
+      :class:`Trajectories` with N rows; there is no derivative.
 
     Raises:
-      ValueError: a policy that is no distribution over available actions, or of another shape.
+      ValueError: an invalid policy.
 
     Example:
       >>> import jaxltl as jl

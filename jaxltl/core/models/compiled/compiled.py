@@ -29,10 +29,9 @@ def is_sparse(model: Model) -> bool:
 def compiled_form(model: Model, reward: Any = None) -> tuple[Any, Any]:
     """A model and a reward for compiled solvers; only sparse models change.
 
-    A product of a sparse model becomes a sparse model with states ``s * Q + q`` and the rows of
+    A product of a sparse model becomes a sparse model with the rows of
     :func:`~jaxltl.core.models.construct.convert.to_sparse`, inside ``jit`` too. A sparse model loses its
-    names, rewards and variables, for which programs would be recompiled, and its reward becomes a
-    structure (see :func:`~jaxltl.core.models.sparse.choice_reward`).
+    names, rewards and variables, for which programs would be recompiled.
     """
     if isinstance(model, Game):
         form, reward = compiled_form(model.mdp, reward)

@@ -1,7 +1,7 @@
 """Batches of products with one task, and demonstrations in them.
 
-Models of one kind become one product whose arrays have a leading axis W, for one ``vmap`` that plans,
-learns or evaluates in all of them. They share the automaton, over the letters of all models.
+Models of one kind become one product whose arrays have a leading axis W, for one ``vmap``. They
+share the automaton, over the letters of all models.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from jaxltl.core.models.trajectories import Trajectories, make_trajectories, req
 def stack_products(worlds: Sequence[MDP], task: Task, *, label_on: str = "exit") -> Product:
     """The products of several models with one task, stacked along a leading axis.
 
-    Smaller models are padded (:func:`pad_states`), and so are successor lists. A formula is translated
-    over the letters of all models.
+    Smaller models are padded with unreachable states, and so are successor lists. A formula is
+    translated over the letters of all models.
 
     Args:
       worlds: W models with the same actions and the same propositions, in any order.
@@ -42,8 +42,8 @@ def stack_products(worlds: Sequence[MDP], task: Task, *, label_on: str = "exit")
       A :class:`Product` whose arrays have the leading axis ``[W]``.
 
     Raises:
-      ValueError: no model, or one that is not an MDP, has other actions or propositions than the first,
-        or a letter that the automaton does not have; models are counted from 0.
+      ValueError: no model, or one (counted from 0) that is not an MDP, has other actions or
+        propositions than the first, or a letter that the automaton does not have.
 
     Example:
       >>> from jaxltl import from_dense
@@ -108,13 +108,9 @@ def _like_first(world: Model, number: int, first: MDP) -> MDP:
 def pad_states(mdp: MDP, num_states: int) -> MDP:
     """The model with unreachable absorbing states appended, labelled like state 0.
 
-    Raises:
-      ValueError: more than `num_states` states.
-
-    Example:
-      >>> from jaxltl import from_dense
-      >>> pad_states(from_dense([[[1.0]]]), 3).successor[:, 0, 0].tolist()
-      [0, 1, 2]
+    >>> from jaxltl import from_dense
+    >>> pad_states(from_dense([[[1.0]]]), 3).successor[:, 0, 0].tolist()
+    [0, 1, 2]
     """
     extra = num_states - mdp.num_states
     if extra < 0:
@@ -174,14 +170,7 @@ def num_worlds(model: Product) -> int:
 
 
 def unstack_product(model: Product, number: int) -> Product:
-    """One product of a batch, padding included.
-
-    Example:
-      >>> from jaxltl import from_dense
-      >>> one = from_dense([[[0, 1.0]], [[0, 1.0]]], label=[[0], [1]], propositions=["goal"])
-      >>> unstack_product(stack_products([one, one], "F goal"), 1).state_shape
-      (2, 2)
-    """
+    """One product of a batch, padding included."""
     if is_traced((model, number)):
         return jax.tree.map(lambda x: x[number], model)
     return to_jax(jax.tree.map(lambda x: np.asarray(x)[number], model))
@@ -208,7 +197,7 @@ def lift_memory_policy(policy: jax.Array, task: Automaton | int) -> jax.Array:
       task: the second automaton of :func:`synchronize`, or its number Q2 of states.
 
     Returns:
-      ``[S, Q1 * Q2, ...]``: the policy ignores the second automaton. Differentiable in the policy.
+      ``[S, Q1 * Q2, ...]``, independent of the second automaton. Differentiable in the policy.
 
     Example:
       >>> lift_memory_policy(jnp.array([[[0.0, 1.0], [1.0, 0.0]]]), 2)[0, :, 1].tolist()
@@ -223,11 +212,7 @@ def lift_memory_policy(policy: jax.Array, task: Automaton | int) -> jax.Array:
 
 
 def stack_models(models: Product | Sequence[Product]) -> Product:
-    """Products of equal shapes with one automaton, stacked; stacked ones are returned unchanged.
-
-    Raises:
-      ValueError: no product, or other propositions, shapes or another automaton than the first.
-    """
+    """Products of equal shapes with one automaton, stacked; stacked ones are returned unchanged."""
     if isinstance(models, Product):
         return as_stacked(models)
     if not models or not all(isinstance(x, Product) for x in models):
@@ -301,11 +286,7 @@ def demonstration_counts(
     """State-action counts of demonstrations in each product, ``float[W, S, Q, A]``.
 
     With a horizon they are counted by time step, ``float[W, T, S, Q, A]``. Trajectories are those of the
-    base models, in a list or along a leading axis; disallowed pairs do not count.
-
-    Raises:
-      ValueError: another number of models, or a trajectory that its model cannot produce, that exceeds
-        the horizon, or that has no allowed action; the message names the model, trajectory and step.
+    base models; disallowed pairs do not count.
     """
     given, count = _of_each_world(trajectories), num_worlds(models)
     if len(given) != count:
@@ -372,9 +353,6 @@ def training_counts(
     """The :func:`demonstration_counts` of training and of held-out trajectories.
 
     `held_out` is the fraction of each model's trajectories, its last ones, or held-out trajectories.
-
-    Raises:
-      ValueError: trajectories that do not fit their model, or no training data.
     """
     test: Any = held_out
     if held_out is None or isinstance(held_out, int | float):

@@ -18,7 +18,7 @@ from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
 def to_sparse(model: Model) -> SparseMDP:
     """Any concrete MDP, DenseMDP, product or sparse model as a :class:`SparseMDP`.
 
-    Row i of a state is the i-th of its available actions, whose number is ``action[i]``. A product's
+    Row i of a state is the i-th of its available actions, with the number ``action[i]``. A product's
     states are numbered ``s * Q + q``, with the labels of the base model.
 
     Args:

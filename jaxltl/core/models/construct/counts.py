@@ -29,9 +29,7 @@ _ANY = "any"  # the only action of an unvisited state
 @brief(facts=facts.counts)
 @dataclass(frozen=True)
 class TransitionCounts:
-    """Counts of observed transitions by state, action and successor.
-
-    Each transition occurs once, in lexicographic order.
+    """Counts of observed transitions, each once and in lexicographic order.
 
     Attributes:
       state, action, successor: ``int32[N]``, indices of names.
@@ -66,7 +64,7 @@ def make_counts(
     states: Sequence[str] | None = None,
     actions: Sequence[str] | None = None,
 ) -> TransitionCounts:
-    """Checked :class:`TransitionCounts` from arrays of transitions, in any order and with repetitions.
+    """Validated :class:`TransitionCounts` from arrays of transitions, in any order, with repetitions.
 
     Args:
       state, action, successor: ``int[N]``.
@@ -190,25 +188,16 @@ def _row_action(model: SparseMDP) -> Integers:
 @brief
 @dataclass(frozen=True)
 class Places:
-    """Index of a model's transitions by the numbers of their names.
-
-    Attributes:
-      states, actions: the names.
-      row_state, row_action: ``int[R]``, of each choice.
-      entry_start: ``int[R + 1]``.
-      successor: ``int[T]``.
-      place: ``int[T]``, the flat position of each entry in the array of probabilities.
-      shape: the shape of that array.
-    """
+    """Index of a model's transitions by the numbers of their names."""
 
     states: tuple[str, ...]
     actions: tuple[str, ...]
-    row_state: Integers
-    row_action: Integers
-    entry_start: Integers
-    successor: Integers
-    place: Integers
-    shape: tuple[int, ...]
+    row_state: Integers  # int[R], of each choice
+    row_action: Integers  # int[R]
+    entry_start: Integers  # int[R + 1]
+    successor: Integers  # int[T]
+    place: Integers  # int[T], the flat position of each entry among the probabilities
+    shape: tuple[int, ...]  # of the array of probabilities
 
     @cached_property
     def _rows(self) -> tuple[Integers, Integers]:
@@ -366,32 +355,29 @@ def model_from_counts(
     labels: Mapping[str, Iterable[Any]] | None = None,
     terminal: Iterable[Any] = (),
 ) -> tuple[SparseMDP, NDArray[np.int64]]:
-    """A model of the choices that were counted, and the counts of its transitions.
+    """Empirical model of the choices that were counted, and the counts of its transitions.
 
-    Its probabilities are the frequencies, or, in rows with a count of 0, those after one more
-    sample of each transition. Confidence sets of the true ones are those of
-    :func:`~jaxltl.core.statistics.confidence_sets.intervals_from_counts` for the returned counts
-    and the model's `entry_start`. A state without samples that is not terminal has one choice,
-    `any`, which may lead to every state.
+    Probabilities are the frequencies, or, in rows with a count of 0, those after one more sample of
+    each transition. A state without samples that is not terminal has one choice, `any`, which may lead
+    to every state. For confidence sets of the true probabilities see
+    :func:`~jaxltl.core.statistics.confidence_sets.intervals_from_counts`.
 
     Args:
       counts: the observed transitions.
-      initial: the state in which runs start, several that are equally likely, or the probabilities
-        of some, by name.
+      initial: the initial state, several that are equally likely, or probabilities by name.
       labels: the states where each proposition holds, by name.
-      terminal: states in which runs stay.
+      terminal: absorbing states.
       graph: the assumption on transitions that were not observed: ``"seen"``, they are impossible
         (except those with a count of 0); ``"complete"``, each choice may lead to every state; or
         :class:`~jaxltl.core.statistics.graph_assumption.LeastProbability`, they are impossible for
-        choices with sufficiently many samples. Pass it to
-        :func:`~jaxltl.core.values.evaluation.data_guarantee.learn_guarantee`, too.
+        choices with sufficiently many samples.
 
     Returns:
       The model, which keeps the names of states as its variable `state`, and ``int64[T]``.
 
     Raises:
-      ValueError: naming the state: it is not among the counted ones, or is terminal and was left;
-        a complete graph of more than 1e8 entries.
+      ValueError: naming the state: an unknown one, or a terminal one with an observed exit; a
+        complete graph of more than 1e8 entries.
 
     Example:
       >>> counts = make_counts([0, 0, 1], [0, 0, 0], [0, 1, 1], [7, 3, 9], states=["a", "b"])

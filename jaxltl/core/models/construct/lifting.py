@@ -39,6 +39,8 @@ def lift_trajectories(model: Product, trajectories: Trajectories) -> Trajectorie
       >>> shown = jl.models.make_trajectories(path, [[(0, 0), (1, 0), (2, 0)]])
       >>> lift_trajectories(prod, shown).state.tolist()  # s * Q + q
       [[0, 3, 5]]
+      >>> project_trajectories(prod, lift_trajectories(prod, shown)).state.tolist()
+      [[0, 1, 2]]
     """
     require_states(trajectories, model.mdp)
     if is_traced((model, trajectories)):
@@ -80,16 +82,14 @@ def project_trajectories(model: Product, trajectories: Trajectories) -> Trajecto
       :class:`Trajectories` of the world.
 
     Raises:
-      ValueError: they are not the product's.
+      ValueError: trajectories of another model.
 
     Example:
       >>> import jaxltl as jl
-      >>> path = jl.make_mdp([[[1]], [[2]], [[2]]], [[[1.0]], [[1.0]], [[1.0]]], initial=[1, 0, 0],
-      ...                    label={"a": [1]})
-      >>> prod = jl.product(path, "F a")
-      >>> shown = jl.make_trajectories(path, [[(0, 0), (1, 0), (2, 0)]])
-      >>> project_trajectories(prod, lift_trajectories(prod, shown)).state.tolist()
-      [[0, 1, 2]]
+      >>> prod = jl.product(jl.from_dense([[[0, 1.0]], [[0, 1.0]]], label={"a": [1]}), "F a")
+      >>> runs = jl.models.Trajectories(jnp.array([[0, 3]]), jnp.zeros((1, 2), int), jnp.array([2]))
+      >>> project_trajectories(prod, runs).state.tolist()
+      [[0, 1]]
     """
     require_states(trajectories, model)
     return replace(
@@ -111,11 +111,7 @@ def memory_along(model: Product, state: np.ndarray) -> np.ndarray:
 
 
 def allowed_steps(model: ActionModel, trajectories: Trajectories) -> np.ndarray:
-    """Steps of the base model's trajectories with an available action, ``bool[N, T]``.
-
-    Raises:
-      ValueError: trajectories of another model, or one without such a step.
-    """
+    """Steps of the base model's trajectories with an available action, ``bool[N, T]``."""
     world = model.mdp if isinstance(model, Product) else model
     require_states(trajectories, world)
     state, action, inside = (
@@ -133,22 +129,20 @@ def allowed_steps(model: ActionModel, trajectories: Trajectories) -> np.ndarray:
 
 
 def lift_policy(model: Product, policy: jax.Array) -> jax.Array:
-    """A memoryless policy of the world as a policy of the product: ``[S, Q, ...]``.
+    """Memoryless policy of the base model as a policy of the product.
 
     Args:
       model: the product.
-      policy: ``[S, ...]``, of the world.
+      policy: ``[S, ...]``, of the base model.
 
     Returns:
-      ``[S, Q, ...]``: the policy does not see the memory. Differentiable in the policy.
+      ``[S, Q, ...]``, the same in all memory states. Differentiable in the policy.
 
     Example:
       >>> import jaxltl as jl
-      >>> path = jl.make_mdp([[[1]], [[2]], [[2]]], [[[1.0]], [[1.0]], [[1.0]]], initial=[1, 0, 0],
-      ...                    label={"a": [1]})
-      >>> prod = jl.product(path, "F a")
-      >>> lift_policy(prod, jnp.array([0, 0, 0])).shape
-      (3, 2)
+      >>> prod = jl.product(jl.from_dense([[[0, 1.0]], [[0, 1.0]]], label={"a": [1]}), "F a")
+      >>> lift_policy(prod, jnp.array([0, 0])).shape
+      (2, 2)
     """
     return jnp.repeat(policy[:, None], model.num_memory, axis=1)
 
@@ -156,22 +150,20 @@ def lift_policy(model: Product, policy: jax.Array) -> jax.Array:
 @brief(facts=facts.memory_policy)
 @struct.dataclass
 class FiniteMemoryPolicy:
-    """A policy of the world whose memory is the automaton's state.
+    """A policy of the base model with the automaton state as its memory.
 
     Attributes:
       action: ``float[S, Q, A]`` or ``int32[S, Q]``, the product policy.
-      initial_memory: ``int32[S]``, the memory at the start of a run in s.
+      initial_memory: ``int32[S]``, the memory of the initial state s.
       next_memory: ``int32[S, Q]``, the memory after reading the label of s.
       label_on: static, as in :class:`Product`.
 
     Example:
       >>> import jaxltl as jl
-      >>> path = jl.make_mdp([[[1]], [[2]], [[2]]], [[[1.0]], [[1.0]], [[1.0]]], initial=[1, 0, 0],
-      ...                    label={"a": [1]})
-      >>> prod = jl.product(path, "F a")
-      >>> runs = jl.project_policy(prod, jnp.zeros((3, 2), jnp.int32))
-      >>> runs.initial_memory.tolist(), runs.next_memory[1].tolist()  # state 1 shows a
-      ([0, 1, 0], [1, 1])
+      >>> prod = jl.product(jl.from_dense([[[0, 1.0]], [[0, 1.0]]], label={"a": [1]}), "F a")
+      >>> runs = jl.project_policy(prod, jnp.zeros((2, 2), jnp.int32))
+      >>> runs.initial_memory.tolist(), runs.next_memory.tolist()
+      ([0, 1], [[0, 1], [1, 1]])
     """
 
     action: jax.Array
@@ -185,7 +177,7 @@ class FiniteMemoryPolicy:
 
 
 def project_policy(model: Product, policy: jax.Array) -> FiniteMemoryPolicy:
-    """A product policy as a finite-memory policy that runs on the world alone.
+    """Product policy as a finite-memory policy of the base model.
 
     Args:
       model: the product.
@@ -199,11 +191,9 @@ def project_policy(model: Product, policy: jax.Array) -> FiniteMemoryPolicy:
 
     Example:
       >>> import jaxltl as jl
-      >>> path = jl.make_mdp([[[1]], [[2]], [[2]]], [[[1.0]], [[1.0]], [[1.0]]], initial=[1, 0, 0],
-      ...                    label={"a": [1]})
-      >>> prod = jl.product(path, "F a")
-      >>> project_policy(prod, jnp.zeros((3, 2), jnp.int32)).action.shape
-      (3, 2)
+      >>> prod = jl.product(jl.from_dense([[[0, 1.0]], [[0, 1.0]]], label={"a": [1]}), "F a")
+      >>> project_policy(prod, jnp.zeros((2, 2), jnp.int32)).action.shape
+      (2, 2)
     """
     operators.policy_distribution(model, policy)
     return FiniteMemoryPolicy(policy, model.initial_memory, model.next_memory, model.label_on)

@@ -29,8 +29,7 @@ def with_allowed(model: ModelT, allowed: chex.Array) -> ModelT:
 
     Args:
       model: an MDP, a DenseMDP, a SparseMDP, an IntervalMDP, a Product or a Game.
-      allowed: ``bool[S, A]``, in a product ``bool[S, Q, A]``, of a sparse model ``bool[R]``, such as a
-        permissive strategy.
+      allowed: ``bool[S, A]``, in a product ``bool[S, Q, A]``, of a sparse model ``bool[R]``.
 
     Returns:
       A model of the same kind and states, whose available actions are the mask.

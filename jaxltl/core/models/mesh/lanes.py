@@ -1,8 +1,6 @@
 """Batches of independent computations over the devices of a mesh.
 
-``vmap`` runs a batch (seeds, hyperparameters, instances, populations) on one device; here each
-device runs its share. No element reads another, so that nothing is communicated, and a loop with a
-data-dependent length runs as long as the device's own elements need.
+Nothing is communicated, and a data-dependent loop runs as long as the device's own elements need.
 """
 
 from __future__ import annotations
@@ -31,19 +29,17 @@ def vmap_over_mesh(
 ) -> Callable[..., PyTree]:
     """``jax.vmap(function, in_axes)`` with the batch distributed over the devices of a mesh.
 
-    Device d of D runs the d-th N / D elements, under ``vmap``, as ``PartitionSpec(axis)`` places them.
-    Results stay on their devices and can be passed on without being moved, from ``train`` to ``run``.
-    Works under ``jit``, and over several processes (``jax.distributed``) that make the same call;
-    :func:`on_host` then collects the results. If D does not divide N, elements are repeated up to the
-    next multiple and dropped again, and the results are replicated. Rounding is that of ``vmap`` of
-    N / D elements and may depend on D where the compiler chooses other instructions.
+    Device d of D runs the d-th N / D elements, as ``PartitionSpec(axis)`` places them, and the results
+    stay there. Works under ``jit``, and over several processes (``jax.distributed``) that make the same
+    call; :func:`on_host` collects the results. If D does not divide N, elements are repeated up to the
+    next multiple, and the results are replicated. Rounding is that of ``vmap`` of N / D elements.
 
     Args:
-      function: of one element, such as a learner's ``train`` or ``run``; compiled once for each
-        function, mesh and shapes.
+      function: of one element, such as a learner's ``train``; compiled once for each function, mesh
+        and shapes.
       mesh: devices, such as ``jax.make_mesh((jax.device_count(),), ("lanes",))``.
       axis: the mesh axis or axes of the batch; devices along others do the same, or share the work of
-        an element where `function` says so. Default: all.
+        an element if `function` does so. Default: all.
       in_axes: as of ``vmap``, 0 or None for each argument or part.
 
     Returns:
@@ -53,7 +49,6 @@ def vmap_over_mesh(
       ValueError: an unknown axis, other `in_axes`, or batches of different size.
 
     Example:
-      >>> import jax.numpy as jnp
       >>> mesh = jax.make_mesh((jax.device_count(),), ("seeds",))
       >>> def walk(key, length, steps):
       ...     return length * jax.random.normal(key, (steps,)).sum()
@@ -79,10 +74,8 @@ def vmap_over_mesh(
 def on_host(tree: PyTree) -> PyTree:
     """NumPy copies of a tree's arrays, in every process; random keys stay keys.
 
-    Collects arrays that are distributed over several processes, so that all processes call it.
-
     Args:
-      tree: arrays and numbers.
+      tree: arrays and numbers; all processes call it for distributed ones.
 
     Returns:
       The tree of NumPy arrays.
@@ -187,7 +180,7 @@ def shard_function(
     """A function that each device applies to its share of the arguments, under ``jit``; None: unchanged.
 
     `axes` are the split axes of the arguments, None for replicated ones, and `out_axes` those of the
-    result, a tree prefix. The function may communicate between devices.
+    result, a tree prefix.
     """
     if sharding is None:
         return function
@@ -225,10 +218,7 @@ def device_ranks(sharding: NamedSharding | None) -> jax.Array:
 def running_sum(
     counted: jax.Array, rank: jax.Array, sharding: NamedSharding | None
 ) -> tuple[jax.Array, jax.Array]:
-    """Cumulative counts over all devices, ``int32[N]`` from a device's ``bool[N]``, and the total.
-
-    For functions under :func:`shard_function`, with the device's entry of :func:`device_ranks`.
-    """
+    """Cumulative counts over all devices, ``int32[N]`` from a device's ``bool[N]``, and the total."""
     number = jnp.cumsum(counted, dtype=jnp.int32)
     if sharding is None:
         return number, number[-1]

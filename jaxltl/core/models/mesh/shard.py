@@ -52,8 +52,7 @@ class ModelPart:
       initial: ``float[n]``; default: uniform over all states.
       label: ``bool[n, P]``.
       rewards: expected rewards of rows by name, ``float[r]``.
-      row: ``int[r]``, row numbers of the whole model, so that :func:`to_mesh` accepts quantities on
-        rows; default: none.
+      row: ``int[r]``, row numbers of the whole model, for quantities on rows in :func:`to_mesh`.
 
     Example:
       >>> part = ModelPart(np.arange(3), np.array([1, 0]), np.ones(2))  # a cycle of two states
@@ -77,9 +76,8 @@ def shard(
 ) -> ShardedMDP:
     """A model distributed over the devices of a mesh axis.
 
-    Solvers accept it like any other model, inside ``jit`` too: discounted and soft values,
-    reachability, satisfaction, total rewards, their gradients and graph fixed points. All processes
-    give the same model; :func:`model_from_parts` builds one that is too large for a process.
+    Solvers of discounted and soft values, reachability, satisfaction and total rewards accept it, inside
+    ``jit`` too. All processes give the same model; :func:`model_from_parts` is for larger ones.
 
     Args:
       model: a concrete MDP, DenseMDP or SparseMDP.
@@ -89,8 +87,8 @@ def shard(
         (1969), which reduces communication; or a permutation ``int[S]``.
 
     Returns:
-      :class:`~jaxltl.core.models.mesh.sharded.ShardedMDP`. Its actions are those of the model, of a
-      sparse one as in :func:`~jaxltl.core.models.construct.padded.to_padded`.
+      :class:`~jaxltl.core.models.mesh.sharded.ShardedMDP`. The actions of a sparse model are those of
+      :func:`~jaxltl.core.models.construct.padded.to_padded`.
 
     Raises:
       ValueError: an invalid model, axis or order, or a probability that is zero or subnormal in JAX's
@@ -143,8 +141,8 @@ def model_from_parts(
     """A distributed model from parts, for models that are too large for one process.
 
     Args:
-      part: the :class:`ModelPart` of a range of states ``(start, stop)``; each process calls it for the
-        ranges of its own devices.
+      part: the :class:`ModelPart` of a range of states ``(start, stop)``; each process calls it for
+        its own devices.
       num_states: S.
       mesh, axis: as for :func:`shard`.
       propositions: names of the labels.
@@ -186,11 +184,10 @@ def to_mesh(model: ShardedMDP, quantity: Any, fill: Any = 0) -> jax.Array:
       fill: the value at padded states and choices.
 
     Returns:
-      ``[N, ...]``, of rows ``[N, A]``. Not differentiable in `quantity`; derivatives start at the result.
+      ``[N, ...]``, of rows ``[N, A]``. Not differentiable in `quantity`.
 
     Raises:
-      ValueError: a wrong shape, or a weight of a choice that is zero or subnormal in the model's
-        precision.
+      ValueError: a wrong shape, or a weight that underflows in the model's precision.
 
     Example:
       >>> import jaxltl as jl
@@ -238,16 +235,14 @@ def _num_rows(model: ShardedMDP) -> int:
 
 
 def from_mesh(model: ShardedMDP, quantity: jax.Array) -> np.ndarray:
-    """A quantity ``[N, ...]`` on the mesh as one of the original model, a NumPy array ``[S, ...]``.
-
-    With several processes, all call it and each gets the whole array.
+    """A quantity ``[N, ...]`` on the mesh as one of the original model, collected in every process.
 
     Args:
       model: the distributed model.
       quantity: ``[N, ...]``, such as a solution's value.
 
     Returns:
-      ``[S, ...]``, NumPy's.
+      A NumPy array ``[S, ...]``.
 
     Example:
       >>> import jaxltl as jl

@@ -27,28 +27,20 @@ from jaxltl.core import validation
 
 
 class RowTable(NamedTuple):
-    """Rows of one width.
+    """Rows of one width, by local places."""
 
-    Attributes:
-      successor: ``int32[M, W]``, local places.
-      probability: ``float[M, W]``, zero in padding.
-    """
-
-    successor: Any
-    probability: Any
+    successor: Any  # int32[M, W]
+    probability: Any  # float[M, W], zero in padding
 
 
 @brief(facts=facts.sharded)
 @struct.dataclass
 class ShardedMDP:
-    """A labelled MDP distributed over the devices of a mesh axis.
+    """Labelled MDP distributed over the devices of a mesh axis; see :func:`~jaxltl.models.shard`.
 
     All devices have the same number of the N places for states; padded places hold absorbing states
-    without reward and initial probability. Quantities on choices are ``[N, A]``.
-    :func:`~jaxltl.core.models.mesh.shard.shard` and
-    :func:`~jaxltl.core.models.mesh.shard.model_from_parts` build one, and
-    :func:`~jaxltl.core.models.mesh.shard.to_mesh` and
-    :func:`~jaxltl.core.models.mesh.shard.from_mesh` convert quantities.
+    without reward and initial probability. Quantities on choices are ``[N, A]``; `to_mesh` and
+    `from_mesh` convert them.
 
     Attributes:
       tables: the rows by width; those of a device are contiguous.

@@ -1,9 +1,7 @@
 """Pytrees annotated with text that compiled programs do not depend on.
 
-The names of propositions and formulas are no part of a program: formulas whose automata have one
-shape share it. So text is carried beside the arrays and is equal to any other text, and it is
-dropped wherever the arrays are traced. A program cannot read it, and the trees that it returns have
-none, rather than that of the formula for which the program was compiled.
+Formulas whose automata have one shape share a compiled program. Text is therefore equal to any other
+text in the pytree's structure, and is dropped wherever the arrays are traced.
 """
 
 from __future__ import annotations
@@ -34,17 +32,14 @@ def register_annotated_pytree(
 ) -> type[ClassT]:
     """Registers a dataclass as a pytree with text.
 
-    Example:
-      >>> from dataclasses import dataclass
-      >>> @dataclass
-      ... class Task:
-      ...     value: float
-      ...     formula: str
-      >>> _ = register_annotated_pytree(Task, ["value"], [], {"formula": ""})
-      >>> jax.tree.map(lambda x: 2 * x, Task(1.0, "F a"))
-      Task(value=2.0, formula='F a')
-      >>> jax.jit(lambda task: task)(Task(1.0, "F a")).formula
-      ''
+    >>> from dataclasses import dataclass
+    >>> @dataclass
+    ... class Task:
+    ...     value: float
+    ...     formula: str
+    >>> _ = register_annotated_pytree(Task, ["value"], [], {"formula": ""})
+    >>> jax.tree.map(lambda x: 2 * x, Task(1.0, "F a")), jax.jit(lambda x: x)(Task(1.0, "F a")).formula
+    (Task(value=2.0, formula='F a'), '')
     """
     arrays, static, names = tuple(arrays), tuple(static), tuple(text)
 

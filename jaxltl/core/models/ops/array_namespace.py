@@ -21,13 +21,7 @@ def is_traced(tree: Any) -> bool:
 
 
 def namespace(*trees: Any) -> tuple[Any, ...]:
-    """``numpy`` and the trees as NumPy arrays; with traced ones, ``jax.numpy`` and JAX arrays.
-
-    Example:
-      >>> xp, one = namespace(jnp.array([True, False]))
-      >>> xp.__name__, type(one).__name__
-      ('numpy', 'ndarray')
-    """
+    """``numpy`` and the trees as NumPy arrays; with traced ones, ``jax.numpy`` and JAX arrays."""
     xp = jnp if is_traced(trees) else np
     return (xp, *jax.tree.map(xp.asarray, trees))
 

@@ -78,13 +78,9 @@ def is_deterministic(policy: chex.Array) -> bool:
 
 @brief
 class Actions(NamedTuple):
-    """Choices padded to the same number of actions in each state.
+    """Choices padded to the same number of actions in each state."""
 
-    Attributes:
-      available: ``bool[S, A]``, the choices that exist.
-    """
-
-    available: jax.Array
+    available: jax.Array  # bool[S, A]
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -205,15 +201,10 @@ class Columns(NamedTuple):
 
 @brief
 class Rows(NamedTuple):
-    """Choices without padding, grouped by state; quantities have the shape ``[R, ...]`` in every layout.
+    """Choices without padding, grouped by state; quantities have the shape ``[R, ...]`` in every layout."""
 
-    Attributes:
-      state: ``int32[R]``, the state of each row, ascending.
-      start: ``int32[S + 1]``, the first row of each state.
-    """
-
-    state: jax.Array
-    start: jax.Array
+    state: jax.Array  # int32[R], ascending
+    start: jax.Array  # int32[S + 1], the first row of each state
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -338,19 +329,12 @@ def row_choices(model: SparseMDP) -> Rows:
 
 
 class RowEntries(NamedTuple):
-    """The transitions of a sparse model for compiled sweeps.
-
-    Attributes:
-      choices: the rows.
-      row: ``int32[T]``, the row of each entry.
-      successor: ``int32[T]``.
-      probability: ``float[T]``.
-    """
+    """The transitions of a sparse model for compiled sweeps."""
 
     choices: Rows
-    row: jax.Array
-    successor: jax.Array
-    probability: jax.Array
+    row: jax.Array  # int32[T]
+    successor: jax.Array  # int32[T]
+    probability: jax.Array  # float[T]
 
     def over_entries(self, operation: Any, quantity: jax.Array) -> jax.Array:
         """A reduction over the entries of each row: ``[R, ...]`` from ``[T, ...]``."""

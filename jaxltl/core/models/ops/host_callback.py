@@ -16,11 +16,6 @@ def host_callback(function: Callable[..., Any], result: Any, *arguments: Any) ->
 
     JAX rounds the arrays of a callback to single precision if double precision is enabled for the
     calling thread only. 64-bit numbers are therefore passed as pairs of 32-bit words.
-
-    Example:
-      >>> import numpy as np
-      >>> host_callback(np.sum, jax.ShapeDtypeStruct((), float), jnp.arange(4)).item()
-      6.0
     """
     arguments = jax.tree.map(jnp.asarray, arguments)
     given = jax.tree.map(lambda x: np.dtype(x.dtype), arguments)

@@ -65,16 +65,15 @@ def expectation(model: Model, value: jax.Array) -> jax.Array:
 
 @singledispatch
 def exists_successor(model: Model, region: jax.Array) -> jax.Array:
-    """Existential predecessors: choices with a successor in a region, ``bool[S, A]`` from ``bool[S]``.
-
-    A successor has positive probability; unavailable actions are False.
+    """Existential predecessors: choices with a possible successor in a region.
 
     Args:
       model: the model.
       region: ``bool[S]``.
 
     Returns:
-      ``bool[S, A]``, of a sparse model ``bool[R]``. There is no derivative.
+      ``bool[S, A]``, of a sparse model ``bool[R]``; False at unavailable actions. There is no
+      derivative.
 
     Raises:
       TypeError: `model` is not a model.
@@ -90,16 +89,15 @@ def exists_successor(model: Model, region: jax.Array) -> jax.Array:
 
 @singledispatch
 def forall_successor(model: Model, region: jax.Array) -> jax.Array:
-    """Universal predecessors: choices with all successors in a region, ``bool[S, A]`` from ``bool[S]``.
-
-    A successor has positive probability; unavailable actions are True.
+    """Universal predecessors: choices with all possible successors in a region.
 
     Args:
       model: the model.
       region: ``bool[S]``.
 
     Returns:
-      ``bool[S, A]``, of a sparse model ``bool[R]``. There is no derivative.
+      ``bool[S, A]``, of a sparse model ``bool[R]``; True at unavailable actions. There is no
+      derivative.
 
     Raises:
       TypeError: `model` is not a model.
@@ -149,11 +147,7 @@ def sample_successor(
 
 @singledispatch
 def induced_chain(model: Model, policy: jax.Array) -> MDP | DenseMDP:
-    """The Markov chain that a deterministic policy ``int32[S]`` induces, as a model with one action.
-
-    It has no labels; that of a product has ``S * Q`` states, numbered ``s * Q + q``. Differentiable in
-    the transition probabilities.
-    """
+    """The Markov chain of a deterministic policy ``int32[S]``, as a model with one action and no labels."""
     raise TypeError(_unknown(model))
 
 
@@ -216,9 +210,7 @@ def combined(
 ) -> jax.Array:
     """A reduction over the successors of each choice, ``[S, ..., A]`` from values ``[S, ...]``.
 
-    `term` maps a weight and a value, and `combine` reduces the terms, as in
-    :func:`~jaxltl.core.models.ops.kernels.fold`; :func:`expectation`, :func:`exists_successor` and
-    :func:`least_successor` are its instances.
+    `term` and `combine` are those of :func:`~jaxltl.core.models.ops.kernels.fold`.
     """
     raise TypeError(_unknown(model))
 
@@ -464,28 +456,16 @@ def policy_distribution(model: Model, policy: Any) -> jax.Array:
 
 
 class Policy(NamedTuple):
-    """A validated policy.
+    """A validated policy."""
 
-    Attributes:
-      distribution: ``float[S, A]``, uniform where the given row is not a distribution.
-      given: the given rows, NaN where an unavailable action has weight.
-      valid: ``bool[]``, True if all rows are distributions over available actions, none with a
-        subnormal weight.
-      representable: ``bool[]``, see :func:`is_representable`, for the model.
-    """
-
-    distribution: jax.Array
-    given: jax.Array
-    valid: jax.Array
-    representable: jax.Array
+    distribution: jax.Array  # float[S, A], uniform in invalid rows
+    given: jax.Array  # as given, NaN where an unavailable action has weight
+    valid: jax.Array  # bool[]: all rows are distributions, without subnormal weights
+    representable: jax.Array  # bool[], of the model, see is_representable
 
 
 def valid_policy(model: Model, policy: jax.Array, where: jax.Array | bool = True) -> Policy:
-    """A policy with its validity: rows are distributions over available actions.
-
-    The model and the policy must not hold subnormal numbers. Only the rows of the states `where` count.
-    Differentiable in a stochastic policy.
-    """
+    """A policy with its validity in the states `where`; differentiable in a stochastic policy."""
     policy, over = policy_distribution(model, policy), choices(model)
     available = over.available
     given = jnp.where(available | (policy == 0), policy, jnp.nan)

@@ -38,10 +38,6 @@ class SuccessorTable(NamedTuple):
 
     Separate arrays are contiguous whatever layout XLA chooses, which lets it vectorise the loops over
     states. Small tables are one array, for smaller programs.
-
-    Attributes:
-      successor: ``int32[N]``, by action and number of the successor.
-      probability: ``float[N]``, likewise; zero at unavailable actions.
     """
 
     successor: list[list[jax.Array]] | jax.Array
@@ -63,11 +59,7 @@ class SuccessorTable(NamedTuple):
 @brief
 @struct.dataclass
 class ModelOperator:
-    """The operator of a model without a table: too wide, too large or of another representation.
-
-    Attributes:
-      model: any model.
-    """
+    """The operator of a `model` without a table: too wide, too large or of another representation."""
 
     model: Model
 
@@ -91,12 +83,7 @@ class ModelOperator:
 @brief
 @struct.dataclass
 class ShardedSuccessorTable:
-    """The :class:`SuccessorTable` of a model on a mesh, in one table.
-
-    Attributes:
-      model: the model.
-      successor, probability: ``[N]`` by action and number of the successor, local places.
-    """
+    """The :class:`SuccessorTable` of a model on a mesh, by local places."""
 
     model: ShardedMDP
     successor: list[list[jax.Array]]
@@ -121,15 +108,10 @@ class ShardedSuccessorTable:
 
 @brief
 class PredecessorTable(NamedTuple):
-    """State-action pairs ``a * N + i`` that lead to each state, padded with probability zero.
+    """State-action pairs ``a * N + i`` that lead to each state, padded with probability zero."""
 
-    Attributes:
-      pair: ``int32[P, N]``.
-      probability: ``float[P, N]``.
-    """
-
-    pair: jax.Array
-    probability: jax.Array
+    pair: jax.Array  # int32[P, N]
+    probability: jax.Array  # float[P, N]
 
     def pushforward(self, mass: jax.Array) -> jax.Array:
         """Mass that flows into each state: ``[N, ...]`` from ``[A * N, ...]``."""

@@ -27,7 +27,7 @@ _TRIALS = 64  # candidate points for a valid model
 @brief(facts=facts.parametric)
 @struct.dataclass
 class ParametricMDP:
-    """A Markov chain or MDP for each point of a box of parameters, with a constant graph.
+    """Markov chain or MDP with probabilities that depend on parameters in a box, with a constant graph.
 
     Built by :func:`make_parametric`, or by ``read_parametric(path).over(low, high)``.
 
@@ -60,11 +60,7 @@ class ParametricMDP:
     roundings: int = struct.field(pytree_node=False, default=0)
 
     def at(self, values: Mapping[str, float] | chex.Array) -> SparseMDP:
-        """The model at a point, ``float[D]`` or a number for each name.
-
-        Raises:
-          ValueError: a point outside of the box, or at which the model is not valid.
-        """
+        """The model at a point, ``float[D]`` or a number for each name; ValueError outside of the box."""
         point = _point("values", values, self.parameters)
         outside = (point < self.low) | (point > self.high)
         if outside.any():
@@ -119,24 +115,22 @@ def make_parametric(
     *,
     parameters: Sequence[str] | None = None,
 ) -> ParametricMDP:
-    """A checked :class:`ParametricMDP` from a JAX function.
+    """Validated :class:`ParametricMDP` from a JAX function.
 
     Args:
-      model: any model with the transitions, labels and rewards that all have; the numbers of
-        transitions are those of its entries.
+      model: a model with the common transitions, labels and rewards.
       numbers: ``float[D] -> float[T]``, the probabilities, or a pair of them and of a dict of
-        rewards by name, on states ``[S]`` or choices ``[R]``. Names that it leaves out are
-        constant. Give arrays that it needs by ``jax.tree_util.Partial(function, *arrays)``.
-      low, high: ``float[D]``, one number for all, or a number for each name: keep the box away
-        from where a probability becomes zero.
+        rewards by name, on states ``[S]`` or choices ``[R]``; other rewards are constant. Pass arrays
+        by ``jax.tree_util.Partial(function, *arrays)``.
+      low, high: ``float[D]``, one number for all, or a number for each name; no probability may
+        become zero in the box.
       parameters: the names; default those of `low`, else p0, p1 and so on.
 
     Returns:
       :class:`ParametricMDP`.
 
     Raises:
-      ValueError: the box is none, names are missing, or the function returns other shapes, or in
-        the box no probabilities of these transitions.
+      ValueError: an invalid box or names, or functions of another shape or without a valid model.
 
     Example:
       >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
@@ -230,11 +224,7 @@ def _evaluated(model: SparseMDP, numbers: Any, point: np.ndarray) -> SparseMDP:
 def point_inside(
     low: np.ndarray, high: np.ndarray, model_at: Callable[[np.ndarray], SparseMDP]
 ) -> tuple[np.ndarray, SparseMDP]:
-    """A point of a box at which functions are a valid model, and the model there.
-
-    Raises:
-      ValueError: none of `_TRIALS` points is valid, with the error at the first.
-    """
+    """A point of a box at which functions are a valid model, and the model there."""
     # Multiples of distinct irrational numbers, at which a nonzero rational function rarely vanishes.
     step = np.modf(np.sqrt(np.arange(low.size) + 2.0))[0]
     first = ""

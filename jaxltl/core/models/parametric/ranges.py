@@ -24,11 +24,7 @@ class Ends(NamedTuple):
 
 
 def ranges(functions: Rationals, low: np.ndarray, high: np.ndarray) -> Ends:
-    """Bounds on F rational functions over a box ``low <= x <= high`` of nonnegative parameters.
-
-    Raises:
-      ValueError: a negative lower bound, or a denominator that may be 0.
-    """
+    """Bounds on F rational functions over a box ``low <= x <= high`` of nonnegative parameters."""
     if not (low >= 0).all():
         d = int(np.flatnonzero(~(low >= 0))[0])
         raise ValueError(

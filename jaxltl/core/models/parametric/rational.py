@@ -19,24 +19,14 @@ Terms = Mapping[tuple[int, ...], Fraction]  # the coefficient of each monomial, 
 @brief
 @struct.dataclass
 class Polynomials:
-    """Polynomials, evaluated together.
+    """Polynomials, evaluated together."""
 
-    Attributes:
-      factor: ``int32[M, W]``, the factors of the M monomials: 0 is one, and the power 2^k of parameter d
-        is ``1 + k D + d``.
-      owner: ``int32[C]``, the polynomial of each term, ascending.
-      monomial: ``int32[C]``.
-      coefficient: ``float[C]``.
-      count: the number of polynomials; static.
-      squares: the largest number of repeated squarings; static.
-    """
-
-    factor: Any
-    owner: Any
-    monomial: Any
-    coefficient: Any
-    count: int = struct.field(pytree_node=False)
-    squares: int = struct.field(pytree_node=False)
+    factor: Any  # int32[M, W]; 0: one; 1 + k D + d: the power 2^k of parameter d
+    owner: Any  # int32[C], the polynomial of each term, ascending
+    monomial: Any  # int32[C]
+    coefficient: Any  # float[C]
+    count: int = struct.field(pytree_node=False)  # of polynomials
+    squares: int = struct.field(pytree_node=False)  # the most repeated squarings
 
     def __call__(self, x: jax.Array) -> jax.Array:
         """Values at ``float[D]``, ``float[count]``; differentiable."""
@@ -58,10 +48,9 @@ class Polynomials:
 def make_polynomials(polynomials: Sequence[Terms], num_parameters: int) -> Polynomials:
     """Polynomials from exact coefficients by the powers of the D parameters; each is rounded once.
 
-    Example:
-      >>> p_plus_2pq2 = {(1, 0): Fraction(1), (1, 2): Fraction(2)}
-      >>> make_polynomials([p_plus_2pq2, {}], 2)(jnp.array([0.5, 3.0])).tolist()
-      [9.5, 0.0]
+    >>> p_plus_2pq2 = {(1, 0): Fraction(1), (1, 2): Fraction(2)}
+    >>> make_polynomials([p_plus_2pq2, {}], 2)(jnp.array([0.5, 3.0])).tolist()
+    [9.5, 0.0]
     """
     number: dict[tuple[int, ...], int] = {}
     owner, monomial, coefficient = [], [], []
