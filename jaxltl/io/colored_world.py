@@ -1,19 +1,12 @@
 """Text files of coloured gridworlds: one letter per cell, and the kinds of cells.
 
 Example:
-  >>> import pathlib, tempfile
+  >>> import tempfile
   >>> from jaxltl.io.colored_world import load_world, read_world, save_world, write_world
-  >>> world = read_world('''
-  ... rbrp
-  ... brbp
-  ... rbry
-  ... ''')
-  >>> world.shape, world.mdp.label[:, 0].tolist()
-  ((1, 2), [True, False])
-  >>> again = read_world(write_world(world))
-  >>> again.shape, bool((again.mdp.label == world.mdp.label).all())
-  ((1, 2), True)
-  >>> path = pathlib.Path(tempfile.mkdtemp()) / "world.txt"
+  >>> world = read_world("rbrp\\nbrbp\\nrbry")
+  >>> world.shape, world.mdp.label[:, 0].tolist(), read_world(write_world(world)).shape
+  ((1, 2), [True, False], (1, 2))
+  >>> path = tempfile.mkdtemp() + "/world.txt"
   >>> save_world(path, world)
   >>> load_world(path).shape
   (1, 2)
@@ -39,7 +32,7 @@ def write_world(world: World) -> str:
     """Text form of a coloured gridworld: margin, slip, kinds of cells and a letter per cell.
 
     Args:
-      world: a :class:`~jaxltl.envs.temporal_gridworld.World`.
+      world: the world.
 
     Returns:
       The text; :func:`read_world` restores the same world.
@@ -56,7 +49,7 @@ def write_world(world: World) -> str:
 
 
 def read_world(text: str) -> World:
-    """Parses a coloured gridworld from the text form of :func:`write_world`.
+    """Coloured gridworld of the text form of :func:`write_world`.
 
     Lines with a colon are settings: ``margin`` (default 1), ``slip`` (default 0) and the colours of
     a kind of cell, such as ``o1: 5 red, 4 black`` (default: the kinds of the dissertation). The

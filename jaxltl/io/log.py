@@ -42,11 +42,10 @@ def read_log(
 ) -> TransitionCounts:
     """Transition counts of a CSV log.
 
-    A log is UTF-8 text (RFC 4180), plain or compressed by gzip or xz::
+    A log is UTF-8 text (RFC 4180), plain or compressed by gzip or xz, such as::
 
         state,action,next
         hall,left,kitchen
-        hall,left,hall
 
     The header names the columns, in any order and among others. An optional column `count` has the
     number of occurrences; 0 marks a possible transition that was not observed. The file is
@@ -54,18 +53,15 @@ def read_log(
 
     Args:
       path: the file.
-      model: an :class:`~jaxltl.core.models.mdp.MDP` or
-        :class:`~jaxltl.core.models.sparse.SparseMDP` that must contain every transition; its names
-        are the variable `state` or the state numbers, and the names or numbers of actions.
+      model: a model that must contain every transition; its names are the variable `state` or the
+        state numbers, and the names or numbers of actions.
       columns: names of the columns of state, action and next state.
       count: name of the column of counts.
-      states, actions: all names, in order. Default: those of the log, in numerical order if all are
-        integers, else in alphabetical order.
+      states, actions: all names, in order. Default: those of the log, sorted (as numbers if all
+        are).
 
     Returns:
-      :class:`~jaxltl.core.models.construct.counts.TransitionCounts`, for
-      :func:`~jaxltl.core.models.construct.counts.align_counts` and
-      :func:`~jaxltl.core.models.construct.counts.model_from_counts`.
+      TransitionCounts, for :func:`~jaxltl.core.models.construct.counts.model_from_counts`.
 
     Raises:
       ValueError: with file and line, for malformed tables, invalid counts, and unknown names or
@@ -74,7 +70,7 @@ def read_log(
     Example:
       >>> import pathlib, tempfile
       >>> path = pathlib.Path(tempfile.mkdtemp()) / "log.csv"
-      >>> _ = path.write_text("state,action,next\\nhall,left,kitchen\\nhall,left,hall\\n" * 1)
+      >>> _ = path.write_text("state,action,next\\nhall,left,kitchen\\nhall,left,hall\\n")
       >>> counts = read_log(path)
       >>> counts.states, counts.successor.tolist(), counts.count.tolist()
       (('hall', 'kitchen'), [0, 1], [1, 1])
@@ -117,9 +113,7 @@ def read_labels(
     *,
     columns: tuple[str, str] = ("state", "label"),
 ) -> dict[str, tuple[str, ...]]:
-    """States of each label, from a CSV table of states and labels.
-
-    Each line assigns one label to one state.
+    """States of each label, from a CSV table with a state and one of its labels in each line.
 
     Args:
       path: the file, as of :func:`read_log`.
@@ -127,8 +121,7 @@ def read_labels(
       columns: names of the columns.
 
     Returns:
-      The states of each label, in the order of the file, as
-      :func:`~jaxltl.core.models.construct.counts.model_from_counts` takes them.
+      The states of each label, in the order of the file.
 
     Raises:
       ValueError: with file and line, as :func:`read_log`.

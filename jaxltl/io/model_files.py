@@ -64,7 +64,7 @@ FORMATS = (
 
 
 def read_model(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP | Game:
-    """Reads a model, with the format detected by file suffix or contents.
+    """Model of a file, with the format detected by suffix or contents.
 
     Formats: UMB (``.umb``), PRISM's explicit files (``.tra`` with its companions, ``.pexp``), DRN
     (``.drn``), parity games of PGSolver (``.pg``, ``.gm``, ``.pgsolver``) and in extended HOA
@@ -74,20 +74,17 @@ def read_model(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP | Game:
       path: the file.
 
     Returns:
-      A :class:`~jaxltl.core.models.sparse.SparseMDP`, a game over one, or an
-      :class:`~jaxltl.core.models.interval.IntervalMDP`. :func:`~jaxltl.io.pgsolver.objective_of`
+      A SparseMDP, a Game over one, or an IntervalMDP. :func:`~jaxltl.io.pgsolver.objective_of`
       gives the objective of a parity game.
 
     Raises:
       ValueError: with file and place, for unknown formats and missing or malformed files.
 
     Example:
-      >>> import tempfile
-      >>> from jaxltl import make_sparse
-      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1], initial=[1, 0, 0],
-      ...                    label={"heads": [1]})
-      >>> path = Path(tempfile.mkdtemp()) / "coin.drn.gz"
-      >>> write_model(path, coin)
+      >>> import tempfile, jaxltl as jl
+      >>> path = tempfile.mkdtemp() + "/coin.drn.gz"
+      >>> write_model(path, jl.make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1],
+      ...                                  initial=[1, 0, 0], label={"heads": [1]}))
       >>> read_model(path).propositions
       ('heads',)
     """
@@ -99,19 +96,16 @@ def write_model(path: str | os.PathLike[str], model: Model) -> None:
 
     Args:
       path: the file.
-      model: a model that :func:`~jaxltl.core.models.construct.convert.to_sparse` takes, a
-        :class:`~jaxltl.core.models.game.Game` or an
-        :class:`~jaxltl.core.models.interval.IntervalMDP`.
+      model: a model that ``to_sparse`` takes, a Game or an IntervalMDP.
 
     Raises:
       ValueError: the format is unknown or cannot represent the model, or the file cannot be
         written.
 
     Example:
-      >>> import tempfile
-      >>> from jaxltl import make_sparse
-      >>> path = Path(tempfile.mkdtemp()) / "coin.umb"
-      >>> write_model(path, make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1]))
+      >>> import tempfile, jaxltl as jl
+      >>> path = tempfile.mkdtemp() + "/coin.umb"
+      >>> write_model(path, jl.make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1]))
       >>> read_model(path).successor.tolist()
       [1, 2, 1, 2]
     """

@@ -260,20 +260,18 @@ def _with_initial(model: SparseT, arrays: Arrays) -> SparseT:
 
 
 def read_npz(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP | Game:
-    """Reads a model from an ``.npz`` file, in double precision.
+    """Model of an ``.npz`` file, in double precision.
 
     A padded file has ``transition``, ``[S, A, S]``, or ``successor`` and ``probability``,
-    ``[S, A, K]``; a sparse one (:func:`write_npz`) the fields of
-    :class:`~jaxltl.core.models.sparse.SparseMDP`. The array ``system`` makes it a game; ``lower``
-    and ``upper`` replace ``probability`` in interval models, with ``center`` and ``radius`` for an
-    L1 ball.
+    ``[S, A, K]``; a sparse one (:func:`write_npz`) the fields of a SparseMDP. The array ``system``
+    makes it a game; ``lower`` and ``upper`` replace ``probability`` in interval models, with
+    ``center`` and ``radius`` for an L1 ball.
 
     Args:
       path: the file.
 
     Returns:
-      A :class:`~jaxltl.core.models.sparse.SparseMDP`, a game over one, or an
-      :class:`~jaxltl.core.models.interval.IntervalMDP`.
+      A SparseMDP, a Game over one, or an IntervalMDP.
 
     Raises:
       ValueError: with file and array, for unknown, missing or invalid arrays.
@@ -311,19 +309,15 @@ def write_npz(path: str | os.PathLike[str], model: Model) -> None:
 
     Args:
       path: the file.
-      model: a model that :func:`~jaxltl.core.models.construct.convert.to_sparse` takes, a game or
-        an interval model.
+      model: a model that ``to_sparse`` takes, a game or an interval model.
 
     Raises:
       ValueError: for variables of an unsupported type, or the file cannot be written.
 
     Example:
-      >>> import pathlib, tempfile
-      >>> from jaxltl import make_sparse
-      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1], initial=[1, 0, 0],
-      ...                    label={"heads": [1]})
-      >>> path = pathlib.Path(tempfile.mkdtemp()) / "coin.npz"
-      >>> write_npz(path, coin)
+      >>> import tempfile, jaxltl as jl
+      >>> path = tempfile.mkdtemp() + "/coin.npz"
+      >>> write_npz(path, jl.make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1]))
       >>> read_npz(path).probability.tolist()
       [0.5, 0.5, 1.0, 1.0]
     """

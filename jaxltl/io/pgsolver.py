@@ -41,7 +41,7 @@ class ParityGame(NamedTuple):
 
 
 def read_pgsolver(path: str | os.PathLike[str]) -> ParityGame:
-    """Reads a parity game from a PGSolver file.
+    """Parity game of a PGSolver file.
 
     States and choices are the vertices and edges in the order of the file. The model's `valuation`
     has the vertex numbers in ``"vertex"``, max-even priorities in ``"priority"`` and, if any, names
@@ -58,16 +58,12 @@ def read_pgsolver(path: str | os.PathLike[str]) -> ParityGame:
         numbers beyond 2^31.
 
     Example:
-      >>> import tempfile
-      >>> from jaxltl import winning_region
-      >>> with tempfile.NamedTemporaryFile("w", suffix=".pg") as file:
-      ...     _ = file.write('parity 2; start 0; 0 1 0 1,2 "a"; 1 2 1 0; 2 3 1 2;')
-      ...     file.flush()
-      ...     game, objective = read_pgsolver(file.name)
+      >>> import pathlib, tempfile
+      >>> path = pathlib.Path(tempfile.mkdtemp()) / "game.pg"
+      >>> _ = path.write_text('parity 2; start 0; 0 1 0 1,2 "a"; 1 2 1 0; 2 3 1 2;')
+      >>> game, objective = read_pgsolver(path)
       >>> game.mdp.valuation["priority"].tolist(), objective.priority.tolist()
       ([1, 2, 3], [3, 2, 1])
-      >>> winning_region(game, objective).region.tolist()
-      [True, True, False]
     """
     return _Reader(str(path), read_text(path, "a game of PGSolver's format")).game()
 
@@ -273,18 +269,13 @@ def write_pgsolver(
       ValueError: for random moves, no objective, or names with a quotation mark.
 
     Example:
-      >>> import pathlib, tempfile
-      >>> from jaxltl import from_dense, make_game
-      >>> from jaxltl.core.games import parity
-      >>> world = from_dense([[[0, 1.0], [1, 0]], [[1.0, 0], [1, 0]]], initial=[1, 0])
-      >>> game = make_game(world, [True, False])
+      >>> import pathlib, tempfile, jaxltl as jl
+      >>> world = jl.from_dense([[[0, 1.0], [1, 0]], [[1.0, 0], [1, 0]]], initial=[1, 0])
+      >>> game = jl.make_game(world, [True, False])
       >>> path = pathlib.Path(tempfile.mkdtemp()) / "game.pg"
-      >>> write_pgsolver(path, game, parity(game, [0, 1]))
-      >>> print(path.read_text().strip())
-      parity 1;
-      start 0;
-      0 2 0 1,0;
-      1 1 1 0,0;
+      >>> write_pgsolver(path, game, jl.games.parity(game, [0, 1]))
+      >>> path.read_text().split("\\n")
+      ['parity 1;', 'start 0;', '0 2 0 1,0;', '1 1 1 0,0;', '']
     """
     row_start, successor = edges_of(game, "write_pgsolver")
     valuation = game.mdp.valuation if isinstance(game.mdp, SparseMDP) else {}
@@ -319,8 +310,7 @@ def objective_of(game: Game) -> Parity:
     """Parity objective stored in the file of a game.
 
     Args:
-      game: of :func:`read_pgsolver`, :func:`~jaxltl.io.hoa.game.read_hoa_game` or
-        :func:`~jaxltl.io.model_files.read_model`.
+      game: of :func:`read_pgsolver`, ``read_hoa_game`` or ``read_model``.
 
     Returns:
       The min-even parity objective.

@@ -47,7 +47,7 @@ class RewardMachine(NamedTuple):
 def read_reward_machine(
     source: str | os.PathLike[str], letters: Iterable[Letter] | None = None
 ) -> RewardMachine:
-    """Reads a reward machine from a file or a text.
+    """Reward machine of a file or a text.
 
     The first line has the initial state, the second the list of terminal states, each other line a
     transition ``(u, v, 'e&!n', ConstantRewardFunction(1))``; ``#`` starts a comment. Guards are
@@ -68,25 +68,16 @@ def read_reward_machine(
         than 12 propositions without `letters`.
 
     Example:
-      A robot gets coffee and then 1 for bringing it to the office; a broken plant costs 5.
-
-      >>> import jaxltl as jl
       >>> machine = read_reward_machine('''
       ... 0      # without coffee
       ... [2]    # done
-      ... (0, 2, 'p', ConstantRewardFunction(-5))
       ... (0, 1, 'c', ConstantRewardFunction(0))
       ... (0, 0, 'True', ConstantRewardFunction(0))
       ... (1, 2, 'o', ConstantRewardFunction(1))
       ... (1, 1, '!o', ConstantRewardFunction(0))
       ... ''')
-      >>> world = jl.gridworld('''
-      ...   s p o
-      ...   . . c ''', initial="s")
-      >>> prod = jl.product(world, machine.automaton)
-      >>> best = jl.optimal_value(prod, machine_reward(prod, machine.reward), discount=0.9)
-      >>> print(f"{best.value[0, 0]:.4f}")  # the office is reached by the fourth step
-      0.7290
+      >>> machine.automaton.propositions, machine.reward.max(axis=1).tolist()
+      (('c', 'o'), [0.0, 1.0, 0.0])
     """
     is_text = isinstance(source, str) and "\n" in source
     place = "read_reward_machine" if is_text else str(source)
@@ -230,19 +221,16 @@ def machine_reward(product: Model, reward: ArrayLike | jax.Array) -> Array:
 
     Returns:
       ``float[S, Q, A]``, zero at unavailable actions, differentiable in the reward and the world's
-      probabilities; for a product over a SparseMDP ``float64[R]``, per choice of
-      ``to_sparse(product)``.
+      probabilities; for a product over a SparseMDP ``float64[R]``, per choice of its sparse form.
 
     Raises:
       ValueError: the reward has another shape, or the model is not a product.
 
     Example:
-      >>> machine = read_reward_machine('''
-      ... 0
+      >>> machine = read_reward_machine('''0
       ... [1]
       ... (0, 1, 'goal', ConstantRewardFunction(1))
-      ... (0, 0, '!goal', ConstantRewardFunction(0))
-      ... ''')
+      ... (0, 0, '!goal', ConstantRewardFunction(0))''')
       >>> from jaxltl import from_dense, product
       >>> world = from_dense([[[0.5, 0.5]], [[0, 1.0]]], label=[[0], [1]], propositions=["goal"])
       >>> machine_reward(product(world, machine.automaton), machine.reward)[0, :, 0].tolist()

@@ -22,7 +22,7 @@ StormModel: TypeAlias = Any  # a sparse model of the optional package stormpy
 
 
 def from_stormpy(model: StormModel) -> SparseMDP | IntervalMDP | Game:
-    """Converts a sparse stormpy model, bit for bit.
+    """Model of a sparse stormpy model, bit for bit.
 
     Keeps the order of states and choices, labels (``"init"`` becomes the initial distribution),
     rewards, choice labels as action names, and state valuations; exact probabilities become the
@@ -32,17 +32,15 @@ def from_stormpy(model: StormModel) -> SparseMDP | IntervalMDP | Game:
       model: a `SparseDtmc`, `SparseMdp` or `SparseSmg`, or one of the first two with intervals.
 
     Returns:
-      A :class:`~jaxltl.core.models.sparse.SparseMDP`, a Game over one, or an
-      :class:`~jaxltl.core.models.interval.IntervalMDP`.
+      A SparseMDP, a Game over one, or an IntervalMDP.
 
     Raises:
       ValueError: stormpy (version 2 or later) is missing, or the model has another type.
 
     Example:
-      >>> from importlib.util import find_spec
-      >>> from jaxltl import make_sparse
-      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1], initial=[1, 0, 0])
-      >>> if find_spec("stormpy"):  # an extra of its own
+      >>> import importlib.util, jaxltl as jl
+      >>> coin = jl.make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
+      >>> if importlib.util.find_spec("stormpy"):
       ...     assert (from_stormpy(to_stormpy(coin)).probability == coin.probability).all()
     """
     storm = _stormpy()
@@ -65,13 +63,10 @@ def from_stormpy(model: StormModel) -> SparseMDP | IntervalMDP | Game:
 
 
 def to_stormpy(model: Model) -> StormModel:
-    """Converts a model to a sparse stormpy model, bit for bit.
-
-    The initial distribution is reduced to its support.
+    """Sparse stormpy model of a model, bit for bit; keeps the support of the initial distribution.
 
     Args:
-      model: a model that :func:`~jaxltl.core.models.construct.convert.to_sparse` takes, a Game or
-        an :class:`~jaxltl.core.models.interval.IntervalMDP`.
+      model: a model that ``to_sparse`` takes, a Game or an IntervalMDP.
 
     Returns:
       A `SparseDtmc` if every state has one choice, else a `SparseMdp` or `SparseSmg`; with
@@ -81,10 +76,9 @@ def to_stormpy(model: Model) -> StormModel:
       ValueError: stormpy (version 2 or later) is missing.
 
     Example:
-      >>> from importlib.util import find_spec
-      >>> from jaxltl import make_sparse
-      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1], initial=[1, 0, 0])
-      >>> if find_spec("stormpy"):  # an extra of its own
+      >>> import importlib.util, jaxltl as jl
+      >>> coin = jl.make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
+      >>> if importlib.util.find_spec("stormpy"):
       ...     assert to_stormpy(coin).nr_states == 3
     """
     storm = _stormpy()

@@ -32,25 +32,21 @@ _STEP = 2**16  # states per piece
 
 
 def read_drn(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP:
-    """Reads a Markov chain, MDP or interval model from a DRN file.
+    """Markov chain, MDP or interval model from a DRN file.
 
-    The states labelled ``init`` are the initial states, with equal probability. Decimals, fractions
-    (``1/3``) and placeholders (``$name``) become the nearest doubles. Actions are numbered without
-    names if all names are numbers, absent if all are ``__NOLABEL__``, and that name is otherwise
-    "". Labels keep the order of the file; comments, which hold Storm's state variables, are
-    ignored. The value types ``double-interval`` and ``rational-interval`` give an interval model,
-    with probabilities ``[l, u]`` and rewards that are numbers or points ``[r, r]``.
+    States labelled ``init`` are initial, with equal probability. Decimals, fractions (``1/3``) and
+    placeholders (``$name``) become the nearest doubles. Actions have no names if all are numbers or
+    ``__NOLABEL__``. Comments, which hold Storm's state variables, are ignored. The value types
+    ``double-interval`` and ``rational-interval`` give an interval model.
 
     Args:
       path: the file, plain or compressed with gzip or xz.
 
     Returns:
-      A :class:`~jaxltl.core.models.sparse.SparseMDP` or
-      :class:`~jaxltl.core.models.interval.IntervalMDP`.
+      A SparseMDP or an IntervalMDP.
 
     Raises:
-      ValueError: with file and line, for malformed text, parameters, observations or continuous
-        time.
+      ValueError: with file and line, for malformed text, parameters, observations or rates.
 
     Example:
       >>> import pathlib, tempfile
@@ -148,16 +144,13 @@ def write_drn(path: str | os.PathLike[str], model: SparseMDP | IntervalMDP) -> N
       model: a concrete model with equally likely initial states.
 
     Raises:
-      ValueError: the format cannot represent the model (transition rewards, for example), or the
-        file cannot be written.
+      ValueError: the format cannot represent the model, or the file cannot be written.
 
     Example:
-      >>> import pathlib, tempfile
-      >>> from jaxltl import make_sparse
-      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1], initial=[1, 0, 0],
-      ...                    label={"heads": [1]})
-      >>> path = pathlib.Path(tempfile.mkdtemp()) / "coin.drn"
-      >>> write_drn(path, coin)
+      >>> import tempfile, jaxltl as jl
+      >>> path = tempfile.mkdtemp() + "/coin.drn"
+      >>> write_drn(path, jl.make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1],
+      ...                                initial=[1, 0, 0]))
       >>> read_drn(path).probability.tolist()
       [0.5, 0.5, 1.0, 1.0]
     """

@@ -42,20 +42,15 @@ Term = tuple[Fraction, list[tuple[int, int]]]  # a coefficient, and parameters w
 @brief
 @dataclass(frozen=True)
 class RationalFunction:
-    """Rational function: the quotient of two polynomials in the parameters.
+    """Quotient of two polynomials in the parameters; ``at`` evaluates it exactly.
 
     Attributes:
       numerator, denominator: polynomials, as maps from exponents to exact coefficients.
 
     Example:
-      >>> import pathlib, tempfile
-      >>> path = pathlib.Path(tempfile.mkdtemp()) / "coin.drn"
-      >>> _ = path.write_text("@type: DTMC\\n@parameters\\np\\n@nr_states\\n2\\n@model\\n"
-      ...     "state 0 init\\n\\taction 0\\n\\t\\t0 : 1-p\\n\\t\\t1 : p\\n"
-      ...     "state 1\\n\\taction 0\\n\\t\\t1 : 1\\n")
-      >>> coin = read_parametric(path)
-      >>> [str(function.at((Fraction(1, 4),))) for function in coin.functions]
-      ['0', '3/4', '1/4', '1']
+      >>> third = RationalFunction({(1,): Fraction(1)}, {(0,): Fraction(3)})  # p / 3
+      >>> str(third.at((Fraction(1, 4),)))
+      '1/12'
     """
 
     numerator: Polynomial
@@ -144,25 +139,14 @@ class ParametricModel:
         )
 
     def over(self, low: Ends, high: Ends) -> ParametricMDP:
-        """Parametric MDP in JAX over a box of parameters.
+        """Parametric MDP in JAX over a box of parameters in which no probability vanishes.
 
         Args:
-          low, high: bounds, as one number, a number per name, or ``float[D]``; no probability may
-            vanish within the box.
+          low, high: bounds, as one number, a number per name, or ``float[D]``.
 
         Raises:
           ValueError: for missing names, crossed bounds, or rows that are no distributions in the
             box.
-
-        Example:
-          >>> import tempfile, pathlib
-          >>> path = pathlib.Path(tempfile.mkdtemp()) / "coin.drn"
-          >>> _ = path.write_text("@type: DTMC\\n@parameters\\np\\n@nr_states\\n2\\n@model\\n"
-          ...     "state 0 init\\n\\taction 0\\n\\t\\t0 : 1-p\\n\\t\\t1 : p\\n"
-          ...     "state 1\\n\\taction 0\\n\\t\\t1 : 1\\n")
-          >>> coin = read_parametric(path).over(0.01, 0.99)
-          >>> coin.numbers(np.array([0.25]))[0].tolist()
-          [0.75, 0.25, 1.0]
         """
         low, high = box_of(low, high, self.parameters)
         some = np.array([bool(f.numerator) for f in self.functions])[self.probability]
@@ -278,7 +262,7 @@ class _Exact:
 
 
 def read_parametric(path: str | os.PathLike[str]) -> ParametricModel:
-    """Reads a parametric Markov chain or MDP from a DRN file.
+    """Parametric Markov chain or MDP from a DRN file.
 
     Functions consist of exact numbers, parameters, sums, products, quotients and integer powers,
     without blanks: ``(-1)*p+1``, ``p^2/(p+q)``.
@@ -293,23 +277,15 @@ def read_parametric(path: str | os.PathLike[str]) -> ParametricModel:
       ValueError: with file and line, as :func:`~jaxltl.io.drn.drn.read_drn`.
 
     Example:
-      >>> import tempfile, pathlib
+      >>> import pathlib, tempfile
       >>> path = pathlib.Path(tempfile.mkdtemp()) / "coin.drn"
-      >>> _ = path.write_text('''@type: DTMC
-      ... @parameters
-      ... p
-      ... @nr_states
-      ... 2
-      ... @model
-      ... state 0 init
-      ...     action 0
-      ...         0 : 1-p
-      ...         1 : p
-      ... state 1
-      ...     action 0
-      ...         1 : 1
-      ... ''')
-      >>> read_parametric(path).at({"p": 0.25}).probability.tolist()
+      >>> _ = path.write_text("@type: DTMC\\n@parameters\\np\\n@nr_states\\n2\\n@model\\n"
+      ...     "state 0 init\\n\\taction 0\\n\\t\\t0 : 1-p\\n\\t\\t1 : p\\n"
+      ...     "state 1\\n\\taction 0\\n\\t\\t1 : 1\\n")
+      >>> coin = read_parametric(path)
+      >>> coin.at({"p": 0.25}).probability.tolist()
+      [0.75, 0.25, 1.0]
+      >>> coin.over(0.01, 0.99).numbers(np.array([0.25]))[0].tolist()
       [0.75, 0.25, 1.0]
     """
     name, data = str(path), read_bytes(path)

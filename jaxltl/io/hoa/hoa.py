@@ -37,12 +37,11 @@ if TYPE_CHECKING:
 
 
 def read_hoa(text: str, letters: Iterable[Letter] | None = None) -> Automaton:
-    """Reads one deterministic automaton from HOA text.
+    """Deterministic automaton of a HOA text.
 
-    Supports labels on edges and states, implicit labels, aliases, acceptance marks on edges and
-    states and any acceptance formula; `acc-name:` is ignored. Buchi, co-Buchi and parity conditions
-    keep their states, others are converted to parity. Missing edges lead to an added rejecting
-    state. Propositions are sorted.
+    Reads labels and acceptance marks on edges and states, implicit labels, aliases and any
+    acceptance formula. Buchi, co-Buchi and parity conditions keep their states, others are
+    converted to parity. Missing edges lead to an added rejecting state. Propositions are sorted.
 
     Args:
       text: the automaton, from `HOA:` to `--END--`.
@@ -51,8 +50,8 @@ def read_hoa(text: str, letters: Iterable[Letter] | None = None) -> Automaton:
 
     Returns:
       An automaton with Buchi acceptance for priorities 0 and 1, else parity; the output of
-      `write_hoa` keeps its acceptance. Letters are ordered as binary numbers with proposition p as
-      bit p.
+      `write_hoa` keeps its acceptance. Letters are ordered as binary numbers, proposition p as bit
+      p.
 
     Raises:
       ValueError: with the line, for malformed text, nondeterminism, no or several automata, or more
@@ -75,9 +74,7 @@ def read_hoa(text: str, letters: Iterable[Letter] | None = None) -> Automaton:
 
 
 def read_hoa_stream(text: str, letters: Iterable[Letter] | None = None) -> list[Automaton]:
-    """Reads a sequence of automata from HOA text.
-
-    Automata that end with `--ABORT--` are skipped.
+    """Automata of a HOA text, without those that end with `--ABORT--`.
 
     Args:
       text: the automata, each from `HOA:` to `--END--`.
@@ -111,8 +108,7 @@ def write_hoa(automaton: Automaton, name: str = "") -> str:
       name: its name, such as a formula.
 
     Returns:
-      The text; `read_hoa` restores the same tables if propositions and letters are sorted, as those
-      of `to_automaton` are.
+      The text; `read_hoa` restores the same tables if propositions and letters are sorted.
 
     Raises:
       ValueError: for priorities above 255.
@@ -120,15 +116,6 @@ def write_hoa(automaton: Automaton, name: str = "") -> str:
     Example:
       >>> from jaxltl import to_automaton
       >>> text = write_hoa(to_automaton("F a"))
-      >>> print(text[: text.index("--BODY--")].strip())
-      HOA: v1
-      tool: "jaxltl"
-      States: 2
-      Start: 0
-      AP: 1 "a"
-      acc-name: Buchi
-      Acceptance: 1 Inf(0)
-      properties: trans-labels explicit-labels state-acc complete deterministic weak terminal
       >>> print(text[text.index("--BODY--"):].strip())
       --BODY--
       State: 0 "F a"

@@ -38,25 +38,24 @@ _NUMBERED = re.compile(rb"_(0|[1-9]\d{0,8}|1\d{9})")  # how actions without name
 
 
 def read_prism(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP:
-    """Reads a Markov chain, MDP or interval model from PRISM's or Storm's explicit files.
+    """Markov chain, MDP or interval model from PRISM's or Storm's explicit files.
 
     The companions of ``name.tra`` are ``name.lab`` (labels), ``name.sta`` (state variables) and
     ``name.srew`` and ``name.trew`` (rewards; numbered ``name1.srew``, ``name2.srew`` if several);
     ``name.pexp`` has all in one file. Each may be compressed with gzip or xz. Storm's dialect
-    starts with ``dtmc`` or ``mdp`` and has its labels between ``#DECLARATION`` and ``#END``.
+    starts with ``dtmc`` or ``mdp``.
 
-    The states labelled ``init`` are the initial states, with equal probability; without labels,
-    state 0. Deadlock states get a self-loop, as in PRISM. Decimals and fractions (``1/3``) become
-    the nearest doubles. A transition reward that is constant on every choice becomes a choice
-    reward. Rewards without a name are called "", or by their number if there are several.
-    Probabilities ``[l,u]`` give an interval model.
+    States labelled ``init`` are initial, with equal probability; without labels, state 0. Deadlock
+    states get a self-loop, as in PRISM. Decimals and fractions (``1/3``) become the nearest
+    doubles. A transition reward that is constant on every choice becomes a choice reward. Rewards
+    without a name are called "", or by their number if several. Probabilities ``[l,u]`` give an
+    interval model.
 
     Args:
       path: the ``.tra`` or ``.pexp`` file.
 
     Returns:
-      A :class:`~jaxltl.core.models.sparse.SparseMDP` or
-      :class:`~jaxltl.core.models.interval.IntervalMDP`.
+      A SparseMDP or an IntervalMDP.
 
     Raises:
       ValueError: with file and line, for malformed text, observations or continuous time.
@@ -67,8 +66,8 @@ def read_prism(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP:
       >>> _ = (folder / "coin.tra").write_text("3 2\\n0 1 1/2\\n0 2 1/2\\n")
       >>> _ = (folder / "coin.lab").write_text('0="init" 1="heads"\\n0: 0\\n1: 1\\n')
       >>> model = read_prism(folder / "coin.tra")
-      >>> model.successor.tolist(), model.probability.tolist(), model.propositions
-      ([1, 2, 1, 2], [0.5, 0.5, 1.0, 1.0], ('heads',))
+      >>> model.successor.tolist(), model.propositions
+      ([1, 2, 1, 2], ('heads',))
     """
     path, match = Path(path), _NAME.fullmatch(Path(path).name)
     if match is None:
@@ -104,12 +103,10 @@ def write_prism(
         files of another model exist.
 
     Example:
-      >>> import pathlib, tempfile
-      >>> from jaxltl import make_sparse
-      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1], initial=[1, 0, 0],
-      ...                    label={"heads": [1]})
-      >>> path = pathlib.Path(tempfile.mkdtemp()) / "coin.tra"
-      >>> write_prism(path, coin)
+      >>> import tempfile, jaxltl as jl
+      >>> path = tempfile.mkdtemp() + "/coin.tra"
+      >>> write_prism(path, jl.make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1],
+      ...                                  initial=[1, 0, 0]))
       >>> read_prism(path).probability.tolist()
       [0.5, 0.5, 1.0, 1.0]
     """

@@ -49,33 +49,29 @@ _Span = tuple[int, int]
 def read_sharded(
     path: str | os.PathLike[str], mesh: Mesh, *, axis: str | None = None
 ) -> ShardedMDP:
-    """Reads a UMB model onto a device mesh; each process reads the states of its own devices.
+    """UMB model on a device mesh; each process reads the states of its own devices.
 
     Equals ``shard(read_model(path), mesh)`` up to the last bit of the initial distribution, for
-    models that need not fit into one process. Compressed archives are read as a whole, once if the
-    members are in the order of :func:`~jaxltl.io.model_files.write_model`. Rewards become expected
-    rewards of choices; state variables and action names are dropped.
+    models that need not fit into one process. Compressed archives are read as a whole. Rewards
+    become expected rewards of choices; state variables and action names are dropped.
 
     Args:
       path: the file of a Markov chain or MDP, plain or compressed by gzip or xz.
       mesh, axis: as for :func:`~jaxltl.core.models.mesh.shard.shard`.
 
     Returns:
-      :class:`~jaxltl.core.models.mesh.sharded.ShardedMDP`.
+      A ShardedMDP.
 
     Raises:
-      ValueError: as :func:`~jaxltl.core.models.mesh.shard.shard` for the mesh and
-        :func:`~jaxltl.io.model_files.read_model` for the parts read; for games and interval models.
+      ValueError: as ``shard`` for the mesh and ``read_model`` for the file; for games and interval
+        models.
 
     Example:
-      >>> import tempfile, jax
-      >>> from jaxltl import make_sparse
-      >>> from jaxltl.io.umb.umb import write_umb
+      >>> import tempfile, jax, jaxltl as jl
       >>> path = tempfile.mkdtemp() + "/coin.umb"
-      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
-      >>> write_umb(path, coin, compression=None)
+      >>> jl.write_model(path, jl.make_sparse(None, [0, 1], [0], [1.0]))
       >>> read_sharded(path, jax.make_mesh((1,), ("states",))).num_given
-      3
+      1
     """
     name = str(path)
     place = f"{name!r}: "

@@ -62,25 +62,21 @@ Members = list[tuple[str, Bytes | bytes]]
 
 
 def read_umb(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP | Game:
-    """Reads a Markov chain, MDP, interval model or turn-based game from a UMB file.
+    """Markov chain, MDP, interval model or turn-based game of a UMB file.
 
     Reads labels, rewards on states, choices and branches, action names and state variables.
     Rational numbers become the nearest doubles, and branches of a choice with equal targets are
-    merged. Player 0 of a game is the system. Interval probabilities give an interval model, whose
-    rewards may be point intervals. Without initial states the initial distribution is uniform over
-    all.
+    merged. Player 0 of a game is the system. Without initial states the initial distribution is
+    uniform. A variable that is absent in some states is a double (NaN there) or an empty string.
 
     Ignored: metadata, names of players, branch actions, other annotations, variables of choices and
-    branches, and integers of more than 64 bits. A variable that is absent in some states is a
-    double (NaN there) or an empty string.
+    branches, and integers of more than 64 bits.
 
     Args:
       path: the file, plain or compressed by gzip or xz.
 
     Returns:
-      A :class:`~jaxltl.core.models.sparse.SparseMDP`, an
-      :class:`~jaxltl.core.models.interval.IntervalMDP`, or a
-      :class:`~jaxltl.core.models.game.Game` over a SparseMDP.
+      A SparseMDP, an IntervalMDP, or a Game over a SparseMDP.
 
     Raises:
       ValueError: with file and member, for unreadable, damaged or inconsistent files, interval
@@ -209,8 +205,8 @@ def write_umb(
 
     Args:
       path: the file.
-      model: a model that :func:`~jaxltl.core.models.construct.convert.to_sparse` takes, an interval
-        model, whose rewards are written as point intervals, or a game.
+      model: a model that ``to_sparse`` takes, an interval model, whose rewards are written as point
+        intervals, or a game.
       compression: "gzip", "xz", None for none, or by suffix: xz for ``.xz``, else gzip.
 
     Raises:
@@ -218,12 +214,9 @@ def write_umb(
         cannot be written.
 
     Example:
-      >>> import pathlib, tempfile
-      >>> from jaxltl import make_sparse
-      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1], initial=[1, 0, 0],
-      ...                    label={"heads": [1]})
-      >>> path = pathlib.Path(tempfile.mkdtemp()) / "coin.umb"
-      >>> write_umb(path, coin)
+      >>> import tempfile, jaxltl as jl
+      >>> path = tempfile.mkdtemp() + "/coin.umb"
+      >>> write_umb(path, jl.make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1]))
       >>> read_umb(path).probability.tolist()
       [0.5, 0.5, 1.0, 1.0]
     """
