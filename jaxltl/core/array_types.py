@@ -1,9 +1,16 @@
-"""Types of NumPy arrays by their kind of number."""
+"""Types of arrays: NumPy arrays by their kind of number, and arrays of NumPy or JAX."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import jax
+
+    Array = jax.Array | NDArray[Any]
+else:  # packages without JAX import this module
+    Array = np.ndarray
 
 Booleans = NDArray[np.bool_]
 Integers = NDArray[np.integer[Any]]
