@@ -21,12 +21,12 @@ Write = Callable[[Path], contextlib.AbstractContextManager[Any]]
 
 
 def is_shared(x: Any) -> bool:
-    """Whether an array lies on the devices of several processes."""
+    """True if an array lies on the devices of several processes."""
     return isinstance(x, jax.Array) and not x.is_fully_addressable
 
 
 def is_apart(x: Any) -> bool:
-    """Whether an array lies on the devices of several processes and is not replicated."""
+    """True if an array lies on the devices of several processes and is not replicated."""
     return is_shared(x) and not x.is_fully_replicated
 
 
@@ -82,12 +82,12 @@ def _part(path: Path, process: int, token: np.ndarray) -> Path:
 
 
 def parts_of(path: Path) -> list[Path]:
-    """All parts beside a file, those that it names and others."""
+    """All parts in the directory of a file, named by it or not."""
     return sorted(path.parent.glob(f"{_literal(path.name)}.part-*"))
 
 
 def unfinished(path: Path) -> list[Path]:
-    """What processes that were killed have begun to write of a file and of its parts."""
+    """Temporary files that killed processes left of a file and of its parts."""
     return sorted(path.parent.glob(f".{_literal(path.name)}.*"))
 
 
@@ -102,18 +102,14 @@ def remove(paths: list[Path]) -> None:
 
 
 class Parts:
-    """The parts beside a file, read as they are needed, each piece once."""
+    """The parts of a file, read on demand, each piece once."""
 
     def __init__(self, path: Path, closing: contextlib.ExitStack) -> None:
         self._beside, self._closing = path, closing
         self._files, self._pieces = dict[str, Any](), dict[tuple[str, str], np.ndarray]()
 
     def read(self, stored: Stored, index: tuple[slice, ...] | None = None) -> np.ndarray:
-        """A block of an array, or all of it, from the pieces that have something of it.
-
-        Raises:
-          ValueError: a part is missing or damaged.
-        """
+        """A block of an array, or all of it, from its pieces; ValueError if a part is missing or damaged."""
         begin, end = _ends(index or (), stored.shape)
         found = np.zeros([b - a for a, b in zip(begin, end, strict=True)], stored.dtype)
         for first, last, file, name in stored.pieces:
@@ -138,7 +134,7 @@ class Parts:
 
 @contextlib.contextmanager
 def reading(path: str | os.PathLike[str]) -> Iterator[Parts]:
-    """The parts beside a file, closed again."""
+    """The open parts of a file."""
     with contextlib.ExitStack() as closing:
         yield Parts(Path(path), closing)
 

@@ -18,8 +18,7 @@ Run = Callable[..., tuple[Any, Any]]
 def run_over_mesh(mesh: Mesh, run: Run, step: Callable[..., Any]) -> Any:
     """Runs of lanes by ``run(step, state, problem, hparams, lengths)``, with metrics on the host.
 
-    The returned function of the lanes' states, the problem, their hyperparameters (with shared values)
-    and the lengths yields the states, which stay on their devices, and metrics ``[rows, N, ...]``.
+    States stay on their devices; hyperparameters have shared values as a second part.
     """
     lanes = vmap_over_mesh(_lane(run, step), mesh, in_axes=(0, None, (0, None), None))
 

@@ -59,21 +59,13 @@ class Output(NamedTuple):
 
 
 def orthogonal(scale: float) -> Any:
-    """An initialiser of orthogonal matrices with a `scale`.
+    """An initialiser ``(key, shape, dtype) -> float[shape]`` of orthogonal matrices of a `scale`.
 
     By Gram-Schmidt twice over instead of LAPACK as in ``flax``: on few processors several batched
     LAPACK calls in one program may deadlock (jaxlib 0.10.1).
 
-    Args:
-      scale: norm of the rows or columns.
-
-    Returns:
-      ``(key, shape, dtype) -> float[shape]``, as ``flax.linen`` takes it, of matrices.
-
-    Example:
-      >>> shape = jax.eval_shape(lambda key: orthogonal(1.0)(key, (3, 2)), jax.random.key(0))
-      >>> shape.shape
-      (3, 2)
+    >>> jax.eval_shape(lambda key: orthogonal(1.0)(key, (3, 2)), jax.random.key(0)).shape
+    (3, 2)
     """
 
     def start(key: Any, shape: Any, dtype: Any = None) -> jax.Array:
@@ -94,19 +86,10 @@ def orthogonal(scale: float) -> Any:
 
 
 def dense(width: int, scale: float, name: str) -> nn.Dense:
-    """A dense layer with orthogonal initialisation and default floats.
+    """A dense layer of `width` outputs with an orthogonal matrix of a `scale`, and its `name`.
 
-    Args:
-      width: number of outputs.
-      scale: of its matrix, see :func:`orthogonal`.
-      name: among the layers of a module.
-
-    Returns:
-      The layer, ``float[..., N] -> float[..., width]``.
-
-    Example:
-      >>> dense(4, 1.0, "hidden").features
-      4
+    >>> dense(4, 1.0, "hidden").features
+    4
     """
     return nn.Dense(
         width, kernel_init=orthogonal(scale), param_dtype=jnp.result_type(float), name=name
@@ -201,29 +184,16 @@ class RecurrentActorCritic(nn.Module):
 
 
 def default_network(actions: Any) -> ActorCritic:
-    """An :class:`ActorCritic` for some actions.
-
-    Args:
-      actions: :class:`~jaxltl.core.environments.environment.Finite`, or a
-        :class:`~jaxltl.core.environments.environment.Box`.
-
-    Returns:
-      The module with its defaults.
-    """
+    """The :class:`ActorCritic` with its defaults for `actions`, finitely many or a box."""
     if isinstance(actions, Finite):
         return ActorCritic(num_actions=actions.num)
     return ActorCritic(shape=actions.shape)
 
 
 def initial_memory(network: nn.Module, memory: Any = None) -> Any:
-    """The initial memory of a network, a tree of arrays; ``()`` without memory.
+    """The initial memory of a `network`, a tree of arrays; ``()`` without memory.
 
-    Args:
-      network: with a method ``initial_memory()`` if it has memory.
-      memory: replaces the network's; None: not given.
-
-    Returns:
-      A tree of arrays.
+    A `memory` replaces that of the network's ``initial_memory()``.
 
     Raises:
       ValueError: not numbers, or shapes other than those of the network's own.
@@ -247,42 +217,27 @@ def initial_memory(network: nn.Module, memory: Any = None) -> Any:
 
 
 def has_memory(problem: Any) -> bool:
-    """Whether the network of a problem is recurrent.
+    """Whether the network of a `problem` is recurrent: the problem's ``memory`` has arrays.
 
-    Args:
-      problem: with a `memory`, such as PPO's.
-
-    Returns:
-      A truth value.
-
-    Example:
-      >>> from types import SimpleNamespace
-      >>> has_memory(SimpleNamespace(memory=())), has_memory(SimpleNamespace(memory=np.zeros(2)))
-      (False, True)
+    >>> from types import SimpleNamespace
+    >>> has_memory(SimpleNamespace(memory=())), has_memory(SimpleNamespace(memory=np.zeros(2)))
+    (False, True)
     """
     return bool(jax.tree.leaves(problem.memory))
 
 
 def evaluated(problem: Any, parameters: Any, memory: Any, observation: Any) -> Output:
-    """The output of a problem's network for one observation.
+    """The :class:`Output` of the network of a `problem` for one `observation`.
 
-    Args:
-      problem: with a `network` and its `memory`, such as PPO's.
-      parameters: of the network.
-      memory: before the observation; ``()`` without memory.
-      observation: one, not a batch.
+    With its `parameters`, in which it is differentiable, and the `memory` before the observation.
 
-    Returns:
-      :class:`Output`; differentiable in the parameters.
-
-    Example:
-      >>> from types import SimpleNamespace
-      >>> problem = SimpleNamespace(network=ActorCritic(num_actions=2, hidden=()), memory=())
-      >>> def first(key, seen):
-      ...     parameters = fresh_parameters(key, problem.network, (), seen)
-      ...     return evaluated(problem, parameters, (), seen)
-      >>> jax.eval_shape(first, jax.random.key(0), jnp.zeros(3)).action.shape
-      (2,)
+    >>> from types import SimpleNamespace
+    >>> problem = SimpleNamespace(network=ActorCritic(num_actions=2, hidden=()), memory=())
+    >>> def first(key, seen):
+    ...     parameters = fresh_parameters(key, problem.network, (), seen)
+    ...     return evaluated(problem, parameters, (), seen)
+    >>> jax.eval_shape(first, jax.random.key(0), jnp.zeros(3)).action.shape
+    (2,)
     """
     if has_memory(problem):
         memory, (action, value) = applied(problem.network, parameters, memory, observation)
@@ -292,29 +247,18 @@ def evaluated(problem: Any, parameters: Any, memory: Any, observation: Any) -> O
 
 
 def fresh_parameters(key: Any, network: nn.Module, memory: Any, observation: Any) -> Any:
-    """The random initial parameters of a network.
+    """The random initial parameters of a `network`, of a `key`, a dict of dicts of arrays.
 
-    Args:
-      key: random key.
-      network: the module.
-      memory: the initial memory; ``()`` without memory.
-      observation: one; only its shapes matter.
-
-    Returns:
-      The parameters, a dict of dicts of arrays.
+    Of the initial `memory`, ``()`` without, and one `observation` only the shapes matter.
     """
     read = (memory, observation) if jax.tree.leaves(memory) else (observation,)
     return network.init(key, *read).get("params", {})
 
 
 def require_network(network: Any, memory: Any, observation: Any, space: Any, finite: bool) -> None:
-    """Raises ValueError for a network that returns other shapes.
+    """Validation of a `network` by the shapes that it returns for `memory` and `observation`.
 
-    Args:
-      network: the user's.
-      memory, observation: shapes of its inputs.
-      space: shape and type of one action, or of the logits.
-      finite: whether there are finitely many actions.
+    `space` is the shape and type of one action, or if there are `finite` many, of the logits.
 
     Raises:
       ValueError: with the shapes returned and expected.

@@ -53,13 +53,7 @@ _PARTS = "parts"  # the name of what is in other files
 
 @contextlib.contextmanager
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
-    """A binary file that appears under its name when it is complete.
-
-    Args:
-      path: of the file.
-
-    Yields:
-      The file, open for bytes.
+    """A binary file that appears under its name, `path`, when it is complete.
 
     Raises:
       ValueError: the directory cannot be written to.
@@ -94,13 +88,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 
 
 def read_arrays(file: BinaryIO) -> dict[str, np.ndarray]:
-    """The arrays of an ``.npz`` file, by name; nothing in it is executed.
-
-    Args:
-      file: open for bytes.
-
-    Returns:
-      NumPy arrays.
+    """The arrays of an ``.npz`` `file`, by name; nothing in it is executed.
 
     Raises:
       ValueError: another format, or damaged; the message describes the fault without the file's name.
@@ -147,18 +135,11 @@ def _umask() -> int:
 
 
 def save(path: str | os.PathLike[str], state: Any, given: Mapping[str, str] | None = None) -> None:
-    """Writes a learner's state as an ``.npz``, atomically.
+    """Writes a learner's `state`, a tree of arrays, as an ``.npz`` at `path`, atomically.
 
-    With several processes all call it, with a shared directory. Each writes its part of arrays on the
-    devices of several, and the first process writes the file last.
-
-    Args:
-      path: of the file.
-      state: a tree of arrays.
-      given: :func:`fingerprint` of the problem and hyperparameters.
-
-    Raises:
-      ValueError: the directory cannot be written to.
+    `given` is the :func:`fingerprint` of the problem and hyperparameters. With several processes all
+    call it, with a shared directory. Each writes its part of arrays on the devices of several, and the
+    first process writes the file last.
     """
     path, named = Path(path), [(name, _data(leaf)) for name, leaf in _named(state)]
     apart = {name: leaf for name, leaf in named if parts.is_apart(leaf)}
@@ -177,27 +158,20 @@ def save(path: str | os.PathLike[str], state: Any, given: Mapping[str, str] | No
 
 
 def remove(path: str | os.PathLike[str]) -> None:
-    """Removes a checkpoint with its parts and unfinished files; no process may be writing it.
+    """Removes the checkpoint at `path`, its parts and unfinished files; no process may be writing it.
 
-    Args:
-      path: of the file; a missing one is no error.
+    A missing file is no error.
     """
     path = Path(path)
     parts.remove([path, *parts.parts_of(path), *parts.unfinished(path)])
 
 
 def load(path: str | os.PathLike[str], like: Any, given: Mapping[str, str] | None = None) -> Any:
-    """Reads a state saved by :func:`save`, bit for bit.
+    """The state saved by :func:`save` at `path`, bit for bit, as a tree like `like`.
 
-    Args:
-      path: of the file.
-      like: a state of the same learner and problem, for example from ``init``; a first axis of length
-        zero matches any length. Arrays are placed on the devices of `like`, whatever devices they
-        were saved from, and each process reads what it needs.
-      given: as for :func:`save`.
-
-    Returns:
-      A tree like `like` with the arrays of the file.
+    `like` is a state of the same learner and problem, for example from ``init``; a first axis of length
+    zero matches any length. Arrays are placed on its devices, and each process reads what it needs.
+    `given` is as for :func:`save`.
 
     Raises:
       ValueError: the file is damaged, its arrays do not fit `like`, or it was saved for another problem
@@ -294,20 +268,13 @@ def _data(leaf: jax.Array) -> jax.Array:
 
 
 def fingerprint(**given: Any) -> dict[str, str]:
-    """Descriptions of arguments by place: types, static fields, and arrays by a hash of their bytes.
+    """A description of each part of `given`: types, static fields, and arrays by a hash of their bytes.
 
     Functions are described by their code, so that other processes find the same.
 
-    Args:
-      given: trees of arrays by name.
-
-    Returns:
-      By place, a text that distinguishes the value from others.
-
-    Example:
-      >>> one, two = (fingerprint(x=(np.arange(2), {"b": y})) for y in (0.5, 0.25))
-      >>> sorted(one), [name for name in one if one[name] != two[name]]
-      (['x[0]', "x[1]['b']"], ["x[1]['b']"])
+    >>> one, two = (fingerprint(x=(np.arange(2), {"b": y})) for y in (0.5, 0.25))
+    >>> sorted(one), [name for name in one if one[name] != two[name]]
+    (['x[0]', "x[1]['b']"], ["x[1]['b']"])
     """
     return dict(pair for name, value in given.items() for pair in _described(name, value))
 

@@ -99,20 +99,13 @@ def run_in_chunks(
     lanes: bool = False,
     options: Options = Options(),
 ) -> Chunks:
-    """Steps in compiled chunks, with a report and a checkpoint after each.
+    """The :class:`Chunks` of steps in compiled chunks, with a report and a checkpoint after each.
 
-    Args:
-      step, problem: of a learner.
-      state: the first state; with `lanes`, of N runs, with a first axis of N.
-      hparams: numbers; with `lanes`, shared by the runs or one for each, ``[N]``.
-      num_steps: the number of steps to reach; a state with ``state.step`` steps makes the rest.
-      until, keep: as for :meth:`~jaxltl.algos.common.learner.Learner.run_until`. A finished run stays
-        unchanged, so that lanes are independent; the loop ends when all have finished.
-      lanes: whether there are N runs.
-      options: :class:`Options`.
-
-    Returns:
-      :class:`Chunks`.
+    With `lanes` there are N runs: `state` has a first axis of N, and `hparams` are shared or one for
+    each, ``[N]``. Steps of the learner's `step` with its `problem` are made until `num_steps`; a state
+    with ``state.step`` steps makes the rest. `until` and `keep` are as for
+    :meth:`~jaxltl.algos.common.learner.Learner.run_until`: a finished run stays unchanged, so that lanes
+    are independent; the loop ends when all have finished. See :class:`Options` for `options`.
 
     Raises:
       ValueError: a hyperparameter is out of range, or the checkpoint belongs to another learner,
@@ -175,19 +168,16 @@ def _metrics_of(step: Step, state: Any, problem: Any, hparams: Any, num_lanes: i
 def trace_lanes(step: Step, state: Any, problem: Any, hparams: Any) -> None:
     """Traces the step of :func:`run_in_chunks` with lanes, for which shapes of states suffice.
 
-    Args:
-      step, problem, hparams: as for :func:`run_in_chunks`.
-      state: of N runs, or its shapes.
+    Of `step`, `problem` and `hparams` as there, and the `state` of N runs, or its shapes.
 
-    Example:
-      >>> from flax import struct
-      >>> @struct.dataclass
-      ... class State:
-      ...     step: jax.Array
-      ...     x: jax.Array
-      >>> def step(state, problem, hparams):
-      ...     return State(state.step + 1, state.x * hparams), {"x": state.x}
-      >>> trace_lanes(step, State(jnp.zeros(2, jnp.int32), jnp.ones(2)), (), 0.5)
+    >>> from flax import struct
+    >>> @struct.dataclass
+    ... class State:
+    ...     step: jax.Array
+    ...     x: jax.Array
+    >>> def step(state, problem, hparams):
+    ...     return State(state.step + 1, state.x * hparams), {"x": state.x}
+    >>> trace_lanes(step, State(jnp.zeros(2, jnp.int32), jnp.ones(2)), (), 0.5)
     """
     _metrics_of(step, state, problem, _spread(hparams, state), len(state.step))
 

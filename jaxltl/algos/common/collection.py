@@ -20,14 +20,10 @@ Evaluate = Callable[[chex.ArrayTree, chex.ArrayTree], Output]
 
 
 class Transition(NamedTuple):
-    """Record of a transition.
+    """Record of a transition: observation, network's memory and action mask before it.
 
-    Attributes:
-      observation, memory, allowed: before it; the memory is the network's, the mask ``bool[A]`` or None.
-      raw: the sampled action before squashing.
-      log_density: of `raw` under the collecting policy.
-      reward, cost, discount, terminated, truncated: of the environment.
-      last: the observation after it.
+    `raw` is the sampled action before squashing, `log_density` its density under the collecting policy,
+    and `last` the observation after it.
     """
 
     observation: chex.ArrayTree

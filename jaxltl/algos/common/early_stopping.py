@@ -32,26 +32,19 @@ class Best:
 def stop_early(
     state: Any, after: Any, held_out: jax.Array, judged: jax.Array, patience: chex.Numeric
 ) -> tuple[Best, jax.Array]:
-    """The best parameters so far, and whether patience has run out.
+    """The :class:`Best` parameters so far, and ``bool[]``, whether patience has run out.
 
-    Args:
-      state: before a step, with ``parameters``, ``step``, ``best`` and ``stopped``.
-      after: the parameters after it.
-      held_out: ``float[]``, negative log-likelihood of the parameters before it.
-      judged: ``bool[]``, whether there is held-out data.
-      patience: steps without anything better after which learning stops.
+    Of the `state` before a step, with ``parameters``, ``step``, ``best`` and ``stopped``; the
+    parameters `after` it; their predecessors' negative log-likelihood `held_out`, ``float[]``; `judged`,
+    whether there is held-out data; and `patience`, in steps.
 
-    Returns:
-      :class:`Best`, and ``bool[]``.
-
-    Example:
-      >>> from types import SimpleNamespace
-      >>> best = Best(jnp.zeros(1), jnp.array(0.5), jnp.int32(2))
-      >>> state = SimpleNamespace(
-      ...     parameters=jnp.ones(1), step=jnp.int32(9), best=best, stopped=jnp.bool_(False))
-      >>> best, stopped = stop_early(state, jnp.full(1, 2.0), jnp.array(0.6), jnp.bool_(True), 5)
-      >>> best.parameters.tolist(), stopped.item()  # nothing better for seven steps
-      ([0.0], True)
+    >>> from types import SimpleNamespace
+    >>> best = Best(jnp.zeros(1), jnp.array(0.5), jnp.int32(2))
+    >>> state = SimpleNamespace(
+    ...     parameters=jnp.ones(1), step=jnp.int32(9), best=best, stopped=jnp.bool_(False))
+    >>> best, stopped = stop_early(state, jnp.full(1, 2.0), jnp.array(0.6), jnp.bool_(True), 5)
+    >>> best.parameters.tolist(), stopped.item()  # nothing better for seven steps
+    ([0.0], True)
     """
     better = judged & (held_out < state.best.neg_log_likelihood) & ~state.stopped
     best = choose(better, Best(state.parameters, held_out, state.step), state.best)

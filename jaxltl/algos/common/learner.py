@@ -99,15 +99,7 @@ class Learner(Protocol[ProblemIn, HparamsIn, StateT, MetricsOut]):
     """
 
     def init(self, key: chex.PRNGKey, problem: ProblemIn, hparams: HparamsIn) -> StateT:
-        """The state before the first step.
-
-        Args:
-          key: random key; the state keeps it.
-          problem: made by the learner's ``make_problem``.
-          hparams: the learner's ``Hparams``.
-
-        Returns:
-          The ``State``.
+        """The state before the first step, of a random key, which it keeps.
 
         Raises:
           ValueError: a hyperparameter is out of range.
@@ -117,14 +109,9 @@ class Learner(Protocol[ProblemIn, HparamsIn, StateT, MetricsOut]):
     def step(
         self, state: StateT, problem: ProblemIn, hparams: HparamsIn
     ) -> tuple[StateT, MetricsOut]:
-        """One step of learning; pure, for ``jit`` and ``vmap``.
+        """The next ``State``, and ``Metrics`` of the step; pure, for ``jit`` and ``vmap``.
 
-        Args:
-          state: from ``init`` or an earlier step.
-          problem, hparams: arrays; new values do not recompile.
-
-        Returns:
-          The next ``State``, and ``Metrics`` of the step.
+        New values in `problem` and `hparams` do not recompile.
 
         Raises:
           ValueError: a hyperparameter is out of range.
@@ -140,17 +127,10 @@ class Learner(Protocol[ProblemIn, HparamsIn, StateT, MetricsOut]):
         num_steps: int,
         max_rows: int = 1000,
     ) -> tuple[StateT, MetricsOut]:
-        """`num_steps` steps from a state, compiled as one loop.
+        """The ``State`` after `num_steps` more steps, and ``Metrics`` with a leading axis of rows.
 
-        Args:
-          state: from ``init`` or an earlier run.
-          problem, hparams: arrays; new values do not recompile.
-          num_steps: number of steps; another one with as many rows does not recompile.
-          max_rows: bound on the rows of metrics, evenly spaced steps that include the last, so
-            that memory does not grow with `num_steps`.
-
-        Returns:
-          The ``State`` after the last step, and ``Metrics`` with a leading axis of rows.
+        One compiled loop; another number of steps with as many rows does not recompile. At most `max_rows`
+        rows, evenly spaced steps that include the last, so that memory does not grow with `num_steps`.
 
         Raises:
           ValueError: num_steps or max_rows is not positive, or a hyperparameter is out of range.
@@ -166,18 +146,7 @@ class Learner(Protocol[ProblemIn, HparamsIn, StateT, MetricsOut]):
         num_steps: int,
         max_rows: int = 1000,
     ) -> tuple[StateT, MetricsOut]:
-        """``init`` and ``run``; ``vmap`` it over keys for many seeds.
-
-        Args:
-          key: random key of ``init``; the state keeps it.
-          problem, hparams, num_steps, max_rows: as for ``run``.
-
-        Returns:
-          The ``State`` after the last step, and ``Metrics`` with a leading axis of rows.
-
-        Raises:
-          ValueError: num_steps or max_rows is not positive, or a hyperparameter is out of range.
-        """
+        """``init`` and ``run``; ``vmap`` it over keys for many seeds. Raises as they do."""
         ...
 
     def run_until(
@@ -196,20 +165,17 @@ class Learner(Protocol[ProblemIn, HparamsIn, StateT, MetricsOut]):
         Under ``vmap`` the state of a finished lane stays unchanged while others continue.
 
         Args:
-          state: from ``init`` or an earlier run.
-          problem, hparams: arrays; new values do not recompile.
-          until: ``(before, after, metrics) -> bool[]``: the states before and after `check_every`
-            steps and the metrics of the last of them. Pass numbers by
-            ``jax.tree_util.Partial(function, *numbers)``: new numbers do not recompile, a new
-            function does.
+          state, problem, hparams: as for ``run``.
+          until: ``(before, after, metrics) -> bool[]``: the states before and after `check_every` steps
+            and the metrics of the last of them. Pass numbers by ``jax.tree_util.Partial(function,
+            *numbers)``: new numbers do not recompile, a new function does.
           num_steps: maximal number of steps; traced.
           check_every: steps between `before` and `after`; static.
-          keep: which state is returned when the condition holds, ``"after"`` or ``"before"`` (the
-            one that the learner's metrics describe); static.
+          keep: which state is returned when the condition holds, ``"after"`` or ``"before"`` (the one
+            that the learner's metrics describe); static.
 
         Returns:
-          :class:`~jaxltl.algos.common.loops.Learned`: the state, its metrics, the number of steps
-          and the status; :func:`~jaxltl.check` accepts it.
+          :class:`~jaxltl.algos.common.loops.Learned`; :func:`~jaxltl.check` accepts it.
 
         Raises:
           ValueError: an unknown `keep`, a number below 1, or a hyperparameter out of range.
@@ -227,30 +193,11 @@ class Learner(Protocol[ProblemIn, HparamsIn, StateT, MetricsOut]):
         check_every: int = 1,
         keep: str = "after",
     ) -> Learned:
-        """``init`` and ``run_until``; ``vmap`` it over keys for many seeds.
-
-        Args:
-          key: random key of ``init``; the state keeps it.
-          problem, hparams, until, num_steps, check_every, keep: as for ``run_until``.
-
-        Returns:
-          :class:`~jaxltl.algos.common.loops.Learned`: the state, its metrics, the number of steps
-          and the status; :func:`~jaxltl.check` accepts it.
-
-        Raises:
-          ValueError: an unknown `keep`, a number below 1, or a hyperparameter out of range.
-        """
+        """``init`` and ``run_until``; ``vmap`` it over keys for many seeds. Raises as they do."""
         ...
 
     def policy(self, state: StateT, problem: ProblemIn, hparams: HparamsIn) -> Any:
-        """The learned policy: action probabilities of a model's states, or an agent.
-
-        Args:
-          state, problem, hparams: of a run.
-
-        Returns:
-          ``float[S, A]`` for models, :class:`~jaxltl.environments.Agent` for environments.
-        """
+        """The learned policy: ``float[S, A]`` for models, an ``Agent`` for environments."""
         ...
 
 
@@ -279,19 +226,11 @@ def bind(
     step_if: Callable[..., tuple[StateT, MetricsT]] | None = None,
     keep: str = "after",
 ) -> Bound[ProblemT, HparamsT, StateT, MetricsT]:
-    """The public functions of a learner, of its ``init`` and ``step``.
+    """A learner's public functions, with the signatures of :class:`Learner`, in the module of `step`.
 
-    They are functions of the module of `step`, which binds them to these names.
-
-    Args:
-      init: ``(key, problem, hparams) -> State``.
-      step: ``(state, problem, hparams) -> (State, Metrics)``.
-      step_if: the step of ``run_until`` with a fourth argument ``bool[]``, which returns the state
-        unchanged where that is False; by default finished lanes are masked array by array.
-      keep: default of that argument of ``run_until``.
-
-    Returns:
-      :class:`Bound`.
+    Of `init` and `step`. A `step_if` is the step of ``run_until`` with a fourth argument ``bool[]``,
+    and returns the state unchanged where that is False; by default finished lanes are masked array by
+    array. `keep` is the default of that argument of ``run_until``.
     """
 
     def checked(made: Callable[..., tuple[StateT, MetricsT]]) -> Callable[..., Any]:
@@ -350,9 +289,8 @@ def completion_status(completed: chex.Array, finite: chex.Array) -> jax.Array:
 
     COMPLETED certifies nothing.
 
-    Example:
-      >>> completion_status(jnp.bool_(True), jnp.bool_(True)).item() == Status.COMPLETED
-      True
+    >>> completion_status(jnp.bool_(True), jnp.bool_(True)).item() == Status.COMPLETED
+    True
     """
     code = jnp.where(completed, Status.COMPLETED, Status.MAX_STEPS)
     return jnp.where(finite, code, Status.NONFINITE).astype(jnp.int32)
@@ -361,9 +299,8 @@ def completion_status(completed: chex.Array, finite: chex.Array) -> jax.Array:
 def init_key(key: chex.PRNGKey) -> chex.PRNGKey:
     """The random key of ``init``: `key` with a number folded in that no step reaches.
 
-    Example:
-      >>> init_key(jax.random.key(0)).shape
-      ()
+    >>> init_key(jax.random.key(0)).shape
+    ()
     """
     return jax.random.fold_in(key, 0xFFFFFFFF)
 
@@ -381,11 +318,10 @@ def step_key(state: HasStep) -> chex.PRNGKey:
 
 
 def saturating_add(total: jax.Array, increment: chex.Numeric) -> jax.Array:
-    """``total + increment`` of counters ``int32``, at most ``2 ** 31 - 1``.
+    """The sum `total` + `increment` of counters ``int32``, at most ``2 ** 31 - 1``.
 
-    Example:
-      >>> saturating_add(jnp.int32(5), 3).item()
-      8
+    >>> saturating_add(jnp.int32(5), 3).item()
+    8
     """
     increment = jnp.asarray(increment, jnp.int32)
     saturated = total > MAX_STEPS - increment

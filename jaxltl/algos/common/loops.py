@@ -135,8 +135,7 @@ def run_until(
 ) -> Learned:
     """:meth:`~jaxltl.algos.common.learner.Learner.run_until` of a learner with this `step`.
 
-    With `idle`, the step takes a fourth argument ``bool[]`` and returns the state unchanged where
-    it is False; otherwise finished lanes are masked array by array.
+    With `idle`, the step takes a fourth argument ``bool[]`` and keeps the state where it is False.
     """
     if keep not in ("after", "before"):
         raise ValueError(f'keep={keep!r}; choose "after" or "before".')
@@ -154,13 +153,7 @@ def run_until(
 
 @struct.dataclass
 class Progress:
-    """A run in progress.
-
-    Attributes:
-      state, metrics: of the last step.
-      count: ``int32[]``, number of steps.
-      done: ``bool[]``, whether the condition was met.
-    """
+    """A run: `state` and `metrics` of the last step, `count` of steps, and `done`, the condition's value."""
 
     state: Any
     metrics: Any
@@ -218,12 +211,11 @@ def while_active(
     A vmapped ``lax.while_loop`` copies all arrays of finished lanes in every iteration. Here `body`
     must return the carry of an inactive lane unchanged, so that only written entries are touched.
 
-    Example:
-      >>> def half(x, bound):  # small numbers are unchanged
-      ...     return jnp.where(x > bound, x / 2, x)
-      >>> run = jax.vmap(lambda x: while_active(lambda x, bound: x > bound, half, x, 1.0))
-      >>> run(jnp.array([0.5, 4.0])).tolist()
-      [0.5, 1.0]
+    >>> def half(x, bound):  # small numbers are unchanged
+    ...     return jnp.where(x > bound, x / 2, x)
+    >>> run = jax.vmap(lambda x: while_active(lambda x, bound: x > bound, half, x, 1.0))
+    >>> run(jnp.array([0.5, 4.0])).tolist()
+    [0.5, 1.0]
     """
     carry, given = jax.tree.map(jnp.asarray, (carry, given))
 

@@ -14,12 +14,7 @@ from jaxltl.core.pretty_print import brief
 @brief
 @struct.dataclass
 class Moments:
-    """Number, mean and sum of squared deviations of a stream of numbers.
-
-    Attributes:
-      count: ``float[]``.
-      mean, squares: of the shape of one of them.
-    """
+    """Number ``float[]``, mean and sum of squared deviations of a stream of arrays of one shape."""
 
     count: jax.Array
     mean: jax.Array
@@ -35,18 +30,12 @@ def no_moments(shape: tuple[int, ...], dtype: jax.typing.DTypeLike | None = None
 def updated_moments(
     moments: Moments, numbers: jax.Array, valid: jax.Array | None = None
 ) -> Moments:
-    """The moments with a batch added (Chan, Golub & LeVeque 1979).
+    """The moments with a batch ``[..., *shape]``, or its `valid` entries, added (Chan et al. 1979).
 
-    Args:
-      moments: so far.
-      numbers: ``[..., *shape]``.
-      valid: ``bool[...]``, which of them to count; default all.
-
-    Example:
-      >>> now = updated_moments(no_moments(()), jnp.array([1.0, 5.0]))
-      >>> now = updated_moments(now, jnp.array([3.0]))
-      >>> float(now.mean), float(now.squares)
-      (3.0, 8.0)
+    >>> now = updated_moments(no_moments(()), jnp.array([1.0, 5.0]))
+    >>> now = updated_moments(now, jnp.array([3.0]))
+    >>> float(now.mean), float(now.squares)
+    (3.0, 8.0)
     """
     numbers = numbers.astype(moments.mean.dtype)
     axes = tuple(range(numbers.ndim - moments.mean.ndim))

@@ -13,19 +13,11 @@ _SCALINGS = {
 
 
 def optimizer(name: str, learning_rate: chex.Numeric) -> optax.GradientTransformationExtraArgs:
-    """An optimizer of optax: ``"lbfgs"``, ``"adam"``, ``"rmsprop"`` or ``"sgd"``.
+    """An optimizer of optax: ``"lbfgs"``, which ignores the rate, ``"adam"``, ``"rmsprop"`` or ``"sgd"``.
 
-    Args:
-      name: of the optimizer.
-      learning_rate: ignored by ``"lbfgs"``, which searches along lines.
-
-    Raises:
-      ValueError: an unknown name.
-
-    Example:
-      >>> import jax.numpy as jnp
-      >>> optimizer("adam", 1e-3).init(jnp.zeros(2))[0].mu.shape
-      (2,)
+    >>> import jax.numpy as jnp
+    >>> optimizer("adam", 1e-3).init(jnp.zeros(2))[0].mu.shape
+    (2,)
     """
     if name == "lbfgs":
         return optax.lbfgs()

@@ -77,36 +77,24 @@ Schedule = Any  # a number, a Polynomial, or a pytree that is called with l = 1,
 
 
 def is_schedule(given: Any) -> bool:
-    """Whether an object is a schedule of the step, in a pytree so that it is traced, and not a number.
+    """Whether `given` is a schedule of the step, in a pytree so that it is traced, and not a number.
 
-    Args:
-      given: anything.
-
-    Returns:
-      A truth value.
-
-    Example:
-      >>> import math
-      >>> [is_schedule(x) for x in (Linear(1.0, 0.0, 4), Polynomial(1.0, -1.0), 0.5, math.exp)]
-      [True, True, False, False]
+    >>> import math
+    >>> [is_schedule(x) for x in (Linear(1.0, 0.0, 4), Polynomial(1.0, -1.0), 0.5, math.exp)]
+    [True, True, False, False]
     """
     own = isinstance(given, Polynomial) or callable(given)
     return own and not jax.tree_util.all_leaves([given])
 
 
 def at(schedule: Schedule, step: jax.Array | int) -> Any:
-    """The value of a schedule in step l = `step` + 1.
+    """The value of a `schedule` in step l = `step` + 1; None of None.
 
-    Args:
-      schedule: a number, :class:`Polynomial`, :class:`Linear`, or a function of l in a pytree.
-      step: at least 0; may be traced.
+    A number, :class:`Polynomial`, :class:`Linear`, or a function of l in a pytree. Differentiable in
+    the schedule's numbers.
 
-    Returns:
-      A number; None of None. Differentiable in the schedule's numbers.
-
-    Example:
-      >>> at(Linear(1.0, 0.0, 2), 1).item(), at(0.5, 1)
-      (0.5, 0.5)
+    >>> at(Linear(1.0, 0.0, 2), 1).item(), at(0.5, 1)
+    (0.5, 0.5)
     """
     l = jnp.asarray(step) + 1  # noqa: E741
     if isinstance(schedule, Polynomial):
@@ -116,16 +104,10 @@ def at(schedule: Schedule, step: jax.Array | int) -> Any:
 
 @brief
 class Condition(NamedTuple):
-    """A condition of theorem 1.
+    """A condition of theorem 1: its `name`, `holds` (None if that is unknown), and the `reason`.
 
-    Attributes:
-      name: of the condition.
-      holds: whether it holds; None if that is unknown.
-      reason: the numbers that decide.
-
-    Example:
-      >>> Condition("samples grow", False, "constant").holds
-      False
+    >>> Condition("samples grow", False, "constant").holds
+    False
     """
 
     name: str
@@ -161,28 +143,16 @@ _ASSUMED = (
 
 
 def theorem_conditions(hparams: Any, *, num_steps: int | None = None) -> Conditions:
-    """Whether hyperparameters satisfy the conditions of theorem 1 (assumption 2b); on the host.
+    """The :class:`Conditions` of theorem 1 (assumption 2b) on concrete `hparams` of ``cce``; on the host.
 
     ``n_l`` grows as ``l^beta`` with beta > 0; ``alpha_l`` is positive, decreases to 0 and has an infinite
     sum; ``lambda_l = O(l^-lambda)`` with lambda > 0 and ``beta + 2 lambda > 1``; and the method is
-    algorithm 2 as printed.
+    algorithm 2 as printed. With `num_steps` the run ends, and `population` bounds n_l, so that samples
+    grow for a limited number of steps.
 
-    Args:
-      hparams: of ``cce``, concrete.
-      num_steps: length of the run; `population` bounds n_l, so that samples grow for a limited number
-        of steps. None: an infinite run.
-
-    Returns:
-      :class:`Conditions`.
-
-    Example:
-      >>> from jaxltl.algos.cce import Hparams
-      >>> theorem_conditions(Hparams(weighting="literal")).failing
-      ('samples grow', 'rate decreases', 'rate vanishes')
-      >>> hparams = Hparams(rate=Polynomial(0.5, -0.7), num_samples=Polynomial(10, 0.5),
-      ...                   weighting="literal")
-      >>> theorem_conditions(hparams, num_steps=90).holds
-      True
+    >>> from jaxltl.algos.cce import Hparams
+    >>> theorem_conditions(Hparams(weighting="literal")).failing
+    ('samples grow', 'rate decreases', 'rate vanishes')
     """
     growth, samples = _samples_condition(hparams, num_steps)
     decay, share = _share_condition(hparams.sample_share)

@@ -56,15 +56,9 @@ class _Valid(NamedTuple):
 
 
 def traced(valid: Range, *, default: Any = dataclasses.MISSING, schedule: bool = False) -> Any:
-    """A dataclass field with a traced number in a range.
+    """A dataclass field with a traced number in the range `valid`, or if `schedule` a schedule of them.
 
-    Args:
-      valid: the range.
-      default: of the field; a field whose default is None may be None.
-      schedule: whether it may be a schedule of such numbers.
-
-    Returns:
-      The field.
+    A field whose `default` is None may be None.
     """
     metadata = {"valid": _Valid(valid, False, schedule)}
     return struct.field(default=default, metadata=metadata)
@@ -73,20 +67,14 @@ def traced(valid: Range, *, default: Any = dataclasses.MISSING, schedule: bool =
 def static(valid: Range | tuple[str, ...] | type[bool], *, default: Any) -> Any:
     """A dataclass field with a static integer (or a tuple of them), word or truth value.
 
-    Args:
-      valid: the range, the words, or bool.
-      default: of the field; a field whose default is None may be None.
+    `valid` is the range, the words, or bool; a field whose `default` is None may be None.
 
-    Returns:
-      The field.
-
-    Example:
-      >>> @struct.dataclass
-      ... class Hparams:
-      ...     method: str = static(("trpo", "cpo"), default="cpo")
-      >>> require_hparams(Hparams(method="ppo"))
-      Traceback (most recent call last):
-      ValueError: method='ppo'; choose one of trpo, cpo.
+    >>> @struct.dataclass
+    ... class Hparams:
+    ...     method: str = static(("trpo", "cpo"), default="cpo")
+    >>> require_hparams(Hparams(method="ppo"))
+    Traceback (most recent call last):
+    ValueError: method='ppo'; choose one of trpo, cpo.
     """
     metadata = {"valid": _Valid(valid, True, False)}
     return struct.field(pytree_node=False, default=default, metadata=metadata)
@@ -104,19 +92,16 @@ def _declared(hparams: object) -> Iterator[tuple[str, Any, _Valid]]:
 
 
 def require_hparams(hparams: object, *, batched: bool = False) -> None:
-    """Raises ValueError if a concrete hyperparameter is outside its declared range.
+    """Raises ValueError if a concrete number in `hparams` is outside its declared range.
 
-    Args:
-      hparams: an instance of a learner's ``Hparams``; anything else has no declared ranges.
-      batched: whether numbers may have a leading axis of lanes.
+    If `batched`, numbers may have a leading axis of lanes.
 
-    Example:
-      >>> @struct.dataclass
-      ... class Hparams:
-      ...     discount: Number = traced(Range(0, 1))
-      >>> require_hparams(Hparams(discount=1.5))
-      Traceback (most recent call last):
-      ValueError: discount=1.5; it must be at least 0 and at most 1.
+    >>> @struct.dataclass
+    ... class Hparams:
+    ...     discount: Number = traced(Range(0, 1))
+    >>> require_hparams(Hparams(discount=1.5))
+    Traceback (most recent call last):
+    ValueError: discount=1.5; it must be at least 0 and at most 1.
     """
     fields = dataclasses.fields(hparams) if dataclasses.is_dataclass(hparams) else ()
     tuples = {field.name for field in fields if isinstance(field.default, tuple)}
@@ -138,26 +123,19 @@ def require_hparams(hparams: object, *, batched: bool = False) -> None:
 
 
 def flag_invalid(metrics: MetricsT, hparams: object, step: jax.Array) -> MetricsT:
-    """A learner's metrics, with status INVALID if a traced hyperparameter is out of range.
+    """The `metrics`, with status INVALID if a traced hyperparameter in `hparams` is out of range.
 
-    Args:
-      metrics: a dataclass with a ``status``.
-      hparams: an instance of the learner's ``Hparams``.
-      step: ``int32[]``, number of steps made, at which schedules are evaluated.
+    Schedules are evaluated at `step`, ``int32[]``.
 
-    Returns:
-      The metrics, with `status` replaced.
-
-    Example:
-      >>> @struct.dataclass
-      ... class Metrics:
-      ...     status: jax.Array
-      >>> @struct.dataclass
-      ... class Hparams:
-      ...     discount: Number = traced(Range(0, 1))
-      >>> check = jax.jit(lambda x: flag_invalid(Metrics(jnp.int32(0)), Hparams(x), jnp.int32(0)))
-      >>> check(1.5).status.item() == Status.INVALID
-      True
+    >>> @struct.dataclass
+    ... class Metrics:
+    ...     status: jax.Array
+    >>> @struct.dataclass
+    ... class Hparams:
+    ...     discount: Number = traced(Range(0, 1))
+    >>> check = jax.jit(lambda x: flag_invalid(Metrics(jnp.int32(0)), Hparams(x), jnp.int32(0)))
+    >>> check(1.5).status.item() == Status.INVALID
+    True
     """
     flags = []
     for _, value, (valid, is_static, may_be_schedule) in _declared(hparams):
@@ -174,10 +152,7 @@ def flag_invalid(metrics: MetricsT, hparams: object, step: jax.Array) -> Metrics
 
 
 def require_arrays(**trees: Any) -> None:
-    """Refuses trees in which something is no array and no number, which nothing compiled takes.
-
-    Args:
-      trees: by name, as they are told.
+    """Validation of `trees` by name: every leaf is an array or a number.
 
     Raises:
       ValueError: naming the place in the tree.
@@ -206,18 +181,10 @@ def _is_array(leaf: Any) -> bool:
 
 
 def applied(network: nn.Module, parameters: Any, *read: Any) -> Any:
-    """What a network says with some parameters.
-
-    Args:
-      network: the module.
-      parameters: of it.
-      read: what it is called with.
-
-    Returns:
-      What it returns.
+    """The output of a `network` with `parameters` for the inputs `read`.
 
     Raises:
-      ValueError: the parameters are of another network, or it reads something else.
+      ValueError: parameters of another network, or inputs of other shapes.
 
     Example:
       >>> applied(nn.Dense(2), {"kernel": np.eye(2), "bias": np.zeros(2)}, np.zeros(3))

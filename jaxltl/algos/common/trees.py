@@ -18,29 +18,22 @@ def _is_key(x: jax.Array) -> bool:
 def strong(tree: TreeT) -> TreeT:
     """The same arrays without weak types, so that all chunks of a run share one program.
 
-    Example:
-      >>> number = jnp.asarray(1.0)
-      >>> number.weak_type, strong({"x": number})["x"].weak_type
-      (True, False)
+    >>> number = jnp.asarray(1.0)
+    >>> number.weak_type, strong({"x": number})["x"].weak_type
+    (True, False)
     """
     return jax.tree.map(lambda x: x if _is_key(x) else lax.convert_element_type(x, x.dtype), tree)
 
 
 def either(condition: jax.Array, one: TreeT, other: TreeT) -> TreeT:
-    """:func:`choose` as one branch, which compiles faster than a choice for each array.
-
-    Example:
-      >>> either(jnp.bool_(False), {"x": jnp.zeros(2)}, {"x": jnp.ones(2)})["x"].tolist()
-      [1.0, 1.0]
-    """
+    """:func:`choose` as one branch, which compiles faster than a choice for each array."""
     return lax.cond(condition, lambda: one, lambda: other)
 
 
 def choose(condition: jax.Array, one: TreeT, other: TreeT) -> TreeT:
     """``jnp.where`` on trees; random keys, which steps do not change, are those of `one`.
 
-    Example:
-      >>> choose(jnp.bool_(False), {"x": jnp.zeros(2)}, {"x": jnp.ones(2)})["x"].tolist()
-      [1.0, 1.0]
+    >>> choose(jnp.bool_(False), {"x": jnp.zeros(2)}, {"x": jnp.ones(2)})["x"].tolist()
+    [1.0, 1.0]
     """
     return jax.tree.map(lambda x, y: x if _is_key(x) else jnp.where(condition, x, y), one, other)

@@ -27,14 +27,7 @@ from jaxltl.core.pretty_print import brief
 @brief
 @struct.dataclass
 class Walkers:
-    """N parallel environments; all arrays have a first axis of N.
-
-    Attributes:
-      world: their states.
-      memory: of the network.
-      episode_return, episode_length: of the current episode.
-      discounted: rewards of the episode, discounted to the present.
-    """
+    """N parallel environments: states, memories, and figures of their current episodes, ``[N, ...]``."""
 
     world: Any
     memory: Any
@@ -46,14 +39,8 @@ class Walkers:
 class Rows(NamedTuple):
     """Transitions ``[T, N, ...]``, flattened, or a minibatch.
 
-    Attributes:
-      observation: before the transition, as the network reads it.
-      start: whether an episode begins with it, so that the memory is the initial one.
-      allowed: ``bool[A]``, or None.
-      raw: the sampled action before squashing.
-      log_density: of `raw` under the collecting policy.
-      value: estimate before the transition.
-      advantage: of the action.
+    Normalised observations, `start` of an episode with the transition, the action mask or None, the
+    `raw` action and its density under the collecting policy, and the value before it.
     """
 
     observation: Any

@@ -264,34 +264,17 @@ class Metrics:
 def make_problem(
     environment: Environment, *, network: nn.Module | None = None, memory: Any = None
 ) -> Problem:
-    """A checked :class:`Problem`.
+    """A checked :class:`Problem` of an `environment` with finitely many actions, or a box of floats.
 
-    Args:
-      environment: with finitely many actions, or a box of floats.
-      network: a ``flax.linen`` module of one observation, ``network(observation) -> (action
-        parameters, value)``; with memory ``network(memory, observation) -> (memory, (action
-        parameters, value))``. Action parameters are logits ``float[A]``, or for a box
-        ``(mean, log_deviation)`` of an action's shape; the value is a scalar.
-        Default :class:`ActorCritic`.
-      memory: initial memory of a recurrent network; default its ``initial_memory()``.
-
-    Returns:
-      :class:`Problem`.
+    The `network` is a ``flax.linen`` module of one observation, ``network(observation) -> (action
+    parameters, value)``; with memory ``network(memory, observation) -> (memory, (action parameters,
+    value))``. Action parameters are logits ``float[A]``, or for a box ``(mean, log_deviation)`` of an
+    action's shape; the value is a scalar. Default :class:`ActorCritic`. The initial `memory` of a
+    recurrent network is by default its ``initial_memory()``.
 
     Raises:
       ValueError: a network that returns other shapes or keeps more than parameters; a memory that
         does not fit; a box of integers; not an environment.
-
-    Example:
-      >>> from jaxltl import make_environment
-      >>> from jaxltl.core.environments.environment import Timestep
-      >>> def go(place, action, key):
-      ...     place = place + 2 * action - 1
-      ...     return Timestep(place, reward=1.0 * (place == 3), terminated=abs(place) == 3)
-      >>> corridor = make_environment(
-      ...     lambda key: jnp.int32(0), go, lambda place: place[None] / 3, actions=2)
-      >>> make_problem(corridor).network.num_actions
-      2
     """
     require_environment(environment)
     actions = environment.actions
@@ -349,16 +332,9 @@ def policy(state: State, problem: Problem, hparams: Hparams) -> Agent:
 
 
 def greedy(state: State, problem: Problem, hparams: Hparams) -> Agent:
-    """The learned policy as an agent that takes the most likely action, or a Gaussian's mean.
+    """The learned policy of a run's `state`, `problem` and `hparams`, taking its most likely action.
 
-    Args:
-      state, problem, hparams: of a run.
-
-    Returns:
-      :class:`~jaxltl.core.environments.episodes.Agent`, a pytree.
-
-    Raises:
-      ValueError: the state or the problem is not PPO's.
+    A Gaussian's is the mean.
     """
     return _agent(state, problem, hparams, False)
 

@@ -41,10 +41,9 @@ def surrogate(
     valid: jax.Array,
     hparams: Any,
 ) -> tuple[jax.Array, jax.Array]:
-    """Gains ``float[V]`` over the sampling policy, and the mean divergence.
+    """Gains ``float[V]`` over the sampling policy, and the mean divergence ``mean_i KL(old || pi)``.
 
-    ``sum_i (pi(a_i) / old(a_i) - 1) A_i`` and ``mean_i KL(old || pi)``, differentiable in the
-    parameters; `old` has mean and deviation ``float[B, A]``, `weighted` is ``float[V, B]``.
+    ``sum_i (pi(a_i) / old(a_i) - 1) A_i`` for `weighted` advantages ``float[V, B]``.
     """
     new = gaussian(parameters, hparams, inputs)
     log_ratio = log_density(action, *new) - log_density(action, *old)

@@ -84,14 +84,7 @@ def policy(state: State, problem: Problem, hparams: Hparams) -> Agent:
 
 
 def greedy(state: State, problem: Problem, hparams: Hparams) -> Agent:
-    """The learned policy as an agent that takes the mean action.
-
-    Args:
-      state, problem, hparams: of a run.
-
-    Returns:
-      :class:`~jaxltl.core.environments.episodes.Agent`, a pytree.
-    """
+    """The learned policy of a run's `state`, `problem` and `hparams`, taking the mean action."""
     return _agent(_mean_action, state, problem, hparams)
 
 
@@ -123,17 +116,10 @@ def _mean_action(
 
 
 def act(state: State, hparams: Hparams, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Mean and standard deviation of the action, both ``float[..., A]``.
+    """The mean and standard deviation of the action at an `observation` ``float[..., O]``.
 
-    Args:
-      state, hparams: of a run.
-      observation: ``float[..., O]``.
-
-    Returns:
-      Two arrays, in units of the action before clipping; differentiable in the parameters.
-
-    Raises:
-      ValueError: arguments of another learner, or an observation of another size.
+    Both ``float[..., A]``, in units of the action before clipping, of a run's `state` and `hparams`;
+    differentiable in the parameters.
     """
     validation.instance("hparams", hparams, Hparams, "trust_region.Hparams")
     require_state(state)
@@ -150,19 +136,10 @@ def rollout(
     num_trajectories: int,
     sampled: bool = True,
 ) -> Batch:
-    """Trajectories of the policy.
+    """The :class:`Batch` of `num_trajectories` trajectories of the policy, of a random `key`.
 
-    Args:
-      key: random key.
-      state, problem, hparams: of a run.
-      num_trajectories: N; static.
-      sampled: whether actions are sampled, or the policy's mean is taken; static.
-
-    Returns:
-      :class:`Batch`; sums over its first axis are those of trajectories.
-
-    Raises:
-      ValueError: arguments of another learner, or no positive number of trajectories.
+    Of a run's `state`, `problem` and `hparams`; actions are `sampled`, or the policy's mean is taken;
+    both static. Sums over its first axis are those of trajectories.
     """
     require_run(problem, hparams)
     require_state(state)

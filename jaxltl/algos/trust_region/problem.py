@@ -42,15 +42,10 @@ class Problem:
 def make_problem(
     environment: Environment, *, horizon: int | None = None, limit: chex.Numeric | None = None
 ) -> Problem:
-    """A checked :class:`Problem`.
+    """A checked :class:`Problem` of an `environment` with a box of floating-point actions.
 
-    Args:
-      environment: with a box of floating-point actions.
-      horizon: T, at least 1; default the environment's.
-      limit: on the expected cost of a trajectory; may be negative. CPO needs it.
-
-    Returns:
-      :class:`Problem`.
+    `horizon` is T, at least 1, by default the environment's; `limit` bounds the expected cost of a
+    trajectory, and may be negative. CPO needs it.
 
     Raises:
       ValueError: not an environment, finitely many actions, no horizon, a horizon below 1, or a limit
