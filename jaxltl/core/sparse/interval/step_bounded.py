@@ -2,16 +2,30 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.sparse.graph.qualitative import backward_reachable
-from jaxltl.core.sparse.interval.robust_values import Query
+from jaxltl.core.sparse.interval.qualitative import zero_one_states
+from jaxltl.core.sparse.interval.reachability import reachability
+from jaxltl.core.sparse.interval.robust_values import Query, RobustValues, distribution_depth
+from jaxltl.core.sparse.interval.total_reward import total_reward
 from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
+from jaxltl.core.sparse.solvers.step_bounded import (
+    UnboundedLimit,
+    narrowed,
+    reached_within,
+    unfinished,
+)
 
 _EPS = float(np.finfo(np.float64).eps)
+_LONG = 4096  # backups after which the effect of all further ones is bounded, then at each doubling
+_CLOSE = 1e-9  # effect of all further backups, relative, at which the iteration stops
+_WORK = 2.0**34  # entries of one iteration; beyond these, the rest is bounded
+_OVERHEAD = 20_000  # entries in the time that NumPy's calls of one backup take
 
 
 @dataclass(frozen=True)
@@ -41,26 +55,89 @@ def until(
     model: UncertainMDP, target: Booleans, stay: Booleans, num_steps: int, query: Query
 ) -> StepBoundedValues:
     """Probability of reaching a target within `num_steps` through states of `stay`."""
-    open_ = stay & ~target
-    value, done = target.astype(np.float64), 0
-    row: Integers = model.mdp.row_start[:-1].astype(np.int64)
-    chance = model.mdp.probability
-    while done < num_steps:
+    mdp, open_, one = model.mdp, stay & ~target, backup_error(model)
+    value, done, is_fixed, check = target.astype(np.float64), 0, False, _LONG
+    row: Integers = mdp.row_start[:-1].astype(np.int64)
+    chance, limit = mdp.probability, _Limit(model, target, open_, num_steps, query)
+    while done < min(num_steps, _most_backups(model)) and not is_fixed:
         done += 1
-        found, row, chance = _backup(model, value[model.mdp.successor], query)
+        found, row, chance = _backup(model, value[mdp.successor], query)
         new = np.where(open_, np.clip(found, 0, 1), target)
-        if np.array_equal(new, value):
-            break
-        value = new
-    total = num_steps * backup_error(model)
-    error = np.where(open_ & (num_steps > 0), min(total, 1.0), 0)
+        is_fixed, value = np.array_equal(new, value), new
+        if done == check and not is_fixed:
+            check *= 2
+            if (limit.upper - np.maximum(limit.lower, value) <= _CLOSE)[open_].all():
+                break
+    complete = is_fixed or done == num_steps
+    # Of fewer backups the value is a lower bound, as a target is reached once.
+    size = min((num_steps if complete else done) * one, 1.0)
+    error = np.where(open_ & (num_steps > 0), size, 0)
+    if not complete or (num_steps > _LONG and size > _CLOSE):
+        value, error = narrowed(limit, value, error, open_, complete)
     # Supports decide which values are exactly 0 or 1.
     if num_steps:
         for surely in (False, True):
-            region = _qualitative(model, (target, open_), num_steps, surely, query)
+            entering = partial(
+                _entering, model, surely=surely, nature_maximizes=query.nature_maximizes
+            )
+            region = reached_within(mdp, (target, open_), num_steps, _any_or_all(query), entering)
             known = open_ & (region if surely else ~region)
             value, error = np.where(known, surely, value), np.where(known, 0, error)
     return StepBoundedValues(value, error, row, chance, done)
+
+
+def _most_backups(model: UncertainMDP) -> int:
+    return int(_WORK / (model.mdp.num_transitions + _OVERHEAD))
+
+
+@dataclass(frozen=True)
+class _Limit:
+    """Bounds of a step-bounded probability by the unbounded one, for many steps n.
+
+    Players that maximise keep to nearly optimal choices of the unbounded problem, which bounds the
+    probability from below. Against them, the players that minimise cannot do better than avoid the
+    target for ever from a state of value zero, once it is met: the probability within n steps is
+    at least the unbounded one less that of a run that lasts n steps without such a state
+    (:class:`~jaxltl.core.sparse.solvers.step_bounded.UnboundedLimit`).
+    """
+
+    model: UncertainMDP
+    target: Booleans
+    open: Booleans
+    num_steps: int
+    query: Query
+
+    @cached_property
+    def found(self) -> RobustValues:
+        """The unbounded probability."""
+        query = replace(self.query, tolerance=_CLOSE / 4)
+        return reachability(self.model, self.target, query, stay=self.open | self.target)
+
+    @property
+    def upper(self) -> Floats:
+        return self.found.upper
+
+    @cached_property
+    def lower(self) -> Floats:
+        part, entry = self.model, np.arange(self.model.mdp.num_transitions)
+        if self.query.maximize:
+            part, entry = self.model.under_policy(self.found.row)
+        depth = self.query.depth + distribution_depth(part.mdp)
+        if self.query.nature_maximizes:
+            chance, able = part.nearest_distributions(self.found.probability[entry])
+            if not able:
+                return np.zeros(self.target.size)
+            fixed = part.resolve(chance)
+            return UnboundedLimit(
+                fixed, self.target, self.open, self.num_steps, maximize=False, depth=depth
+            ).lower
+        least = Query(False, False, tolerance=_CLOSE / 4, depth=self.query.depth)
+        value = reachability(part, self.target, least, stay=self.open | self.target).lower
+        absorbing = part.with_absorbing(~self.open)[0]
+        ended = ~self.open | zero_one_states(absorbing, self.target, least).zero
+        longest = Query(True, True, tolerance=0.1, depth=self.query.depth)
+        time = total_reward(part, np.ones(part.mdp.num_rows), ended, longest).upper
+        return value - unfinished(time, self.num_steps)
 
 
 def next_step(model: UncertainMDP, target: Booleans, query: Query) -> StepBoundedValues:
@@ -81,28 +158,37 @@ def total(
 ) -> StepBoundedValues:
     """Expected reward of `num_steps` steps plus a final reward."""
     mdp, one = model.mdp, backup_error(model)
-    value, error, done = start, 0.0, 0
+    value, error, done, check = start, 0.0, 0, _LONG
     row: Integers = mdp.row_start[:-1].astype(np.int64)
-    chance = mdp.probability
-    while done < num_steps:
+    chance, most = mdp.probability, min(num_steps, _most_backups(model))
+    width: Floats = np.zeros(value.size)
+    while done < most:
         done += 1
         ahead = earned + value[mdp.successor]
         found, row, chance = _backup(model, ahead, query)
-        still = np.array_equal(found, value)
-        # At a fixed point the error of all further steps follows from e -> (1 + one) e + one size.
-        size, repeated = float(np.abs(ahead).max(initial=0)), num_steps - done + 1 if still else 1
-        growth = float(np.expm1(min(repeated * np.log1p(one), 500)))
-        error = (
-            1.01 * (error * (1 + growth) + growth * size)
-            if still
-            else (error + one * (size + error))
-        )
-        value = found
-        if still:
+        left, size = num_steps - done + 1, float(np.abs(ahead).max(initial=0))
+        if np.array_equal(found, value):
+            # At a fixed point the error of all further steps follows from e -> (1 + u) e + u size.
+            growth = float(np.expm1(min(left * np.log1p(one), 500)))
+            error = 1.01 * (error * (1 + growth) + growth * size)
             break
+        if left > 1 and done in (check, most):
+            check *= 2
+            # T is monotone and T (v + c) = T v + c: each further step adds at least the least, and
+            # at most the largest, of T v - v (Puterman 1994, section 8.5).
+            step, slack = found - value, error + 2 * left * one * size
+            low, high = (value + left * x for x in (step.min(), step.max()))
+            if not earned.any():
+                low, high = np.maximum(low, found.min()), np.minimum(high, found.max())
+            if done == most or (high - low <= _CLOSE * np.maximum(np.abs(low), 1)).all():
+                value, width, error = (low + high) / 2, (high - low) / 2, 1.01 * slack
+                break
+        value, error = found, error + one * (size + error)
     some = start != 0
     some[mdp.state[mdp.row[earned != 0]]] = True
-    off = np.where(backward_reachable(mdp, some), error if num_steps else 0, 0)
+    # Without a reward ahead the value is exactly 0, also where the remaining steps are bounded.
+    some = backward_reachable(mdp, some)
+    value, off = np.where(some, value, 0), np.where(some & (num_steps > 0), width + error, 0)
     return StepBoundedValues(value, off, row, chance, done)
 
 
@@ -128,22 +214,3 @@ def _entering(
     if surely:
         return model.can_stay_in(region) if nature_maximizes else ~leads(~region)
     return leads(region) if nature_maximizes else ~model.can_stay_in(~region)
-
-
-def _qualitative(
-    model: UncertainMDP,
-    sets: tuple[Booleans, Booleans],
-    num_steps: int,
-    surely: bool,
-    query: Query,
-) -> Booleans:
-    """States that reach a target through open ones in time with positive probability, or surely."""
-    target, open_ = sets
-    region = target
-    for _ in range(num_steps):
-        rows = _entering(model, region, surely, query.nature_maximizes)
-        new = target | (open_ & model.mdp.over_choices(_any_or_all(query), rows))
-        if (new == region).all():
-            break
-        region = new
-    return region

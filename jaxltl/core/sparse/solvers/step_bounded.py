@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -187,9 +187,9 @@ def until(
         open_ &= _near(mdp, target, open_, num_steps)
     backup = backup_on(mdp, np.flatnonzero(open_), operation)
     cost = backup.taken @ target.astype(np.float64)
-    choose_some = operation is np.maximum
+    maximize = operation is np.maximum
     every: list[Integers] | None = [] if by_step else None
-    places, limit = backup.places, _Limit(mdp, target, open_, num_steps, choose_some)
+    places, limit = backup.places, UnboundedLimit(mdp, target, open_, num_steps, maximize)
 
     def enough(x: Iterate) -> bool:
         low = np.maximum(limit.lower[places], x.value)
@@ -204,19 +204,15 @@ def until(
     )
     error = np.where(open_ & (num_steps > 0), np.minimum(value * relative + UNDERFLOW, 1), 0)
     if places.size and (not complete or relative > _CLOSE):
-        low, high = limit.lower, limit.upper
-        low = np.maximum(low, value - error)
-        high = np.minimum(high, value + error) if complete else high
-        value, error = (
-            np.where(open_, (low + high) / 2, value),
-            np.where(open_, np.maximum(high - low, 0) / 2 + UNDERFLOW, error),
-        )
+        value, error = narrowed(limit, value, error, open_, complete)
     # The graph decides which values are exactly zero or one.
+    leads, choose = mdp.support.some_successor_in, np.logical_or if maximize else np.logical_and
+    sets = target, open_
     if num_steps and (open_ & (value - error <= 0)).any():
-        zero = open_ & ~_within(mdp, target, open_, num_steps, False, choose_some)
+        zero = open_ & ~reached_within(mdp, sets, num_steps, choose, leads)
         value[zero] = error[zero] = 0
     if num_steps and (open_ & (value + error >= 1)).any():
-        one = open_ & _within(mdp, target, open_, num_steps, True, choose_some)
+        one = open_ & reached_within(mdp, sets, num_steps, choose, lambda x: ~leads(~x))
         value[one], error[one] = 1, 0
     if every is not None:
         return Steps(value, error, _policies(mdp, backup, every, num_steps), found.num_steps)
@@ -224,7 +220,18 @@ def until(
     return Steps(value, error, _policy(mdp, backup, row), found.num_steps)
 
 
-class _Limit:
+class Limit(Protocol):
+    """Bounds ``float64[S]`` of a step-bounded probability that hold for many steps."""
+
+    @property
+    def lower(self) -> Floats: ...
+
+    @property
+    def upper(self) -> Floats: ...
+
+
+@dataclass(frozen=True)
+class UnboundedLimit:
     """Bounds of a step-bounded probability by the unbounded one, for many steps n.
 
     With T a bound on the expected time until the target or a state of value zero is met, from every
@@ -234,11 +241,12 @@ class _Limit:
     of a minimum for T of every policy.
     """
 
-    def __init__(
-        self, mdp: HostMDP, target: Booleans, open_: Booleans, num_steps: int, maximize: bool
-    ) -> None:
-        self.mdp, self.target, self.open = mdp, target, open_
-        self.num_steps, self.maximize = num_steps, maximize
+    mdp: HostMDP
+    target: Booleans
+    open: Booleans
+    num_steps: int
+    maximize: bool
+    depth: int = 0  # roundings behind each number of the model
 
     @cached_property
     def found(self) -> Enclosure:
@@ -249,6 +257,7 @@ class _Limit:
             maximize=self.maximize,
             stay=self.open | self.target,
             tolerance=_CLOSE / 4,
+            depth=self.depth,
         )
 
     @property
@@ -257,15 +266,32 @@ class _Limit:
 
     @cached_property
     def lower(self) -> Floats:
-        """``float64[S]``."""
         mdp = self.mdp
         if self.maximize and not mdp.is_chain:
             mdp = mdp.chain(self.found.row)
         ended = ~self.open | ~positive_under_all_policies(mdp, self.target, among=self.open)
-        time = total_reward(mdp, np.ones(mdp.num_rows), ended, maximize=True, tolerance=0.1)
-        twice = max(2 * float(time.upper.max()), 1)
-        halvings = self.num_steps // math.ceil(twice) if twice < self.num_steps else 0
-        return self.found.lower - 2.0 ** -min(halvings, 1000)
+        one = np.ones(mdp.num_rows)
+        time = total_reward(mdp, one, ended, maximize=True, tolerance=0.1, depth=self.depth)
+        return self.found.lower - unfinished(time.upper, self.num_steps)
+
+
+def unfinished(time: Floats, num_steps: int) -> float:
+    """Bound of the probability that a run lasts n steps, from bounds of its expected time."""
+    twice = max(2 * float(time.max()), 1)
+    halvings = num_steps // math.ceil(twice) if twice < num_steps else 0
+    return 2.0 ** -min(halvings, 1000)
+
+
+def narrowed(
+    limit: Limit, value: Floats, error: Floats, open_: Booleans, complete: bool
+) -> tuple[Floats, Floats]:
+    """Values of open states within their limit; of incomplete backups they are a lower bound."""
+    low, high = np.maximum(limit.lower, value - error), limit.upper
+    high = np.minimum(high, value + error) if complete else high
+    return (
+        np.where(open_, (low + high) / 2, value),
+        np.where(open_, np.maximum(high - low, 0) / 2 + UNDERFLOW, error),
+    )
 
 
 def _unit(mdp: HostMDP, backup: Backup, num_steps: int) -> float:
@@ -301,24 +327,18 @@ def _near(mdp: HostMDP, target: Booleans, open_: Booleans, num_steps: int) -> Bo
     return seen
 
 
-def _within(
+def reached_within(
     mdp: HostMDP,
-    target: Booleans,
-    open_: Booleans,
+    sets: tuple[Booleans, Booleans],
     num_steps: int,
-    surely: bool,
-    choose_some: bool,
+    choose: np.ufunc,
+    entering: Callable[[Booleans], Booleans],
 ) -> Booleans:
-    """True if a target is reached in n steps possibly, or surely, by some choices or by all."""
+    """States that reach a target through open ones in n steps; `entering` gives the rows."""
+    target, open_ = sets
     region = target
-    choose = np.logical_or if choose_some else np.logical_and
     for _ in range(num_steps):
-        rows = (
-            ~mdp.support.some_successor_in(~region)
-            if surely
-            else mdp.support.some_successor_in(region)
-        )
-        new = target | (open_ & mdp.over_choices(choose, rows))
+        new = target | (open_ & mdp.over_choices(choose, entering(region)))
         if (new == region).all():
             break
         region = new
@@ -388,7 +408,9 @@ def total(
         value[places], off[places] = (low + high) / 2, np.maximum(high - low, 0) / 2 + UNDERFLOW
     some = start != 0
     some[mdp.state[magnitude > 0]] = True
-    off = np.where(backward_reachable(mdp, some) & (num_steps > 0), off, 0)
+    # Without a reward ahead the value is exactly 0, also where the remaining steps are bounded.
+    some = backward_reachable(mdp, some)
+    value, off = np.where(some, value, 0), np.where(some & (num_steps > 0), off, 0)
     if every is not None:
         return Steps(value, off, _policies(mdp, backup, every, num_steps), found.num_steps)
     row = backup.greedy(cost, found.before)

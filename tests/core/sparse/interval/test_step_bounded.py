@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from jaxltl.core.models.interval import interval_rows
+from jaxltl.core.sparse.interval import step_bounded as bounded
 from jaxltl.core.sparse.interval.robust_values import Query
 from jaxltl.core.sparse.interval.step_bounded import next_step, total, until
 
@@ -154,3 +155,60 @@ def test_many_steps_are_as_few_that_changed_something():
     found = until(model.host, target, stay, 10**9, Query(True, False))
     assert found.num_steps < 10**4
     assert ((found.error >= 0) & (found.error <= 1)).all()
+
+
+@pytest.mark.parametrize("maximize, helpful", list(product((False, True), repeat=2)))
+def test_a_huge_number_of_steps_is_answered_by_the_limit(maximize, helpful):
+    # State 0 leaves with probability 2e-7 at most, to a coin between the target and a sink.
+    model = interval_rows(
+        None,
+        [0, 2, 4, 5, 6],
+        [0, 1, 2, 3, 2, 3],
+        [1 - 2e-7, 1e-7, 0.25, 0.5, 1, 1],
+        [1 - 1e-7, 2e-7, 0.5, 0.75, 1, 1],
+    )
+    target, stay = np.arange(4) == 2, np.ones(4, bool)
+    found = until(model.host, target, stay, 10**10, Query(maximize, helpful))
+    exact = 0.5 if helpful else 0.25
+    assert abs(found.value[0] - exact) <= found.error[0] <= 1e-8
+    assert found.num_steps < 10**5
+    # Before the limit holds, backups or wide bounds enclose the closed form.
+    rate = 2e-7 if helpful else 1e-7
+    steps = 3 * 10**4
+    found = until(model.host, target, stay, steps, Query(maximize, helpful))
+    assert abs(found.value[0] + exact * np.expm1((steps - 1) * np.log1p(-rate))) <= found.error[0]
+
+
+def test_average_growth_bounds_a_huge_reward():
+    model = interval_rows(
+        None, [0, 2, 4], [0, 1, 0, 1], [0.25, 0.5, 0.5, 0.25], [0.5, 0.75, 0.75, 0.5]
+    )
+    earned = np.array([1.0, 1.0, 0.0, 0.0])
+    for helpful, share in ((True, 0.6), (False, 0.4)):
+        found = total(model.host, earned, np.zeros(2), 10**11, Query(helpful, helpful))
+        assert np.allclose(found.value / 10**11, share, rtol=1e-9)
+        assert (found.error <= 1e-2 * found.value).all() and found.num_steps < 10**5
+
+
+@pytest.mark.parametrize("seed", range(24))
+def test_bounds_of_remaining_steps_enclose_all_backups(seed, monkeypatch):
+    rng = np.random.default_rng(seed)
+    model = random_interval(rng, chain=seed % 4 == 0).host
+    size = model.mdp.num_transitions
+    target, stay, num_steps = rng.random(5) < 0.3, rng.random(5) < 0.8, int(rng.integers(3, 300))
+    earned = rng.random(size) * (rng.random(size) < 0.4) - 0.5 * (seed % 3 == 1)
+    start = rng.random(5) - 0.5
+
+    def answers():
+        for query in (Query(*x) for x in product((False, True), repeat=2)):
+            yield until(model, target, stay, num_steps, query)
+            yield total(model, earned, np.zeros(5), num_steps, query)
+            yield total(model, np.zeros(size), start, num_steps, query)
+
+    whole = list(answers())
+    for long, close, work in ((2, 1e-9, 2.0**34), (2, 1e-2, 2.0**34), (2, 0.0, 80_000.0)):
+        for name, x in (("_LONG", long), ("_CLOSE", close), ("_WORK", work)):
+            monkeypatch.setattr(bounded, name, x)
+        for exact, found in zip(whole, answers(), strict=True):
+            width = exact.error + found.error + 1e-13
+            assert (np.abs(exact.value - found.value) <= width).all()

@@ -328,3 +328,12 @@ def test_bounds_of_remaining_steps_enclose_all_backups(seed, monkeypatch):
 def test_choices_of_too_many_steps_are_refused_with_their_size():
     with pytest.raises(ValueError, match=r"GB; leave out by_step"):
         bounded_reachability(chain_left_with(0.5), [False, True], 10**11, by_step=True)
+
+
+def test_a_state_without_reward_ahead_is_worth_zero_where_remaining_steps_are_bounded(monkeypatch):
+    monkeypatch.setattr(bounded, "_WORK", 1e8)
+    stay = 1 - 1e-6
+    model = make_sparse([0, 2, 3], [0, 2, 4, 5], [0, 1, 0, 1, 1], [stay, 1e-6, stay, 1e-6, 1.0])
+    found = cumulative_reward(model, [-1.0, 0.0], 10**7)
+    assert found.value[1] == found.lower[1] == found.upper[1] == 0
+    assert found.num_steps < 10**7 and found.lower[0] <= -1e6 * (1 - np.exp(-10)) <= found.upper[0]
