@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
-from jaxltl.core.sparse.graph.qualitative import shortest_path_rows
+from jaxltl.core.sparse.graph.qualitative import EndComponents, shortest_path_rows
 from jaxltl.core.sparse.interval.policy_iteration import Accuracy, PathProblem, enclose_paths
 from jaxltl.core.sparse.interval.qualitative import (
     attracting_rows,
@@ -103,48 +103,56 @@ def _joint(
     mdp, up = model.mdp, query.maximize
     zero, one = zero_one_states(model, target, query)
     open_ = ~(zero | one)
-    row: Integers = mdp.row_start[:-1].astype(np.int64)
-    chance = mdp.probability.copy()
-    bound, rounds = one.astype(np.float64), 0
-    pair: Enclosure | None = Enclosure(bound, bound, bound, row, 0, 0.0, "")
-    if open_.any():
-        components = joint_end_components(model, open_) if up else None
-        problem = PathProblem(
-            model=model,
-            open=open_,
-            known=bound,
-            cost=np.zeros(mdp.num_rows),
-            component=np.arange(mdp.num_states) if components is None else components[0].component,
-            maximize=up,
-            depth=query.depth,
-        )
-        accuracy = Accuracy(query.tolerance)
-        found = enclose_paths(problem, accuracy)
-        bound, rounds = np.clip(found.beyond, 0, 1), found.rounds
-        pair = found.enclosed(problem, accuracy)
-        row, chance = np.where(open_, found.row, row), found.probability
-        if components is not None and components[0].inside.any():
-            inside, used = components[0].inside, components[1]
-            row, chance = move_to_exits(model, (row, chance), problem.component, inside, used)
     # Choices that keep the value where it is decided.
     keep = one if up else zero
     rows = model.can_stay_in(keep) & keep[mdp.state]
-    entries = keep[mdp.successor] & rows[mdp.row]
-    chance = np.where(rows[mdp.row], model.interior_distributions(entries), chance)
-    some = (
+    kept = model.interior_distributions(keep[mdp.successor] & rows[mdp.row])
+    chance = np.where(rows[mdp.row], kept, mdp.probability)
+    row = (
         shortest_path_rows(model.resolve(chance), target, rows) if up else mdp.first_choice(rows)[1]
     )
-    row = np.where(keep, some, row)
-    if pair is None:
-        chain, entry = model.under_policy(row)
-        pair = under_nature(fixed_nature, chain, chance[entry], np.zeros(0), up)
-    low, high = (
-        (pair.lower, np.maximum(bound, pair.lower))
-        if up
-        else (np.minimum(bound, pair.upper), np.minimum(pair.upper, 1))
+    components = joint_end_components(model, open_) if up else None
+    problem = PathProblem(
+        model=model,
+        open=open_,
+        known=one.astype(np.float64),
+        cost=np.zeros(mdp.num_rows),
+        component=np.arange(mdp.num_states) if components is None else components[0].component,
+        maximize=up,
+        depth=query.depth,
     )
+    pair = np.where(keep, row, mdp.row_start[:-1]).astype(np.int64), chance
+    return joint_optimum(problem, Accuracy(query.tolerance), components, pair, fixed_nature)
+
+
+def joint_optimum(
+    problem: PathProblem,
+    accuracy: Accuracy,
+    components: tuple[EndComponents, Booleans] | None,
+    pair: tuple[Integers, Floats],
+    fixed_nature: MDPSolver,
+) -> RobustValues:
+    """The optimum of policy and nature together; `pair` are their choices in decided states."""
+    model, up, (row, chance) = problem.model, problem.maximize, pair
+    bound, rounds, highest = problem.known, 0, np.inf if accuracy.relative else 1.0
+    best: Enclosure | None = Enclosure(bound, bound, bound, row, 0, 0.0, "")
+    if problem.open.any():
+        found = enclose_paths(problem, accuracy)
+        bound, rounds = np.clip(found.beyond, 0, highest), found.rounds
+        best = found.enclosed(problem, accuracy)
+        row = np.where(problem.open, found.row, row)
+        chance = np.where(problem.open[model.mdp.state][model.mdp.row], found.probability, chance)
+        if components is not None and components[0].inside.any():
+            inside, used = components[0].inside, components[1]
+            row, chance = move_to_exits(model, (row, chance), problem.component, inside, used)
+    if best is None:
+        chain, entry = model.under_policy(row)
+        best = under_nature(fixed_nature, chain, chance[entry], problem.cost[row], up)
+    low, high = best.lower, np.maximum(bound, best.lower)
+    if not up:
+        low, high = np.minimum(bound, best.upper), np.minimum(best.upper, highest)
     return RobustValues(
-        pair.value, low, high, row, chance, rounds + pair.rounds, pair.residual, METHOD
+        best.value, low, high, row, chance, rounds + best.rounds, best.residual, METHOD
     )
 
 

@@ -8,21 +8,20 @@ import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.sparse.graph.qualitative import backward_reachable
-from jaxltl.core.sparse.interval.policy_iteration import Accuracy, PathProblem, enclose_paths
+from jaxltl.core.sparse.interval.policy_iteration import Accuracy, PathProblem
 from jaxltl.core.sparse.interval.qualitative import (
     almost_sure_states,
     attracting_rows,
     joint_end_components,
     zero_one_states,
 )
-from jaxltl.core.sparse.interval.reachability import METHOD, move_to_exits, without_absorbing
+from jaxltl.core.sparse.interval.reachability import joint_optimum, without_absorbing
 from jaxltl.core.sparse.interval.robust_values import Query, RobustValues, distribution_depth
 from jaxltl.core.sparse.interval.strategy_iteration import (
     MDPSolver,
     Subproblems,
     improve_nature,
     improve_policy,
-    under_nature,
 )
 from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
 from jaxltl.core.sparse.mdp import HostMDP
@@ -104,45 +103,23 @@ def _joint(
 ) -> RobustValues:
     """Optimal reward where policy and nature cooperate, in a model that ends almost surely."""
     mdp, up = model.mdp, query.maximize
-    row: Integers = mdp.row_start[:-1].astype(np.int64)
-    chance = mdp.probability.copy()
-    bound, rounds = np.zeros(mdp.num_states), 0
-    pair: Enclosure | None = Enclosure(bound, bound, bound, row, 0, 0.0, "")
     earning = np.zeros(mdp.num_states, bool)
     earning[mdp.state[cost > 0]] = True
     open_ = ~target & (backward_reachable(mdp, earning) if up else True)
-    if open_.any():
-        free = (cost == 0)[mdp.row]
-        components = None if up else joint_end_components(model, open_, free)
-        problem = PathProblem(
-            model=model,
-            open=open_,
-            known=bound,
-            cost=cost,
-            component=np.arange(mdp.num_states) if components is None else components[0].component,
-            maximize=up,
-            depth=query.depth,
-            may_stay=not up,
-        )
-        accuracy = Accuracy(query.tolerance, relative=True)
-        found = enclose_paths(problem, accuracy)
-        bound, rounds = found.beyond, found.rounds
-        pair = found.enclosed(problem, accuracy)
-        row, chance = np.where(open_, found.row, row), found.probability
-        if components is not None and components[0].inside.any():
-            inside, used = components[0].inside, components[1]
-            row, chance = move_to_exits(model, (row, chance), problem.component, inside, used)
-    if pair is None:
-        chain, entry = model.under_policy(row)
-        pair = under_nature(fixed_nature, chain, chance[entry], cost[row], up)
-    low, high = (
-        (pair.lower, np.maximum(bound, pair.lower))
-        if up
-        else (np.minimum(bound, pair.upper), pair.upper)
+    components = None if up else joint_end_components(model, open_, (cost == 0)[mdp.row])
+    problem = PathProblem(
+        model=model,
+        open=open_,
+        known=np.zeros(mdp.num_states),
+        cost=cost,
+        component=np.arange(mdp.num_states) if components is None else components[0].component,
+        maximize=up,
+        depth=query.depth,
+        may_stay=not up,
     )
-    return RobustValues(
-        pair.value, low, high, row, chance, rounds + pair.rounds, pair.residual, METHOD
-    )
+    pair = mdp.row_start[:-1].astype(np.int64), mdp.probability
+    accuracy = Accuracy(query.tolerance, relative=True)
+    return joint_optimum(problem, accuracy, components, pair, fixed_nature)
 
 
 def _first_policy(model: UncertainMDP, goal: Booleans, solve: Subproblems) -> Integers:
