@@ -130,3 +130,26 @@ def quotient(mdp: HostMDP, component: Integers, inside: Booleans, cost: Floats) 
     count = np.bincount(node[mdp.state[row]], minlength=leaders.size)
     smaller, _ = _renamed(mdp, row, count, node)
     return Contraction(smaller, node, row, np.zeros(size), cost[row])
+
+
+def with_stops(
+    mdp: HostMDP, row: Integers, node: Integers, stops: tuple[Integers, Integers], num_nodes: int
+) -> tuple[HostMDP, Integers]:
+    """Some rows on the nodes of their states, and then rows that lead from one node to another.
+
+    Returns the place of each row in that list, too.
+    """
+    owner = np.concatenate([node[mdp.state[row]], stops[0]])
+    width = np.concatenate([np.diff(mdp.entry_start)[row], np.ones(stops[0].size, np.int64)])
+    entry = concatenated_ranges(mdp.entry_start[row], width[: row.size])
+    successor = np.concatenate([node[mdp.successor[entry]], stops[1]]).astype(np.int32)
+    probability = np.concatenate([mdp.probability[entry], np.ones(stops[0].size)])
+    order = np.argsort(owner, kind="stable")
+    entry = concatenated_ranges((width.cumsum() - width)[order], width[order])
+    small = HostMDP(
+        offsets_from_counts(np.bincount(owner, minlength=num_nodes)),
+        offsets_from_counts(width[order]),
+        successor[entry],
+        probability[entry],
+    )
+    return small, order

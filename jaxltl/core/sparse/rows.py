@@ -129,6 +129,17 @@ def group_starts(number: Integers) -> Booleans:
     return found
 
 
+def first_hits(hit: Booleans, owner: Integers, otherwise: Integers) -> Integers:
+    """The first marked element of each owner, or another number where none is marked.
+
+    >>> first_hits(np.array([False, True, True]), np.array([0, 1, 1]), np.array([7, 7])).tolist()
+    [7, 1]
+    """
+    place, found = np.flatnonzero(hit)[::-1], otherwise.copy()
+    found[owner[place]] = place  # the first one is written last
+    return found
+
+
 def decrement(counter: Integers, number: Integers) -> None:
     """Decrements a counter once for each occurrence of its number, in place."""
     if number.size < counter.size:

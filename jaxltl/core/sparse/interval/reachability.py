@@ -7,6 +7,7 @@ strategy improvement where that is not narrow enough.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -55,14 +56,23 @@ def reachability(
     enclose the values for both readings.
     """
     stop = target if stay is None else target | ~stay
-    found = _reachability(model, target, stop, query)
-    wide = model.enlarged
-    if wide is None:
+    return hull_of_readings(
+        model,
+        lambda x: _reachability(x, target, stop, query),
+        lambda x: zero_one_states(x.with_absorbing(stop)[0], target, query),
+    )
+
+
+def hull_of_readings(
+    model: UncertainMDP,
+    solve: Callable[[UncertainMDP], RobustValues],
+    decided: Callable[[UncertainMDP], tuple[Booleans, ...]],
+) -> RobustValues:
+    """Bounds for both readings of sums of ends, if these decide states differently."""
+    found, wide = solve(model), model.enlarged
+    if wide is None or all(map(np.array_equal, decided(model), decided(wide))):
         return found
-    mine, other = (zero_one_states(x.with_absorbing(stop)[0], target, query) for x in (model, wide))
-    if (mine.zero == other.zero).all() and (mine.one == other.one).all():
-        return found
-    return found.hull(_reachability(wide, target, stop, query))
+    return found.hull(solve(wide))
 
 
 def _reachability(

@@ -17,6 +17,7 @@ import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.sparse.interval.l1_ball import BallLimits, narrow_intervals
+from jaxltl.core.sparse.linear.extended_precision import two_sum
 from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
 
 _EPS = float(np.finfo(np.float64).eps)
@@ -254,10 +255,8 @@ def exact_greedy(lower: Floats, upper: Floats) -> Floats:
 
     def subtract(x: Floats) -> None:
         nonlocal high, low
-        total = high - x
-        part = total - high
-        low = low + ((high - (total - part)) - (x + part))
-        high = total
+        high, lost = two_sum(high, -x)
+        low = low + lost
 
     for j in range(1, lower.shape[1]):
         subtract(lower[:, j])
@@ -282,12 +281,9 @@ def exact_sum(terms: Floats, share: float = SUM_ERROR) -> Floats:
     high = terms[0].copy()
     low, size = np.zeros_like(high), np.zeros_like(high)
     for x in terms[1:]:
-        total = high + x
-        part = total - high
-        lost = (high - (total - part)) + (x - part)
+        high, lost = two_sum(high, x)
         low += lost
         size += np.abs(lost)
-        high = total
     found = high + low
     unsure = np.flatnonzero(share * np.abs(found) < len(terms) * _EPS * size)
     if unsure.size:

@@ -119,12 +119,13 @@ class _Limit:
 
     @cached_property
     def lower(self) -> Floats:
-        part, entry = self.model, np.arange(self.model.mdp.num_transitions)
+        part, chance = self.model, self.found.probability
         if self.query.maximize:
-            part, entry = self.model.under_policy(self.found.row)
+            part, entry = part.under_policy(self.found.row)
+            chance = chance[entry]
         depth = self.query.depth + distribution_depth(part.mdp)
         if self.query.nature_maximizes:
-            chance, able = part.nearest_distributions(self.found.probability[entry])
+            chance, able = part.nearest_distributions(chance)
             if not able:
                 return np.zeros(self.target.size)
             fixed = part.resolve(chance)

@@ -15,7 +15,11 @@ from jaxltl.core.sparse.interval.qualitative import (
     joint_end_components,
     zero_one_states,
 )
-from jaxltl.core.sparse.interval.reachability import joint_optimum, without_absorbing
+from jaxltl.core.sparse.interval.reachability import (
+    hull_of_readings,
+    joint_optimum,
+    without_absorbing,
+)
 from jaxltl.core.sparse.interval.robust_values import Query, RobustValues, distribution_depth
 from jaxltl.core.sparse.interval.strategy_iteration import (
     MDPSolver,
@@ -39,14 +43,11 @@ def total_reward(
     that minimise, and some choice of those that maximise. Where sums of ends within rounding of one
     decide that, the bounds enclose the values for both readings.
     """
-    found = _total_reward(model, reward, target, query)
-    wide = model.enlarged
-    if wide is None:
-        return found
-    mine, other = (finite_states(x.with_absorbing(target)[0], target, query) for x in (model, wide))
-    if (mine[0] == other[0]).all():
-        return found
-    return found.hull(_total_reward(wide, reward, target, query))
+    return hull_of_readings(
+        model,
+        lambda x: _total_reward(x, reward, target, query),
+        lambda x: finite_states(x.with_absorbing(target)[0], target, query)[:1],
+    )
 
 
 def finite_states(model: UncertainMDP, target: Booleans, query: Query) -> tuple[Booleans, Booleans]:

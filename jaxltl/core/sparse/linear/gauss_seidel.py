@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
+from jaxltl.core.sparse.rows import first_hits
 
 Values = NDArray[np.floating[Any]]  # in either precision
 
@@ -417,9 +418,5 @@ def _first(image: Values, best: Values, begin: Integers, width: int) -> Integers
         for k in range(width - 1, -1, -1):
             np.copyto(rank, k, where=table[:, k] == best)
         return begin + rank
-    count = np.diff(begin, append=image.size)
-    hit = np.flatnonzero(image == np.repeat(best, count))
-    owner = np.searchsorted(begin, hit, "right") - 1
-    found = np.array(begin, np.int64)
-    found[owner[::-1]] = hit[::-1]  # the first one is written last
-    return found
+    owner = np.repeat(np.arange(begin.size), np.diff(begin, append=image.size))
+    return first_hits(image == best[owner], owner, np.array(begin, np.int64))

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
+from jaxltl.core.sparse.contraction import with_stops
 from jaxltl.core.sparse.graph.qualitative import (
     EndComponents,
     end_components,
@@ -23,7 +24,7 @@ from jaxltl.core.sparse.graph.qualitative import (
     shortest_path_rows,
 )
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
+from jaxltl.core.sparse.rows import first_hits
 from jaxltl.core.sparse.solvers.policy_iteration import policy_iteration
 from jaxltl.core.sparse.solvers.total_cost import ShortestPathProblem
 
@@ -155,22 +156,11 @@ def _quotient(
     stops = np.flatnonzero(stop >= 0)
     row = np.flatnonzero(rows & ~free.inside)
     end = heads.size
-    owner = np.concatenate([node[mdp.state[row]], stops, [end]])
-    width = np.concatenate([np.diff(mdp.entry_start)[row], np.ones(stops.size + 1, np.int64)])
-    entry = concatenated_ranges(mdp.entry_start[row], width[: row.size])
-    target = np.concatenate([node[mdp.successor[entry]], np.full(stops.size + 1, end)])
-    chance = np.concatenate([mdp.probability[entry], np.ones(stops.size + 1)])
+    ends = np.append(stops, end), np.full(stops.size + 1, end)
+    small, place = with_stops(mdp, row, node, ends, end + 1)
     known = np.concatenate([np.zeros(row.size), worth[best[stop[stops]]], [0.0]])
     origin = np.concatenate([row, np.full(stops.size + 1, -1)])
-    order = np.argsort(owner, kind="stable")
-    taken = concatenated_ranges((width.cumsum() - width)[order], width[order])
-    small = HostMDP(
-        offsets_from_counts(np.bincount(owner, minlength=end + 1)),
-        offsets_from_counts(width[order]),
-        target[taken].astype(np.int32),
-        chance[taken],
-    )
-    return _Quotient(small, node, origin[order], known[order], stop)
+    return _Quotient(small, node, origin[place], known[place], stop)
 
 
 def _solved(
@@ -241,10 +231,8 @@ def _signed(
         if (gain + slack <= 0).all():
             return np.append(value, 0.0), policy
         best = np.maximum.reduceat(gain, starts)
-        hit = np.flatnonzero(gain == best[owner])
-        new = chosen.copy()
-        new[owner[hit[::-1]]] = hit[::-1]
-        chosen = np.where(best > -extra / 2, new, chosen)
+        better = (gain == best[owner]) & (best > -extra / 2)[owner]
+        chosen = first_hits(better, owner, chosen)
         solver = solver.other(chosen)
     return np.full(mdp.num_states, np.inf), policy
 

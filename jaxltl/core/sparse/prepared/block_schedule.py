@@ -19,7 +19,7 @@ from jaxltl.core.sparse.linear.topological_order import (
     ordered_components,
     topological_levels,
 )
-from jaxltl.core.sparse.rows import concatenated_ranges
+from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
 
 # What entries lead to besides nodes: the value one, what is reached, and what is lost.
 ONE, GOAL, LOST = -1, -2, -3
@@ -197,8 +197,12 @@ def _ordered(nodes: Nodes) -> list[list[Integers]]:
 def _edges(nodes: Nodes) -> Edges:
     kept = nodes.target >= 0
     source = nodes.owner[nodes.row[kept]]
-    start = np.concatenate([[0], np.bincount(source, minlength=nodes.number).cumsum()])
-    return Edges(start, nodes.target[kept].astype(np.int64))
+    return _graph(source, nodes.target[kept].astype(np.int64), nodes.number)
+
+
+def _graph(source: Integers, target: Integers, size: int) -> Edges:
+    """The graph of edges by ascending source."""
+    return Edges(offsets_from_counts(np.bincount(source, minlength=size)), target)
 
 
 def _peeled(back: Edges, number: Integers, among: Booleans) -> list[Integers]:
@@ -220,23 +224,21 @@ def _layers(edges: Edges, core: Integers) -> list[Integers]:
     leaves = np.zeros(core.size, bool)
     leaves[source[target < 0]] = True
     source, target = source[target >= 0], target[target >= 0]
-    start = np.concatenate([[0], np.bincount(source, minlength=core.size).cumsum()])
-    label = ordered_components(Edges(start, target))
+    label = ordered_components(_graph(source, target, core.size))
     same = label[source] == label[target]
     leaves[source[~same]] = True
     layer = _distances(source[same], target[same], leaves, label)
     kept = (label[target] < label[source]) | (same & (layer[target] < layer[source]))
-    source, target = source[kept], target[kept]
-    start = np.concatenate([[0], np.bincount(source, minlength=core.size).cumsum()])
-    onward = Edges(start, target)
-    levels = _peeled(onward.reverse(), np.diff(start).astype(np.int32), np.ones(core.size, bool))
+    onward = _graph(source[kept], target[kept], core.size)
+    degree = np.diff(onward.start).astype(np.int32)
+    levels = _peeled(onward.reverse(), degree, np.ones(core.size, bool))
     return [core[x] for x in levels]
 
 
 def _distances(source: Integers, target: Integers, leaves: Booleans, label: Integers) -> Integers:
     """Distance from the exits of each strongly connected component."""
     size = leaves.size
-    start = np.concatenate([[0], np.bincount(target, minlength=size).cumsum()])
+    start = offsets_from_counts(np.bincount(target, minlength=size))
     before = source[np.argsort(target, kind="stable")]
     stuck = ~np.isin(label, np.unique(label[leaves]))
     first: Any = np.full(int(label.max()) + 1, -1, np.int64)

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
+from jaxltl.core.sparse.contraction import with_stops
 from jaxltl.core.sparse.graph.components import strong_components
 from jaxltl.core.sparse.graph.qualitative import (
     EndComponents,
@@ -32,6 +33,7 @@ from jaxltl.core.sparse.linear.topological_order import Edges, ordered_component
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
 from jaxltl.core.sparse.solvers.policy_iteration import policy_iteration
+from jaxltl.core.sparse.solvers.reachability import quotient_policy
 from jaxltl.core.sparse.solvers.step_bounded import backup_unit
 from jaxltl.core.sparse.solvers.total_cost import ShortestPathProblem
 
@@ -107,24 +109,10 @@ def average(
         value=(low + high) / 2,
         lower=low - slack,
         upper=high + slack,
-        row=_row_of_states(mdp, found, taken, row),
+        row=quotient_policy(mdp, found, taken, row),
         residual=half,
         rounds=gains.rounds + rounds,
     )
-
-
-def _row_of_states(mdp: HostMDP, found: EndComponents, taken: Integers, row: Integers) -> Integers:
-    """Rows of states from those of nodes, -1 for components to stop in."""
-    region = found.region(mdp)
-    moves = taken >= 0
-    exits = np.zeros(mdp.num_states, bool)
-    exits[mdp.state[taken[moves & region]]] = True
-    at_exit = moves & (mdp.state[np.maximum(taken, 0)] == np.arange(mdp.num_states))
-    row = np.where(at_exit, taken, row)
-    inner = moves & region & ~at_exit
-    if inner.any():
-        row = np.where(inner, shortest_path_rows(mdp, exits, found.inside), row)
-    return row
 
 
 @dataclass(frozen=True)
@@ -168,21 +156,9 @@ def _stopping_problem(mdp: HostMDP, found: EndComponents, leaders: Integers) -> 
     node = np.searchsorted(heads, found.component)
     stops = np.arange(leaders.size) + heads.size
     row = np.flatnonzero(~found.inside)
-    owner = np.concatenate([node[mdp.state[row]], node[leaders], stops])
-    width = np.concatenate([np.diff(mdp.entry_start)[row], np.ones(2 * stops.size, np.int64)])
-    entry = concatenated_ranges(mdp.entry_start[row], width[: row.size])
-    successor = np.concatenate([node[mdp.successor[entry]], stops, stops]).astype(np.int32)
-    probability = np.concatenate([mdp.probability[entry], np.ones(2 * stops.size)])
+    ends = np.concatenate([node[leaders], stops]), np.tile(stops, 2)
+    small, order = with_stops(mdp, row, node, ends, heads.size + stops.size)
     origin = np.concatenate([row, np.full(2 * stops.size, -1)])
-    order = np.argsort(owner, kind="stable")
-    entry = concatenated_ranges((width.cumsum() - width)[order], width[order])
-    count = np.bincount(owner, minlength=heads.size + stops.size)
-    small = HostMDP(
-        offsets_from_counts(count),
-        offsets_from_counts(width[order]),
-        successor[entry],
-        probability[entry],
-    )
     return _Stopping(node, small, origin[order])
 
 

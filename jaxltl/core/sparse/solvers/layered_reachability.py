@@ -31,9 +31,9 @@ from jaxltl.core.sparse.linear.topological_order import Edges, ordered_component
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.rows import offsets_from_counts
 from jaxltl.core.sparse.solvers.reachability import expands_fast, quotient_policy
+from jaxltl.core.sparse.solvers.total_cost import TINY
 
 _EPS = float(np.finfo(np.float64).eps)
-_TINY = 1e-290
 _STARTS = 8  # states from one of which few steps
 _MET = 4096  # lead to that many, so that the graph is shallow and sweeps end soon
 _MOST = 2**27  # transitions of a component that is written out, at most
@@ -90,10 +90,7 @@ class _Rows:
     @cached_property
     def cut(self) -> RowBlocks:
         """Blocks of all rows."""
-        host = self.host
-        return row_blocks(
-            host.row_start, host.entry_start, host.successor, host.probability, host.num_states
-        )
+        return _cut(self.host)
 
     def of(self, choices: Booleans) -> Booleans:
         """A mask of actions ``bool[S, A]`` as a mask of rows."""
@@ -212,8 +209,8 @@ class _Search:
         low, high = (self.attained, self.outer) if self.sign > 0 else (self.outer, self.attained)
         # Products too small for a float to hold are lost; relative errors do not count them.
         open_ = low != high
-        low = np.where(open_, np.clip(low - _TINY, 0, 1), low)
-        high = np.where(open_, np.clip(high + _TINY, 0, 1), high)
+        low = np.where(open_, np.clip(low - TINY, 0, 1), low)
+        high = np.where(open_, np.clip(high + TINY, 0, 1), high)
         return LayeredBounds(low.T, high.T, self.action, self.sweeps)
 
 
@@ -292,39 +289,37 @@ def _solved(
     problem: _Problem, sign: int, budget: float, unit: float, guess: tuple[Floats, float] | None
 ) -> SweptBounds | None:
     """Bounds of the nodes, and their rows."""
-    host, circles = problem.host, None
-    settings = SweepSettings(sign=sign, tolerance=budget, relative=False, unit=unit)
-    if problem.stays.any():
-        # Rows that stay in the component of the automaton, and where they can be taken for ever.
-        here = problem.stays & problem.inner
-        rows = problem.stays[host.state] & ~host.support.some_successor_in(~here)
-        if problem.rows is not None:
-            rows &= problem.rows
-        circles = end_components(host, problem.stays, rows)
-        if not circles.inside.any():
-            circles = None
-    if circles is None:
-        blocks = problem.cut or _cut(host)
-        sums = BlockProblem(
-            blocks, problem.open, problem.live, problem.attained, problem.outer, None, problem.rows
+    host, cut, allowed, part = problem.host, problem.cut, problem.rows, None
+    # Rows that stay in the component of the automaton, and where they can be taken for ever.
+    rows = problem.stays[host.state]
+    if rows.any():
+        rows &= ~host.support.some_successor_in(~(problem.stays & problem.inner))
+        if allowed is not None:
+            rows &= allowed
+    circles = end_components(host, problem.stays, rows) if rows.any() else None
+    leader: Any = slice(None)
+    if circles is not None and circles.inside.any():
+        part, cut, guess = (
+            quotient(host, circles.component, circles.inside, np.zeros(host.num_rows)),
+            None,
+            None,
         )
-        start, time = (None, None) if guess is None else guess
-        return solve_by_sweeps(sums, settings, start, time)
-    part = quotient(host, circles.component, circles.inside, np.zeros(host.num_rows))
-    leader = np.flatnonzero(circles.component == np.arange(host.num_states))
-    mask = None if problem.rows is None else problem.rows[part.row]
+        leader = np.flatnonzero(circles.component == np.arange(host.num_states))
+        allowed = None if allowed is None else allowed[part.row]
+    blocks = cut or _cut(host if part is None else part.mdp)
+    settings = SweepSettings(sign=sign, tolerance=budget, relative=False, unit=unit)
     sums = BlockProblem(
-        _cut(part.mdp),
+        blocks,
         problem.open[leader],
         problem.live[leader],
         problem.attained[leader],
         problem.outer[leader],
         None,
-        mask,
+        allowed,
     )
-    found = solve_by_sweeps(sums, settings)
-    if found is None:
-        return None
+    found = solve_by_sweeps(sums, settings, *(guess or (None, None)))
+    if found is None or part is None or circles is None:
+        return found
     row = quotient_policy(host, circles, part.row[found.row][part.node])
     return replace(found, attained=found.attained[part.node], outer=found.outer[part.node], row=row)
 

@@ -347,17 +347,20 @@ def _solve_nodes(reduced: ReducedProblem, tolerance: float) -> Enclosure:
     return replace(found, value=value, lower=lower, upper=upper, row=row)
 
 
-def quotient_policy(mdp: HostMDP, components: EndComponents, row: Integers) -> Integers:
-    """The policy that stays in an end component up to the state of the row by which it is left."""
-    states = np.flatnonzero(components.region(mdp))
-    exits = np.zeros(mdp.num_states, bool)
-    exits[mdp.state[row[states]]] = True
-    found: Any = mdp.row_start[:-1].astype(np.int64)
-    own = mdp.state[row] == np.arange(mdp.num_states)
-    found[own] = row[own]
-    inner = states[~exits[states]]
-    found[inner] = shortest_path_rows(mdp, exits, components.inside)[inner]
-    return found
+def quotient_policy(
+    mdp: HostMDP, components: EndComponents, row: Integers, otherwise: Integers | None = None
+) -> Integers:
+    """The policy that stays in an end component up to the state of the row by which it is left.
+
+    Where `row` is -1 the component is not left, and `otherwise` has the rows.
+    """
+    found: Any = mdp.row_start[:-1].astype(np.int64) if otherwise is None else otherwise
+    moves = row >= 0
+    own = moves & (mdp.state[np.maximum(row, 0)] == np.arange(mdp.num_states))
+    inner = moves & components.region(mdp) & ~own
+    if inner.any():
+        found = np.where(inner, shortest_path_rows(mdp, own, components.inside), found)
+    return np.where(own, row, found)
 
 
 def solve_shortest_path(
@@ -464,13 +467,3 @@ def _stochastic_loops(problem: ShortestPathProblem) -> tuple[Floats, Booleans | 
     allowed = np.ones(mdp.num_rows, bool) if problem.allowed is None else problem.allowed.copy()
     allowed[row[rest == 0]] = False
     return weight, allowed
-
-
-def worst_width(found: Enclosure, *, relative: bool) -> float:
-    """The width of the widest enclosure, relative to the value if `relative`."""
-    low, high = found.lower, found.upper
-    finite = np.isfinite(high)
-    width: Any = np.where(finite, high - np.where(finite, low, 0), np.where(low == high, 0, np.inf))
-    if relative:
-        width = np.where(width > 0, width / np.maximum(np.where(finite, high, 1), 1e-300), 0)
-    return float(width.max(initial=0))

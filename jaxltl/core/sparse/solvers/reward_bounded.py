@@ -22,7 +22,7 @@ from jaxltl.core.sparse.graph.qualitative import (
     shortest_path_rows,
 )
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import concatenated_ranges
+from jaxltl.core.sparse.rows import concatenated_ranges, first_hits
 from jaxltl.core.sparse.solvers.step_bounded import backup_unit
 
 _LEVELS = 10**7  # amounts of reward at most
@@ -251,11 +251,9 @@ class _System:
         starts = self.shape.starts
         if starts.size < self.shape.row.size:
             count = np.diff(np.append(starts, self.shape.row.size))
-            hit = np.flatnonzero(image == np.repeat(best, count))
-            node = np.repeat(np.arange(starts.size), count)[hit]
-            first = starts.copy()
-            first[node[::-1]] = hit[::-1]  # the first one is written last
-            self.chosen = np.where(kept, self.chosen, first)
+            node = np.repeat(np.arange(starts.size), count)
+            better = (image == best[node]) & ~kept[node]
+            self.chosen = first_hits(better, node, self.chosen)
 
     def _factor(self) -> None:
         from scipy import sparse

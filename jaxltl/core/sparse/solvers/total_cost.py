@@ -11,7 +11,7 @@ import numpy as np
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.sparse.linear.topological_order import Edges, Levels
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import SCIPY_SIZE, concatenated_ranges, offsets_from_counts
+from jaxltl.core.sparse.rows import SCIPY_SIZE, concatenated_ranges, first_hits, offsets_from_counts
 
 TINY = 1e-290  # products that underflow: relative errors do not count them
 
@@ -210,19 +210,12 @@ def solve_levels(
             np.add.reduceat(weight * side[target], starts, out=image)
             side[node] = image if begin is None else operation.reduceat(image, begin)
     if not single:
-        rank = _first_best(images, sides[-1][levels.node], part.row_start)
-        policy[levels.node] = rows.row_start[levels.node] + rank
+        start = part.row_start[:-1]
+        owner = np.arange(start.size, dtype=np.int32).repeat(np.diff(part.row_start))
+        first = first_hits(images == sides[-1][levels.node][owner], owner, start)
+        policy[levels.node] = rows.row_start[levels.node] + first - start
     if same:
         bounds[:2, levels.node] = bounds[2, levels.node]
-
-
-def _first_best(image: Floats, best: Floats, row_start: Integers) -> Integers:
-    """The rank of the first row that attains the optimum of its state."""
-    owner = np.arange(best.size, dtype=np.int32).repeat(np.diff(row_start))
-    hit = np.flatnonzero(image == best[owner])[::-1]
-    found = np.empty(best.size, np.int64)
-    found[owner[hit]] = hit  # the first one is written last
-    return found - row_start[:-1]
 
 
 def _reduction(sign: int) -> np.ufunc:

@@ -12,7 +12,7 @@ from jaxltl.core.sparse.linear import elimination
 from jaxltl.core.sparse.linear import topological_order as levels
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.solvers import policy_iteration as transient
-from jaxltl.core.sparse.solvers.reachability import reachability, total_reward, worst_width
+from jaxltl.core.sparse.solvers.reachability import reachability, total_reward
 
 
 def random_model(rng, num_states, most_choices=3):
@@ -281,3 +281,13 @@ def test_sums_of_many_terms_are_rounded_outwards(back):
     hit, left = (sum(w for w, t in goes if t >= 2 and (target[t] or which)) for which in (0, 1))
     assert Fraction(float(found.lower[0])) <= hit / left <= Fraction(float(found.upper[0]))
     assert found.upper[0] - found.lower[0] <= 1e-6
+
+
+def worst_width(found, *, relative):
+    """The width of the widest enclosure, relative to the value if `relative`."""
+    low, high = found.lower, found.upper
+    finite = np.isfinite(high)
+    width = np.where(finite, high - np.where(finite, low, 0), np.where(low == high, 0, np.inf))
+    if relative:
+        width = np.where(width > 0, width / np.maximum(np.where(finite, high, 1), 1e-300), 0)
+    return float(width.max(initial=0))
