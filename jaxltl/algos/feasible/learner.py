@@ -63,8 +63,12 @@ from jaxltl.core.models.parametric.parametric import ParametricMDP
 from jaxltl.core.pretty_print import brief, history
 from jaxltl.core.types import Status
 from jaxltl.core import validation
-from jaxltl.core.values.prepared.prepared import Prepared, solve_prepared
-from jaxltl.core.values.prepared.prepared_chain import evaluate_prepared, is_direct
+from jaxltl.core.values.prepared.prepared import (
+    Prepared,
+    evaluate_prepared,
+    is_direct,
+    solve_prepared,
+)
 
 from jaxltl.algos.feasible.problem import Problem, certify, require_problem
 

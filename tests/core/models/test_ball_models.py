@@ -19,7 +19,7 @@ from jaxltl.core.values.interval.robust import (
     robust_reachability,
 )
 from jaxltl.core.values.interval.sensitivity import robust_sensitivity
-from jaxltl.core.values.prepared.prepared_interval import prepare_interval
+from jaxltl.core.values.prepared.preparation import prepare
 from jaxltl.core.values.undiscounted.satisfaction import (
     optimal_satisfaction,
     satisfaction_probability,
@@ -193,7 +193,7 @@ def test_restricted_and_written(tmp_path):
     far = robust_reachability(world, "a", nature="adversarial").value
     np.testing.assert_allclose(near, far[np.asarray(part.base_state)], atol=1e-9)
     for solve in (
-        lambda: prepare_interval(world, "a"),
+        lambda: prepare(world, "a"),
         lambda: robust_sensitivity(world, kept, "a", nature="adversarial"),
     ):
         with pytest.raises(ValueError, match=r"the model has a radius, .* model.box"):

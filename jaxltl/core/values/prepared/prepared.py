@@ -2,249 +2,37 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import chex
 import jax
 import jax.numpy as jnp
-import numpy as np
-from flax import struct
+import numpy.typing as npt
 from jax import lax
 
-from jaxltl.core.values.engine.validated import validated
-from jaxltl.core.models.construct.convert import to_sparse
-from jaxltl.core.models.mesh.sharded import refuse_sharded
-from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
 from jaxltl.core.models.ops.operators import is_deterministic
 from jaxltl.core.models.ops.underflow import is_subnormal
-from jaxltl.core.models.sparse import Rewards, choice_reward, refuse_underflow
-from jaxltl.core.pretty_print import brief
-from jaxltl.core.sparse.prepared.reachability_plan import Plan, plan_optimum, plan_policy
-from jaxltl.core.sparse.solvers.reachability import reduce_reachability, reduce_total_reward
 from jaxltl.core.types import Solution, require_shape, row_tolerance, status_code
-from jaxltl.core.values import facts
 from jaxltl.core.values.engine.block_sweeps import Blocks, Chosen, chosen_names, meets, sweep
 from jaxltl.core.values.engine.implicit_diff import implicit
 from jaxltl.core.values.engine.iterate import in_turn
-from jaxltl.core.models.interval import IntervalMDP
-from jaxltl.core.values.interval.robust import refuse_nature
+from jaxltl.core.values.engine.linear import inverse
+from jaxltl.core.values.engine.validated import validated
+from jaxltl.core.values.prepared.interval_iteration import SLACK, Problem, enclose_cycles
+from jaxltl.core.values.prepared.preparation import Prepared, prepare
 from jaxltl.core.values.prepared.prepared_interval import (
     PreparedInterval,
-    prepare_interval,
+    require_prepared_reward,
     solve_prepared_interval,
 )
-from jaxltl.core.values.prepared.interval_iteration import SLACK, Problem, enclose_cycles
 
+__all__ = ["Prepared", "evaluate_prepared", "is_direct", "prepare", "solve_prepared"]
 
-@brief(facts=facts.prepared)
-@struct.dataclass
-class Prepared:
-    """A question about a model after preprocessing, for solves with other numbers.
-
-    Made by :func:`prepare`, read by :func:`solve_prepared`. Give it to a compiled function as an
-    argument: what a function closes over becomes part of the program.
-
-    Attributes:
-      segments: the blocks.
-      place: ``int32[S]``, where a state's value is.
-      nodes: ``int32[M]``, the places with rows; others fill blocks.
-      own: ``int32[S]``, the place whose row a state takes, or -1.
-      row: ``int32[S]``, the row that it takes else.
-      entry_row: ``int32[T]``, the row of each transition.
-      row_state: ``int32[R]``, the state of each row.
-      probability, reward: ``float[T]`` and ``float[R]``, as they were.
-      loops: rows that lead to where they are: entries, groups, rows, groups of these; or None.
-      cycles: end components that are one node, or None.
-      question: ``"probability"`` or ``"reward"``, static.
-      objective: ``"max"``, ``"min"`` or ``"policy"``, static.
-      cyclic: whether some nodes are on cycles, static.
-      levels, choices, terms, groups: see the plan, static.
-
-    Example:
-      >>> from jaxltl import make_sparse
-      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
-      >>> prepared = prepare(coin, [False, True, False])
-      >>> prepared.question, prepared.objective, prepared.num_states, prepared.num_rows
-      ('probability', 'max', 3, 3)
-    """
-
-    segments: tuple[Blocks, Blocks, Blocks]
-    place: Any
-    nodes: Any
-    own: Any
-    row: Any
-    entry_row: Any
-    row_state: Any
-    probability: Any
-    reward: Any
-    loops: Any
-    cycles: Any
-    question: str = struct.field(pytree_node=False)
-    objective: str = struct.field(pytree_node=False)
-    cyclic: bool = struct.field(pytree_node=False)
-    levels: int = struct.field(pytree_node=False)
-    choices: int = struct.field(pytree_node=False)
-    terms: int = struct.field(pytree_node=False)
-    groups: int = struct.field(pytree_node=False)
-
-    @property
-    def num_states(self) -> int:
-        """S, of the model."""
-        return self.place.shape[-1]
-
-    @property
-    def num_rows(self) -> int:
-        """R, of the model."""
-        return self.row_state.shape[-1]
-
-    @property
-    def size(self) -> int:
-        """Number N of places."""
-        return self.segments[2].last
-
-
-def prepare(
-    model: Any,
-    target: chex.Array,
-    *,
-    stay: chex.Array | None = None,
-    reward: str | Rewards | chex.Array | None = None,
-    policy: chex.Array | None = None,
-    objective: str = "max",
-    nature: str | None = None,
-) -> Prepared | PreparedInterval:
-    """Prepares a question about a model for solves with other numbers inside ``jit``.
-
-    What the graph decides is decided here: chains of single successors, states worth nothing, one
-    or infinity, and end components are gone from what is solved. What is left stands in blocks of
-    equal shape, later states first, so that one pass solves what has no cycles.
-
-    Args:
-      model: a concrete SparseMDP, or what :func:`~jaxltl.core.models.construct.convert.to_sparse` takes.
-      target: ``bool[S]``.
-      stay: ``bool[S]``, the states that may be passed before; default all. Not with a reward.
-      reward: asks for the expected total reward until the target and not for the probability of
-        reaching it; as of :func:`~jaxltl.core.models.sparse.choice_reward`, finite and at least 0.
-      policy: of an IntervalMDP, rows ``int32[S]`` to be evaluated; default: optimise.
-      objective: ``"max"``, ``"min"``, or ``"policy"`` for values of policies that are given later.
-      nature: of an IntervalMDP, ``"adversarial"`` (default) or ``"cooperative"``, see
-        :func:`~jaxltl.core.values.prepared.prepared_interval.prepare_interval`.
-
-    Returns:
-      A pytree of arrays. Which transitions are possible and which rewards are zero is settled.
-
-    Raises:
-      ValueError: a shape or the objective is wrong, a reward is negative or not finite, there is
-        `stay` with a reward, or something is traced.
-
-    Not differentiable: it reads the graph, on the host; :func:`solve_prepared` has the derivatives.
-
-    Example:
-      >>> from jaxltl import make_sparse
-      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
-      >>> prepared = prepare(coin, [False, True, False])
-      >>> solve = jax.jit(lambda p: solve_prepared(prepared, probability=p).value[0])
-      >>> round(solve(jnp.array([0.25, 0.75, 1, 1])).item(), 3)
-      0.25
-    """
-    if isinstance(model, IntervalMDP):
-        return prepare_interval(
-            model,
-            target,
-            stay=stay,
-            reward=reward,
-            policy=policy,
-            objective=objective,
-            nature=nature,
-        )
-    refuse_nature(nature)
-    if policy is not None:
-        raise ValueError(
-            'policy is for models with intervals; prepare with objective="policy" and give the '
-            "policy to solve_prepared."
-        )
-    if objective not in ("max", "min", "policy"):
-        raise ValueError(f'objective={objective!r}; it must be "max", "min" or "policy".')
-    refuse_sharded(model)
-    if is_traced((model, target, stay, reward)):
-        raise ValueError(
-            "prepare reads its model, so it works on concrete arrays only; call it "
-            "before jit, and solve_prepared inside."
-        )
-    if stay is not None and reward is not None:
-        raise ValueError("expected rewards are until the target alone: leave stay out.")
-    sparse = to_sparse(model)
-    host = sparse.host
-    target = np.asarray(target, bool).ravel()
-    require_shape("target", target, (host.num_states,))
-    if stay is not None:
-        stay = np.asarray(stay, bool).ravel()
-        require_shape("stay", stay, (host.num_states,))
-    cost = None if reward is None else choice_reward(sparse, reward)
-    if cost is not None and not (np.isfinite(cost) & (cost >= 0)).all():
-        r = int(np.flatnonzero(~(np.isfinite(cost) & (cost >= 0)))[0])
-        raise ValueError(
-            f"the reward of a choice of state {host.state[r]} is {cost[r]:.6g}; "
-            "prepared solves need finite rewards of at least 0."
-        )
-    if objective == "policy":
-        plan = plan_policy(host, target, stay, cost)
-    elif cost is None:
-        plan = plan_optimum(
-            reduce_reachability(host, target, maximize=objective == "max", stay=stay), None
-        )
-    else:
-        kept = host.over_choices(np.maximum, cost) > 0
-        plan = plan_optimum(
-            reduce_total_reward(host, cost, target, maximize=objective == "max", kept=kept), cost
-        )
-    return _prepared(host, plan, cost, objective)
-
-
-def _prepared(host: Any, plan: Plan, cost: Any, objective: str) -> Prepared:
-    dtype = jnp.zeros(()).dtype
-    refuse_underflow(host.row_start, host.entry_start, host.probability, dtype)
-    vector = np.concatenate(
-        [host.probability, np.zeros(host.num_rows) if cost is None else cost, [1.0, 0.0]]
-    )
-    if plan.loops is not None:
-        rest = np.bincount(plan.loops.group, host.probability[plan.loops.entry], plan.loops.groups)
-        scale = np.ones(host.num_rows)
-        scale[plan.loops.row] = 1 / np.maximum(rest, 1e-300)[plan.loops.row_group]
-        vector[: host.num_transitions] *= scale[host.row]
-        vector[host.num_transitions : -2] *= scale
-    blocks, nodes, first = [], [], 0
-    for part in plan.schedule.segments:
-        full = (part.source != vector.size - 1).any((1, 2)).ravel()
-        nodes.append(first + np.flatnonzero(full))
-        weight = vector[part.source].astype(dtype)
-        blocks.append(Blocks(part.target, part.source, weight, part.name, first))
-        first = blocks[-1].last
-    loops = None if plan.loops is None else tuple(x.astype(np.int32) for x in plan.loops[:4])
-    cycles = None if plan.cycles is None else tuple(x.astype(np.int32) for x in plan.cycles)
-    found = Prepared(
-        segments=(blocks[0], blocks[1], blocks[2]),
-        place=plan.place,
-        nodes=np.concatenate(nodes).astype(np.int32),
-        own=plan.own,
-        row=plan.row,
-        entry_row=host.row.astype(np.int32),
-        row_state=host.state.astype(np.int32),
-        probability=host.probability.astype(dtype),
-        reward=None if cost is None else cost.astype(dtype),
-        loops=loops,
-        cycles=cycles,
-        question="probability" if cost is None else "reward",
-        objective=objective,
-        cyclic=plan.schedule.segments[1].target.size > 0,
-        levels=plan.schedule.levels,
-        choices=plan.schedule.choices,
-        terms=plan.terms + blocks[0].target.shape[2],
-        groups=0 if plan.loops is None else plan.loops.groups,
-    )
-    return to_jax(found)
+_Maybe: TypeAlias = jax.Array | None
+ELIMINATED = 256  # nodes up to which cycles are solved by elimination
 
 
 @validated()
@@ -261,14 +49,14 @@ def solve_prepared(
 ) -> Solution:
     """Solves a prepared question, with other probabilities, intervals or rewards.
 
-    Without cycles one pass is exact but for rounding, which is known in advance. With cycles,
-    bounds of both sides are proven by passes, see :mod:`jaxltl.core.values.prepared.interval_iteration`.
+    An acyclic system is solved by one pass, with an a priori rounding bound; a cyclic one is
+    enclosed by :mod:`jaxltl.core.values.prepared.interval_iteration`.
 
     Args:
       prepared: the question.
       probability: ``float[T]``, of the same transitions, all positive; rows sum to one.
-      lower, upper: ``float[T]``, of a prepared IntervalMDP in place of probabilities, see
-        :func:`~jaxltl.core.values.prepared.prepared_interval.solve_prepared_interval`.
+      lower, upper: ``float[T]``, of a prepared IntervalMDP in place of probabilities, enclosed by
+        robust policy iteration, :mod:`jaxltl.core.values.interval.contest`.
       reward: ``float[R]``, finite, at least 0, and 0 where it was; also positive where it was, if
         the least is asked for. Only if a reward was prepared.
       policy: rows ``int32[S]`` or weights ``float[R]``, if it was prepared for policies; a chain
@@ -314,7 +102,7 @@ def solve_prepared(
         )
     if lower is not None or upper is not None:
         raise ValueError("lower and upper are for a prepared IntervalMDP; give probability.")
-    probability, reward = given_numbers(prepared, probability, reward)
+    probability, reward = _given_numbers(prepared, probability, reward)
     policy = None if policy is None else jnp.asarray(policy)
     chain = prepared.num_rows == prepared.num_states
     if prepared.objective == "policy":
@@ -334,36 +122,43 @@ def solve_prepared(
     return _solve(prepared, probability, reward, policy, tolerance, max_steps)
 
 
-def given_numbers(prepared: Prepared, probability: Any, reward: Any) -> tuple[Any, Any]:
+def _given_numbers(
+    prepared: Prepared, probability: npt.ArrayLike | None, reward: npt.ArrayLike | None
+) -> tuple[jax.Array | None, jax.Array | None]:
     """Given probabilities and rewards, with checked shapes."""
-    probability, reward = (None if x is None else jnp.asarray(x) for x in (probability, reward))
-    if probability is not None:
-        require_shape("probability", probability, prepared.probability.shape)
-    if reward is not None:
-        if prepared.reward is None:
-            raise ValueError(
-                "a reward is given, but the question is a probability: prepare it with a reward."
-            )
-        require_shape("reward", reward, prepared.reward.shape)
-    return probability, reward
+    p, r = (None if x is None else jnp.asarray(x) for x in (probability, reward))
+    if p is not None:
+        require_shape("probability", p, prepared.probability.shape)
+    require_prepared_reward(prepared.reward, r)
+    return p, r
 
 
 @jax.jit
 def _solve(
-    prepared: Prepared, probability: Any, reward: Any, policy: Any, tolerance: Any, max_steps: Any
+    prepared: Prepared,
+    probability: _Maybe,
+    reward: _Maybe,
+    policy: _Maybe,
+    tolerance: jax.Array,
+    max_steps: jax.Array,
 ) -> Solution:
-    dtype = prepared.probability.dtype
-    tolerance = jnp.asarray(tolerance, dtype)
+    tolerance = jnp.asarray(tolerance, prepared.probability.dtype)
     share, taken = _shares(prepared, policy)
-    finite, valid = checked_numbers(prepared, probability, reward, share)
+    finite, valid = _checked_numbers(prepared, probability, reward, share)
     if probability is not None or reward is not None or share is not None:
-        prepared = refilled(prepared, probability, reward, share)
+        prepared = _refilled(prepared, probability, reward, share)
     decided = None
-    if prepared.objective == "policy":
+    if share is not None:
         decided = _decided(prepared, reward, share)
     found = _enclosed(prepared, decided, tolerance, max_steps)
     value = _attached(prepared, found, decided)
-    return _answer(prepared, found, decided, value, tolerance, finite, valid, taken)
+    return _answer(prepared, found, decided, value, taken, _Checks(tolerance, finite, valid))
+
+
+class _Checks(NamedTuple):
+    tolerance: jax.Array
+    finite: jax.Array
+    valid: jax.Array
 
 
 class _Shares(NamedTuple):
@@ -373,7 +168,7 @@ class _Shares(NamedTuple):
     finite: jax.Array
 
 
-def _shares(prepared: Prepared, policy: Any) -> tuple[_Shares | None, Any]:
+def _shares(prepared: Prepared, policy: _Maybe) -> tuple[_Shares | None, _Maybe]:
     """Weights of the rows under the policy, normalised, and the policy of the solution."""
     if prepared.objective != "policy":
         return None, None
@@ -399,8 +194,8 @@ def _shares(prepared: Prepared, policy: Any) -> tuple[_Shares | None, Any]:
     return _Shares(weight / total[prepared.row_state], used, valid, finite), policy
 
 
-def checked_numbers(
-    prepared: Prepared, probability: Any, reward: Any, share: _Shares | None
+def _checked_numbers(
+    prepared: Prepared, probability: _Maybe, reward: _Maybe, share: _Shares | None
 ) -> tuple[jax.Array, jax.Array]:
     """Whether numbers are finite, and whether they are valid."""
     finite, valid = jnp.asarray(True), jnp.asarray(True)
@@ -412,7 +207,7 @@ def checked_numbers(
         finite &= jnp.all(jnp.isfinite(total))
         slack = row_tolerance(probability.dtype)
         valid &= jnp.all(probability > 0) & jnp.all(jnp.abs(total - 1) <= slack)
-    if reward is not None:
+    if reward is not None and prepared.reward is not None:
         finite &= jnp.all(jnp.isfinite(reward))
         before = prepared.reward > 0
         valid &= jnp.all(reward >= 0) & jnp.all(before | (reward == 0))
@@ -423,7 +218,9 @@ def checked_numbers(
     return finite, valid
 
 
-def refilled(prepared: Prepared, probability: Any, reward: Any, share: _Shares | None) -> Prepared:
+def _refilled(
+    prepared: Prepared, probability: _Maybe, reward: _Maybe, share: _Shares | None = None
+) -> Prepared:
     """The prepared question with other weights in its blocks."""
     dtype = prepared.probability.dtype
     p = prepared.probability if probability is None else jnp.asarray(probability, dtype)
@@ -457,9 +254,8 @@ class _Decided(NamedTuple):
     infinite: jax.Array
 
 
-def _decided(prepared: Prepared, reward: Any, share: _Shares | None) -> _Decided:
+def _decided(prepared: Prepared, reward: _Maybe, share: _Shares) -> _Decided:
     """Places where the value of a policy is 0, 1 or infinite."""
-    assert share is not None
     size = prepared.size
     earned = prepared.reward if reward is None else reward
     paid = jnp.zeros(prepared.num_rows, bool) if earned is None else share.used & (earned > 0)
@@ -494,24 +290,25 @@ class _Found(NamedTuple):
     proven: jax.Array
 
 
-def _least(prepared: Prepared) -> float:
-    """Bound on what a sum loses to underflow."""
-    return 4 * prepared.terms * float(jnp.finfo(prepared.probability.dtype).tiny)
+def _rounding(prepared: Prepared) -> tuple[float, float]:
+    """Relative rounding error of a sum, and its loss to underflow."""
+    info = jnp.finfo(prepared.probability.dtype)
+    return prepared.terms * float(info.eps), 4 * prepared.terms * float(info.tiny)
 
 
 def _enclosed(
-    prepared: Prepared, decided: _Decided | None, tolerance: jax.Array, max_steps: Any
+    prepared: Prepared, decided: _Decided | None, tolerance: jax.Array, max_steps: jax.Array
 ) -> _Found:
     prepared = lax.stop_gradient(prepared)
     dtype, size = prepared.probability.dtype, prepared.size
-    unit, least = prepared.terms * float(jnp.finfo(dtype).eps), _least(prepared)
+    unit, least = _rounding(prepared)
     given: dict[str, Any] = {"maximize": prepared.objective != "min"}
     if decided is not None:
         given["keep"] = decided.keep[:size].astype(dtype)
         given["put"] = decided.put[:size].astype(dtype)
     start = jnp.zeros(size + 3, dtype).at[size].set(1)
     if prepared.cyclic:
-        return _solve_cyclic(prepared, start, given, unit, least, tolerance, max_steps)
+        return _solve_cyclic(prepared, start, given, tolerance, max_steps)
     x, rank = sweep(prepared.segments[0], start, choose=decided is None, **given)
     x = x[:size]
     share = 1.3 * prepared.levels * unit
@@ -526,12 +323,11 @@ def _solve_cyclic(
     prepared: Prepared,
     start: jax.Array,
     given: dict[str, Any],
-    unit: float,
-    least: float,
     tolerance: jax.Array,
-    max_steps: Any,
+    max_steps: jax.Array,
 ) -> _Found:
     """Bounds from both sides where the system has cycles."""
+    unit, least = _rounding(prepared)
     before, core, after = prepared.segments
     size = prepared.size
     down: Any = partial(sweep, factor=1 - unit, shift=-least, **given)
@@ -568,15 +364,12 @@ def _solve_cyclic(
     return _Found(middle, low, high, rank, s.moved, s.steps, s.proven)
 
 
-# --- what comes out -----------------------------------------------------------------------------
-
-
 def _attached(prepared: Prepared, found: _Found, decided: _Decided | None) -> jax.Array:
     """Values of the places with implicit derivatives."""
     size, dtype = prepared.size, prepared.probability.dtype
     if not size:
         return found.value
-    system = chosen_rows(prepared, found.rank)
+    system = _chosen_rows(prepared, found.rank)
     put = jnp.zeros(size, dtype)
     if decided is not None:
         count, _, block = system.target.shape
@@ -592,7 +385,7 @@ def _attached(prepared: Prepared, found: _Found, decided: _Decided | None) -> ja
     return implicit(operator, found.value, solve=fixed.solve, transpose_solve=fixed.transpose_solve)
 
 
-def chosen_rows(prepared: Prepared, rank: jax.Array | None) -> Chosen:
+def _chosen_rows(prepared: Prepared, rank: jax.Array | None) -> Chosen:
     """The linear system of the rows with given ranks; by default the first ones."""
     target = jnp.concatenate([x.target for x in prepared.segments])
     weight = jnp.concatenate([x.weight for x in prepared.segments])
@@ -611,12 +404,11 @@ def _answer(
     found: _Found,
     decided: _Decided | None,
     value: jax.Array,
-    tolerance: jax.Array,
-    finite: jax.Array,
-    valid: jax.Array,
-    taken: Any,
+    taken: _Maybe,
+    checks: _Checks,
 ) -> Solution:
     """The solution; checked at the nodes, which may be far fewer than the states."""
+    tolerance, finite, valid = checks
     dtype, size = prepared.probability.dtype, prepared.size
     relative = prepared.question == "reward"
     most = jnp.inf if relative else 1.0
@@ -628,16 +420,14 @@ def _answer(
         value, lower, upper = (jnp.where(keep, x, known) for x in (value, lower, upper))
     width = jnp.where(lower == upper, 0, upper - jnp.where(jnp.isfinite(lower), lower, 0))
     scale = jnp.where(jnp.isfinite(upper), upper, 1) if relative else 1
-    floor = 1e3 * SLACK * _least(prepared)  # what rewards of zero are known to
+    floor = 1e3 * SLACK * _rounding(prepared)[1]  # what rewards of zero are known to
     narrow = jnp.all((width <= tolerance * scale + floor) & (lower <= upper))
     finite &= jnp.all(~jnp.isnan(lax.stop_gradient(value)))
     status = status_code(found.proven & narrow, finite, found.proven, valid=valid | ~finite)
     good = valid & finite
-    ends = jnp.asarray([0, 0, jnp.inf] if relative else [1, 0, 0], dtype)
 
     def everywhere(x: jax.Array, bad: float) -> jax.Array:
-        x = jnp.where(good, jnp.concatenate([x, ends]), jnp.asarray(bad, dtype))
-        return x.at[prepared.place].get(mode="promise_in_bounds")
+        return jnp.where(good, _at_states(prepared, x), jnp.asarray(bad, dtype))
 
     return Solution(
         value=everywhere(value, jnp.nan),
@@ -650,6 +440,12 @@ def _answer(
     )
 
 
+def _at_states(prepared: Prepared, x: jax.Array) -> jax.Array:
+    """A quantity of the places, at the states."""
+    ends = jnp.asarray([0, 0, jnp.inf] if prepared.question == "reward" else [1, 0, 0], x.dtype)
+    return jnp.concatenate([x, ends]).at[prepared.place].get(mode="promise_in_bounds")
+
+
 def _policy(prepared: Prepared, found: _Found) -> jax.Array:
     """An optimal policy, ``int32[S]``."""
     names = jnp.concatenate([x.name for x in prepared.segments])
@@ -658,14 +454,12 @@ def _policy(prepared: Prepared, found: _Found) -> jax.Array:
     chosen = chosen_names(names, found.rank, prepared.choices)
     own = prepared.own
     rows = jnp.where(own >= 0, chosen[jnp.maximum(own, 0)], prepared.row)
-    if prepared.cycles is None:
-        return rows
-    return _going_round(prepared, rows)
+    return rows if prepared.cycles is None else _towards_exits(prepared, prepared.cycles, rows)
 
 
-def _going_round(prepared: Prepared, rows: jax.Array) -> jax.Array:
+def _towards_exits(prepared: Prepared, cycles: tuple[jax.Array, ...], rows: jax.Array) -> jax.Array:
     """The policy completed inside end components by rows towards the exit."""
-    state, inside, owner, entry_row, successor = prepared.cycles
+    state, inside, owner, entry_row, successor = cycles
     picked = rows[state]
     there = prepared.row_state[picked] == state
     count, many = state.shape[0], inside.shape[0]
@@ -687,3 +481,96 @@ def _going_round(prepared: Prepared, rows: jax.Array) -> jax.Array:
 
     _, picked, _ = lax.while_loop(lambda c: c[2], further, (there, picked, jnp.asarray(True)))
     return rows.at[state].set(picked, unique_indices=True)
+
+
+def is_direct(prepared: Prepared) -> bool:
+    """Whether the work of :func:`evaluate_prepared` is independent of the numbers."""
+    return not prepared.cyclic or prepared.nodes.shape[0] <= ELIMINATED
+
+
+def evaluate_prepared(
+    prepared: Prepared,
+    *,
+    probability: chex.Array | None = None,
+    reward: chex.Array | None = None,
+) -> tuple[jax.Array, jax.Array]:
+    """Uncertified values of a prepared Markov chain.
+
+    One linear system ``x = r + P x``: a pass where there are no cycles, elimination up to
+    `ELIMINATED` nodes, and Krylov steps on passes beyond.
+
+    Raises:
+      ValueError: a shape is wrong, or the question is of another kind.
+
+    Differentiable, forward and reverse, as there.
+
+    Example:
+      >>> from jaxltl import make_sparse, prepare
+      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
+      >>> prepared = prepare(coin, [False, True, False])
+      >>> value = lambda p: evaluate_prepared(prepared, probability=jnp.array([p, 1 - p, 1, 1]))[0]
+      >>> jax.grad(lambda p: value(p)[0])(0.25).item()
+      1.0
+    """
+    if prepared.num_rows != prepared.num_states or prepared.objective == "policy":
+        raise ValueError(
+            "evaluate_prepared takes Markov chains, not prepared for policies: use solve_prepared."
+        )
+    return _evaluate(prepared, *_given_numbers(prepared, probability, reward))
+
+
+@jax.jit
+def _evaluate(
+    prepared: Prepared, probability: _Maybe, reward: _Maybe
+) -> tuple[jax.Array, jax.Array]:
+    size, dtype = prepared.size, prepared.probability.dtype
+    finite, valid = _checked_numbers(prepared, probability, reward, None)
+    if probability is not None or reward is not None:
+        prepared = _refilled(prepared, probability, reward)
+    value = jnp.zeros(0, dtype)
+    if size:
+        system = _chosen_rows(prepared, None)
+        fixed = lax.stop_gradient(system)
+        eliminated = prepared.cyclic and is_direct(prepared)
+        solve, transpose = (
+            _eliminated(fixed, prepared.nodes)
+            if eliminated
+            else (fixed.solve, fixed.transpose_solve)
+        )
+
+        def operator(x: jax.Array) -> jax.Array:
+            return system.image(jnp.concatenate([x, jnp.asarray([1, 0, 0], dtype)]))
+
+        constant = lax.stop_gradient(operator(jnp.zeros(size, dtype)))
+        value = implicit(operator, solve(constant), solve=solve, transpose_solve=transpose)
+    finite &= jnp.all(jnp.isfinite(lax.stop_gradient(value)))
+    status = status_code(True, finite, certified=False, valid=valid | ~finite)
+    return _at_states(prepared, value), status
+
+
+def _eliminated(
+    system: Chosen, nodes: jax.Array
+) -> tuple[Callable[[jax.Array], jax.Array], Callable[[jax.Array], jax.Array]]:
+    """Solvers of a system and of its transpose by a dense inverse on its nodes."""
+    count, _, block = system.target.shape
+    size, most = count * block, nodes.shape[0]
+    number = jnp.full(size + 3, most, jnp.int32).at[nodes].set(jnp.arange(most, dtype=jnp.int32))
+    target, weight = (
+        jnp.moveaxis(x, 1, 2).reshape(size, -1)[nodes] for x in (system.target, system.weight)
+    )
+    rows = jnp.arange(most, dtype=jnp.int32)[:, None]
+    matrix = jnp.eye(most, most + 1, dtype=weight.dtype)
+    matrix = matrix.at[rows, number[target]].add(-weight)[:, :most]
+    found = inverse(matrix)
+
+    def solve(b: jax.Array) -> jax.Array:
+        c = b[nodes]
+        x = found @ c
+        return b.at[nodes].set(x + found @ (c - matrix @ x))
+
+    def transpose(b: jax.Array) -> jax.Array:
+        c = b[nodes]
+        x = c @ found
+        return b.at[nodes].set(x + (c - x @ matrix) @ found)
+
+    return solve, transpose

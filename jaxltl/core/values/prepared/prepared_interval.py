@@ -12,8 +12,7 @@ import numpy as np
 from flax import struct
 from jax import lax
 
-from jaxltl.core.values.engine.validated import validated
-from jaxltl.core.models.interval import IntervalMDP, refuse_ball, require_interval
+from jaxltl.core.models.interval import IntervalMDP, refuse_ball
 from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
 from jaxltl.core.models.ops.operators import is_deterministic, row_weights
 from jaxltl.core.pretty_print import brief
@@ -121,32 +120,8 @@ def prepare_interval(
     objective: str = "max",
     nature: str | None = None,
 ) -> PreparedInterval:
-    """Prepares a question about an interval model for solves with other intervals.
-
-    Raises:
-      ValueError: a shape or a direction is wrong, the model has a radius, a reward is negative, not
-        finite or depends on nature, there is `stay` with a reward, or something is traced.
-
-    Not differentiable: it reads the graph, on the host; :func:`solve_prepared_interval` has the
-    derivatives.
-
-    Example:
-      >>> from jaxltl import make_interval, make_sparse
-      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
-      >>> model = make_interval(coin, [0.4, 0.3, 1, 1], [0.7, 0.6, 1, 1])
-      >>> prepared = prepare_interval(model, [False, True, False])
-      >>> solve = jax.jit(lambda low: solve_prepared_interval(prepared, lower=low).value[0])
-      >>> round(solve(jnp.array([0.5, 0.3, 1, 1])).item(), 3)
-      0.5
-    """
-    if is_traced((model, target, stay, reward, policy)):
-        raise ValueError(
-            "prepare_interval reads its model, so it works on concrete arrays only; "
-            "call it before jit, and solve_prepared_interval inside."
-        )
-    refuse_ball(require_interval(model), "prepare_interval has no rule for its derivatives")
-    if stay is not None and reward is not None:
-        raise ValueError("expected rewards are until the target alone: leave stay out.")
+    """Preprocessed question about an interval model, see `prepare`."""
+    refuse_ball(model, "prepare has no rule for its derivatives")
     direction = nature_direction(nature, objective)
     target = state_mask(model.nominal, target, "target")
     stay = None if stay is None else state_mask(model.nominal, stay, "stay")
@@ -240,7 +215,17 @@ def _prepared(
     return to_jax(found)
 
 
-@validated()
+def require_prepared_reward(prepared: jax.Array | None, reward: jax.Array | None) -> None:
+    """Raises ValueError if a reward is given and none was prepared, or has another shape."""
+    if reward is None:
+        return
+    if prepared is None:
+        raise ValueError(
+            "a reward is given, but the question is a probability: prepare it with a reward."
+        )
+    require_shape("reward", reward, prepared.shape)
+
+
 def solve_prepared_interval(
     prepared: PreparedInterval,
     *,
@@ -250,31 +235,7 @@ def solve_prepared_interval(
     tolerance: chex.Array | float | None = None,
     max_steps: chex.Array | int = 100,
 ) -> Solution:
-    """Solves a prepared question about an interval model, with other intervals or rewards.
-
-    ``x(s) = opt_a opt_p (r(s, a) + sum_t p_t x(t))``, p among the distributions of row a between
-    its ends (Nilim and El Ghaoui 2005, Iyengar 2005), enclosed from both contest, see
-    :mod:`jaxltl.core.values.interval.contest`. Under ``vmap`` lanes are solved one after the other, each in
-    its own number of rounds.
-
-    Raises:
-      ValueError: a shape is wrong, or a reward is given and none was prepared.
-
-    Differentiable, forward and reverse, in the ends and in the rewards, with the policy and the
-    order of each row's successors held fixed: where neither is tied, that is the derivative.
-
-    Example:
-      >>> from jaxltl.core.models import interval_rows
-      >>> coin = interval_rows(None, [0, 2, 3, 4], [1, 2, 1, 2], [.4, .3, 1, 1], [.7, .6, 1, 1])
-      >>> prepared = prepare_interval(coin, [False, True, False])
-      >>> value = jax.jit(lambda low: solve_prepared_interval(prepared, lower=low).value[0])
-      >>> round(value(jnp.array([0.5, 0.3, 1, 1])).item(), 3)
-      0.5
-    """
-    if not isinstance(prepared, PreparedInterval):
-        raise ValueError(
-            f"prepared is {validation.shorten(prepared)}; give what prepare_interval returns."
-        )
+    """Solution of a prepared question about an interval model, see `solve_prepared`."""
     shape = prepared.lower.shape
     lower, upper, reward = (
         None
@@ -291,12 +252,7 @@ def solve_prepared_interval(
     for name, ends in (("lower", lower), ("upper", upper)):
         if ends is not None:
             require_shape(name, ends, shape)
-    if reward is not None:
-        if prepared.reward is None:
-            raise ValueError(
-                "a reward is given, but the question is a probability: prepare it with a reward."
-            )
-        require_shape("reward", reward, prepared.reward.shape)
+    require_prepared_reward(prepared.reward, reward)
     if tolerance is None:
         tolerance = 1e-6 if prepared.lower.dtype == jnp.float64 else 1e-3
     return _solve(prepared, lower, upper, reward, tolerance, max_steps)

@@ -8,9 +8,13 @@ import pytest
 from jaxltl.core.models.sparse import make_sparse
 from jaxltl.core.sparse.solvers import reachability as optimal
 from jaxltl.core.types import Status
-from jaxltl.core.values.prepared import prepared_chain
-from jaxltl.core.values.prepared.prepared import prepare, solve_prepared
-from jaxltl.core.values.prepared.prepared_chain import evaluate_prepared, is_direct
+from jaxltl.core.values.prepared import prepared as module
+from jaxltl.core.values.prepared.prepared import (
+    evaluate_prepared,
+    is_direct,
+    prepare,
+    solve_prepared,
+)
 from tests.sparse_models import random_sparse
 
 SIZE = 12
@@ -71,14 +75,14 @@ def test_elimination_and_passes_say_the_same(monkeypatch):
         def first(p):  # a new function, which is traced anew
             return jnp.sum(evaluate_prepared(prepared, probability=p)[0])
 
-        prepared_chain._evaluate.clear_cache()
+        module._evaluate.clear_cache()
         return jax.value_and_grad(first)(prepared.probability)
 
     one = slopes()
-    monkeypatch.setattr(prepared_chain, "ELIMINATED", 0)
+    monkeypatch.setattr(module, "ELIMINATED", 0)
     assert not is_direct(prepared)
     other = slopes()
-    prepared_chain._evaluate.clear_cache()
+    module._evaluate.clear_cache()
     for x, y in zip(one, other, strict=True):
         np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-10)
     bounded = jax.grad(lambda p: jnp.sum(solve_prepared(prepared, probability=p).value))

@@ -12,7 +12,7 @@ from jaxltl.core.types import Status
 from jaxltl.core.values.interval.contest import greedy_distributions
 from jaxltl.core.values.interval.robust import robust_reachability, robust_total_reward
 from jaxltl.core.values.interval.sensitivity import robust_sensitivity
-from jaxltl.core.values.prepared.prepared_interval import prepare_interval, solve_prepared_interval
+from jaxltl.core.values.prepared.prepared import prepare, solve_prepared
 from tests.reference_intervals import vertices
 from tests.support import nature_word
 
@@ -101,12 +101,10 @@ def test_all_ends_of_a_batch_are_enclosed_as_by_brute_force(seed, objective, nat
     successor, lower, upper, cost = _cases(seed, 12)
     model = _model(successor, lower[0], upper[0])
     for reward in (None, cost):
-        prepared = prepare_interval(
+        prepared = prepare(
             model, GOAL, reward=reward, objective=objective, nature=nature_word(objective, nature)
         )
-        solve = jax.jit(
-            jax.vmap(lambda a, b, p=prepared: solve_prepared_interval(p, lower=a, upper=b))
-        )
+        solve = jax.jit(jax.vmap(lambda a, b, p=prepared: solve_prepared(p, lower=a, upper=b)))
         found = solve(lower, upper)
         assert int(found.status[0]) == Status.CONVERGED
         assert set(np.asarray(found.status).tolist()) <= {Status.CONVERGED, Status.INVALID}
@@ -128,10 +126,8 @@ def test_all_ends_of_a_batch_are_enclosed_as_by_brute_force(seed, objective, nat
 def test_policy_and_nature_attain_what_they_are_shown_for(objective, nature):
     successor, lower, upper, _ = _cases(3, 1)
     model = _model(successor, lower[0], upper[0])
-    found = solve_prepared_interval(
-        prepare_interval(
-            model, GOAL, stay=STAY, objective=objective, nature=nature_word(objective, nature)
-        )
+    found = solve_prepared(
+        prepare(model, GOAL, stay=STAY, objective=objective, nature=nature_word(objective, nature))
     )
     host = robust_reachability(
         model, GOAL, stay=STAY, objective=objective, nature=nature_word(objective, nature)
@@ -155,11 +151,11 @@ def test_given_policies_are_evaluated():
     policy = np.array([0, 1, 3, 4, 7], np.int32)
     for nature in ("adversarial", "cooperative"):
         question = {"policy": policy, "nature": nature}
-        found = solve_prepared_interval(prepare_interval(model, GOAL, **question))
+        found = solve_prepared(prepare(model, GOAL, **question))
         host = robust_reachability(model, GOAL, **question)
         np.testing.assert_allclose(found.value, host.value, atol=1e-6)
         np.testing.assert_array_equal(found.policy, policy)
-        found = solve_prepared_interval(prepare_interval(model, GOAL, reward=cost, **question))
+        found = solve_prepared(prepare(model, GOAL, reward=cost, **question))
         host = robust_total_reward(model, cost, GOAL, **question)
         np.testing.assert_allclose(found.value, host.value, rtol=1e-6)
 
@@ -192,14 +188,12 @@ def test_derivatives_in_the_ends_are_differences(objective, nature, question):
             return robust_reachability(model, goal, stay=STAY, tolerance=1e-12, **ask)
         return robust_total_reward(model, reward, goal, tolerance=1e-12, **ask)
 
-    prepared = prepare_interval(
-        model, goal, stay=STAY if reward is None else None, reward=reward, **ask
-    )
+    prepared = prepare(model, goal, stay=STAY if reward is None else None, reward=reward, **ask)
 
     def derivatives(ends):
         """The slope and the change on the way, both of one linear program."""
         _, forward = jax.linearize(
-            lambda a, b: solve_prepared_interval(prepared, lower=a, upper=b).value @ weight, *ends
+            lambda a, b: solve_prepared(prepared, lower=a, upper=b).value @ weight, *ends
         )
         return jax.linear_transpose(forward, *ends)(1.0), forward(*way)
 
@@ -228,10 +222,10 @@ def test_derivatives_in_the_ends_are_differences(objective, nature, question):
 def test_other_graphs_are_refused_inside_jit():
     successor, lower, upper, _ = _cases(6, 1)
     model = _model(successor, lower[0], upper[0])
-    prepared = prepare_interval(model, GOAL, objective="max", nature="adversarial")
+    prepared = prepare(model, GOAL, objective="max", nature="adversarial")
 
     def status(lower, upper):
-        return int(solve_prepared_interval(prepared, lower=lower, upper=upper).status)
+        return int(solve_prepared(prepared, lower=lower, upper=upper).status)
 
     low, high = lower[0], upper[0]
     assert status(low, high) == Status.CONVERGED
@@ -250,13 +244,13 @@ def test_nature_that_may_drop_other_successors_is_refused():
         return interval_rows(None, [0, 1, 3], [0, 0, 1], [1, 0, 0], [1, 0.75, room])
 
     goal = np.array([True, False])
-    prepared = prepare_interval(model(0.5), goal, objective="min", nature="cooperative")
+    prepared = prepare(model(0.5), goal, objective="min", nature="cooperative")
     ends = [(m.lower, m.upper) for m in map(model, (0.5, 0.75, 1.0))]
-    found = [solve_prepared_interval(prepared, lower=a, upper=b) for a, b in ends]
+    found = [solve_prepared(prepared, lower=a, upper=b) for a, b in ends]
     assert [int(x.status) for x in found] == [Status.CONVERGED] * 2 + [Status.INVALID]
     assert float(found[0].value[1]) == 1
-    again = prepare_interval(model(1.0), goal, objective="min", nature="cooperative")
-    assert float(solve_prepared_interval(again).value[1]) == 0
+    again = prepare(model(1.0), goal, objective="min", nature="cooperative")
+    assert float(solve_prepared(again).value[1]) == 0
 
 
 @pytest.mark.parametrize("width", [3, 20])
@@ -288,4 +282,4 @@ def test_nature_gives_mass_in_order(width):
 def test_misuse_is_told_in_words(change, words):
     successor, lower, upper, _ = _cases(0, 1)
     with pytest.raises(ValueError, match=words):
-        prepare_interval(_model(successor, lower[0], upper[0]), GOAL, **change)
+        prepare(_model(successor, lower[0], upper[0]), GOAL, **change)

@@ -1,0 +1,240 @@
+"""Preprocessing of questions whose probabilities and rewards are given later."""
+
+from __future__ import annotations
+
+
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from jaxltl.core.models.construct.convert import to_sparse
+from jaxltl.core.models.interval import IntervalMDP
+from jaxltl.core.models.mesh.sharded import refuse_sharded
+from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
+from jaxltl.core.models.protocols import Model
+from jaxltl.core.models.sparse import Rewards, choice_reward, refuse_underflow
+from jaxltl.core.pretty_print import brief
+from jaxltl.core.sparse.mdp import HostMDP
+from jaxltl.core.sparse.prepared.reachability_plan import Plan, plan_optimum, plan_policy
+from jaxltl.core.sparse.solvers.reachability import reduce_reachability, reduce_total_reward
+from jaxltl.core.types import require_shape
+from jaxltl.core.values import facts
+from jaxltl.core.values.engine.block_sweeps import Blocks
+from jaxltl.core.values.interval.robust import refuse_nature
+from jaxltl.core.values.prepared.prepared_interval import PreparedInterval, prepare_interval
+
+
+@brief(facts=facts.prepared)
+@struct.dataclass
+class Prepared:
+    """A question about a model after preprocessing, for solves with other numbers.
+
+    Made by :func:`prepare`, read by :func:`solve_prepared`. Give it to a compiled function as an
+    argument: what a function closes over becomes part of the program.
+
+    Attributes:
+      segments: the blocks.
+      place: ``int32[S]``, where a state's value is.
+      nodes: ``int32[M]``, the places with rows; others fill blocks.
+      own: ``int32[S]``, the place whose row a state takes, or -1.
+      row: ``int32[S]``, the row that it takes else.
+      entry_row: ``int32[T]``, the row of each transition.
+      row_state: ``int32[R]``, the state of each row.
+      probability, reward: ``float[T]`` and ``float[R]``, as they were.
+      loops: rows that lead to where they are: entries, groups, rows, groups of these; or None.
+      cycles: end components that are one node, or None.
+      question: ``"probability"`` or ``"reward"``, static.
+      objective: ``"max"``, ``"min"`` or ``"policy"``, static.
+      cyclic: whether some nodes are on cycles, static.
+      levels, choices, terms, groups: see the plan, static.
+
+    Example:
+      >>> from jaxltl import make_sparse
+      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
+      >>> prepared = prepare(coin, [False, True, False])
+      >>> prepared.question, prepared.objective, prepared.num_states, prepared.num_rows
+      ('probability', 'max', 3, 3)
+    """
+
+    segments: tuple[Blocks, Blocks, Blocks]
+    place: jax.Array
+    nodes: jax.Array
+    own: jax.Array
+    row: jax.Array
+    entry_row: jax.Array
+    row_state: jax.Array
+    probability: jax.Array
+    reward: jax.Array | None
+    loops: tuple[jax.Array, ...] | None
+    cycles: tuple[jax.Array, ...] | None
+    question: str = struct.field(pytree_node=False)
+    objective: str = struct.field(pytree_node=False)
+    cyclic: bool = struct.field(pytree_node=False)
+    levels: int = struct.field(pytree_node=False)
+    choices: int = struct.field(pytree_node=False)
+    terms: int = struct.field(pytree_node=False)
+    groups: int = struct.field(pytree_node=False)
+
+    @property
+    def num_states(self) -> int:
+        """S, of the model."""
+        return self.place.shape[-1]
+
+    @property
+    def num_rows(self) -> int:
+        """R, of the model."""
+        return self.row_state.shape[-1]
+
+    @property
+    def size(self) -> int:
+        """Number N of places."""
+        return self.segments[2].last
+
+
+def prepare(
+    model: Model | IntervalMDP,
+    target: chex.Array,
+    *,
+    stay: chex.Array | None = None,
+    reward: str | Rewards | chex.Array | None = None,
+    policy: chex.Array | None = None,
+    objective: str = "max",
+    nature: str | None = None,
+) -> Prepared | PreparedInterval:
+    """Prepares a question about a model for solves with other numbers inside ``jit``.
+
+    Contracts chains of single successors and end components, removes states of value 0, 1 or
+    infinity, and orders the others in blocks of equal shape, in reverse topological order: one pass
+    solves an acyclic system.
+
+    Args:
+      model: a concrete SparseMDP, or what :func:`~jaxltl.core.models.construct.convert.to_sparse` takes.
+      target: ``bool[S]``.
+      stay: ``bool[S]``, the states that may be passed before; default all. Not with a reward.
+      reward: asks for the expected total reward until the target and not for the probability of
+        reaching it; as of :func:`~jaxltl.core.models.sparse.choice_reward`, finite and at least 0.
+      policy: of an IntervalMDP, rows ``int32[S]`` to be evaluated; default: optimise.
+      objective: ``"max"``, ``"min"``, or ``"policy"`` for values of policies that are given later.
+      nature: of an IntervalMDP, ``"adversarial"`` (default) or ``"cooperative"``, see
+        :func:`~jaxltl.core.values.prepared.prepared_interval.prepare_interval`.
+
+    Returns:
+      A pytree of arrays. Which transitions are possible and which rewards are zero is settled.
+
+    Raises:
+      ValueError: a shape or the objective is wrong, a reward is negative or not finite, there is
+        `stay` with a reward, or something is traced.
+
+    Not differentiable: it reads the graph, on the host; :func:`solve_prepared` has the derivatives.
+
+    Example:
+      >>> from jaxltl import make_sparse, solve_prepared
+      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
+      >>> prepared = prepare(coin, [False, True, False])
+      >>> solve = jax.jit(lambda p: solve_prepared(prepared, probability=p).value[0])
+      >>> round(solve(jnp.array([0.25, 0.75, 1, 1])).item(), 3)
+      0.25
+    """
+    refuse_sharded(model)
+    if stay is not None and reward is not None:
+        raise ValueError("expected rewards are until the target alone: leave stay out.")
+    if is_traced((model, target, stay, reward, policy)):
+        raise ValueError(
+            "prepare reads its model, so it works on concrete arrays only; call it "
+            "before jit, and solve_prepared inside."
+        )
+    if isinstance(model, IntervalMDP):
+        return prepare_interval(
+            model,
+            target,
+            stay=stay,
+            reward=reward,
+            policy=policy,
+            objective=objective,
+            nature=nature,
+        )
+    refuse_nature(nature)
+    if policy is not None:
+        raise ValueError(
+            'policy is for models with intervals; prepare with objective="policy" and give the '
+            "policy to solve_prepared."
+        )
+    if objective not in ("max", "min", "policy"):
+        raise ValueError(f'objective={objective!r}; it must be "max", "min" or "policy".')
+    sparse = to_sparse(model)
+    host = sparse.host
+    target = np.asarray(target, bool).ravel()
+    require_shape("target", target, (host.num_states,))
+    if stay is not None:
+        stay = np.asarray(stay, bool).ravel()
+        require_shape("stay", stay, (host.num_states,))
+    cost = None if reward is None else choice_reward(sparse, reward)
+    if cost is not None and not (np.isfinite(cost) & (cost >= 0)).all():
+        r = int(np.flatnonzero(~(np.isfinite(cost) & (cost >= 0)))[0])
+        raise ValueError(
+            f"the reward of a choice of state {host.state[r]} is {cost[r]:.6g}; "
+            "prepared solves need finite rewards of at least 0."
+        )
+    if objective == "policy":
+        plan = plan_policy(host, target, stay, cost)
+    elif cost is None:
+        plan = plan_optimum(
+            reduce_reachability(host, target, maximize=objective == "max", stay=stay), None
+        )
+    else:
+        kept = host.over_choices(np.maximum, cost) > 0
+        plan = plan_optimum(
+            reduce_total_reward(host, cost, target, maximize=objective == "max", kept=kept), cost
+        )
+    return _prepared(host, plan, cost, objective)
+
+
+def _prepared(host: HostMDP, plan: Plan, cost: np.ndarray | None, objective: str) -> Prepared:
+    """The arrays of a plan, with the weights of the model in its blocks."""
+    dtype = jnp.zeros(()).dtype
+    refuse_underflow(host.row_start, host.entry_start, host.probability, dtype)
+    vector = np.concatenate(
+        [host.probability, np.zeros(host.num_rows) if cost is None else cost, [1.0, 0.0]]
+    )
+    if plan.loops is not None:
+        rest = np.bincount(plan.loops.group, host.probability[plan.loops.entry], plan.loops.groups)
+        scale = np.ones(host.num_rows)
+        scale[plan.loops.row] = 1 / np.maximum(rest, 1e-300)[plan.loops.row_group]
+        vector[: host.num_transitions] *= scale[host.row]
+        vector[host.num_transitions : -2] *= scale
+    blocks, nodes, first = [], [], 0
+    for part in plan.schedule.segments:
+        full = (part.source != vector.size - 1).any((1, 2)).ravel()
+        nodes.append(first + np.flatnonzero(full))
+        weight = vector[part.source].astype(dtype)
+        blocks.append(Blocks(part.target, part.source, weight, part.name, first))
+        first = blocks[-1].last
+    loops = None if plan.loops is None else tuple(x.astype(np.int32) for x in plan.loops[:4])
+    cycles = None if plan.cycles is None else tuple(x.astype(np.int32) for x in plan.cycles)
+    arrays: dict[str, Any] = {
+        "segments": tuple(blocks),
+        "place": plan.place,
+        "nodes": np.concatenate(nodes).astype(np.int32),
+        "own": plan.own,
+        "row": plan.row,
+        "entry_row": host.row.astype(np.int32),
+        "row_state": host.state.astype(np.int32),
+        "probability": host.probability.astype(dtype),
+        "reward": None if cost is None else cost.astype(dtype),
+        "loops": loops,
+        "cycles": cycles,
+    }
+    return Prepared(
+        **to_jax(arrays),
+        question="probability" if cost is None else "reward",
+        objective=objective,
+        cyclic=plan.schedule.segments[1].target.size > 0,
+        levels=plan.schedule.levels,
+        choices=plan.schedule.choices,
+        terms=plan.terms + blocks[0].target.shape[2],
+        groups=0 if plan.loops is None else plan.loops.groups,
+    )
