@@ -282,15 +282,7 @@ def policy_in_world(
 
 
 def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
-    """The best policy so far in the problem's worlds: ``float[W, S, Q, A]``.
-
-    Args:
-      state: of one run; ``vmap`` over several.
-      problem, hparams: of the run.
-
-    Returns:
-      ``float[W, S, Q, A]``; :func:`policy_in_world` has it in others.
-    """
+    """The best policy so far in the problem's worlds: ``float[W, S, Q, A]``; see :func:`policy_in_world`."""
     del hparams
     scores = _scores(state.best.parameters, problem)
     return jax.nn.softmax(jnp.where(problem.available[:, :, None], scores, -jnp.inf), axis=-1)

@@ -113,15 +113,9 @@ class Metrics:
 
 
 def make_problem(model: MDP, reward: ArrayLike, *, allowed: ArrayLike | None = None) -> Problem:
-    """A checked :class:`Problem`.
+    """A checked :class:`Problem` of an explicit MDP, `model`, and a `reward` ``float[S, A]``.
 
-    Args:
-      model: an explicit MDP; transitions are sampled from it.
-      reward: ``float[S, A]``.
-      allowed: ``bool[S, A]``, actions that may be taken; default all available ones.
-
-    Returns:
-      :class:`Problem`.
+    `allowed`, ``bool[S, A]``, are the actions that may be taken; default all available ones.
 
     Raises:
       ValueError: a wrong shape, a reward that is not finite, or a state without an allowed action.

@@ -81,22 +81,19 @@ from jaxltl.core.pretty_print import brief
 class SequenceNetwork(nn.Module):
     """An actor and a critic that read a :class:`~sequence_task.SequenceObservation`.
 
-    Where `events_seen` tells which events the agent sees where, each place is described to the
-    network by what the sequence says of its events: whether a step wants one of them or avoids one.
-    Then a network that was trained on some events does the same on others, for their names have
-    gone. Otherwise the observation is given as it is, beside what dense layers make of the
-    sequence's rows.
+    With `events_seen`, each place is described by whether the current steps of the sequence reach or
+    avoid one of its events; the names of events do not matter, so that a trained network generalises to
+    other events. Otherwise it reads the observation, and an embedding of the sequence's rows.
 
     Attributes:
       num_actions, shape, hidden, activation, initial_deviation: as of PPO's default network,
         :class:`~jaxltl.algos.common.actor_critic.ActorCritic`; hidden layers read both parts.
-      events_seen: ``observation -> float[..., E]``, or None; hashable, such as a function of a
-        module.
-      by_name: whether, where `events_seen` is given, the observation and the sequence's rows are
-        told as they are too: for a world that stays the same.
-      detailed: how many steps of the sequence are told so; of those that follow the network knows
-        only how many events they ask for and avoid.
-      embedding: width of the layer that reads a step's events as they are.
+      events_seen: ``observation -> float[..., E]``, the events at each place, or None; hashable.
+      by_name: whether the network with `events_seen` also reads the observation and the sequence's
+        rows, for a fixed world.
+      detailed: number of steps of the sequence described so; of later ones the network reads the
+        numbers of events to reach and to avoid.
+      embedding: width of the layer that embeds a step's events.
     """
 
     num_actions: int = 0
@@ -164,20 +161,11 @@ def make_plan(
     depth: int,
     most: int = 16,
 ) -> Plan:
-    """The :class:`Plan` of a task; made on the host.
+    """The :class:`Plan` of a `task`: a formula, its text, or an automaton; made on the host.
 
-    Args:
-      task: the formula, its text, or the automaton whose states the agent will be told.
-      events: ``bool[E, P]``, the labels that occur, those that the network was trained on.
-      propositions: names of the P columns.
-      depth: D, as in training.
-      most: M, sequences a state.
-
-    Returns:
-      :class:`Plan`, NumPy arrays; not differentiable.
-
-    Raises:
-      ValueError: as :func:`~jaxltl.core.automata.sequences.reach_avoid_sequences`.
+    `events`, ``bool[E, P]``, are the labels that occur, as in training, with columns `propositions`;
+    `depth` is D, as in training, and `most` is M, the number of sequences for each state. Not
+    differentiable. Raises as :func:`~jaxltl.core.automata.sequences.reach_avoid_sequences`.
     """
     automaton = task if isinstance(task, Automaton) else to_automaton(task)
     found = sequences.reach_avoid_sequences(
@@ -191,13 +179,7 @@ def make_plan(
 
 
 def stack_plans(plans: Sequence[Plan]) -> Plan:
-    """Plans of several tasks, padded to one shape, with a leading axis; ``vmap`` over it.
-
-    Args:
-      plans: N of them.
-
-    Returns:
-      :class:`Plan`, ``[N, Q, ...]``.
+    """The `plans` of several tasks, padded to one shape, with a leading axis; ``vmap`` over it.
 
     Raises:
       ValueError: no plan, or plans of different depths or events.
@@ -225,16 +207,10 @@ _FORGETS = 1 / 16  # share of what a choice has been worth that is forgotten in 
 
 @brief
 class Choice(NamedTuple):
-    """What an agent has taken up.
+    """The sequence that an agent follows: automaton `state`, index `sequence`, and recent `worth`.
 
-    Attributes:
-      state: ``int32[]``, of the automaton.
-      sequence: ``int32[]``, which of its sequences.
-      worth: ``float[]``, what that one has been worth of late.
-
-    Example:
-      >>> Choice(jnp.int32(0), jnp.int32(1), jnp.array(0.5)).sequence.item()
-      1
+    >>> Choice(jnp.int32(0), jnp.int32(1), jnp.array(0.5)).sequence.item()
+    1
     """
 
     state: jax.Array
@@ -250,21 +226,20 @@ def sequence_agent(
     squash: str = "clip",
     sampled: bool = True,
 ) -> Agent:
-    """The agent of one formula, of a network that was trained on sequences.
+    """An agent for one formula, of a network that was trained on sequences.
 
-    In each state of the automaton that it comes to, it takes the sequence that the network values
-    most, and does what the network does for that one until the state changes, or until another is
-    worth more than this one has been of late (a mean that forgets in some 16 steps). So a way that
-    turns out to be none is left; and it does not go to and fro, as it might if every step chose
-    anew, between two that are nearly worth the same.
+    At each new automaton state it selects the sequence with the highest value, and follows it until the
+    state changes, or until the value of another exceeds the recent mean of this one's values (with a
+    memory of some 16 steps). So it abandons sequences that turn out infeasible, without alternating
+    between two of nearly equal value.
 
     Args:
       network: ``observation -> (parameters of the action, value)`` of a trained network; a
         ``Partial`` whose arrays are its parameters, such as :func:`trained` makes.
       plan: of the formula; a lane of :func:`stack_plans` under ``vmap``.
-      actions: the environment's, ``environment.actions``; of finitely many it may be left out.
-      squash: how a Gaussian action gets into its box, ``"clip"`` or ``"tanh"``, as in training.
-      sampled: whether actions are drawn; else the most likely one is taken.
+      actions: ``environment.actions``; required for a box.
+      squash: map of a Gaussian action into its box, ``"clip"`` or ``"tanh"``, as in training.
+      sampled: whether actions are sampled; else the most likely one is taken.
 
     Returns:
       An :class:`~jaxltl.core.environments.episodes.Agent` for observations
@@ -272,8 +247,7 @@ def sequence_agent(
       automaton's state.
 
     Raises:
-      ValueError: what is no plan or function, or at the first step Gaussian actions whose box is
-        not given.
+      ValueError: not a plan or a function, or at the first step Gaussian actions without `actions`.
     """
     validation.instance("plan", plan, Plan, "one of make_plan")
     if actions is not None:
@@ -291,30 +265,18 @@ def sequence_agent(
 def sequence_policy(
     network: Callable[..., Any], plan: Plan, observation: Any, memory: chex.Numeric
 ) -> jax.Array:
-    """How likely each action is to an agent that chooses its sequence anew at every step.
+    """The action probabilities ``float[A]`` of an agent that selects its sequence anew at every step.
 
-    By the world's observation and the automaton's state alone, so that
+    Of the world's `observation` and the automaton's state `memory`, ``int32[]``, so that
     ``Partial(sequence_policy, network, plan)`` is a policy for
-    :func:`~jaxltl.core.values.evaluation.optimality_gap.tabulate_policy`.
+    :func:`~jaxltl.core.values.evaluation.optimality_gap.tabulate_policy`. `network` and `plan` are as for
+    :func:`sequence_agent`, for finitely many actions; differentiable in the network's parameters.
 
-    Args:
-      network, plan: as of :func:`sequence_agent`; of finitely many actions.
-      observation: of the world, without the task.
-      memory: ``int32[]``, the automaton's state.
-
-    Returns:
-      ``float[A]``, a distribution; differentiable in the network's parameters.
-
-    Raises:
-      ValueError: what is no plan or function, a memory that is no whole number, or a network of
-        actions in a box.
-
-    Example:
-      >>> plan = make_plan("F a", np.eye(2, 1, -1, bool), ["a"], depth=1, most=1)
-      >>> def network(observation):  # says what it is asked to reach
-      ...     return jnp.log(1.0 + observation.sequence.reach[0]), jnp.array(0.0)
-      >>> jax.eval_shape(lambda x: sequence_policy(network, plan, x, 0), jnp.zeros(1)).shape
-      (2,)
+    >>> plan = make_plan("F a", np.eye(2, 1, -1, bool), ["a"], depth=1, most=1)
+    >>> def network(observation):  # logits of the events to reach
+    ...     return jnp.log(1.0 + observation.sequence.reach[0]), jnp.array(0.0)
+    >>> jax.eval_shape(lambda x: sequence_policy(network, plan, x, 0), jnp.zeros(1)).shape
+    (2,)
     """
     validation.instance("plan", plan, Plan, "one of make_plan")
     if not (isinstance(memory, jax.Array) and jnp.issubdtype(memory.dtype, jnp.integer)):
@@ -329,7 +291,7 @@ def sequence_policy(
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class _Module:
-    """A network's definition, which is no array."""
+    """A network's definition as a static part of a pytree."""
 
     network: nn.Module
 
@@ -337,25 +299,17 @@ class _Module:
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class _How:
-    """How an action is made of what a network says."""
+    """Settings by which an action is sampled."""
 
     squash: str
     sampled: bool
 
 
 def trained(network: nn.Module, parameters: Any, moments: Any = None) -> Partial:
-    """``observation -> (parameters of the action, value)``: a network with its parameters.
+    """A function ``observation -> (parameters of the action, value)``: a network with parameters.
 
-    Args:
-      network: a module without memory.
-      parameters: of it, such as ``state.parameters`` of PPO.
-      moments: by which observations were normalised in training, ``state.moments``; None: not.
-
-    Returns:
-      A function, and a pytree whose arrays are the parameters and moments.
-
-    Raises:
-      ValueError: no module; at the first call parameters that are not this network's.
+    A pytree of the `network` without memory, its `parameters`, such as ``state.parameters`` of PPO, and
+    the `moments` by which observations were normalised in training, ``state.moments``; None: not.
     """
     validation.instance("network", network, nn.Module, "a flax.linen.Module")
     return Partial(_applied, _Module(network), parameters, moments)
@@ -464,22 +418,19 @@ def train_in_stages(
     enough: float | Sequence[float] = 0.9,
     report: Callable[[int, int, Any], None] | None = None,
 ) -> Staged:
-    """A curriculum: a learner on one problem after the other, each once the one before is mastered.
+    """A curriculum: a learner on one problem after the other, each once the previous is mastered.
 
     Args:
       key: of ``init``.
       problems: from easy to hard, of the same shapes, such as PPO's of environments whose samplers
-        draw longer and longer sequences; then no stage compiles anew.
+        draw longer and longer sequences; then no stage recompiles.
       hparams: of the learner.
       init, run: the learner's, ``ppo.init`` and ``ppo.run``.
-      num_chunks: how many times `run` is called.
-      num_steps: steps of the learner each time.
-      enough: the next problem is taken up when the mean return of the episodes that ended in a
-        chunk reaches this; a number, or one for each problem but the last.
+      num_chunks: number of calls of `run`.
+      num_steps: steps of the learner in each.
+      enough: mean return of the episodes that ended in a chunk at which the next problem begins; a
+        number, or one for each problem but the last.
       report: called after each chunk with its number, its stage and its metrics.
-
-    Returns:
-      :class:`Staged`.
 
     Raises:
       ValueError: no problem, or a number of thresholds that does not fit.

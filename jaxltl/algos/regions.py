@@ -177,17 +177,10 @@ def prove_regions(
     high: Corner = None,
     max_boxes: int = 1000,
 ) -> Regions:
-    """A partition of a box by iterated bisection of the largest open box; on the host.
+    """The :class:`Regions` of a box by iterated bisection of the largest open box; on the host.
 
-    The longest side, relative to the whole box, is bisected.
-
-    Args:
-      problem, low, high: as of :func:`enclose`.
-      threshold: of the value, on the side given by ``problem.bound``.
-      max_boxes: number of boxes to examine.
-
-    Returns:
-      :class:`Regions`.
+    The longest side, relative to the whole box, is bisected, until `max_boxes` are examined. `problem`,
+    `low` and `high` are as for :func:`enclose`, and `threshold` is on the side of ``problem.bound``.
 
     Raises:
       ValueError: as :func:`enclose`, the threshold is NaN, or `max_boxes` below 1.
@@ -238,17 +231,11 @@ def _limit(threshold: Any) -> float:
 def prove_around(
     problem: Problem, threshold: float, point: ArrayLike, *, num_halvings: int = 12
 ) -> tuple[Point, Point] | None:
-    """The largest accepted box around a point, by bisection of its size; on the host.
+    """The corners ``float64[D]`` of the largest accepted box around a `point`; on the host.
 
-    All sides are the same share of the problem's box, clipped to it.
-
-    Args:
-      problem, threshold: as of :func:`prove_regions`.
-      point: ``float[D]`` in the problem's box, such as a feasible one.
-      num_halvings: of the share.
-
-    Returns:
-      The corners, ``float64[D]``; None if the smallest examined box is not accepted.
+    By `num_halvings` bisections of its size; None if the smallest examined box is not accepted. All
+    sides are the same share of the problem's box, clipped to it. `problem` and `threshold` are as for
+    :func:`prove_regions`, and `point` is ``float[D]``, such as a feasible one.
 
     Raises:
       ValueError: as :func:`prove_regions`, or the point is not in the box.

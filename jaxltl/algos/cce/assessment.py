@@ -77,16 +77,10 @@ class Result(NamedTuple):
 def assess(
     problem: Problem, parameters: jax.Array, key: chex.PRNGKey, *, num_evaluations: int = 1000
 ) -> Assessment:
-    """A policy evaluated with `num_evaluations` fresh keys, for ``jit`` and ``vmap``.
+    """The :class:`Assessment` of a policy `parameters`, ``float[D]``, on fresh evaluations.
 
-    Args:
-      problem: of the search.
-      parameters: ``float[D]``.
-      key: fresh random key.
-      num_evaluations: at least 2; static.
-
-    Returns:
-      :class:`Assessment`; not differentiable.
+    With `num_evaluations`, at least 2, static, of a `problem` with keys of a fresh `key`; for ``jit``
+    and ``vmap``; not differentiable.
 
     Raises:
       ValueError: fewer than two evaluations, or arguments of another search.
@@ -147,16 +141,10 @@ def result(
     *,
     num_evaluations: int = 1000,
 ) -> Result:
-    """The solution of a search: the mean policy and the best sample on fresh evaluations; on the host.
+    """The :class:`Result` of a search: the mean policy and the best sample on fresh evaluations.
 
-    Args:
-      state: of one run, not of a batch.
-      problem, hparams: of the run.
-      key: fresh random key.
-      num_evaluations: of each policy.
-
-    Returns:
-      :class:`Result`.
+    On the host, of the `state`, `problem` and `hparams` of one run, with `num_evaluations` of each policy by
+    keys of a fresh `key`.
 
     Raises:
       ValueError: the last step had no usable sample, a batch of states, or arguments of another search.

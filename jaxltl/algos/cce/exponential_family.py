@@ -103,14 +103,7 @@ Family = DiagonalGaussian | FullGaussian | Gamma
 
 
 def diagonal_gaussian(mean: chex.Array, std: chex.Array | float) -> DiagonalGaussian:
-    """A :class:`DiagonalGaussian` with a mean and standard deviations.
-
-    Args:
-      mean: ``float[D]``.
-      std: positive, ``float[D]`` or one for all entries.
-
-    Returns:
-      :class:`DiagonalGaussian`.
+    """A :class:`DiagonalGaussian` of a `mean` ``float[D]`` and positive `std`, ``float[D]`` or a number.
 
     Raises:
       ValueError: `mean` is not a vector, `std` does not fit it, or is not positive.
@@ -126,14 +119,7 @@ def diagonal_gaussian(mean: chex.Array, std: chex.Array | float) -> DiagonalGaus
 
 
 def full_gaussian(mean: chex.Array, covariance: chex.Array) -> FullGaussian:
-    """A :class:`FullGaussian` with a mean and a positive definite covariance.
-
-    Args:
-      mean: ``float[D]``.
-      covariance: ``float[D, D]``.
-
-    Returns:
-      :class:`FullGaussian`.
+    """A :class:`FullGaussian` of a `mean` ``float[D]`` and positive definite `covariance`.
 
     Raises:
       ValueError: a wrong shape, or a covariance that is not symmetric and positive definite.
@@ -154,14 +140,7 @@ def full_gaussian(mean: chex.Array, covariance: chex.Array) -> FullGaussian:
 
 
 def gamma(shape: chex.Array, rate: chex.Array | float) -> Gamma:
-    """A :class:`Gamma` with shapes and rates.
-
-    Args:
-      shape: positive, ``float[D]``.
-      rate: positive, ``float[D]`` or one for all entries.
-
-    Returns:
-      :class:`Gamma`.
+    """A :class:`Gamma` of positive `shape` ``float[D]`` and `rate`, ``float[D]`` or a number.
 
     Raises:
       ValueError: a wrong shape, or a number that is not positive.
@@ -283,25 +262,14 @@ def project(family: Any, samples: jax.Array, weights: jax.Array, rate: jax.Array
     """The family with its mean parameter moved to that of weighted samples (dissertation, (4.11)).
 
     ``m(v') = rate * sum_i w_i Gamma(x_i) / sum_i w_i + (1 - rate) * m(v)`` gives the member closest in
-    cross entropy to the mixture of the weighted samples and ``f_v``. Variances are sums of squares.
+    cross entropy to the mixture of the weighted samples ``float[n, D]`` and ``f_v``. Variances are sums
+    of squares. Weights have a positive sum; at rate 0 the family is unchanged, bit for bit except for a
+    full Gaussian. TypeError: the family is not registered.
 
-    Args:
-      family: ``f_v``.
-      samples: ``float[n, D]``.
-      weights: ``float[n]``, not negative, of positive sum.
-      rate: in [0, 1]; at 0 the family is unchanged, bit for bit except for a full Gaussian.
-
-    Returns:
-      ``f_v'``.
-
-    Raises:
-      TypeError: the family is not registered.
-
-    Example:
-      >>> start = diagonal_gaussian([0.0], 1.0)
-      >>> moved = project(start, jnp.array([[1.0], [3.0]]), jnp.array([1.0, 1.0]), 0.5)
-      >>> moved.mean.tolist(), moved.variance.tolist()
-      ([1.0], [2.0])
+    >>> start = diagonal_gaussian([0.0], 1.0)
+    >>> moved = project(start, jnp.array([[1.0], [3.0]]), jnp.array([1.0, 1.0]), 0.5)
+    >>> moved.mean.tolist(), moved.variance.tolist()
+    ([1.0], [2.0])
     """
     raise TypeError(_unknown(family))
 

@@ -55,9 +55,6 @@ def make_problem(
       scale: divisors of violations, a number or ``float[C]``; default ``|limit|``, or 1 where that is
         zero or infinite. Without effect for one cost.
 
-    Returns:
-      :class:`Problem`.
-
     Raises:
       ValueError: evaluate returns other shapes, or a limit or scale is invalid.
 

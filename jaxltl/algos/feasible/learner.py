@@ -359,9 +359,6 @@ def feasible(
       hparams: settings of the search.
       budget: steps, proofs and their tolerance; default :class:`Budget`.
 
-    Returns:
-      :class:`Feasible`.
-
     Raises:
       ValueError: the threshold is not finite, a number is out of range, or a start is outside of
         the box.

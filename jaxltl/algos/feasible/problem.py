@@ -84,9 +84,6 @@ def make_problem(
       objective: ``"max"`` or ``"min"`` over the policies of a decision process: with ``"max"``,
         ``">="`` asks for some policy and ``"<="`` for all policies.
 
-    Returns:
-      :class:`Problem`.
-
     Raises:
       ValueError: an unknown bound, objective, reward or label, a wrong shape, or a reward that is
         infinite at every point because the target is not reached almost surely.

@@ -175,18 +175,10 @@ def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
 def guarantee(state: State, problem: Problem, confidence: float, **options: Any) -> DataGuarantee:
     """The certified satisfaction probability that the counts guarantee, however sampled; on the host.
 
-    It assumes the graph, and nothing else that the learner assumes. Each look has the confidence,
-    and so have all looks at once.
-
-    Args:
-      state: of one run; of vmapped runs, ``jax.tree.map(itemgetter(i), states)``.
-      problem: of the run.
-      confidence: in (0, 1).
-      options: such as `tolerance`, of
-        :func:`~jaxltl.core.values.evaluation.data_guarantee.learn_guarantee`.
-
-    Returns:
-      :class:`~jaxltl.core.values.evaluation.data_guarantee.DataGuarantee`, by anytime intervals.
+    By anytime intervals at a `confidence` in (0, 1), of the `state` and `problem` of one run. It assumes
+    the graph, and nothing else that the learner assumes. Each look has the confidence, and so have all
+    looks at once. `options`, such as `tolerance`, are those of
+    :func:`~jaxltl.core.values.evaluation.data_guarantee.learn_guarantee`.
 
     Raises:
       ValueError: the confidence is out of range, or an argument is of another type.

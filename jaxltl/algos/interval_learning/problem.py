@@ -59,9 +59,6 @@ def make_problem(world: Model, task: Task) -> Problem:
       task: a formula, its text, or an automaton over the letters that occur. To make a probability
         small, negate the formula.
 
-    Returns:
-      :class:`Problem`.
-
     Raises:
       ValueError: the world is a game or no model, or the formula has unknown labels.
 

@@ -84,9 +84,6 @@ def make_problem(
       start: ``float[S]``, distribution of the chains' initial states; default the game's.
       method: ``"generalized"`` or ``"maximin"``.
 
-    Returns:
-      :class:`Problem`.
-
     Raises:
       ValueError: a wrong shape, a reward that is not finite, a mask that allows an unavailable
         action or none in a reachable state, rows or a start that are no distributions, or a game
@@ -122,19 +119,10 @@ def make_problem(
 def with_exact_value(
     problem: Problem, exact: ArrayLike, measured: ArrayLike | None = None
 ) -> Problem:
-    """The `problem` with its known value, against which ``Metrics.error`` is measured.
+    """The `problem` with its known value `exact`, ``float[S]``, for ``Metrics.error``.
 
-    Args:
-      problem: of :func:`make_problem`.
-      exact: ``float[S]``, the minimax value.
-      measured: ``bool[S]``, the states of the error, such as :func:`recurrent_states`; default
-        all with an allowed action (with maximin: of the system).
-
-    Returns:
-      :class:`Problem`.
-
-    Raises:
-      ValueError: a wrong shape.
+    `measured`, ``bool[S]``, are the states of the error, such as :func:`recurrent_states`; default all
+    with an allowed action (with maximin: of the system).
     """
     exact = jnp.asarray(exact, problem.game.dtype)
     if measured is None:

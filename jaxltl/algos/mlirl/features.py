@@ -109,9 +109,6 @@ def task_features(
       progress: automaton states; default :func:`progress_states`.
       best: of :func:`~jaxltl.core.values.undiscounted.satisfaction.optimal_satisfaction`; concrete.
 
-    Returns:
-      :class:`Features`.
-
     Raises:
       ValueError: a state or proposition does not exist, or `progress` is given for a task that is
         not co-safe.

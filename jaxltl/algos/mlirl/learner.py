@@ -240,9 +240,6 @@ def make_problem(
         Demonstrated steps outside of it
         (:func:`~jaxltl.core.models.construct.lifting.allowed_steps`) do not count.
 
-    Returns:
-      :class:`Problem`.
-
     Raises:
       ValueError: features, weights, mask or reward of a wrong shape, features that are not finite,
         an unknown `satisfaction_over`, demonstrations that do not fit the world, or no allowed step.
@@ -288,14 +285,7 @@ def solve(
     """The softmax value and policy (2.3) at `parameters` of the reward of a `problem`.
 
     By ``policy`` and ``adjoint`` of `hparams`; the Boltzmann iteration starts from `initial`,
-    ``float[S]`` (``[S, Q]``).
-
-    Returns:
-      :class:`Solution`, with `policy` ``float[S, A]`` (``[S, Q, A]``); differentiable in the
-      parameters.
-
-    Raises:
-      ValueError: unknown kind of policy or adjoint.
+    ``float[S]`` (``[S, Q]``). Differentiable in the parameters.
     """
     return _solve(problem.reward(parameters, problem.features), problem, hparams, initial)
 
@@ -317,11 +307,9 @@ def objective(
 ) -> tuple[jax.Array, Objective]:
     """``J = -sum log pi(s, a) - mu g(y) + l2 / 2 |theta|^2``: (2.4), (2.6) and the prior.
 
-    For `parameters`, `problem`, `hparams` and `initial` as in :func:`solve`.
-
-    Returns:
-      The loss ``float[]``, and :class:`Objective`. Differentiable in the parameters: exactly, or as
-      in (2.7) with the policy held constant in the Bellman equation.
+    The loss ``float[]`` and :class:`Objective`, for `parameters`, `problem`, `hparams` and `initial` as in
+    :func:`solve`. Differentiable in the parameters: exactly, or as in (2.7) with the policy held
+    constant in the Bellman equation.
 
     Raises:
       ValueError: unknown kind of policy or adjoint, or a satisfaction term without a task.
@@ -433,13 +421,6 @@ init, step, run, train, run_until, train_until = learner.bind(_init, _step, keep
 def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
     """The softmax policy of the reward: ``float[S, A]``, in a product ``[S, Q, A]``.
 
-    :func:`solve` gives certified bounds of its value.
-
-    Args:
-      state: of one run; ``vmap`` over several.
-      problem, hparams: of the run.
-
-    Returns:
-      ``float[S, A]``, in a product ``[S, Q, A]``; zero at actions that are not available.
+    Zero at unavailable actions; :func:`solve` gives certified bounds of its value.
     """
     return solve(state.parameters, problem, hparams, state.value).policy

@@ -81,14 +81,10 @@ class Evidence:
 def evidence(
     state: State, problem: Problem, hparams: Hparams, *, confidence: float | None = None
 ) -> Evidence:
-    """The certified value of a learned strategy in the true game; on the host.
+    """The :class:`Evidence` of a learned strategy in the true game; on the host.
 
-    Args:
-      state, problem, hparams: of one run; of vmapped runs, ``jax.tree.map(itemgetter(i), states)``.
-      confidence: in (0, 1), of ``Evidence.data``; None leaves it out.
-
-    Returns:
-      :class:`Evidence`.
+    Of the `state`, `problem` and `hparams` of one run; `confidence`, in (0, 1), of ``Evidence.data``, or
+    None without it.
 
     Raises:
       ValueError: a reward outside of [0, R_max] was observed, which voids every guarantee.
@@ -151,19 +147,12 @@ def data_evidence(
     confidence: float,
     method: Method = "anytime",
 ) -> DataEvidence:
-    """The discounted values that transition counts guarantee, for a strategy and the optimum.
+    """The :class:`DataEvidence` of transition counts, for a strategy and the optimum.
 
-    The graph and the rewards of transitions are assumed to be known, the probabilities are not.
-
-    Args:
-      problem: of which the probabilities are not read.
-      counts: ``int[S, A, K]``.
-      strategy: ``float[S, A]``, of the system.
-      discount: in ``[0, 1)``.
-      confidence, method: of :func:`~jaxltl.core.statistics.confidence_sets.intervals_from_counts`.
-
-    Returns:
-      :class:`DataEvidence`.
+    Discounted values that `counts`, ``int[S, A, K]``, guarantee, if the graph and the rewards of
+    transitions are known; the probabilities in `problem` are not read. The `strategy` of the system is
+    ``float[S, A]``, and `discount` in ``[0, 1)``. `confidence` and `method` are those of
+    :func:`~jaxltl.core.statistics.confidence_sets.intervals_from_counts`.
     """
     region, mdp = np.asarray(problem.region), problem.game.mdp
     state = np.flatnonzero(region)

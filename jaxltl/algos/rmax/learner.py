@@ -170,16 +170,10 @@ def observe(
 ) -> State:
     """The next state of the learner after a transition of an external world; on the host.
 
-    The system's actions are to be drawn from ``policy(state, problem, hparams)[state.position]``.
-    To restart, set the position first: ``state.replace(position=jnp.int32(s))``.
-
-    Args:
-      state, problem, hparams: of a learner.
-      action, successor: the action at ``state.position``, and the next state of ``problem.game``.
-      reward: of the transition.
-
-    Returns:
-      The next :class:`State`.
+    Of its `state`, `problem` and `hparams`: the `action` at ``state.position``, the `successor` in
+    ``problem.game``, and the `reward`. The system's actions are to be drawn from
+    ``policy(state, problem, hparams)[state.position]``. To restart, set the position first:
+    ``state.replace(position=jnp.int32(s))``.
 
     Raises:
       ValueError: the action is not allowed, the successor is not in the graph, or the reward lies

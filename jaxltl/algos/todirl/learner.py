@@ -123,11 +123,8 @@ def solve(
 ) -> Solution:
     """The soft values and policies of `parameters` in all worlds of a `problem`.
 
-    By `hparams`, with initial values `initial`, ``float[W, S, Q]``.
-
-    Returns:
-      :class:`~jaxltl.core.types.Solution`, `value` ``float[W, S, Q]`` and `policy`
-      ``float[W, S, Q, A]``, with a horizon ``[W, T, ...]``; differentiable in the parameters.
+    ``float[W, S, Q]`` and ``float[W, S, Q, A]``, with a horizon ``[W, T, ...]``, by `hparams`, with
+    initial values `initial`; differentiable in the parameters.
     """
 
     def world(model: Product, observation: jax.Array, initial: jax.Array) -> Solution:
@@ -179,13 +176,11 @@ def objective(
 ) -> tuple[jax.Array, Objective]:
     """``-sum log pi(a | s, q) + l2 / 2 |theta|^2``: minus (3.2), over all pairs of all worlds.
 
-    For `parameters`, `problem`, `hparams` and `initial` as in :func:`solve`; with ``hparams.mu``
-    minus mu times the satisfaction probability in each world, as in (2.6). The gradient costs one
-    linear solve with the transposed transition matrix of the policy (implicit function theorem),
-    instead of one system (3.6) for each parameter.
-
-    Returns:
-      The loss ``float[]``, in nats, and :class:`Objective`; differentiable in the parameters.
+    The loss ``float[]``, in nats, and :class:`Objective`, for `parameters`, `problem`, `hparams` and
+    `initial` as in :func:`solve`; with ``hparams.mu`` minus mu times the satisfaction probability in
+    each world, as in (2.6). Differentiable in the parameters: the gradient costs one linear solve with
+    the transposed transition matrix of the policy (implicit function theorem), instead of one system
+    (3.6) for each parameter.
 
     Raises:
       ValueError: the problem does not count pairs by time up to ``hparams.horizon``, or `mu` is
@@ -395,15 +390,8 @@ init, step, run, train, run_until, train_until = learner.bind(_init, _step)
 
 
 def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
-    """The soft policy of the best reward so far: ``float[W, S, Q, A]``.
+    """The soft policy of the best reward so far: ``float[W, S, Q, A]``, with a horizon ``[W, T, ...]``.
 
-    With a horizon ``[W, T, S, Q, A]``; :func:`plan` finds it in other worlds.
-
-    Args:
-      state: of one run; ``vmap`` over several.
-      problem, hparams: of the run.
-
-    Returns:
-      ``float[W, S, Q, A]``, or with a horizon ``[W, T, S, Q, A]``.
+    :func:`plan` computes it in other worlds.
     """
     return solve(state.best.parameters, problem, hparams).policy
