@@ -411,7 +411,7 @@ def summary(outcome: Outcome) -> Record:
 def _expected_steps(setup: Setup, learned: np.ndarray) -> Record | None:
     """Expected steps until a co-safe formula is decided: learned and quickest optimal policy."""
     model, best = setup.model, setup.guarantee.best
-    if model.automaton.acceptance != "cosafe":
+    if not model.automaton.is_cosafe:
         return None
     ended = np.asarray(model.final) | (np.asarray(best.upper) <= 0)
     policies = {"learned": learned, "quickest": best.policy}

@@ -222,9 +222,9 @@ def _merit(setup: Setup, found: Evaluation) -> tuple[float, float, float]:
     """Lexicographic criterion of seeds: verdicts, then accepting visits or length."""
     success, violation, visits = found.success, found.violation, found.visits
     assert success is not None and violation is not None and visits is not None
-    if setup.automaton.acceptance == "safety":  # an undecided episode does not violate it
+    if setup.automaton.is_safety:  # an undecided episode does not violate it
         return -violation.mean, success.mean, 0.0
-    if setup.automaton.acceptance == "cosafe":
+    if setup.automaton.is_cosafe:
         return success.mean, -violation.mean, -found.length.mean
     return success.mean - violation.mean, visits.mean, 0.0
 

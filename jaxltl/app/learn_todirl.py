@@ -101,7 +101,7 @@ def prepare(task: TodirlTask, seed: int) -> Setup:
     scenes, others = load_scenes(task, judge)
     found = load_demonstrations(task, scenes) if shown.files is not None else []
     worlds = _stack(task, [*scenes, *others], judge, memory)
-    soft = judge.acceptance == "cosafe" and (shown.discount is not None or bool(found))
+    soft = judge.is_cosafe and (shown.discount is not None or bool(found))
     expert, bests = _experts(task, worlds.scenes, judge, soft=soft)
     dropped = 0
     if not found:
@@ -424,7 +424,7 @@ def _within(model: Product, policy: jax.Array) -> Performance:
     For a safety formula, the probability of no violation within T steps.
     """
     done = model.final.astype(model.dtype)
-    kept = jnp.minimum if model.automaton.acceptance == "safety" else jnp.maximum
+    kept = jnp.minimum if model.automaton.is_safety else jnp.maximum
 
     def backup(value: jax.Array, policy: jax.Array) -> tuple[jax.Array, None]:
         return kept(done, action_mean(policy, expectation(model, value))), None

@@ -276,7 +276,7 @@ def _on_kinds(task: Task, kinds: Kinds) -> tuple[Automaton, NDArray[np.int32]]:
 
 def _is_feasible(family: _Family, kind: NDArray[np.int32]) -> bool:
     flat, task = kind.ravel(), family.automaton
-    if task.acceptance != "cosafe":
+    if not task.is_cosafe:
         label = flat[:, None] == np.arange(len(family.kinds))
         world = replace(
             family.blank,

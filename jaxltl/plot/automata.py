@@ -70,7 +70,7 @@ def automaton(
     for label in graph.labels:
         draw_label(axes, label, MUTED if doomed[label.key[1]] else INK)
     draw_start(axes, graph.position[int(table.initial)])
-    final = table.final if table.acceptance in ("cosafe", "safety") else doomed & False
+    final = table.final if table.has_final_states else doomed & False
     for q, center in enumerate(graph.position):
         draw_state(axes, center, str(q), bool(final[q]), bool(doomed[q]))
     return figure
@@ -155,9 +155,9 @@ def edge_texts(table: Automaton, doomed: NDArray[np.bool_]) -> dict[drawing.Key,
     curves: dict[drawing.Key, drawing.Rows] = {}
     for (source, target, number), text in texts.items():
         mark, curve = "", 0
-        if table.acceptance == "buchi":
+        if table.is_buchi:
             mark, curve = ("●", 0) if number == 0 else ("", 1)
-        elif table.acceptance == "parity" and not doomed[target]:
+        elif table.is_parity and not doomed[target]:
             mark = str(number)
         key = (source, target, curve)
         curves[key] = (*curves.get(key, ()), (mark, text))
@@ -189,7 +189,7 @@ def _edge_color(table: Automaton, key: drawing.Key, doomed: NDArray[np.bool_]) -
         return FAINT
     if doomed[target]:
         return MUTED
-    return ACCENT if table.acceptance == "buchi" and curve == 0 else INK
+    return ACCENT if table.is_buchi and curve == 0 else INK
 
 
 def draw_label(axes: Axes, label: drawing.Label, color: str) -> None:

@@ -64,7 +64,7 @@ def live_automaton(automaton: Automaton, name: str) -> str:
     for edge in graph.edges:
         source, target, _ = edge.key
         kind = "edge doomed" if doomed[target] else "edge"
-        if table.acceptance == "buchi" and edge.key[2] == 0:
+        if table.is_buchi and edge.key[2] == 0:
             kind += " accepting"
         text = ""
         if edge.key in labels:
@@ -74,7 +74,7 @@ def live_automaton(automaton: Automaton, name: str) -> str:
             f'<g class="{kind}" data-from="{source}" data-to="{target}">'
             f"{_arrow(at(edge.curve))}{text}</g>"
         )
-    final = table.final if table.acceptance in ("cosafe", "safety") else doomed & False
+    final = table.final if table.has_final_states else doomed & False
     names = table.state_names or ("",) * len(table.delta)
     radius = layout.RADIUS * _INCH
     start = at(graph.position[int(table.initial)])

@@ -113,11 +113,11 @@ def task_features(
       ValueError: a state or proposition does not exist, or `progress` is given for a task that is
         not co-safe.
     """
-    kind = model.automaton.acceptance
-    if progress is not None and kind != "cosafe":
+    task = model.automaton
+    if progress is not None and not task.is_cosafe:
         raise ValueError("progress belongs to co-safe tasks, which have final states.")
     chosen: tuple[int, ...] = ()
-    if kind == "cosafe":
+    if task.is_cosafe:
         chosen = progress_states(model) if progress is None else tuple(progress)
     for q in chosen:
         if not 0 <= q < model.num_memory:
@@ -126,14 +126,14 @@ def task_features(
             )
     _require_known(model.mdp, avoid, "avoid")
     nearer, remark = None, None
-    if best is not None and kind != "safety":
+    if best is not None and not task.is_safety:
         nearer = _nearer(model, best)
         remark = _TOO_LONG if nearer is None else None
     counts = pair_counts(model, lift_trajectories(model, demonstrations))
     values = _task_values(model, counts, nearer, avoid=tuple(avoid), progress=chosen)
-    main = {"cosafe": ("goal", "progress"), "safety": ()}.get(kind, ("accepting",))
+    main = {"cosafe": ("goal", "progress"), "safety": ()}.get(task.acceptance, ("accepting",))
     names = ("demonstrated", *main, *(("avoid",) if avoid else ()))
-    names += (("time",) if kind == "cosafe" else ()) + (("nearer",) if nearer is not None else ())
+    names += (("time",) if task.is_cosafe else ()) + (("nearer",) if nearer is not None else ())
     return Features(values=values, names=names, remark=remark)
 
 
@@ -183,24 +183,24 @@ def _task_values(
     avoid: tuple[str, ...],
     progress: tuple[int, ...],
 ) -> jax.Array:
-    kind, num_memory = model.automaton.acceptance, model.num_memory
+    task, num_memory = model.automaton, model.num_memory
     columns = [(counts > 0).astype(model.dtype)]
-    done = model.final if kind == "cosafe" else jnp.zeros(model.state_shape, bool)
+    done = model.final if task.is_cosafe else jnp.zeros(model.state_shape, bool)
     regions = [_labelled(model.mdp, avoid)[:, None]] if avoid else []
-    if kind == "cosafe":
+    if task.is_cosafe:
         target, every = np.isin(np.arange(num_memory), progress), np.arange(num_memory)
         regions += [model.final, *(target & (every != q) for q in every)]
     entered = _chances(model, regions)
-    if kind == "cosafe":
+    if task.is_cosafe:
         goal, *entering = entered[-1 - num_memory :]
         columns += [goal, jnp.stack([x[:, q] for q, x in enumerate(entering)], axis=1)]
-    elif kind != "safety":
+    elif not task.is_safety:
         priority = jnp.asarray(model.automaton.priority)
         even = jnp.where(priority % 2 == 0, priority, jnp.iinfo(priority.dtype).max)
         columns.append(read_probability(model, priority == jnp.min(even)))
     if avoid:
         columns.append(-entered[0])
-    if kind == "cosafe":
+    if task.is_cosafe:
         columns.append(-jnp.ones_like(columns[0]))
     if nearer is not None:
         columns.append(nearer)

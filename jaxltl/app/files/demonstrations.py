@@ -175,7 +175,7 @@ def synthetic_demonstrations(
             f"take about {size / 1e9:.3g} GB; ask for fewer or shorter ones, at most "
             f"{_LARGEST_BYTES / 1e9:g} GB."
         )
-    ends = model.automaton.acceptance == "cosafe"
+    ends = model.automaton.is_cosafe
     stop = model.final if ends else jax.numpy.asarray(np.asarray(best.upper) <= 0)
     # One more step than the length separates arrival at the last step from no arrival.
     runs = rollout(
@@ -215,7 +215,7 @@ def _demonstrator(path: Path, table: SyntheticTable, model: Product, best: Solut
 
 def require_cosafe(path: Path, table: SyntheticTable, automaton: Automaton) -> None:
     """Raises ValueError for a discount of the demonstrator if the formula is not co-safe."""
-    if table.discount is not None and automaton.acceptance != "cosafe":
+    if table.discount is not None and not automaton.is_cosafe:
         raise ValueError(
             f"{path}: [demonstrations] discount is that of the reward for satisfying the formula, "
             "which takes a co-safe formula; leave it out for rollouts of the quickest optimal policy."

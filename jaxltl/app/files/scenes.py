@@ -214,7 +214,7 @@ def load_automata(task: TodirlTask) -> tuple[Automaton, Automaton]:
     """
     alphabet = _alphabet(task)
     judge = _translate(task, "[task] formula", task.formula, alphabet)
-    if task.learner.horizon is not None and judge.acceptance not in ("cosafe", "safety"):
+    if task.learner.horizon is not None and not judge.has_final_states:
         raise ValueError(
             f"{task.path}: [learner] horizon = {task.learner.horizon} ends an episode after so "
             "many steps, which satisfy co-safe formulas and violate safety formulas only (the "

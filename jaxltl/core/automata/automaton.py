@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,7 +15,21 @@ from numpy.typing import ArrayLike, NDArray
 from jaxltl.core.logic.ltl import Letter, as_letters
 from jaxltl.core.pretty_print import brief, truncate, batch_text, propositions_text, readable
 
-ACCEPTANCES = ("cosafe", "safety", "buchi", "parity")
+
+class Condition(NamedTuple):
+    """An acceptance condition: the table that determines it, and the condition of complements."""
+
+    table: Literal["final", "accepting", "priority"]
+    complement: str | None = None  # None: that of the priorities of the complement
+
+
+CONDITIONS = {
+    "cosafe": Condition("final", "safety"),
+    "safety": Condition("final", "cosafe"),
+    "buchi": Condition("accepting"),
+    "parity": Condition("priority"),
+}
+ACCEPTANCES = tuple(CONDITIONS)
 
 
 def _facts(automaton: Any) -> Iterator[str]:
@@ -71,13 +85,38 @@ class Automaton:
     state_names: tuple[str, ...] = ()
 
     @property
+    def has_final_states(self) -> bool:
+        """True if finite prefixes decide acceptance: co-safe and safety automata."""
+        return CONDITIONS[self.acceptance].table == "final"
+
+    @property
+    def is_cosafe(self) -> bool:
+        """True if words are accepted by reaching a final state."""
+        return self.acceptance == "cosafe"
+
+    @property
+    def is_safety(self) -> bool:
+        """True if words are accepted by never leaving the final states."""
+        return self.acceptance == "safety"
+
+    @property
+    def is_buchi(self) -> bool:
+        """True if words are accepted by taking accepting transitions infinitely often."""
+        return self.acceptance == "buchi"
+
+    @property
+    def is_parity(self) -> bool:
+        """True if the parity of the least priority taken infinitely often decides acceptance."""
+        return self.acceptance == "parity"
+
+    @property
     def final(self) -> NDArray[np.bool_]:
         """bool `[Q]`, the final states of a co-safe or safety automaton.
 
         Raises:
           ValueError: for Buchi and parity acceptance, which is on transitions.
         """
-        if self.acceptance not in ("cosafe", "safety"):
+        if not self.has_final_states:
             raise ValueError(
                 f"final: an automaton with {self.acceptance} acceptance has no final states. "
                 "Read its priority[Q, L], or accepting[Q, L]."
@@ -172,14 +211,14 @@ def _priorities(
     """The acceptance and its priorities `[Q, L]`, from the one table that is given."""
     given = {"final": final, "accepting": accepting, "priority": priority}
     (name, *more) = [key for key, table in given.items() if table is not None] or [""]
-    kinds = {"final": ("cosafe", "safety"), "accepting": ("buchi",), "priority": ("parity",)}
     if not name or more:
         raise ValueError("make_automaton: give exactly one of final, accepting and priority.")
-    kind = kinds[name][0] if acceptance is None and name != "final" else acceptance
-    if kind not in kinds[name]:
+    kinds = [kind for kind, condition in CONDITIONS.items() if condition.table == name]
+    kind = kinds[0] if acceptance is None and name != "final" else acceptance
+    if kind not in kinds:
         raise ValueError(
             f"make_automaton: acceptance = {acceptance!r} with {name}. "
-            f"Pass one of {', '.join(kinds[name])}."
+            f"Pass one of {', '.join(kinds)}."
         )
     if name == "priority":
         table = np.asarray(priority)
@@ -348,19 +387,16 @@ def complement(automaton: Automaton) -> Automaton:
       ('!(F a)', 'false')
     """
     constants = {"true": "false", "false": "true"}
-    kind = automaton.acceptance
     priority = automaton.priority + 1
-    if kind in ("cosafe", "safety"):
+    if automaton.has_final_states:
         priority = 1 - automaton.priority
     elif automaton.priority.min() > 0:
         priority = automaton.priority - 1
-    only_two = priority.max() <= 1
+    derived = "buchi" if priority.max() <= 1 else "parity"
     return replace(
         automaton,
         priority=priority,
-        acceptance={"cosafe": "safety", "safety": "cosafe"}.get(
-            kind, "buchi" if only_two else "parity"
-        ),
+        acceptance=CONDITIONS[automaton.acceptance].complement or derived,
         state_names=tuple(constants.get(name, f"!({name})") for name in automaton.state_names),
     )
 

@@ -47,7 +47,7 @@ def synchronize(memory: Task, task: Task, *, alphabet: Iterable[Letter] | None =
     initial = int(first.initial) * num2 + int(second.initial)
     titles = [x.state_names or tuple(map(str, range(len(x.delta)))) for x in (first, second)]
     state_names = [f"{a} | {b}" for a in titles[0] for b in titles[1]]
-    if second.acceptance in ("cosafe", "safety"):
+    if second.has_final_states:
         final = np.tile(np.asarray(second.final), num1)
         return make_automaton(
             delta,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxltl.core.automata.automaton import Automaton, extent_text, make_automaton
+from jaxltl.core.automata.automaton import CONDITIONS, Automaton, extent_text, make_automaton
 from jaxltl.core.logic.diagram import FALSE, TRUE, Cube, Diagrams, prime_cubes
 from jaxltl.core.logic.ltl import proposition_text
 
@@ -158,16 +158,16 @@ def to_text(automaton: Automaton) -> str:
 
 def _final_states(automaton: Automaton) -> NDArray[np.bool_]:
     """bool `[Q]`, none where acceptance is on transitions."""
-    if automaton.acceptance in ("cosafe", "safety"):
+    if automaton.has_final_states:
         return np.asarray(automaton.final)
     return np.zeros(len(automaton.delta), bool)
 
 
 def _mark(automaton: Automaton, priority: int, accepting: str) -> str:
     """Acceptance marks of a transition, for acceptance on transitions."""
-    if automaton.acceptance == "parity":
+    if automaton.is_parity:
         return f" {{{priority}}}"
-    return accepting if automaton.acceptance == "buchi" and priority == 0 else ""
+    return accepting if automaton.is_buchi and priority == 0 else ""
 
 
 def to_dot(automaton: Automaton) -> str:
@@ -194,7 +194,7 @@ def to_dot(automaton: Automaton) -> str:
         lines.append(f"{q} [shape={shape}, label={_dot_string(label)}];")
     for (q, successor, priority), text in edge_guards(automaton).items():
         label = _dot_string(text + _mark(automaton, priority, " ●"))
-        bold = automaton.acceptance == "buchi" and priority == 0
+        bold = automaton.is_buchi and priority == 0
         style = ', style=bold, color="#1f6f8b"' if bold else ""
         lines.append(f"{q} -> {successor} [label={label}{style}];")
     return "\n".join(["digraph automaton {", *(f"  {line}" for line in lines), "}"])
@@ -212,7 +212,7 @@ def to_dict(automaton: Automaton) -> dict[str, Any]:
       >>> to_dict(to_automaton("F a"))["delta"]
       [[0, 1], [1, 1]]
     """
-    table = {"buchi": "accepting", "parity": "priority"}.get(automaton.acceptance, "final")
+    table = CONDITIONS[automaton.acceptance].table
     return {
         "delta": automaton.delta.tolist(),
         "initial": int(automaton.initial),
@@ -235,7 +235,7 @@ def from_dict(tables: Mapping[str, Any]) -> Automaton:
       >>> from_dict(to_dict(to_automaton("F a"))).acceptance
       'cosafe'
     """
-    table = {"buchi": "accepting", "parity": "priority"}.get(tables.get("acceptance", ""), "final")
+    table = CONDITIONS.get(tables.get("acceptance", ""), CONDITIONS["cosafe"]).table
     fields = set(Automaton.__dataclass_fields__) - {"priority"} | {table}
     if set(tables) != fields:
         wrong = ", ".join(sorted(map(str, set(tables) ^ fields)))

@@ -347,11 +347,10 @@ def _lasso_text(lasso: tuple[list[frozenset[str]], list[frozenset[str]]]) -> str
 
 def _with_acceptance(formula: Formula, automaton: Automaton, acceptance: Acceptance) -> Automaton:
     """The automaton with the requested acceptance, if the language has one."""
-    kind = automaton.acceptance
     if acceptance == "auto":
         return automaton
     if acceptance == "dfa":
-        if kind in ("cosafe", "safety"):
+        if automaton.has_final_states:
             return automaton
         raise ValueError(
             f"to_automaton: {formula} has no finite acceptance, because neither a finite prefix "
@@ -360,7 +359,7 @@ def _with_acceptance(formula: Formula, automaton: Automaton, acceptance: Accepta
             '  Ask for acceptance="auto", or bound the formula by an event.'
         )
     if acceptance == "buchi":
-        if kind == "parity":
+        if automaton.is_parity:
             raise ValueError(
                 f"to_automaton: {formula} has no deterministic Buchi automaton: some word is "
                 "accepted because certain letters stop occurring, which a deterministic run "

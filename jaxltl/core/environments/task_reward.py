@@ -158,7 +158,7 @@ def _require_fit(automaton: Automaton, name: str) -> None:
 
 def _ranks(automaton: Automaton) -> np.ndarray:
     """``int[Q, L]``: the priorities, with adjacent ones of one parity merged."""
-    if automaton.acceptance in ("cosafe", "safety"):  # known as soon as the state is entered
+    if automaton.has_final_states:  # known as soon as the state is entered
         return (~automaton.final[np.asarray(automaton.delta)]).astype(int)
     values, place = np.unique(automaton.priority, return_inverse=True)
     rank = np.cumsum(np.diff(values % 2, prepend=0) != 0)

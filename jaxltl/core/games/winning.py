@@ -182,9 +182,9 @@ def task_game(game: Game, spec: Automaton | Formula | str) -> tuple[Game, Parity
     joint = product(game, spec, label_on="exit")
     automaton, letter = joint.mdp.automaton, joint.mdp.letter
     none = to_jax(np.zeros(joint.state_shape, bool))
-    if automaton.acceptance in ("cosafe", "safety"):
+    if automaton.has_final_states:
         xp, final = namespace(joint.mdp.final)
-        cosafe = automaton.acceptance == "cosafe"
+        cosafe = automaton.is_cosafe
         return joint, Parity(
             priority=to_jax(np.full(joint.state_shape, int(cosafe), np.int32)),
             won=to_jax(final) if cosafe else none,

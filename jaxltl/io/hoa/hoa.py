@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core.array_types import Integers
-from jaxltl.core.automata.automaton import Automaton, make_automaton
+from jaxltl.core.automata.automaton import CONDITIONS, Automaton, make_automaton
 from jaxltl.core.automata.emerson_lei import to_parity
 from jaxltl.core.automata.text import prime_cover
 from jaxltl.core.logic.diagram import Cube
@@ -131,7 +131,7 @@ def write_hoa(automaton: Automaton, name: str = "") -> str:
         lines.append(f"name: {quoted(name)}")
     lines += [f"States: {len(automaton.delta)}", f"Start: {int(automaton.initial)}"]
     lines.append(" ".join([f"AP: {len(names)}", *map(quoted, names)]))
-    if automaton.acceptance == "parity":
+    if automaton.is_parity:
         count = int(automaton.priority.max()) + 1
         lines += [f"acc-name: parity min even {count}", f"Acceptance: {count} {parity_text(count)}"]
     else:
@@ -149,15 +149,15 @@ def _is_full(automaton: Automaton) -> bool:
 
 def _properties(automaton: Automaton) -> list[str]:
     """HOA properties; `terminal`, `cosafe` and `weak` determine the acceptance on reading."""
-    full, kind = _is_full(automaton), automaton.acceptance
+    full = _is_full(automaton)
     words = ["trans-labels", "explicit-labels"]
-    words.append("state-acc" if kind in ("cosafe", "safety") else "trans-acc")
+    words.append("state-acc" if automaton.has_final_states else "trans-acc")
     words += ["complete", "deterministic"] if full else ["deterministic"]
-    if kind == "parity":
+    if automaton.is_parity:
         words.append("colored")
-    if kind in ("cosafe", "safety"):
+    if automaton.has_final_states:
         words.append("weak")
-    if kind == "cosafe":  # a terminal automaton is complete where it accepts
+    if automaton.is_cosafe:  # a terminal automaton is complete where it accepts
         words.append("terminal" if full else "cosafe")
     return words
 
@@ -179,7 +179,7 @@ def parity_text(count: int, style: str = "min") -> str:
 
 def _written_state(automaton: Automaton, q: int) -> Iterator[str]:
     """Lines of state q and its edges."""
-    on_state = automaton.acceptance in ("cosafe", "safety")
+    on_state = automaton.has_final_states
     priorities = automaton.priority[q]
     head = f"State: {q}"
     if automaton.state_names:
@@ -191,7 +191,7 @@ def _written_state(automaton: Automaton, q: int) -> Iterator[str]:
         label = " | ".join(
             "&".join(f"{p}" if value else f"!{p}" for p, value in cube) for cube in chosen
         )
-        marked = not on_state and (automaton.acceptance == "parity" or priority == 0)
+        marked = not on_state and (automaton.is_parity or priority == 0)
         yield f"[{label or 't'}] {successor}" + (f" {{{priority}}}" if marked else "")
 
 
@@ -253,15 +253,15 @@ def _automaton(
     # The added sink rejects, even if the condition accepts runs without marks.
     priority[base == (-1 if table.sink is None else table.sink)] = 1
     kind = acceptance_of(header, delta, priority)
-    is_final = kind in ("cosafe", "safety")
+    marks = CONDITIONS[kind].table
     return make_automaton(
         delta,
         initial,
         alphabet,
         names,
         state_names=[table.names[q] for q in base] if table.names else (),
-        final=priority[:, 0] == 0 if is_final else None,
-        acceptance=kind if is_final else None,
-        accepting=priority == 0 if kind == "buchi" else None,
-        priority=priority if kind == "parity" else None,
+        final=priority[:, 0] == 0 if marks == "final" else None,
+        acceptance=kind if marks == "final" else None,
+        accepting=priority == 0 if marks == "accepting" else None,
+        priority=priority if marks == "priority" else None,
     )

@@ -67,12 +67,12 @@ def robust_satisfaction(
         sparse_product(numbered, delta, letter, states, initial, on_entry=False, still=yes | no),
     )
     priority = None
-    if automaton.acceptance in ("buchi", "parity"):
+    if not automaton.has_final_states:
         source = product.memory, letter[product.base_state]
         priority = np.asarray(automaton.priority)[source]
     moves = None if system is None else system[product.base_state]
     q = product.memory
-    verdicts = _Verdicts(yes[q], no[q], priority, automaton.acceptance == "safety")
+    verdicts = _Verdicts(yes[q], no[q], priority, automaton.is_safety)
     found = _solved(host_sides(host, moves, objective, nature), host, verdicts, asked)
     row = product.base_row[found.row].astype(np.int32)
     solution = _solution(found, asked, product.start.shape, product.start, row)
@@ -136,7 +136,7 @@ def robust_product_satisfaction(
     )
     pair: Integers = np.arange(product.memory.size)
     level = None
-    if task.acceptance in ("buchi", "parity"):
+    if not task.has_final_states:
         level = priority[product.memory, letter[product.base_state]]
         if on_entry:
             mdp = host.mdp
@@ -148,7 +148,7 @@ def robust_product_satisfaction(
     if policy is not None:
         sides = _fixed(model, product, host, np.asarray(policy), sides.helpful)
     q = product.memory[pair]
-    verdicts = _Verdicts(yes[q], no[q], level, task.acceptance == "safety")
+    verdicts = _Verdicts(yes[q], no[q], level, task.is_safety)
     found = _solved(sides, host, verdicts, asked)
     if policy is not None:
         solution = _solution(found, asked, shape, product.start, np.asarray(policy))

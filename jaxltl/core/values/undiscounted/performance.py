@@ -127,7 +127,7 @@ def task_performance(
 def _task_performance(model: Product, policy: jax.Array, tolerance, *, method: str) -> Performance:
     policy, _, valid, representable = valid_policy(model, policy)
     valid &= representable
-    simple = model.automaton.acceptance in ("cosafe", "safety")
+    simple = model.automaton.has_final_states
     if method == "blocks" and not simple:
         raise ValueError(
             f'method="blocks" is for co-safe and safety tasks, not {model.automaton.acceptance}; '
@@ -135,7 +135,7 @@ def _task_performance(model: Product, policy: jax.Array, tolerance, *, method: s
         )
     few = model.mdp.num_states <= _BLOCK_LIMIT
     if method == "blocks" or (method == "auto" and simple and few):
-        safety = model.automaton.acceptance == "safety"
+        safety = model.automaton.is_safety
         target = ~model.final if safety else model.final
         value, error = _reach(model, target, policy)
         value = 1 - value if safety else value
@@ -309,7 +309,7 @@ def task_performances(
     if policies.shape == shape[1:]:
         policies = jnp.broadcast_to(policies, shape)
     require_shape("policies", policies, shape)
-    if models.automaton.acceptance in ("cosafe", "safety"):
+    if models.automaton.has_final_states:
         found = _batched(models, policies, tolerance, batch=batch)
     else:
         found = _one_by_one(models, policies, tolerance)
@@ -364,9 +364,8 @@ def _together(models: Product, policies: jax.Array, tolerance) -> Performance:
 def _by_elimination(model: Product, policy: jax.Array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Satisfaction probabilities and their bounds, ``float64[S, Q]``, by GTH elimination."""
     # Weights stay sums of products of weights, so that their relative errors are small.
-    kind = model.automaton.acceptance
-    safety = kind == "safety"
-    if kind in ("cosafe", "safety"):
+    safety = model.automaton.is_safety
+    if model.automaton.has_final_states:
         target = np.asarray(~model.final if safety else model.final).ravel()
     else:
         target = np.asarray(accepting_bottom_components(model, policy)).ravel()

@@ -101,9 +101,9 @@ def satisfaction_probability(
     refuse_nature(nature)
     if is_sparse(model):
         return product_satisfaction(model, policy=policy, tolerance=tolerance)
-    kind = model.automaton.acceptance
-    if kind in ("cosafe", "safety"):
-        target = model.final if kind == "cosafe" else _not_final(model)
+    task = model.automaton
+    if task.has_final_states:
+        target = model.final if task.is_cosafe else _not_final(model)
     else:
         require_policy(model, policy)
         support = policy
@@ -113,7 +113,7 @@ def satisfaction_probability(
     reach = reachability_probability(
         model, target, policy=policy, method=method, tolerance=tolerance
     )
-    return complement_event(reach) if kind == "safety" else reach
+    return complement_event(reach) if task.is_safety else reach
 
 
 @overload
@@ -301,10 +301,10 @@ def as_reachability(model: Product, objective: str) -> Reaching:
     """The reachability problem whose optimum is the optimal satisfaction probability."""
     if objective not in ("max", "min"):
         raise ValueError(f'objective={objective!r}; it must be "max" or "min".')
-    kind = model.automaton.acceptance
-    if kind == "cosafe":
+    task = model.automaton
+    if task.is_cosafe:
         return Reaching(model, model.final, objective, False)
-    if kind == "safety":
+    if task.is_safety:
         return Reaching(model, _not_final(model), "min" if objective == "max" else "max", True)
     if objective == "min":
         model = replace(model, automaton=_shifted(model.automaton))

@@ -135,12 +135,10 @@ def _best(
 ) -> tuple[Solution, np.ndarray]:
     """The optimal probability from all states of a product, and the rows that attain it."""
     automaton = reader.automaton
-    opposite = automaton.acceptance == "safety" or (
-        automaton.acceptance in ("buchi", "parity") and objective == "min"
-    )
+    opposite = automaton.is_safety or (not automaton.has_final_states and objective == "min")
     goal: Any = (reader.rejecting if opposite else reader.accepting)[product.memory]
     visiting = None
-    if automaton.acceptance in ("buchi", "parity"):
+    if not automaton.has_final_states:
         entry_letter = product.entry_letter(reader.letter, reader.on_entry)
         source = product.host.state[product.host.row]
         priority = automaton.priority[product.memory[source], entry_letter] + opposite
