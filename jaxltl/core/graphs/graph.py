@@ -25,6 +25,7 @@ from jaxltl.core.models.ops import kernels, operators
 from jaxltl.core.models.ops.array_namespace import is_traced
 from jaxltl.core.models.ops.choices import choice_shape, choices
 from jaxltl.core.models.ops.host_callback import host_callback
+from jaxltl.core.models.ops.latest import keep_latest
 from jaxltl.core.models.product import Product, reads
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.sparse.graph.row_graph import RowGraph, product_graph
@@ -147,7 +148,7 @@ def graph_of(model: Any, *arguments: Any) -> Graph:
         model = compiled_form(model)[0]
     if is_traced((model, arguments)) or not is_table(model):
         return TracedGraph(lax.stop_gradient(model))  # supports have no derivative
-    return host_graph(model)
+    return host_graph(model.mdp if isinstance(model, Game) else model)
 
 
 def is_table(model: Any) -> bool:
@@ -157,10 +158,10 @@ def is_table(model: Any) -> bool:
     return isinstance(world, MDP | DenseMDP)
 
 
-def host_graph(model: MDP | DenseMDP | Product | Game) -> RowGraph:
+@keep_latest
+def host_graph(model: MDP | DenseMDP | Product) -> RowGraph:
     """The graph of a concrete padded model; unavailable actions are not read."""
-    lazy = model.mdp if isinstance(model, Game) else model
-    world = lazy.mdp if isinstance(lazy, Product) else lazy
+    world = model.mdp if isinstance(model, Product) else model
     available, used = np.asarray(world.available), support(world)
     if isinstance(world, DenseMDP):
         rows = rows_from_dense(used)
@@ -168,16 +169,16 @@ def host_graph(model: MDP | DenseMDP | Product | Game) -> RowGraph:
         rows = rows_from_padded(np.asarray(world.successor), used, world.num_states)
     row_start = np.arange(0, available.size + 1, available.shape[1])
     host = HostGraph(row_start, rows.entry_start, rows.successor)
-    if world is lazy:
+    if not isinstance(model, Product):
         return RowGraph(host, world.state_shape, available)
-    letter = np.asarray(lazy.letter)
+    letter = np.asarray(model.letter)
     return product_graph(
         host,
         available,
-        np.asarray(lazy.automaton.delta)[:, letter].T,
+        np.asarray(model.automaton.delta)[:, letter].T,
         letter,
-        on_entry=lazy.label_on == "entry",
-        allowed=None if lazy.allowed is None else np.asarray(lazy.allowed),
+        on_entry=model.label_on == "entry",
+        allowed=None if model.allowed is None else np.asarray(model.allowed),
     )
 
 

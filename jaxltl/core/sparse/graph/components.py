@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+import sys
 
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Integers
 from jaxltl.core.sparse.rows import SCIPY_SIZE
+
+_READY = 500  # edges from which SciPy's search is faster, once it is imported
 
 
 def strong_components(source: Integers, target: Integers, num_nodes: int) -> Integers:
@@ -16,13 +18,15 @@ def strong_components(source: Integers, target: Integers, num_nodes: int) -> Int
     >>> strong_components(np.array([0, 1, 1]), np.array([1, 0, 2]), 3).tolist()
     [0, 0, 2]
     """
-    if max(source.size, num_nodes) <= SCIPY_SIZE // 4:
-        label = _tarjan(source, target, num_nodes)
-    else:
-        from scipy.sparse import csgraph
+    if _is_quick(max(source.size, num_nodes)):
+        from scipy.sparse import csgraph, csr_array
 
-        graph = _matrix(source, target, num_nodes)
+        # Repeated edges are merged (with them SciPy may not end); of Booleans they never add to zero.
+        ones = np.ones(source.size, bool)
+        graph = csr_array((ones, (source, target)), shape=(num_nodes, num_nodes))
         _, label = csgraph.connected_components(graph, connection="strong")
+    else:
+        label = _tarjan(source, target, num_nodes)
     node = np.arange(num_nodes)
     smallest = np.zeros(num_nodes, np.int64)
     smallest[label[::-1]] = node[::-1]  # of the nodes with one label the first is written last
@@ -31,48 +35,48 @@ def strong_components(source: Integers, target: Integers, num_nodes: int) -> Int
 
 def forward_reachable(source: Integers, target: Integers, start: Booleans) -> Booleans:
     """Nodes that are reachable from some nodes, these included: ``bool[N]``."""
-    seen = start.copy()
-    if max(source.size, start.size) > SCIPY_SIZE // 4:
+    count = np.bincount(source, minlength=start.size)
+    order = np.argsort(source, kind="stable")
+    return forward_search(np.concatenate([[0], count.cumsum()]), target[order], start)
+
+
+def forward_search(start: Integers, after: Integers, first: Booleans) -> Booleans:
+    """Nodes that are reachable from some nodes; node i has successors ``after[start[i] : ...]``."""
+    seen = first.copy()
+    sources = np.flatnonzero(first)
+    if _is_quick(after.size):
+        from scipy import sparse
         from scipy.sparse import csgraph
 
-        # One search from an additional node that leads to every start.
-        first, num_nodes = np.flatnonzero(start), start.size
-        graph = _matrix(
-            np.concatenate([source, np.full(first.size, num_nodes)]),
-            np.concatenate([target, first]),
-            num_nodes + 1,
-        )
-        order = csgraph.breadth_first_order(graph, num_nodes, return_predecessors=False)
+        # One search from an additional node that leads to all starts.
+        size = first.size + 1
+        starts = np.append(start, start[-1] + sources.size)
+        targets = np.concatenate([after, sources.astype(after.dtype)])
+        graph = sparse.csr_array((np.ones(targets.size), targets, starts), shape=(size, size))
+        order = csgraph.breadth_first_order(graph, first.size, return_predecessors=False)
         seen[order[1:]] = True
         return seen
-    after = _lists(source, target, start.size)
-    todo = np.flatnonzero(start).tolist()
+    begin, successor, mark = memoryview(start), memoryview(after), memoryview(seen)
+    todo = sources.tolist()
     while todo:
-        for node in after[todo.pop()]:
-            if not seen[node]:
-                seen[node] = True
-                todo.append(node)
+        node = todo.pop()
+        for other in successor[begin[node] : begin[node + 1]]:
+            if not mark[other]:
+                mark[other] = True
+                todo.append(other)
     return seen
 
 
-def _matrix(source: Integers, target: Integers, num_nodes: int) -> Any:
-    from scipy.sparse import csr_array
-
-    # Repeated edges are merged (with them SciPy may not end); of Booleans they never add to zero.
-    ones = np.ones(source.size, bool)
-    return csr_array((ones, (source, target)), shape=(num_nodes, num_nodes))
-
-
-def _lists(source: Integers, target: Integers, num_nodes: int) -> list[list[int]]:
-    after: list[list[int]] = [[] for _ in range(num_nodes)]
-    for a, b in zip(source.tolist(), target.tolist(), strict=True):
-        after[a].append(b)
-    return after
+def _is_quick(size: int) -> bool:
+    """Whether SciPy's searches are faster, its import included."""
+    return size > SCIPY_SIZE // 4 or (size > _READY and "scipy.sparse.csgraph" in sys.modules)
 
 
 def _tarjan(source: Integers, target: Integers, num_nodes: int) -> Integers:
     """Tarjan's algorithm (1972), with a stack of iterators instead of recursion."""
-    after = _lists(source, target, num_nodes)
+    after: list[list[int]] = [[] for _ in range(num_nodes)]
+    for a, b in zip(source.tolist(), target.tolist(), strict=True):
+        after[a].append(b)
     label, number = [-1] * num_nodes, [-1] * num_nodes
     low = [0] * num_nodes
     visited = components = 0

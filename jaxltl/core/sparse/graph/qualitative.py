@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-import sys
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Integers
 from jaxltl.core.sparse.graph.attractor import attracted
-from jaxltl.core.sparse.graph.components import strong_components
+from jaxltl.core.sparse.graph.components import forward_search, strong_components
 from jaxltl.core.sparse.mdp import HostGraph
-from jaxltl.core.sparse.rows import (
-    SCIPY_SIZE,
-    concatenated_ranges,
-)
-
-_READY = 500  # edges from which SciPy's search is faster, once it is imported
+from jaxltl.core.sparse.rows import concatenated_ranges
 
 
 def backward_reachable(mdp: HostGraph, goal: Booleans, rows: Booleans | None = None) -> Booleans:
@@ -28,33 +22,6 @@ def backward_reachable(mdp: HostGraph, goal: Booleans, rows: Booleans | None = N
         source = source[kept]
         start = np.concatenate([[0], kept.cumsum()])[start]
     return forward_search(start, source, goal)
-
-
-def forward_search(start: Integers, after: Integers, first: Booleans) -> Booleans:
-    """Nodes that are reachable from some nodes; node i has successors ``after[start[i] : ...]``."""
-    seen = first.copy()
-    frontier = np.flatnonzero(first)
-    ready = after.size > _READY and "scipy.sparse.csgraph" in sys.modules
-    if ready or after.size > SCIPY_SIZE // 4:
-        from scipy import sparse
-        from scipy.sparse import csgraph
-
-        # One search from an additional node that leads to all starts.
-        size = first.size + 1
-        starts = np.append(start, start[-1] + frontier.size)
-        targets = np.concatenate([after, frontier.astype(after.dtype)])
-        graph = sparse.csr_array((np.ones(targets.size), targets, starts), shape=(size, size))
-        order = csgraph.breadth_first_order(graph, first.size, return_predecessors=False)
-        seen[order[1:]] = True
-        return seen
-    while frontier.size:
-        new = after[concatenated_ranges(start[frontier], start[frontier + 1] - start[frontier])]
-        seen_new = np.zeros(first.size, bool)
-        seen_new[new] = True
-        seen_new &= ~seen
-        seen |= seen_new
-        frontier = np.flatnonzero(seen_new)
-    return seen
 
 
 def positive_under_all_policies(

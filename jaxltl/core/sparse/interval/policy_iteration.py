@@ -19,7 +19,7 @@ from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.sparse.interval.refinement import Refinement
 from jaxltl.core.sparse.interval.row_operator import PolicyPair, RowOperator
 from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
-from jaxltl.core.sparse.linear.krylov import SystemSequence
+from jaxltl.core.sparse.linear.system_sequence import SystemSequence
 from jaxltl.core.sparse.rows import offsets_from_counts
 from jaxltl.core.sparse.solvers.total_cost import Enclosure
 

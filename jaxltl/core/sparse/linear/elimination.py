@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxltl.core.array_types import Floats, Integers
+from jaxltl.core.sparse.linear.krylov import iterate
 
 # Limits of elimination; measured on the models of benchmarks.real_models and on random graphs.
 _SMALL = 3000  # states of a component up to which it may fill
@@ -336,10 +337,7 @@ def _transposed_system(matrix: Any) -> Any:
 
 def _swept(matrix: Any, b: Floats) -> Floats:
     """Solution by BiCGSTAB (van der Vorst 1992), then by sweeps while the residual shrinks."""
-    from scipy.sparse import linalg
-
     size = np.abs(b).max(initial=0)
-    system = linalg.LinearOperator(matrix.shape, matvec=lambda x: x - matrix @ x, dtype=float)
     x, left = np.zeros(b.size), np.array(b)
 
     def enough() -> bool:
@@ -348,7 +346,8 @@ def _swept(matrix: Any, b: Floats) -> Floats:
         return bool(np.abs(left).max(initial=0) <= least)
 
     for _ in range(_AGAIN):  # restarts where it stagnates or breaks down
-        more, _ = linalg.bicgstab(system, left, rtol=0, atol=_LEFT * size, maxiter=_KRYLOV)
+        with np.errstate(all="ignore"):
+            more = iterate(matrix, left, np.zeros(b.size), _LEFT * size, _KRYLOV)
         after = left - (more - matrix @ more)
         if not np.isfinite(more).all() or not np.abs(after).max() < np.abs(left).max():
             break

@@ -21,7 +21,7 @@ from fractions import Fraction
 import numpy as np
 
 from jaxltl.core.array_types import Floats, Integers
-from jaxltl.core.sparse.graph.qualitative import forward_search
+from jaxltl.core.sparse.graph.components import forward_search
 from jaxltl.core.sparse.linear.optimality_equation import OptimalityEquation
 from jaxltl.core.sparse.linear.topological_order import Edges
 

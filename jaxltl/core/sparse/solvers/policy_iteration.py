@@ -23,7 +23,7 @@ import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.sparse.choice_order import choices_of
-from jaxltl.core.sparse.graph.qualitative import forward_search
+from jaxltl.core.sparse.graph.components import forward_search
 from jaxltl.core.sparse.linear.elimination import Factors, elimination_order, factorize
 from jaxltl.core.sparse.linear.extended_precision import (
     MAX_FRACTIONS,

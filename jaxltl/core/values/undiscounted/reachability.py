@@ -16,6 +16,7 @@ from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.mdp import MDP, support
 from jaxltl.core.models.mesh.sharded import is_sharded
 from jaxltl.core.models.ops.array_namespace import is_traced
+from jaxltl.core.models.ops.latest import keep_latest
 from jaxltl.core.models.ops.operators import require_policy
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import ActionModel, Array, Model
@@ -183,7 +184,10 @@ def _tolerances(model: Model, tolerance: Array | None, *, exact: bool) -> tuple[
 
 def rows_of_model(model: Model) -> SparseMDP:
     """The sparse rows of a concrete model or game; a float32 model means its normalised rows."""
-    return to_sparse(model.mdp if isinstance(model, Game) else model)
+    return _rows(model.mdp if isinstance(model, Game) else model)
+
+
+_rows = keep_latest(to_sparse)
 
 
 def on_rows(sparse: SparseMDP, quantity: Array) -> Array:

@@ -10,6 +10,7 @@ from jaxltl.core.sparse.graph.components import forward_reachable, strong_compon
 @pytest.mark.parametrize("large", [-1, 10**9])
 def test_components_and_searches_equal_the_closure(large, monkeypatch):
     monkeypatch.setattr(components, "SCIPY_SIZE", large)
+    monkeypatch.setattr(components, "_READY", large)
     rng = np.random.default_rng(0)
     sizes = set()
     for _ in range(200):

@@ -21,6 +21,7 @@ from jaxltl.core.graphs.graph import host_graph
 from jaxltl.core.models.construct.convert import to_padded, to_sparse
 from jaxltl.core.sparse import rows
 from jaxltl.core.sparse.graph import attractor as host_attract
+from jaxltl.core.sparse.graph import components
 from jaxltl.core.sparse.graph import qualitative as sparse_graph
 from jaxltl.core.sparse.mdp import HostMDP
 from tests.core.models.test_sparse import random_padded
@@ -51,7 +52,7 @@ def way(request, monkeypatch):
     monkeypatch.setattr(host_attract, "FEW", 0 if request.param == "numpy" else 1000)
     if request.param == "scipy":
         monkeypatch.setattr(rows, "SCIPY_SIZE", 0)
-        monkeypatch.setattr(sparse_graph, "SCIPY_SIZE", 0)
+        monkeypatch.setattr(components, "SCIPY_SIZE", 0)
 
 
 @pytest.mark.usefixtures("way")

@@ -13,8 +13,8 @@ from jaxltl.core.sparse.interval.policy_iteration import Accuracy, PathProblem
 from jaxltl.core.sparse.interval.refinement import Refinement
 from jaxltl.core.sparse.interval.robust_values import Query
 from jaxltl.core.sparse.interval.row_operator import PolicyPair
-from jaxltl.core.sparse.linear import krylov
-from jaxltl.core.sparse.linear.krylov import SystemSequence
+from jaxltl.core.sparse.linear import system_sequence
+from jaxltl.core.sparse.linear.system_sequence import SystemSequence
 
 
 def walks(size, rng, drift):
@@ -62,7 +62,7 @@ def test_who_could_go_round_where_nothing_is_lost(maximize, monkeypatch):
 
 @pytest.mark.parametrize("mixes", (True, False))
 def test_systems_of_changing_choices(mixes, monkeypatch):
-    monkeypatch.setattr(krylov, "_DIRECT", 0)
+    monkeypatch.setattr(system_sequence, "_DIRECT", 0)
     rng = np.random.default_rng(7)
     dense = rng.random((60, 60)) * (rng.random((60, 60)) < 0.1)
     dense = 0.95 * dense / np.maximum(dense.sum(1), 1)[:, None]

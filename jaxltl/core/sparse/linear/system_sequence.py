@@ -1,0 +1,69 @@
+"""Sequences of similar linear systems ``x = P x + b``: BiCGSTAB and reused factors.
+
+In policy iteration each system differs from the last one in a few rows. Where few steps lead to
+many states, BiCGSTAB (van der Vorst 1992) from the last solution converges fast. Elsewhere the
+factors of an earlier system precondition it, until they are too old and are computed anew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from jaxltl.core.array_types import Floats, Integers
+from jaxltl.core.sparse.linear.elimination import Factors, factorize
+from jaxltl.core.sparse.linear.krylov import bicgstab
+
+_DIRECT = 2000  # unknowns up to which each system is eliminated
+_PRECONDITIONED = 10  # steps after which old factors are given up
+_STEPS = 200  # of BiCGSTAB without factors
+
+
+@dataclass
+class SystemSequence:
+    """Solver of systems of one size.
+
+    Attributes:
+      label: computes ``int[M]``, strongly connected components in topological order.
+      mixes: whether few steps lead to many unknowns.
+      factors: of the earlier system `matrix`.
+    """
+
+    label: Callable[[], Integers]
+    mixes: bool
+    factors: Factors | None = None
+    matrix: Any = None
+
+    def solve(self, matrix: Any, b: Floats, start: Floats, residual: float) -> Floats | None:
+        """The solution up to a residual, or up to rounding if that is more; None if singular."""
+        if self.mixes:
+            found = bicgstab(matrix, b, start, residual, steps=_STEPS)
+            if found is not None:
+                return found
+            self.mixes = False
+        if self.factors is not None and self.matrix is not matrix and b.size > _DIRECT:
+            old = self.factors.solve
+            found = bicgstab(matrix, b, start, residual, steps=_PRECONDITIONED, precondition=old)
+            if found is not None:
+                return found
+        return self.solve_directly(matrix, b)
+
+    def solve_directly(self, matrix: Any, b: Floats) -> Floats | None:
+        """The solution by factors of this system; None if it is singular."""
+        if self.matrix is not matrix and not self._factor(matrix):
+            return None
+        assert self.factors is not None
+        x = self.factors.solve(b)
+        return x if np.isfinite(x).all() else None
+
+    def _factor(self, matrix: Any) -> bool:
+        rows = np.arange(matrix.shape[0])
+        if self.factors is None:
+            self.factors = factorize(matrix, self.label(), rows)
+        else:
+            self.factors = self.factors._replace(rows=matrix).other(rows)
+        self.matrix = matrix
+        return self.factors is not None
