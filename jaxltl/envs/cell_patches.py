@@ -6,6 +6,7 @@ Maps of colours have a ring around them, ``int[rows + 2, columns + 2]``, maps of
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,21 +109,27 @@ def filled(
     return colors
 
 
+@dataclass(frozen=True)
+class Placement:
+    """Kinds to place on a map: objects first, then obstacles."""
+
+    shape: tuple[int, int]
+    counts: Sequence[int]  # the number of cells of each kind
+    distances: Sequence[int]  # of each kind from objects
+    num_objects: int
+    stamps: list[NDArray[np.int64]]
+    codes: NDArray[np.int64]
+
+
 def placed(
-    random: np.random.Generator,
-    shape: tuple[int, int],
-    counts: Sequence[int],
-    distances: Sequence[int],
-    num_objects: int,
-    stamps: list[NDArray[np.int64]],
-    codes: NDArray[np.int64],
+    random: np.random.Generator, placement: Placement
 ) -> tuple[NDArray[np.int64], NDArray[np.int32]] | None:
     """Patches in random cells with their kinds, or None if they do not fit."""
-    rows, columns = shape
+    rows, columns = placement.shape
     colors = np.full((rows + 2, columns + 2), FREE)
-    kind = np.full(shape, -1, np.int32)
+    kind = np.full(placement.shape, -1, np.int32)
     objects: list[tuple[int, int]] = []
-    for i, (count, distance) in enumerate(zip(counts, distances, strict=True)):
+    for i, (count, distance) in enumerate(zip(placement.counts, placement.distances, strict=True)):
         open_ = kind < 0
         for row, column in objects:
             near = slice(max(row - distance + 1, 0), row + distance)
@@ -130,27 +137,36 @@ def placed(
         for cell in random.permutation(np.flatnonzero(open_)):
             if not count:
                 break
-            row, column = divmod(int(cell), columns)
-            if _adds(colors, kind, i, stamps[i], codes, row, column):
+            place = divmod(int(cell), columns)
+            if _adds(colors, kind, i, place, placement):
                 count -= 1
-                if i < num_objects:
-                    objects.append((row, column))
+                if i < placement.num_objects:
+                    objects.append(place)
         if count:
             return None
     return colors, kind
 
 
-def _adds(colors, kind, number, stamp, codes, row: int, column: int) -> bool:
+def _adds(
+    colors: NDArray[np.int64],
+    kind: NDArray[np.int32],
+    number: int,
+    place: tuple[int, int],
+    placement: Placement,
+) -> bool:
     """Stamps a kind around a cell if that creates no other kind."""
+    row, column = place
     patch = colors[row : row + 3, column : column + 3]
     before = patch.copy()
-    if not _stamp(colors, stamp, row, column):
+    if not _stamp(colors, placement.stamps[number], row, column):
         return False
     kind[row, column] = number
     # Only cells up to two away see the patch.
     top, left = max(row - 2, 0), max(column - 2, 0)
     planned = kind[top : row + 3, left : column + 3]
-    if np.array_equal(find_kinds(colors[top : row + 5, left : column + 5], codes), planned):
+    if np.array_equal(
+        find_kinds(colors[top : row + 5, left : column + 5], placement.codes), planned
+    ):
         return True
     patch[:], kind[row, column] = before, -1
     return False

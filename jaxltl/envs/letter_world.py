@@ -12,7 +12,7 @@ symmetries, while their letters are drawn anew: the published drawing rejects 72
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypedDict, Unpack
 
 import chex
 import jax
@@ -51,6 +51,21 @@ class LetterState(NamedTuple):
     place: Any
 
 
+class Maps(TypedDict, total=False):
+    """Optional settings of random maps.
+
+    Attributes:
+      connected: draw maps in which all cells are reachable across empty ones; default: True.
+      num_maps: the number of sets of cells in the table of connected maps, before symmetries;
+        default: 1024.
+      seed: of the drawing of the table; default: 0.
+    """
+
+    connected: bool
+    num_maps: int
+    seed: int
+
+
 def letter_world(
     *,
     size: int = 7,
@@ -59,10 +74,8 @@ def letter_world(
     horizon: int | None = 75,
     layout: str | ArrayLike | None = None,
     start: int | None = None,
-    connected: bool = True,
     flat: bool = False,
-    num_maps: int = 1024,
-    seed: int = 0,
+    **maps: Unpack[Maps],
 ) -> Environment:
     """LetterWorld with a random map per episode, or with a given map.
 
@@ -78,10 +91,9 @@ def letter_world(
         ``.`` for empty cells, or ``int[size, size]``, numbers of letters, -1 for none. It determines
         the size.
       start: the initial cell in a given layout; default: any empty one.
-      connected: draw maps in which all cells are reachable across empty ones.
       flat: flatten the observations.
-      num_maps: the number of sets of cells in the table of connected maps, before symmetries.
-      seed: of the drawing of the table.
+      maps: of random maps: `connected` (default True), `num_maps` (1024) and `seed` (0), see
+        :class:`Maps`.
 
     Returns:
       :class:`~jaxltl.core.environments.environment.Environment` with states :class:`LetterState`, or
@@ -96,16 +108,16 @@ def letter_world(
       >>> world.propositions[:3], world.observations.shape, world.horizon
       (('a', 'b', 'c'), (7, 7, 13), 75)
     """
+    validation.keywords("letter_world", maps, Maps)
     names, starts = _names(letters), None
-    connected, flat = validation.boolean("connected", connected), validation.boolean("flat", flat)
-    copies, num_maps = (
-        validation.integer("copies", copies),
-        validation.integer("num_maps", num_maps, most=2**24),
+    connected = validation.boolean("connected", maps.get("connected", True))
+    flat = validation.boolean("flat", flat)
+    copies = validation.integer("copies", copies)
+    num_maps = validation.integer(
+        "num_maps", maps.get("num_maps", 1024), least=int(connected), most=2**24
     )
-    size, seed = validation.integer("size", size, most=2**10), validation.integer("seed", seed)
-    num_maps = (
-        max(num_maps, 1) if not connected else validation.integer("num_maps", num_maps, least=1)
-    )
+    size = validation.integer("size", size, most=2**10)
+    seed = validation.integer("seed", maps.get("seed", 0))
     if layout is None:
         if start is not None:
             raise ValueError(f"start={start} is for a given layout; leave it out.")
@@ -116,8 +128,8 @@ def letter_world(
                 f"{size} x {size} cells with one left for the agent."
             )
         if connected:
-            maps = connected_cells(size, used, num_maps, seed)
-            reset = Partial(_draw_connected, *_orders(maps, size), np.zeros((copies, len(names))))
+            cells = connected_cells(size, used, num_maps, seed)
+            reset = Partial(_draw_connected, *_orders(cells, size), np.zeros((copies, len(names))))
         else:
             reset = Partial(_draw_any, np.zeros((size, size)), np.zeros((copies, len(names))))
     else:

@@ -26,7 +26,7 @@ The dissertation gives the geometry only in figure 9, from which these numbers a
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypedDict, Unpack
 
 import chex
 import jax
@@ -117,28 +117,45 @@ class _Static:
     value: Any = struct.field(pytree_node=False)
 
 
+class Settings(TypedDict, total=False):
+    """Optional settings of the robot and of the tasks.
+
+    Attributes:
+      speed, turn, time_step: see :class:`Navigation`; default: 1, pi / 6 and 0.5.
+      radii: of the sensor's circles; default: 0.5, 1, 1.5, 2 and 2.5.
+      num_directions: points on each circle, evenly spaced, the first ahead; default: 12.
+      strip, weight: see :class:`Navigation`; default: (-2, -0.2) and 30.
+
+    Example:
+      >>> settings = Settings(speed=0.5, radii=[1.0])
+      >>> navigation(**settings).num_observations
+      14
+    """
+
+    speed: float
+    turn: float
+    time_step: float
+    radii: Sequence[float]
+    num_directions: int
+    strip: ArrayLike
+    weight: float
+
+
 def navigation(
     *,
     goal: ArrayLike = ((1.5, 1.0), (2.5, 2.0)),
     obstacle: ArrayLike = ((-1.0, 0.2), (1.0, 2.0)),
     bounds: ArrayLike = ((-4.0, -4.0), (4.0, 4.0)),
     start: ArrayLike = ((-3.0, -2.5), (-1.5, -0.5)),
-    speed: float = 1.0,
-    turn: float = np.pi / 6,
-    time_step: float = 0.5,
-    radii: Sequence[float] = (0.5, 1.0, 1.5, 2.0, 2.5),
-    num_directions: int = 12,
-    strip: ArrayLike = (-2.0, -0.2),
-    weight: float = 30.0,
     horizon: int = 30,
+    **settings: Unpack[Settings],
 ) -> Navigation:
     """A map with a goal and an obstacle, and a robot.
 
     Args:
       goal, obstacle, bounds, start: boxes, each the lower left and the upper right corner.
-      radii: of the sensor's circles.
-      num_directions: points on each circle, evenly spaced, the first ahead.
-      speed, turn, time_step, strip, weight, horizon: see :class:`Navigation`.
+      horizon: N.
+      settings: see :class:`Settings`.
 
     Raises:
       ValueError: an empty box or range, or a size that is not positive.
@@ -150,10 +167,16 @@ def navigation(
     """
     boxes = {"goal": goal, "obstacle": obstacle, "bounds": bounds, "start": start}
     corners = {name: _box(name, box) for name, box in boxes.items()}
-    sizes = {
-        "speed": speed,
-        "turn": turn,
-        "time_step": time_step,
+    validation.keywords("navigation", settings, Settings)
+    numbers = {
+        "speed": settings.get("speed", 1.0),
+        "turn": settings.get("turn", np.pi / 6),
+        "time_step": settings.get("time_step", 0.5),
+    }
+    radii = settings.get("radii", (0.5, 1.0, 1.5, 2.0, 2.5))
+    num_directions = settings.get("num_directions", 12)
+    strip = settings.get("strip", (-2.0, -0.2))
+    sizes = numbers | {
         "num_directions": num_directions,
         "horizon": horizon,
         "the least of radii": min(radii, default=0),
@@ -168,7 +191,7 @@ def navigation(
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     offset = (np.asarray(radii, float)[:, None, None] * circle).reshape(-1, 2)
     # NumPy's, so that a computation in either precision starts from the exact numbers.
-    numbers = {"speed": speed, "turn": turn, "time_step": time_step, "weight": weight}
+    numbers["weight"] = settings.get("weight", 30.0)
     arrays = {name: np.asarray(x, float) for name, x in numbers.items()}
     return Navigation(**corners, **arrays, offset=offset, strip=low_high, horizon=int(horizon))
 

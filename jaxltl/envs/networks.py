@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import Any
 
 import chex
 import jax
@@ -27,6 +26,7 @@ from jaxltl.core.environments.environment import (
     flat_observation,
 )
 from jaxltl.core.environments.episodes import Agent
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.pretty_print import brief
 
 ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {
@@ -299,19 +299,18 @@ def network_agent(network: Network, environment: Environment) -> Partial:
 def _agent(network: Network, actions: Finite | Box, parameters: jax.Array) -> Agent:
     # Taken apart here, for inside of a loop over steps it would be in every pass.
     parts = padded(layers(network, parameters))
-    return Agent(Partial(_act, network, actions, parts))
+    return Agent(Partial(_act, (network, actions, parts)))
 
 
 def _act(
-    network: Network,
-    actions: Finite | Box,
-    parts: Layers,
-    memory: Any,
-    observation: Any,
-    allowed: Any,
+    policy: tuple[Network, Finite | Box, Layers],
+    memory: PyTree,
+    observation: PyTree,
+    allowed: jax.Array | None,
     key: chex.PRNGKey,
-) -> tuple[jax.Array, Any]:
+) -> tuple[jax.Array, PyTree]:
     del key
+    network, actions, parts = policy
     said = apply_layers(network, parts, flat_observation(observation).astype(parts[0][0].dtype))
     if isinstance(actions, Box):
         return clipped_action(actions, said.reshape(actions.shape).astype(actions.dtype)), memory

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypedDict, Unpack
 
 import chex
 import jax
@@ -30,6 +30,7 @@ from jaxltl.core.models.ops import operators
 from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.models.product import Product, product
 from jaxltl.core.models.trajectories import Trajectories, rollout
+from jaxltl.core import validation
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.values.discounted.soft import soft_value
 from jaxltl.core.values.undiscounted.performance import infeasible_starts
@@ -44,7 +45,7 @@ from jaxltl.envs.cell_kinds import (
     codes_of,
     make_kinds,
 )
-from jaxltl.envs.cell_patches import filled, placed, plan_map, planned, stamps_of
+from jaxltl.envs.cell_patches import Placement, filled, placed, plan_map, planned, stamps_of
 from jaxltl.envs.gridworld import gridworld
 
 COMPLETE = "(!o2 & !o3 & !ob) U (o1 & ((!o3 & !ob) U (o2 & (!ob U o3))))"
@@ -117,15 +118,50 @@ def _assemble(
     return World(mdp, to_jax(np.asarray(colors, np.int32)), margin, (rows, columns), kinds)
 
 
+class Appearance(TypedDict, total=False):
+    """Optional settings of worlds.
+
+    Attributes:
+      shape: rows and columns; default: 10 and 10.
+      objects, obstacles, margin, slip: see :func:`colored_world`.
+
+    Example:
+      >>> make_world({}, 0, **Appearance(shape=(2, 3), margin=2)).colors.shape
+      (6, 7)
+    """
+
+    shape: tuple[int, int]
+    objects: Counts
+    obstacles: Counts
+    margin: int
+    slip: float
+
+
+class _Grid(NamedTuple):
+    """The validated :class:`Appearance` of a world, with a world of no kinds."""
+
+    shape: tuple[int, int]
+    kinds: Kinds
+    num_objects: int
+    margin: int
+    blank: MDP
+
+
+def _grid(function: str, appearance: Appearance) -> _Grid:
+    validation.keywords(function, appearance, Appearance)
+    shape, margin = appearance.get("shape", (10, 10)), appearance.get("margin", 1)
+    objects = appearance.get("objects", OBJECTS)
+    kinds = make_kinds(objects, appearance.get("obstacles", OBSTACLES))
+    check_margin(margin)
+    if len(shape) != 2 or min(shape) < 1:
+        raise ValueError(f"shape={tuple(shape)}; give (rows, columns), both at least 1.")
+    return _Grid(shape, kinds, len(objects), margin, _blank(shape, appearance.get("slip", 0.0)))
+
+
 def make_world(
     plan: Mapping[str, Sequence[tuple[int, int]]],
     seed: int | np.random.Generator,
-    *,
-    shape: tuple[int, int] = (10, 10),
-    objects: Counts = OBJECTS,
-    obstacles: Counts = OBSTACLES,
-    margin: int = 1,
-    slip: float = 0.0,
+    **appearance: Unpack[Appearance],
 ) -> World:
     """A world with objects and obstacles in given cells and random colours elsewhere.
 
@@ -137,22 +173,19 @@ def make_world(
     Args:
       plan: cells ``(row, column)``, from 1, of each kind by its name.
       seed: of the random colours. The inner rings do not depend on the margin.
-      shape: rows and columns.
-      objects, obstacles, margin, slip: see :func:`colored_world`.
+      appearance: shape, kinds and slip, see :class:`Appearance`.
 
     Example:
       >>> world = make_world({"o1": [(1, 2)], "ob": [(4, 3)]}, seed=0, shape=(4, 4))
       >>> world.mdp.label[1].tolist(), int(world.mdp.label.sum())
       ([True, False, False, False], 2)
     """
-    kinds = make_kinds(objects, obstacles)
-    check_margin(margin)
-    _check_shape(shape)
+    shape, kinds, _, margin, blank = _grid("make_world", appearance)
     kind = plan_map(plan, kinds, shape)
     colors = filled(
         np.random.default_rng(seed), planned(kind, kinds), kind, codes_of(kinds), margin
     )
-    return _assemble(_blank(shape, slip), colors, kind, kinds, margin)
+    return _assemble(blank, colors, kind, kinds, margin)
 
 
 def training_world(seed: int = 0, *, margin: int = 1, slip: float = 0.0) -> World:
@@ -173,16 +206,10 @@ def training_world(seed: int = 0, *, margin: int = 1, slip: float = 0.0) -> Worl
     return make_world(plan, seed, margin=margin, slip=slip)
 
 
-def _check_shape(shape: Sequence[int]) -> None:
-    if len(shape) != 2 or min(shape) < 1:
-        raise ValueError(f"shape={tuple(shape)}; give (rows, columns), both at least 1.")
-
-
 class _Family(NamedTuple):
     """Quantities shared by a family of random worlds."""
 
     blank: MDP
-    successor: NDArray[Any]  # [S, A, K]
     kinds: Kinds
     automaton: Automaton
     step: NDArray[np.int32]  # [P + 1, Q], the memory after leaving a cell; the last row: of no kind
@@ -192,26 +219,22 @@ def random_worlds(
     seeds: Iterable[int],
     task: Task = COMPLETE,
     *,
-    shape: tuple[int, int] = (10, 10),
-    objects: Counts = OBJECTS,
-    obstacles: Counts = OBSTACLES,
     num_obstacles: int = 5,
     min_distance: int = 3,
     obstacle_distance: int = 3,
-    margin: int = 1,
-    slip: float = 0.0,
     max_tries: int = 1000,
+    **appearance: Unpack[Appearance],
 ) -> list[World]:
     """The random worlds of some seeds in which the task is satisfiable from every distractor cell.
 
     Args:
       seeds: one for each world, which depends on its own seed alone.
       task: an automaton, or a formula over the kinds of cells. A cell's label is read on exit.
-      shape, objects, obstacles, margin, slip: see :func:`make_world`.
       num_obstacles: cells of each kind of obstacle, which may touch; each object has one.
       min_distance, obstacle_distance: of objects from objects, and of obstacles from objects, in the
         maximum norm.
       max_tries: placements to try for each world.
+      appearance: shape, kinds and slip, see :class:`Appearance`.
 
     Raises:
       ValueError: an unknown proposition, or no placement found.
@@ -221,22 +244,25 @@ def random_worlds(
       >>> [world.shape for world in worlds]
       [(6, 8), (6, 8)]
     """
-    kinds = make_kinds(objects, obstacles)
-    check_margin(margin)
-    _check_shape(shape)
+    shape, kinds, num_objects, margin, blank = _grid("random_worlds", appearance)
     if num_obstacles < 0:
         raise ValueError(f"num_obstacles={num_obstacles}; give 0 or more.")
     automaton, step = _on_kinds(task, kinds)
-    blank = _blank(shape, slip)
-    family = _Family(blank, np.asarray(blank.successor), kinds, automaton, step)
-    counts = (1,) * len(objects) + (num_obstacles,) * len(obstacles)
-    distances = (min_distance,) * len(objects) + (obstacle_distance,) * len(obstacles)
-    codes, stamps = codes_of(kinds), stamps_of(kinds)
+    family = _Family(blank, kinds, automaton, step)
+    num_kinds = len(kinds) - num_objects
+    placement = Placement(
+        shape,
+        (1,) * num_objects + (num_obstacles,) * num_kinds,
+        (min_distance,) * num_objects + (obstacle_distance,) * num_kinds,
+        num_objects,
+        stamps_of(kinds),
+        codes_of(kinds),
+    )
     worlds = []
     for seed in seeds:
         random = np.random.default_rng(seed)
         for _ in range(max_tries):
-            found = placed(random, shape, counts, distances, len(objects), stamps, codes)
+            found = placed(random, placement)
             if found is not None and _is_feasible(family, found[1]):
                 break
         else:
@@ -245,7 +271,7 @@ def random_worlds(
                 "objects had no room, or the task could not be done from every distractor cell. "
                 "Use a larger grid or fewer obstacles, or check the task."
             )
-        colors = filled(random, *found, codes, margin)
+        colors = filled(random, *found, placement.codes, margin)
         worlds.append(_assemble(blank, colors, found[1], kinds, margin))
     return worlds
 
@@ -286,7 +312,7 @@ def _is_feasible(family: _Family, kind: NDArray[np.int32]) -> bool:
         )
         return not np.asarray(infeasible_starts(product(world, task, label_on="exit"))).any()
     # The last row of the table is for cells without a kind, number -1.
-    can = _can_finish(family.successor, family.step[flat], np.asarray(task.final))
+    can = _can_finish(np.asarray(family.blank.successor), family.step[flat], np.asarray(task.final))
     return bool(can[flat < 0, int(task.initial)].all())
 
 

@@ -7,6 +7,7 @@ steps here, each of which chooses one component; the last one moves the environm
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import chex
@@ -38,27 +39,30 @@ class PartObservation(NamedTuple):
     turn: jax.Array
 
 
+@dataclass(frozen=True)
+class Inner:
+    """Functions of the environment whose actions are vectors of components."""
+
+    reset: Callable[..., Any]
+    step: Callable[..., Timestep]  # (world, int32[N], key)
+    observe: Callable[..., Any]
+    labels: Partial | None
+    mask: Callable[..., jax.Array] | None  # world -> bool of all combinations, or bool[N, M]
+
+
 def in_turn(
-    counts: Sequence[int],
-    reset: Callable[..., Any],
-    step: Callable[..., Timestep],
-    observe: Callable[..., Any],
-    *,
-    labels: Partial | None,
-    propositions: Sequence[str],
-    mask: Callable[..., jax.Array] | None,
-    horizon: int | None,
+    counts: Sequence[int], inner: Inner, *, propositions: Sequence[str], horizon: int | None
 ) -> Environment:
     """Environment in which the N components of an action are chosen sequentially."""
     held = Held(tuple(counts))
     return make_environment(
-        Partial(_begin, held, reset),
-        Partial(_choose, held, step),
-        Partial(_seen, held, observe),
+        Partial(_begin, held, inner.reset),
+        Partial(_choose, held, inner.step),
+        Partial(_seen, held, inner.observe),
         actions=max(counts),
-        labels=None if labels is None else Partial(_labels, labels),
+        labels=None if inner.labels is None else Partial(_labels, inner.labels),
         propositions=propositions,
-        allowed=Partial(_allowed, held, mask),
+        allowed=Partial(_allowed, held, inner.mask),
         horizon=None if horizon is None else horizon * len(counts),
     )
 

@@ -36,6 +36,7 @@ from jaxltl.envs.adapters.common import (
     some_allowed,
     timestep,
 )
+from jaxltl.envs.adapters.in_turn import Inner
 from jaxltl.envs.adapters.in_turn import in_turn as parts_in_turn
 
 # More are learned part by part, and a mask of all their combinations would fill the memory.
@@ -103,12 +104,14 @@ def from_jumanji(
             )
         return parts_in_turn(
             parts,
-            Partial(_reset, held),
-            Partial(_moved, held, endless),
-            Partial(observation_of),
-            labels=labels_of_state(labels),
+            Inner(
+                Partial(_reset, held),
+                Partial(_moved, held, endless),
+                Partial(observation_of),
+                labels_of_state(labels),
+                None if _mask(env, parts) is None else Partial(_mask_in),
+            ),
             propositions=propositions,
-            mask=None if _mask(env, parts) is None else Partial(_mask_in),
             horizon=limit,
         )
     return make_environment(
