@@ -41,8 +41,7 @@ def xla_flags(flags: Mapping[str, str], version: str | None = None) -> str:
     """
     version = version or metadata.version("jaxlib")
     first, end = _TESTED
-    release = tuple(int(part) for part in re.findall(r"\d+", version)[:2])
-    if not first <= release < end:
+    if not first <= tuple(int(part) for part in re.findall(r"\d+", version)[:2]) < end:
         return ""
     return " ".join(f"--{name}={value}" for name, value in flags.items())
 

@@ -223,8 +223,7 @@ class Search(Generic[Learned]):
         found += [self._between(x, sure) for x in ([first] if below is first else [first, below])]
         if all(one.attained > asked + WINDOW for one in found):
             # A learned policy that delays satisfaction leaves no share for other actions.
-            best = np.asarray(self.guarantee.best.policy)
-            quick = best[..., None] == np.arange(policy.shape[-1])
+            quick = np.asarray(self.guarantee.best.policy)[..., None] == np.arange(policy.shape[-1])
             sure = self._attempt(quick.astype(float), learned, None, 1.0)
             found.append(self._between(first, sure))
         return min(found, key=lambda one: one.neg_log_likelihood)

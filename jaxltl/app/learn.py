@@ -239,8 +239,7 @@ def _solved(
     parameters: Any, problem: mlirl.Problem, hparams: mlirl.Hparams
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     solution = mlirl.solve(parameters, problem, hparams)
-    seen = problem.counts > 0
-    log_policy = jnp.log(jnp.where(seen, solution.policy, 1))
+    log_policy = jnp.log(jnp.where(problem.counts > 0, solution.policy, 1))
     return solution.policy, -jnp.sum(problem.counts * log_policy), solution.status
 
 

@@ -200,8 +200,7 @@ def _agent(setup: Setup, states: Any, i: int) -> Agent:
 
 
 def _acting(setup: Setup, state: Any) -> Agent:
-    likeliest = setup.task.evaluation.policy == "likeliest"
-    return setup.method.agent(state, likeliest)
+    return setup.method.agent(state, setup.task.evaluation.policy == "likeliest")
 
 
 def _evaluated(key: jax.Array, agent: Agent, setup: Setup, *, threshold: bool) -> Evaluation:

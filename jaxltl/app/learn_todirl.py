@@ -433,8 +433,7 @@ def _within(model: Product, policy: jax.Array) -> Performance:
     value = jnp.take_along_axis(value, model.initial_memory[:, None], axis=1)[:, 0]
     starts = model.mdp.initial > 0
     # Rounding of T steps of sums of K + A products of numbers in [0, 1], to first order.
-    terms = model.num_successors + model.num_actions + 4
-    half = len(policy) * terms * jnp.finfo(model.dtype).eps
+    half = len(policy) * (model.num_successors + model.num_actions + 4) * jnp.finfo(model.dtype).eps
     worst = jnp.argmin(jnp.where(starts, value, jnp.inf)).astype(jnp.int32)
     mean = jnp.sum(model.mdp.initial * value)
     finite = jnp.all(jnp.isfinite(value))

@@ -194,8 +194,7 @@ def _several_entry(found: Achievable | ConstrainedOptimum | Pareto) -> Record:
     """A multi-objective answer: achievability, optimum, or points of the Pareto curve."""
     entry: Record = {"status": Status(found.status).name}
     if isinstance(found, Pareto):
-        points = found.points.tolist()
-        return entry | {"value": points, "gap": _number(float(found.gap))}
+        return entry | {"value": found.points.tolist(), "gap": _number(float(found.gap))}
     if found.nearest is not None:
         near = found.nearest
         entry["nearest"] = {
@@ -238,8 +237,7 @@ def text(result: Result) -> str:
     status = "" if found.status == Status.CONVERGED else f", {Status(found.status).name}"
     if not isinstance(found, Answer):
         return "\n".join([*lines, *_several_text(found), f"  {result.seconds:.3f} s{status}"])
-    shown = found.states[:SHOWN].tolist()
-    for i, state in enumerate(shown):
+    for i, state in enumerate(found.states[:SHOWN].tolist()):
         where = f"state {state}: " if found.states.size > 1 else ""
         lines.append(f"  {where}{_value_text(found, i)}")
     if found.states.size > SHOWN:

@@ -87,13 +87,11 @@ def _entry(model: ShardedMDP, seconds: float) -> Record:
     filled = model.num_states - model.num_given
     choices = count(model.available) - filled
     ours = filled if model.place is None else model.num_devices  # transitions of padding states
-    transitions = sum(count(table.probability) for table in model.tables) - ours
-    kind = "chain" if choices == model.num_given else "mdp"
     return {
-        "kind": kind,
+        "kind": "chain" if choices == model.num_given else "mdp",
         "states": model.num_given,
         "choices": choices,
-        "transitions": transitions,
+        "transitions": sum(count(table.probability) for table in model.tables) - ours,
         "seconds": seconds,
     }
 
@@ -154,8 +152,7 @@ class MeshSolver:
             bounds, part, made = _restored(path, mark, model, question, bounds)
         chunk = steps_between(model)
         while True:
-            width = question.tolerance(self.tolerance, FINER[part])
-            found = question.advance(bounds, width, chunk)
+            found = question.advance(bounds, question.tolerance(self.tolerance, FINER[part]), chunk)
             bounds, steps = (found.lower, found.upper), int(np.asarray(found.num_steps))
             made += steps
             if question.goes_on and steps >= chunk and made < MAX_STEPS:
@@ -173,8 +170,7 @@ class MeshSolver:
 
 def steps_between(model: ShardedMDP) -> int:
     """Steps between checkpoints; a constant of the model, so that resumed runs are identical."""
-    size = sum(table.successor.size for table in model.tables)
-    return max(16, int(_WORK / (_ROUND * size)))
+    return max(16, int(_WORK / (_ROUND * sum(table.successor.size for table in model.tables))))
 
 
 def _digest_text(mark: Mapping[str, str]) -> str:

@@ -190,8 +190,7 @@ def lost_play(nodes: Nodes, winning: Winning, node: int, actions: tuple[str, ...
     while not failed[node]:
         if system[node]:
             # A losing node has a losing successor by every move.
-            moves = np.flatnonzero(available[node])
-            action = int(max(moves, key=lambda a: time[worst(int(a))]))
+            action = int(max(np.flatnonzero(available[node]), key=lambda a: time[worst(int(a))]))
         else:
             action = int(counter[node, memory])
         target, mover = worst(action), "system" if system[node] else "environment"

@@ -102,8 +102,7 @@ def plan_in(learned: LearnedReward, world: MDP, observation: ArrayLike) -> tuple
     """
     model = product(world, learned.memory, label_on=learned.label_on)
     seen = jnp.asarray(observation, model.dtype)
-    kernel = learned.parameters["params"]["kernel"]
-    width = kernel.shape[0] - model.num_memory - model.num_actions
+    width = learned.parameters["params"]["kernel"].shape[0] - model.num_memory - model.num_actions
     if seen.shape != (world.num_states, width):
         raise ValueError(
             f"observation has shape {seen.shape}; the network reads {width} numbers in each of the "

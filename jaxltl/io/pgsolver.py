@@ -77,8 +77,7 @@ def min_even(priority: Integers, neutral: NDArray[np.bool_] | None = None) -> In
     """
     decides = np.ones(priority.shape, bool) if neutral is None else ~neutral
     values = np.unique(priority[decides])[::-1]
-    changes = np.concatenate([values[:1] % 2, (np.diff(values) % 2 != 0).astype(np.int64)])
-    number = changes.cumsum()
+    number = np.concatenate([values[:1] % 2, (np.diff(values) % 2 != 0).astype(np.int64)]).cumsum()
     converted = np.full(priority.shape, number[-1] if number.size else 0, np.int32)
     converted[decides] = number[::-1][np.searchsorted(values[::-1], priority[decides])]
     return converted
@@ -378,5 +377,4 @@ def max_even(
     ):
         return np.asarray(stored), decided
     largest = int(priority.max(initial=0))
-    turned = largest + largest % 2 - priority
-    return np.where(decided, np.where(won & ~lost, 0, 1), turned), decided
+    return np.where(decided, np.where(won & ~lost, 0, 1), largest + largest % 2 - priority), decided

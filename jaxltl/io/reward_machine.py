@@ -81,8 +81,7 @@ def read_reward_machine(
     """
     is_text = isinstance(source, str) and "\n" in source
     place = "read_reward_machine" if is_text else str(source)
-    text = str(source) if is_text else read_text(source, "a reward machine")
-    reader = _Reader(place, text)
+    reader = _Reader(place, str(source) if is_text else read_text(source, "a reward machine"))
     initial, terminal, transitions = reader.statements()
     names = tuple(sorted({name for x in transitions for name in x.guard.propositions}))
     try:
@@ -135,8 +134,7 @@ class _Reader:
             raise self.error(
                 line, f"found {text[:40]!r}; expected the list of terminal states, such as [2]."
             )
-        terminal = {int(x) for x in _STATE.findall(text)}
-        return initial, terminal, [self._transition(*x) for x in head]
+        return initial, {int(x) for x in _STATE.findall(text)}, [self._transition(*x) for x in head]
 
     def _transition(self, line: int, text: str) -> _Transition:
         match = _TRANSITION.fullmatch(text)
@@ -252,6 +250,5 @@ def machine_reward(product: Model, reward: ArrayLike | jax.Array) -> Array:
     state, memory = np.divmod(host.state, model.num_memory)
     if model.label_on == "exit":
         return pays[memory, letter[state]]
-    entered = letter[host.successor // model.num_memory]
-    earned = host.probability * pays[memory[host.row], entered]
+    earned = host.probability * pays[memory[host.row], letter[host.successor // model.num_memory]]
     return np.add.reduceat(earned, host.entry_start[:-1])

@@ -9,12 +9,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Circle, Polygon, Rectangle
 from numpy.typing import ArrayLike, NDArray
 
 from jaxltl.envs.text_map import parse_map
-from jaxltl.plot.style import FAINT, INK, MUTED, PAPER
+from jaxltl.plot.style import FAINT, INK, MUTED, PAPER, SCALE
 
 STEPS = {"up": (0, -1), "down": (0, 1), "left": (-1, 0), "right": (1, 0)}
 DIRECTIONS = {**STEPS, "stay": (0, 0)}
@@ -103,16 +104,17 @@ def draw_moves(
     world: Board,
     mask: NDArray[np.bool_],
     actions: Sequence[str],
-    dark: NDArray[np.bool_] | None = None,
-    *,
-    hollow: bool = False,
+    colors: Sequence[str] | None = None,
     scale: float = 1.0,
 ) -> None:
-    """Draws an action mask: a triangle per allowed move, a dot for staying."""
+    """Draws an action mask: a triangle per allowed move, a dot for staying.
+
+    `colors` are those of places, default ink; marks of the colour ``"none"`` are hollow.
+    """
     for place, a in np.argwhere(mask):
         # Drawn over the environment's robot, which may be in the same cell.
-        color = PAPER if dark is not None and dark[place] else INK
-        face, edge = ("none", MUTED) if hollow else (color, "none")
+        face = INK if colors is None else colors[place]
+        edge = MUTED if face == "none" else "none"
         row, column = world.places[place]
         center, step = np.array([column + 0.5, row + 0.5]), np.array(DIRECTIONS[actions[a]], float)
         if not step.any():
@@ -144,8 +146,7 @@ def draw_arrows(
     shape: tuple[int, int],
     policy: NDArray[np.float64],
     values: NDArray[np.float64] | None,
-    low: float,
-    high: float,
+    limits: tuple[float, float],
     actions: Sequence[str],
 ) -> None:
     """Draws a policy: triangles whose length is the probability of the action."""
@@ -153,7 +154,7 @@ def draw_arrows(
     colors: list[str] = []
     for state, chances in enumerate(policy):
         row, column = divmod(state, shape[1])
-        dark = values is not None and values[state] < low + 0.5 * (high - low)
+        dark = values is not None and values[state] < sum(limits) / 2
         for a, chance in enumerate(chances):
             if not chance > 0.04:
                 continue
@@ -162,6 +163,18 @@ def draw_arrows(
             shapes.append(_triangle(center, step, 0.03, tip, width))
             colors.append(PAPER if dark else INK)
     axes.add_collection(PolyCollection(shapes, facecolors=colors, lw=0, alpha=0.92, zorder=4))
+
+
+def shade_cells(axes: Axes, values: NDArray[np.float64], limits: tuple[float, float]) -> AxesImage:
+    """Draws values ``[rows, columns]`` as colours; NaN is blank."""
+    return axes.imshow(
+        np.ma.masked_invalid(values),
+        cmap=SCALE,
+        vmin=limits[0],
+        vmax=limits[1],
+        extent=(0, values.shape[1], values.shape[0], 0),
+        interpolation="nearest",
+    )
 
 
 def _triangle(

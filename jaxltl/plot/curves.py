@@ -23,6 +23,7 @@ from jaxltl.plot.style import (
     PAPER,
     SERIES,
     bottom_labels,
+    legend_below,
     panel_rows,
     plain_axes,
     settle,
@@ -137,15 +138,10 @@ def bands(
         if limits and column in limits.get(row, {}):
             axes.axhline(limits[row][column], color=INK, lw=1, ls="--")
     bottom_labels(panels, [label] * len(panels))
-    handles = [Line2D([], [], color=SERIES[i % len(SERIES)]) for i in range(len(names))]
-    figure.legend(
-        handles,
+    legend_below(
+        figure,
+        [Line2D([], [], color=SERIES[i % len(SERIES)]) for i in range(len(names))],
         names,
-        loc="outside lower center",
-        ncols=len(names),
-        frameon=False,
-        fontsize=8.5,
-        labelcolor=INK,
     )
     return figure
 
@@ -236,14 +232,10 @@ def lines(
         if reference is not None:
             axes.plot(np.asarray(reference, float), color=SERIES[1], lw=1.3, ls="--")
     bottom_labels(panels, labels)
-    figure.legend(
+    legend_below(
+        figure,
         [Line2D([], [], color=ACCENT), Line2D([], [], color=SERIES[1], ls="--")],
         names,
-        loc="outside lower center",
-        ncols=2,
-        frameon=False,
-        fontsize=8.5,
-        labelcolor=INK,
     )
     return figure
 
@@ -353,14 +345,10 @@ def paths(
     ends = [
         Line2D([], [], ls="", marker=m, color=c, ms=4) for m, c in (("o", INK), ("s", SERIES[1]))
     ]
-    figure.legend(
+    legend_below(
+        figure,
         [*handles, *ends],
         [*boxes, "first", "last"],
-        loc="outside lower center",
-        ncols=len(boxes) + 2,
-        frameon=False,
-        fontsize=8.5,
-        labelcolor=INK,
     )
     settle(figure)
     return figure

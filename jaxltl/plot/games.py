@@ -28,6 +28,7 @@ from jaxltl.plot.board import (
     number_cells,
     require_directions,
     rows_of_maps,
+    shade_cells,
 )
 from jaxltl.plot.style import (
     ACCENT,
@@ -35,7 +36,6 @@ from jaxltl.plot.style import (
     INK,
     MUTED,
     PAPER,
-    SCALE,
     SERIES,
     head,
     note,
@@ -98,7 +98,8 @@ def game_values(
         image = _shade(axes, world, table[place], limits)
         draw_robot(axes, world, place)
         if allowed is not None:
-            draw_moves(axes, world, allowed[place], actions, table[place] < sum(limits) / 2)
+            colors = np.where(table[place] < sum(limits) / 2, PAPER, INK)
+            draw_moves(axes, world, allowed[place], actions, colors.tolist())
         elif size >= 0.27:
             _figures(axes, world, table[place], place, sum(limits) / 2)
         keep_out_of_layout(axes)
@@ -207,7 +208,7 @@ def game_moves(
         number_cells(axes, rows, columns)
         if available is not None:
             can = _of_turns(np.asarray(available, bool), world, "available")[environment]
-            draw_moves(axes, world, can & ~mask & wins[:, None], actions, hollow=True)
+            draw_moves(axes, world, can & ~mask & wins[:, None], actions, ["none"] * len(wins))
         draw_moves(axes, world, mask, actions)
         draw_robot(axes, world, environment)
         if system is not None:
@@ -277,24 +278,12 @@ def _small_multiples(
     return figure, maps, size
 
 
-def _on_board(world: Board, values: NDArray[np.float64]) -> NDArray[np.float64]:
-    shown: NDArray[np.float64] = np.full(world.cells.shape, np.nan)
-    shown[tuple(world.places.T)] = values
-    return shown
-
-
 def _shade(
     axes: Axes, world: Board, values: NDArray[np.float64], limits: tuple[float, float]
 ) -> AxesImage:
-    rows, columns = world.cells.shape
-    image = axes.imshow(
-        np.ma.masked_invalid(_on_board(world, values)),
-        cmap=SCALE,
-        vmin=limits[0],
-        vmax=limits[1],
-        extent=(0, columns, rows, 0),
-        interpolation="nearest",
-    )
+    shown: NDArray[np.float64] = np.full(world.cells.shape, np.nan)
+    shown[tuple(world.places.T)] = values
+    image = shade_cells(axes, shown, limits)
     frame_cells(axes, world)
     return image
 

@@ -72,8 +72,7 @@ class Box(NamedTuple):
 
     def overlapped(self, others: Points) -> NDArray[np.bool_]:
         """``bool[B]`` for boxes ``float[B, 2, 2]``."""
-        apart = np.abs(others[:, 0] - self.center) - others[:, 1]
-        return np.all(apart < self.half, axis=1)
+        return np.all((np.abs(others[:, 0] - self.center) - others[:, 1]) < self.half, axis=1)
 
     def near(self, centers: Points, distance: float) -> int:
         gap = np.maximum(np.abs(centers - self.center) - self.half, 0)
@@ -231,8 +230,7 @@ def _positions(
 def _layers(delta: NDArray[np.integer], initial: int) -> NDArray[np.int64]:
     """Longest paths between components, breadth-first inside each: ``int[Q]``."""
     count = len(delta)
-    source = np.repeat(np.arange(count), delta.shape[1])
-    component = strong_components(source, delta.ravel(), count)
+    component = strong_components(np.repeat(np.arange(count), delta.shape[1]), delta.ravel(), count)
     layer = np.full(count, -1)
     layer[initial] = 0
     for _ in range(count):  # longest paths need at most as many rounds as states

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from matplotlib.patches import Rectangle
 from numpy.typing import ArrayLike, NDArray
 
@@ -25,6 +25,7 @@ from jaxltl.plot.board import (
     require_directions,
     rows_of_maps,
     rule_cells,
+    shade_cells,
     short_name,
 )
 from jaxltl.plot.style import (
@@ -32,7 +33,6 @@ from jaxltl.plot.style import (
     INK,
     KINDS,
     PAPER,
-    SCALE,
     head,
     note,
     scale_bar,
@@ -99,14 +99,14 @@ def grid(
         facecolor=PAPER,
     )
     all_axes = np.atleast_1d(figure.subplots(down, across, squeeze=False)).ravel()
-    low, high = value_limits(np.zeros(0) if panels is None else panels, limits)
+    limits = value_limits(np.zeros(0) if panels is None else panels, limits)
     for axes in all_axes[count:]:
         axes.axis("off")
     for m, axes in enumerate(all_axes[:count]):
         shown = None if panels is None else panels[m]
-        image = _cells(axes, kinds, shown, low, high, wall, arrows is None)
+        image = _cells(axes, kinds, shown, limits, wall, arrows is None)
         if arrows is not None:
-            draw_arrows(axes, kinds.shape, arrows[m], shown, low, high, actions)
+            draw_arrows(axes, kinds.shape, arrows[m], shown, limits, actions)
         head(axes, titles[m])
         keep_out_of_layout(axes)
     if panels is not None:
@@ -148,24 +148,16 @@ def _cells(
     axes: Axes,
     kinds: NDArray[np.str_],
     values: NDArray[np.float64] | None,
-    low: float,
-    high: float,
+    limits: tuple[float, float],
     wall: str,
     numbers: bool,
-) -> Any:
+) -> AxesImage:
     rows, columns = kinds.shape
     special = kind_colors(kinds, wall)
     shown: NDArray[np.float64] = np.full(kinds.shape, np.nan)
     if values is not None:
         shown = values.reshape(kinds.shape)
-    image = axes.imshow(
-        np.ma.masked_invalid(shown),
-        cmap=SCALE,
-        vmin=low,
-        vmax=high,
-        extent=(0, columns, rows, 0),
-        interpolation="nearest",
-    )
+    image = shade_cells(axes, shown, limits)
     tiny = max(rows, columns) > 16
     for (r, c), kind in np.ndenumerate(kinds):
         blank = np.isnan(shown[r, c]) or kind == wall
@@ -201,7 +193,6 @@ def _cells(
                     bbox={"facecolor": color, "edgecolor": "none", "pad": 0.9},
                 )
         if numbers and not blank and not tiny:
-            dark = shown[r, c] < low + 0.5 * (high - low)
             axes.text(
                 c + 0.5,
                 r + 0.58,
@@ -209,7 +200,7 @@ def _cells(
                 ha="center",
                 va="center",
                 fontsize=7,
-                color=PAPER if dark else INK,
+                color=PAPER if shown[r, c] < sum(limits) / 2 else INK,
             )
     rule_cells(axes, rows, columns, FAINT)
     axes.set(xlim=(0, columns), ylim=(rows, 0), aspect="equal")

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.colors import LinearSegmentedColormap
@@ -91,11 +92,10 @@ def note(figure: Figure, marks: Sequence[tuple[Any, ...]], title: str = "") -> N
     ]
     if not handles:
         return
-    across = max(1, min(len(handles), int(figure.get_figwidth() / 1.6)))
     legend = figure.legend(
         handles=handles,
         loc="outside lower left",
-        ncols=across,
+        ncols=max(1, min(len(handles), int(figure.get_figwidth() / 1.6))),
         frameon=False,
         fontsize=8,
         labelcolor=INK,
@@ -134,6 +134,19 @@ def scale_bar(
     bar.set_label(label, fontsize=9, color=INK)
     bar.outline.set_visible(False)
     bar.ax.tick_params(labelsize=8, color=MUTED, labelcolor=INK, length=2)
+
+
+def legend_below(figure: Figure, handles: Sequence[Artist], names: Sequence[str]) -> None:
+    """Draws a legend in one row below the axes."""
+    figure.legend(
+        handles,
+        names,
+        loc="outside lower center",
+        ncols=len(names),
+        frameon=False,
+        fontsize=8.5,
+        labelcolor=INK,
+    )
 
 
 def head(axes: Axes, text: str) -> None:

@@ -9,7 +9,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
-from matplotlib.image import AxesImage
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
@@ -22,8 +21,9 @@ from jaxltl.plot.board import (
     number_cells,
     require_directions,
     rule_cells,
+    shade_cells,
 )
-from jaxltl.plot.style import ACCENT, INK, PAPER, SCALE, SERIES, head, note, scale_bar, value_limits
+from jaxltl.plot.style import ACCENT, INK, PAPER, SERIES, head, note, scale_bar, value_limits
 
 if TYPE_CHECKING:
     from jaxltl.core.models.trajectories import Trajectories
@@ -101,13 +101,22 @@ def temporal_gridworld(
     for i, (axes, name) in enumerate(zip(every[0], titles, strict=True)):
         light = _color_cells(axes, world)
         if moves is not None:
-            draw_arrows(axes, shape, moves[i], light, 0.0, 1.0, actions)
+            draw_arrows(axes, shape, moves[i], light, (0.0, 1.0), actions)
         _draw_walks(axes, lines)
         _name_kinds(axes, world)
         head(axes, name)
         keep_out_of_layout(axes)
     if values is not None:
-        _value_panels(figure, every[1], world, values, moves, limits, label, actions)
+        limits = value_limits(values, limits)
+        for i, axes in enumerate(every[1]):
+            image = shade_cells(axes, values[i].reshape(shape), limits)
+            if moves is not None:
+                draw_arrows(axes, shape, moves[i], values[i], limits, actions)
+            number_cells(axes, *shape)
+            axes.set(xlim=(0, shape[1]), ylim=(shape[0], 0), aspect="equal")
+            _name_kinds(axes, world)
+            keep_out_of_layout(axes)
+        scale_bar(figure, image, every[1], label, shrink=0.7)
     if lines:
         note(figure, [(ACCENT, "first cell", "o"), (ACCENT, "last cell", "s")])
     return figure
@@ -155,8 +164,7 @@ def _color_cells(axes: Axes, world: World) -> NDArray[np.float64]:
     axes.add_patch(Rectangle((0, 0), columns, rows, fill=False, edgecolor=INK, lw=1.1))
     number_cells(axes, rows, columns)
     axes.set(xlim=(-margin, columns + margin), ylim=(rows + margin, -margin), aspect="equal")
-    inner = colors[margin : margin + rows, margin : margin + columns]
-    return _IS_LIGHT[inner.ravel()]
+    return _IS_LIGHT[colors[margin : margin + rows, margin : margin + columns].ravel()]
 
 
 def _name_kinds(axes: Axes, world: World) -> None:
@@ -233,34 +241,3 @@ def _draw_walks(axes: Axes, walks: Sequence[NDArray[np.float64]]) -> None:
                 zorder=6,
                 alpha=max(faint, 0.6),
             )
-
-
-def _value_panels(
-    figure: Figure,
-    every: Sequence[Axes],
-    world: World,
-    values: NDArray[np.float64],
-    moves: NDArray[np.float64] | None,
-    limits: tuple[float, float] | None,
-    label: str,
-    actions: Sequence[str],
-) -> None:
-    limits = value_limits(values, limits)
-    rows, columns = world.shape
-    image: AxesImage | None = None
-    for i, axes in enumerate(every):
-        image = axes.imshow(
-            np.ma.masked_invalid(values[i].reshape(rows, columns)),
-            cmap=SCALE,
-            vmin=limits[0],
-            vmax=limits[1],
-            extent=(0, columns, rows, 0),
-            interpolation="nearest",
-        )
-        if moves is not None:
-            draw_arrows(axes, world.shape, moves[i], values[i], *limits, actions)
-        number_cells(axes, rows, columns)
-        axes.set(xlim=(0, columns), ylim=(rows, 0), aspect="equal")
-        _name_kinds(axes, world)
-        keep_out_of_layout(axes)
-    scale_bar(figure, image, every, label, shrink=0.7)

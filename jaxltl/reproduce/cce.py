@@ -150,8 +150,7 @@ def _regulator(name: str, seeds: int, plan: Plan, optimum: lqr.Optimum) -> tuple
     allowed = cost <= 0
     rank = jnp.where(allowed.any(1)[:, None], jnp.where(allowed, objective, -jnp.inf), -cost)
     chosen = jnp.argmax(rank, 1)
-    policy = both[jnp.arange(seeds), chosen]
-    run = lqr.simulate(world, network, policy.T)
+    run = lqr.simulate(world, network, both[jnp.arange(seeds), chosen].T)
     feasible = np.asarray(allowed.any(1))
     gap = np.asarray(run.total) - optimum.total
     good = gap[feasible]

@@ -32,8 +32,7 @@ def run_seconds(job: Callable[[], ResultT]) -> tuple[ResultT, float]:
     """The result of a job and the seconds of its second run; the first run compiles."""
     jax.block_until_ready(job())
     begin = time.perf_counter()
-    result = jax.block_until_ready(job())
-    return result, round(time.perf_counter() - begin, 4)
+    return jax.block_until_ready(job()), round(time.perf_counter() - begin, 4)
 
 
 def svg_files(drawn: Mapping[str, Any]) -> list[tuple[str, bytes]]:

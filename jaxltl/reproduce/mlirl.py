@@ -157,8 +157,7 @@ def _missing_safety(world: MDP, shown: Trajectories, mu: float | None) -> Figure
     """
     incomplete = product(world, TASK_WITHOUT_SAFETY)
     features = irl.task_features(incomplete, shown, avoid=["r"])
-    problem = irl.make_problem(incomplete, features.values, shown)
-    [(_, policy, _)] = learn_cases(problem, (mu,))
+    [(_, policy, _)] = learn_cases(irl.make_problem(incomplete, features.values, shown), (mu,))
     reached = restrict(incomplete)
     true = product(reached.model, TASK)
     lifted = lift_policy(true, policy[reached.base_state, reached.memory])

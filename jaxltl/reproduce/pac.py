@@ -271,8 +271,7 @@ def table(result: Figures) -> str:
         f"{'':6}{f'restarts, one in {round(1 / RESTART)} moves':>38}{'no restarts':>38}",
         f"{'seed':>6}" + f"{'last update':>14}{'updates':>10}{'worst':>7}{'played':>7}" * 2,
     ]
-    both = zip(result["learned"], result["learned_without_restarts"], strict=True)
-    for pair in both:
+    for pair in zip(result["learned"], result["learned_without_restarts"], strict=True):
         lines.append(
             f"{pair[0]['seed']:>6}"
             + "".join(

@@ -250,6 +250,5 @@ def load_demonstrations(task: TodirlTask, scenes: Sequence[Scene]) -> list[Traje
     found = []
     for name, scene in zip(task.demonstrations.files or (), scenes, strict=True):
         cells = np.arange(scene.mdp.num_states).reshape(scene.shape).astype(str)
-        world = World(scene.mdp, cells, ACTIONS)
-        found.append(read_demonstrations(task.path.parent / name, world))
+        found.append(read_demonstrations(task.path.parent / name, World(scene.mdp, cells, ACTIONS)))
     return found

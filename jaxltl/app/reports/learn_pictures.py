@@ -125,12 +125,11 @@ def _layers(outcome: Any) -> dict[str, Layer]:
 
 def _maps(outcome: Any, cells: np.ndarray) -> list[Picture]:
     layers = _layers(outcome)
-    start = layers.pop(START)
     maps = [
         Picture(
             "values.svg",
             "Satisfaction probability",
-            drawing("grid", cells, start.value, label=_LABEL),
+            drawing("grid", cells, layers.pop(START).value, label=_LABEL),
             "Satisfaction probability of the learned policy from each initial state.",
             LIVE,
         )

@@ -220,8 +220,7 @@ def save(out: Path, found: Synthesis) -> None:
     region = {"region": found.wins}
     nodes = found.nodes
     if found.strategy is not None and found.restricted is not None:
-        state = found.restricted.base_state
-        base = np.asarray(found.strategy.base_state[state])
+        base = np.asarray(found.strategy.base_state[found.restricted.base_state])
         arrays = _arrays(found, found.restricted.model, base) | region
         arrays["mask"] = found.restricted.model.available
         arrays["memory"] = found.restricted.memory
@@ -328,8 +327,7 @@ def _moves_picture(found: Synthesis, environment: int | None) -> Any:
     place = state // (2 * count)
     if environment is None:
         forbids = can[state].sum(-1) - np.asarray(restricted.model.available).sum(-1)
-        total = np.bincount(place[mine], forbids[mine], minlength=count)
-        environment = int(np.argmax(total))
+        environment = int(np.argmax(np.bincount(place[mine], forbids[mine], minlength=count)))
     here = mine & (place == environment)
     pairs, size = np.unique(
         np.stack([automaton[here], memory[here]], 1), axis=0, return_counts=True

@@ -60,10 +60,9 @@ def hold(setup: Setup, policy: Any, inside: Any) -> Held:
     assert setup.sure is not None
     found = []
     for w, sure in enumerate(setup.sure[: len(policy)]):
-        model = part_of(setup.worlds.model, w)
         found.append(
             reaching(
-                model,
+                part_of(setup.worlds.model, w),
                 np.asarray(policy[w]),
                 np.asarray(inside[w]),
                 sure.best,

@@ -219,8 +219,7 @@ def _begins(block: Block, at: Integers, word: bytes) -> Booleans:
 
 def _order(block: Block, body: Body, is_state: Booleans, is_action: Booleans) -> Integers:
     """Index of the last state or action line up to each line of the block, or -1."""
-    index = np.arange(is_state.size)
-    last = np.maximum.accumulate(np.where(is_state | is_action, index, -1))
+    last = np.maximum.accumulate(np.where(is_state | is_action, np.arange(is_state.size), -1))
     within = np.where(last >= 0, is_action[last], body.after_action)
     block.require_form(is_state | is_action | within, "'state number' or 'action name' before it")
     block.require_form(

@@ -108,8 +108,7 @@ def _model(header: Header, body: Body) -> SparseMDP | IntervalMDP:
     state, row, line = (np.concatenate(x) for x in (body.state, body.row, body.line))
     probability = np.concatenate(body.value)
     start = np.concatenate([[0], np.bincount(row, minlength=body.num_rows).cumsum()])
-    total = np.add.reduceat(probability, start[:-1])
-    if (bad := first_without_distribution(total)) is not None:
+    if (bad := first_without_distribution(np.add.reduceat(probability, start[:-1]))) is not None:
         action, subject, problem = bad
         raise text.error(
             int(line[action]), f"{subject} of this action of state {state[action]} {problem}."
@@ -231,8 +230,7 @@ def _pieces(
 def _state_lines(
     states: slice, labels: list[tuple[str, NDArray[np.bool_]]], rewards: list[_Reward]
 ) -> list[str]:
-    count = states.stop - states.start
-    after = _bracketed([state for state, _ in rewards], states, count)
+    after = _bracketed([state for state, _ in rewards], states, states.stop - states.start)
     for text, holds in labels:
         for i in np.flatnonzero(holds[states]).tolist():
             after[i] += text
@@ -245,8 +243,7 @@ def _action_lines(
     actions: Callable[[int], str] | None,
     rewards: list[_Reward],
 ) -> list[str]:
-    count = rows.stop - rows.start
-    after = _bracketed([choice for _, choice in rewards], rows, count)
+    after = _bracketed([choice for _, choice in rewards], rows, rows.stop - rows.start)
     if actions is None or model.action is None:
         return [f"\taction {NO_LABEL.decode()}{text}\n" for text in after]
     numbers = np.asarray(model.action)[rows].tolist()
@@ -272,8 +269,7 @@ def _label_texts(model: SparseMDP) -> list[tuple[str, NDArray[np.bool_]]]:
         check_name("label", name, '"')
         if not name:
             raise ValueError("a label has the name ''; the format requires a name.")
-        plain = re.fullmatch(r"[^\s\[\]]+", name)
-        labels.append((f" {name}" if plain else f' "{name}"', where))
+        labels.append((f" {name}" if re.fullmatch(r"[^\s\[\]]+", name) else f' "{name}"', where))
     return labels
 
 

@@ -493,8 +493,7 @@ class _Reader:
             if not re.fullmatch(r"[0-9]{1,4}", exponent) or int(exponent) > _MOST_POWER:
                 raise _Malformed("no whole power up to 1000")
             base, result = result, self.number(1)
-            terms = max(len(base.numerator), len(base.denominator))
-            if (terms - 1) * int(exponent) > _MOST_POWER:
+            if (max(len(base.numerator), len(base.denominator)) - 1) * int(exponent) > _MOST_POWER:
                 raise _Malformed("too large")
             for _ in range(int(exponent)):
                 result = _multiply(result, base)

@@ -106,8 +106,7 @@ def _read(tokens: list[Token]) -> HoaGame:
     try:
         (version, items), states = parse_tokens(tokens)
         header = read_header(version, items)
-        outputs = _controllable(items, header)
-        return _Reader(header, outputs).game(by_number(header, states))
+        return _Reader(header, _controllable(items, header)).game(by_number(header, states))
     except RecursionError:  # evaluation recurses into guards
         raise error_at(
             tokens[0].line, "a label or the acceptance formula nests hundreds of levels deep, or "
@@ -403,8 +402,7 @@ def write_hoa_game(
     lines = ["HOA: v1", 'tool: "jaxltl"', *([f"name: {quoted(name)}"] if name else [])]
     lines += [f"States: {len(edges)}", f"Start: {number[starts[0]]}"]
     lines.append(" ".join([f"AP: {len(names)}", *map(quoted, names)]))
-    chosen = range(len(labels.inputs), len(names))
-    lines.append(" ".join(["controllable-AP:", *map(str, chosen)]))
+    lines.append(" ".join(["controllable-AP:", *map(str, range(len(labels.inputs), len(names)))]))
     lines += [f"acc-name: parity max even {count}", f"Acceptance: {count} "
               f"{parity_text(count, 'max')}"]  # fmt: skip
     lines.append("properties: trans-labels explicit-labels trans-acc colored complete "

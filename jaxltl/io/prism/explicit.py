@@ -316,11 +316,10 @@ def _columns(
     action = np.full(at.size, -1, np.int32)
     named = block.count > width
     action[named] = numbered(block.texts(at[named] + width), names)
-    is_chain = width == 3
     return (
         block.integers(at, "a state", below),
         np.zeros(at.size, np.int32)
-        if is_chain
+        if (width == 3)
         else block.integers(at + 1, "the number of a choice"),
         block.integers(at + width - 2, "a state", below),
         np.stack(intervals(block, at + width - 1), 1)
@@ -338,8 +337,7 @@ def _new_rows(text: Text, rows: _Rows, form: str) -> Booleans:
     other[1:] = state[1:] != state[:-1]
     new = other.copy()
     new[1:] |= choice[1:] != choice[:-1]
-    expected = np.where(other, 0, np.roll(choice, 1) + new)
-    wrong = choice != expected
+    wrong = choice != np.where(other, 0, np.roll(choice, 1) + new)
     wrong[1:] |= state[1:] < state[:-1]
     if wrong.any():
         i = int(wrong.argmax())

@@ -138,11 +138,9 @@ def _fields(block: Block, width: int) -> list[list[bytes]]:
     block.columns(1, 0, form := "'state:(value,value)' without blanks")
     joined = block.joined(block.first[:-1])
     sign = np.flatnonzero(_SIGN[joined])
-    pattern = b":(" + b"," * (width - 1) + b") "
-    fits = joined[sign].tobytes() == pattern * block.num_lines
+    fits = joined[sign].tobytes() == (b":(" + b"," * (width - 1) + b") ") * block.num_lines
     if fits:
-        by_line = sign.reshape(-1, width + 3)
-        fits = bool((np.diff(by_line)[:, [0, -1]] == 1).all())
+        fits = bool((np.diff(sign.reshape(-1, width + 3))[:, [0, -1]] == 1).all())
     fields = joined.tobytes().translate(_TO_BLANKS).split()
     states = fields[:: width + 1]
     if (
@@ -272,8 +270,7 @@ def _transition_reward(text: Text, model: SparseMDP, is_chain: bool) -> Rewards:
         row = host.row_start[state].astype(np.int64)
         if not is_chain:
             row += block.integers(at + 1, "the number of a choice")
-        target = block.integers(at + width - 2, "a state", host.num_states)
-        sought = row * host.num_states + target
+        sought = row * host.num_states + block.integers(at + width - 2, "a state", host.num_states)
         entry = np.minimum(np.searchsorted(place, sought), place.size - 1)
         valid = (place[entry] == sought) & (row < host.row_start[state + 1])
         block.require_form(valid, f"{form} of a transition that exists")

@@ -122,8 +122,7 @@ def _label_lines(names: list[str], holds: list[NDArray[np.bool_]], storm: bool) 
         yield (" ".join(f'{i}="{name}"' for i, name in enumerate(names)) + "\n").encode()
     texts = [f" {name}" if storm else f" {i}" for i, name in enumerate(names)]
     for begin in range(0, holds[0].size, _STEP):
-        part = np.stack([h[begin : begin + _STEP] for h in holds], 1)
-        state, column = np.nonzero(part)
+        state, column = np.nonzero(np.stack([h[begin : begin + _STEP] for h in holds], 1))
         first = np.diff(state, prepend=-1) > 0
         after = "" if storm else ":"
         lines = [

@@ -119,8 +119,7 @@ def _check_kind(index: Index, place: str) -> None:
 
 def _check_memory(index: Index, ranges: list[_Span], place: str) -> None:
     size = sum(x.size(index.counts[x.part]) for x in index.items().values())
-    here = sum(stop - start for start, stop in ranges)
-    check_memory(size * here // index.states, place)
+    check_memory(size * sum(stop - start for start, stop in ranges) // index.states, place)
 
 
 @dataclass(frozen=True)
