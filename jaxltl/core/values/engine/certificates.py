@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxltl.core.models.protocols import ActionModel
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.types import Solution, Status
 
@@ -49,6 +50,9 @@ def backup_error(unit: Any, *sizes: Any) -> jax.Array:
     # epsilon``.
     info = jnp.finfo(jnp.asarray(sizes[0]).dtype)
     return unit * (sum(sizes) + 2 * float(info.tiny) / float(info.eps))
+
+
+Operator = Callable[[jax.Array], jax.Array]
 
 
 class Enclosure(NamedTuple):
@@ -101,16 +105,20 @@ def judged(down: Any, up: Any, rounding: Any, tolerance: Any) -> Enclosure:
 
 
 def m_matrix_error(
-    model: Any,
-    solve: Callable[[jax.Array], jax.Array],
-    onward: Callable[[jax.Array], jax.Array],
-    value: jax.Array,
+    model: ActionModel,
+    solve: Operator,
+    onward: Operator,
+    start: jax.Array,
+    one: jax.Array,
     undecided: jax.Array,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Certified error of an approximate solution of ``y = P y`` on the undecided states."""
+    """A solution of ``y = one + P y`` from its approximation, its certified error and residual."""
     # If e >= 0 satisfies ``e - P e >= |r|`` there, where r is the residual of y and decided states
     # are absorbing, then ``|y - y*| <= e``, because ``I - P`` is an M-matrix. A second solve gives
     # e, and a check of the inequality, rounding included, proves it.
+    value = jnp.where(undecided, start, one)
+    # Elimination can break down where rounding closes a set that is hardly ever left.
+    value = jnp.clip(jnp.where(jnp.isfinite(value), value, 0), 0, 1)
     unit = rounding_unit(model)
     residual = jnp.where(undecided, jnp.abs(onward(value) - value), 0)
     claim = jnp.where(undecided, 2 * residual + 4 * unit * (value + 1e-3), 0)
@@ -118,7 +126,7 @@ def m_matrix_error(
     enough = error - onward(error) >= residual + unit * (value + error)
     proven = jnp.all(jnp.where(undecided, enough, True) & (error >= 0))
     error = jnp.where(undecided, jnp.where(proven, error, 1), 0)
-    return error, jnp.max(residual), proven
+    return value, error, jnp.max(residual)
 
 
 def refuse(

@@ -188,19 +188,8 @@ def discounted(
         earned, magnitude = (chain.mean(x, host.row_start) for x in (earned, magnitude))
         host, depth = chain.mdp, chain.depth
     found = discounted_value(host, earned, magnitude, float(discount), tolerance=asked, depth=depth)
-    width = found.upper - found.lower
-    status = Status.CONVERGED if (width <= asked).all() else Status.PRECISION
-    parts: dict[str, Any] = {
-        "value": found.value,
-        "policy": found.row.astype(np.int32),
-        "lower": found.lower,
-        "upper": found.upper,
-        "residual": np.float64(found.residual),
-        "num_steps": np.int32(found.rounds),
-        "status": np.int32(status),
-    }
-    parts = {name: x.reshape(model.state_shape) if np.ndim(x) else x for name, x in parts.items()}
-    return with_given_policy(Solution(**parts, method=found.method), policy)
+    solution = solution_from_enclosure(model, sparse, found, asked, relative=False)
+    return with_given_policy(solution, policy)
 
 
 def default_tolerance(model: Model) -> float:

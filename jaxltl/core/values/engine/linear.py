@@ -123,15 +123,7 @@ class Krylov(NamedTuple):
 
     def counted(self, b: jax.Array) -> tuple[jax.Array, jax.Array]:
         """The solution of the system, and the number of products."""
-        x, n = _krylov(
-            lambda table, given, x: System(table, *given).matvec(x),
-            self.system.table,
-            self.system[1:],
-            b.ravel(),
-            self.tolerance,
-            self.max_steps,
-        )
-        return x.reshape(b.shape), n
+        return self._counted(System.matvec, b)
 
     def transpose_solve(self, b: jax.Array) -> jax.Array:
         """The solution of the transposed system."""
@@ -139,8 +131,13 @@ class Krylov(NamedTuple):
 
     def transpose_counted(self, b: jax.Array) -> tuple[jax.Array, jax.Array]:
         """The solution of the transposed system, and the number of products."""
+        return self._counted(System.vecmat, b)
+
+    def _counted(
+        self, apply: Callable[[System, jax.Array], jax.Array], b: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
         x, n = _krylov(
-            lambda table, given, x: System(table, *given).vecmat(x),
+            lambda table, given, x: apply(System(table, *given), x),
             self.system.table,
             self.system[1:],
             b.ravel(),

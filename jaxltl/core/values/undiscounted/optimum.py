@@ -7,7 +7,6 @@ components collapsed.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -78,18 +77,12 @@ def policy_reachability(
     onward, chain = partial(image, *constant), ChainSystem(*constant, undecided)
     goal = _half_width(model, tolerance)
 
-    def enclosed(solve: Callable[[jax.Array], jax.Array], value: jax.Array) -> tuple[Any, ...]:
-        value = jnp.where(undecided, value, one)
-        # Elimination can break down where rounding closes a set that is hardly ever left.
-        value = jnp.clip(jnp.where(jnp.isfinite(value), value, 0), 0, 1)
-        return value, *m_matrix_error(model, solve, onward, value, undecided)[:2]
-
-    def eliminated() -> tuple[Any, ...]:
+    def eliminated() -> tuple[jax.Array, ...]:
         solve = partial(chain.solve, lambda x: x - onward(x))
-        return enclosed(solve, solve(one))
+        return m_matrix_error(model, solve, onward, solve(one), one, undecided)
 
     start, n = linear.counted(one)
-    found = enclosed(linear.solve, start)
+    found = m_matrix_error(model, linear.solve, onward, start, one, undecided)
     if method == "auto" and not isinstance(linear, Inverse) and not is_sharded(model):
         # Krylov steps stagnate in chains that take very long.
         found = lax.cond(jnp.max(found[1]) <= goal, lambda: found, eliminated)

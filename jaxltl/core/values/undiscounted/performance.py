@@ -34,9 +34,12 @@ from jaxltl.core.models.ops.operators import (
 )
 from jaxltl.core.models.product import Product
 from jaxltl.core.pretty_print import brief
+from jaxltl.core.sparse.graph.qualitative import backward_reachable
 from jaxltl.core.types import Status, require_shape, status_code
 from jaxltl.core.values.engine.certificates import m_matrix_error
+from jaxltl.core.values.engine.host_solution import induced_chain
 from jaxltl.core.values.engine.linear import inverse
+from jaxltl.core.values.undiscounted.reachability import rows_of_model
 from jaxltl.core.values.undiscounted.satisfaction import as_reachability, satisfaction_probability
 
 _BLOCK_LIMIT = 1024  # world states up to which a block is inverted
@@ -203,8 +206,7 @@ def _summarize(model: Product, value, lower, upper, tolerance) -> Performance:
 def _reach(model: Product, target: jax.Array, policy: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Reachability probabilities ``float[S, Q]``, and a certified bound on the error."""
     # ``(I - P) y = b`` on the undecided states is solved by block Jacobi over memory states,
-    # exactly if the automaton's only cycles are self-loops, and certified by
-    # :func:`~jaxltl.core.values.engine.certificates.m_matrix_error`.
+    # exactly if the automaton's only cycles are self-loops.
     sets = policy_sets(TracedGraph(model), target, policy)
     undecided = ~(sets.one | sets.zero)
     one = sets.one.astype(model.dtype)
@@ -213,10 +215,7 @@ def _reach(model: Product, target: jax.Array, policy: jax.Array) -> tuple[jax.Ar
     def onward(y: jax.Array) -> jax.Array:
         return jnp.where(undecided, action_mean(policy, expectation(model, y)), 0)
 
-    value = jnp.where(undecided, solve(one), one)
-    # Elimination can break down where rounding closes a set that is hardly ever left.
-    value = jnp.clip(jnp.where(jnp.isfinite(value), value, 0), 0, 1)
-    return value, m_matrix_error(model, solve, onward, value, undecided)[0]
+    return m_matrix_error(model, solve, onward, solve(one), one, undecided)[:2]
 
 
 def _block_solver(model: Product, policy: jax.Array, undecided: jax.Array):
@@ -369,9 +368,12 @@ def _by_elimination(model: Product, policy: jax.Array) -> tuple[np.ndarray, np.n
         target = np.asarray(~model.final if safety else model.final).ravel()
     else:
         target = np.asarray(accepting_bottom_components(model, policy)).ravel()
-    weight = _chain(model, policy)
-    reaching = _reaching(weight, target)
-    doomed = _reaching(np.where(target[:, None], 0, weight), ~reaching)
+    given = np.asarray(policy, np.float64)
+    given = given / given.sum(-1, keepdims=True)
+    chain = induced_chain(model, rows_of_model(model), given).mdp
+    weight = chain.matrix.toarray()
+    reaching = backward_reachable(chain, target)
+    doomed = backward_reachable(chain, ~reaching, ~target)
     rest = np.flatnonzero(doomed & reaching)
     value = (~doomed).astype(float)
     inner = weight[np.ix_(rest, rest)]
@@ -403,37 +405,6 @@ def _by_elimination(model: Product, policy: jax.Array) -> tuple[np.ndarray, np.n
     bounds = (value, np.maximum(value - error, 0), np.minimum(value + error, 1))
     value, lower, upper = (x.reshape(model.state_shape) for x in bounds)
     return value, lower, upper
-
-
-def _chain(model: Product, policy: jax.Array) -> np.ndarray:
-    """``float64[S * Q, S * Q]``, the policy's transitions, of rows that sum to one."""
-    world = model.mdp
-    num_states, num_memory = model.state_shape
-    memory = np.asarray(model.next_memory)
-    given = np.asarray(policy, np.float64)
-    given = given / given.sum(-1, keepdims=True)
-    probability = np.asarray(world.successor_probability, np.float64)
-    total = probability.sum(-1, keepdims=True)
-    probability = np.divide(probability, total, where=total > 0, out=np.zeros_like(probability))
-    successor = np.broadcast_to(
-        getattr(world, "successor", np.arange(num_states)), probability.shape
-    )
-    s, q, a, k = np.indices((num_states, num_memory, *probability.shape[1:]))
-    read = successor[s, a, k] if model.label_on == "entry" else s
-    column = successor[s, a, k] * num_memory + memory[read, q]
-    weight = np.zeros((model.num_states, model.num_states))
-    np.add.at(weight, (s * num_memory + q, column), given[s, q, a] * probability[s, a, k])
-    return weight
-
-
-def _reaching(weight: np.ndarray, goal: np.ndarray) -> np.ndarray:
-    """States with a path of positive weight to a goal."""
-    found = np.flatnonzero(goal)
-    inside = np.array(goal, bool)
-    while found.size:
-        found = np.flatnonzero((weight[:, found] > 0).any(1) & ~inside)
-        inside[found] = True
-    return inside
 
 
 # --- summaries over worlds ------------------------------------------------------------------------

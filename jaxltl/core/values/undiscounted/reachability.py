@@ -29,6 +29,7 @@ from jaxltl.core.sparse.solvers.layered_reachability import PaddedProduct, layer
 from jaxltl.core.sparse.solvers.total_cost import Enclosure
 from jaxltl.core.sparse.solvers.shortest_path import fastest_rows
 from jaxltl.core.types import Solution, require_shape
+from jaxltl.core.values.engine.state_quantities import reduction_for
 from jaxltl.core.values.engine.host_solution import (
     induced_chain,
     default_tolerance,
@@ -108,8 +109,7 @@ def reachability_probability(
     """
     if method not in ("auto", "direct", "iterative"):
         raise ValueError(f"method={method!r}; choose auto, direct or iterative.")
-    if objective not in ("max", "min"):
-        raise ValueError(f'objective={objective!r}; it must be "max" or "min".')
+    reduction_for(objective)
     if isinstance(model, IntervalMDP):
         return robust_reachability(
             model,

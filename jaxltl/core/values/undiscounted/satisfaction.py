@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from jax import lax
 
+from jaxltl.core.values.engine.state_quantities import reduction_for
 from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.graphs.acceptance import (
@@ -299,8 +300,7 @@ class Reaching(NamedTuple):
 
 def as_reachability(model: Product, objective: str) -> Reaching:
     """The reachability problem whose optimum is the optimal satisfaction probability."""
-    if objective not in ("max", "min"):
-        raise ValueError(f'objective={objective!r}; it must be "max" or "min".')
+    reduction_for(objective)
     task = model.automaton
     if task.is_cosafe:
         return Reaching(model, model.final, objective, False)

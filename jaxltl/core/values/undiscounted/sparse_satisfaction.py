@@ -23,6 +23,7 @@ from jaxltl.core.sparse.product import SparseProduct, sparse_product, product_wi
 from jaxltl.core.sparse.solvers.reachability import reachability
 from jaxltl.core.types import Solution, require_shape
 from jaxltl.core.values import facts
+from jaxltl.core.values.engine.state_quantities import reduction_for
 from jaxltl.core.values.engine.host_solution import (
     Chain,
     induced_chain,
@@ -71,8 +72,7 @@ def sparse_satisfaction(
     tolerance: float | None = None,
 ) -> Satisfaction:
     """Optimal satisfaction probability on the reachable product, up to states with a verdict."""
-    if objective not in ("max", "min"):
-        raise ValueError(f'objective={objective!r}; it must be "max" or "min".')
+    reduction_for(objective)
     if label_on not in ("entry", "exit"):
         raise ValueError(f'label_on={label_on!r}; it must be "entry" or "exit".')
     automaton, letter = automaton_and_letters(model, task)

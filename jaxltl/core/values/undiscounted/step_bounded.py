@@ -176,9 +176,8 @@ def cumulative_reward(
         )
     refuse_nature(nature)
     model, operation = _problem(model, objective, num_steps)
-    earned, magnitude = finite_reward(model, reward)
-    zero = np.zeros(model.num_states)
-    found = host.total(model.host, earned, magnitude, zero, num_steps, operation, by_step)
+    rewards = *finite_reward(model, reward), np.zeros(model.num_states)
+    found = host.total(model.host, *rewards, num_steps, operation, by_step)
     return solution_from_error(found.value, found.error, found.row, found.num_steps)
 
 
@@ -222,9 +221,9 @@ def instantaneous_reward(
         )
     refuse_nature(nature)
     model, operation = _problem(model, objective, num_step)
-    start = state_reward(model, reward)
     zero = np.zeros(model.num_rows)
-    found = host.total(model.host, zero, zero, start, num_step, operation, by_step)
+    rewards = zero, zero, state_reward(model, reward)
+    found = host.total(model.host, *rewards, num_step, operation, by_step)
     return solution_from_error(found.value, found.error, found.row, found.num_steps)
 
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxltl.core.values.engine.state_quantities import reduction_for
 from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.interval import IntervalMDP
@@ -89,8 +90,7 @@ def total_reward(
       >>> total_reward(coin, np.ones(2), np.array([False, True])).value.round(6).tolist()
       [2.0, 0.0]
     """
-    if objective not in ("max", "min"):
-        raise ValueError(f'objective={objective!r}; it must be "max" or "min".')
+    reduction_for(objective)
     if isinstance(model, IntervalMDP):
         if target is None:
             raise ValueError("total rewards of interval models need a target; give one.")
