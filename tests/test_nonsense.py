@@ -217,7 +217,7 @@ def things(folder):
         ),
         (
             jl.learn_guarantee,
-            {**told, "graph": "given", "rows": None, "num_claims": None, "tolerance": 1e-6},
+            {**told, "graph": "given", "tolerance": 1e-6},
         ),
         (jl.values.guarantee_curve, {**told, "graph": "given", "sizes": [1, 2], "seed": 0}),
         (jl.solve_property, {"model": model, "prop": 'Pmaxmin=? [F "a"]', "states": None}),

@@ -18,6 +18,7 @@ from .evaluation.data_guarantee import (
 )
 from .evaluation.episode_scores import episode_evaluator as episode_evaluator
 from .evaluation.evaluation import (
+    Batch as Batch,
     EpisodeTotals as EpisodeTotals,
     Estimate as Estimate,
     Evaluation as Evaluation,

@@ -71,9 +71,7 @@ def minimax_value(
     system's states and 1 at the environment's, so that time is counted in moves of the system.
 
     The bounds rest on a function h with ``h >= 1 + g P h`` for all moves of both players, the
-    discounted time that is left at most: ``|T v - v| <= e`` puts the value within ``e * h`` of
-    v. It is what :func:`~jaxltl.core.values.engine.certificates.m_matrix_error` asks of an error, for all
-    choices at once, and found by policy iteration too.
+    maximal discounted time: ``|T v - v| <= e`` puts the value within ``e * h`` of v.
 
     Args:
       game: a Game; any other model is the game in which the system always moves.
@@ -86,17 +84,14 @@ def minimax_value(
         ``"value_iteration"``, sweeps alone; or ``"strategy_iteration"`` (Hoffman and Karp 1966),
         the environment answering best before the system improves, which always ends.
       allowed: ``bool[S, A]``, the moves that may be made, such as a permissive strategy's;
-        default the available ones. A play that reaches a state without any is worth minus
-        infinity, so the system keeps away, and that is the value where it cannot.
+        default the available ones. A state without any has the value minus infinity.
       tolerance: width of the enclosure; default: what the dtype allows.
-      max_steps: applications of the operator, or of the linear one of fixed choices, at most;
-        in strategy iteration, choices that are looked at. As many again may go into h where
-        not every move is discounted; they are not counted.
+      max_steps: maximal number of backups; in strategy iteration, of strategies. As many again may
+        go into h with ``per="system_move"``; they are not counted.
 
     Returns:
       :class:`Solution`; `policy` is ``int32[S]``, greedy for both players: the system's part
-      secures at least `lower`, the environment's concedes at most `upper`. Where the value is
-      minus infinity the policy means nothing.
+      secures at least `lower`, the environment's concedes at most `upper`, where these are finite.
 
     Raises:
       ValueError: a wrong shape, an unknown method or `per`, or, with ``per="system_move"``,
@@ -131,22 +126,8 @@ def minimax_value(
     moves = moves & ~graph.on_choices(lost) & ~graph.exists(lost)
     defined = _returns(graph, per, system | lost, moves, xp.zeros_like(lost))
     moves, live = to_jax((moves, ~lost))
-    return reshape_solution(
-        given,
-        _solve(
-            game,
-            None,
-            moves,
-            live,
-            defined,
-            reward,
-            discount,
-            tolerance,
-            max_steps,
-            per=per,
-            method=method,
-        ),
-    )
+    problem = _Problem(game, None, moves, live, defined, reward, discount)
+    return reshape_solution(given, _solve(problem, tolerance, max_steps, per=per, method=method))
 
 
 @validated(per=_PER, method=_METHODS, environment=("adversarial",))
@@ -225,22 +206,9 @@ def strategy_value(
     moves = moves & ~graph.on_choices(lost)
     defined = _returns(graph, per, system | lost, moves, drawn)
     moves, drawn, live = to_jax((moves, drawn, ~lost))
-    return reshape_solution(
-        asked,
-        _solve(
-            game,
-            checked._replace(used=drawn),
-            moves,
-            live,
-            defined,
-            reward,
-            discount,
-            tolerance,
-            max_steps,
-            per=per,
-            method=method,
-        ),
-    )
+    checked = checked._replace(used=drawn)
+    problem = _Problem(game, checked, moves, live, defined, reward, discount)
+    return reshape_solution(asked, _solve(problem, tolerance, max_steps, per=per, method=method))
 
 
 def _read(game: Game, states: Any) -> Any:
@@ -252,20 +220,25 @@ def _read(game: Game, states: Any) -> Any:
 
 
 class _Drawn(NamedTuple):
-    """Policies of the players that do not optimise.
+    """Policies of the players that do not optimise."""
 
-    Attributes:
-      weight: ``float[S, A]``, distributions.
-      given: as they were, NaN at moves that are not available.
-      valid: whether they are distributions.
-      used: ``bool[S, A]``, the moves of positive weight; later ``bool[S]``, where they count.
-    """
-
-    weight: jax.Array
-    given: jax.Array
-    valid: jax.Array
+    weight: jax.Array  # distributions
+    given: jax.Array  # as they were, NaN at moves that are not available
+    valid: jax.Array  # whether they are distributions
     representable: jax.Array
-    used: jax.Array
+    used: jax.Array  # bool[S, A], the moves of positive weight; later bool[S], where they count
+
+
+class _Problem(NamedTuple):
+    """A discounted game with its graph's preprocessing."""
+
+    game: Game
+    drawn: _Drawn | None  # policies of the players that do not optimise
+    moves: jax.Array  # that may be made
+    live: jax.Array  # states from which play does not get stuck
+    defined: jax.Array  # whether values exist
+    reward: chex.Array
+    discount: chex.Numeric
 
 
 @jax.jit
@@ -299,30 +272,16 @@ def _returns(graph: Graph, per: str, goal: Any, moves: Any, drawn: Any) -> Any:
     return back.all()
 
 
-# --- the game ------------------------------------------------------------------------
-
-
 class _Play(NamedTuple):
-    """Numbers of a discounted game over flat states; lanes may differ in all of them.
-
-    Attributes:
-      system: ``bool[N]``.
-      drawn: ``bool[N]``, where moves are drawn by `weight`; None where nobody's are.
-      weight: in columns.
-      horizon: the largest value of h; infinite or NaN without a bound.
-      discount: a scalar.
-      unit: relative rounding of a backup.
-      size: the largest reward.
-      tolerance: width of the enclosure, or None.
-    """
+    """Numbers of a discounted game over flat states; lanes may differ in all of them."""
 
     system: jax.Array
-    drawn: jax.Array | None
-    weight: Any
-    horizon: jax.Array
+    drawn: jax.Array | None  # states in which moves are drawn by `weight`
+    weight: Any  # in columns
+    horizon: jax.Array  # the largest value of h; infinite or NaN without a bound
     discount: jax.Array
-    unit: jax.Array
-    size: jax.Array
+    unit: jax.Array  # relative rounding of a backup
+    size: jax.Array  # the largest reward
     tolerance: jax.Array | None
 
 
@@ -357,22 +316,23 @@ def _gains(rows: Any, play: _Play, reward: Any, moves: Any, live: jax.Array) -> 
     )
 
 
-# --- bounds --------------------------------------------------------------------------------
-
-
-def _horizon(rows: Any, play: _Play, moves, live, per: str, defined, max_steps) -> jax.Array:
+def _horizon(
+    rows: Any, play: _Play, problem: _Problem, moves: Any, per: str, max_steps: chex.Numeric
+) -> jax.Array:
     """A function h with ``h >= 1 + g P h`` for all moves; infinite or NaN without one.
 
     With tau the expected number of undiscounted moves before the next discounted one, at most,
     and L its maximum: ``h = (1 + discount * L) / (1 - discount) + tau``. It is the value of the
     play in which both players want it long. Where each move is discounted it is one number.
     """
-    tau = jnp.zeros((), play.discount.dtype)
+    tau, live, defined = jnp.zeros((), play.discount.dtype), problem.live.ravel(), problem.defined
     if per == "system_move":
         free = live & ~play.system
         slow = play._replace(system=jnp.ones_like(live))
 
-        def judge(tau, after, given):
+        def judge(
+            tau: jax.Array, after: jax.Array, given: tuple[_Play, jax.Array]
+        ) -> tuple[jax.Array, jax.Array]:
             growth = jnp.max(after - tau, axis=0)
             # Below, from 1 + P tau <= tau + growth follows that tau / (1 - growth) is enough.
             return (growth <= 2.0**-7) | ~jnp.isfinite(growth) | ~given[1], jnp.abs(growth)
@@ -425,27 +385,19 @@ def _judge(value: jax.Array, image: jax.Array, play: _Play) -> tuple[jax.Array, 
     return found.converged | found.exhausted | ~jnp.isfinite(found.half), found.half
 
 
-# --- solvers -------------------------------------------------------------------------------
-
-
 _FIRST_SWEEPS = 128  # of large games: they cost less than linear systems far from the value
 
 
 @partial(jax.jit, static_argnames=("per", "method"))
 def _solve(
-    game: Game,
-    drawn: _Drawn | None,
-    moves,
-    live,
-    defined,
-    reward,
-    discount,
-    tolerance,
-    max_steps,
+    problem: _Problem,
+    tolerance: chex.Numeric | None,
+    max_steps: chex.Numeric,
     *,
     per: str,
     method: str,
 ) -> Solution:
+    game, drawn, moves, live, _, reward, discount = problem
     discount = jnp.asarray(discount, game.dtype)
     size = jnp.where(moves, expected_reward(game, jax.tree.map(jnp.abs, reward)), 0)
     reward, over = jnp.where(moves, expected_reward(game, reward), 0), choices(game)
@@ -472,7 +424,7 @@ def _solve(
         None if tolerance is None else jnp.asarray(tolerance, game.dtype),
     )
     rows, columns = sweep_operator(game), over.columns(moves)
-    horizon = _horizon(rows, play, columns, flat, per, defined, max_steps)
+    horizon = _horizon(rows, play, problem, columns, per, max_steps)
     play = play._replace(horizon=jnp.max(horizon))
     numbers = newton.Backup(
         _gains(rows, play, over.columns(reward), columns, flat),

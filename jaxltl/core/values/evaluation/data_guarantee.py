@@ -21,6 +21,7 @@ from jaxltl.core.models.interval import IntervalMDP, make_interval
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.statistics.confidence_sets import ConfidenceSets, Method, intervals_from_counts
+from jaxltl.core.types import require_shape
 from jaxltl.core import validation
 from jaxltl.core.values import facts
 from jaxltl.core.values.interval.robust import require_objective
@@ -76,15 +77,13 @@ class DataGuarantee:
 
 def learn_guarantee(
     model: Any,
-    counts: TransitionCounts | np.ndarray,
+    counts: TransitionCounts | ConfidenceSets | np.ndarray,
     task: Task,
     confidence: float,
     *,
     graph: Graph,
-    method: Method = "anytime",
+    method: Method | None = None,
     objective: str = "max",
-    rows: Any = None,
-    num_claims: int | None = None,
     tolerance: float | None = None,
 ) -> DataGuarantee:
     """A policy for a temporal-logic task, with a guarantee from counted transitions.
@@ -97,16 +96,16 @@ def learn_guarantee(
     Args:
       model: its graph, labels and initial distribution are used, its probabilities are not. See
         :func:`~jaxltl.core.models.construct.counts.model_from_counts` for a model of a log.
-      counts: of its transitions, matched by name; or ``int[T]``, one for each of its entries.
+      counts: of its transitions, matched by name; or ``int[T]``, one for each of its entries; or
+        confidence sets of its entries, such as those of selected rows, from `intervals_from_counts`.
       task: a formula, its text, or an automaton.
       confidence: in (0, 1), of all returned statements at once.
       graph: the assumption on the model's graph: ``"given"``, it is known; ``"seen"``,
         ``"complete"`` or :class:`~jaxltl.core.statistics.graph_assumption.LeastProbability`, as it
         was given to `model_from_counts`. There is no default: the guarantee holds under it only.
-      method: ``"anytime"`` holds for any way of gathering data; ``"clopper-pearson"``,
+      method: of counts; ``"anytime"`` (default) holds for any way of gathering data; ``"clopper-pearson"``,
         ``"hoeffding"`` and ``"weissman"`` need numbers of samples that do not depend on outcomes.
       objective: ``"max"`` or ``"min"``.
-      rows, num_claims: see :func:`~jaxltl.core.statistics.confidence_sets.intervals_from_counts`.
       tolerance: width of the enclosures of the interval model's values.
 
     Returns:
@@ -129,15 +128,22 @@ def learn_guarantee(
     """
     require_objective(objective)
     sparse = to_sparse(model)
-    count = align_counts(sparse, counts) if isinstance(counts, TransitionCounts) else counts
-    sets = intervals_from_counts(
-        count,
-        _confidence_of_sets(sparse, graph, confidence),
-        method=method,
-        entry_start=sparse.entry_start,
-        rows=rows,
-        num_claims=num_claims,
-    )
+    needed = _confidence_of_sets(sparse, graph, confidence)
+    if isinstance(counts, ConfidenceSets):
+        sets = counts
+        require_shape("counts.lower", sets.lower, (sparse.num_transitions,))
+        if method is not None or sets.confidence < needed:
+            raise ValueError(
+                f"counts are confidence sets by {sets.method}, of confidence {sets.confidence:g}; "
+                f"leave method out, and make them with a confidence of at least {needed:g}."
+            )
+    else:
+        sets = intervals_from_counts(
+            align_counts(sparse, counts) if isinstance(counts, TransitionCounts) else counts,
+            needed,
+            method=method or "anytime",
+            entry_start=sparse.entry_start,
+        )
     interval, kept = _with_sets(sparse, sets)
     found = robust_satisfaction(
         interval, task, objective=objective, nature="adversarial", tolerance=tolerance

@@ -271,6 +271,23 @@ _SHARES = {
 }
 
 
+class Batch(NamedTuple):
+    """Episodes simulated at a time, and the devices among which they are split.
+
+    Attributes:
+      size: number of episodes; memory grows with it.
+      sharding: a ``NamedSharding`` with the mesh axis over which episodes are split; of several
+        processes, each makes the same call and returns the same.
+
+    Example:
+      >>> Batch(size=64).sharding is None
+      True
+    """
+
+    size: int = 256
+    sharding: NamedSharding | None = None
+
+
 def evaluate(
     key: chex.PRNGKey,
     agent: Agent,
@@ -281,26 +298,22 @@ def evaluate(
     confidence: float = 0.95,
     threshold: float | None = None,
     discount: float | None = None,
-    batch: int = 256,
-    sharding: NamedSharding | None = None,
+    batch: int | Batch = 256,
 ) -> Evaluation:
     """Evaluates an agent: frequencies and means over fresh episodes, with confidence intervals.
 
-    Episode i is ``run_episode(fold_in(key, i), environment, agent, num_steps=num_steps)``, whatever
-    the batch. Each interval alone holds with probability `confidence` (several at once: take
+    Episode i is ``run_episode(fold_in(key, i), environment, agent, num_steps=num_steps)`` for every
+    batch size. Each interval alone holds with probability `confidence` (several at once: take
     ``1 - (1 - confidence) / number`` for each).
 
-    - Shares of success, violation and undecided: exact by Clopper and Pearson (1934), where the
-      number of episodes is fixed.
-    - With a `threshold` the simulation stops after the first batch after which success is known to
-      be at least that, or below. The number of episodes then depends on what came, and the shares'
-      intervals are those of Jeffreys' mixture: the probability to miss *at any time* is at most
-      ``1 - confidence`` (Ville; Robbins 1970): so is the chance of a wrong decision.
-    - Lengths and visits are bounded by `num_steps`: empirical Bernstein, which holds at any time
+    - Shares of success, violation and undecided: exact by Clopper and Pearson (1934).
+    - With a `threshold` the simulation stops after the first batch that decides it; the shares'
+      intervals are then anytime-valid (Jeffreys' mixture; Ville; Robbins 1970), and the decision is
+      wrong with probability at most ``1 - confidence``.
+    - Lengths and visits are bounded by `num_steps`: empirical Bernstein, anytime-valid
       (Waudby-Smith and Ramdas 2024, theorem 2).
-    - Rewards and costs have no known bounds: Student's interval, which rests on the
-      central limit theorem, and as if the number of episodes had been fixed. What never varied
-      has an interval of length zero.
+    - Rewards and costs: Student's interval, which rests on the central limit theorem and on a fixed
+      number of episodes.
 
     Args:
       key: of everything that is drawn.
@@ -311,9 +324,7 @@ def evaluate(
       confidence: of each interval, in (0, 1).
       threshold: on the chance of success, in (0, 1).
       discount: in (0, 1), of `discounted_reward` and `discounted_visits`.
-      batch: episodes that are simulated side by side; they alone take memory.
-      sharding: a ``NamedSharding`` with the mesh axis over which episodes are split; in
-        several processes each makes the same call and returns the same.
+      batch: episodes simulated at a time, or a :class:`Batch` with a sharding.
 
     Returns:
       :class:`Evaluation`, on the host.
@@ -339,7 +350,8 @@ def evaluate(
     num_steps = checked_steps(require_environment(environment), num_steps)
     most = 2**31 - 1
     num_episodes = validation.integer("num_episodes", num_episodes, least=1, most=most)
-    batch = validation.integer("batch", batch, least=1, most=most)
+    size, sharding = batch if isinstance(batch, Batch) else (batch, None)
+    size = validation.integer("batch", size, least=1, most=most)
     confidence = validation.fraction("confidence", confidence, ends=(False, False))
     if threshold is not None:
         threshold = validation.fraction("threshold", threshold, ends=(False, False))
@@ -358,13 +370,11 @@ def evaluate(
         found = on_host(
             _batch(
                 key,
-                environment,
-                agent,
+                (environment, agent),
                 jnp.int32(count),
                 1.0 if discount is None else discount,
                 num_steps=num_steps,
-                batch=min(batch, num_episodes),
-                sharding=sharding,
+                batch=Batch(min(size, num_episodes), sharding),
             )
         )
         parts.append(jax.tree.map(lambda x, most=num_episodes - count: x[:most], found))
@@ -376,28 +386,23 @@ def evaluate(
     return _told(totals, num_steps, confidence, threshold, discount, decision)
 
 
-@partial(jax.jit, static_argnames=("num_steps", "batch", "sharding"))
+@partial(jax.jit, static_argnames=("num_steps", "batch"))
 def _batch(
     key: chex.PRNGKey,
-    environment: Environment,
-    agent: Agent,
+    players: tuple[Environment, Agent],
     first: jax.Array,
     discount: chex.Numeric,
     *,
     num_steps: int,
-    batch: int,
-    sharding: NamedSharding | None = None,
+    batch: Batch,
 ) -> EpisodeTotals:
     def one(
-        key: chex.PRNGKey, environment: Environment, agent: Agent, discount: Any
+        key: chex.PRNGKey, players: tuple[Environment, Agent], discount: chex.Numeric
     ) -> EpisodeTotals:
-        return episode_totals(key, environment, agent, num_steps=num_steps, discount=discount)
+        return episode_totals(key, *players, num_steps=num_steps, discount=discount)
 
-    axes, keys = (
-        (0, None, None, None),
-        jax.vmap(partial(jax.random.fold_in, key))(first + jnp.arange(batch)),
-    )
-    return vmap_split(one, sharding, axes)(keys, environment, agent, discount)
+    keys = jax.vmap(partial(jax.random.fold_in, key))(first + jnp.arange(batch.size))
+    return vmap_split(one, batch.sharding, (0, None, None))(keys, players, discount)
 
 
 # --- on the host ----------------------------------------------------------------------------------

@@ -8,6 +8,7 @@ import pytest
 from jaxltl.core.models.construct.counts import make_counts, model_from_counts
 from jaxltl.core.models.interval import make_interval
 from jaxltl.core.models.sparse import make_sparse
+from jaxltl.core.statistics.confidence_sets import intervals_from_counts
 from jaxltl.core.statistics.graph_assumption import LeastProbability, describe_graph
 from jaxltl.core.values.evaluation.data_guarantee import guarantee_curve, learn_guarantee, safe_mean
 from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction
@@ -256,3 +257,18 @@ def test_assumptions_that_are_refused():
         learn_guarantee(coins(), counts, "F a", 0.95, graph=LeastProbability(0.1, failure=0.1))
     with pytest.raises(ValueError, match=r"value=0; it must be above 0"):
         LeastProbability(0)
+
+
+def test_confidence_sets_in_place_of_counts():
+    coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1], initial=[1, 0, 0],
+                       label=[[0], [1], [0]], propositions=["a"])  # fmt: skip
+    counts = np.array([900, 100, 0, 0])
+    sets = intervals_from_counts(counts, 0.95, method="anytime", entry_start=coin.entry_start)
+    found = [learn_guarantee(coin, x, "F a", 0.95, graph="given") for x in (counts, sets)]
+    assert found[0].bound == found[1].bound and found[0].optimistic == found[1].optimistic
+    for option in ({"confidence": 0.99}, {"confidence": 0.95, "method": "anytime"}):
+        with pytest.raises(ValueError, match="counts are confidence sets by anytime"):
+            learn_guarantee(coin, sets, "F a", graph="given", **option)
+    graph = LeastProbability(0.1, failure=0.01)
+    with pytest.raises(ValueError, match=r"confidence of at least 0\.96"):
+        learn_guarantee(coin, sets, "F a", 0.95, graph=graph)

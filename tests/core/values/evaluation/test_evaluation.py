@@ -165,10 +165,9 @@ def test_episodes_over_devices_are_the_episodes(number):
         num_episodes=NUMBER,
         num_steps=STEPS,
         discount=DISCOUNT,
-        batch=NUMBER // 2 + 1,
     )
-    split = run(sharding=NamedSharding(mesh, PartitionSpec("episodes")))
-    assert split == run()
+    size, over = NUMBER // 2 + 1, NamedSharding(mesh, PartitionSpec("episodes"))
+    assert run(batch=evaluation.Batch(size, over)) == run(batch=size)
 
 
 def test_worlds_are_not_kept():
@@ -176,7 +175,12 @@ def test_worlds_are_not_kept():
     shown = str(
         jax.make_jaxpr(
             lambda key: evaluation._batch(
-                key, ENVIRONMENTS["finite"], WANDERER, 0, 1.0, num_steps=977, batch=16
+                key,
+                (ENVIRONMENTS["finite"], WANDERER),
+                0,
+                1.0,
+                num_steps=977,
+                batch=evaluation.Batch(16),
             )
         )(jax.random.key(0))
     )
@@ -281,7 +285,12 @@ def test_simulated_evaluations_cover(number, chance, threshold, monkeypatch):
     run = jax.jit(
         lambda first: jax.vmap(
             lambda seed: evaluation._batch(
-                jax.random.key(seed), environment, IDLE, 0, 1.0, num_steps=1, batch=most
+                jax.random.key(seed),
+                (environment, IDLE),
+                0,
+                1.0,
+                num_steps=1,
+                batch=evaluation.Batch(most),
             )
         )(first + jnp.arange(200))
     )
@@ -291,9 +300,9 @@ def test_simulated_evaluations_cover(number, chance, threshold, monkeypatch):
         jax.random.key(1), IDLE, environment, num_episodes=most, batch=batch, threshold=threshold
     )
 
-    def handed(key, environment, agent, first, discount, *, num_steps, batch, sharding):
+    def handed(key, players, first, discount, *, num_steps, batch):
         begin = int(first)
-        return jax.tree.map(lambda x: x[seed, begin : begin + batch], every)
+        return jax.tree.map(lambda x: x[seed, begin : begin + batch.size], every)
 
     monkeypatch.setattr(evaluation, "_batch", handed)
     for name in ("share_estimate", "_decided"):  # of few counts, many times
