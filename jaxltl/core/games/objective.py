@@ -38,8 +38,7 @@ class Parity:
 
     Example:
       >>> import jaxltl as jl
-      >>> path = jl.make_sparse(None, [0, 1, 2, 3], [1, 2, 0], [1, 1, 1],
-      ...                       label={"a": [0], "b": [1, 2]})
+      >>> path = jl.from_dense(np.roll(np.eye(3), 1, 1)[:, None], label={"a": [0], "b": [1, 2]})
       >>> never = safety(path, "b")
       >>> never.lost.tolist(), never.num_priorities
       ([True, False, False], 1)
@@ -66,8 +65,7 @@ class GR1:
 
     Example:
       >>> import jaxltl as jl
-      >>> path = jl.make_sparse(None, [0, 1, 2, 3], [1, 2, 0], [1, 1, 1],
-      ...                       label={"a": [0], "b": [1, 2]})
+      >>> path = jl.from_dense(np.roll(np.eye(3), 1, 1)[:, None], label={"a": [0], "b": [1, 2]})
       >>> fair = gr1(path, ["a"], ["b"])
       >>> fair.assumptions.tolist(), fair.guarantees.tolist()
       ([[True, False, False]], [[False, True, True]])
@@ -130,13 +128,11 @@ def safety(game: Any, safe: States) -> Parity:
       :class:`Parity`.
 
     Raises:
-      ValueError: a set has the wrong shape, or a formula is not Boolean or mentions an unknown
-        proposition.
+      ValueError: see :func:`states_with_label`.
 
     Example:
       >>> import jaxltl as jl
-      >>> path = jl.make_sparse(None, [0, 1, 2, 3], [1, 2, 0], [1, 1, 1],
-      ...                       label={"a": [0], "b": [1, 2]})
+      >>> path = jl.from_dense(np.roll(np.eye(3), 1, 1)[:, None], label={"a": [0], "b": [1, 2]})
       >>> jl.winning_region(path, safety(path, "!a")).region.tolist()
       [False, False, False]
       >>> jl.winning_region(path, safety(path, "a | b")).region.tolist()
@@ -157,13 +153,11 @@ def reach(game: Any, goal: States, *, safe: States = "true") -> Parity:
       :class:`Parity`.
 
     Raises:
-      ValueError: a set has the wrong shape, or a formula is not Boolean or mentions an unknown
-        proposition.
+      ValueError: see :func:`states_with_label`.
 
     Example:
       >>> import jaxltl as jl
-      >>> path = jl.make_sparse(None, [0, 1, 2, 3], [1, 2, 0], [1, 1, 1],
-      ...                       label={"a": [0], "b": [1, 2]})
+      >>> path = jl.from_dense(np.roll(np.eye(3), 1, 1)[:, None], label={"a": [0], "b": [1, 2]})
       >>> jl.winning_region(path, reach(path, "a", safe="b")).region.tolist()
       [True, True, True]
       >>> middle = np.array([False, True, False])
@@ -185,13 +179,11 @@ def buchi(game: Any, accepting: States, *, safe: States = "true") -> Parity:
       :class:`Parity`.
 
     Raises:
-      ValueError: a set has the wrong shape, or a formula is not Boolean or mentions an unknown
-        proposition.
+      ValueError: see :func:`states_with_label`.
 
     Example:
       >>> import jaxltl as jl
-      >>> path = jl.make_sparse(None, [0, 1, 2, 3], [1, 2, 0], [1, 1, 1],
-      ...                       label={"a": [0], "b": [1, 2]})
+      >>> path = jl.from_dense(np.roll(np.eye(3), 1, 1)[:, None], label={"a": [0], "b": [1, 2]})
       >>> buchi(path, "a").priority.tolist()
       [0, 1, 1]
       >>> jl.winning_region(path, buchi(path, "a")).region.tolist()
@@ -213,13 +205,11 @@ def cobuchi(game: Any, persistent: States, *, safe: States = "true") -> Parity:
       :class:`Parity`.
 
     Raises:
-      ValueError: a set has the wrong shape, or a formula is not Boolean or mentions an unknown
-        proposition.
+      ValueError: see :func:`states_with_label`.
 
     Example:
       >>> import jaxltl as jl
-      >>> path = jl.make_sparse(None, [0, 1, 2, 3], [1, 2, 0], [1, 1, 1],
-      ...                       label={"a": [0], "b": [1, 2]})
+      >>> path = jl.from_dense(np.roll(np.eye(3), 1, 1)[:, None], label={"a": [0], "b": [1, 2]})
       >>> cobuchi(path, "b").priority.tolist()
       [1, 2, 2]
       >>> jl.winning_region(path, cobuchi(path, "b")).region.tolist()
@@ -249,8 +239,7 @@ def parity(
 
     Example:
       >>> import jaxltl as jl
-      >>> path = jl.make_sparse(None, [0, 1, 2, 3], [1, 2, 0], [1, 1, 1],
-      ...                       label={"a": [0], "b": [1, 2]})
+      >>> path = jl.from_dense(np.roll(np.eye(3), 1, 1)[:, None], label={"a": [0], "b": [1, 2]})
       >>> spec = parity(path, np.array([3, 2, 3]))
       >>> spec.num_priorities, jl.winning_region(path, spec).region.tolist()
       (4, [True, True, True])
@@ -295,13 +284,11 @@ def generalized_buchi(game: Any, sets: Sequence[States], *, safe: States = "true
       :class:`GR1` with one assumption that always holds.
 
     Raises:
-      ValueError: a set has the wrong shape, or a formula is not Boolean or mentions an unknown
-        proposition.
+      ValueError: see :func:`states_with_label`.
 
     Example:
       >>> import jaxltl as jl
-      >>> path = jl.make_sparse(None, [0, 1, 2, 3], [1, 2, 0], [1, 1, 1],
-      ...                       label={"a": [0], "b": [1, 2]})
+      >>> path = jl.from_dense(np.roll(np.eye(3), 1, 1)[:, None], label={"a": [0], "b": [1, 2]})
       >>> jl.winning_region(path, generalized_buchi(path, ["a", "b"])).region.tolist()
       [True, True, True]
     """
@@ -331,8 +318,7 @@ def gr1(
 
     Example:
       >>> import jaxltl as jl
-      >>> path = jl.make_sparse(None, [0, 1, 2, 3], [1, 2, 0], [1, 1, 1],
-      ...                       label={"a": [0], "b": [1, 2]})
+      >>> path = jl.from_dense(np.roll(np.eye(3), 1, 1)[:, None], label={"a": [0], "b": [1, 2]})
       >>> jl.winning_region(path, gr1(path, ["a"], ["b", "!b"])).region.tolist()
       [True, True, True]
     """

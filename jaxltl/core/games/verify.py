@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxltl.core.array_types import Booleans, Integers
 from jaxltl.core.games.objective import GR1, Parity
 from jaxltl.core.models.compiled.compiled import compiled_form
 from jaxltl.core.models.game import as_game
@@ -19,9 +20,6 @@ from jaxltl.core.models.mdp import DenseMDP, support
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.graph.components import forward_reachable, strong_components
-
-Booleans = NDArray[np.bool_]
-Integers = NDArray[np.integer[Any]]
 
 
 @brief

@@ -70,7 +70,8 @@ def components_within(graph: Graph, region: Any, allowed: Any = None) -> EndComp
     """:func:`end_components` of a graph."""
     allowed = graph.available if allowed is None else allowed & graph.available
     if isinstance(graph, RowGraph):
-        return EndComponents(*graph.components(region, allowed, closed=False))
+        found: Any = graph.components(region, allowed, closed=False)
+        return EndComponents(*found)
     # Few states can stay in the region, as a rule.
     core = region & avoid(graph, ~region, allowed)
     allowed = allowed & graph.forall(core) & graph.on_choices(core)

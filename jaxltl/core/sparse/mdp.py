@@ -13,6 +13,8 @@ from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.rows import Rows, concatenated_ranges, offsets_from_counts
 
+_SMALL = 2000  # entries up to which NumPy alone is as fast, and SciPy need not be imported
+
 
 @dataclass(frozen=True)
 class HostGraph:
@@ -117,6 +119,9 @@ class HostMDP(HostGraph):
 
     def expectation(self, value: Floats) -> Floats:
         """The expected value of the next state, ``float64[R]``."""
+        if self.successor.size <= _SMALL:
+            weighted = self.probability * value[self.successor]
+            return np.add.reduceat(weighted, self.entry_start[:-1])
         return self.matrix @ value
 
     def over_choices(self, operation: np.ufunc, quantity: NDArray[Any]) -> NDArray[Any]:

@@ -41,8 +41,6 @@ def hoeffding(count: Integers, total: Integers, failure: float) -> Ends:
 
     ``k / n -+ sqrt(log(2 / failure) / (2 n))``, if n does not depend on what came.
 
-    Args, Returns: as of :func:`clopper_pearson`.
-
     Example:
       >>> lower, upper = hoeffding(np.array([0, 50]), np.array([10, 100]), 0.05)
       >>> lower.round(4).tolist(), upper.round(4).tolist()
@@ -59,8 +57,6 @@ def anytime(count: Integers, total: Integers, failure: float) -> Ends:
     ``1 / failure`` is at most `failure` (Ville; Robbins 1970; Waudby-Smith and Ramdas 2020). The
     intervals of all n hold at once: n may depend on what came, as where one tries until
     something happens, or looks at the intervals in order to go on.
-
-    Args, Returns: as of :func:`clopper_pearson`.
 
     Example:
       >>> lower, upper = anytime(np.array([0, 5]), np.array([10, 10]), 0.05)

@@ -95,51 +95,34 @@ def intervals_from_counts(
 ) -> ConfidenceSets:
     """Confidence sets of the probabilities of all rows, simultaneously valid.
 
-    The chance to be wrong, ``1 - confidence``, is shared equally by M claims, each of which fails
-    with a chance of at most ``(1 - confidence) / M``; so all hold together, however rows and
-    outcomes depend on one another (union bound). A row of J possible outcomes makes
-
-    - none if J is 1: the probability is one;
-    - one if J is 2: the interval of an outcome is one minus that of the other;
-    - J if it has more: an interval for each;
-    - one if J > 1 for ``"weissman"``: the ball.
-
-    Each claim is that of :mod:`~jaxltl.core.statistics.binomial`, ``"clopper-pearson"``, ``"hoeffding"``
-    or ``"anytime"``; or ``"weissman"``: ``sum_t |p_t - k_t / n| <= sqrt(2 / n log((2^J - 2) M / (1
-    - confidence)))`` (Weissman et al. 2003, theorem 2.1). All but ``"anytime"`` are valid if the
-    number of throws of a row does not depend on what came: as many of each row, say, asked of a
-    simulator. In the log of an agent it does depend (who falls back tries again), and more so where
-    data decide what is tried or when to end. There take ``"anytime"``, which holds for any
-    way to gather data, at all times at once.
-
-    A guarantee for all policies that is drawn from these sets holds for one chosen by the same
-    data. Rows that were never seen have [0, 1]; they are counted in M, as `rows` says.
+    The failure probability ``1 - confidence`` is shared equally by M claims (union bound). A row
+    of J possible outcomes makes none if J is 1, one if J is 2 or for ``"weissman"``, and else J.
+    ``"weissman"`` is the ball ``sum_t |p_t - k_t / n| <= sqrt(2 / n log((2^J - 2) M / (1 -
+    confidence)))`` (Weissman et al. 2003, theorem 2.1); the others are intervals of
+    :mod:`~jaxltl.core.statistics.binomial`. All but ``"anytime"`` require that the number of samples
+    of a row does not depend on outcomes, as with a simulator. In an agent's log it depends on them;
+    ``"anytime"`` holds for any way to gather data, at all times at once.
 
     Args:
-      counts: how often each successor came, integers: ``[..., K]`` with the successors of a row on
-        the last axis, or ``[T]`` by rows, with `entry_start`. Zero is a successor never seen.
+      counts: observed successors, integers: ``[..., K]``, or ``[T]`` by rows with `entry_start`.
       confidence: in (0, 1).
-      method: how.
-      entry_start: ``int[R + 1]``, where the rows of ``counts[T]`` begin, as in a
-        :class:`~jaxltl.core.models.sparse.SparseMDP`.
-      used: ``bool[..., K]``, which entries of a padded table are successors; default: all.
-      rows: ``bool[R]`` or ``bool[...]``, the rows that matter: what a policy can meet, or what was
-        sampled. The others have [0, 1] and make no claim. What they are may depend on how often
-        rows were thrown where that is decided before, but never on what came: for a policy that is
-        learned from the same data, it must be all rows.
-      num_outcomes: J, an integer or one of each row: how many outcomes a row may truly have, listed
-        or not; of an unknown graph, all S states. Default: those listed. What is not listed shares
-        what the others leave, `rest`, and none of it has more than an outcome that never came.
-      num_claims: M, at least as many as these rows make. Where data decided which rows there are,
-        it must have been fixed before: ``S * A * S``, say. Default: as many as these rows make.
+      method: of the intervals.
+      entry_start: ``int[R + 1]``, the first entry of each row of ``counts[T]``.
+      used: ``bool[..., K]``, entries of a padded table that are successors; default: all.
+      rows: ``bool[R]`` or ``bool[...]``, rows that make claims; the others have [0, 1]. It must not
+        depend on outcomes: for a policy learned from the same data, it must be all rows.
+      num_outcomes: J, an integer or one for each row: possible outcomes, listed or not; all S
+        states for an unknown graph. Default: those listed. Unlisted ones share `rest`.
+      num_claims: M, at least as many as these rows make (the default). Where data decided which
+        rows there are, it must have been fixed before, for example ``S * A * S``.
 
     Returns:
-      The sets; rounding never makes them smaller.
+      The sets, rounded outwards.
 
     Raises:
-      ValueError: naming the argument, and the row and entry: `confidence` is not in (0, 1), counts
-        are no integers, negative, or at what is no successor, shapes do not fit, or a row lists
-        more than `num_outcomes`.
+      ValueError: naming the argument, the row and the entry: `confidence` is not in (0, 1), counts
+        are not nonnegative integers at successors, shapes do not fit, or a row lists more than
+        `num_outcomes`.
 
     Example:
       >>> sets = intervals_from_counts([[8, 2, 0], [5, 5, 0]], 0.9,

@@ -128,9 +128,8 @@ class _Search(NamedTuple):
     def few(self, frontier: Integers, rank: int) -> tuple[Integers, int]:
         """Rounds by plain loops while few states join, as along a chain; the next frontier."""
         arrays: tuple[Any, ...] = (*self.graph.predecessors, self.graph.state, *self[1:])
-        start, pred, owner, waiting, lacking, left, open_, rule, region, first, joined = (
-            None if x is None else memoryview(x) for x in arrays
-        )
+        views: list[Any] = [None if x is None else memoryview(x) for x in arrays]
+        start, pred, owner, waiting, lacking, left, open_, rule, region, first, joined = views
         todo = frontier.tolist()
         while todo and len(todo) <= FEW:
             rows: list[int] = []
