@@ -42,6 +42,7 @@ import optax
 from flax import linen as nn
 from flax import struct
 
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.algos.common.settings import COUNT, Number, static, traced
 from jaxltl.core.validation import Range
 from jaxltl.algos.common import learner
@@ -107,7 +108,9 @@ class DensePolicy(nn.Module):
         return _dense_layers(self, observation, memory)
 
 
-def _dense_layers(module: Any, seen: jax.Array, memory: jax.Array) -> jax.Array:
+def _dense_layers(
+    module: ConvolutionalPolicy | DensePolicy, seen: jax.Array, memory: jax.Array
+) -> jax.Array:
     """Scores by (observation, memory); the first layer is a sum of one for each."""
     widths = (*module.hidden, module.num_actions)
     inputs = seen.shape[-1] + memory.shape[-1]
@@ -177,8 +180,8 @@ class State:
 
     key: jax.Array
     step: jax.Array
-    parameters: Any
-    optimizer: Any
+    parameters: PyTree
+    optimizer: PyTree
     best: Best
     stopped: jax.Array
 
@@ -203,7 +206,7 @@ class Metrics:
 
 def make_problem(
     models: Product | Sequence[Product],
-    observation: Any,
+    observation: PyTree,
     demonstrations: Trajectories | Sequence[Trajectories],
     *,
     held_out: float | Trajectories | Sequence[Trajectories] | None = 0.2,
@@ -268,7 +271,7 @@ def _inputs(problem: Problem) -> tuple[jax.Array, jax.Array]:
 
 
 def policy_in_world(
-    network: nn.Module, parameters: Any, model: Product, observation: jax.Array
+    network: nn.Module, parameters: PyTree, model: Product, observation: jax.Array
 ) -> jax.Array:
     """The policy ``float[S, Q, A]`` in any world, zero at unavailable actions.
 
@@ -288,7 +291,7 @@ def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
     return jax.nn.softmax(jnp.where(problem.available[:, :, None], scores, -jnp.inf), axis=-1)
 
 
-def _scores(parameters: Any, problem: Problem) -> jax.Array:
+def _scores(parameters: PyTree, problem: Problem) -> jax.Array:
     memory = jnp.eye(problem.counts.shape[2], dtype=problem.observation.dtype)[None, None]
     return jnp.asarray(problem.network.apply(parameters, problem.observation[:, :, None], memory))
 
@@ -296,7 +299,7 @@ def _scores(parameters: Any, problem: Problem) -> jax.Array:
 # --- learning -------------------------------------------------------------------------------------
 
 
-def neg_log_likelihood(parameters: Any, problem: Problem, counts: jax.Array) -> jax.Array:
+def neg_log_likelihood(parameters: PyTree, problem: Problem, counts: jax.Array) -> jax.Array:
     """The negative log-likelihood (3.10) of the average pair in `counts`, in nats; NaN without any.
 
     Differentiable in the `parameters` of the network of the `problem`.
@@ -331,7 +334,7 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
     """One step of Adam on a minibatch, drawn with replacement from the demonstrated pairs."""
     pairs = _draw(learner.step_key(state), problem.counts, hparams.batch)
 
-    def loss_of(parameters: Any) -> jax.Array:
+    def loss_of(parameters: PyTree) -> jax.Array:
         w, s, q, a = pairs
         memory = jax.nn.one_hot(q, problem.counts.shape[2], dtype=problem.observation.dtype)
         scores: Any = problem.network.apply(parameters, problem.observation[w, s], memory)

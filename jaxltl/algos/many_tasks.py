@@ -56,6 +56,7 @@ from flax import struct
 from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.algos.common import action_distributions
 from jaxltl.algos.common.actor_critic import dense
 from jaxltl.algos.common.moments import normalized
@@ -101,13 +102,13 @@ class SequenceNetwork(nn.Module):
     hidden: Sequence[int] = (64, 64)
     activation: str = "relu"
     initial_deviation: float = 1.0
-    events_seen: Callable[[Any], jax.Array] | None = None
+    events_seen: Callable[[PyTree], jax.Array] | None = None
     by_name: bool = False
     detailed: int = 4
     embedding: int = 32
 
     @nn.compact
-    def __call__(self, observation: Any) -> tuple[Any, jax.Array]:
+    def __call__(self, observation: PyTree) -> tuple[PyTree, jax.Array]:
         world, (reach, avoid, length) = observation
         kind = jnp.result_type(float)
         depth = reach.shape[0]
@@ -219,7 +220,7 @@ class Choice(NamedTuple):
 
 
 def sequence_agent(
-    network: Callable[..., Any],
+    network: Callable[..., PyTree],
     plan: Plan,
     *,
     actions: Finite | Box | None = None,
@@ -263,7 +264,7 @@ def sequence_agent(
 
 
 def sequence_policy(
-    network: Callable[..., Any], plan: Plan, observation: Any, memory: chex.Numeric
+    network: Callable[..., PyTree], plan: Plan, observation: PyTree, memory: chex.Numeric
 ) -> jax.Array:
     """The action probabilities ``float[A]`` of an agent that selects its sequence anew at every step.
 
@@ -305,7 +306,7 @@ class _How:
     sampled: bool
 
 
-def trained(network: nn.Module, parameters: Any, moments: Any = None) -> Partial:
+def trained(network: nn.Module, parameters: PyTree, moments: PyTree = None) -> Partial:
     """A function ``observation -> (parameters of the action, value)``: a network with parameters.
 
     A pytree of the `network` without memory, its `parameters`, such as ``state.parameters`` of PPO, and
@@ -315,11 +316,11 @@ def trained(network: nn.Module, parameters: Any, moments: Any = None) -> Partial
     return Partial(_applied, _Module(network), parameters, moments)
 
 
-def _applied(module: _Module, parameters: Any, moments: Any, observation: Any) -> Any:
+def _applied(module: _Module, parameters: PyTree, moments: PyTree, observation: PyTree) -> PyTree:
     return applied(module.network, parameters, normalized(moments, observation))
 
 
-def _actions_of(parameters: Any) -> Finite:
+def _actions_of(parameters: PyTree) -> Finite:
     """The actions of logits."""
     if isinstance(parameters, tuple):
         raise ValueError(
@@ -330,8 +331,8 @@ def _actions_of(parameters: Any) -> Finite:
 
 
 def _judged(
-    network: Callable[..., Any], plan: Plan, seen: Any, state: jax.Array
-) -> tuple[Any, jax.Array]:
+    network: Callable[..., PyTree], plan: Plan, seen: PyTree, state: jax.Array
+) -> tuple[PyTree, jax.Array]:
     """What the network would do for each sequence of a state, and what it values each at."""
     rows = sequence_task.Sequence(
         jnp.asarray(plan.reach)[state],
@@ -352,13 +353,13 @@ def _judged(
 def _act(
     how: _How,
     space: Finite | Box | None,
-    network: Callable[..., Any],
+    network: Callable[..., PyTree],
     plan: Plan,
-    memory: Any,
-    observation: Any,
-    allowed: Any,
+    memory: PyTree,
+    observation: PyTree,
+    allowed: jax.Array | None,
     key: chex.PRNGKey,
-) -> tuple[Any, Any]:
+) -> tuple[PyTree, PyTree]:
     if not (hasattr(observation, "world") and hasattr(observation, "memory")):
         validation.instance(
             "observation",
@@ -400,23 +401,23 @@ class Staged:
       seconds: ``float[C]``, since the start, compilation included.
     """
 
-    state: Any
-    metrics: list[Any]
+    state: PyTree
+    metrics: list[PyTree]
     stages: np.ndarray
     seconds: np.ndarray
 
 
 def train_in_stages(
     key: chex.PRNGKey,
-    problems: Sequence[Any],
-    hparams: Any,
+    problems: Sequence[PyTree],
+    hparams: PyTree,
     *,
-    init: Callable[..., Any],
-    run: Callable[..., Any],
+    init: Callable[..., PyTree],
+    run: Callable[..., PyTree],
     num_chunks: int,
     num_steps: int = 10,
     enough: float | Sequence[float] = 0.9,
-    report: Callable[[int, int, Any], None] | None = None,
+    report: Callable[[int, int, PyTree], None] | None = None,
 ) -> Staged:
     """A curriculum: a learner on one problem after the other, each once the previous is mastered.
 

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core import validation
 from jaxltl.core.models.mesh import lanes
 from jaxltl.core.types import require_shape
@@ -23,7 +24,7 @@ def per_cost(name: str, value: Any, num_costs: int) -> np.ndarray:
     return np.broadcast_to(value, (num_costs,))
 
 
-def split(value: Any) -> tuple[jax.Array, jax.Array]:
+def split(value: PyTree) -> tuple[jax.Array, jax.Array]:
     """The objective and costs ``[C]`` in the result of ``evaluate``."""
     if isinstance(value, tuple | list):
         if len(value) != 2:

@@ -38,10 +38,11 @@ Example:
 
 from __future__ import annotations
 
+from numpy.typing import ArrayLike
+
 import math
 from dataclasses import replace
 from functools import singledispatch
-from typing import Any
 
 import chex
 import jax
@@ -51,6 +52,7 @@ from flax import struct
 from jax import lax
 from jax.scipy.special import digamma, gammaln
 
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.algos.cce._gamma_shape import convex_part, log_digamma_gap, shape_of_gap
 from jaxltl.algos.common import splitmix
 from jaxltl.core.pretty_print import brief
@@ -156,7 +158,7 @@ def gamma(shape: chex.Array, rate: chex.Array | float) -> Gamma:
     return Gamma(shape, rate)
 
 
-def _vector(name: str, x: Any) -> jax.Array:
+def _vector(name: str, x: ArrayLike) -> jax.Array:
     x = jnp.asarray(x)
     x = x.astype(jnp.promote_types(x.dtype, jnp.float32))
     if x.ndim != 1:
@@ -164,7 +166,7 @@ def _vector(name: str, x: Any) -> jax.Array:
     return x
 
 
-def _like(name: str, x: Any, model: jax.Array) -> jax.Array:
+def _like(name: str, x: ArrayLike, model: jax.Array) -> jax.Array:
     x = jnp.asarray(x, model.dtype)
     if x.shape not in ((), model.shape):
         raise ValueError(f"{name} has shape {x.shape}; expected () or {model.shape}.")
@@ -186,7 +188,7 @@ def _require_positive(name: str, x: jax.Array) -> None:
 
 
 @singledispatch
-def sufficient_statistics(family: Any, samples: jax.Array) -> tuple[jax.Array, jax.Array]:
+def sufficient_statistics(family: PyTree, samples: jax.Array) -> tuple[jax.Array, jax.Array]:
     """``Gamma(x)`` of samples ``float[..., D]`` of a `family`, a pair of arrays.
 
     The second is ``float[..., D, D]`` for a full Gaussian, else ``float[..., D]``. Here and below a type
@@ -199,7 +201,7 @@ def sufficient_statistics(family: Any, samples: jax.Array) -> tuple[jax.Array, j
 
 
 @singledispatch
-def mean_parameter(family: Any) -> tuple[jax.Array, jax.Array]:
+def mean_parameter(family: PyTree) -> tuple[jax.Array, jax.Array]:
     """``m(v) = E_v[Gamma(x)]`` of a `family`, a pair of arrays; differentiable in its parameters.
 
     Raises:
@@ -209,7 +211,7 @@ def mean_parameter(family: Any) -> tuple[jax.Array, jax.Array]:
 
 
 @singledispatch
-def from_mean_parameter(family: Any, eta: tuple[jax.Array, jax.Array]) -> Any:
+def from_mean_parameter(family: PyTree, eta: tuple[jax.Array, jax.Array]) -> PyTree:
     """The member of the type of `family` with mean parameter `eta`, ``m^{-1}(eta)``.
 
     Variances are differences here; :func:`project` moves a family without cancellation.
@@ -226,7 +228,7 @@ def from_mean_parameter(family: Any, eta: tuple[jax.Array, jax.Array]) -> Any:
 
 
 @singledispatch
-def log_density(family: Any, samples: jax.Array) -> jax.Array:
+def log_density(family: PyTree, samples: jax.Array) -> jax.Array:
     """``log f_v(x)`` in nats, ``float[...]`` of `samples` ``float[..., D]``; differentiable in both.
 
     Here v is the natural parameter of `family`.
@@ -238,7 +240,7 @@ def log_density(family: Any, samples: jax.Array) -> jax.Array:
 
 
 @singledispatch
-def sample(family: Any, key: chex.PRNGKey, num_samples: int) -> jax.Array:
+def sample(family: PyTree, key: chex.PRNGKey, num_samples: int) -> jax.Array:
     """``float[num_samples, D]``, independent samples of a `family` by a `key`; `num_samples` is static.
 
     Raises:
@@ -248,7 +250,7 @@ def sample(family: Any, key: chex.PRNGKey, num_samples: int) -> jax.Array:
 
 
 @singledispatch
-def sample_antithetic(family: Any, key: chex.PRNGKey, num_samples: int) -> jax.Array:
+def sample_antithetic(family: PyTree, key: chex.PRNGKey, num_samples: int) -> jax.Array:
     """``float[num_samples, D]``: samples 2 i and 2 i + 1 of `family` by `key` are mirrored at the mean.
 
     Raises:
@@ -258,7 +260,9 @@ def sample_antithetic(family: Any, key: chex.PRNGKey, num_samples: int) -> jax.A
 
 
 @singledispatch
-def project(family: Any, samples: jax.Array, weights: jax.Array, rate: jax.Array | float) -> Any:
+def project(
+    family: PyTree, samples: jax.Array, weights: jax.Array, rate: jax.Array | float
+) -> PyTree:
     """The family with its mean parameter moved to that of weighted samples (dissertation, (4.11)).
 
     ``m(v') = rate * sum_i w_i Gamma(x_i) / sum_i w_i + (1 - rate) * m(v)`` gives the member closest in
@@ -275,7 +279,7 @@ def project(family: Any, samples: jax.Array, weights: jax.Array, rate: jax.Array
 
 
 @singledispatch
-def center(family: Any) -> jax.Array:
+def center(family: PyTree) -> jax.Array:
     """``E_v[x]``, ``float[D]``, of a `family`.
 
     Raises:
@@ -285,7 +289,7 @@ def center(family: Any) -> jax.Array:
 
 
 @singledispatch
-def standard_deviation(family: Any) -> jax.Array:
+def standard_deviation(family: PyTree) -> jax.Array:
     """``float[D]``, standard deviations of the entries under a `family`.
 
     Raises:
@@ -295,7 +299,7 @@ def standard_deviation(family: Any) -> jax.Array:
 
 
 @singledispatch
-def widen(family: Any, variance: jax.Array | float) -> Any:
+def widen(family: PyTree, variance: jax.Array | float) -> PyTree:
     """A `family` with the same mean and a `variance` (a number or ``float[D]``) added to that of entries.
 
     Raises:
@@ -305,7 +309,7 @@ def widen(family: Any, variance: jax.Array | float) -> Any:
 
 
 @singledispatch
-def at_least(family: Any, variance: jax.Array | float) -> Any:
+def at_least(family: PyTree, variance: jax.Array | float) -> PyTree:
     """A `family` with the same mean and at least a `variance` in every direction.
 
     Raises:
@@ -314,7 +318,7 @@ def at_least(family: Any, variance: jax.Array | float) -> Any:
     raise TypeError(_unknown(family))
 
 
-def _unknown(family: Any) -> str:
+def _unknown(family: PyTree) -> str:
     return (
         f"{type(family).__name__} is not a family: pass a DiagonalGaussian, a FullGaussian "
         "or a Gamma."
@@ -481,7 +485,7 @@ def _(family: FullGaussian, variance: jax.Array | float) -> FullGaussian:
     return replace(family, factor=_factor(length[:, None] * axes))
 
 
-def _mirrored(family: Any, key: chex.PRNGKey, num_samples: int) -> jax.Array:
+def _mirrored(family: PyTree, key: chex.PRNGKey, num_samples: int) -> jax.Array:
     half = sample(family, key, -(-num_samples // 2))
     pairs = jnp.stack([half, 2 * center(family) - half], axis=1)
     return pairs.reshape(-1, half.shape[-1])[:num_samples]

@@ -42,13 +42,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.validation import Range
 from jaxltl.algos.cce import exponential_family as families
 from jaxltl.algos.cce._elites import (
@@ -221,7 +221,7 @@ def _sizes(hparams: Hparams, step: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 def _moved(
     state: State, hparams: Hparams, fresh: Pool, elites: Pool, enough: jax.Array, rate: jax.Array
-) -> Any:
+) -> PyTree:
     """The distribution after (4.14) and the options that add variance."""
     weights = elite_weights(
         elites.objective,
@@ -247,7 +247,7 @@ def _moved(
     return jax.tree.map(lambda x, y: jnp.where(some, x, y).astype(y.dtype), moved, state.family)
 
 
-def _restarted(family: Any, problem: Problem, hparams: Hparams) -> tuple[Any, jax.Array]:
+def _restarted(family: PyTree, problem: Problem, hparams: Hparams) -> tuple[PyTree, jax.Array]:
     if hparams.restart_below is None:
         return family, jnp.bool_(False)
     narrow = jnp.all(families.standard_deviation(family) < hparams.restart_below)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import chex
 import jax
@@ -12,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.algos.cce import exponential_family as families
 from jaxltl.algos.cce._evaluation import per_cost, split
 from jaxltl.algos.common.schedules import Polynomial as Polynomial
@@ -31,15 +31,15 @@ class Problem:
       scale: ``float[C]``, divisors of violations, which make constraints comparable.
     """
 
-    evaluate: Any
-    family: Any
+    evaluate: Callable[..., PyTree]
+    family: PyTree
     limit: jax.Array
     scale: jax.Array
 
 
 def make_problem(
-    evaluate: Callable[..., Any],
-    family: Any,
+    evaluate: Callable[..., PyTree],
+    family: PyTree,
     *,
     limit: chex.Array | float | None = None,
     scale: chex.Array | float | None = None,

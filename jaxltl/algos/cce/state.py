@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from jax.sharding import NamedSharding
+
 from functools import partial
-from typing import Any
 
 import jax
 from flax import struct
 
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.algos.common.settings import COUNT, Number, static, traced
 from jaxltl.core.validation import Range
 from jaxltl.algos.cce._elites import (
@@ -70,7 +72,7 @@ class Hparams:
     variance_floor: Number | None = traced(Range(0), default=None)
     noise: Schedule = None
     restart_below: Number | None = traced(Range(0), default=None)
-    sharding: Any = struct.field(pytree_node=False, default=None)
+    sharding: NamedSharding | None = struct.field(pytree_node=False, default=None)
 
 
 @brief(codes={"status": Status})
@@ -95,10 +97,10 @@ class State:
 
     key: jax.Array
     step: jax.Array
-    family: Any
+    family: PyTree
     best: Sample
     least: Sample
-    elites: Any
+    elites: PyTree
     num_evaluated: jax.Array
     num_invalid: jax.Array
     num_restarts: jax.Array

@@ -7,27 +7,30 @@ dies, that file and the parts that it names are complete.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import BinaryIO
+
 import contextlib
 import os
 import secrets
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
-Write = Callable[[Path], contextlib.AbstractContextManager[Any]]
+Write = Callable[[Path], contextlib.AbstractContextManager[BinaryIO]]
 
 
-def is_shared(x: Any) -> bool:
+def is_shared(x: object) -> bool:
     """True if an array lies on the devices of several processes."""
     return isinstance(x, jax.Array) and not x.is_fully_addressable
 
 
-def is_apart(x: Any) -> bool:
+def is_apart(x: object) -> bool:
     """True if an array lies on the devices of several processes and is not replicated."""
-    return is_shared(x) and not x.is_fully_replicated
+    return isinstance(x, jax.Array) and is_shared(x) and not x.is_fully_replicated
 
 
 class Stored(NamedTuple):
@@ -139,14 +142,14 @@ def reading(path: str | os.PathLike[str]) -> Iterator[Parts]:
         yield Parts(Path(path), closing)
 
 
-def _ends(index: tuple[slice, ...], shape: Any) -> tuple[list[int], list[int]]:
+def _ends(index: tuple[slice, ...], shape: Sequence[int]) -> tuple[list[int], list[int]]:
     """Where a block begins and ends; axes that are not named are whole."""
     index = (*index, *(slice(None),) * (len(shape) - len(index)))
     each = [x.indices(int(n)) for x, n in zip(index, shape, strict=True)]
     return [x[0] for x in each], [x[1] for x in each]
 
 
-def _block(low: Any, high: Any, first: Any) -> tuple[slice, ...]:
+def _block(low: Iterable[int], high: Iterable[int], first: Iterable[int]) -> tuple[slice, ...]:
     return tuple(slice(int(a - c), int(b - c)) for a, b, c in zip(low, high, first, strict=True))
 
 

@@ -4,25 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache, partial
-from typing import Any
 
 import jax
 import numpy as np
 from jax.sharding import Mesh
 
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.models.mesh.lanes import on_host, vmap_over_mesh
 
-Run = Callable[..., tuple[Any, Any]]
+Run = Callable[..., tuple[PyTree, PyTree]]
 
 
-def run_over_mesh(mesh: Mesh, run: Run, step: Callable[..., Any]) -> Any:
+def run_over_mesh(
+    mesh: Mesh, run: Run, step: Callable[..., PyTree]
+) -> Callable[..., tuple[PyTree, PyTree]]:
     """Runs of lanes by ``run(step, state, problem, hparams, lengths)``, with metrics on the host.
 
     States stay on their devices; hyperparameters have shared values as a second part.
     """
     lanes = vmap_over_mesh(_lane(run, step), mesh, in_axes=(0, None, (0, None), None))
 
-    def advance(state: Any, problem: Any, given: Any, lengths: np.ndarray) -> tuple[Any, Any]:
+    def advance(
+        state: PyTree, problem: PyTree, given: PyTree, lengths: np.ndarray
+    ) -> tuple[PyTree, PyTree]:
         state, rows = lanes(state, problem, given, lengths)
         return state, jax.tree.map(lambda x: np.swapaxes(x, 0, 1), on_host(rows))
 
@@ -30,5 +34,5 @@ def run_over_mesh(mesh: Mesh, run: Run, step: Callable[..., Any]) -> Any:
 
 
 @cache  # compiled once for each step, so it must stay the same function
-def _lane(run: Run, step: Callable[..., Any]) -> Callable[..., Any]:
+def _lane(run: Run, step: Callable[..., PyTree]) -> Callable[..., PyTree]:
     return partial(run, step)

@@ -7,13 +7,15 @@ it: clipped, or squashed by a hyperbolic tangent.
 
 from __future__ import annotations
 
-from typing import Any
+from jax.typing import DTypeLike
+
 
 import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.environments.environment import Box, Finite, clipped_action
 
 Actions = Finite | Box
@@ -24,14 +26,18 @@ _NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(16)
 _WEIGHTS = _WEIGHTS / np.sqrt(2 * np.pi)
 
 
-def noise(key: chex.PRNGKey, shape: tuple[int, ...], actions: Actions, dtype: Any) -> jax.Array:
+def noise(
+    key: chex.PRNGKey, shape: tuple[int, ...], actions: Actions, dtype: DTypeLike
+) -> jax.Array:
     """Gumbel or normal noise of a batch of actions."""
     if isinstance(actions, Finite):
         return jax.random.gumbel(key, (*shape, actions.num), dtype)
     return jax.random.normal(key, (*shape, *actions.shape), dtype)
 
 
-def drawn(actions: Actions, parameters: Any, allowed: Any, noise: jax.Array | None) -> jax.Array:
+def drawn(
+    actions: Actions, parameters: PyTree, allowed: jax.Array | None, noise: jax.Array | None
+) -> jax.Array:
     """A raw action; without noise the most likely one."""
     if isinstance(actions, Finite):
         scores = _masked(parameters, allowed)
@@ -56,8 +62,8 @@ def as_action(actions: Actions, raw: jax.Array, squash: str | None) -> jax.Array
 def chosen(
     key: chex.PRNGKey,
     actions: Actions,
-    parameters: Any,
-    allowed: Any,
+    parameters: PyTree,
+    allowed: jax.Array | None,
     *,
     sampled: bool,
     squash: str,
@@ -68,7 +74,9 @@ def chosen(
     return as_action(actions, raw, squash)
 
 
-def log_density(actions: Actions, parameters: Any, allowed: Any, raw: jax.Array) -> jax.Array:
+def log_density(
+    actions: Actions, parameters: PyTree, allowed: jax.Array | None, raw: jax.Array
+) -> jax.Array:
     """Log density of a raw action; that of the action differs by a term without parameters."""
     if isinstance(actions, Finite):
         return jax.nn.log_softmax(_masked(parameters, allowed))[raw]
@@ -77,7 +85,9 @@ def log_density(actions: Actions, parameters: Any, allowed: Any, raw: jax.Array)
     return -jnp.sum(scaled**2 / 2 + log_deviation + np.log(2 * np.pi) / 2)
 
 
-def entropy(actions: Actions, parameters: Any, allowed: Any, squash: str) -> jax.Array:
+def entropy(
+    actions: Actions, parameters: PyTree, allowed: jax.Array | None, squash: str
+) -> jax.Array:
     """Entropy of an action, over allowed ones.
 
     For a squashed Gaussian by Gauss-Hermite quadrature; for a clipped one, that of the Gaussian.
@@ -99,7 +109,7 @@ def entropy(actions: Actions, parameters: Any, allowed: Any, squash: str) -> jax
     return jnp.sum(own + jnp.where(bounded, stretch, 0))
 
 
-def _masked(logits: jax.Array, allowed: Any) -> jax.Array:
+def _masked(logits: jax.Array, allowed: jax.Array | None) -> jax.Array:
     """Logits with those of disallowed actions minus infinity."""
     if allowed is None:
         return logits

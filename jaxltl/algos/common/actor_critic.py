@@ -27,19 +27,34 @@ Example:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, Protocol
 
+import chex
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.typing import DTypeLike
 
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.algos.common.settings import applied
 from jaxltl.core import validation
-from jaxltl.core.environments.environment import Finite, flat_observation
+from jaxltl.core.environments.environment import Box, Finite, flat_observation
 from jaxltl.core.pretty_print import brief
+
+
+class HasNetwork(Protocol):
+    """A problem with a network and its initial memory."""
+
+    @property
+    def network(self) -> nn.Module:
+        """The module."""
+
+    @property
+    def memory(self) -> PyTree:
+        """Its initial memory; ``()`` without."""
 
 
 @brief
@@ -53,12 +68,12 @@ class Output(NamedTuple):
       value: ``float[]``.
     """
 
-    memory: Any
-    action: Any
+    memory: PyTree
+    action: PyTree
     value: jax.Array
 
 
-def orthogonal(scale: float) -> Any:
+def orthogonal(scale: float) -> Callable[..., jax.Array]:
     """An initialiser ``(key, shape, dtype) -> float[shape]`` of orthogonal matrices of a `scale`.
 
     By Gram-Schmidt twice over instead of LAPACK as in ``flax``: on few processors several batched
@@ -68,12 +83,12 @@ def orthogonal(scale: float) -> Any:
     (3, 2)
     """
 
-    def start(key: Any, shape: Any, dtype: Any = None) -> jax.Array:
+    def start(key: chex.PRNGKey, shape: Sequence[int], dtype: DTypeLike | None = None) -> jax.Array:
         rows, columns = shape
         most, least = max(rows, columns), min(rows, columns)
         drawn = jax.random.normal(key, (least, most), dtype)
 
-        def add(i: Any, found: jax.Array) -> jax.Array:
+        def add(i: jax.Array, found: jax.Array) -> jax.Array:
             row = drawn[i]
             for _ in range(2):
                 row = row - (found @ row) @ found
@@ -111,7 +126,7 @@ class _Layers(nn.Module):
         return dense(self.outputs, self.last_scale, "out")(x)
 
 
-def _heads(module: Any, x: jax.Array) -> tuple[Any, jax.Array]:
+def _heads(module: Any, x: jax.Array) -> tuple[PyTree, jax.Array]:
     """Action parameters and value, by two networks that share nothing."""
     hidden = tuple(module.hidden)
     outputs = module.num_actions or int(np.prod(module.shape))
@@ -146,7 +161,7 @@ class ActorCritic(nn.Module):
     initial_deviation: float = 1.0
 
     @nn.compact
-    def __call__(self, observation: Any) -> tuple[Any, jax.Array]:
+    def __call__(self, observation: PyTree) -> tuple[PyTree, jax.Array]:
         return _heads(self, flat_observation(observation))
 
 
@@ -170,7 +185,7 @@ class RecurrentActorCritic(nn.Module):
         return jnp.zeros(self.memory, jnp.result_type(float))
 
     @nn.compact
-    def __call__(self, memory: jax.Array, observation: Any) -> tuple[jax.Array, Any]:
+    def __call__(self, memory: jax.Array, observation: PyTree) -> tuple[jax.Array, PyTree]:
         x = dense(self.memory, np.sqrt(2), "input")(flat_observation(observation))
         x = getattr(nn, self.activation)(x)
         cell = nn.GRUCell(
@@ -183,14 +198,14 @@ class RecurrentActorCritic(nn.Module):
         return memory, _heads(self, x)
 
 
-def default_network(actions: Any) -> ActorCritic:
+def default_network(actions: Finite | Box) -> ActorCritic:
     """The :class:`ActorCritic` with its defaults for `actions`, finitely many or a box."""
     if isinstance(actions, Finite):
         return ActorCritic(num_actions=actions.num)
     return ActorCritic(shape=actions.shape)
 
 
-def initial_memory(network: nn.Module, memory: Any = None) -> Any:
+def initial_memory(network: nn.Module, memory: PyTree = None) -> PyTree:
     """The initial memory of a `network`, a tree of arrays; ``()`` without memory.
 
     A `memory` replaces that of the network's ``initial_memory()``.
@@ -216,7 +231,7 @@ def initial_memory(network: nn.Module, memory: Any = None) -> Any:
     return found
 
 
-def has_memory(problem: Any) -> bool:
+def has_memory(problem: HasNetwork) -> bool:
     """Whether the network of a `problem` is recurrent: the problem's ``memory`` has arrays.
 
     >>> from types import SimpleNamespace
@@ -226,7 +241,9 @@ def has_memory(problem: Any) -> bool:
     return bool(jax.tree.leaves(problem.memory))
 
 
-def evaluated(problem: Any, parameters: Any, memory: Any, observation: Any) -> Output:
+def evaluated(
+    problem: HasNetwork, parameters: PyTree, memory: PyTree, observation: PyTree
+) -> Output:
     """The :class:`Output` of the network of a `problem` for one `observation`.
 
     With its `parameters`, in which it is differentiable, and the `memory` before the observation.
@@ -246,7 +263,9 @@ def evaluated(problem: Any, parameters: Any, memory: Any, observation: Any) -> O
     return Output(memory, action, value)
 
 
-def fresh_parameters(key: Any, network: nn.Module, memory: Any, observation: Any) -> Any:
+def fresh_parameters(
+    key: chex.PRNGKey, network: nn.Module, memory: PyTree, observation: PyTree
+) -> PyTree:
     """The random initial parameters of a `network`, of a `key`, a dict of dicts of arrays.
 
     Of the initial `memory`, ``()`` without, and one `observation` only the shapes matter.
@@ -255,7 +274,13 @@ def fresh_parameters(key: Any, network: nn.Module, memory: Any, observation: Any
     return network.init(key, *read).get("params", {})
 
 
-def require_network(network: Any, memory: Any, observation: Any, space: Any, finite: bool) -> None:
+def require_network(
+    network: nn.Module,
+    memory: PyTree,
+    observation: PyTree,
+    space: jax.ShapeDtypeStruct,
+    finite: bool,
+) -> None:
     """Validation of a `network` by the shapes that it returns for `memory` and `observation`.
 
     `space` is the shape and type of one action, or if there are `finite` many, of the logits.
@@ -287,11 +312,11 @@ def require_network(network: Any, memory: Any, observation: Any, space: Any, fin
             "what is not learned by gradients."
         )
 
-    def shapes(tree: Any) -> Any:
+    def shapes(tree: PyTree) -> PyTree:
         return jax.tree.map(lambda x: x.shape, tree)
 
     action = space.shape if finite else (space.shape, space.shape)
-    expected: Any = (action, ())
+    expected: PyTree = (action, ())
     if recurrent:
         expected = (shapes(memory), expected)
     if shapes(found) != expected:

@@ -44,6 +44,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.algos.common import _checkpoint_parts as parts
 from jaxltl.core.models.ops.array_namespace import to_jax
 
@@ -134,7 +135,9 @@ def _umask() -> int:
     return mask
 
 
-def save(path: str | os.PathLike[str], state: Any, given: Mapping[str, str] | None = None) -> None:
+def save(
+    path: str | os.PathLike[str], state: PyTree, given: Mapping[str, str] | None = None
+) -> None:
     """Writes a learner's `state`, a tree of arrays, as an ``.npz`` at `path`, atomically.
 
     `given` is the :func:`fingerprint` of the problem and hyperparameters. With several processes all
@@ -166,7 +169,9 @@ def remove(path: str | os.PathLike[str]) -> None:
     parts.remove([path, *parts.parts_of(path), *parts.unfinished(path)])
 
 
-def load(path: str | os.PathLike[str], like: Any, given: Mapping[str, str] | None = None) -> Any:
+def load(
+    path: str | os.PathLike[str], like: PyTree, given: Mapping[str, str] | None = None
+) -> PyTree:
     """The state saved by :func:`save` at `path`, bit for bit, as a tree like `like`.
 
     `like` is a state of the same learner and problem, for example from ``init``; a first axis of length
@@ -201,7 +206,7 @@ class _Another(Exception):
     """An array of another learner or problem."""
 
 
-def _loaded(path: str, name: str, leaf: Any, found: Any, others: parts.Parts) -> Any:
+def _loaded(path: str, name: str, leaf: Any, found: PyTree, others: parts.Parts) -> Any:
     """An array on its devices, from the file or from the parts."""
     expected = _data(leaf)
     if found is None or not _fits(found, expected):
@@ -213,8 +218,9 @@ def _loaded(path: str, name: str, leaf: Any, found: Any, others: parts.Parts) ->
     over = isinstance(expected, jax.Array) and len(expected.sharding.device_set) > 1
     if over:
 
-        def block(index: Any) -> np.ndarray:
-            return others.read(found, index) if isinstance(found, parts.Stored) else found[index]
+        def block(index: tuple[slice, ...] | None) -> np.ndarray:
+            stored = isinstance(found, parts.Stored)
+            return others.read(found, index) if stored else found[index or ()]
 
         value = jax.make_array_from_callback(tuple(found.shape), expected.sharding, block)
     else:
@@ -243,7 +249,7 @@ def _require_same(path: str, before: dict[str, str], now: dict[str, str]) -> Non
         )
 
 
-def _named(tree: Any) -> list[tuple[str, Any]]:
+def _named(tree: PyTree) -> list[tuple[str, Any]]:
     """Leaves with distinct file-safe names, whose numbers distinguish nested paths."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
     return [
@@ -267,7 +273,7 @@ def _data(leaf: jax.Array) -> jax.Array:
 # --- fingerprints ---------------------------------------------------------------------------
 
 
-def fingerprint(**given: Any) -> dict[str, str]:
+def fingerprint(**given: object) -> dict[str, str]:
     """A description of each part of `given`: types, static fields, and arrays by a hash of their bytes.
 
     Functions are described by their code, so that other processes find the same.
@@ -279,7 +285,7 @@ def fingerprint(**given: Any) -> dict[str, str]:
     return dict(pair for name, value in given.items() for pair in _described(name, value))
 
 
-def _described(name: str, value: Any) -> Iterator[tuple[str, str]]:
+def _described(name: str, value: PyTree) -> Iterator[tuple[str, str]]:
     value = inspect.unwrap(value)  # what jax.jit wraps
     if value is None or isinstance(value, bool | int | float | complex | str | bytes | np.dtype):
         yield name, repr(value)
@@ -309,7 +315,7 @@ def _described(name: str, value: Any) -> Iterator[tuple[str, str]]:
             yield from _described(name, leaves)
 
 
-def _array(value: Any) -> str:
+def _array(value: object) -> str:
     """Shape, dtype and a hash of the bytes; small arrays also as text."""
     if isinstance(value, jax.Array):
         value = _data(value)
@@ -335,11 +341,11 @@ def _code(code: types.CodeType) -> str:
     return hashlib.sha256(code.co_code + repr((held, code.co_names)).encode()).hexdigest()[:16]
 
 
-def _constant(value: Any) -> str:
+def _constant(value: object) -> str:
     """The representation of a constant; sets in an order that is the same in every process."""
     return repr(sorted(map(repr, value)) if isinstance(value, frozenset) else value)
 
 
-def _type(value: Any) -> str:
+def _type(value: object) -> str:
     kind = value if isinstance(value, type) else type(value)
     return f"{kind.__module__}.{kind.__qualname__}"

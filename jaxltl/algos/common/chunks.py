@@ -21,11 +21,13 @@ Example: half of what is lacking in each step, for two runs side by side.
 
 from __future__ import annotations
 
+from numpy.typing import ArrayLike
+
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -34,6 +36,7 @@ from jax import lax
 from jax.sharding import Mesh
 from jax.tree_util import Partial
 
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.algos.common import checkpoint as files
 from jaxltl.algos.common._run_over_mesh import run_over_mesh
 from jaxltl.algos.common.loops import Progress, Step, Until, block_lengths, run_blocks
@@ -65,7 +68,7 @@ class Options:
 
     chunk: int | None = None
     max_rows: int = 10
-    report: Callable[[int, Any], None] | None = None
+    report: Callable[[int, PyTree], None] | None = None
     checkpoint: str | os.PathLike[str] | None = None
     mesh: Mesh | None = None
 
@@ -81,17 +84,17 @@ class Chunks(NamedTuple):
       done: whether the condition was met; with lanes ``bool[N]``.
     """
 
-    state: Any
-    metrics: Any
+    state: PyTree
+    metrics: PyTree
     step: np.ndarray
     done: np.ndarray
 
 
 def run_in_chunks(
     step: Step,
-    state: Any,
-    problem: Any,
-    hparams: Any,
+    state: PyTree,
+    problem: PyTree,
+    hparams: PyTree,
     *,
     num_steps: int,
     until: Until | None = None,
@@ -120,11 +123,12 @@ def run_in_chunks(
     until = until if until is None or isinstance(until, Partial) else Partial(until)
     now = _begin(step, state, problem, hparams, num_lanes)
     rows = jax.tree.map(lambda x: np.zeros((0, *x.shape), x.dtype), (now.count, now.metrics))
-    given: Any = None
+    given: PyTree = None
     if checkpoint is not None:
         given = files.fingerprint(step=step, problem=problem, hparams=hparams)
         if os.path.exists(checkpoint):
             now, rows = files.load(checkpoint, (now, rows), given)
+    advance: Callable[..., tuple[PyTree, PyTree]]
     if mesh is None:
         advance = partial(run_blocks, _lane_steps(step, keep, num_lanes))
     else:
@@ -147,7 +151,9 @@ def run_in_chunks(
     )
 
 
-def _begin(step: Step, state: Any, problem: Any, hparams: Any, num_lanes: int | None) -> Progress:
+def _begin(
+    step: Step, state: PyTree, problem: PyTree, hparams: PyTree, num_lanes: int | None
+) -> Progress:
     """Progress before the first chunk, without compilation."""
     lanes = () if num_lanes is None else (num_lanes,)
     shape = _metrics_of(step, state, problem, hparams, num_lanes)
@@ -156,7 +162,9 @@ def _begin(step: Step, state: Any, problem: Any, hparams: Any, num_lanes: int | 
     return Progress(state, *to_jax((metrics, count, np.zeros(count.shape, bool))))
 
 
-def _metrics_of(step: Step, state: Any, problem: Any, hparams: Any, num_lanes: int | None) -> Any:
+def _metrics_of(
+    step: Step, state: PyTree, problem: PyTree, hparams: PyTree, num_lanes: int | None
+) -> PyTree:
     """Shapes of the metrics of one run, from a step's trace."""
     one = (state, hparams)
     if num_lanes is not None:
@@ -165,7 +173,7 @@ def _metrics_of(step: Step, state: Any, problem: Any, hparams: Any, num_lanes: i
     return jax.eval_shape(jax.jit(step), one[0], problem, one[1])[1]
 
 
-def trace_lanes(step: Step, state: Any, problem: Any, hparams: Any) -> None:
+def trace_lanes(step: Step, state: PyTree, problem: PyTree, hparams: PyTree) -> None:
     """Traces the step of :func:`run_in_chunks` with lanes, for which shapes of states suffice.
 
     Of `step`, `problem` and `hparams` as there, and the `state` of N runs, or its shapes.
@@ -186,7 +194,7 @@ def trace_lanes(step: Step, state: Any, problem: Any, hparams: Any) -> None:
 def _lane_steps(step: Step, keep: str, num_lanes: int | None) -> Step:
     """A step of :class:`Progress`, of one run or of several, with rows of counts and metrics."""
 
-    def one(now: Progress, problem: Any, given: Any) -> tuple[Progress, Any]:
+    def one(now: Progress, problem: PyTree, given: PyTree) -> tuple[Progress, PyTree]:
         hparams, until = given
 
         def go(now: Progress) -> Progress:
@@ -206,7 +214,7 @@ def _lane_steps(step: Step, keep: str, num_lanes: int | None) -> Step:
     if num_lanes > 1:
         return jax.vmap(one, in_axes=(0, None, (0, None)))
 
-    def alone(now: Progress, problem: Any, given: Any) -> tuple[Progress, Any]:
+    def alone(now: Progress, problem: PyTree, given: PyTree) -> tuple[Progress, PyTree]:
         # Without vmap, whose loops and branches take several times as long to compile.
         first, hparams = jax.tree.map(lambda x: x[0], (now, given[0]))
         return jax.tree.map(lambda x: x[None], one(first, problem, (hparams, given[1])))
@@ -214,13 +222,13 @@ def _lane_steps(step: Step, keep: str, num_lanes: int | None) -> Step:
     return alone
 
 
-def _spread(hparams: Any, state: Any) -> Any:
+def _spread(hparams: PyTree, state: PyTree) -> PyTree:
     """Hyperparameters of each of N runs, floats in the precision of the states."""
     size = len(state.step)
     floats = [x.dtype for x in jax.tree.leaves(state) if jnp.issubdtype(x.dtype, jnp.floating)]
 
-    def one(x: Any) -> np.ndarray:
-        x = np.asarray(x)
+    def one(given: ArrayLike) -> np.ndarray:
+        x = np.asarray(given)
         x = x.astype(floats[0]) if floats and np.issubdtype(x.dtype, np.floating) else x
         return np.broadcast_to(x, (size, *x.shape[1:]))
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
 
 import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
 
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.algos.common.trees import choose
 from jaxltl.core.pretty_print import brief
 
@@ -24,13 +24,13 @@ class Best:
       step: ``int32[]``, the number of steps after which they were reached.
     """
 
-    parameters: Any
+    parameters: PyTree
     neg_log_likelihood: jax.Array
     step: jax.Array
 
 
 def stop_early(
-    state: Any, after: Any, held_out: jax.Array, judged: jax.Array, patience: chex.Numeric
+    state: PyTree, after: PyTree, held_out: jax.Array, judged: jax.Array, patience: chex.Numeric
 ) -> tuple[Best, jax.Array]:
     """The :class:`Best` parameters so far, and ``bool[]``, whether patience has run out.
 

@@ -58,6 +58,7 @@ import jax
 import jax.numpy as jnp
 from jax.tree_util import Partial
 
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.algos.common import loops
 from jaxltl.algos.common.loops import MAX_STEPS, Learned, Until
 from jaxltl.algos.common.settings import HasStatus, flag_invalid, require_hparams
@@ -196,7 +197,7 @@ class Learner(Protocol[ProblemIn, HparamsIn, StateT, MetricsOut]):
         """``init`` and ``run_until``; ``vmap`` it over keys for many seeds. Raises as they do."""
         ...
 
-    def policy(self, state: StateT, problem: ProblemIn, hparams: HparamsIn) -> Any:
+    def policy(self, state: StateT, problem: ProblemIn, hparams: HparamsIn) -> PyTree:
         """The learned policy: ``float[S, A]`` for models, an ``Agent`` for environments."""
         ...
 

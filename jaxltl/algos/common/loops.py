@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import chex
 import jax
@@ -15,6 +15,7 @@ from flax import struct
 from jax import lax
 from jax.tree_util import Partial
 
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.algos.common.settings import require_arrays, require_hparams
 from jaxltl.algos.common.trees import choose
 from jaxltl.core.pretty_print import brief
@@ -90,7 +91,7 @@ def run_blocks(
     return lax.scan(block, state, lengths)
 
 
-def _zero_metrics(step: Callable[..., tuple[Any, MetricsT]], *arguments: Any) -> MetricsT:
+def _zero_metrics(step: Callable[..., tuple[PyTree, MetricsT]], *arguments: PyTree) -> MetricsT:
     # One trace of the step serves all: two could be compiled to different roundings.
     _, shape = jax.eval_shape(step, *arguments)
     return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shape)
@@ -109,8 +110,8 @@ class Learned:
         of the last step's metrics.
     """
 
-    state: Any
-    metrics: Any
+    state: PyTree
+    metrics: PyTree
     num_steps: jax.Array
     status: jax.Array
 
@@ -155,25 +156,25 @@ def run_until(
 class Progress:
     """A run: `state` and `metrics` of the last step, `count` of steps, and `done`, the condition's value."""
 
-    state: Any
-    metrics: Any
+    state: PyTree
+    metrics: PyTree
     count: jax.Array
     done: jax.Array
 
 
 @partial(jax.jit, static_argnames=("step", "check_every", "keep", "idle"))
 def _run_until(
-    step: Callable[..., tuple[Any, Any]],
-    state: Any,
-    given: tuple[Any, ...],
+    step: Callable[..., tuple[PyTree, PyTree]],
+    state: PyTree,
+    given: tuple[PyTree, ...],
     check_every: int,
     keep: str,
     idle: bool,
 ) -> Learned:
-    def active(carry: tuple[Progress, Any], given: tuple[Any, ...]) -> jax.Array:
+    def active(carry: tuple[Progress, PyTree], given: tuple[PyTree, ...]) -> jax.Array:
         return ~carry[0].done & (carry[0].count < given[-1])
 
-    def body(carry: tuple[Progress, Any], given: tuple[Any, ...]) -> tuple[Progress, Any]:
+    def body(carry: tuple[Progress, PyTree], given: tuple[PyTree, ...]) -> tuple[Progress, PyTree]:
         going, (problem, hparams, until, _) = active(carry, given), given
         now, window = carry
         before = now.state if window is None else window
@@ -224,7 +225,7 @@ def while_active(
         return lax.while_loop(lambda c: active(c, given), lambda c: body(c, given), carry)
 
     @loop.def_vmap
-    def _(size: int, batched: Any, carry: CarryT, given: GivenT) -> tuple[CarryT, Any]:
+    def _(size: int, batched: PyTree, carry: CarryT, given: GivenT) -> tuple[CarryT, PyTree]:
         lanes, shared = batched
         carry = jax.tree.map(
             lambda x, b: x if b else jnp.broadcast_to(x, (size, *x.shape)), carry, lanes

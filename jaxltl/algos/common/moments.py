@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.pretty_print import brief
 
 
@@ -68,7 +68,7 @@ def standardized(moments: Moments, numbers: jax.Array) -> jax.Array:
     return (numbers - moments.mean) / scale_of(moments)
 
 
-def normalized(moments: Any, observation: Any) -> Any:
+def normalized(moments: PyTree, observation: PyTree) -> PyTree:
     """A tree of observations with floats :func:`standardized` and clipped to ten deviations.
 
     `moments` is a tree of :class:`Moments`, or None for no change.

@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.pretty_print import brief
 
 # Products such as .07 * 100 come out a little above the integer that they are.
@@ -76,7 +77,7 @@ class Linear:
 Schedule = Any  # a number, a Polynomial, or a pytree that is called with l = 1, 2, ...
 
 
-def is_schedule(given: Any) -> bool:
+def is_schedule(given: object) -> bool:
     """Whether `given` is a schedule of the step, in a pytree so that it is traced, and not a number.
 
     >>> import math
@@ -142,7 +143,7 @@ _ASSUMED = (
 )
 
 
-def theorem_conditions(hparams: Any, *, num_steps: int | None = None) -> Conditions:
+def theorem_conditions(hparams: PyTree, *, num_steps: int | None = None) -> Conditions:
     """The :class:`Conditions` of theorem 1 (assumption 2b) on concrete `hparams` of ``cce``; on the host.
 
     ``n_l`` grows as ``l^beta`` with beta > 0; ``alpha_l`` is positive, decreases to 0 and has an infinite
@@ -187,7 +188,7 @@ def _polynomial(schedule: Schedule) -> tuple[float, float, float] | None:
 _FUNCTION = "it is a function; its limits cannot be told"
 
 
-def _samples_condition(hparams: Any, num_steps: int | None) -> tuple[float | None, Condition]:
+def _samples_condition(hparams: PyTree, num_steps: int | None) -> tuple[float | None, Condition]:
     name = "samples grow"
     if hparams.num_samples is None:
         return 0.0, Condition(name, False, f"n_l is always {hparams.population}")

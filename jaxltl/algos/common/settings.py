@@ -26,6 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.algos.common.schedules import at, is_schedule
 from jaxltl.core import validation
 from jaxltl.core.types import Status, worst
@@ -151,7 +152,7 @@ def flag_invalid(metrics: MetricsT, hparams: object, step: jax.Array) -> Metrics
     return dataclasses.replace(cast(Any, metrics), status=status)
 
 
-def require_arrays(**trees: Any) -> None:
+def require_arrays(**trees: PyTree) -> None:
     """Validation of `trees` by name: every leaf is an array or a number.
 
     Raises:
@@ -180,7 +181,7 @@ def _is_array(leaf: Any) -> bool:
     return isinstance(leaf, np.ndarray | np.generic) and leaf.dtype.kind in "biufc"
 
 
-def applied(network: nn.Module, parameters: Any, *read: Any) -> Any:
+def applied(network: nn.Module, parameters: PyTree, *read: PyTree) -> PyTree:
     """The output of a `network` with `parameters` for the inputs `read`.
 
     Raises:

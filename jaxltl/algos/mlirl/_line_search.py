@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +12,7 @@ from flax import struct
 from jax import lax
 
 
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.algos.common import trees
 
 _MOST = 16  # evaluations for one step
@@ -23,10 +24,10 @@ _MEMORY = 10
 class Point:
     """Parameters with the loss, its gradient and its terms."""
 
-    parameters: Any
+    parameters: PyTree
     loss: jax.Array
-    gradient: Any
-    parts: Any
+    gradient: PyTree
+    parts: PyTree
 
 
 @struct.dataclass
@@ -41,14 +42,14 @@ class Search:
     """
 
     point: Point
-    direction: Any
-    memory: Any
+    direction: PyTree
+    memory: PyTree
     known: jax.Array
 
 
 class _Trial(NamedTuple):
     base: Point
-    direction: Any
+    direction: PyTree
     known: jax.Array
     best: Point  # the lowest loss so far
     moved: jax.Array  # whether that is another point than the base
@@ -63,7 +64,7 @@ def _directions() -> optax.GradientTransformation:
     return optax.scale_by_lbfgs(memory_size=_MEMORY)
 
 
-def start(parameters: Any, point: Point) -> Search:
+def start(parameters: PyTree, point: Point) -> Search:
     """The state before the first evaluation; `point` gives the shapes."""
     zero = optax.tree.zeros_like(parameters)
     # optax starts from weakly typed zeros, which a second run would compile anew for.
@@ -71,7 +72,7 @@ def start(parameters: Any, point: Point) -> Search:
     return Search(point, zero, memory, jnp.bool_(False))
 
 
-def step(evaluate: Callable[[Any, Point], Point], search: Search) -> tuple[Search, Point]:
+def step(evaluate: Callable[[PyTree, Point], Point], search: Search) -> tuple[Search, Point]:
     """One step of L-BFGS (Liu and Nocedal 1989) to a point that satisfies Wolfe's conditions.
 
     The step size is bracketed and bisected or doubled (Lewis and Overton 2013), which terminates
@@ -140,5 +141,5 @@ def step(evaluate: Callable[[Any, Point], Point], search: Search) -> tuple[Searc
     return Search(new, optax.tree.scale(-1, moved), memory, jnp.bool_(True)), found.base
 
 
-def _ahead(base: Point, direction: Any, size: jax.Array) -> Any:
+def _ahead(base: Point, direction: PyTree, size: jax.Array) -> PyTree:
     return jax.tree.map(lambda x, d: x + size.astype(x.dtype) * d, base.parameters, direction)

@@ -94,7 +94,7 @@ __all__ = [
     "world_features",
 ]
 
-Reward = Callable[[Any, jax.Array], jax.Array]
+Reward = Callable[[PyTree, jax.Array], jax.Array]
 
 
 def linear_reward(weights: jax.Array, features: jax.Array) -> jax.Array:
@@ -171,9 +171,9 @@ class State:
 
     key: jax.Array
     step: jax.Array
-    parameters: Any
+    parameters: PyTree
     value: jax.Array
-    optimizer: Any
+    optimizer: PyTree
 
 
 @brief(facts=partial(history, codes={"status": Status}))
@@ -280,7 +280,7 @@ def make_problem(
 
 
 def solve(
-    parameters: Any, problem: Problem, hparams: Hparams, initial: jax.Array | None = None
+    parameters: PyTree, problem: Problem, hparams: Hparams, initial: jax.Array | None = None
 ) -> Solution:
     """The softmax value and policy (2.3) at `parameters` of the reward of a `problem`.
 
@@ -303,7 +303,7 @@ def _solve(
 
 
 def objective(
-    parameters: Any, problem: Problem, hparams: Hparams, initial: jax.Array | None = None
+    parameters: PyTree, problem: Problem, hparams: Hparams, initial: jax.Array | None = None
 ) -> tuple[jax.Array, Objective]:
     """``J = -sum log pi(s, a) - mu g(y) + l2 / 2 |theta|^2``: (2.4), (2.6) and the prior.
 
@@ -366,7 +366,7 @@ def _init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
 
 @jax.jit  # traced once for all its uses
 def _evaluate(
-    parameters: Any, problem: Problem, hparams: Hparams, initial: jax.Array
+    parameters: PyTree, problem: Problem, hparams: Hparams, initial: jax.Array
 ) -> line_search.Point:
     (loss, parts), gradient = jax.value_and_grad(objective, has_aux=True)(
         parameters, problem, hparams, initial
@@ -383,7 +383,7 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
 def _update(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
     if hparams.optimizer == "lbfgs":
 
-        def evaluate(parameters: Any, before: line_search.Point) -> line_search.Point:
+        def evaluate(parameters: PyTree, before: line_search.Point) -> line_search.Point:
             return _evaluate(parameters, problem, hparams, _usable(before.parts))
 
         optimizer, before = line_search.step(evaluate, state.optimizer)

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from jaxltl.core.environments.environment import Environment
+from jax.sharding import NamedSharding
+
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import chex
 import jax
@@ -12,6 +16,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import lax
 
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.algos.common import action_distributions as actions_of
 
 from jaxltl.algos.common import trees
@@ -23,14 +28,17 @@ from jaxltl.algos.common.moments import Moments, normalized, scale_of, updated_m
 from jaxltl.core.models.mesh import lanes
 from jaxltl.core.pretty_print import brief
 
+if TYPE_CHECKING:
+    from jaxltl.algos.ppo.learner import Hparams, Problem, State
+
 
 @brief
 @struct.dataclass
 class Walkers:
     """N parallel environments: states, memories, and figures of their current episodes, ``[N, ...]``."""
 
-    world: Any
-    memory: Any
+    world: PyTree
+    memory: PyTree
     episode_return: jax.Array
     episode_length: jax.Array
     discounted: jax.Array
@@ -43,9 +51,9 @@ class Rows(NamedTuple):
     `raw` action and its density under the collecting policy, and the value before it.
     """
 
-    observation: Any
+    observation: PyTree
     start: jax.Array
-    allowed: Any
+    allowed: jax.Array | None
     raw: jax.Array
     log_density: jax.Array
     value: jax.Array
@@ -69,8 +77,8 @@ class _Record(NamedTuple):
 
 
 def collected(
-    key: chex.PRNGKey, state: Any, problem: Any, hparams: Any
-) -> tuple[Any, Any, Rows, dict[str, jax.Array]]:
+    key: chex.PRNGKey, state: State, problem: Problem, hparams: Hparams
+) -> tuple[State, PyTree, Rows, dict[str, jax.Array]]:
     """T transitions of N environments: the next state, initial memories, transitions, and figures.
 
     Figures are those of ``Metrics``, whether every mask allows an action, ``permitted``, and whether all
@@ -129,7 +137,7 @@ def _discounted_sums(
 ) -> tuple[jax.Array, Walkers]:
     """``float[T, N]``, discounted rewards of each episode so far, and the environments with the last."""
 
-    def on(before: jax.Array, row: Any) -> tuple[jax.Array, jax.Array]:
+    def on(before: jax.Array, row: PyTree) -> tuple[jax.Array, jax.Array]:
         reward, discount, ended = row
         now = before + reward
         return jnp.where(ended, 0, discount * now), now
@@ -138,7 +146,9 @@ def _discounted_sums(
     return sums, replace(walkers, discounted=last)
 
 
-def _walked(key: chex.PRNGKey, state: Any, problem: Any, hparams: Any) -> tuple[Walkers, _Record]:
+def _walked(
+    key: chex.PRNGKey, state: State, problem: Problem, hparams: Hparams
+) -> tuple[Walkers, _Record]:
     environment, size = problem.environment, (hparams.num_steps, hparams.num_envs)
     noise_key, move_key, reset_key = jax.random.split(key, 3)
     dtype = state.walkers.discounted.dtype
@@ -159,12 +169,12 @@ def _walked(key: chex.PRNGKey, state: Any, problem: Any, hparams: Any) -> tuple[
 def _walk(
     rank: jax.Array,
     walkers: Walkers,
-    begin: Any,
-    noise: Any,
+    begin: PyTree,
+    noise: jax.Array,
     keys: jax.Array,
-    given: Any,
+    given: PyTree,
     *,
-    sharding: Any,
+    sharding: NamedSharding | None,
 ) -> tuple[Walkers, _Record]:
     """Transitions of all environments, or of one device's."""
     parameters, moments, problem, hparams, pool = given
@@ -180,7 +190,7 @@ def _walk(
         row = _Record(made, walker.episode_length == 0, total, length)
         return replace(walker, world=world, memory=memory), row
 
-    def restarted(walker: Walkers, fresh: Any, row: _Record) -> Walkers:
+    def restarted(walker: Walkers, fresh: PyTree, row: _Record) -> Walkers:
         ended = row.of.terminated | row.of.truncated
         world, memory = jax.tree.map(
             lambda x, y: jnp.where(ended, x, y),
@@ -195,7 +205,7 @@ def _walk(
             walker.discounted,
         )
 
-    def move(carry: Any, given: Any) -> Any:
+    def move(carry: PyTree, given: PyTree) -> PyTree:
         walkers, used = carry
         start, *chance = given
         walkers, row = jax.vmap(one)(walkers, *chance)
@@ -212,7 +222,7 @@ def _walk(
     return walkers, path
 
 
-def _starts(key: chex.PRNGKey, environment: Any, hparams: Any) -> tuple[Any, Any]:
+def _starts(key: chex.PRNGKey, environment: Environment, hparams: Hparams) -> tuple[PyTree, PyTree]:
     """Initial states or keys ``[T, N]`` of the episodes that begin, or a pool of initial states."""
     size, number = (hparams.num_steps, hparams.num_envs), hparams.num_resets
     if number:
@@ -222,16 +232,16 @@ def _starts(key: chex.PRNGKey, environment: Any, hparams: Any) -> tuple[Any, Any
 
 
 def _evaluated_all(
-    problem: Any, parameters: Any, memory: Any, observation: Any, num_axes: int
+    problem: Problem, parameters: PyTree, memory: PyTree, observation: PyTree, num_axes: int
 ) -> Output:
     """Outputs of the network for observations with `num_axes` leading axes."""
-    function: Any = partial(evaluated, problem, parameters)
+    function: Callable[..., Output] = partial(evaluated, problem, parameters)
     for _ in range(num_axes):
         function = jax.vmap(function)
     return function(memory, observation)
 
 
-def _at_ends(cut: jax.Array, following: jax.Array, ends: Any, judge: Any) -> jax.Array:
+def _at_ends(cut: jax.Array, following: jax.Array, ends: PyTree, judge: PyTree) -> jax.Array:
     """Next values, with those at truncated observations inserted.
 
     Truncations are rare, so only these observations are evaluated, a batch at a time.
@@ -242,10 +252,10 @@ def _at_ends(cut: jax.Array, following: jax.Array, ends: Any, judge: Any) -> jax
     place = jnp.nonzero(cut.ravel(), size=size, fill_value=size)[0]
     place = jnp.concatenate([place, jnp.full(some, size, place.dtype)])
 
-    def active(carry: Any, given: Any) -> jax.Array:
+    def active(carry: PyTree, given: PyTree) -> jax.Array:
         return carry[0] * some < given[0]
 
-    def body(carry: Any, given: Any) -> Any:
+    def body(carry: PyTree, given: PyTree) -> PyTree:
         turn, values = carry
         _, place, (memory, last), moments, parameters = given
         chosen = lax.dynamic_slice(place, (turn * some,), (some,))

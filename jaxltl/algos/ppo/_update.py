@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from jaxltl.algos.common.schedules import Schedule
+
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import chex
 import jax
@@ -11,6 +13,7 @@ import jax.numpy as jnp
 import optax
 from jax import lax
 
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.algos.common import action_distributions as actions_of
 
 from jaxltl.algos.common import trees
@@ -20,6 +23,9 @@ from jaxltl.algos.common.schedules import at
 from jaxltl.algos.ppo._collect import Rows
 from jaxltl.core.models.mesh import lanes
 
+if TYPE_CHECKING:
+    from jaxltl.algos.ppo.learner import Hparams, Problem, State
+
 
 Figures = dict[str, jax.Array]  # of Metrics: of a minibatch before its update, or means
 
@@ -27,17 +33,22 @@ Figures = dict[str, jax.Array]  # of Metrics: of a minibatch before its update, 
 class Limits(NamedTuple):
     """Values of schedules in this step."""
 
-    clip: Any
-    value_clip: Any
+    clip: chex.Numeric
+    value_clip: chex.Numeric | None
 
 
-def descent(hparams: Any) -> optax.GradientTransformation:
+def descent(hparams: Hparams) -> optax.GradientTransformation:
     """Adam without its learning rate, which a schedule supplies."""
     return optax.scale_by_adam(eps=hparams.adam_epsilon)
 
 
 def loss(
-    parameters: Any, rows: Rows, begun: Any, problem: Any, hparams: Any, limits: Limits
+    parameters: PyTree,
+    rows: Rows,
+    begun: PyTree,
+    problem: Problem,
+    hparams: Hparams,
+    limits: Limits,
 ) -> tuple[jax.Array, Figures]:
     """The loss (Schulman et al. 2017, equation 9) and its parts, of rows ``[N', ...]``::
 
@@ -77,12 +88,12 @@ def loss(
     }
 
 
-def _said(parameters: Any, rows: Rows, begun: Any, problem: Any) -> Output:
+def _said(parameters: PyTree, rows: Rows, begun: PyTree, problem: Problem) -> Output:
     say = jax.vmap(partial(evaluated, problem, parameters))
     if not has_memory(problem):
         return say((), rows.observation)
 
-    def on(memory: Any, row: Any) -> tuple[Any, Output]:
+    def on(memory: PyTree, row: PyTree) -> tuple[PyTree, Output]:
         start, observation = row
         memory = jax.vmap(lambda s, m: trees.choose(s, problem.memory, m))(start, memory)
         said = say(memory, observation)
@@ -92,14 +103,14 @@ def _said(parameters: Any, rows: Rows, begun: Any, problem: Any) -> Output:
 
 
 class _Going(NamedTuple):
-    parameters: Any
-    optimizer: Any
+    parameters: PyTree
+    optimizer: PyTree
     stopped: jax.Array
 
 
 def improved(
-    key: chex.PRNGKey, state: Any, rows: Rows, begun: Any, problem: Any, hparams: Any
-) -> tuple[Any, Any, Figures]:
+    key: chex.PRNGKey, state: State, rows: Rows, begun: PyTree, problem: Problem, hparams: Hparams
+) -> tuple[PyTree, PyTree, Figures]:
     """Parameters and the optimiser's state after the epochs, and mean figures.
 
     Updates with a gradient that is not finite are skipped and counted, as are all after the first
@@ -112,7 +123,7 @@ def improved(
     if not recurrent:
         rows = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rows)
 
-    def update(going: _Going, chosen: jax.Array) -> tuple[_Going, Any]:
+    def update(going: _Going, chosen: jax.Array) -> tuple[_Going, PyTree]:
         some = jax.tree.map(lambda x: jnp.take(x, chosen, axis=int(recurrent)), rows)
         memory = jax.tree.map(lambda x: x[chosen], begun) if recurrent else ()
         some, memory = lanes.split_axis(some, over, int(recurrent)), lanes.split_axis(memory, over)
@@ -154,5 +165,5 @@ def improved(
     return going.parameters, going.optimizer, figures
 
 
-def _at(schedule: Any, step: jax.Array) -> Any:
+def _at(schedule: Schedule | None, step: jax.Array) -> chex.Numeric | None:
     return None if schedule is None else at(schedule, step)

@@ -46,10 +46,11 @@ for seconds, so only shapes are shown.)
 
 from __future__ import annotations
 
+from jax.sharding import NamedSharding
+
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache, partial
-from typing import Any
 
 import chex
 import flax.linen as nn
@@ -124,7 +125,7 @@ class Problem:
     """
 
     environment: Environment
-    memory: Any
+    memory: PyTree
     network: nn.Module = struct.field(pytree_node=False)
 
 
@@ -191,7 +192,7 @@ class Hparams:
     normalize_reward: bool = static(bool, default=False)
     squash: str = static(actions_of.SQUASHES, default="clip")
     num_resets: int | None = static(Range(0, MAX_INT, integer=True), default=None)
-    sharding: Any = struct.field(pytree_node=False, default=None)
+    sharding: NamedSharding | None = struct.field(pytree_node=False, default=None)
 
 
 @brief
@@ -212,10 +213,10 @@ class State:
 
     key: jax.Array
     step: jax.Array
-    parameters: Any
-    optimizer: Any
+    parameters: PyTree
+    optimizer: PyTree
     walkers: Walkers
-    moments: Any
+    moments: PyTree
     return_moments: Moments | None
     transitions: jax.Array
 
@@ -262,7 +263,7 @@ class Metrics:
 
 
 def make_problem(
-    environment: Environment, *, network: nn.Module | None = None, memory: Any = None
+    environment: Environment, *, network: nn.Module | None = None, memory: PyTree = None
 ) -> Problem:
     """A checked :class:`Problem` of an `environment` with finitely many actions, or a box of floats.
 
@@ -357,8 +358,8 @@ def _actor(sampled: bool, squash: str) -> Callable[..., tuple[jax.Array, chex.Ar
     ) -> tuple[jax.Array, PyTree]:
         problem, parameters, moments = run
         output = evaluated(problem, parameters, memory, normalized(moments, observation))
-        mode = {"sampled": sampled, "squash": squash}
-        action = actions_of.chosen(key, problem.environment.actions, output.action, allowed, **mode)
+        actions, given = problem.environment.actions, output.action
+        action = actions_of.chosen(key, actions, given, allowed, sampled=sampled, squash=squash)
         return action, output.memory
 
     return act

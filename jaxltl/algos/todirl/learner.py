@@ -39,7 +39,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import chex
 import jax
@@ -85,9 +85,9 @@ class State:
 
     key: jax.Array
     step: jax.Array
-    parameters: Any
+    parameters: PyTree
     value: jax.Array
-    optimizer: Any
+    optimizer: PyTree
     best: Best
     stopped: jax.Array
 
@@ -119,7 +119,7 @@ class Metrics:
 
 
 def solve(
-    parameters: Any, problem: Problem, hparams: Hparams, initial: jax.Array | None = None
+    parameters: PyTree, problem: Problem, hparams: Hparams, initial: jax.Array | None = None
 ) -> Solution:
     """The soft values and policies of `parameters` in all worlds of a `problem`.
 
@@ -172,7 +172,7 @@ class Objective:
 
 
 def objective(
-    parameters: Any, problem: Problem, hparams: Hparams, initial: jax.Array | None = None
+    parameters: PyTree, problem: Problem, hparams: Hparams, initial: jax.Array | None = None
 ) -> tuple[jax.Array, Objective]:
     """``-sum log pi(a | s, q) + l2 / 2 |theta|^2``: minus (3.2), over all pairs of all worlds.
 
@@ -343,14 +343,14 @@ def _init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
 
 
 @partial(jax.jit, static_argnums=0)
-def _draw(network: nn.Module, key: chex.PRNGKey, inputs: tuple[jax.Array, ...]) -> Any:
+def _draw(network: nn.Module, key: chex.PRNGKey, inputs: tuple[jax.Array, ...]) -> PyTree:
     return network.init(key, *inputs)
 
 
 def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
     """One full-batch step of the optimiser on :func:`objective`; deterministic given the state."""
 
-    def loss_of(parameters: Any) -> jax.Array:
+    def loss_of(parameters: PyTree) -> jax.Array:
         return objective(parameters, problem, hparams, state.value)[0]
 
     (loss, parts), gradient = jax.value_and_grad(objective, has_aux=True)(

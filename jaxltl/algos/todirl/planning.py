@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +9,7 @@ from flax import linen as nn
 from jax import lax
 
 
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.models.construct.restrict import with_allowed
 from jaxltl.core.models.product import Product
 from jaxltl.core.types import Solution, status_code
@@ -19,7 +19,7 @@ from jaxltl.algos.todirl.problem import Hparams, network_inputs
 
 
 def reward(
-    network: nn.Module, parameters: Any, model: Product, observation: jax.Array
+    network: nn.Module, parameters: PyTree, model: Product, observation: jax.Array
 ) -> jax.Array:
     """The reward ``float[S, Q, A]`` of a `network` with `parameters` in a `model`, a product.
 
@@ -40,7 +40,7 @@ def reward(
 
 def plan(
     network: nn.Module,
-    parameters: Any,
+    parameters: PyTree,
     model: Product,
     observation: jax.Array,
     hparams: Hparams,

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from flax import linen as nn
 from flax import struct
 
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.algos.common.settings import COUNT, Number, static, traced
 from jaxltl.core.validation import Range
 
@@ -95,7 +96,7 @@ class Hparams:
 
 def make_problem(
     worlds: Product | Sequence[Product],
-    observation: Any,
+    observation: PyTree,
     demonstrations: Trajectories | Sequence[Trajectories],
     *,
     held_out: float | Trajectories | Sequence[Trajectories] | None = 0.2,

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+from jax.typing import DTypeLike
+
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from jaxltl.algos.trust_region.state import Hparams
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.algos.common.moments import Moments, scale_of, standardized
 from jaxltl.algos.common.settings import applied
 
@@ -18,7 +21,7 @@ class Network(nn.Module):
     hidden: tuple[int, ...]
     outputs: int
     last_scale: float
-    dtype: Any
+    dtype: DTypeLike
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
@@ -31,17 +34,19 @@ class Network(nn.Module):
         return layer(self.outputs, "out", self.last_scale)(x)
 
 
-def mean_network(hparams: Any, num_actions: int, dtype: Any) -> Network:
+def mean_network(hparams: Hparams, num_actions: int, dtype: DTypeLike) -> Network:
     """The network of a policy's mean."""
     return Network(hparams.hidden, num_actions, 0.1, dtype)
 
 
-def value_network(hparams: Any, dtype: Any) -> Network:
+def value_network(hparams: Hparams, dtype: DTypeLike) -> Network:
     """The network of a value of rewards or costs."""
     return Network(hparams.value_hidden, 1, 0.1, dtype)
 
 
-def gaussian(parameters: Any, hparams: Any, inputs: jax.Array) -> tuple[jax.Array, jax.Array]:
+def gaussian(
+    parameters: PyTree, hparams: Hparams, inputs: jax.Array
+) -> tuple[jax.Array, jax.Array]:
     """Mean and standard deviation of the actions."""
     log_deviation = parameters["log_deviation"]
     network = mean_network(hparams, log_deviation.shape[0], log_deviation.dtype)
@@ -61,7 +66,7 @@ def kl_divergence(old: tuple[jax.Array, jax.Array], new: tuple[jax.Array, jax.Ar
     return jnp.sum((ratio**2 + ((mean - other) / spread) ** 2 - 1) / 2 - jnp.log(ratio), -1)
 
 
-def values_at(values: Any, hparams: Any, inputs: jax.Array) -> jax.Array:
+def values_at(values: PyTree, hparams: Hparams, inputs: jax.Array) -> jax.Array:
     """Values ``float[V, ...]`` before scaling."""
     network = value_network(hparams, inputs.dtype)
     return jax.vmap(lambda p: jnp.asarray(applied(network, p, inputs))[..., 0])(values)
@@ -80,12 +85,12 @@ def inputs_at(inputs: jax.Array, time: jax.Array, horizon: int) -> jax.Array:
     return jnp.concatenate([inputs, times[jnp.minimum(time, horizon - 1)][:, None]], -1)
 
 
-def normalized(moments: Moments, hparams: Any, observation: jax.Array) -> jax.Array:
+def normalized(moments: Moments, hparams: Hparams, observation: jax.Array) -> jax.Array:
     """Standardised observations if ``hparams.normalize``."""
     return standardized(moments, observation) if hparams.normalize else observation
 
 
-def refolded(network: Any, old: Moments, new: Moments) -> Any:
+def refolded(network: PyTree, old: Moments, new: Moments) -> PyTree:
     """Parameters of the same function of observations under new moments.
 
     Without this the policy would change with the moments, outside of any trust region.

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.scipy.sparse.linalg import cg
 
+from jaxltl.algos.trust_region.state import Hparams
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.algos.trust_region._cpo_dual import Case, Dual, cpo_dual, cpo_weights, ratio
 from jaxltl.algos.trust_region._policy_networks import (
     gaussian,
@@ -33,13 +35,13 @@ def fisher_product(divergence: Callable[[jax.Array], jax.Array], parameters: jax
 
 
 def surrogate(
-    parameters: Any,
+    parameters: PyTree,
     old: tuple[jax.Array, jax.Array],
     inputs: jax.Array,
     action: jax.Array,
     weighted: jax.Array,
     valid: jax.Array,
-    hparams: Any,
+    hparams: Hparams,
 ) -> tuple[jax.Array, jax.Array]:
     """Gains ``float[V]`` over the sampling policy, and the mean divergence ``mean_i KL(old || pi)``.
 
@@ -58,7 +60,7 @@ def direction(
     flat: jax.Array,
     excess: jax.Array,
     delta: jax.Array,
-    hparams: Any,
+    hparams: Hparams,
 ) -> tuple[jax.Array, Dual]:
     """The solution of the linear-quadratic problem in the span of ``H^-1 g`` and ``H^-1 b``."""
     damping = jnp.asarray(hparams.damping, flat.dtype)
@@ -95,7 +97,7 @@ def line_search(
     change: jax.Array,
     excess: jax.Array,
     delta: jax.Array,
-    hparams: Any,
+    hparams: Hparams,
 ) -> tuple[jax.Array, Surrogate]:
     """The longest accepted step of a geometric sequence, and its effect; zero if none is accepted.
 
@@ -111,13 +113,13 @@ def line_search(
         falls = jnp.where(excess > 0, after.cost < 0, after.cost <= -excess)
         return found & falls
 
-    def search(carry: Any) -> Any:
+    def search(carry: PyTree) -> PyTree:
         count, scale, _, _ = carry
         scale = jnp.where(count == 0, jnp.ones_like(scale), scale * ratio)
         after = judged(flat + scale * change)
         return count + 1, scale, after, good(after)
 
-    def searching(carry: Any) -> jax.Array:
+    def searching(carry: PyTree) -> jax.Array:
         return (carry[0] < hparams.search_steps) & ~carry[3]
 
     zero = jnp.zeros((), flat.dtype)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
 
 import chex
 import jax
 import jax.numpy as jnp
 import optax
 
+from jaxltl.algos.trust_region.state import Hparams, State
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.algos.common.collection import minibatch_epochs
 from jaxltl.algos.trust_region._policy_networks import (
     values_at,
@@ -17,12 +18,12 @@ from jaxltl.algos.trust_region._policy_networks import (
 
 def fitted(
     key: chex.PRNGKey,
-    state: Any,
+    state: State,
     inputs: jax.Array,
     target: jax.Array,
     valid: jax.Array,
-    hparams: Any,
-) -> tuple[Any, Any, jax.Array]:
+    hparams: Hparams,
+) -> tuple[PyTree, PyTree, jax.Array]:
     """Value networks after Adam's steps on the squared error to targets ``float[V, T, N]``."""
     mean = jnp.where(valid, target, 0).sum((1, 2)) / jnp.maximum(valid.sum(), 1)
     deviation = jnp.sqrt(weighted_variance(target, valid))
@@ -35,11 +36,11 @@ def fitted(
     weight = valid.reshape(-1).astype(inputs.dtype)
     optimizer = optax.adam(hparams.value_rate)
 
-    def loss(values: Any, chosen: jax.Array) -> jax.Array:
+    def loss(values: PyTree, chosen: jax.Array) -> jax.Array:
         error = values_at(values, hparams, inputs[chosen]) - target[:, chosen]
         return jnp.sum(weight[chosen] * error**2) / jnp.maximum(weight[chosen].sum(), 1)
 
-    def descend(carry: Any, chosen: jax.Array) -> Any:
+    def descend(carry: PyTree, chosen: jax.Array) -> PyTree:
         values, memory = carry
         updates, memory = optimizer.update(jax.grad(loss)(values, chosen), memory)
         return (optax.apply_updates(values, updates), memory), None

@@ -53,7 +53,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import chex
 import jax
@@ -61,6 +60,7 @@ import jax.numpy as jnp
 import optax
 from jax.flatten_util import ravel_pytree
 
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.algos.common import learner
 from jaxltl.algos.common.collection import masked_advantages
 from jaxltl.algos.common.moments import no_moments, updated_moments
@@ -239,20 +239,22 @@ def _estimated(
 
 
 def _improved(
-    parameters: Any,
+    parameters: PyTree,
     batch: Batch,
     inputs: jax.Array,
     found: jax.Array,
     problem: Problem,
     hparams: Hparams,
-) -> tuple[Any, Metrics]:
+) -> tuple[PyTree, Metrics]:
     """The policy after the step, and metrics."""
     dtype, constrained = inputs.dtype, hparams.method == "cpo"
     number = jnp.maximum(batch.finite.sum(), 1)
     paid = jnp.power(jnp.asarray(hparams.cost_discount, dtype), jnp.arange(problem.horizon))
     sums = jnp.sum(paid[:, None] * batch.cost, 0)
     cost = sums.sum() / number
-    excess = cost - problem.limit.astype(dtype) if constrained else jnp.zeros((), dtype)
+    excess = jnp.zeros((), dtype)
+    if problem.limit is not None and constrained:
+        excess = cost - problem.limit.astype(dtype)
 
     # Advantages of rewards are weighted evenly, as is usual; those of costs as the limit demands.
     weight = batch.valid.astype(dtype) / number

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import chex
 import jax
@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax import lax
 from jax.tree_util import Partial
 
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.algos.common import action_distributions as actions_of
 from jaxltl.algos.common.actor_critic import Output
 from jaxltl.algos.common.collection import Transition, transition
@@ -23,6 +24,7 @@ from jaxltl.core import validation
 from jaxltl.core.environments.environment import (
     flat_observation,
     require_key,
+    some_action,
 )
 from jaxltl.core.environments.episodes import Agent
 from jaxltl.core.pretty_print import brief
@@ -92,7 +94,10 @@ _Run = tuple[State, Problem, Hparams]
 
 
 def _agent(
-    choose: Callable[..., tuple[jax.Array, Any]], state: State, problem: Problem, hparams: Hparams
+    choose: Callable[..., tuple[jax.Array, PyTree]],
+    state: State,
+    problem: Problem,
+    hparams: Hparams,
 ) -> Agent:
     require_run(problem, hparams)
     require_state(state)
@@ -100,8 +105,8 @@ def _agent(
 
 
 def _sampled_action(
-    run: _Run, memory: Any, observation: Any, allowed: None, key: chex.PRNGKey
-) -> tuple[jax.Array, Any]:
+    run: _Run, memory: PyTree, observation: PyTree, allowed: None, key: chex.PRNGKey
+) -> tuple[jax.Array, PyTree]:
     state, problem, hparams = run
     mean, deviation = act(state, hparams, flat_observation(observation))
     noise = jax.random.normal(key, mean.shape, mean.dtype)
@@ -109,8 +114,8 @@ def _sampled_action(
 
 
 def _mean_action(
-    run: _Run, memory: Any, observation: Any, allowed: None, key: chex.PRNGKey
-) -> tuple[jax.Array, Any]:
+    run: _Run, memory: PyTree, observation: PyTree, allowed: None, key: chex.PRNGKey
+) -> tuple[jax.Array, PyTree]:
     state, problem, hparams = run
     return as_action(problem, act(state, hparams, flat_observation(observation))[0]), memory
 
@@ -164,7 +169,7 @@ def _rollout(
 
     def evaluate(memory: chex.ArrayTree, observation: chex.ArrayTree) -> Output:
         mean, deviation = act(state, hparams, flat_observation(observation))
-        shape = environment.actions.shape
+        shape = some_action(environment.actions).shape
         action = (mean.reshape(shape), jnp.log(deviation).reshape(shape))
         return Output(memory, action, jnp.zeros((), mean.dtype))
 
@@ -172,7 +177,7 @@ def _rollout(
         after, _, record = transition(environment, evaluate, None, (world, ()), *chance)
         return after, record
 
-    def move(carry: Any, chance: Any) -> Any:
+    def move(carry: PyTree, chance: PyTree) -> PyTree:
         worlds, active, cut = carry
         after, made = jax.vmap(one)(worlds, *chance)
 

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core import validation
 from jaxltl.core.environments.environment import (
     Box,
@@ -35,7 +36,7 @@ class Problem:
     """
 
     environment: Environment
-    limit: Any
+    limit: jax.Array | None
     horizon: int = struct.field(pytree_node=False)
 
 
@@ -87,7 +88,7 @@ def make_problem(
     return Problem(environment=environment, limit=limit, horizon=horizon)
 
 
-def observed_vector(problem: Problem, world: Any) -> jax.Array:
+def observed_vector(problem: Problem, world: PyTree) -> jax.Array:
     """The flattened observation ``float[O]``."""
     return flat_observation(problem.environment.observe(world))
 

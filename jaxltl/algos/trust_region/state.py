@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
 
 import jax
 from flax import struct
 
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.algos.common.settings import COUNT, MAX_INT, Number, static, traced
 from jaxltl.core.validation import Range
 from jaxltl.algos.common.moments import Moments
@@ -88,10 +88,10 @@ class State:
 
     key: jax.Array
     step: jax.Array
-    parameters: Any
-    values: Any
+    parameters: PyTree
+    values: PyTree
     value_moments: jax.Array
-    optimizer: Any
+    optimizer: PyTree
     moments: Moments
     trajectories: jax.Array
 
