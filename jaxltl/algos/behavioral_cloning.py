@@ -39,21 +39,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from flax import linen as nn
-from flax import struct
+from flax import linen as nn, struct
 
-from jaxltl.core.models.protocols import PyTree
-from jaxltl.algos.common.settings import COUNT, Number, static, traced
-from jaxltl.core.validation import Range
-from jaxltl.algos.common import learner
-
-from jaxltl.algos.common import trees
+from jaxltl.algos.common import learner, trees
 from jaxltl.algos.common.early_stopping import Best, stop_early
+from jaxltl.algos.common.settings import COUNT, Number, static, traced
 from jaxltl.core.models.construct.batch import stack_models, stack_observations, training_counts
 from jaxltl.core.models.product import Product
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.pretty_print import brief, history
 from jaxltl.core.types import Status
+from jaxltl.core.validation import Range
 
 # --- policy networks -----------------------------------------------------------------------------
 

@@ -56,7 +56,6 @@ from flax import struct
 from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 
-from jaxltl.core.models.protocols import PyTree
 from jaxltl.algos.common import action_distributions
 from jaxltl.algos.common.actor_critic import dense
 from jaxltl.algos.common.moments import normalized
@@ -76,6 +75,7 @@ from jaxltl.core.environments.environment import (
 from jaxltl.core.environments.episodes import Agent
 from jaxltl.core.environments.task_environment import TaskObservation
 from jaxltl.core.logic.ltl import Formula
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.pretty_print import brief
 
 

@@ -35,13 +35,13 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jaxltl.core import validation
 from jaxltl.core.models.interval import IntervalMDP, make_interval
 from jaxltl.core.models.parametric.parametric import ParametricMDP, box_of
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.interval.reachability import reachability
 from jaxltl.core.sparse.interval.robust_values import Query
 from jaxltl.core.sparse.interval.total_reward import total_reward
-from jaxltl.core import validation
 from jaxltl.core.values.undiscounted.mixture import safe_ends
 
 ACCEPTED, REJECTED, OPEN = 1, -1, 0

@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxltl.core.models.protocols import PyTree
 from jaxltl.core import validation
 from jaxltl.core.models.mesh import lanes
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.types import require_shape
 
 

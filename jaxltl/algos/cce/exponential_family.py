@@ -38,8 +38,6 @@ Example:
 
 from __future__ import annotations
 
-from numpy.typing import ArrayLike
-
 import math
 from dataclasses import replace
 from functools import singledispatch
@@ -51,10 +49,11 @@ import numpy as np
 from flax import struct
 from jax import lax
 from jax.scipy.special import digamma, gammaln
+from numpy.typing import ArrayLike
 
-from jaxltl.core.models.protocols import PyTree
 from jaxltl.algos.cce._gamma_shape import convex_part, log_digamma_gap, shape_of_gap
 from jaxltl.algos.common import splitmix
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.pretty_print import brief
 
 

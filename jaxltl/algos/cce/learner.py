@@ -48,8 +48,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxltl.core.models.protocols import PyTree
-from jaxltl.core.validation import Range
 from jaxltl.algos.cce import exponential_family as families
 from jaxltl.algos.cce._elites import (
     Pool,
@@ -61,16 +59,16 @@ from jaxltl.algos.cce._elites import (
     select,
 )
 from jaxltl.algos.cce._evaluation import evaluate_all
-from jaxltl.algos.common import learner
-from jaxltl.algos.common.schedules import SLACK, at, is_schedule
-from jaxltl.algos.common.schedules import Polynomial as Polynomial
-from jaxltl.core import validation
-from jaxltl.core.environments.environment import require_key
-from jaxltl.core.types import Status, require_shape
-
 from jaxltl.algos.cce.assessment import Assessment, Result, assess, require_run, result
 from jaxltl.algos.cce.problem import Problem, make_problem
 from jaxltl.algos.cce.state import WEIGHTINGS, Hparams, Metrics, State
+from jaxltl.algos.common import learner
+from jaxltl.algos.common.schedules import SLACK, Polynomial as Polynomial, at, is_schedule
+from jaxltl.core import validation
+from jaxltl.core.environments.environment import require_key
+from jaxltl.core.models.protocols import PyTree
+from jaxltl.core.types import Status, require_shape
+from jaxltl.core.validation import Range
 
 __all__ = [
     "WEIGHTINGS",

@@ -11,11 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from jaxltl.core.models.protocols import PyTree
 from jaxltl.algos.cce import exponential_family as families
 from jaxltl.algos.cce._evaluation import per_cost, split
 from jaxltl.algos.common.schedules import Polynomial as Polynomial
 from jaxltl.core.environments.environment import as_partial
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.pretty_print import brief
 
 

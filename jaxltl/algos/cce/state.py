@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-from jax.sharding import NamedSharding
-
 from functools import partial
 
 import jax
 from flax import struct
+from jax.sharding import NamedSharding
 
-from jaxltl.core.models.protocols import PyTree
-from jaxltl.algos.common.settings import COUNT, Number, static, traced
-from jaxltl.core.validation import Range
 from jaxltl.algos.cce._elites import (
     Sample,
 )
-from jaxltl.algos.common.schedules import Schedule
-from jaxltl.algos.common.schedules import Polynomial as Polynomial
+from jaxltl.algos.common.schedules import Polynomial as Polynomial, Schedule
+from jaxltl.algos.common.settings import COUNT, Number, static, traced
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.pretty_print import brief, history
 from jaxltl.core.types import Status
-
+from jaxltl.core.validation import Range
 
 WEIGHTINGS = ("until_feasible", "literal", "uniform")
 

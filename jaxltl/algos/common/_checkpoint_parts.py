@@ -7,15 +7,12 @@ dies, that file and the parts that it names are complete.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import BinaryIO
-
 import contextlib
 import os
 import secrets
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import jax
 import numpy as np

@@ -9,8 +9,8 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 
-from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.models.mesh.lanes import on_host, vmap_over_mesh
+from jaxltl.core.models.protocols import PyTree
 
 Run = Callable[..., tuple[PyTree, PyTree]]
 

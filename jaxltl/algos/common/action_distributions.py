@@ -7,16 +7,14 @@ it: clipped, or squashed by a hyperbolic tangent.
 
 from __future__ import annotations
 
-from jax.typing import DTypeLike
-
-
 import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 
-from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.environments.environment import Box, Finite, clipped_action
+from jaxltl.core.models.protocols import PyTree
 
 Actions = Finite | Box
 SQUASHES = ("clip", "tanh")

@@ -38,10 +38,10 @@ import numpy as np
 from jax import lax
 from jax.typing import DTypeLike
 
-from jaxltl.core.models.protocols import PyTree
 from jaxltl.algos.common.settings import applied
 from jaxltl.core import validation
 from jaxltl.core.environments.environment import Box, Finite, flat_observation
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.pretty_print import brief
 
 

@@ -44,9 +44,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxltl.core.models.protocols import PyTree
 from jaxltl.algos.common import _checkpoint_parts as parts
 from jaxltl.core.models.ops.array_namespace import to_jax
+from jaxltl.core.models.protocols import PyTree
 
 _GIVEN = "given"  # the fingerprint's name in the file
 _PARTS = "parts"  # the name of what is in other files

@@ -21,8 +21,6 @@ Example: half of what is lacking in each step, for two runs side by side.
 
 from __future__ import annotations
 
-from numpy.typing import ArrayLike
-
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -35,16 +33,17 @@ import numpy as np
 from jax import lax
 from jax.sharding import Mesh
 from jax.tree_util import Partial
+from numpy.typing import ArrayLike
 
-from jaxltl.core.models.protocols import PyTree
 from jaxltl.algos.common import checkpoint as files
 from jaxltl.algos.common._run_over_mesh import run_over_mesh
 from jaxltl.algos.common.loops import Progress, Step, Until, block_lengths, run_blocks
 from jaxltl.algos.common.settings import require_hparams
 from jaxltl.algos.common.trees import either, strong
+from jaxltl.core import validation
 from jaxltl.core.models.mesh.lanes import on_host
 from jaxltl.core.models.ops.array_namespace import to_jax
-from jaxltl.core import validation
+from jaxltl.core.models.protocols import PyTree
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-
 import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxltl.core.models.protocols import PyTree
 from jaxltl.algos.common.trees import choose
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.pretty_print import brief
 
 

@@ -58,10 +58,10 @@ import jax
 import jax.numpy as jnp
 from jax.tree_util import Partial
 
-from jaxltl.core.models.protocols import PyTree
 from jaxltl.algos.common import loops
 from jaxltl.algos.common.loops import MAX_STEPS, Learned, Until
 from jaxltl.algos.common.settings import HasStatus, flag_invalid, require_hparams
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.types import Status
 

@@ -15,12 +15,12 @@ from flax import struct
 from jax import lax
 from jax.tree_util import Partial
 
-from jaxltl.core.models.protocols import PyTree
 from jaxltl.algos.common.settings import require_arrays, require_hparams
 from jaxltl.algos.common.trees import choose
+from jaxltl.core import validation
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.types import Status, worst
-from jaxltl.core import validation
 
 ProblemT = TypeVar("ProblemT")
 HparamsT = TypeVar("HparamsT")

@@ -26,9 +26,9 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from jaxltl.core.models.protocols import PyTree
 from jaxltl.algos.common.schedules import at, is_schedule
 from jaxltl.core import validation
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.types import Status, worst
 from jaxltl.core.validation import Range
 

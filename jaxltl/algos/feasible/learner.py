@@ -52,25 +52,21 @@ from jax import lax
 from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 
-from jaxltl.algos.common.settings import Number, static, traced
-from jaxltl.core.validation import Range
-from jaxltl.algos.common import learner
-from jaxltl.algos.common import trees
-from jaxltl.algos.common import optimizers
-from jaxltl.algos.common import loops
+from jaxltl.algos.common import learner, loops, optimizers, trees
 from jaxltl.algos.common.schedules import Schedule, at
+from jaxltl.algos.common.settings import Number, static, traced
+from jaxltl.algos.feasible.problem import Problem, certify, require_problem
+from jaxltl.core import validation
 from jaxltl.core.models.parametric.parametric import ParametricMDP
 from jaxltl.core.pretty_print import brief, history
 from jaxltl.core.types import Status
-from jaxltl.core import validation
+from jaxltl.core.validation import Range
 from jaxltl.core.values.prepared.prepared import (
     Prepared,
     evaluate_prepared,
     is_direct,
     solve_prepared,
 )
-
-from jaxltl.algos.feasible.problem import Problem, certify, require_problem
 
 _FINEST = 1e-12  # the width of bounds if those of the requested width contain the threshold
 

@@ -11,6 +11,7 @@ import numpy as np
 from flax import struct
 from numpy.typing import ArrayLike
 
+from jaxltl.core import validation
 from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.models.parametric.parametric import Ends, ParametricMDP
 from jaxltl.core.models.protocols import Array
@@ -18,7 +19,6 @@ from jaxltl.core.models.sparse import SparseMDP, choice_reward
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.solvers import reachability as optimal
 from jaxltl.core.types import require_shape
-from jaxltl.core import validation
 from jaxltl.core.values.interval.robust import width_asked
 from jaxltl.core.values.prepared.prepared import Prepared, prepare
 from jaxltl.core.values.undiscounted.mixture import safe_ends

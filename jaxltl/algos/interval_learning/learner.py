@@ -52,9 +52,7 @@ import numpy as np
 from jax import lax
 from jax.tree_util import Partial
 
-from jaxltl.algos.common import learner, pac
-
-from jaxltl.algos.common import loops
+from jaxltl.algos.common import learner, loops, pac
 from jaxltl.algos.common.play import take
 from jaxltl.algos.interval_learning._intervals import (
     confidence_intervals,

@@ -8,9 +8,9 @@ import jax
 from flax import struct
 
 from jaxltl.algos.common.settings import COUNT, Number, static, traced
-from jaxltl.core.validation import Range
 from jaxltl.core.pretty_print import brief, history
 from jaxltl.core.types import Status
+from jaxltl.core.validation import Range
 
 INTERVALS = ("linear", "confidence")
 

@@ -51,22 +51,21 @@ from flax import struct
 from jax import lax
 from jax.tree_util import Partial
 
-from jaxltl.algos.common.settings import COUNT, Number, static, traced
-from jaxltl.core.validation import Range
-from jaxltl.algos.common import learner, splitmix
-from jaxltl.algos.common import loops
-from jaxltl.algos.maximin_q._alias import draw_alias
-from jaxltl.algos.maximin_q.problem import Problem
+from jaxltl.algos.common import learner, loops, splitmix
 from jaxltl.algos.common.play import (
     draw,
     observed_reward,
     take,
 )
+from jaxltl.algos.common.settings import COUNT, Number, static, traced
+from jaxltl.algos.maximin_q._alias import draw_alias
+from jaxltl.algos.maximin_q.problem import Problem
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.ops.operators import action_argmax, sample_successor
 from jaxltl.core.models.protocols import Array
 from jaxltl.core.pretty_print import brief, history
 from jaxltl.core.types import Status
+from jaxltl.core.validation import Range
 
 MOST_VISITS = 2**30  # counted; a step adds at most as many again
 _UNROLLED = 16  # actions up to which a maximum over them is unrolled, several times faster

@@ -11,9 +11,8 @@ import optax
 from flax import struct
 from jax import lax
 
-
-from jaxltl.core.models.protocols import PyTree
 from jaxltl.algos.common import trees
+from jaxltl.core.models.protocols import PyTree
 
 _MOST = 16  # evaluations for one step
 _DECREASE, _CURVATURE = 1e-4, 0.9  # Wolfe's constants

@@ -45,17 +45,16 @@ import optax
 from flax import struct
 from jax.flatten_util import ravel_pytree
 
+from jaxltl.algos.common import learner, optimizers, trees
 from jaxltl.algos.common.settings import Number, static, traced
-from jaxltl.core.validation import Range
-from jaxltl.algos.common import learner
-from jaxltl.algos.common import trees
-from jaxltl.algos.common import optimizers
 from jaxltl.algos.mlirl import _line_search as line_search
-from jaxltl.algos.mlirl.features import Features as Features
-from jaxltl.algos.mlirl.features import pair_counts
-from jaxltl.algos.mlirl.features import progress_states as progress_states
-from jaxltl.algos.mlirl.features import task_features as task_features
-from jaxltl.algos.mlirl.features import world_features as world_features
+from jaxltl.algos.mlirl.features import (
+    Features as Features,
+    pair_counts,
+    progress_states as progress_states,
+    task_features as task_features,
+    world_features as world_features,
+)
 from jaxltl.core.models.construct.lifting import allowed_steps, lift_trajectories
 from jaxltl.core.models.construct.restrict import with_allowed
 from jaxltl.core.models.mdp import MDP, DenseMDP
@@ -65,6 +64,7 @@ from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.pretty_print import brief, history
 from jaxltl.core.types import Solution, Status, require_shape, worst
+from jaxltl.core.validation import Range
 from jaxltl.core.values.discounted.boltzmann import boltzmann_value
 from jaxltl.core.values.discounted.soft import policy_logits, soft_value
 from jaxltl.core.values.engine.iterate import in_turn

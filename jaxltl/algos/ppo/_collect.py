@@ -3,45 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from jaxltl.core.environments.environment import Environment
-from jax.sharding import NamedSharding
-
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import chex
 import jax
 import jax.numpy as jnp
-from flax import struct
 from jax import lax
+from jax.sharding import NamedSharding
 
-from jaxltl.core.models.protocols import PyTree
-from jaxltl.algos.common import action_distributions as actions_of
-
-from jaxltl.algos.common import trees
-
-from jaxltl.algos.common import loops
+from jaxltl.algos.common import action_distributions as actions_of, loops, trees
 from jaxltl.algos.common.actor_critic import Output, evaluated
 from jaxltl.algos.common.collection import Transition, generalized_advantages, transition
 from jaxltl.algos.common.moments import Moments, normalized, scale_of, updated_moments
+from jaxltl.algos.ppo.state import Hparams, Problem, State, Walkers
+from jaxltl.core.environments.environment import Environment
 from jaxltl.core.models.mesh import lanes
-from jaxltl.core.pretty_print import brief
-
-if TYPE_CHECKING:
-    from jaxltl.algos.ppo.learner import Hparams, Problem, State
-
-
-@brief
-@struct.dataclass
-class Walkers:
-    """N parallel environments: states, memories, and figures of their current episodes, ``[N, ...]``."""
-
-    world: PyTree
-    memory: PyTree
-    episode_return: jax.Array
-    episode_length: jax.Array
-    discounted: jax.Array
+from jaxltl.core.models.protocols import PyTree
 
 
 class Rows(NamedTuple):

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from jaxltl.algos.common.schedules import Schedule
-
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import chex
 import jax
@@ -13,18 +11,14 @@ import jax.numpy as jnp
 import optax
 from jax import lax
 
-from jaxltl.core.models.protocols import PyTree
-from jaxltl.algos.common import action_distributions as actions_of
-
-from jaxltl.algos.common import trees
+from jaxltl.algos.common import action_distributions as actions_of, trees
 from jaxltl.algos.common.actor_critic import Output, evaluated, has_memory
 from jaxltl.algos.common.collection import minibatch_epochs
-from jaxltl.algos.common.schedules import at
+from jaxltl.algos.common.schedules import Schedule, at
 from jaxltl.algos.ppo._collect import Rows
+from jaxltl.algos.ppo.state import Hparams, Problem, State
 from jaxltl.core.models.mesh import lanes
-
-if TYPE_CHECKING:
-    from jaxltl.algos.ppo.learner import Hparams, Problem, State
+from jaxltl.core.models.protocols import PyTree
 
 
 Figures = dict[str, jax.Array]  # of Metrics: of a minibatch before its update, or means

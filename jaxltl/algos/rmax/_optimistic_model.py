@@ -7,9 +7,7 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 
-from jaxltl.algos.common import pac
-
-from jaxltl.algos.common import loops
+from jaxltl.algos.common import loops, pac
 from jaxltl.algos.common.play import take
 from jaxltl.algos.rmax._rollout import Rollout
 from jaxltl.algos.rmax.problem import Problem

@@ -52,9 +52,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
 
-from jaxltl.algos.common import learner, pac, splitmix
-
-from jaxltl.algos.common import loops
+from jaxltl.algos.common import learner, loops, pac, splitmix
 from jaxltl.algos.common.play import draw
 from jaxltl.algos.rmax._optimistic_model import (
     exploration,

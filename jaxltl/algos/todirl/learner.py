@@ -45,16 +45,13 @@ import chex
 import jax
 import jax.numpy as jnp
 import optax
-from flax import linen as nn
-from flax import struct
+from flax import linen as nn, struct
 from jax import lax
 
-from jaxltl.algos.common import learner
-
-from jaxltl.algos.common import trees
-
-from jaxltl.algos.common import optimizers
+from jaxltl.algos.common import learner, optimizers, trees
 from jaxltl.algos.common.early_stopping import Best, stop_early
+from jaxltl.algos.todirl.planning import backward_induction, plan, reward, soft_plan
+from jaxltl.algos.todirl.problem import Hparams, Problem, network_inputs
 from jaxltl.core.models.ops.successor_tables import PredecessorTable
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import PyTree
@@ -62,9 +59,6 @@ from jaxltl.core.pretty_print import brief, history
 from jaxltl.core.types import Solution, Status
 from jaxltl.core.values.discounted.soft import policy_logits, soft_policy_adjoint
 from jaxltl.core.values.undiscounted.satisfaction import satisfaction_probability
-
-from jaxltl.algos.todirl.planning import backward_induction, plan, reward, soft_plan
-from jaxltl.algos.todirl.problem import Hparams, Problem, network_inputs
 
 _ResultT = TypeVar("_ResultT")
 

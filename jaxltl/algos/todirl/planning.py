@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
 from jax import lax
 
-
-from jaxltl.core.models.protocols import PyTree
+from jaxltl.algos.todirl.problem import Hparams, network_inputs
 from jaxltl.core.models.construct.restrict import with_allowed
 from jaxltl.core.models.product import Product
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.types import Solution, status_code
 from jaxltl.core.values.discounted.soft import policy_logits, soft_value
-
-from jaxltl.algos.todirl.problem import Hparams, network_inputs
 
 
 def reward(

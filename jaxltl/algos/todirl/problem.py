@@ -7,27 +7,23 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from flax import linen as nn
-from flax import struct
+from flax import linen as nn, struct
 
-from jaxltl.core.models.protocols import PyTree
 from jaxltl.algos.common.settings import COUNT, Number, static, traced
-from jaxltl.core.validation import Range
-
-
+from jaxltl.algos.todirl.networks import RewardNetwork
 from jaxltl.core.models.construct.batch import (
     restrict_stacked_actions,
     stack_models,
     stack_observations,
     training_counts,
+    unstack_product as lane,
 )
-from jaxltl.core.models.construct.batch import unstack_product as lane
 from jaxltl.core.models.ops.successor_tables import PredecessorTable, predecessor_table
 from jaxltl.core.models.product import Product
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.pretty_print import brief
-
-from jaxltl.algos.todirl.networks import RewardNetwork
+from jaxltl.core.validation import Range
 
 
 @brief

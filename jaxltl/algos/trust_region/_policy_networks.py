@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from jax.typing import DTypeLike
-
-
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 
-from jaxltl.algos.trust_region.state import Hparams
-from jaxltl.core.models.protocols import PyTree
 from jaxltl.algos.common.moments import Moments, scale_of, standardized
 from jaxltl.algos.common.settings import applied
+from jaxltl.algos.trust_region.state import Hparams
+from jaxltl.core.models.protocols import PyTree
 
 
 class Network(nn.Module):

@@ -10,8 +10,6 @@ import jax.numpy as jnp
 from jax import lax
 from jax.scipy.sparse.linalg import cg
 
-from jaxltl.algos.trust_region.state import Hparams
-from jaxltl.core.models.protocols import PyTree
 from jaxltl.algos.trust_region._cpo_dual import Case, Dual, cpo_dual, cpo_weights, ratio
 from jaxltl.algos.trust_region._policy_networks import (
     gaussian,
@@ -19,6 +17,8 @@ from jaxltl.algos.trust_region._policy_networks import (
     log_density,
 )
 from jaxltl.algos.trust_region._value_fit import positive
+from jaxltl.algos.trust_region.state import Hparams
+from jaxltl.core.models.protocols import PyTree
 
 
 class Surrogate(NamedTuple):

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-
 import chex
 import jax
 import jax.numpy as jnp
 import optax
 
-from jaxltl.algos.trust_region.state import Hparams, State
-from jaxltl.core.models.protocols import PyTree
 from jaxltl.algos.common.collection import minibatch_epochs
 from jaxltl.algos.trust_region._policy_networks import (
     values_at,
 )
+from jaxltl.algos.trust_region.state import Hparams, State
+from jaxltl.core.models.protocols import PyTree
 
 
 def fitted(

@@ -60,7 +60,6 @@ import jax.numpy as jnp
 import optax
 from jax.flatten_util import ravel_pytree
 
-from jaxltl.core.models.protocols import PyTree
 from jaxltl.algos.common import learner
 from jaxltl.algos.common.collection import masked_advantages
 from jaxltl.algos.common.moments import no_moments, updated_moments
@@ -83,10 +82,6 @@ from jaxltl.algos.trust_region._step import (
     surrogate,
 )
 from jaxltl.algos.trust_region._value_fit import fitted, positive, weighted_variance
-from jaxltl.core.environments.environment import (
-    require_key,
-)
-
 from jaxltl.algos.trust_region.policies import (
     Batch,
     act,
@@ -98,6 +93,10 @@ from jaxltl.algos.trust_region.policies import (
 )
 from jaxltl.algos.trust_region.problem import Problem, action_size, make_problem, observed_vector
 from jaxltl.algos.trust_region.state import METHODS, Hparams, Metrics, State
+from jaxltl.core.environments.environment import (
+    require_key,
+)
+from jaxltl.core.models.protocols import PyTree
 
 __all__ = [
     "METHODS",

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 from jax import lax
 from jax.tree_util import Partial
 
-from jaxltl.core.models.protocols import PyTree
 from jaxltl.algos.common import action_distributions as actions_of
 from jaxltl.algos.common.actor_critic import Output
 from jaxltl.algos.common.collection import Transition, transition
@@ -20,6 +19,8 @@ from jaxltl.algos.trust_region._policy_networks import (
     gaussian,
     normalized,
 )
+from jaxltl.algos.trust_region.problem import Problem, as_action, observed_vector
+from jaxltl.algos.trust_region.state import Hparams, State
 from jaxltl.core import validation
 from jaxltl.core.environments.environment import (
     flat_observation,
@@ -27,10 +28,8 @@ from jaxltl.core.environments.environment import (
     some_action,
 )
 from jaxltl.core.environments.episodes import Agent
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.pretty_print import brief
-
-from jaxltl.algos.trust_region.problem import Problem, as_action, observed_vector
-from jaxltl.algos.trust_region.state import Hparams, State
 
 
 @brief

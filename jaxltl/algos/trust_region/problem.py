@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxltl.core.models.protocols import PyTree
 from jaxltl.core import validation
 from jaxltl.core.environments.environment import (
     Box,
@@ -20,6 +19,7 @@ from jaxltl.core.environments.environment import (
     require_environment,
     some_action,
 )
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.types import require_shape
 

@@ -7,13 +7,12 @@ from functools import partial
 import jax
 from flax import struct
 
-from jaxltl.core.models.protocols import PyTree
-from jaxltl.algos.common.settings import COUNT, MAX_INT, Number, static, traced
-from jaxltl.core.validation import Range
 from jaxltl.algos.common.moments import Moments
+from jaxltl.algos.common.settings import COUNT, MAX_INT, Number, static, traced
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.pretty_print import brief, history
 from jaxltl.core.types import Status
-
+from jaxltl.core.validation import Range
 
 METHODS = ("trpo", "cpo")
 
