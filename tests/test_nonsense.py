@@ -131,7 +131,10 @@ def things(folder):
             jl.values.robust_expectation,
             {"model": model, "value": [0.0, 1, 2], "nature": "adversarial"},
         ),
-        (jl.optimal_satisfaction, {"model": model, "task": "F a", "states": [0]}),
+        (
+            jl.optimal_satisfaction,
+            {"model": model, "task": "F a", "states": [0], "label_on": None},
+        ),
         (jl.values.robust_next_probability, asked),
         (jl.values.robust_bounded_reachability, {**asked, "num_steps": 2, "stay": None}),
         (jl.values.robust_cumulative_reward, {"model": model, "reward": "r", "num_steps": 2}),

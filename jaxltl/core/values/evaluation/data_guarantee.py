@@ -141,7 +141,7 @@ def learn_guarantee(
         sets = intervals_from_counts(
             align_counts(sparse, counts) if isinstance(counts, TransitionCounts) else counts,
             needed,
-            method=method or "anytime",
+            method="anytime" if method is None else method,
             entry_start=sparse.entry_start,
         )
     interval, kept = _with_sets(sparse, sets)

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from jax import lax
 
 from jaxltl.core.values.engine.state_quantities import reduction_for
+from jaxltl.core import validation
 from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.graphs.acceptance import (
@@ -221,8 +222,8 @@ def optimal_satisfaction(
         if max_steps is not None or start is not None:
             raise ValueError("max_steps and start are options of products; leave task out.")
         if isinstance(model, IntervalMDP | Game):
-            if label_on not in (None, "exit"):
-                raise ValueError(f'label_on={label_on!r}; interval models read labels on "exit".')
+            if label_on is not None:  # interval models read labels on exit
+                validation.choice("label_on", label_on, ("exit",))
             return robust_satisfaction(
                 model, task, objective=objective, nature=nature, states=states, tolerance=tolerance
             )
@@ -232,7 +233,7 @@ def optimal_satisfaction(
             task,
             objective=objective,
             states=states,
-            label_on=label_on or "entry",
+            label_on="entry" if label_on is None else label_on,
             tolerance=tolerance,
         )
     if states is not None or label_on is not None:
