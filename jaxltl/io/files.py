@@ -140,6 +140,15 @@ def _too_large(name: str, limit: int) -> ValueError:
     return ValueError(f"{name!r} has more than {limit} bytes, the most that are read.")
 
 
+@contextlib.contextmanager
+def errors_in(place: str) -> Iterator[None]:
+    """Prepends a place to the message of a ValueError."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{place}{error}") from None
+
+
 def read_text(path: str | os.PathLike[str], expected: str) -> str:
     """Decoded UTF-8 contents of a file, decompressed as by :func:`read_bytes`."""
     data = read_bytes(path)

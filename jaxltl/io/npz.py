@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
 import os
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TypeVar
 
@@ -21,7 +20,7 @@ from jaxltl.core.models.mdp import MDP, DenseMDP, from_dense, make_mdp
 from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.models.sparse import Annotations, Rewards, SparseMDP, make_sparse
 from jaxltl.core.sparse.rows import offsets_from_counts
-from jaxltl.io.files import ALWAYS_ALLOWED, MAX_RATIO, raw_bytes
+from jaxltl.io.files import ALWAYS_ALLOWED, MAX_RATIO, errors_in, raw_bytes
 from jaxltl.io.text_output import exact_part
 
 Arrays = Mapping[str, Array]
@@ -100,22 +99,13 @@ def _check_size(raw: bytes, name: str) -> None:
 
 def model_of(arrays: Arrays, name: str) -> tuple[MDP, tuple[str, ...] | None]:
     """Padded model in JAX's default precision, and its action names."""
-    with _errors_in(name):
+    with errors_in(f"{name!r}: "):
         if set(arrays) & set(_ENDS):
             raise ValueError("its probabilities are intervals; a padded model has single numbers.")
         if _is_sparse(arrays):
             return to_padded(exact_part(sparse_model(arrays))), None
         mdp, _ = _padded_model(arrays)
         return mdp, _action_names(arrays, mdp.num_actions)
-
-
-@contextlib.contextmanager
-def _errors_in(name: str) -> Iterator[None]:
-    """Prefixes ValueErrors with the file name."""
-    try:
-        yield
-    except ValueError as error:
-        raise ValueError(f"{name!r}: {error}") from None
 
 
 def _is_sparse(arrays: Arrays) -> bool:
@@ -279,7 +269,7 @@ def read_npz(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP | Game:
     name = str(path)
     try:
         arrays = parse_arrays(raw_bytes(path), name, ("system",))
-        with _errors_in(name):
+        with errors_in(f"{name!r}: "):
             if set(arrays) & set(_OF_INTERVALS) and "system" in arrays:
                 raise ValueError(
                     "the probabilities of this game are intervals; chains and "

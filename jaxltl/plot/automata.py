@@ -32,30 +32,27 @@ def automaton(
     names: bool = True,
     layout: Literal["auto", "graphviz", "matplotlib"] = "auto",
 ) -> Figure:
-    """An automaton as a graph from left to right.
+    """Graph of an automaton, from left to right.
 
-    Final states have a double circle. Accepting transitions of a Buchi automaton are coloured
-    and have a dot before their guard; in a parity automaton each guard has its priority there,
-    filled if it is even. States in which the word is already rejected are grey, and no mark
-    counts on the way to them.
+    Final states have a double circle. Accepting transitions of a Buchi automaton are coloured, with
+    a dot before their guard; guards of a parity automaton have their priority there, filled if
+    even. States in which the word is already rejected are grey.
 
     Args:
       automaton: the automaton.
-      names: list the formula that each state has left to satisfy under the graph.
-      layout: the layout engine: ``"graphviz"``, or ``"matplotlib"`` for the built-in one, which needs
-        nothing else and puts rejecting states below, or ``"auto"``, which is graphviz if its
-        program ``dot`` is there.
+      names: list the remaining formula of each state under the graph.
+      layout: ``"graphviz"``, ``"matplotlib"`` for the built-in layout, or ``"auto"``: graphviz if
+        its program ``dot`` is installed.
 
     Returns:
-      The figure, in inches that suit the graph.
+      The figure.
 
     Raises:
       ValueError: ``layout="graphviz"`` and graphviz cannot be run.
 
     Example:
       >>> from jaxltl import to_automaton
-      >>> figure = automaton(to_automaton("F a"), layout="matplotlib")
-      >>> len(figure.axes)
+      >>> len(automaton(to_automaton("F a"), layout="matplotlib").axes)
       1
     """
     table = on_the_host(automaton)

@@ -65,11 +65,7 @@ def fill_cells(axes: Axes, world: Board, colors: Sequence[str], lines: str = PAP
 
 
 def short_name(kind: str) -> str:
-    """The name of a cell, cut to five characters.
-
-    >>> short_name("goal"), short_name("upper_left")
-    ('goal', 'uppe…')
-    """
+    """The name of a cell, cut to five characters."""
     return kind if len(kind) <= 5 else f"{kind[:4]}…"
 
 
@@ -107,10 +103,7 @@ def draw_moves(
     colors: Sequence[str] | None = None,
     scale: float = 1.0,
 ) -> None:
-    """Draws an action mask: a triangle per allowed move, a dot for staying.
-
-    `colors` are those of places, default ink; marks of the colour ``"none"`` are hollow.
-    """
+    """Draws an action mask, in colours of places ("none": hollow marks); a dot is staying."""
     for place, a in np.argwhere(mask):
         # Drawn over the environment's robot, which may be in the same cell.
         face = INK if colors is None else colors[place]

@@ -41,22 +41,18 @@ class Described(NamedTuple):
 
 
 def described(figure: Figure, text: str, *, page: str | None = None) -> Described:
-    """A figure with a text alternative.
-
-    As the last line of a notebook's cell it is shown as a picture. The text is the output's plain
-    text, and the ``alt`` of the picture's metadata, from which pages of notebooks are made.
+    """Figure with a text alternative, shown as a picture by notebooks.
 
     Args:
       figure: the figure.
       text: the text alternative: the objects in the figure and its main result.
-      page: HTML that shows the same and moves, such as that of
-        :func:`~jaxltl.plot.episodes.play_episode`.
+      page: HTML of an animation, such as that of :func:`~jaxltl.plot.episodes.play_episode`.
 
     Returns:
       The figure with its text and page.
 
     Raises:
-      ValueError: the text is empty or has brackets or line breaks, which such places do not take.
+      ValueError: the text is empty or has brackets or line breaks.
 
     >>> from matplotlib.figure import Figure
     >>> described(Figure(), "Nothing yet: white paper.")

@@ -63,15 +63,15 @@ class Scene(NamedTuple):
 
 
 def draw_episode(environment: Environment, episode: Episode, *, title: str | None = None) -> Figure:
-    """One episode in a letter world, a flat world or a zone world, as a line on its map.
+    """Map of a letter world, a flat world or a zone world with one episode as a line.
 
-    Of another world the line alone, with a mark where a proposition begins to hold, if its worlds
-    have a ``place``, ``float[2]``, as an attribute or as a key.
+    Other worlds need a ``place``, ``float[2]``, as an attribute or key; marks show where a
+    proposition begins to hold.
 
     Args:
       environment: the world, with or without a time limit, or a task's environment of it.
       episode: of :func:`~jaxltl.core.environments.episodes.run_episode`, of one trajectory.
-      title: default what held on the way, in order.
+      title: default the propositions that held, in order.
 
     Returns:
       The figure.

@@ -64,11 +64,10 @@ def game_values(
       values: ``float[2 * C * C]``, of the states of :func:`jaxltl.envs.robots.robots` or
         :func:`jaxltl.envs.robots.grid_game`; NaN leaves a cell blank.
       board: the size of the former, or the text map of the latter.
-      policy: ``int[S]``, the system's moves, as arrows instead of figures; negative for none. Or
-        ``bool[S, A]``, several moves.
+      policy: ``int[S]``, the system's moves, as arrows (negative for none), or ``bool[S, A]``.
       actions: the name of each action, of up, down, left, right and stay.
       environment: numbers of the environment's places to show; default all, laid out as they lie.
-      label: what the colours mean.
+      label: of the colour scale.
       limits: values at the ends of the scale; default the data's.
       wall: the kind of cell that is not a place.
 
@@ -79,10 +78,7 @@ def game_values(
       ValueError: values or policy do not fit the board, or an action has no direction.
 
     Example:
-      >>> from jaxltl.envs.robots import robots
-      >>> game = robots(2)  # four cells, two robots, and who moves
-      >>> figure = game_values(np.linspace(0, 1, game.num_states), 2, label="value")
-      >>> len(figure.axes)  # four maps and a scale
+      >>> len(game_values(np.linspace(0, 1, 32), 2, label="value").axes)  # four maps and a scale
       5
     """
     world = board_of(board, wall)
@@ -128,9 +124,7 @@ def game_region(
       ValueError: the region does not fit the board.
 
     Example:
-      >>> from jaxltl.envs.robots import robots
-      >>> game = robots(2)  # four cells, two robots, and who moves
-      >>> len(game_region(np.ones(game.num_states, bool), 2, environment=[0, 3]).axes)
+      >>> len(game_region(np.ones(32, bool), 2, environment=[0, 3]).axes)
       2
     """
     world = board_of(board, wall)
@@ -166,8 +160,8 @@ def game_moves(
     """Allowed moves of the system in each cell, for one cell of the environment.
 
     Args:
-      allowed: ``bool[2 * C * C, A]``, or with M panels first, such as one for each memory
-        state of a strategy; see :func:`game_values` for the states.
+      allowed: ``bool[2 * C * C, A]`` over the states of :func:`game_values`, or with M panels
+        first, such as one for each memory state of a strategy.
       board, actions, wall: as there.
       environment: the number of the environment's place.
       region: ``bool[2 * C * C]``, or with M panels first: where the system wins.
@@ -182,9 +176,7 @@ def game_moves(
       ValueError: an array does not fit the board, or an action has no direction.
 
     Example:
-      >>> from jaxltl.envs.robots import robots
-      >>> game = robots(2)  # four cells, two robots, and who moves
-      >>> len(game_moves(game.available, 2, environment=3, system=0).axes)
+      >>> len(game_moves(np.ones((32, 5), bool), 2, environment=3, system=0).axes)
       1
     """
     world = board_of(board, wall)
@@ -318,10 +310,10 @@ def compare(
     """Values of the same states under several strategies, one column per state.
 
     Args:
-      values: ``float[S]`` by the name of the strategy. States are sorted by the first, then by
-        the second, and so on; those that come first are drawn on top.
-      groups: the name of each state's group; groups stand side by side as they first occur.
-      label: what the values are.
+      values: ``float[S]`` by the name of the strategy, first on top. States are sorted by the
+        first, then by the second, and so on.
+      groups: the name of each state's group, which stand side by side as they first occur.
+      label: of the values.
 
     Returns:
       The figure.
@@ -330,8 +322,7 @@ def compare(
       ValueError: there is nothing to show, or lengths differ.
 
     Example:
-      >>> figure = compare({"optimal": [1.0, 0.5], "safe": [0.75, 0.5]}, groups=["near", "far"])
-      >>> len(figure.axes)
+      >>> len(compare({"optimal": [1.0, 0.5], "safe": [0.75, 0.5]}, groups=["near", "far"]).axes)
       1
     """
     series = {name: np.asarray(value, float) for name, value in values.items()}

@@ -32,23 +32,22 @@ _INCH = 96.0
 
 
 def live_automaton(automaton: Automaton, name: str) -> str:
-    """An automaton as a graph; each state is a button.
+    """Graph of an automaton as SVG in which each state is a button.
 
     A state is ``g.state#NAME-qQ`` with ``data-memory``, an arrow ``g.edge`` with ``data-from`` and
     ``data-to``; classes ``final`` and ``doomed`` are as in :func:`jaxltl.plot.automaton`.
 
     Args:
       automaton: the automaton.
-      name: what the ids begin with.
+      name: prefix of the ids.
 
     Returns:
       The text of an SVG.
 
     Example:
       >>> from jaxltl import to_automaton
-      >>> text = live_automaton(to_automaton("F a"), "task")
-      >>> text.startswith("<svg"), text.count('data-memory')
-      (True, 2)
+      >>> live_automaton(to_automaton("F a"), "task").count("data-memory")
+      2
     """
     table = on_the_host(automaton)
     doomed = layout.rejecting(table)
@@ -169,26 +168,25 @@ def live_map(
     wall: str = "#",
     pieces: int = 1,
 ) -> str:
-    """A map with one layer per memory state, the first of which is visible.
+    """Map as SVG, with one layer per memory state, the first of which is visible.
 
     Args:
       place: the cells of a text map, ``str[rows, columns]``, or a coloured world.
-      name: what the ids begin with.
-      layers: by ``data-memory``, values ``[S]`` in [0, 1] as colours, NaN where there is none, and
-        a policy ``[S, A]`` as arrows as long as an action is likely; or None.
+      name: prefix of the ids.
+      layers: by ``data-memory``, values ``[S]`` in [0, 1] as colours (NaN is blank) and a policy
+        ``[S, A]`` as arrows as long as an action is likely; or None.
       runs: the cells of each run, a line from a dot, ``data-run``.
-      marked: (state, memory, action) to be seen at once: ``g.marked``.
+      marked: (state, memory, action) to be highlighted: ``g.marked``.
       actions: A names, of up, down, left and right.
       wall: the kind of cell that is not a place.
-      pieces: how many are moved on the map, ``circle.token``.
+      pieces: number of moving pieces, ``circle.token``.
 
     Returns:
       The text of an SVG.
 
     Example:
-      >>> place = np.array([[".", "g"]])
-      >>> text = live_map(place, "map", {"0": ([0.5, 1.0], None)}, runs=[[0, 1]])
-      >>> text.startswith("<svg"), 'data-run' in text
+      >>> text = live_map(np.array([[".", "g"]]), "map", {"0": ([0.5, 1.0], None)}, runs=[[0, 1]])
+      >>> text.startswith("<svg"), "data-run" in text
       (True, True)
     """
     ground = _ground(place, wall)

@@ -238,8 +238,6 @@ def strategies(
 ) -> Figure:
     """Mixed strategies on a map: large arrows for likely moves, small ones for rare moves.
 
-    For strategies with moves too rare for :func:`grid`.
-
     Args:
       cells: a text map (see :func:`jaxltl.envs.text_map.parse_map`) or its cells.
       play: ``float[S, A]``, or ``float[M, S, A]`` for M panels: the probability of each move;

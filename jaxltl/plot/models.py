@@ -1,7 +1,7 @@
 """Pictures of models and solutions: grid maps, or graphs of small models.
 
-Kinds of models are recognised by their fields: importing their types would load JAX, and a caller that draws
-in a process apart need not wait.
+Kinds of models are recognised by their fields: importing their types would load JAX, and a caller
+that draws in a process apart need not wait.
 """
 
 from __future__ import annotations
@@ -32,16 +32,15 @@ _WALL = "#"
 
 
 def model(model: Any) -> Figure:
-    """A model as a grid map if its moves lie on one, else as a graph.
+    """Grid map of a model whose moves lie on one, else its graph.
 
-    That moves lie on a map is read off them: there are four actions, most of what each does goes
-    one cell up, down, left or right, or stays, and states are numbered in rows from the top left,
-    as :func:`~jaxltl.gridworld` has it. Cells without moves in or out are walls. In a game of two
-    robots, see :func:`~jaxltl.envs.grid_game`, the map is that of both.
+    Moves lie on a map if there are four actions, the likeliest successor of each is one cell up,
+    down, left or right, or the cell itself, and states are numbered in rows from the top left.
+    Cells without moves in or out are walls. Games of two robots (:func:`~jaxltl.envs.grid_game`)
+    have the map of both.
 
     Args:
-      model: an MDP, a DenseMDP, a SparseMDP, or a Game or a Product of one of them, of which the
-        world is shown.
+      model: an MDP, a DenseMDP, a SparseMDP, or a Game or a Product of one of them.
 
     Returns:
       The figure. In a graph an arrow has the choice and its probability, unless that is 1; states
@@ -68,7 +67,7 @@ def model(model: Any) -> Figure:
 
 
 def solution(solution: Solution, model: Any = None, *, memories: Any = None) -> Figure:
-    """A solution: values and policy on the map or graph of a model, or values alone.
+    """Values and policy of a solution on the map or graph of a model, or values alone.
 
     Args:
       solution: of one lane; without a model also of several.
@@ -183,13 +182,7 @@ def _strip(found: Solution) -> Figure:
 
 
 def map_of(world: Any) -> NDArray[np.str_] | None:
-    """The cells of a map on which a model's moves lie, ``str[rows, columns]``, or None.
-
-    Example:
-      >>> from jaxltl import gridworld
-      >>> map_of(gridworld("b.#y")).tolist()
-      [['b', '.', '#', 'y']]
-    """
+    """The cells of a map on which a model's moves lie, ``str[rows, columns]``, or None."""
     if hasattr(world, "row_start") or not (hasattr(world, "successor") or _is_dense(world)):
         return None
     if world.available.ndim != 2 or not (

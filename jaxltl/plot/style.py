@@ -28,7 +28,7 @@ SCALE = LinearSegmentedColormap.from_list(
 
 
 def to_bytes(figure: Figure, kind: str = "svg", dpi: int = 150) -> bytes:
-    """A figure as the bytes of a file.
+    """Bytes of a figure's file; the same figure gives the same bytes.
 
     Args:
       figure: the figure.
@@ -36,7 +36,7 @@ def to_bytes(figure: Figure, kind: str = "svg", dpi: int = 150) -> bytes:
       dpi: dots per inch of a PNG.
 
     Returns:
-      What the file holds; the same figure gives the same bytes.
+      The contents of the file.
 
     Raises:
       ValueError: a kind that matplotlib does not write.

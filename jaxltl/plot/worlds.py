@@ -46,9 +46,7 @@ def temporal_gridworld(
     limits: tuple[float, float] | None = None,
     actions: Sequence[str] = ("up", "down", "left", "right"),
 ) -> Figure:
-    """A coloured world and its objects, with a policy as arrows and trajectories as lines.
-
-    Objects and obstacles have a frame and their name; the margin, seen in patches only, is pale.
+    """Map of a coloured world and its objects, with a policy as arrows and trajectories as lines.
 
     Args:
       world: a :class:`jaxltl.envs.temporal_gridworld.World`.
@@ -69,13 +67,8 @@ def temporal_gridworld(
 
     Example:
       >>> from jaxltl.io.colored_world import read_world
-      >>> world = read_world('''
-      ... rbrp
-      ... brbp
-      ... rbry
-      ... ''')
-      >>> policy = np.full((2, 4), 0.25)
-      >>> len(temporal_gridworld(world, policy, value=[0.5, 1.0]).axes)
+      >>> world = read_world("rbrp\\nbrbp\\nrbry")
+      >>> len(temporal_gridworld(world, np.full((2, 4), 0.25), value=[0.5, 1.0]).axes)
       3
     """
     chosen = [memory] if isinstance(memory, int | np.integer) else list(memory)

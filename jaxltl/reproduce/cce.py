@@ -60,16 +60,11 @@ def figures(
       plan: sizes of the experiment.
 
     Returns:
-      ``lqr_optimum``. ``lqr``, for each network: ``network``, ``seeds``, ``feasible`` (number of
-      feasible returned policies), ``gap_median`` and ``gap_max``, their costs above the optimum.
-      ``navigation``, for each task and method: ``task``, ``method``, ``seeds``;
-      ``trajectories_to_feasible``, for each seed until the sampled policies first satisfied the
-      constraint on average, or None; on fresh trajectories of the returned policies
-      ``seeds_feasible``, ``seeds_confident`` (the 95% interval of the cost too), the means
-      ``objective_mean`` and ``cost_mean``, and for each seed ``objective``, ``cost`` and
-      ``cost_interval``; ``seeds_feasible_at_end`` and ``final_objective``, of the last sampled
-      policies. ``navigation_feasible_start``, the same with feasible initial policies.
-      ``seconds``. ``figure8``, ``figure10``, ``figure11`` and ``maps``, data of the pictures.
+      ``lqr_optimum``; ``lqr`` for each network, with the costs of feasible policies above the
+      optimum; ``navigation`` for each task and method, with the trajectories until the sampled
+      policies first satisfied the constraint on average, and scores of fresh trajectories of the
+      returned policies; ``navigation_feasible_start``, the same with feasible initial policies;
+      ``seconds``; and data of the pictures.
     """
     begin = time.perf_counter()
     plan = plan or Plan()

@@ -52,17 +52,11 @@ def figures(progress: Callable[[str], None] = lambda text: None, *, seeds: int =
     """Section 6.7: the game, its optimal and initial values, and learned strategies.
 
     Returns:
-      Of the game, ``states``, ``system_states``, ``system_transitions``, ``transitions``,
-      ``reachable_system_states``, ``almost_sure_states``, and ``values``, the number of system
-      states by optimal value. ``initial_strategy`` (uniform) and ``winning_strategy`` (by the
-      graph): ``min``, ``max`` and ``mean`` of their worst-case value. ``hat_strategy_gap`` and
-      ``uniform_hat_strategy_gap``: the loss of the strategies of algorithm 4 in the true model.
-      ``learned`` and ``learned_without_restarts``, for each seed: ``seed``, ``restart``,
-      ``last_update_step``, ``moves``, ``updates``, ``eps_optimal_states`` (reachable ones, in the
-      worst case), ``eps_optimal_states_played`` (against the environment that was played) and
-      ``always_almost_sure``. ``seconds`` and ``last_update_seconds``, medians of single runs;
-      ``seconds_together``, of one vmapped call. ``figure17``, ``figure18`` and ``figure19``, data
-      of the pictures.
+      Sizes of the game and the number of system states by optimal value; ``initial_strategy`` and
+      ``winning_strategy``: worst-case values; the losses of the strategies of algorithm 4 in the
+      true model; ``learned`` and ``learned_without_restarts`` for each seed, with the states that
+      are optimal up to eps in the worst case and against the environment that was played; medians
+      of ``seconds`` of single runs and of one vmapped call; and data of the pictures.
 
     Raises:
       NotConverged: a value or a learner did not converge.

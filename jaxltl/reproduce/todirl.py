@@ -54,19 +54,15 @@ def figures(
 
     Args:
       progress: called with a line before each part.
-      seeds: repetitions of learning, each with other colours in the training world, other
-        demonstrations and other initial parameters; default 10. The test worlds stay the same.
+      seeds: repetitions of learning, each with other training worlds, demonstrations and initial
+        parameters; default 10. The test worlds stay the same.
       plan: sizes of the experiment.
 
     Returns:
-      ``by_demonstrations``: for each number of ``demonstrations`` and each ``method``, L_phi
-      (3.9) as ``train_mean`` and ``train_std`` over the seeds, ``test_mean`` (over seeds and test
-      worlds), ``test_std`` (over the seeds, of their means), ``test_worst`` (minimum over seeds and
-      test worlds), ``test_worst_of_each_seed``, ``test_of_each_seed``, ``seeds``, ``steps`` (until
-      the returned parameters, mean over the seeds) and ``half_width``, of the widest certified
-      bounds. ``reference``: L_phi of the expert and of a random policy, ``train_mean``,
-      ``test_mean`` and ``test_worst``. ``seeds``, ``seconds``. ``figure6``: learning curves, and
-      trajectories of the first seed's policy of the method ``todirl``.
+      ``by_demonstrations``: for each number of demonstrations and each method, L_phi (3.9) in
+      training and test worlds over the seeds, the steps until the returned parameters, and the
+      ``half_width`` of the widest certified bounds; ``reference``: L_phi of the expert and of a
+      random policy; ``seeds``, ``seconds``; and ``figure6``, learning curves and trajectories.
     """
     begin = time.perf_counter()
     plan, num_seeds = plan or Plan(), seeds or 10

@@ -19,7 +19,7 @@ from jaxltl.core.models.mdp import refuse_negative
 from jaxltl.core.models.mesh.shard import ModelPart, model_from_parts, ranges_of
 from jaxltl.core.models.mesh.sharded import ShardedMDP
 from jaxltl.core.models.sparse import choice_reward, sparse_part
-from jaxltl.io.files import FileBytes, compression_of, opened, pieces
+from jaxltl.io.files import FileBytes, compression_of, errors_in, opened, pieces
 from jaxltl.io.umb.index import ACTIONS, Index, Items
 from jaxltl.io.umb.members import (
     annotations_of,
@@ -91,7 +91,7 @@ def read_sharded(
                     parts[span] = part
         except MemoryError:
             raise ValueError(f"{place}the model does not fit into the memory.") from None
-    try:
+    with errors_in(place):
         return model_from_parts(
             lambda start, stop: parts.pop((start, stop)),
             index.states,
@@ -99,8 +99,6 @@ def read_sharded(
             axis=axis,
             propositions=names,
         )
-    except ValueError as error:
-        raise ValueError(f"{place}{error}") from None
 
 
 def _check_kind(index: Index, place: str) -> None:
@@ -325,7 +323,7 @@ def _part(
         initial = np.full(index.states, 1 / num_states)
         if some:
             initial = read_bits(contents[_IS_INITIAL], index.states) / some
-    try:
+    with errors_in(place):
         model = sparse_part(
             row_start,
             entry_start,
@@ -336,8 +334,6 @@ def _part(
             num_states,
         )
         refuse_negative(initial, first=index.begins[0])
-    except ValueError as error:
-        raise ValueError(f"{place}{error}") from None
     part = ModelPart(
         row_start=model.row_start,
         entry_start=model.entry_start,

@@ -20,7 +20,14 @@ from jaxltl.core.models.interval import IntervalMDP, interval_rows, refuse_ball
 from jaxltl.core.models.mdp import checked_initial
 from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import SparseMDP, make_sparse
-from jaxltl.io.files import Compression, compression_by_name, pieces, raw_bytes, write_bytes
+from jaxltl.io.files import (
+    Compression,
+    compression_by_name,
+    errors_in,
+    pieces,
+    raw_bytes,
+    write_bytes,
+)
 from jaxltl.io.umb.index import (
     ACTIONS,
     INITIAL,
@@ -121,14 +128,12 @@ def _model(contents: dict[str, Bytes], index: Index, place: str) -> SparseMDP | 
     owner = _owners(contents, index, row_start, place)
     rows = row_start, entry_start, target
     interval = None
-    try:
+    with errors_in(place):
         if probability.ndim > 1:
             interval = interval_rows(*rows, *probability.T, initial=initial, **annotations)
             model = interval.nominal
         else:
             model = make_sparse(*rows, probability, initial=initial, **annotations)
-    except ValueError as error:
-        raise ValueError(f"{place}{error}") from None
     exact = exact_initial(contents)
     if exact is not None:  # validation may have rescaled it
         model = replace(model, initial=exact)
