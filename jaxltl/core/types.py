@@ -221,7 +221,8 @@ def worst(*statuses: chex.Array, axis: int | None = None) -> jax.Array:
     """The most severe of several statuses; of one batch, along an axis or of all of it."""
     if len(statuses) == 1:
         return jnp.max(statuses[0], axis=axis)
-    return reduce(jnp.maximum, statuses)
+    found: jax.Array = reduce(jnp.maximum, statuses)
+    return found
 
 
 def row_tolerance(dtype: Any) -> float:

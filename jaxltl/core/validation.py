@@ -252,7 +252,7 @@ def fraction(name: str, value: Any, *, ends: tuple[bool, bool] = (True, True)) -
     return number
 
 
-def function(name: str, value: Any) -> Callable[..., Any]:
+def function(name: str, value: object) -> Callable[..., Any]:
     """Returns `value` if it is callable.
 
     Raises:

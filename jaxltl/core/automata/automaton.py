@@ -121,12 +121,14 @@ class Automaton:
                 f"final: an automaton with {self.acceptance} acceptance has no final states. "
                 "Read its priority[Q, L], or accepting[Q, L]."
             )
-        return self.priority[..., 0] == 0
+        final: NDArray[np.bool_] = self.priority[..., 0] == 0
+        return final
 
     @property
     def accepting(self) -> NDArray[np.bool_]:
         """bool `[Q, L]`, the transitions of even priority."""
-        return self.priority % 2 == 0
+        even: NDArray[np.bool_] = self.priority % 2 == 0
+        return even
 
 
 def make_automaton(

@@ -36,9 +36,9 @@ def holds(condition: Condition, colors: int) -> bool:
     """
     match condition[0]:
         case "true" | "false":
-            return condition[0] == "true"
+            return bool(condition[0] == "true")
         case "inf" | "fin":
-            return bool(colors >> condition[1] & 1) == (condition[0] == "inf")
+            return bool((colors >> condition[1] & 1) == (condition[0] == "inf"))
         case "and":
             return all(holds(part, colors) for part in condition[1:])
         case "or":

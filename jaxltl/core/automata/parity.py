@@ -15,12 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core.automata.automaton import Automaton
-from jaxltl.core.automata.emerson_lei import (
-    parity_condition,
-    reached_from,
-    strong_components,
-    to_parity,
-)
+from jaxltl.core.automata.emerson_lei import parity_condition, reached_from, to_parity
+from jaxltl.core.sparse.graph.components import strong_components
 
 Integers: TypeAlias = NDArray[np.integer[Any]]
 

@@ -328,7 +328,7 @@ def require_environment(environment: Any) -> Environment:
 def require_key(key: Any) -> chex.PRNGKey:
     """Raises ValueError for anything but a single random key."""
     dtype = getattr(key, "dtype", None)
-    typed = dtype is not None and jax.dtypes.issubdtype(dtype, jax.dtypes.prng_key)
+    typed = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key)
     if not (typed and key.shape == ()) and not (dtype == np.uint32 and key.ndim == 1):
         raise ValueError(f"key is {validation.shorten(key)}; give a single one, jax.random.key(0).")
     return key
@@ -532,6 +532,6 @@ def _same(first: Any, again: Any) -> bool:
             np.array_equal(np.asarray(x), np.asarray(y), equal_nan=np.asarray(x).dtype.kind == "f")
             for x, y in constants
             if not isinstance(x, jax.core.Tracer)
-            and not jax.dtypes.issubdtype(getattr(x, "dtype", np.dtype(float)), jax.dtypes.prng_key)
+            and not jnp.issubdtype(getattr(x, "dtype", np.dtype(float)), jax.dtypes.prng_key)
         )
     )

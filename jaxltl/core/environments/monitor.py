@@ -217,7 +217,8 @@ def trace_verdicts(
     _check_shape(letters, length)
     counts = jnp.broadcast_to(jnp.arange(steps) < length[..., None], letters.shape)
     _check_range(monitor, letters, length, counts)
-    return _scan(monitor, letters, counts)
+    found: jax.Array = _scan(monitor, letters, counts)
+    return found
 
 
 @jax.jit  # so that calls outside of jit share one compilation

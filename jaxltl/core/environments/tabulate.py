@@ -171,7 +171,7 @@ class _Kind(NamedTuple):
 
 
 def _is_key(x: Any) -> bool:
-    return jax.dtypes.issubdtype(
+    return jnp.issubdtype(
         jnp.asarray(x).dtype if not hasattr(x, "dtype") else x.dtype, jax.dtypes.prng_key
     )
 
@@ -195,7 +195,7 @@ def _typed(kind: _Kind, plain: PyTree) -> Any:
 def _bytes(world: PyTree) -> jax.Array:
     """``uint8[W]``, equal for equal states."""
 
-    def of(x: Any) -> jax.Array:
+    def of(x: jax.Array) -> jax.Array:
         if jnp.issubdtype(x.dtype, jnp.inexact):
             x = jnp.where(x == 0, jnp.zeros_like(x), x)  # minus zero is zero
         if jnp.issubdtype(x.dtype, jnp.complexfloating):

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, NamedTuple, Unpack, cast
+from typing import Any, NamedTuple, TypeVar, Unpack, cast
 
 import chex
 import jax
@@ -43,6 +43,8 @@ from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.pretty_print import brief
 
 ENDINGS = ("repeat", "violated", "undecided")
+
+_Tree = TypeVar("_Tree")
 
 
 @brief(codes={"verdict": Verdict})
@@ -582,8 +584,9 @@ def _padded(tables: Sequence[TaskTables]) -> list[TaskTables]:
     ]
 
 
-def _stacked(trees: Sequence[PyTree]) -> PyTree:
-    return jax.tree.map(lambda *rows: jnp.stack([jnp.asarray(row) for row in rows]), *trees)
+def _stacked(trees: Sequence[_Tree]) -> _Tree:
+    made: _Tree = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(row) for row in x]), *trees)
+    return made
 
 
 def _structure(tree: Any) -> Any:

@@ -203,7 +203,7 @@ def _potential(
             steps = _distance(delta, np.full(len(delta), np.inf), np.where(accepting, 1, np.inf))
         known = np.isfinite(steps)
         most = max(steps[known].max(initial=0), 1)
-        share = np.where(known, steps, most) / most
+        share: np.ndarray = np.where(known, steps, most) / most
         return share if name == "keep" else 1 - share
     table = np.asarray(shaping)
     if (

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 from jaxltl.core.logic.ltl import FALSE, TRUE, Formula, subformulas
 from jaxltl.core.logic.simplify import (
@@ -236,7 +237,7 @@ class Part:
     formula: Formula
 
 
-Combination = Part | tuple  # ("&" | "|", combination, ...)
+Combination = Part | tuple[Any, ...]  # ("&" | "|", combination, ...)
 
 
 def limit_parts(formula: Formula) -> tuple[Formula, ...]:

@@ -74,7 +74,8 @@ def frequency(count: Integers, total: Integers) -> Floats:
 def hoeffding_deviation(total: Integers, failure: float) -> Floats:
     """Hoeffding's deviation of a frequency at failure probability `failure`."""
     with np.errstate(divide="ignore"):
-        return np.sqrt((np.log(2) - np.log(failure)) / (2.0 * np.asarray(total)))
+        deviation: Floats = np.sqrt((np.log(2) - np.log(failure)) / (2.0 * np.asarray(total)))
+    return deviation
 
 
 def around(center: Floats, deviation: Floats) -> Ends:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.pretty_print import brief, count, readable, value_range
@@ -341,7 +342,7 @@ def _name(row: int, shape: tuple[int, ...]) -> str:
     return f"state {place[0]}, action {place[1]}" if len(place) == 2 else f"row {place}"
 
 
-def _asked(rows: Any, shape: tuple[int, ...]) -> Booleans:
+def _asked(rows: ArrayLike | None, shape: tuple[int, ...]) -> Booleans:
     if rows is None:
         return np.ones(int(np.prod(shape)), bool)
     rows = np.asarray(rows)
