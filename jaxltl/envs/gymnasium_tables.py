@@ -76,7 +76,6 @@ def from_gymnasium(
 
 
 def _made(env: Any) -> Any:
-    """The environment, made if an id is given."""
     if isinstance(env, str):
         try:
             import gymnasium

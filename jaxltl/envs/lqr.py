@@ -231,7 +231,6 @@ def _plain(network: Network, world: LQR, parameters: jax.Array) -> tuple[jax.Arr
 
 
 def _as(world: LQR, parameters: jax.Array) -> LQR:
-    """The problem in the dtype of the parameters."""
     dtype = jnp.promote_types(parameters.dtype, jnp.float32)
     return jax.tree.map(lambda x: jnp.asarray(x, dtype), world)
 

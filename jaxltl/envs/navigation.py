@@ -302,7 +302,6 @@ def _inside(box: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
 
 
 def _as(world: Navigation, like: jax.Array) -> Navigation:
-    """The world in the dtype of an array."""
     dtype = jnp.promote_types(jnp.asarray(like).dtype, jnp.float32)
     return jax.tree.map(lambda x: jnp.asarray(x, dtype), world)
 

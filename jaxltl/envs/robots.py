@@ -319,7 +319,6 @@ def _in_turns(
     names: Sequence[str],
     start: np.ndarray,
 ) -> Game:
-    """The game of two robots."""
     count, num_actions, width = system.target.shape
     shape = (count, count, 2, num_actions)
     here = np.arange(count, dtype=np.int32)

@@ -26,7 +26,6 @@ _INNER = 92  # characters of a model inside of another
 
 
 def padded(model: Any) -> Iterator[str]:
-    """Summary of an MDP or a DenseMDP."""
     yield batch_text(model.available.shape[:-2])
     yield count(model.num_states, "state")
     yield count(model.num_actions, "action")
@@ -44,7 +43,6 @@ def padded(model: Any) -> Iterator[str]:
 
 
 def sparse(model: Any) -> Iterator[str]:
-    """Summary of a SparseMDP."""
     yield batch_text(model.row_start.shape[:-1])
     yield count(model.num_states, "state")
     yield "a chain" if model.is_chain else count(model.num_rows, "choice")
@@ -56,7 +54,6 @@ def sparse(model: Any) -> Iterator[str]:
 
 
 def _more(model: Any) -> Iterator[str]:
-    """Optional parts of a model."""
     if model.rewards:
         yield f"rewards {names_text(model.rewards)}"
     if getattr(model, "action_names", ()):
@@ -77,7 +74,6 @@ def _begins(initial: Any) -> str:
 
 
 def interval(model: Any) -> Iterator[str]:
-    """Summary of an IntervalMDP."""
     yield from sparse(model.nominal)
     low, high = readable(model.lower), readable(model.upper)
     if low is not None and high is not None and low.size:
@@ -87,14 +83,12 @@ def interval(model: Any) -> Iterator[str]:
 
 
 def parametric(model: Any) -> Iterator[str]:
-    """Summary of a ParametricMDP."""
     ends = zip(model.parameters, np.asarray(model.low), np.asarray(model.high), strict=True)
     yield f"{names_text((f'{name} in [{low:.6g}, {high:.6g}]' for name, low, high in ends), 90)}"
     yield nested_repr(model.model, _INNER)
 
 
 def sharded(model: Any) -> Iterator[str]:
-    """Summary of a ShardedMDP."""
     yield count(model.num_given, "state")
     yield count(model.num_actions, "action")
     rows = " and ".join(f"{t.successor.shape[0]:,} of {t.successor.shape[1]}" for t in model.tables)
@@ -106,7 +100,6 @@ def sharded(model: Any) -> Iterator[str]:
 
 
 def part(value: Any) -> Iterator[str]:
-    """Summary of a ModelPart."""
     rows = len(value.entry_start) - 1
     yield count(rows if value.row_start is None else len(value.row_start) - 1, "state")
     yield count(rows, "choice")
@@ -115,7 +108,6 @@ def part(value: Any) -> Iterator[str]:
 
 
 def product(model: Any) -> Iterator[str]:
-    """Summary of a Product."""
     yield batch_text(model.automaton.delta.shape[:-2])
     memories = count(model.num_memory, "memory", "memories")
     yield f"{count(model.num_states, 'state')} with {memories}"
@@ -127,7 +119,6 @@ def product(model: Any) -> Iterator[str]:
 
 
 def game(value: Any) -> Iterator[str]:
-    """Summary of a Game."""
     read = readable(value.system)
     if read is None:
         yield f"system: {array_text(value.system)}"
@@ -137,7 +128,6 @@ def game(value: Any) -> Iterator[str]:
 
 
 def memory_policy(value: Any) -> Iterator[str]:
-    """Summary of a FiniteMemoryPolicy."""
     *more, states, memories = value.next_memory.shape
     yield batch_text(more)
     yield count(states, "state")
@@ -149,7 +139,6 @@ def memory_policy(value: Any) -> Iterator[str]:
 
 
 def counts(value: Any) -> Iterator[str]:
-    """Summary of TransitionCounts."""
     samples = readable(value.count)
     yield count(samples.sum(), "sample") if samples is not None else ""
     yield f"of {count(len(value.count), 'transition')}"
@@ -158,7 +147,6 @@ def counts(value: Any) -> Iterator[str]:
 
 
 def trajectories(value: Any) -> Iterator[str]:
-    """Summary of Trajectories."""
     *more, number_of, longest = value.state.shape
     yield batch_text(more)
     yield f"{number_of:,} of at most {count(longest, 'step')}"
@@ -168,7 +156,6 @@ def trajectories(value: Any) -> Iterator[str]:
 
 
 def table(value: Any) -> Iterator[str]:
-    """Summary of a Table."""
     yield nested_repr(value.model, _INNER)
     yield count(value.start.shape[-1], "beginning")
     for name in ("terminated", "truncated"):
@@ -179,7 +166,6 @@ def table(value: Any) -> Iterator[str]:
 
 
 def monitor(value: Any, codes: Any) -> Iterator[str]:
-    """Summary of a Monitor."""
     *more, states, letters = value.delta.shape
     yield batch_text(more)
     yield count(states, "state")
@@ -188,14 +174,12 @@ def monitor(value: Any, codes: Any) -> Iterator[str]:
 
 
 def space(value: Any) -> Iterator[str]:
-    """Summary of a Box."""
     yield f"{value.dtype}[{', '.join(str(n) for n in value.shape)}]"
     low, high = (value_range(x) for x in (value.low, value.high))
     yield f"from {low} to {high}" if max(len(low), len(high)) < 40 else ""
 
 
 def environment(value: Any) -> Iterator[str]:
-    """Summary of an Environment."""
     finite = hasattr(value.actions, "num")
     yield count(value.actions.num, "action") if finite else f"actions {nested_repr(value.actions)}"
     yield f"observations {_spaces(value.observations)}"
@@ -220,7 +204,6 @@ def _spaces(tree: Any) -> str:
 
 
 def episode(value: Any) -> Iterator[str]:
-    """Summary of an Episode or a batch of them."""
     *more, steps = value.valid.shape
     yield batch_text(more)
     yield f"at most {count(steps, 'step')}"

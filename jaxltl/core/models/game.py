@@ -177,12 +177,10 @@ def as_padded_game(model: Model) -> Game:
 
 
 def is_deterministic(model: Model) -> bool:
-    """True if every choice has one successor."""
     return not bool((support(base_model(model)).sum(-1) > 1).any())
 
 
 def swap_players(game: Game) -> Game:
-    """The game with the players exchanged."""
     xp, system = namespace(game.system)
     return replace(game, system=to_jax(xp.logical_not(system)))
 

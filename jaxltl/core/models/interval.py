@@ -497,7 +497,6 @@ def _scaled(
     lower: np.ndarray,
     upper: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Ends scaled so that each row contains a distribution."""
     low, high = (np.add.reduceat(x, entry_start[:-1]) for x in (lower, upper))
     rounding = (np.diff(entry_start) + 2) * np.finfo(np.float64).eps  # what is no miss
     bad = (low > 1 + NEAR) | (high < 1 - NEAR)

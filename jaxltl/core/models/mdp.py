@@ -20,9 +20,28 @@ from jaxltl.core.pretty_print import brief
 from jaxltl.core import validation
 
 
+class _PaddedShape:
+    available: jax.Array
+
+    @property
+    def num_states(self) -> int:
+        """S."""
+        return self.available.shape[-2]
+
+    @property
+    def num_actions(self) -> int:
+        """A."""
+        return self.available.shape[-1]
+
+    @property
+    def state_shape(self) -> tuple[int, ...]:
+        """The shape of a value: ``(S,)``."""
+        return (self.num_states,)
+
+
 @brief(facts=facts.padded, drawn=True)
 @struct.dataclass
-class MDP:
+class MDP(_PaddedShape):
     """Labelled Markov decision process with padded successor lists; :func:`make_mdp` builds one.
 
     Action ``a`` in state ``s`` leads to ``successor[s, a, k]`` with ``probability[s, a, k]``. Padding and
@@ -54,21 +73,6 @@ class MDP:
     propositions: tuple[str, ...] = struct.field(pytree_node=False, default=())
 
     @property
-    def num_states(self) -> int:
-        """S."""
-        return self.available.shape[-2]
-
-    @property
-    def num_actions(self) -> int:
-        """A."""
-        return self.available.shape[-1]
-
-    @property
-    def state_shape(self) -> tuple[int, ...]:
-        """The shape of a value: ``(S,)``."""
-        return (self.num_states,)
-
-    @property
     def num_successors(self) -> int:
         """K."""
         return self.probability.shape[-1]
@@ -86,7 +90,7 @@ class MDP:
 
 @brief(facts=facts.padded, drawn=True)
 @struct.dataclass
-class DenseMDP:
+class DenseMDP(_PaddedShape):
     """The same process with a full matrix, ``transition[s, a, t]``, for small batched problems.
 
     Attributes:
@@ -107,24 +111,9 @@ class DenseMDP:
     propositions: tuple[str, ...] = struct.field(pytree_node=False, default=())
 
     @property
-    def num_states(self) -> int:
-        """S."""
-        return self.available.shape[-2]
-
-    @property
-    def num_actions(self) -> int:
-        """A."""
-        return self.available.shape[-1]
-
-    @property
     def num_successors(self) -> int:
         """S: all states are listed as successors."""
         return self.num_states
-
-    @property
-    def state_shape(self) -> tuple[int, ...]:
-        """The shape of a value: ``(S,)``."""
-        return (self.num_states,)
 
     @property
     def successor_probability(self) -> jax.Array:

@@ -337,11 +337,6 @@ def _(model: Product, region: jax.Array) -> jax.Array:
     )
 
 
-@operators.forall_successor.register
-def _(model: Product, region: jax.Array) -> jax.Array:
-    return ~operators.exists_successor(model, ~region)
-
-
 @operators.least_successor.register
 def _(model: Product, value: jax.Array) -> jax.Array:
     return _through(

@@ -54,6 +54,20 @@ class Rewards:
     choice: Array | None = None
     transition: Array | None = None
 
+    def gathered(self, state: Array, choice: Array, transition: Array) -> Rewards:
+        """The rewards at given indices of each part."""
+        return Rewards(
+            _taken(self.state, state),
+            _taken(self.choice, choice),
+            _taken(self.transition, transition),
+        )
+
+
+def _taken(x: Array | None, index: Array) -> Array | None:
+    if x is None:
+        return None
+    return gather(x, index) if is_traced((x, index)) else np.asarray(x)[index]
+
 
 @brief(facts=facts.sparse, drawn=True)
 @struct.dataclass
@@ -147,6 +161,11 @@ class SparseMDP:
         )
         probability = np.asarray(self.probability, np.float64)
         return HostMDP(row_start, entry_start, successor, probability)
+
+    @property
+    def rank(self) -> np.ndarray:
+        """``int[R]``, the number of each row among those of its state."""
+        return np.arange(self.num_rows) - self.host.row_start[self.host.state]
 
     def states_with_label(self, proposition: str) -> Array:
         """``bool[S]``, the states in which a proposition holds; ValueError for an unknown one."""

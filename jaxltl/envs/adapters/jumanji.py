@@ -166,13 +166,11 @@ def _actions(spec: Any, parts: tuple[int, ...] | None) -> Finite | Box:
 
 
 def _mask_of(env: Any) -> Any:
-    """Shape of the action mask in observations, or None."""
     seen = jax.eval_shape(lambda key: env.reset(key)[1].observation, jax.random.key(0))
     return getattr(seen, "action_mask", None)
 
 
 def _mask(env: Any, parts: tuple[int, ...] | None) -> Partial | None:
-    """The action mask of an observation, or None."""
     mask = None if parts is None else _mask_of(env)
     if parts is None or mask is None:
         return None

@@ -17,7 +17,7 @@ from jaxltl.core.models.ops.kernels import gather, segment_ids
 from jaxltl.core.models.ops.operators import is_deterministic
 from jaxltl.core.models.product import Product, flat_successor
 from jaxltl.core.models.protocols import Model
-from jaxltl.core.models.sparse import Rewards, SparseMDP, reward_structure
+from jaxltl.core.models.sparse import SparseMDP, reward_structure
 from jaxltl.core.types import Solution
 
 
@@ -115,18 +115,6 @@ def _written_out(model: Product) -> SparseMDP:
         model.label_on,
     )
 
-    def of_product(reward: Rewards) -> Rewards:
-        return Rewards(
-            *(
-                None if x is None else gather(x, index)
-                for x, index in (
-                    (reward.state, state),
-                    (reward.choice, row),
-                    (reward.transition, entry),
-                )
-            )
-        )
-
     return SparseMDP(
         row_start=starts,
         entry_start=begins,
@@ -134,7 +122,7 @@ def _written_out(model: Product) -> SparseMDP:
         probability=gather(world.probability, entry),
         initial=model.initial.ravel(),
         label=world.label,
-        rewards={n: of_product(x) for n, x in world.rewards.items()},
+        rewards={n: x.gathered(state, row, entry) for n, x in world.rewards.items()},
     )
 
 

@@ -150,7 +150,6 @@ def _pad_successors(mdp: MDP, width: int) -> MDP:
 
 
 def is_stacked(model: Product) -> bool:
-    """True if a product's arrays have a leading batch axis."""
     return jnp.ndim(model.letter) == 2
 
 
@@ -165,7 +164,6 @@ def _stacked(models: Sequence[Product]) -> Product:
 
 
 def num_worlds(model: Product) -> int:
-    """W, the batch size; 1 for a single product."""
     return model.letter.shape[0] if is_stacked(model) else 1
 
 

@@ -12,7 +12,7 @@ from jaxltl.core.models.mdp import MDP, DenseMDP, support
 from jaxltl.core.models.construct.padded import to_padded as to_padded
 from jaxltl.core.models.product import Product, flat_successor
 from jaxltl.core.models.protocols import Model
-from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
+from jaxltl.core.models.sparse import SparseMDP, make_sparse
 
 
 def to_sparse(model: Model) -> SparseMDP:
@@ -76,9 +76,7 @@ def _product(model: Product) -> SparseMDP:
     shape = (host.num_states, num_memory)
     kept = np.ones((host.num_rows, num_memory), bool)
     if model.allowed is not None:
-        action = world.action
-        if action is None:
-            action = np.arange(host.num_rows) - host.row_start[host.state]
+        action = world.rank if world.action is None else world.action
         kept = np.asarray(model.allowed)[host.state, :, action]
     # Rows of (s, q) are those of s, in order: state first, memory next, choice last.
     state, memory = np.divmod(np.arange(shape[0] * shape[1]), num_memory)
@@ -94,14 +92,6 @@ def _product(model: Product) -> SparseMDP:
     entry = concatenated_ranges(host.entry_start[row], width)
     s_of, q_of = np.repeat(host.state[row], width), np.repeat(q, width)
     target = flat_successor(host.successor[entry], step, s_of, q_of, model.label_on)
-    rewards = {
-        name: Rewards(
-            None if x.state is None else np.asarray(x.state)[state],
-            None if x.choice is None else np.asarray(x.choice)[row],
-            None if x.transition is None else np.asarray(x.transition)[entry],
-        )
-        for name, x in world.rewards.items()
-    }
     return make_sparse(
         offsets_from_counts(per_state),
         offsets_from_counts(width),
@@ -110,7 +100,7 @@ def _product(model: Product) -> SparseMDP:
         initial=_distribution(model.initial).ravel(),
         label=np.asarray(world.label)[state],
         propositions=world.propositions,
-        rewards=rewards,
+        rewards={name: x.gathered(state, row, entry) for name, x in world.rewards.items()},
         action=None if world.action is None else np.asarray(world.action)[row],
         action_names=world.action_names,
     )

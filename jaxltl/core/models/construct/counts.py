@@ -179,10 +179,7 @@ def action_names(model: MDP | DenseMDP | SparseMDP) -> tuple[str, ...]:
 
 
 def _row_action(model: SparseMDP) -> Integers:
-    if model.action is not None:
-        return np.asarray(model.action)
-    host = model.host
-    return np.arange(host.num_rows) - host.row_start[host.state]
+    return model.rank if model.action is None else np.asarray(model.action)
 
 
 @brief
@@ -482,7 +479,6 @@ def _variable(names: tuple[str, ...]) -> NDArray[Any]:
 
 
 def _numbers(names: Iterable[Any], number: Mapping[str, int], what: str) -> list[int]:
-    """State numbers from names."""
     found = []
     for name in [names] if isinstance(names, str | int) else validation.sequence(what, names):
         if str(name) not in number:

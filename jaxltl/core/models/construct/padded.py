@@ -15,10 +15,9 @@ def row_actions(model: SparseMDP) -> np.ndarray:
     """The action of each row in the padded model, ``int[R]``."""
     if not isinstance(model, SparseMDP):
         raise ValueError(validation.unsupported_model(model))
-    host = model.host
     if model.action is not None and not model.action_names:
         return np.asarray(model.action)
-    return np.arange(host.num_rows) - host.row_start[host.state]
+    return model.rank
 
 
 def to_padded(model: SparseMDP) -> MDP:

@@ -18,7 +18,7 @@ from jaxltl.core.models.mdp import MDP, DenseMDP, make_mdp, support
 from jaxltl.core.models.product import Product, flat_successor
 from jaxltl.core import validation
 from jaxltl.core.models.protocols import ActionModel, Model, ModelT
-from jaxltl.core.models.sparse import Rewards, SparseMDP
+from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.sparse.graph.components import forward_reachable
 from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
 from jaxltl.core.pretty_print import brief
@@ -206,7 +206,6 @@ def _reached(
 
 
 def _restriction(model: Model, part: Model, states: np.ndarray, num_memory: int) -> Restriction:
-    """A model of some of the states, with their original numbers."""
     base, memory = to_jax(tuple(x.astype(np.int32) for x in np.divmod(states, num_memory)))
     if isinstance(model, Game):
         part = Game(part, to_jax(np.asarray(model.system).ravel()[states]))
@@ -252,14 +251,6 @@ def submodel(model: SparseMDP, states: np.ndarray, rows: np.ndarray) -> SparseMD
         raise ValueError(f"no choice is left in state {kept[int(np.argmin(choices))]}; allow one.")
     width = np.diff(host.entry_start)[row]
     entry = concatenated_ranges(host.entry_start[row], width)
-
-    def taken(x: Any, index: np.ndarray) -> Any:
-        return None if x is None else np.asarray(x)[index]
-
-    rewards = {
-        name: Rewards(taken(x.state, kept), taken(x.choice, row), taken(x.transition, entry))
-        for name, x in model.rewards.items()
-    }
     initial = np.asarray(model.initial)[kept]
     return replace(
         model,
@@ -269,9 +260,9 @@ def submodel(model: SparseMDP, states: np.ndarray, rows: np.ndarray) -> SparseMD
         probability=host.probability[entry],
         initial=initial / initial.sum() if initial.sum() else initial,
         label=np.asarray(model.label)[kept],
-        rewards=rewards,
-        action=taken(model.action, row),
-        valuation={name: taken(x, kept) for name, x in model.valuation.items()},
+        rewards={name: x.gathered(kept, row, entry) for name, x in model.rewards.items()},
+        action=None if model.action is None else np.asarray(model.action)[row],
+        valuation={name: np.asarray(x)[kept] for name, x in model.valuation.items()},
     )
 
 

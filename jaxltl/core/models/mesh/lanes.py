@@ -260,7 +260,6 @@ def _spread(in_axes: Any, arguments: tuple[Any, ...]) -> list[bool]:
 
 
 def _number(lanes: tuple[bool, ...], arguments: PyTree) -> int:
-    """The batch size."""
     shapes = [np.shape(x) for x, has in zip(jax.tree.leaves(arguments), lanes, strict=True) if has]
     numbers = sorted({shape[:1] for shape in shapes})
     if len(numbers) != 1 or not numbers[0] or numbers[0][0] < 1:
@@ -275,7 +274,6 @@ def _number(lanes: tuple[bool, ...], arguments: PyTree) -> int:
 def _placed(
     arguments: PyTree, lanes: tuple[bool, ...], number: int, mesh: Mesh, axes: tuple[str, ...]
 ) -> PyTree:
-    """Arguments on the devices of the mesh."""
     if jax.sharding.get_abstract_mesh().empty:
         mesh = automatic(mesh)
     even = number % _count(mesh, axes) == 0

@@ -28,7 +28,6 @@ class StateLayout(NamedTuple):
 
     @property
     def size(self) -> int:
-        """The number of places on a device."""
         return -(-self.num_given // self.parts)
 
     def place(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -67,7 +66,6 @@ class StateLayout(NamedTuple):
         return int(self.starts[d]), int(self.starts[d + 1])
 
     def array(self, pieces: Mapping[int, np.ndarray]) -> jax.Array:
-        """The global array from pieces of one shape."""
         here, found = jax.process_index(), []
         for d, piece in pieces.items():
             found += [
@@ -80,7 +78,6 @@ class StateLayout(NamedTuple):
         return jax.make_array_from_single_device_arrays(shape, self.sharding, found)
 
     def replicated(self, x: np.ndarray) -> jax.Array:
-        """An array on all devices."""
         return jax.make_array_from_callback(
             x.shape, NamedSharding(self.mesh, PartitionSpec()), lambda index: x[index]
         )

@@ -285,8 +285,6 @@ def _order(model: SparseMDP, order: Any) -> np.ndarray:
 
 
 class _Piece(NamedTuple):
-    """A device's share of the arrays of a ShardedMDP."""
-
     tables: tuple[RowTable, ...]
     place: np.ndarray | None
     available: np.ndarray
@@ -331,8 +329,6 @@ def _assembled(
 
 
 class _Range(NamedTuple):
-    """A validated part with its defaults."""
-
     entry_start: np.ndarray
     successor: np.ndarray
     probability: np.ndarray
@@ -439,7 +435,6 @@ class _Halo(NamedTuple):
         return d * self.layout.size if self.asked is None else 0
 
     def places(self, d: int, successor: np.ndarray) -> np.ndarray:
-        """State numbers as local places."""
         owner, found = self.layout.place(successor)
         if self.asked is None:
             return (owner * self.layout.size + found).astype(np.int32)

@@ -260,26 +260,6 @@ def _(model: ShardedMDP) -> jax.Array:
     return model.number >= 0
 
 
-@operators.expectation.register
-def _(model: ShardedMDP, value: jax.Array) -> jax.Array:
-    return operators.combined(model, value, jnp.multiply, jnp.add)
-
-
-@operators.exists_successor.register
-def _(model: ShardedMDP, region: jax.Array) -> jax.Array:
-    return operators.combined(model, region, kernels.positive_hits, jnp.logical_or)
-
-
-@operators.forall_successor.register
-def _(model: ShardedMDP, region: jax.Array) -> jax.Array:
-    return ~operators.exists_successor(model, ~jnp.asarray(region))
-
-
-@operators.least_successor.register
-def _(model: ShardedMDP, value: jax.Array) -> jax.Array:
-    return operators.combined(model, value, kernels.where_positive, jnp.minimum)
-
-
 @operators.policy_operator.register
 def _(model: ShardedMDP, policy: jax.Array) -> Any:
     def one(tables: Any, place: Any, sent: Any, available: Any, policy: Any, value: Any) -> Any:

@@ -84,12 +84,10 @@ class Actions(NamedTuple):
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """The shape of a quantity on choices."""
         return self.available.shape
 
     @property
     def layout(self) -> Columns:
-        """The reductions of quantities in column layout."""
         return Columns()
 
     def spread(self, x: jax.Array) -> jax.Array:
@@ -109,7 +107,6 @@ class Actions(NamedTuple):
         return action_argmax(quantity, self.available)
 
     def first(self, condition: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """True where a condition holds for some choice, and the first one, or choice 0."""
         return first_action(condition)
 
     def all(self, condition: jax.Array) -> jax.Array:
@@ -121,15 +118,12 @@ class Actions(NamedTuple):
         return jnp.where(self.available, quantity, -jnp.inf)
 
     def top(self, logits: jax.Array) -> jax.Array:
-        """The largest of the logits."""
         return jnp.max(logits, axis=-1)
 
     def logsumexp(self, logits: jax.Array) -> jax.Array:
-        """``log sum_a exp x(s, a)``."""
         return jax.scipy.special.logsumexp(logits, axis=-1)
 
     def softmax(self, logits: jax.Array) -> jax.Array:
-        """``exp x(s, a) / sum_b exp x(s, b)``."""
         return jax.nn.softmax(logits, axis=-1)
 
     def mean(self, policy: jax.Array, quantity: jax.Array) -> jax.Array:
@@ -137,7 +131,6 @@ class Actions(NamedTuple):
         return action_mean(policy, quantity)
 
     def one_hot(self, choice: jax.Array, dtype: Any) -> jax.Array:
-        """Weight one on the chosen action of each state."""
         return jax.nn.one_hot(choice, self.shape[-1], dtype=dtype)
 
     def columns(self, quantity: jax.Array) -> list[jax.Array]:
@@ -187,15 +180,12 @@ class Columns(NamedTuple):
         return self.sum([_beside(w, x) * x for w, x in zip(weight, quantity, strict=True)])
 
     def size(self, quantity: list[jax.Array]) -> int:
-        """The number of states."""
         return quantity[0].shape[0]
 
     def packed(self, quantity: list[jax.Array]) -> jax.Array:
-        """All columns as one array."""
         return jnp.stack(quantity)
 
     def unpacked(self, packed: jax.Array) -> list[jax.Array]:
-        """The inverse of `packed`."""
         return list(packed)
 
 
@@ -208,12 +198,10 @@ class Rows(NamedTuple):
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """The shape of a quantity on choices."""
         return self.state.shape
 
     @property
     def layout(self) -> Rows:
-        """Itself."""
         return self
 
     @property
@@ -222,11 +210,9 @@ class Rows(NamedTuple):
 
     @property
     def available(self) -> jax.Array:
-        """All rows exist."""
         return jnp.ones(self.shape, bool)
 
     def size(self, quantity: jax.Array) -> int:
-        """The number of states."""
         return self.num_states
 
     def spread(self, x: jax.Array, like: jax.Array | None = None) -> jax.Array:
@@ -270,7 +256,6 @@ class Rows(NamedTuple):
         return quantity
 
     def top(self, logits: jax.Array) -> jax.Array:
-        """See :class:`Actions`; without derivative."""
         fixed = lax.stop_gradient(logits)
         return kernels.segment_reduce(jax.ops.segment_max, fixed, self.state, self.num_states)
 
@@ -283,7 +268,6 @@ class Rows(NamedTuple):
         return raised / self.spread(self.sum(raised))
 
     def mean(self, policy: jax.Array, quantity: jax.Array) -> jax.Array:
-        """See :class:`Actions`; weights may lack the batch axis."""
         if is_deterministic(policy):
             return kernels.gather(quantity, policy)
         return self.sum(_beside(policy, quantity) * quantity)
@@ -298,19 +282,15 @@ class Rows(NamedTuple):
         return best, self.one_hot(row, best.dtype)
 
     def columns(self, quantity: jax.Array) -> jax.Array:
-        """Itself: every layout is one."""
         return quantity
 
     def whole(self, quantity: jax.Array) -> jax.Array:
-        """Itself."""
         return quantity
 
     def packed(self, quantity: jax.Array) -> jax.Array:
-        """Itself."""
         return quantity
 
     def unpacked(self, quantity: jax.Array) -> jax.Array:
-        """Itself."""
         return quantity
 
 
@@ -324,7 +304,6 @@ def choices(model: Model) -> Actions | Rows:
 
 @choices.register(SparseMDP)
 def row_choices(model: SparseMDP) -> Rows:
-    """The choices of a sparse model."""
     return Rows(kernels.segment_ids(model.row_start, model.num_rows), jnp.asarray(model.row_start))
 
 

@@ -101,7 +101,6 @@ def folded(
 
 
 def stacked(columns: Sequence[jax.Array]) -> jax.Array:
-    """Columns of actions as the last axis."""
     return jnp.stack(columns, axis=-1)
 
 
@@ -116,7 +115,6 @@ def where_positive(weight: jax.Array, value: jax.Array) -> jax.Array:
 
 
 def dtype_max(dtype: Any) -> Any:
-    """The largest value of a dtype."""
     is_float = jnp.issubdtype(dtype, jnp.floating)
     return jnp.inf if is_float else jnp.iinfo(dtype).max
 

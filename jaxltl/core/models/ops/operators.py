@@ -4,8 +4,8 @@ Algorithms see a model through these functions and through the reductions of
 :func:`~jaxltl.core.models.ops.choices.choices`. Values have the shape of the model's states, ``[S]``
 or ``[S, Q]``; quantities on choices have one more axis, A, and for a sparse model the shape ``[R]``.
 The functions are open (``functools.singledispatch``): a new representation registers
-``expectation``, ``exists_successor``, ``forall_successor`` and ``sample_successor``, and
-``least_successor`` for ranks.
+``combined``, or ``expectation`` and ``exists_successor``, and ``least_successor`` for ranks; and
+``sample_successor``.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def expectation(model: Model, value: jax.Array) -> jax.Array:
       >>> expectation(mdp, jnp.array([0.0, 4.0])).tolist()
       [[2.0], [4.0]]
     """
-    raise TypeError(_unknown(model))
+    return combined(model, value, jnp.multiply, jnp.add)
 
 
 @singledispatch
@@ -84,7 +84,7 @@ def exists_successor(model: Model, region: jax.Array) -> jax.Array:
       >>> exists_successor(fork, np.array([False, True, False])).tolist()  # one for each choice
       [True, False, True, False]
     """
-    raise TypeError(_unknown(model))
+    return combined(model, jnp.asarray(region), kernels.positive_hits, jnp.logical_or)
 
 
 @singledispatch
@@ -108,13 +108,13 @@ def forall_successor(model: Model, region: jax.Array) -> jax.Array:
       >>> forall_successor(fork, np.array([False, True, True])).tolist()  # one for each choice
       [True, False, True, True]
     """
-    raise TypeError(_unknown(model))
+    return ~exists_successor(model, jnp.logical_not(region))
 
 
 @singledispatch
 def least_successor(model: Model, value: jax.Array) -> jax.Array:
     """Least value among the successors, ``[S, A]`` from ``[S]``; the dtype's largest at unavailable actions."""
-    raise TypeError(_unknown(model))
+    return combined(model, value, where_positive, jnp.minimum)
 
 
 @singledispatch
@@ -255,26 +255,6 @@ def greatest_predecessor(model: Model, quantity: jax.Array) -> jax.Array:
     raise TypeError(_unknown(model))
 
 
-@expectation.register
-def _(model: MDP, value: jax.Array) -> jax.Array:
-    return combined(model, value, jnp.multiply, jnp.add)
-
-
-@exists_successor.register
-def _(model: MDP, region: jax.Array) -> jax.Array:
-    return combined(model, jnp.asarray(region), kernels.positive_hits, jnp.logical_or)
-
-
-@forall_successor.register
-def _(model: MDP, region: jax.Array) -> jax.Array:
-    return ~exists_successor(model, ~jnp.asarray(region))
-
-
-@least_successor.register
-def _(model: MDP, value: jax.Array) -> jax.Array:
-    return combined(model, value, where_positive, jnp.minimum)
-
-
 @combined.register
 def _(model: MDP, value: jax.Array, term: Any, combine: Any) -> jax.Array:
     weight = model.successor_probability
@@ -387,11 +367,6 @@ def _(model: SparseMDP, region: jax.Array) -> jax.Array:
     of = row_entries(model)
     inside = kernels.positive_hits(of.probability, kernels.gather(region, of.successor))
     return of.over_entries(jax.ops.segment_max, inside.astype(jnp.int32)) > 0
-
-
-@forall_successor.register
-def _(model: SparseMDP, region: jax.Array) -> jax.Array:
-    return ~exists_successor(model, ~jnp.asarray(region))
 
 
 @least_successor.register

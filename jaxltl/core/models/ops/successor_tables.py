@@ -45,7 +45,6 @@ class SuccessorTable(NamedTuple):
 
     @property
     def choices(self) -> Columns:
-        """The layout of quantities on actions."""
         return Columns()
 
     def expectation(self, value: jax.Array) -> list[jax.Array]:
@@ -65,7 +64,6 @@ class ModelOperator:
 
     @property
     def choices(self) -> Columns:
-        """As of :class:`SuccessorTable`."""
         return Columns()
 
     def expectation(self, value: jax.Array) -> list[jax.Array]:
@@ -91,7 +89,6 @@ class ShardedSuccessorTable:
 
     @property
     def choices(self) -> Columns:
-        """As of :class:`SuccessorTable`."""
         return Columns()
 
     def expectation(self, value: jax.Array) -> list[jax.Array]:
