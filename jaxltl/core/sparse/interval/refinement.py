@@ -14,13 +14,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jaxltl.core.array_types import Floats
 from jaxltl.core.sparse.interval.row_operator import PairSystem, PolicyPair, RowOperator, TwoFloats
 from jaxltl.core.sparse.linear.extended_precision import two_sum
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 _ROUNDS = 30  # policies
 _STEPS = 16  # of iterative refinement
@@ -31,7 +34,7 @@ _NARROW = 0.4  # share of the tolerance that a bound may be from the value
 _LEAST = 2.0**-80  # smallest share of a proportional extra
 _FLOOR = 1e-8  # of the distance that it is a share of, as a share of the largest value
 
-Solver = Callable[[Any, Floats], Floats | None]
+Solver = Callable[["csr_array", Floats], Floats | None]
 
 
 @dataclass(frozen=True)

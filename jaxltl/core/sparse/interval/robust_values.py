@@ -81,7 +81,8 @@ def row_gains(
 
 def gain_noise(value: Floats) -> Floats:
     """Gains that rounding can make."""
-    return 64 * _EPS * (np.abs(value) + np.abs(value).max(initial=0))
+    size = np.abs(value)
+    return 64 * _EPS * (size + float(size.max(initial=0)))
 
 
 def distribution_depth(mdp: HostMDP) -> int:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple, TYPE_CHECKING
 
 import numpy as np
 
@@ -22,6 +22,9 @@ from jaxltl.core.sparse.linear.topological_order import Edges, ordered_component
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
 from jaxltl.core.sparse.solvers.reachability import expands_fast
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 _EPS = float(np.finfo(np.float64).eps)
 _TINY = 1e-290
@@ -45,7 +48,7 @@ class PolicyPair:
 class PairSystem(NamedTuple):
     """``x = matrix x + earned``, the values of a pair, self-loops eliminated."""
 
-    matrix: Any
+    matrix: csr_array
     earned: Floats
 
 
@@ -89,7 +92,8 @@ class Block:
 
     def leaving(self, p: Floats) -> Floats:
         """Mass that leaves the node of each row, ``float64[N]``."""
-        return (p if self.leaves is None else p * self.leaves).sum(0)
+        found: Floats = (p if self.leaves is None else p * self.leaves).sum(0)
+        return found
 
 
 @dataclass(frozen=True)
@@ -344,4 +348,5 @@ class RowOperator:
         slack = terms * _EPS * (np.einsum("wn,wn->n", p, size) + np.abs(cost))
         slack += terms * _TINY * (slack > 0)
         slack += table.mean_error(p, side * gain, over_all=over_all)
-        return np.einsum("wn,wn->n", p, gain) + cost + side * slack
+        found: Floats = np.einsum("wn,wn->n", p, gain) + cost + side * slack
+        return found

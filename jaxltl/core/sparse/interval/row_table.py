@@ -128,7 +128,7 @@ class RowTable:
             return self._dual_bound(p, gain) if over_all else self._nearest_bound(p, gain)
         room = np.minimum(p - self.lower, self.upper - p)
         partial = room > 0
-        found = np.einsum("wn,wn->n", partial, np.abs(gain)) * self.rounding
+        found: Floats = np.einsum("wn,wn->n", partial, np.abs(gain)) * self.rounding
         # With one entry strictly between its ends, by more than rounding, only that one may err.
         certain = (partial.sum(0) == 1) & (room.max(0) > self.rounding)
         certain[self.fine] = False
@@ -183,7 +183,8 @@ class RowTable:
         size = np.where(at == p, 0, np.abs(at - self.center) + np.abs(p - self.center))
         slack = 8 * _EPS * (np.abs(part) + rise * size).sum(0)
         unused = _upward(rise * self._unused_gain(p))
-        return _upward(price * missing) + (part - paid).sum(0) + slack + unused
+        total: Floats = _upward(price * missing) + (part - paid).sum(0) + slack + unused
+        return total
 
     def _nearest_bound(self, p: Floats, gain: Floats) -> Floats:
         """Bound of ``sum (q - p) gain`` for the distribution q of `nearest`."""
@@ -237,8 +238,9 @@ def _marginal_gain(more: Booleans, less: Booleans, gain: Floats, missing: Floats
     """Gain of the next unit of mass, or of the last one where mass is in excess."""
     high = np.where(more, gain, -np.inf).max(0)
     low = np.where(less, gain, np.inf).min(0)
-    found = np.where(missing < 0, low, high)
-    return np.where(np.isfinite(found), found, gain.min(0))
+    found: Floats = np.where(missing < 0, low, high)
+    np.copyto(found, gain.min(0), where=~np.isfinite(found))
+    return found
 
 
 def _upward(x: Floats) -> Floats:
@@ -284,7 +286,7 @@ def exact_sum(terms: Floats, share: float = SUM_ERROR) -> Floats:
         high, lost = two_sum(high, x)
         low += lost
         size += np.abs(lost)
-    found = high + low
+    found: Floats = high + low
     unsure = np.flatnonzero(share * np.abs(found) < len(terms) * _EPS * size)
     if unsure.size:
         found[unsure] = [math.fsum(x) for x in terms[:, unsure].T.tolist()]

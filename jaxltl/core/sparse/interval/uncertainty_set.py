@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.pretty_print import brief
@@ -117,7 +116,7 @@ class UncertainMDP:
             )
         return found
 
-    def sum_rows(self, quantity: NDArray) -> NDArray:
+    def sum_rows(self, quantity: Floats) -> Floats:
         """The sum over each row's entries, ``[R]`` from ``[T]``."""
         return np.add.reduceat(quantity, self.mdp.entry_start[:-1])
 

@@ -8,12 +8,11 @@ are certified in floating point with its rounding, or in fractions.
 from __future__ import annotations
 
 from fractions import Fraction
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from jaxltl.core.array_types import Floats
+from jaxltl.core.array_types import Floats, Integers
 
 _EPS = float(np.finfo(np.float64).eps)
 _NEAR = 1e-6  # of the size of a program: differences that it does not resolve
@@ -88,8 +87,9 @@ def _apart(ahead: Floats) -> tuple[float, Floats, Floats] | None:
 
 def mixture(lower: Floats, share: Floats) -> Floats:
     """Lower bound of the value of a mixture of policies, ``float64[n]``."""
-    sums = share @ lower
-    return sums - 4 * _EPS * (len(share) + 2) * (share @ np.abs(lower)) / max(share.sum(), 1e-300)
+    scale = 4 * _EPS * (len(share) + 2) / max(share.sum(), 1e-300)
+    found: Floats = share @ lower - scale * (share @ np.abs(lower))
+    return found
 
 
 def meets(lower: Floats, share: Floats, wanted: Floats) -> bool:
@@ -164,7 +164,7 @@ def largest(
 
 
 def _largest_mixtures(
-    points: Floats, index: int, least: Floats, asked: Any, scale: Floats
+    points: Floats, index: int, least: Floats, asked: Integers, scale: Floats
 ) -> list[Floats]:
     """Candidates for the best mixture under thresholds."""
     from scipy import optimize
@@ -196,7 +196,7 @@ def _largest_mixtures(
 
 
 def _outer(
-    normals: Floats, bounds: Floats, index: int, least: Floats, asked: Any, scale: Floats
+    normals: Floats, bounds: Floats, index: int, least: Floats, asked: Integers, scale: Floats
 ) -> tuple[float, Floats | None]:
     from scipy import optimize
 
@@ -231,7 +231,7 @@ def _outer(
     return float(upper + slack), found.x * scale
 
 
-def corners(normals: Floats, bounds: Floats, floor: Floats) -> NDArray[Any]:
+def corners(normals: Floats, bounds: Floats, floor: Floats) -> Floats:
     """The corners of half-spaces above a floor, ``float64[V, n]``."""
     normals, bounds = normals[np.isfinite(bounds)], bounds[np.isfinite(bounds)]
     size = len(floor)
@@ -251,13 +251,14 @@ def corners(normals: Floats, bounds: Floats, floor: Floats) -> NDArray[Any]:
     )
     if inner.status != 0 or inner.x[-1] <= 1e-12:
         return np.zeros((0, size))
-    found = spatial.HalfspaceIntersection(
-        np.hstack([faces, -limits[:, None]]), inner.x[:-1], qhull_options="QJ"
-    )
-    return found.intersections
+    sides = np.hstack([faces, -limits[:, None]])
+    found: Floats = spatial.HalfspaceIntersection(
+        sides, inner.x[:-1], qhull_options="QJ"
+    ).intersections
+    return found
 
 
-def _corners_of_two(normals: Floats, bounds: Floats, floor: Floats) -> NDArray[Any]:
+def _corners_of_two(normals: Floats, bounds: Floats, floor: Floats) -> Floats:
     faces = np.vstack([normals, -np.eye(2)])
     limits = np.concatenate([bounds, -floor])
     first, second = np.triu_indices(len(faces), 1)
@@ -268,4 +269,6 @@ def _corners_of_two(normals: Floats, bounds: Floats, floor: Floats) -> NDArray[A
     c, d = limits[first[kept]], limits[second[kept]]
     points = np.stack([(c * b[:, 1] - d * a[:, 1]) / det, (a[:, 0] * d - b[:, 0] * c) / det], -1)
     slack = 1e-9 * (1 + np.abs(limits) + np.abs(faces) @ np.abs(floor))
-    return points[(points @ faces.T <= limits + slack).all(1)]
+    kept = (points @ faces.T <= limits + slack).all(1)
+    found: Floats = points[kept]
+    return found

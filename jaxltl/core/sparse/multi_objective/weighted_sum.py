@@ -10,10 +10,9 @@ Norman, Parker and Qu 2011).
 from __future__ import annotations
 
 import itertools
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.sparse.contraction import with_stops
@@ -39,7 +38,7 @@ class WeightedProblem(NamedTuple):
     start: Floats  # float64[N], the initial distribution
     # int[B, R], for each probability objective the least priority that a row reads; it is satisfied
     # where the least recurring one is even
-    priority: NDArray[Any]
+    priority: Integers
     gain: Floats  # float64[K, R], at least 0: rewards to maximise
     cost: Floats  # float64[C, R], at least 0: rewards to minimise
     ended: Booleans  # bool[N], where all rewards with a target have reached it
@@ -74,7 +73,7 @@ def final_components(sums: WeightedProblem) -> FinalComponents | None:
     return FinalComponents(rows, np.array(sets, bool).reshape(len(sets), count), found)
 
 
-def _satisfying(mdp: HostMDP, priority: NDArray[Any], rows: Booleans) -> Booleans:
+def _satisfying(mdp: HostMDP, priority: Integers, rows: Booleans) -> Booleans:
     """The rows of end components whose least priorities are all even.
 
     A component whose least priority is odd is searched again without the rows that read it.

@@ -9,7 +9,7 @@ connected component is left come first, and entries that lead on read what was f
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -65,7 +65,7 @@ def schedule(nodes: Nodes, one: int, nothing: int) -> Schedule:
     nodes, choices = _narrow_nodes(nodes, most, one)
     parts = [[level for level in part if level.size] for part in _ordered(nodes)]
     size = _block_size([x.size for part in parts for x in part], most * width)
-    place: Any = np.zeros(nodes.number, np.int32)
+    place: Integers = np.zeros(nodes.number, np.int32)
     blocks, start = [], 0
     for part in parts:
         blocks.append(start // size)
@@ -216,7 +216,7 @@ def _peeled(back: Edges, number: Integers, among: Booleans) -> list[Integers]:
 
 def _layers(edges: Edges, core: Integers) -> list[Integers]:
     """Nodes on cycles, by their distance from the exits of their component."""
-    number: Any = np.full(edges.num_nodes, -1, np.int64)
+    number: Integers = np.full(edges.num_nodes, -1, np.int64)
     number[core] = np.arange(core.size)
     width = edges.start[core + 1] - edges.start[core]
     target = number[edges.target[concatenated_ranges(edges.start[core], width)]]
@@ -241,10 +241,10 @@ def _distances(source: Integers, target: Integers, leaves: Booleans, label: Inte
     start = offsets_from_counts(np.bincount(target, minlength=size))
     before = source[np.argsort(target, kind="stable")]
     stuck = ~np.isin(label, np.unique(label[leaves]))
-    first: Any = np.full(int(label.max()) + 1, -1, np.int64)
+    first: Integers = np.full(int(label.max()) + 1, -1, np.int64)
     first[label[stuck][::-1]] = np.flatnonzero(stuck)[::-1]
     frontier = np.concatenate([np.flatnonzero(leaves), first[first >= 0]])
-    layer: Any = np.full(size, -1, np.int64)
+    layer: Integers = np.full(size, -1, np.int64)
     layer[frontier], steps = 0, 0
     while frontier.size:
         steps += 1
@@ -275,9 +275,9 @@ def _filled(
     blocks = total // size
     if total * most * width >= 2**31:
         raise ValueError(f"the model has {nodes.row.size} entries; a schedule has room for 2^31.")
-    target: Any = np.full((blocks, most, width, size), total + 1, np.int32)
-    source: Any = np.full((blocks, most, width, size), nothing, np.int32)
-    name: Any = np.zeros((blocks, most, size), np.int32)
+    target: Integers = np.full((blocks, most, width, size), total + 1, np.int32)
+    source: Integers = np.full((blocks, most, width, size), nothing, np.int32)
+    name: Integers = np.zeros((blocks, most, size), np.int32)
     at = place[nodes.owner].astype(np.int64)
     rank = _ranks(nodes.owner, nodes.number)
     link = nodes.name < 0
@@ -292,7 +292,7 @@ def _filled(
     )
     source.reshape(-1)[flat] = nodes.source
     # Rows that a node has not got are its first one again.
-    count: Any = np.full(total, most)
+    count: Integers = np.full(total, most)
     count[place] = np.bincount(nodes.owner, minlength=nodes.number)
     count = count.reshape(blocks, size)
     for a in range(1, most):

@@ -6,7 +6,7 @@ order: T + R is one, and T + R + 1 zero.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -165,8 +165,8 @@ def _own(reduced: ReducedProblem, codes: Integers) -> tuple[Integers, Integers]:
     """Place of the node that decides for each state, and fixed rows elsewhere."""
     mdp, whole, part = reduced.mdp, reduced.contraction, reduced.quotient
     mine = mdp.state[whole.row[whole.mdp.row_start[:-1]]]  # the state that each node is
-    chosen: Any = reduced.known_row
-    node: Any = np.arange(mine.size)
+    chosen: Integers = reduced.known_row
+    node: Integers = np.arange(mine.size)
     if part is not None and reduced.components is not None:
         chosen = quotient_policy(
             whole.mdp, reduced.components, part.row[reduced.known_row][part.node]
@@ -174,9 +174,9 @@ def _own(reduced: ReducedProblem, codes: Integers) -> tuple[Integers, Integers]:
         node = part.node
     if reduced.fixed is not None and reduced.fixed_row is not None:
         chosen = np.where(reduced.fixed, reduced.fixed_row, chosen)
-    row: Any = mdp.row_start[:-1].astype(np.int32)
+    row: Integers = mdp.row_start[:-1].astype(np.int32)
     row[mine] = whole.row[chosen]
-    own: Any = np.full(mdp.num_states, -1, np.int32)
+    own: Integers = np.full(mdp.num_states, -1, np.int32)
     if reduced.problem is not None:
         own[mine] = np.where(reduced.problem.interior, codes, -1)[node]
     return own, row
@@ -190,7 +190,7 @@ def _circles(reduced: ReducedProblem) -> Cycles | None:
     mdp = whole.mdp
     open_ = reduced.problem.interior[part.node]
     inside = components.inside & open_[mdp.state]
-    region: Any = np.zeros(mdp.num_states, bool)
+    region: Booleans = np.zeros(mdp.num_states, bool)
     region[mdp.state[inside]] = True
     if not region.any():
         return None
@@ -257,7 +257,7 @@ def plan_policy(mdp: HostMDP, target: Booleans, stay: Booleans | None, cost: Flo
     place = order.size - 1 - codes
     place[open_] = order.place
     most = int(np.diff(mdp.row_start).max())
-    row: Any = mdp.row_start[:-1].astype(np.int32)
+    row: Integers = mdp.row_start[:-1].astype(np.int32)
     return Plan(
         order,
         place[node].astype(np.int32),

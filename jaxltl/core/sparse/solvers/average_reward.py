@@ -10,7 +10,6 @@ then a shortest path problem (Puterman 1994, chapter 9).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -220,7 +219,7 @@ def _submodel(
     rewards: tuple[Floats, Floats],
 ) -> _Submodel:
     """Some components of a model, with the rows that stay inside."""
-    number: Any = np.full(mdp.num_states, -1, np.int32)
+    number: Integers = np.full(mdp.num_states, -1, np.int32)
     number[states] = np.arange(states.size)
     row = np.flatnonzero(inside & (number[mdp.state] >= 0))
     row = row[np.argsort(number[mdp.state[row]], kind="stable")]
@@ -475,7 +474,7 @@ def _gain_and_bias(
     # Self-loops are eliminated, however likely: their time is in how rarely a state is left.
     source, target = np.repeat(np.arange(states.size), np.diff(matrix.indptr)), matrix.indices
     loops = source == target
-    leaves: Any = np.bincount(source[~loops], matrix.data[~loops], states.size)
+    leaves = np.bincount(source[~loops], matrix.data[~loops], states.size).astype(np.float64)
     if leaves[visited] == 0:
         leaves[visited] = 1  # absorbing: every step is a visit
     if (leaves == 0).any():

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
-from jaxltl.core.array_types import Floats
+from jaxltl.core.array_types import Booleans, Floats
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.solvers.reachability import solve_shortest_path
 from jaxltl.core.sparse.solvers.total_cost import Enclosure, ShortestPathProblem
@@ -48,7 +47,7 @@ def _with_final_state(mdp: HostMDP, discount: float) -> HostMDP:
     entry_start = np.append(mdp.entry_start + np.arange(rows + 1), 0)
     entry_start[-1] = entry_start[-2] + 1
     last = entry_start[1:-1] - 1
-    place: Any = np.ones(int(entry_start[-1]), bool)
+    place: Booleans = np.ones(int(entry_start[-1]), bool)
     place[last] = place[-1] = False
     successor = np.full(place.size, end, np.int32)
     probability = np.full(place.size, 1 - discount)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -122,7 +122,7 @@ def _mixes(world: PaddedProduct) -> bool:
     """True if few steps from some state lead to many others."""
     size = world.letter.size
 
-    def follow(states: Any) -> Any:
+    def follow(states: Integers) -> Integers:
         return world.successor[states][world.used[states]]
 
     return any(
@@ -147,11 +147,11 @@ class _Search:
         return _Rows(self.world)
 
     @staticmethod
-    def has(words: Any, q: Any) -> Booleans:
+    def has(words: Integers, q: int) -> Booleans:
         """The states in which a set holds an automaton state."""
         return (words >> q & 1).astype(bool)
 
-    def open(self, q: Any) -> Booleans:
+    def open(self, q: int) -> Booleans:
         """The states in which the probability is neither 0 nor 1."""
         return ~self.has(self.sets.one | self.sets.zero, q)
 
@@ -166,7 +166,7 @@ class _Search:
             )
         )
         parts = [np.flatnonzero(label == i) for i in range(label.max() + 1)]
-        parts = [x for x in parts if any(self.open(q).any() for q in x)]
+        parts = [x for x in parts if any(self.open(int(q)).any() for q in x)]
         for i, part in enumerate(parts, 1):
             budget = self.tolerance * i / len(parts) - self.known
             if budget <= 0 or not self.component(part, budget):
@@ -202,7 +202,7 @@ class _Search:
     @cached_property
     def unit(self) -> float:
         """The relative rounding of one backup."""
-        return (4 * self.world.used.shape[2] + 16) * _EPS
+        return (4 * int(self.world.used.shape[2]) + 16) * _EPS
 
     def found(self) -> LayeredBounds:
         """The final bounds."""
@@ -297,7 +297,7 @@ def _solved(
         if allowed is not None:
             rows &= allowed
     circles = end_components(host, problem.stays, rows) if rows.any() else None
-    leader: Any = slice(None)
+    leader: slice | Integers = slice(None)
     if circles is not None and circles.inside.any():
         part, cut, guess = (
             quotient(host, circles.component, circles.inside, np.zeros(host.num_rows)),

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -51,6 +51,9 @@ from jaxltl.core.sparse.solvers.total_cost import (
     solve_levels,
 )
 
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+
 _EPS = float(np.finfo(np.float64).eps)
 _SHARE = 0.1  # of the tolerance that the extra cost of the steps may take
 _SHARE_CHAIN = 1e-5  # of a chain, where ties between choices do not matter
@@ -73,9 +76,9 @@ def policy_iteration(
     n = rows.num_nodes
     # A product and a sum for each successor of a row, twice for its normalisation, and the bounds.
     unit = (4 * rows.widest + problem.depth + 16) * _EPS
-    bounds: Any = np.zeros((3, n + 1))  # the bound that the policy attains, the other one, value
+    bounds: Floats = np.zeros((3, n + 1))  # the bound that the policy attains, the other one, value
     bounds[:, n] = 1
-    policy: Any = rows.row_start[:-1].copy()
+    policy: Integers = rows.row_start[:-1].copy()
     edges = rows.edges()
     back, among = edges.reverse(), np.ones(n, bool)
     below = topological_levels(back, np.diff(edges.start).astype(np.int32), among)
@@ -159,15 +162,15 @@ def _core_solver(
     core = core[choices.states]
     width = np.diff(rows.entry_start)[row]
     entry = concatenated_ranges(rows.entry_start[row], width)
-    number: Any = np.full(rows.num_nodes + 1, -1, np.int32)
+    number: Integers = np.full(rows.num_nodes + 1, -1, np.int32)
     number[core] = np.arange(core.size)
     target, weight = rows.target[entry], rows.weight[entry]
     inner = number[target] >= 0
     of = np.repeat(np.arange(row.size, dtype=np.int32), width)
     out = np.flatnonzero(~inner)
-    cost: Any = np.bincount(of[out], weight[out] * value[target[out]], row.size)
+    cost = np.bincount(of[out], weight[out] * value[target[out]], row.size).astype(np.float64)
     below = out[target[out] != rows.num_nodes]
-    leaving: Any = np.bincount(of[below], weight[below], row.size) + rows.leaving[row]
+    leaving: Floats = np.bincount(of[below], weight[below], row.size) + rows.leaving[row]
     start = offsets_from_counts(np.bincount(of[inner], minlength=row.size))
     shape = (row.size, core.size)
     matrix = sparse.csr_array((weight[inner], number[target[inner]], start), shape=shape)
@@ -362,7 +365,7 @@ class _CoreSolver:
         return _CoreValues(attained, outer, value, policy, rounds, method)
 
 
-def _reaches(rows: Any, goal: Booleans) -> Booleans:
+def _reaches(rows: csr_array, goal: Booleans) -> Booleans:
     """The nodes of a chain from which a goal is reachable."""
     back = Edges(rows.indptr, rows.indices).reverse()
     return forward_search(back.start, back.target, goal)

@@ -354,7 +354,7 @@ def quotient_policy(
 
     Where `row` is -1 the component is not left, and `otherwise` has the rows.
     """
-    found: Any = mdp.row_start[:-1].astype(np.int64) if otherwise is None else otherwise
+    found: Integers = mdp.row_start[:-1].astype(np.int64) if otherwise is None else otherwise
     moves = row >= 0
     own = moves & (mdp.state[np.maximum(row, 0)] == np.arange(mdp.num_states))
     inner = moves & components.region(mdp) & ~own
@@ -385,7 +385,7 @@ def mixes(problem: ShortestPathProblem, size: int) -> bool:
     mdp, interior = problem.mdp, problem.interior
     first = mdp.entry_start[mdp.row_start]
 
-    def follow(states: Any) -> Any:
+    def follow(states: Integers) -> Integers:
         after = mdp.successor[concatenated_ranges(first[states], first[states + 1] - first[states])]
         return after[interior[after]]
 
@@ -396,15 +396,15 @@ def mixes(problem: ShortestPathProblem, size: int) -> bool:
 
 
 def expands_fast(
-    follow: Callable[[Any], Any],
-    start: Any,
+    follow: Callable[[Integers], Integers],
+    start: Integers,
     num_states: int,
     met: int | None = None,
     steps: int = _STEPS,
 ) -> bool:
     """True if few steps from a state lead to many others."""
     left = (_MET if met is None else met) - 1
-    seen: Any = np.zeros(num_states, bool)
+    seen: Booleans = np.zeros(num_states, bool)
     seen[start] = True
     for _ in range(steps):
         if left <= 0:

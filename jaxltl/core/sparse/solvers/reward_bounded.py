@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Any, NamedTuple
+from typing import NamedTuple, TYPE_CHECKING
 
 import numpy as np
 
@@ -24,6 +24,10 @@ from jaxltl.core.sparse.graph.qualitative import (
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.rows import concatenated_ranges, first_hits
 from jaxltl.core.sparse.solvers.step_bounded import backup_unit
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+    from scipy.sparse.linalg import SuperLU
 
 _LEVELS = 10**7  # amounts of reward at most
 _LARGEST = 8 * 2**30  # bytes of the levels that are kept
@@ -152,7 +156,7 @@ def _shape(
 
 def _parts(
     mdp: HostMDP, shape: _Shape, target: Booleans, cost: Integers, most: int
-) -> list[tuple[int, Any, Floats]]:
+) -> list[tuple[int, csr_array, Floats]]:
     """For each cost: the matrix of the entries of that cost, and the probability of the target."""
     from scipy import sparse
 
@@ -204,12 +208,12 @@ class _System:
     """
 
     shape: _Shape
-    matrix: Any
+    matrix: csr_array
     maximal: bool
 
     def __post_init__(self) -> None:
         self.chosen = self.shape.starts
-        self.factors: Any = None
+        self.factors: SuperLU = None
         self.longest = 1.0
         if self.matrix.nnz:
             wish, self.maximal = self.maximal, True
@@ -237,7 +241,7 @@ class _System:
     def _iterate(self, b: Floats) -> Floats:
         """Policy iteration (Howard 1960) from the last policy, whose factors are known."""
         for _ in range(_ROUNDS):
-            value = self.factors.solve(b[self.chosen])
+            value: Floats = self.factors.solve(b[self.chosen])
             image = b + self.matrix @ value
             best = self.best(image)
             kept = np.abs(best - image[self.chosen]) <= _GAIN * np.abs(best)

@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol, TYPE_CHECKING
 
 import numpy as np
 
@@ -21,6 +21,9 @@ from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.rows import sorted_unique, concatenated_ranges
 from jaxltl.core.sparse.solvers.total_cost import Enclosure
 from jaxltl.core.sparse.solvers.reachability import reachability, reward_forever, total_reward
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 UNDERFLOW = 1e-300  # bounds the loss by underflow
 _HUGE = 1e150
@@ -57,8 +60,8 @@ def relative_error(unit: float, num_steps: int) -> float:
 class Backup(NamedTuple):
     """``x -> opt (cost + P x)`` over the choices of N states, with zero on all other states."""
 
-    matrix: Any  # SciPy's float64[R', N]
-    taken: Any  # the same with the columns of all states, float64[R', S]
+    matrix: csr_array  # SciPy's float64[R', N]
+    taken: csr_array  # the same with the columns of all states, float64[R', S]
     choices: Choices  # the order of the states and of their choices
     row: Integers  # int[R'], the model's rows, in that order
     places: Integers  # int[N], the states
@@ -103,7 +106,7 @@ class Backup(NamedTuple):
                 if enough(Iterate(before, value, done, False)):
                     return Iterate(before, value, done, False)
         if done < num_steps and self.small_chain:
-            matrix: Any = self.matrix.toarray()
+            matrix: Floats = self.matrix.toarray()
             value = _power(matrix, cost, value, num_steps - done)
             return Iterate(before, value, num_steps, False)
         return Iterate(before, value, done, False)
@@ -393,7 +396,7 @@ def total(
 
     found = backup.iterate(cost, start[places], num_steps, enough, every)
     complete = found.is_fixed or found.num_steps == num_steps
-    size: Any = found.value
+    size: Floats = found.value
     if signed:
         # Rounding is relative to the largest sum of absolute values.
         size = _largest_sum(mdp, magnitude, np.abs(start), num_steps)[places]

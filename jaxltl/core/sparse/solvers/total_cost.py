@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,6 +12,9 @@ from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.sparse.linear.topological_order import Edges, Levels
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.rows import SCIPY_SIZE, concatenated_ranges, first_hits, offsets_from_counts
+
+if TYPE_CHECKING:
+    pass
 
 TINY = 1e-290  # products that underflow: relative errors do not count them
 
@@ -96,7 +99,9 @@ class InteriorRows:
             from scipy import sparse
 
             arrays = self.weight, self.target, self.entry_start
-            return sparse.csr_array(arrays, shape=(self.row.size, value.size)) @ value
+            matrix = sparse.csr_array(arrays, shape=(self.row.size, value.size))
+            found: Floats = matrix @ value
+            return found
         return np.add.reduceat(self.weight * value[self.target], self.entry_start[:-1])
 
     def residual(self, value: Floats, sign: int) -> float:
@@ -125,11 +130,11 @@ def interior_rows(problem: ShortestPathProblem) -> InteriorRows:
         of = np.repeat(np.arange(row.size, dtype=np.int32), width)
     state = mdp.state[row]
     inner = interior[target]
-    known: Any = problem.cost[row]
-    leaving: Any = np.zeros(row.size)
+    known: Floats = problem.cost[row]
+    leaving: Floats = np.zeros(row.size)
     if not inner.all():
         out = np.flatnonzero(~inner)
-        leaving = np.bincount(of[out], weight[out], row.size)
+        leaving = np.bincount(of[out], weight[out], row.size).astype(np.float64)
         known = known + np.bincount(
             of[out], weight[out] * problem.terminal_value[target[out]], row.size
         )
@@ -161,7 +166,7 @@ def _with_known_values(
     """Puts the known part of each row, if it is positive or the row is empty, before its entries."""
     (row, state, known, leaving), (target, weight, of) = rows, entries
     node = np.flatnonzero(problem.interior)
-    number: Any = np.zeros(problem.interior.size, np.int32)
+    number: Integers = np.zeros(problem.interior.size, np.int32)
     number[node] = np.arange(node.size)
     count = np.bincount(of, minlength=row.size)
     some = (known != 0) | (count == 0)
@@ -195,7 +200,7 @@ def solve_levels(
     same = bool((bounds[0] == bounds[1]).all())
     sides = [bounds[2]] if same else [bounds[2], bounds[1], bounds[0]]
     operation = _reduction(sign)
-    images: Any = np.empty(part.row.size)
+    images: Floats = np.empty(part.row.size)
     row_at = part.row_start[levels.start]
     entry_at = part.entry_start[row_at].tolist()
     for (a, b), (r0, r1), (e0, e1) in zip(
