@@ -195,10 +195,10 @@ def test_parity(count):
         values = optima([parity(p, priority) for _, p in chains(model, np.zeros(4, bool))])
         for (maximize, helpful), value in values.items():
             if maximize:
-                found = _largest(model, priority, helpful, 1e-6)
+                found = _largest(model, priority, Query(True, helpful, 1e-6))
                 enclosed(found, value)
             else:
-                found = _largest(model, priority + 1, not helpful, 1e-6)
+                found = _largest(model, priority + 1, Query(True, not helpful, 1e-6))
                 enclosed(found, 1 - value)
             within_ball(model, found.probability)
         found = parity_against_nature(model, priority)

@@ -82,9 +82,9 @@ def test_parity(count):
         values = optima([parity(p, priority) for _, p in chains(model, np.zeros(4, bool))])
         for (maximize, helpful), value in values.items():
             if maximize:
-                enclosed(_largest(model, priority, helpful, 1e-6), value)
+                enclosed(_largest(model, priority, Query(True, helpful, 1e-6)), value)
             else:
-                enclosed(_largest(model, priority + 1, not helpful, 1e-6), 1 - value)
+                enclosed(_largest(model, priority + 1, Query(True, not helpful, 1e-6)), 1 - value)
 
 
 def test_nature_that_is_against_a_parity_condition_is_returned():
