@@ -50,17 +50,7 @@ def brief(
     drawn: bool = False,
     codes: Mapping[str, Any] | None = None,
 ) -> Any:
-    """A class decorator for a short ``repr``.
-
-    Example:
-      >>> @brief
-      ... @dataclasses.dataclass
-      ... class Pair:
-      ...     left: object
-      ...     right: object
-      >>> Pair(np.linspace(0, 1, 1000), 2)
-      Pair(left=float64[1000] from 0 to 1, right=2)
-    """
+    """A class decorator for a short ``repr``."""
     if cls is None:
         return functools.partial(_given, facts=facts, drawn=drawn, codes=codes or {})
     return _given(cls, facts=facts, drawn=drawn, codes=codes or {})

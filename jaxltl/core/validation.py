@@ -78,14 +78,6 @@ def require_in_range(name: str, value: Any, valid: Range | None = None) -> None:
     """Raises ValueError unless `value` is one real number in its range.
 
     Of a traced value shape and dtype are checked; the range is checked by `contains` inside jit.
-
-    Raises:
-      ValueError: with the value and the range.
-
-    Example:
-      >>> require_in_range("discount", 1.5)
-      Traceback (most recent call last):
-      ValueError: discount=1.5; it must be at least 0 and below 1.
     """
     valid = RANGES[name] if valid is None else valid
     known = is_concrete(value)
@@ -119,16 +111,7 @@ def shorten(value: Any) -> str:
 
 
 def float_array(name: str, value: Any) -> Floats:
-    """Converts to an array in double precision.
-
-    Raises:
-      ValueError: an element is not a real number.
-
-    Example:
-      >>> float_array("lower", ["x"])
-      Traceback (most recent call last):
-      ValueError: lower is ['x']; give numbers.
-    """
+    """Converts to an array in double precision."""
     try:
         if np.asarray(value).dtype.kind != "c":
             return np.asarray(value, np.float64)
@@ -138,16 +121,7 @@ def float_array(name: str, value: Any) -> Floats:
 
 
 def boolean_array(name: str, value: Any) -> Booleans:
-    """Converts to a Boolean array; the numbers 0 and 1 are accepted.
-
-    Raises:
-      ValueError: an element is something else.
-
-    Example:
-      >>> boolean_array("available", [["yes"]])
-      Traceback (most recent call last):
-      ValueError: available is [['yes']]; give True or False for each entry.
-    """
+    """Converts to a Boolean array; the numbers 0 and 1 are accepted."""
     try:
         array = np.asarray(value)
     except ValueError:  # ragged
@@ -158,11 +132,7 @@ def boolean_array(name: str, value: Any) -> Booleans:
 
 
 def integer_array(name: str, value: Any) -> Integers:
-    """Converts to an array of integers.
-
-    Raises:
-      ValueError: an element is not an integer below ``2 ** 53`` in magnitude.
-    """
+    """Converts to an array of integers."""
     array = float_array(name, value)
     if not (np.abs(array) < _INEXACT).all() or (array != np.floor(array)).any():
         raise ValueError(f"{name} is {shorten(value)}; give integers.")
@@ -170,11 +140,7 @@ def integer_array(name: str, value: Any) -> Integers:
 
 
 def finite_number(name: str, value: Any) -> float:
-    """Converts to a float.
-
-    Raises:
-      ValueError: the value is not one finite number.
-    """
+    """Converts to a float."""
     array = float_array(name, np.nan if value is None else value)
     if array.ndim or not np.isfinite(array):
         raise ValueError(f"{name}={shorten(value)}; give a finite number.")
@@ -182,16 +148,7 @@ def finite_number(name: str, value: Any) -> float:
 
 
 def integer(name: str, value: Any, *, least: int = 0, most: int = 2**63 - 1) -> int:
-    """Converts to an int from `least` to `most`.
-
-    Raises:
-      ValueError: the value is not one integer, or out of range.
-
-    Example:
-      >>> integer("num_steps", 1.5, least=1)
-      Traceback (most recent call last):
-      ValueError: num_steps=1.5; it must be an integer of at least 1.
-    """
+    """Converts to an int from `least` to `most`."""
     try:
         number = int(value)
         exact = np.ndim(value) == 0 and bool(number == value)
@@ -206,27 +163,14 @@ def integer(name: str, value: Any, *, least: int = 0, most: int = 2**63 - 1) -> 
 
 
 def choice(name: str, value: Any, known: Sequence[str]) -> str:
-    """Returns `value` if it is one of some words.
-
-    Raises:
-      ValueError: it is not, with the words to choose from.
-    """
+    """Returns `value` if it is one of some words."""
     if not isinstance(value, str) or value not in known:
         raise ValueError(f"{name}={shorten(value)}; choose one of {', '.join(known)}.")
     return value
 
 
 def boolean(name: str, value: Any) -> bool:
-    """Converts a Boolean of Python, NumPy or JAX to bool.
-
-    Raises:
-      ValueError: the value is not one concrete Boolean.
-
-    Example:
-      >>> boolean("flat", [True, False])
-      Traceback (most recent call last):
-      ValueError: flat=[True, False]; give True or False.
-    """
+    """Converts a Boolean of Python, NumPy or JAX to bool."""
     kind = getattr(value, "dtype", None)
     if isinstance(value, bool) or (kind == np.bool_ and np.ndim(value) == 0):
         with contextlib.suppress(TypeError):  # a tracer
@@ -235,16 +179,7 @@ def boolean(name: str, value: Any) -> bool:
 
 
 def fraction(name: str, value: Any, *, ends: tuple[bool, bool] = (True, True)) -> float:
-    """Converts to a float from 0 to 1; `ends` are whether 0 and 1 are valid.
-
-    Raises:
-      ValueError: the value is not such a number.
-
-    Example:
-      >>> fraction("confidence", 1, ends=(False, False))
-      Traceback (most recent call last):
-      ValueError: confidence=1; it must be above 0 and below 1.
-    """
+    """Converts to a float from 0 to 1; `ends` are whether 0 and 1 are valid."""
     number = finite_number(name, value)
     valid = Range(0, 1, open_below=not ends[0], open_above=not ends[1])
     if not valid.contains(number):
@@ -253,22 +188,14 @@ def fraction(name: str, value: Any, *, ends: tuple[bool, bool] = (True, True)) -
 
 
 def function(name: str, value: object) -> Callable[..., Any]:
-    """Returns `value` if it is callable.
-
-    Raises:
-      ValueError: it is not.
-    """
+    """Returns `value` if it is callable."""
     if not callable(value):
         raise ValueError(f"{name} is {shorten(value)}; give a function.")
     return value
 
 
 def instance(name: str, value: Any, kind: Any, remedy: str) -> Any:
-    """Returns `value` if it is an instance of a type, or of one of several.
-
-    Raises:
-      ValueError: it is not, with `remedy` as what to give.
-    """
+    """Returns `value` if it is an instance of a type, or of one of several."""
     if not isinstance(value, kind):
         found = "an array" if hasattr(value, "aval") else type(value).__name__
         raise ValueError(f"{name} is {found}; give {remedy}.")
@@ -276,11 +203,7 @@ def instance(name: str, value: Any, kind: Any, remedy: str) -> Any:
 
 
 def sequence(name: str, value: Any) -> list[Any]:
-    """Converts an iterable to a list; a text becomes the list of its letters.
-
-    Raises:
-      ValueError: the value is not iterable.
-    """
+    """Converts an iterable to a list; a text becomes the list of its letters."""
     if isinstance(value, Iterable):
         with contextlib.suppress(TypeError):  # a scalar array
             return list(value)
@@ -288,11 +211,7 @@ def sequence(name: str, value: Any) -> list[Any]:
 
 
 def distinct_names(name: str, value: Any) -> tuple[str, ...]:
-    """Converts an iterable of distinct strings to a tuple.
-
-    Raises:
-      ValueError: an element is not a string, or occurs twice.
-    """
+    """Converts an iterable of distinct strings to a tuple."""
     found = sequence(name, value)
     for one in found:
         if not isinstance(one, str) or found.count(one) > 1:

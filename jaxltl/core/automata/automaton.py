@@ -282,16 +282,7 @@ def _booleans(values: ArrayLike | None, place: str, shape: tuple[int, ...]) -> N
 
 
 def letter_index(automaton: Automaton, letter: Letter) -> int:
-    """The index l of a letter, so that `delta[q, l]` reads it.
-
-    Raises:
-      ValueError: for a combination of propositions that is not among the letters.
-
-    Example:
-      >>> from jaxltl import to_automaton
-      >>> letter_index(to_automaton("F a"), {"a", "unrelated"})
-      1
-    """
+    """The index l of a letter, so that `delta[q, l]` reads it."""
     return _read(automaton, [letter], "letter_index: letter")[0]
 
 
@@ -318,11 +309,6 @@ def run(automaton: Automaton, word: Iterable[Letter]) -> NDArray[np.int32]:
     """The states passed while reading a finite word, from `initial` on.
 
     `q[0] = initial` and `q[t+1] = delta[q[t], w[t]]`.
-
-    Example:
-      >>> from jaxltl import to_automaton
-      >>> run(to_automaton("F a"), [set(), {"a"}, set()]).tolist()
-      [0, 0, 1, 1]
     """
     states = [int(automaton.initial)]
     for letter in _read(automaton, word, "run: letter"):

@@ -28,12 +28,7 @@ MAX_SUBSETS = 20_000  # parts examined in one decomposition before it is given u
 
 
 def holds(condition: Condition, colors: int) -> bool:
-    """True if a condition holds of the set of colors that occur infinitely often.
-
-    Example:
-      >>> holds(("and", ("inf", 0), ("fin", 1)), 0b01)
-      True
-    """
+    """True if a condition holds of the set of colors that occur infinitely often."""
     match condition[0]:
         case "true" | "false":
             return bool(condition[0] == "true")
@@ -80,12 +75,7 @@ def to_parity(
     condition: Condition,
     max_states: int = 1_000_000,
 ) -> tuple[Integers, Integers, int, Integers]:
-    """A deterministic min-even parity automaton with the language of an Emerson-Lei one.
-
-    Raises:
-      ValueError: for more than `max_states` states, too many parts to examine, or a color
-        above 61.
-    """
+    """A deterministic min-even parity automaton with the language of an Emerson-Lei one."""
     inf, fin = polarities(condition)
     if (inf | fin) >> MAX_COLORS:
         raise ValueError(

@@ -26,34 +26,17 @@ def find_accepted(automaton: Automaton) -> Lasso | None:
     For each even p: a cycle that reads p and nothing less, that is a strongly connected part of
     the transitions of priority p or more, with one of priority p (Baier & Katoen 2008, section
     4.4, for one priority).
-
-    Example:
-      >>> from jaxltl import to_automaton
-      >>> find_accepted(to_automaton("F a"))
-      ([frozenset({'a'})], [frozenset()])
     """
     return find_lasso([automaton], [(EVEN,)])
 
 
 def is_empty(automaton: Automaton) -> bool:
-    """True if the automaton accepts no word.
-
-    Example:
-      >>> from jaxltl import to_automaton
-      >>> is_empty(to_automaton("F a", letters=[set()]))
-      True
-    """
+    """True if the automaton accepts no word."""
     return not some_loop(joint_runs([automaton]), [(EVEN,)])
 
 
 def is_universal(automaton: Automaton) -> bool:
-    """True if the automaton accepts every word over its letters.
-
-    Example:
-      >>> from jaxltl import to_automaton
-      >>> is_universal(to_automaton("F a")), is_universal(to_automaton("F a", letters=[{"a"}]))
-      (False, True)
-    """
+    """True if the automaton accepts every word over its letters."""
     return not some_loop(joint_runs([automaton]), [(ODD,)])
 
 
@@ -105,14 +88,6 @@ def find_not_included(a: Task, b: Task) -> Lasso | None:
 
     On the runs of both, for each even p and odd r: a cycle on which the least priorities are p
     and r. Neither acceptance has to be converted.
-
-    Raises:
-      ValueError: if there is no joint letter, or too many.
-
-    Example:
-      >>> from jaxltl import to_automaton
-      >>> find_not_included(to_automaton("a U b"), to_automaton("F b & a"))
-      ([frozenset({'b'})], [frozenset()])
     """
     return find_lasso(_aligned(a, b), [(EVEN, ODD)])
 
@@ -139,44 +114,17 @@ def is_included(a: Task, b: Task) -> bool:
 
 
 def intersection(a: Task, b: Task) -> Automaton:
-    """The automaton that accepts the words that both accept.
-
-    Raises:
-      ValueError: if there is no joint letter, or too many, or too many priorities.
-
-    Example:
-      >>> from jaxltl import to_automaton
-      >>> both = intersection(to_automaton("F a"), to_automaton("F b"))
-      >>> is_equivalent(both, to_automaton("F a & F b"))
-      True
-    """
+    """The automaton that accepts the words that both accept."""
     return _combine(a, b, "and")
 
 
 def union(a: Task, b: Task) -> Automaton:
-    """The automaton that accepts the words that at least one accepts.
-
-    Arguments, result and errors are as in `intersection`.
-
-    Example:
-      >>> from jaxltl import to_automaton
-      >>> either = union(to_automaton("F a"), to_automaton("F b"))
-      >>> is_equivalent(either, to_automaton("F (a | b)"))
-      True
-    """
+    """The automaton that accepts the words that at least one accepts."""
     return _combine(a, b, "or")
 
 
 def difference(a: Task, b: Task) -> Automaton:
-    """The automaton that accepts the words that `a` accepts and `b` rejects.
-
-    Arguments, result and errors are as in `intersection`.
-
-    Example:
-      >>> from jaxltl import to_automaton
-      >>> is_empty(difference(to_automaton("a U b"), to_automaton("F b")))
-      True
-    """
+    """The automaton that accepts the words that `a` accepts and `b` rejects."""
     return _combine(a, complement(as_automaton(b)), "and")
 
 

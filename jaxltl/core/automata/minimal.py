@@ -18,11 +18,6 @@ def minimize(automaton: Automaton) -> Automaton:
     Unreachable states are dropped and equivalent ones merged, by `equivalence_classes`. Co-safe
     and safety automata of one language, over the same letters, give identical tables. A merged
     state keeps the shortest of the names.
-
-    Example:
-      >>> from jaxltl import to_automaton
-      >>> minimize(to_automaton("F a & F b")).delta.shape
-      (4, 4)
     """
     return quotient(automaton, equivalence_classes(automaton))
 

@@ -38,14 +38,6 @@ def simplify(automaton: Automaton) -> Automaton:
     Co-safe and safety where a finite prefix proves or refutes (then the automaton is minimal),
     else Buchi where the language has a deterministic Buchi automaton, else parity. If every
     cycle's verdict is that of its component, the automaton is minimal too.
-
-    Example:
-      >>> from jaxltl.core.automata import make_automaton
-      >>> twice = make_automaton([[1, 1], [0, 0]], 0, [[False], [True]], ["a"],
-      ...                        accepting=[[False, True], [False, True]])
-      >>> small = simplify(twice)
-      >>> small.delta.tolist(), small.priority.tolist(), small.acceptance
-      ([[0, 0]], [[1, 0]], 'buchi')
     """
     table = Table(automaton.delta, automaton.priority, int(automaton.initial))
     small, kind, base = reduce_table(table)

@@ -24,24 +24,12 @@ EVEN, ODD = 0, 1
 
 
 def live_states(automaton: Automaton) -> NDArray[np.bool_]:
-    """bool `[Q]`, the states from which some word is accepted.
-
-    Example:
-      >>> from jaxltl import to_automaton
-      >>> live_states(to_automaton("!r U g", letters=[{}, {"r"}, {"g"}])).tolist()
-      [True, True, False]
-    """
+    """bool `[Q]`, the states from which some word is accepted."""
     return _states_that_may(automaton, EVEN)
 
 
 def universal_states(automaton: Automaton) -> NDArray[np.bool_]:
-    """bool `[Q]`, the states from which every word is accepted.
-
-    Example:
-      >>> from jaxltl import to_automaton
-      >>> universal_states(to_automaton("!r U g", letters=[{}, {"r"}, {"g"}])).tolist()
-      [False, True, False]
-    """
+    """bool `[Q]`, the states from which every word is accepted."""
     return ~_states_that_may(automaton, ODD)
 
 
@@ -51,15 +39,6 @@ def align(a: Automaton, b: Automaton) -> tuple[Automaton, Automaton]:
     The propositions are those of either, sorted. The letters are what a letter of `a` and a
     letter of `b` that agree on the shared propositions say together, by binary number: all
     2^P if both have all of theirs, and the common letters if the propositions are the same.
-
-    Raises:
-      ValueError: if there is no joint letter, or too many.
-
-    Example:
-      >>> from jaxltl import to_automaton
-      >>> left, right = align(to_automaton("F a"), to_automaton("F b"))
-      >>> left.propositions, left.delta.tolist(), right.delta.tolist()
-      (('a', 'b'), [[0, 1, 0, 1], [1, 1, 1, 1]], [[0, 0, 1, 1], [1, 1, 1, 1]])
     """
     shared = [name for name in a.propositions if name in b.propositions]
     read_by_a, read_by_b = _agreeing(_columns(a, shared), _columns(b, shared))

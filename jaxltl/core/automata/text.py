@@ -20,24 +20,13 @@ def guards(automaton: Automaton) -> dict[tuple[int, int], str]:
     A guard is true of the letters that make the transition and false of the other letters; what
     it says of combinations that are no letter is left to brevity. It is an irredundant
     disjunction of prime cubes, not always the shortest.
-
-    Example:
-      >>> from jaxltl import to_automaton
-      >>> guards(to_automaton("!r U g", letters=[{}, {"r"}, {"g"}]))
-      {(0, 0): '!g & !r', (0, 1): 'g', (0, 2): 'r', (1, 1): 'true', (2, 2): 'true'}
     """
     same = np.zeros_like(np.asarray(automaton.priority))
     return {(q, end): text for (q, end, _), text in _guards(automaton, same).items()}
 
 
 def edge_guards(automaton: Automaton) -> dict[tuple[int, int, int], str]:
-    """The condition of each (state, successor, priority) that some letter has, see `guards`.
-
-    Example:
-      >>> from jaxltl import to_automaton
-      >>> edge_guards(to_automaton("G F a"))
-      {(0, 0, 0): 'a', (0, 0, 1): '!a'}
-    """
+    """The condition of each (state, successor, priority) that some letter has, see `guards`."""
     return _guards(automaton, np.asarray(automaton.priority))
 
 
@@ -70,10 +59,6 @@ def prime_cover(chosen: set[int], others: set[int], width: int) -> list[Cube]:
     """Prime cubes, none to spare, that together hold in the chosen letters and in no other.
 
     Letters that are in neither set may fall on either side; see `diagram.prime_cubes`.
-
-    Example:
-      >>> prime_cover({0b01, 0b11}, {0b00}, 2)
-      [((0, True),)]
     """
     if len(chosen) + len(others) < 1 << width:
         # Where few letters occur, a few propositions tell, and guards of others would be long.
@@ -128,21 +113,6 @@ def to_text(automaton: Automaton) -> str:
 
     In a Buchi automaton `*` marks the accepting transitions instead, and in a parity automaton
     each transition is followed by its priority in braces.
-
-    Example:
-      >>> from jaxltl import to_automaton
-      >>> print(to_text(to_automaton("F a")))
-      cosafe automaton: 2 states, 2 letters over a
-      >  0: F a
-           !a -> 0
-           a -> 1
-       * 1: true
-           true -> 1
-      >>> print(to_text(to_automaton("G F a")))
-      buchi automaton: 1 state, 2 letters over a
-      >  0: G F a
-           a -> 0 *
-           !a -> 0
     """
     lines = [f"{automaton.acceptance} automaton: {extent_text(automaton)}"]
     final = _final_states(automaton)
@@ -175,17 +145,6 @@ def to_dot(automaton: Automaton) -> str:
 
     The accepting transitions of a Buchi automaton are bold and have a dot after their condition,
     and those of a parity automaton have their priority in braces there.
-
-    Example:
-      >>> from jaxltl import to_automaton
-      >>> print(to_dot(to_automaton("true")))
-      digraph automaton {
-        rankdir=LR;
-        start [shape=point, label=""];
-        start -> 0;
-        0 [shape=doublecircle, label="0: true"];
-        0 -> 0 [label="true"];
-      }
     """
     lines = ["rankdir=LR;", 'start [shape=point, label=""];', f"start -> {automaton.initial};"]
     final = _final_states(automaton)
@@ -205,13 +164,7 @@ def _dot_string(text: str) -> str:
 
 
 def to_dict(automaton: Automaton) -> dict[str, Any]:
-    """The automaton as lists, numbers and strings, for JSON; `from_dict` is the inverse.
-
-    Example:
-      >>> from jaxltl import to_automaton
-      >>> to_dict(to_automaton("F a"))["delta"]
-      [[0, 1], [1, 1]]
-    """
+    """The automaton as lists, numbers and strings, for JSON; `from_dict` is the inverse."""
     table = CONDITIONS[automaton.acceptance].table
     return {
         "delta": automaton.delta.tolist(),
@@ -225,16 +178,7 @@ def to_dict(automaton: Automaton) -> dict[str, Any]:
 
 
 def from_dict(tables: Mapping[str, Any]) -> Automaton:
-    """The automaton that `to_dict` wrote.
-
-    Raises:
-      ValueError: for a missing or unknown entry, or tables that are no automaton.
-
-    Example:
-      >>> from jaxltl import to_automaton
-      >>> from_dict(to_dict(to_automaton("F a"))).acceptance
-      'cosafe'
-    """
+    """The automaton that `to_dict` wrote."""
     table = CONDITIONS.get(tables.get("acceptance", ""), CONDITIONS["cosafe"]).table
     fields = set(Automaton.__dataclass_fields__) - {"priority"} | {table}
     if set(tables) != fields:

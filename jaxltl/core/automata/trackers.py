@@ -94,11 +94,7 @@ def track(
     max_states: int,
     max_nodes: int,
 ) -> tuple[NDArray[np.int32], NDArray[np.int64], Condition, NDArray[np.intp]]:
-    """The trackers of a combination as one automaton with an Emerson-Lei condition.
-
-    Raises:
-      ValueError: for too many states.
-    """
+    """The trackers of a combination as one automaton with an Emerson-Lei condition."""
     trackers: dict[Part, Tracker] = {}
     for part in _leaves(parts):
         trackers.setdefault(part, Tracker(part))

@@ -9,14 +9,7 @@ import jax
 
 
 def reads_key(function: Callable[..., Any], *arguments: Any) -> bool:
-    """True if a result may depend on the last argument; False is a proof, by the jaxpr.
-
-    Example:
-      >>> reads_key(lambda x, key: x + 1, 0.0, jax.random.key(0))
-      False
-      >>> reads_key(lambda x, key: x + jax.random.normal(key), 0.0, jax.random.key(0))
-      True
-    """
+    """True if a result may depend on the last argument; False is a proof, by the jaxpr."""
     program = jax.make_jaxpr(function)(*arguments).jaxpr
     count = len(jax.tree.leaves(arguments[-1]))
     marked = [False] * (len(program.invars) - count) + [True] * count

@@ -369,12 +369,7 @@ def clipped_action(actions: Box, action: chex.Array) -> jax.Array:
 
 
 def flat_observation(observation: PyTree) -> jax.Array:
-    """An observation as one vector ``float[O]``, the concatenated arrays of its tree.
-
-    Example:
-      >>> flat_observation({"at": jnp.array([1.5, 2.5]), "open": jnp.bool_(True)}).tolist()
-      [1.5, 2.5, 1.0]
-    """
+    """An observation as one vector ``float[O]``, the concatenated arrays of its tree."""
     leaves = [jnp.asarray(x) for x in jax.tree.leaves(observation)]
     floats = [x.dtype for x in leaves if jnp.issubdtype(x.dtype, jnp.floating)]
     kind = jnp.result_type(*floats) if floats else jnp.result_type(float)
@@ -472,11 +467,7 @@ def _described(tree: Any) -> Any:
 
 
 def traced(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """Shapes of the results of a function that is pure, as far as tracing it twice shows.
-
-    Raises:
-      ValueError: it cannot be traced, leaks its arguments, or differs between two calls.
-    """
+    """Shapes of the results of a function that is pure, as far as tracing it twice shows."""
     try:
         try:
             with jax.checking_leaks():

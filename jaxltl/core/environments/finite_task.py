@@ -111,18 +111,7 @@ def make_finite_task(formula: Formula | str | Automaton, propositions: Sequence[
 def finite_verdicts(
     task: FiniteTask, label: chex.Array, length: chex.Array | None = None
 ) -> jax.Array:
-    """The verdict of each trajectory at its end.
-
-    Raises:
-      ValueError: labels that are not Boolean, or have not P columns.
-
-    Example:
-      >>> task = make_finite_task("!wet U dry", ["wet", "dry"])
-      >>> dries, swims, waits = [[0, 0], [0, 1]], [[1, 0], [0, 1]], [[0, 0], [0, 0]]
-      >>> label = jnp.array([dries, swims, waits], bool)
-      >>> [Verdict(v).name for v in finite_verdicts(task, label).tolist()]
-      ['SATISFIED', 'VIOLATED', 'UNDECIDED']
-    """
+    """The verdict of each trajectory at its end."""
     label = jnp.asarray(label)
     if label.dtype != bool or label.ndim < 2 or label.shape[-1] != task.num_columns:
         raise ValueError(
@@ -138,12 +127,7 @@ def finite_verdicts(
 def verdict_frequencies(
     verdict: chex.Array, axis: int | tuple[int, ...] | None = -1
 ) -> VerdictFrequencies:
-    """Frequencies of the three verdicts among trajectories, along an axis.
-
-    Example:
-      >>> [float(x) for x in verdict_frequencies(jnp.array([1, 1, 0, 2]))]
-      [0.5, 0.25, 0.25]
-    """
+    """Frequencies of the three verdicts among trajectories, along an axis."""
     verdict = jnp.asarray(verdict)
     order = (Verdict.SATISFIED, Verdict.VIOLATED, Verdict.UNDECIDED)
     return VerdictFrequencies(*(jnp.mean(verdict == v, axis=axis, dtype=float) for v in order))

@@ -100,11 +100,6 @@ def lasso_verdicts(automaton: Automaton) -> np.ndarray:
     """``int32[Q, L]``: the verdict on a word that leads to a state and then repeats one letter for ever.
 
     For terminal states: the automaton state after the last label, and its letter. Never undecided.
-
-    Example:
-      >>> from jaxltl import to_automaton
-      >>> lasso_verdicts(to_automaton("G F a"))[0].tolist()
-      [2, 1]
     """
     delta, least = np.asarray(automaton.delta), np.asarray(automaton.priority)
     # The state after 2^n readings of one letter, and the least priority among them. After as many

@@ -168,15 +168,7 @@ class TaskOptions(RewardOptions, total=False):
 def make_task_tables(
     formula: Formula | str | Automaton, propositions: Sequence[str], **options: Unpack[TaskOptions]
 ) -> TaskTables:
-    """The tables of a task.
-
-    Raises:
-      ValueError: as :func:`task_environment`.
-
-    Example:
-      >>> make_task_tables("F goal", ["wall", "goal"]).weight.tolist()
-      [0, 1]
-    """
+    """The tables of a task."""
     validation.keywords("make_task_tables", options, TaskOptions)
     ending, embedding = options.get("ending", "repeat"), options.get("embedding")
     validation.choice("ending", ending, ENDINGS)
@@ -326,9 +318,6 @@ def stack_tables(tables: Sequence[TaskTables]) -> TaskTables:
     """Tasks of different formulas, padded to one shape, with a leading axis; for ``vmap``.
 
     States in padding are violated and unreachable.
-
-    Raises:
-      ValueError: no task, or tasks over different propositions or with embeddings of different width.
     """
     tables = validation.sequence("tables", tables)
     if not tables:

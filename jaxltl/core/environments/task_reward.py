@@ -103,9 +103,6 @@ def make_task_reward(
     verdict for ``"keep"``.
 
     `decisions` are the verdicts ``int32[Q]`` of the automaton states.
-
-    Raises:
-      ValueError: a reward that does not fit the automaton, or a number out of range.
     """
     reward, ratio = options.get("reward", "auto"), options.get("ratio")
     discount, shaping = options.get("discount"), options.get("shaping")

@@ -75,10 +75,6 @@ def unfolded(path: Bounded) -> Formula:
     """The equivalent formula without bounds, for a bound on steps.
 
     `a U[l,u] b` is `a & X(a U[l-1,u-1] b)`, and `a U<=u b` is `b | a & X(a U<=u-1 b)`; `R` dually.
-
-    Example:
-      >>> print(unfolded(Bounded("U", TRUE, Formula("ap", proposition="a"), upper=1)))
-      a | X a
     """
     if path.operator == "R":
         left = TRUE if path.left == FALSE else ~path.left

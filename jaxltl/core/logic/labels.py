@@ -33,15 +33,7 @@ def require_known(needed: Collection[str], known: Sequence[str], place: str) -> 
 def satisfying(
     label: NDArray[np.bool_], propositions: Sequence[str], condition: Formula | str, place: str
 ) -> NDArray[np.bool_]:
-    """The rows of labels that satisfy a Boolean formula.
-
-    Raises:
-      ValueError: an unknown proposition or a temporal operator.
-
-    Example:
-      >>> satisfying(np.array([[1, 0], [1, 1]], bool), ["a", "b"], "a & !b", "here").tolist()
-      [True, False]
-    """
+    """The rows of labels that satisfy a Boolean formula."""
     condition = as_formula(condition)
     temporal = [f for f in subformulas(condition) if f.operator not in _BOOLEAN]
     if temporal:

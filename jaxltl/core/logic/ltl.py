@@ -131,12 +131,7 @@ FALSE = Formula("false")
 
 
 def subformulas(formula: Formula) -> tuple[Formula, ...]:
-    """The distinct subformulas, each after its operands; the formula itself is last.
-
-    Example:
-      >>> [str(f) for f in subformulas(parse_ltl("a & X a"))]
-      ['a', 'X a', 'a & X a']
-    """
+    """The distinct subformulas, each after its operands; the formula itself is last."""
     done: dict[Formula, None] = {}
     stack = [(formula, False)]
     while stack:
@@ -294,12 +289,7 @@ def as_formula(formula: Formula | str) -> Formula:
 
 
 def proposition_text(name: str) -> str:
-    """The name as `parse_ltl` reads it: plain where it can be, else quoted.
-
-    Example:
-      >>> print(proposition_text("goal"), proposition_text("Goal"))
-      goal "Goal"
-    """
+    """The name as `parse_ltl` reads it: plain where it can be, else quoted."""
     if re.fullmatch(_NAME, name, re.ASCII):
         return name
     return '"' + re.sub(r'(["\\])', r"\\\1", name) + '"'
@@ -340,10 +330,6 @@ def negation_normal_form(formula: Formula) -> Formula:
 
     Negation is pushed inwards by the dualities `!X f = X !f`, `!F f = G !f`,
     `!(f U g) = !f R !g` and `!(f W g) = !f M !g` (Baier & Katoen 2008, section 5.1.5).
-
-    Example:
-      >>> print(negation_normal_form(parse_ltl("!(a U (b -> X c))")))
-      !a R (b & X !c)
     """
     forms: dict[Formula, tuple[Formula, Formula]] = {}  # the normal forms of f and of !f
     for node in subformulas(formula):
@@ -366,34 +352,19 @@ def negation_normal_form(formula: Formula) -> Formula:
 
 
 def offending_subformula(formula: Formula, fragment: Fragment) -> Formula | None:
-    """The outermost subformula of the normal form that leaves a fragment, or None.
-
-    Example:
-      >>> print(offending_subformula(parse_ltl("a & G F b"), "safety"))
-      F b
-    """
+    """The outermost subformula of the normal form that leaves a fragment, or None."""
     allowed = _BOOLEAN | _TEMPORAL[fragment]
     nodes = reversed(subformulas(negation_normal_form(formula)))
     return next((node for node in nodes if node.operator not in allowed), None)
 
 
 def is_syntactically_cosafe(formula: Formula) -> bool:
-    """True if the normal form uses only `X F U M`, so a finite prefix proves the formula.
-
-    Example:
-      >>> is_syntactically_cosafe(parse_ltl("!(G a)")), is_syntactically_cosafe(parse_ltl("G a"))
-      (True, False)
-    """
+    """True if the normal form uses only `X F U M`, so a finite prefix proves the formula."""
     return offending_subformula(formula, "cosafe") is None
 
 
 def is_syntactically_safe(formula: Formula) -> bool:
-    """True if the normal form uses only `X G R W`, so a finite prefix refutes the formula.
-
-    Example:
-      >>> is_syntactically_safe(parse_ltl("!F a")), is_syntactically_safe(parse_ltl("F a"))
-      (True, False)
-    """
+    """True if the normal form uses only `X G R W`, so a finite prefix refutes the formula."""
     return offending_subformula(formula, "safety") is None
 
 
@@ -405,11 +376,7 @@ Letter = Collection[str]
 
 
 def as_letters(letters: Iterable[Letter], place: str) -> list[frozenset[str]]:
-    """The letters as sets of proposition names.
-
-    Raises:
-      ValueError: where a letter is a bare string, which would be read character by character.
-    """
+    """The letters as sets of proposition names."""
     result = []
     for index, letter in enumerate(letters):
         if isinstance(letter, str) or not all(isinstance(name, str) for name in letter):
@@ -451,12 +418,7 @@ def holds_on_lasso(
 def truth_on_lasso(
     formula: Formula | str, prefix: Iterable[Letter], cycle: Iterable[Letter]
 ) -> list[bool]:
-    """Truth of the formula at each of the `n + m` positions, see `holds_on_lasso`.
-
-    Example:
-      >>> truth_on_lasso("a & X a", prefix=[], cycle=[{"a"}, {"a"}, set()])
-      [True, False, False]
-    """
+    """Truth of the formula at each of the `n + m` positions, see `holds_on_lasso`."""
     formula = as_formula(formula)
     stem = as_letters(prefix, "holds_on_lasso: prefix")
     word = stem + as_letters(cycle, "holds_on_lasso: cycle")

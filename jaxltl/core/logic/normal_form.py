@@ -248,11 +248,7 @@ def limit_parts(formula: Formula) -> tuple[Formula, ...]:
 def combination(
     formula: Formula, grouped: bool = True, dual: bool = False, steps: int = 1_000_000
 ) -> Combination:
-    """A positive combination of Sigma-2 and Pi-2 formulas and limits.
-
-    Raises:
-      ValueError: for too many steps or parts.
-    """
+    """A positive combination of Sigma-2 and Pi-2 formulas and limits."""
     parts = _combine(formula, grouped, dual, Rewriter(steps))
     if _size(parts) > MAX_PARTS:
         raise ValueError(

@@ -147,13 +147,7 @@ def is_invariant(formula: Formula) -> bool:
 
 
 def simplify(formula: Formula) -> Formula:
-    """An equivalent formula in negation normal form, with limits pulled outwards.
-
-    Example:
-      >>> from jaxltl import parse_ltl
-      >>> print(simplify(parse_ltl("G F (a | X F b) & F F c")))
-      (G F a | G F b) & F c
-    """
+    """An equivalent formula in negation normal form, with limits pulled outwards."""
     form: dict[Formula, Formula] = {}
     for node in subformulas(negation_normal_form(formula)):
         if node.operator in ("true", "false", "ap", "!"):

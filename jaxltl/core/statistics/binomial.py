@@ -27,11 +27,6 @@ def clopper_pearson(count: Integers, total: Integers, failure: float) -> Ends:
 
     ``P(Bin(n, lower) >= k) = P(Bin(n, upper) <= k) = failure / 2``. Each side misses with a chance
     of at most ``failure / 2``, whatever the probability, if n does not depend on what came.
-
-    Example:
-      >>> lower, upper = clopper_pearson(np.array([0, 5]), np.array([10, 10]), 0.05)
-      >>> lower.round(4).tolist(), upper.round(4).tolist()
-      ([0.0, 0.1871], [0.3085, 0.8129])
     """
     return _of_distinct(_tails, count, total, failure)
 
@@ -40,11 +35,6 @@ def hoeffding(count: Integers, total: Integers, failure: float) -> Ends:
     """Hoeffding interval (1963, theorem 1) around the frequency.
 
     ``k / n -+ sqrt(log(2 / failure) / (2 n))``, if n does not depend on what came.
-
-    Example:
-      >>> lower, upper = hoeffding(np.array([0, 50]), np.array([10, 100]), 0.05)
-      >>> lower.round(4).tolist(), upper.round(4).tolist()
-      ([0.0, 0.3642], [0.4295, 0.6358])
     """
     return around(frequency(count, total), hoeffding_deviation(total, failure))
 
@@ -57,11 +47,6 @@ def anytime(count: Integers, total: Integers, failure: float) -> Ends:
     ``1 / failure`` is at most `failure` (Ville; Robbins 1970; Waudby-Smith and Ramdas 2020). The
     intervals of all n hold at once: n may depend on what came, as where one tries until
     something happens, or looks at the intervals in order to go on.
-
-    Example:
-      >>> lower, upper = anytime(np.array([0, 5]), np.array([10, 10]), 0.05)
-      >>> lower.round(4).tolist(), upper.round(4).tolist()
-      ([0.0, 0.1176], [0.377, 0.8824])
     """
     return _of_distinct(_mixed, count, total, failure)
 

@@ -180,10 +180,6 @@ def l1_radius(total: Integers, num_outcomes: Integers, failure: float) -> Floats
     """L1 deviation of frequencies from probabilities at failure probability `failure`.
 
     ``sqrt(2 / n log((2^J - 2) / failure))`` (Weissman et al. 2003, theorem 2.1), at most 2.
-
-    Example:
-      >>> l1_radius(np.array([100, 0]), np.array([3, 3]), 0.1).round(4).tolist()
-      [0.2862, 2.0]
     """
     many = np.maximum(num_outcomes, 2)
     with np.errstate(divide="ignore"):
@@ -204,14 +200,6 @@ def samples_needed(
     """Number of samples of a row after which every interval has at most a given width.
 
     The widest interval is that of an outcome which comes half of the time.
-
-    Raises:
-      ValueError: `width` or `confidence` is not in (0, 1), `num_claims` is below 1 or
-        `num_outcomes` below 2, or more than 2^53 throws are needed.
-
-    Example:
-      >>> [samples_needed(0.02, 0.99, method=m) for m in ("clopper-pearson", "hoeffding")]
-      [16684, 26492]
     """
     _check_method(method)
     check_confidence(confidence)

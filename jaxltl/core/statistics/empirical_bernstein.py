@@ -25,16 +25,7 @@ _MOST = 0.5  # of a weight; more gains little where the variance is small, and l
 def bounded_mean(
     numbers: Floats, failure: float, *, planned: int | None = None
 ) -> tuple[float, float]:
-    """Confidence interval of the mean of numbers in [0, 1].
-
-    Raises:
-      ValueError: what are no numbers, or a chance outside of its range.
-
-    Example:
-      >>> ends = bounded_mean(np.tile([0.2, 0.3], 500), 0.05, planned=1000)
-      >>> [round(end, 3) for end in ends]
-      [0.242, 0.258]
-    """
+    """Confidence interval of the mean of numbers in [0, 1]."""
     x = np.atleast_1d(validation.float_array("numbers", numbers))
     failure = validation.fraction("failure", failure, ends=(False, False))
     if planned is not None:
