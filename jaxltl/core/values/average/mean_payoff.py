@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 from fractions import Fraction
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import NDArray
 
+from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.models.construct.padded import pad_rows
 from jaxltl.core.models.compiled.compiled import compiled_form, reshape_solution
@@ -23,13 +23,14 @@ from jaxltl.core.models.game import Game, as_game, as_padded_game, is_determinis
 from jaxltl.core.models.mesh.sharded import refuse_sharded
 from jaxltl.core.models.ops.array_namespace import is_traced
 from jaxltl.core.models.ops.operators import induced_chain
+from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import SparseMDP, choice_reward
 from jaxltl.core.types import Solution, status_code
 from jaxltl.core.values.discounted.discounted import expected_reward
 
 
 @validated()
-def mean_payoff(game: Any, reward: chex.Array, *, max_steps: int = 100_000) -> Solution:
+def mean_payoff(game: Model | Game, reward: chex.Array, *, max_steps: int = 100_000) -> Solution:
     """Mean payoff: the exact average reward that the system secures in a deterministic game.
 
     The value of ``liminf (r_1 + ... + r_n) / n`` under optimal play (Ehrenfeucht and
@@ -83,7 +84,7 @@ def mean_payoff(game: Any, reward: chex.Array, *, max_steps: int = 100_000) -> S
             "mean_payoff is for deterministic games, and some move of this one has several "
             "successors; use minimax_value with a discount near 1, or remove chance."
         )
-    graph, scale = _graph(game, reward)
+    graph, scale = _graph(form, reward)
     policy, gain, num_steps, done = _mean_iteration(graph, max_steps)
     exact = [Fraction(int(p), int(q) * scale) for p, q in zip(*gain, strict=True)]
     value, lower, upper = _as_floats(exact, np.dtype(game.dtype))
@@ -104,10 +105,10 @@ def mean_payoff(game: Any, reward: chex.Array, *, max_steps: int = 100_000) -> S
 class _Graph(NamedTuple):
     """A deterministic game over flat states, with integer rewards."""
 
-    successor: NDArray[Any]  # int[S, A]
-    weight: NDArray[Any]  # int64[S, A], or Python's integers where these are too small
-    available: NDArray[np.bool_]
-    system: NDArray[np.bool_]
+    successor: Integers  # int[S, A]
+    weight: Integers  # int64[S, A], or Python's integers where these are too small
+    available: Booleans
+    system: Booleans
 
 
 class _Biases(NamedTuple):
@@ -116,10 +117,10 @@ class _Biases(NamedTuple):
     # g is ``numerator / denominator`` in lowest terms, `rank` orders the gains, and `bias` is the
     # denominator times v.
 
-    numerator: NDArray[Any]
-    denominator: NDArray[Any]
-    rank: NDArray[np.integer[Any]]
-    bias: NDArray[Any]
+    numerator: Integers
+    denominator: Integers
+    rank: Integers
+    bias: Integers
 
 
 def _graph(game: Game, reward: jax.Array) -> tuple[_Graph, int]:
@@ -155,7 +156,9 @@ def _most_bias(num_states: int) -> int:
     return 2**61 // (8 * num_states)
 
 
-def _mean_iteration(graph: _Graph, max_steps: int):
+def _mean_iteration(
+    graph: _Graph, max_steps: int
+) -> tuple[Integers, tuple[Integers, Integers], int, bool]:
     """Optimal strategies of both players, the gains, the steps, and whether they are optimal."""
     states = np.arange(len(graph.system))
     policy = graph.available.argmax(-1)
@@ -179,7 +182,7 @@ def _mean_iteration(graph: _Graph, max_steps: int):
     return policy, (inner.numerator, inner.denominator), max_steps, False
 
 
-def _evaluate(successor: NDArray[Any], weight: NDArray[Any], old: _Biases) -> _Biases:
+def _evaluate(successor: Integers, weight: Integers, old: _Biases) -> _Biases:
     """Gains and biases of fixed choices, whose paths all end in cycles, by doubling of steps."""
     # On each cycle the bias of its first state is the old one where the gain is, and else zero.
     states = np.arange(len(successor))
@@ -205,20 +208,20 @@ def _evaluate(successor: NDArray[Any], weight: NDArray[Any], old: _Biases) -> _B
     return _Biases(numerator, denominator, _ranks(numerator, denominator), bias)
 
 
-def _ranks(numerator: NDArray[Any], denominator: NDArray[Any]) -> NDArray[Any]:
+def _ranks(numerator: Integers, denominator: Integers) -> Integers:
     pairs = list(zip(numerator.tolist(), denominator.tolist(), strict=True))
     order = sorted(set(pairs), key=lambda pair: Fraction(*pair))
     number = {pair: i for i, pair in enumerate(order)}
     return np.array([number[pair] for pair in pairs])
 
 
-def _images(graph: _Graph, v: _Biases) -> NDArray[Any]:
+def _images(graph: _Graph, v: _Biases) -> Integers:
     """Denominator times ``r - g + v(t)`` for each move to t, with the gain g of t."""
     t = graph.successor
     return v.denominator[t] * graph.weight - v.numerator[t] + v.bias[t]
 
 
-def _improve(graph: _Graph, v: _Biases, policy, chooser: NDArray[np.bool_]) -> NDArray[Any]:
+def _improve(graph: _Graph, v: _Biases, policy: Integers, chooser: Booleans) -> Integers:
     """The choosers' best moves, by gain and then by bias; changed only if strictly better."""
     states = np.arange(len(policy))
     sign = np.where(graph.system, 1, -1)[:, None]
@@ -232,7 +235,7 @@ def _improve(graph: _Graph, v: _Biases, policy, chooser: NDArray[np.bool_]) -> N
     return np.where(chooser & better, action, policy)
 
 
-def _taken_over(graph: _Graph, policy, v: _Biases, old: _Biases) -> _Biases:
+def _taken_over(graph: _Graph, policy: Integers, v: _Biases, old: _Biases) -> _Biases:
     """Biases of the environment's best answer that agree with old ones where these fit."""
     # They fit if no gain has changed. Then, on cycles of moves without slack, the bias is the old
     # one; elsewhere it exceeds v by the least sum of slack and excess on the way to such states.
@@ -256,7 +259,7 @@ def _taken_over(graph: _Graph, policy, v: _Biases, old: _Biases) -> _Biases:
         lift = least
 
 
-def _on_cycles(successor: NDArray[Any], used: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _on_cycles(successor: Integers, used: Booleans) -> Booleans:
     """States on a cycle of used moves."""
     from scipy import sparse  # a tenth of a second that only host graphs need
 
@@ -269,7 +272,7 @@ def _on_cycles(successor: NDArray[Any], used: NDArray[np.bool_]) -> NDArray[np.b
     return large
 
 
-def _as_floats(exact: list[Fraction], dtype: np.dtype) -> tuple[NDArray[Any], ...]:
+def _as_floats(exact: list[Fraction], dtype: np.dtype[np.floating]) -> tuple[Floats, ...]:
     """The nearest floats, and floats that enclose the exact numbers."""
     value = np.array([float(x) for x in exact]).astype(dtype)
     lower, upper = value.copy(), value.copy()

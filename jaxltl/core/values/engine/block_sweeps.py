@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -62,7 +63,7 @@ def sweep(
         return x, jnp.zeros((0, size), jnp.int32) if choose else None
     better = jnp.greater if maximize else jnp.less
 
-    def body(x: jax.Array, block: Any) -> Any:
+    def body(x: jax.Array, block: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array | None]:
         c, target, weight = block
         images = _combined(target, weight, x)
         best, rank = images[0], jnp.zeros(size, jnp.int32)
@@ -104,7 +105,7 @@ def meets(
     def once(blocks: Blocks, has: jax.Array, x: jax.Array) -> jax.Array:
         count, _, _, size = blocks.target.shape
 
-        def body(x: jax.Array, block: Any) -> Any:
+        def body(x: jax.Array, block: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array | None]:
             c, target, has = block
             start = blocks.first + c * size
             found = lax.dynamic_slice(x, (start,), (size,))
@@ -119,7 +120,7 @@ def meets(
     x = once(segments[0], support[0], x)
     if cyclic:
 
-        def again(state: Any) -> Any:
+        def again(state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
             x, _ = state
             new = once(segments[1], support[1], x)
             return new, jnp.any(new != x)
@@ -135,8 +136,8 @@ def meets(
 class Chosen:
     """The rows of a policy: ``x = sum_w weight * x[target]``."""
 
-    target: Any  # ``int32[C, W, B]`` of all blocks
-    weight: Any  # ``float[C, W, B]``
+    target: jax.Array  # ``int32[C, W, B]`` of all blocks
+    weight: jax.Array  # ``float[C, W, B]``
     cyclic: bool = struct.field(pytree_node=False)  # static
 
     def image(self, x: jax.Array) -> jax.Array:
@@ -152,7 +153,7 @@ class Chosen:
         """A pass of ``x = b + P x``; the constants are 0."""
         size = self.target.shape[2]
 
-        def body(x: jax.Array, block: Any) -> Any:
+        def body(x: jax.Array, block: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array | None]:
             start, target, weight = block
             (image,) = _combined(target[None], weight[None], x)
             image = image + lax.dynamic_slice(b, (start,), (size,))
@@ -173,7 +174,9 @@ class Chosen:
             spread = jnp.where(inner, 0, self.weight) * x.reshape(self.target.shape[0], 1, size)
             sums = sums.at[self.target].add(spread)
 
-        def body(sums: jax.Array, block: Any) -> Any:
+        def body(
+            sums: jax.Array, block: tuple[jax.Array, ...]
+        ) -> tuple[jax.Array, jax.Array | None]:
             start, target, weight = block
             mine = lax.dynamic_slice(sums, (start,), (size,))
             return sums.at[target].add(weight * mine, mode="promise_in_bounds"), None
@@ -189,7 +192,9 @@ class Chosen:
         """x with ``x - P' x = b``."""
         return self._solved(self._backward, b)
 
-    def _solved(self, one_pass: Any, b: jax.Array) -> jax.Array:
+    def _solved(
+        self, one_pass: Callable[[jax.Array, jax.Array], jax.Array], b: jax.Array
+    ) -> jax.Array:
         # A pass leaves what goes round for the next one, and nothing where there are no cycles.
         first = one_pass(jnp.zeros_like(b), b)
         if not self.cyclic:

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
 
-from jaxltl.core.models.protocols import ActionModel
+from jaxltl.core.models.protocols import ActionModel, Model, SuccessorModel
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.types import Solution, Status
 
 
-def rounding_unit(model: Any) -> Any:
+def rounding_unit(model: Model) -> jax.Array | float:
     """Rounding error of one backup, relative to the magnitude of its terms."""
     # A backup adds at most K products and takes a maximum or a mean over A actions. The sum of a
     # row may miss 1 by a rounding for each entry, since a model means its normalised rows.
@@ -22,34 +22,34 @@ def rounding_unit(model: Any) -> Any:
     return terms * float(jnp.finfo(model.dtype).eps)
 
 
-def underflow(model: Any) -> Any:
+def underflow(model: Model) -> jax.Array | float:
     """Absolute error of one backup by products that underflow, where XLA flushes them to zero."""
     return (widest_row(model) + most_choices(model) + 4) * float(jnp.finfo(model.dtype).tiny)
 
 
-def most_choices(model: Any) -> Any:
+def most_choices(model: Model) -> jax.Array | int:
     """Maximal number of choices of a state: static, for a sparse model ``int32[]``."""
     world = getattr(model, "mdp", model)
     if isinstance(world, SparseMDP):
         return jnp.max(jnp.diff(jnp.asarray(world.row_start)))
-    return model.num_actions
+    return cast(ActionModel, model).num_actions
 
 
-def widest_row(model: Any) -> Any:
+def widest_row(model: Model) -> jax.Array | int:
     """Maximal number of successors of a choice: static, for a sparse model ``int32[]``."""
     world = getattr(model, "mdp", model)
     if isinstance(world, SparseMDP):
         return jnp.max(jnp.diff(jnp.asarray(world.entry_start)))
-    return model.num_successors
+    return cast(SuccessorModel, model).num_successors
 
 
-def backup_error(unit: Any, *sizes: Any) -> jax.Array:
+def backup_error(unit: jax.Array | float, *sizes: jax.Array) -> jax.Array:
     """Absolute error of one backup: rounding relative to the magnitudes, and underflow."""
     # XLA flushes results below the least normal number to zero. A backup has ``unit / epsilon``
     # roundings, each of which may flush a product and a sum, hence the least magnitude ``2 tiny /
     # epsilon``.
     info = jnp.finfo(jnp.asarray(sizes[0]).dtype)
-    return unit * (sum(sizes) + 2 * float(info.tiny) / float(info.eps))
+    return unit * (sum(sizes[1:], sizes[0]) + 2 * float(info.tiny) / float(info.eps))
 
 
 Operator = Callable[[jax.Array], jax.Array]
@@ -88,7 +88,9 @@ def enclose(
     return judged(down, up, rounding, tolerance)
 
 
-def judged(down: Any, up: Any, rounding: Any, tolerance: Any) -> Enclosure:
+def judged(
+    down: jax.Array, up: jax.Array, rounding: jax.Array, tolerance: jax.Array | None
+) -> Enclosure:
     """The enclosure between two ends, relative to the image; `rounding` is included in both."""
     # A quarter of `rounding` on each side pays for rounding in ``middle - half`` and ``middle +
     # half``, so that the width is at most the tolerance as computed.

@@ -9,39 +9,42 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
-Step = Callable[[Any, Any, Any], Any]
+Table = TypeVar("Table")  # trees of arrays
+Carry = TypeVar("Carry")
+Given = TypeVar("Given")
+Result = TypeVar("Result")
 
 _ROW = 16  # the floats of the widest vector unit
 
 
 def iterate(
-    step: Step,
-    finished: Callable[[Any, Any], jax.Array],
-    table: Any,
-    carry: Any,
-    given: Any,
+    step: Callable[[Table, Carry, Given], Carry],
+    finished: Callable[[Carry, Given], jax.Array],
+    table: Table,
+    carry: Carry,
+    given: Given,
     *,
     max_steps: jax.Array | int,
     lanes: str = "in turn",
     every: int = 1,
-) -> tuple[Any, jax.Array]:
+) -> tuple[Carry, jax.Array]:
     """Repeats ``carry = step(table, carry, given)`` until ``finished(carry, given)``, at least once."""
 
-    def loop(table: Any, carry: Any, given: Any, most: jax.Array) -> tuple[Any, jax.Array]:
-        def one(carry: Any, n: jax.Array, active: jax.Array) -> tuple[Any, jax.Array]:
+    def loop(table: Table, carry: Carry, given: Given, most: jax.Array) -> tuple[Carry, jax.Array]:
+        def one(carry: Carry, n: jax.Array, active: jax.Array) -> tuple[Carry, jax.Array]:
             new = step(table, carry, given)
             if every == 1 and most.ndim == 0:
                 return new, n + 1  # the loop condition has tested it
             goes = active & (n < most)
             return jax.tree.map(partial(jnp.where, goes), new, carry), n + goes
 
-        def body(state):
+        def body(state: tuple[Carry, jax.Array, jax.Array]) -> tuple[Carry, jax.Array, jax.Array]:
             carry, n, active = state
             if every == 1:
                 carry, n = one(carry, n, active)
@@ -54,37 +57,40 @@ def iterate(
         return lax.while_loop(lambda state: jnp.any(state[2]), body, start)[:2]
 
     most = jnp.maximum(jnp.asarray(max_steps, jnp.int32), 1)
-    run = {"in turn": in_turn, "side by side": side_by_side, "mapped": _mapped}[lanes]
+    if lanes == "mapped":
+        return loop(table, carry, given, most)
+    run = side_by_side if lanes == "side by side" else in_turn
     return run(loop, table, carry, given, most)
 
 
-def _mapped(function: Callable[..., Any], *arguments: Any) -> Any:
-    return function(*arguments)
-
-
-def in_turn(function: Callable[..., Any], *arguments: Any) -> Any:
+def in_turn(function: Callable[..., Result], *arguments: object) -> Result:
     """``function(*arguments)``, batched sequentially under ``vmap``; not differentiable."""
     # For work whose amount depends on the data, or that is slower in a batch. The function takes
     # trees of arrays and closes over no batched array.
 
     @jax.custom_batching.sequential_vmap
-    def one(arguments: tuple[Any, ...]) -> Any:
+    def one(arguments: tuple[object, ...]) -> Result:
         return function(*arguments)
 
     return one(lax.stop_gradient(jax.tree.map(jnp.asarray, arguments)))
 
 
-def side_by_side(function: Callable[..., Any], table: Any, *arguments: Any) -> Any:
+def side_by_side(function: Callable[..., Result], table: Table, *arguments: object) -> Result:
     """``function(table, *arguments)``, batched under ``vmap`` with a last axis of lanes."""
     # The function takes arrays with and without that axis, and closes over no traced array. A
     # batched `table` is mapped as usual.
 
     @jax.custom_batching.custom_vmap
-    def one(table: Any, arguments: tuple[Any, ...]) -> Any:
+    def one(table: Table, arguments: tuple[object, ...]) -> Result:
         return function(table, *arguments)
 
     @one.def_vmap
-    def _(size: int, batched: Any, table: Any, arguments: tuple[Any, ...]) -> Any:
+    def _(
+        size: int,
+        batched: tuple[Table, tuple[object, ...]],
+        table: Table,
+        arguments: tuple[object, ...],
+    ) -> tuple[Result, Result]:
         of_table, of_arguments = batched
         if any(jax.tree.leaves(of_table)):
             axes = jax.tree.map(lambda b: 0 if b else None, (of_table, of_arguments))

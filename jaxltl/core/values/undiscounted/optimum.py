@@ -174,11 +174,11 @@ class _Search(NamedTuple):
         return self.components is None and not isinstance(self.model, Product)
 
     @property
-    def slack(self) -> float:
+    def slack(self) -> jax.Array | float:
         return rounding_unit(self.model)
 
     @property
-    def least(self) -> float:
+    def least(self) -> jax.Array | float:
         return underflow(self.model)
 
     @property

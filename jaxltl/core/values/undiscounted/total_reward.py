@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+
+from typing import TypeAlias, cast
 
 import chex
 import jax
@@ -12,13 +13,14 @@ from numpy.typing import NDArray
 
 from jaxltl.core.values.engine.state_quantities import reduction_for
 from jaxltl.core.values.engine.validated import validated
+from jaxltl.core.array_types import Floats
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.mesh.sharded import ShardedMDP, is_sharded
 from jaxltl.core.models.ops.array_namespace import is_traced
 from jaxltl.core.models.product import Product
-from jaxltl.core.models.protocols import Array, Model
+from jaxltl.core.models.protocols import ActionModel, Array, Model
 from jaxltl.core.models.sparse import Rewards, SparseMDP, choice_reward
 from jaxltl.core.sparse.solvers import reachability as optimal
 from jaxltl.core.types import Solution, require_shape
@@ -33,11 +35,13 @@ from jaxltl.core.values.interval.robust import refuse_nature, robust_total_rewar
 from jaxltl.core.values.undiscounted.traced_total_reward import total_reward_by_sweeps
 
 _SIX_DIGITS = 1e-6
+Reward: TypeAlias = str | Rewards | Array | None
+World = MDP | DenseMDP | ShardedMDP
 
 
 @validated()
 def total_reward(
-    model: Any,
+    model: Model,
     reward: str | Rewards | chex.Array | None,
     target: chex.Array | None = None,
     *,
@@ -181,7 +185,7 @@ def hitting_time(model: Model, policy: Array, target: Array) -> NDArray[np.float
     return time.reshape(model.state_shape)
 
 
-def _earned(model: Any, sparse: SparseMDP, reward: Any) -> np.ndarray:
+def _earned(model: Model, sparse: SparseMDP, reward: Reward) -> Floats:
     if is_sparse(model):
         return choice_reward(sparse, reward)
     if reward is None or isinstance(reward, str | Rewards):
@@ -190,7 +194,7 @@ def _earned(model: Any, sparse: SparseMDP, reward: Any) -> np.ndarray:
     states = model.state_shape
     if reward.shape == states:
         return reward.ravel()[sparse.host.state]
-    require_shape("reward", reward, (*states, model.num_actions))
+    require_shape("reward", reward, (*states, cast(ActionModel, model).num_actions))
     flat = reward.reshape(sparse.num_states, -1)
     return flat[sparse.host.state, np.asarray(sparse.action)]
 
@@ -199,7 +203,12 @@ def _earned(model: Any, sparse: SparseMDP, reward: Any) -> np.ndarray:
 
 
 def _by_sweeps(
-    model: Any, reward: Any, target: Any, policy: Any, objective: str, tolerance: Any
+    model: Model,
+    reward: Reward,
+    target: Array | None,
+    policy: Array | None,
+    objective: str,
+    tolerance: Array | float | None,
 ) -> Solution:
     world = model.mdp if isinstance(model, Product) else model
     if not isinstance(world, MDP | DenseMDP | ShardedMDP):
@@ -213,13 +222,14 @@ def _by_sweeps(
             "target."
         )
     require_shape("target", target, model.state_shape)
-    reward = _on_choices(model, world, reward)
-    _require_rewards(model, world, reward)
+    padded = cast(ActionModel, model)
+    reward = _on_choices(padded, world, reward)
+    _require_rewards(padded, world, reward)
     asked = default_tolerance(model) if tolerance is None else tolerance
-    return total_reward_by_sweeps(model, reward, target, policy, asked, objective=objective)
+    return total_reward_by_sweeps(padded, reward, target, policy, asked, objective=objective)
 
 
-def _on_choices(model: Any, world: Any, reward: Any) -> Any:
+def _on_choices(model: ActionModel, world: World, reward: Reward) -> Array:
     """A reward as one on actions: ``float[S, A]``."""
     actions = (*model.state_shape, model.num_actions)
     if reward is None or isinstance(reward, str | Rewards):
@@ -237,7 +247,7 @@ def _on_choices(model: Any, world: Any, reward: Any) -> Any:
     return reward
 
 
-def _require_rewards(model: Any, world: Any, reward: Any) -> None:
+def _require_rewards(model: ActionModel, world: World, reward: Array) -> None:
     least, state = _least_reward(model, world, reward)
     # Inside jit the status is NONFINITE.
     if not isinstance(least, jax.core.Tracer) and not least >= 0:
@@ -248,7 +258,7 @@ def _require_rewards(model: Any, world: Any, reward: Any) -> None:
 
 
 @jax.jit
-def _least_reward(model: Any, world: Any, reward: Any) -> Any:
+def _least_reward(model: ActionModel, world: World, reward: Array) -> tuple[jax.Array, jax.Array]:
     """The least reward of an available action, and its state; NaN if one is NaN."""
     least = jnp.min(jnp.where(model.available, reward, jnp.inf), axis=-1)
     least = least.reshape(world.num_states, -1).min(-1)

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -42,6 +42,7 @@ from jaxltl.core.models.ops.operators import (
 )
 from jaxltl.core.models.ops.successor_tables import action_columns, sweep_operator
 from jaxltl.core.models.product import Product
+from jaxltl.core.models.protocols import ActionModel
 from jaxltl.core.types import Solution, status_code
 from jaxltl.core.values.engine.certificates import refuse, rounding_unit, underflow
 from jaxltl.core.values.engine.chain_systems import ChainSystem
@@ -63,7 +64,7 @@ _MOST_STEPS = 1_000_000
 class _Problem(NamedTuple):
     """Residual problem after qualitative preprocessing."""
 
-    model: Any  # the model
+    model: ActionModel  # the model
     sign: int  # 1 for a maximum, -1 for a minimum; static
     reward: jax.Array  # ``float[S, A]``
     policy: jax.Array | None  # ``float[S, A]``, the policy to evaluate, or None
@@ -85,6 +86,10 @@ class _Point(NamedTuple):
     leaves: jax.Array
 
 
+_Progress = tuple[_Point, jax.Array, jax.Array, jax.Array, jax.Array]
+Tree = TypeVar("Tree")
+
+
 class Found(NamedTuple):
     """Result of :func:`total_reward_by_sweeps` without derivatives."""
 
@@ -102,7 +107,7 @@ class Found(NamedTuple):
 
 @partial(jax.jit, static_argnames=("objective",))
 def total_reward_by_sweeps(
-    model: Any,
+    model: ActionModel,
     reward: jax.Array,
     target: jax.Array,
     policy: jax.Array | None,
@@ -153,11 +158,11 @@ def total_reward_by_sweeps(
 
 
 def _enclosed(
-    model: Any,
+    model: ActionModel,
     reward: jax.Array,
     target: jax.Array,
-    policy: Any,
-    tolerance: Any,
+    policy: jax.Array | None,
+    tolerance: jax.Array | float,
     *,
     objective: str,
 ) -> Found:
@@ -172,7 +177,9 @@ def _enclosed(
 # --- what the graph decides -------------------------------------------------------------------
 
 
-def _of_policy(graph: TracedGraph, reward: jax.Array, target: jax.Array, policy: Any) -> _Problem:
+def _of_policy(
+    graph: TracedGraph, reward: jax.Array, target: jax.Array, policy: jax.Array
+) -> _Problem:
     taken = graph.available & (policy > 0)
     finite = policy_sets(graph, target, policy).one
     first = graph.first(taken)[1]
@@ -190,7 +197,9 @@ def _of_policy(graph: TracedGraph, reward: jax.Array, target: jax.Array, policy:
     )
 
 
-def _earning(graph: TracedGraph, reward: jax.Array, target: jax.Array, taken: Any) -> jax.Array:
+def _earning(
+    graph: TracedGraph, reward: jax.Array, target: jax.Array, taken: jax.Array
+) -> jax.Array:
     """The states from which a positive reward may be earned before the target."""
     some = graph.first(taken & _positive(reward))[0] & ~target
     return attract(graph, some, taken, among=~target).region & ~target
@@ -345,7 +354,7 @@ def _solved(
         size = jnp.maximum(jnp.maximum(jnp.abs(swept), jnp.abs(at.value)), tiny)
         return jnp.max(jnp.where(problem.open, jnp.abs(swept - at.value) / size, 0))
 
-    def body(carry: Any) -> Any:
+    def body(carry: _Progress) -> _Progress:
         at, n, _, best, rest = carry
         value, m = _improved(problem, factor, at)
         new = _backup(problem, value)
@@ -360,7 +369,7 @@ def _solved(
             jnp.where(halved, 0, waits).astype(jnp.int32),
         )
 
-    def goes_on(carry: Any) -> jax.Array:
+    def goes_on(carry: _Progress) -> jax.Array:
         _, n, found, _, rest = carry
         return ~(found <= goal) & (rest < _REST) & (n < _MOST_STEPS)
 
@@ -406,16 +415,14 @@ def _tried(problem: _Problem, unit: jax.Array, tolerance: jax.Array, k: _Search)
     holds = jnp.where(above, most <= offered, fewest >= offered)
     proven = jnp.all(jnp.where(problem.open, holds & jnp.isfinite(offered), True))
 
-    def kept(new: Any, old: Any, where: jax.Array) -> Any:
+    def kept(new: Tree, old: Tree, where: jax.Array) -> Tree:
         return jax.tree.map(lambda x, y: jnp.where(where, x, y), new, old)
 
-    news = tuple(
-        proven & side & (k.share <= old)
-        for side, old in zip((~above, above), k.shares, strict=True)
-    )
-    bounds = tuple(kept(offered, old, new) for new, old in zip(news, k.bounds, strict=True))
-    shares = tuple(kept(k.share, old, new) for new, old in zip(news, k.shares, strict=True))
-    safe = kept(at, k.safe, news[0] if problem.sign > 0 else news[1])
+    below = proven & ~above & (k.share <= k.shares[0])
+    over = proven & above & (k.share <= k.shares[1])
+    bounds = kept(offered, k.bounds[0], below), kept(offered, k.bounds[1], over)
+    shares = kept(k.share, k.shares[0], below), kept(k.share, k.shares[1], over)
+    safe = kept(at, k.safe, below if problem.sign > 0 else over)
     below_known, above_known = (x <= k.share for x in shares)
     narrower = jnp.clip(tolerance / (2 * _width(problem, bounds)), 1e-3, 0.5)
     floor = _ROUNDINGS * unit
