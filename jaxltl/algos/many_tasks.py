@@ -1,14 +1,14 @@
-"""One agent for many formulas: it follows sequences of what to reach and what to avoid.
+"""Zero-shot agents for temporal-logic formulas, conditioned on reach-avoid sequences.
 
-A network reads the world and the sequence that is still to be done. Trained on sequences that are
-drawn (:func:`~jaxltl.core.environments.sequence_task.sequence_environment`), by PPO or another learner,
-it does any formula over the same labels: the automaton of the formula tells, for each of its
-states, the sequences that lead to acceptance, and the network's own value which of them to follow
-(Jackermeier and Abate 2025, "DeepLTL"). Automata are made on the host once a formula; their tables
-are arrays, so that episodes of different formulas are lanes of one ``vmap``.
+A network reads the world and the remaining reach-avoid sequence. Trained on random sequences
+(:func:`~jaxltl.core.environments.sequence_task.sequence_environment`), by PPO or another learner,
+it generalises to any formula over the same labels: each state of the formula's automaton has
+sequences that lead to acceptance, of which the agent follows the one with the highest value
+(Jackermeier and Abate 2025, "DeepLTL"). Automata are translated on the host; their tables are arrays,
+so that episodes of different formulas are lanes of one ``vmap``.
 
-Example: what a network of the letter world would be trained on, and two formulas that it does then.
-(Of the network shapes alone: nothing is trained here.)
+Example: the training stages of a network of the letter world, and agents of two formulas. (Only
+shapes are shown; nothing is trained.)
 
   >>> import jax, numpy as np
   >>> from functools import partial
@@ -203,7 +203,7 @@ def stack_plans(plans: Sequence[Plan]) -> Plan:
     return jax.tree.map(lambda *rows: jnp.stack([padded(x) for x in rows]), *plans)
 
 
-_FORGETS = 1 / 16  # share of what a choice has been worth that is forgotten in a step
+_FORGETS = 1 / 16  # weight of the newest value in the mean of those of a followed sequence
 
 
 @brief
@@ -260,7 +260,7 @@ def sequence_agent(
         validation.boolean("sampled", sampled),
     )
     begin = Choice(jnp.int32(-1), jnp.int32(0), jnp.asarray(0.0))
-    return Agent(Partial(_act, how, actions, as_partial(network, "network"), plan), begin)
+    return Agent(Partial(_act, (how, actions, as_partial(network, "network"), plan)), begin)
 
 
 def sequence_policy(
@@ -324,7 +324,7 @@ def _actions_of(parameters: PyTree) -> Finite:
     """The actions of logits."""
     if isinstance(parameters, tuple):
         raise ValueError(
-            "actions=None, but the network speaks of a box; give the environment's, "
+            "actions=None, but the network returns a Gaussian; give the environment's, "
             "environment.actions."
         )
     return Finite(parameters.shape[-1])
@@ -333,7 +333,7 @@ def _actions_of(parameters: PyTree) -> Finite:
 def _judged(
     network: Callable[..., PyTree], plan: Plan, seen: PyTree, state: jax.Array
 ) -> tuple[PyTree, jax.Array]:
-    """What the network would do for each sequence of a state, and what it values each at."""
+    """Action parameters and values of each sequence of an automaton state."""
     rows = sequence_task.Sequence(
         jnp.asarray(plan.reach)[state],
         jnp.asarray(plan.avoid)[state],
@@ -351,15 +351,13 @@ def _judged(
 
 
 def _act(
-    how: _How,
-    space: Finite | Box | None,
-    network: Callable[..., PyTree],
-    plan: Plan,
+    agent: tuple[_How, Finite | Box | None, Callable[..., PyTree], Plan],
     memory: PyTree,
     observation: PyTree,
     allowed: jax.Array | None,
     key: chex.PRNGKey,
 ) -> tuple[PyTree, PyTree]:
+    how, space, network, plan = agent
     if not (hasattr(observation, "world") and hasattr(observation, "memory")):
         validation.instance(
             "observation",

@@ -307,7 +307,7 @@ def test_a_network_of_ppo_does_the_same_with_boxes(squash):
         np.testing.assert_allclose(same(keys), act(keys), rtol=1e-6)
         ends.append(np.asarray(same(keys)))
     assert (ends[0] >= [0, -3]).all() and (ends[0] <= [10, 5]).all() and ends[0].std(0).min() > 0.5
-    with pytest.raises(ValueError, match="actions=None, but the network speaks of a box"):
+    with pytest.raises(ValueError, match="actions=None, but the network returns a Gaussian"):
         agent = many_tasks.sequence_agent(network, told)
         agent.act(agent.memory, seen, None, jax.random.key(0))
 

@@ -524,7 +524,7 @@ def only(*rows):
             {"allowed": only([1, 0], [0, 0])},
             "no action is allowed in state 1",
         ),
-        (SPLIT, np.zeros((2, 1)), {"start": [1.0, 1.0]}, "start is no distribution"),
+        (SPLIT, np.zeros((2, 1)), {"start": [1.0, 1.0]}, "start is not a distribution"),
         (SPLIT, np.zeros((2, 1)), {"start": [1.0]}, r"start has shape \(1,\)"),
         (
             TURNS,
@@ -551,7 +551,7 @@ def only(*rows):
             {"method": "maximin"},
             "in state 0 action 0 has several",
         ),
-        (to_dense(TWO), np.zeros((2, 2)), {}, "model is a DenseMDP; learning plays in an explicit"),
+        (to_dense(TWO), np.zeros((2, 2)), {}, "model is a DenseMDP; learners sample an explicit"),
     ],
 )
 def test_bad_problems_are_refused(model, reward, options, message):

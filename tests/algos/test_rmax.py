@@ -452,7 +452,7 @@ def test_a_start_outside_the_region_is_told():
     )
     reward = np.zeros((3, 2))
     with pytest.raises(
-        ValueError, match=r"1 of the initial states .* region: 2\. .*environment can keep"
+        ValueError, match=r"1 of the initial states .* region: 2\. .*no strategy satisfies the task"
     ):
         rmax.make_problem(mdp, np.array([False, True, False]), reward)
     game = Game(mdp, jnp.array([False, True, True]))
@@ -502,7 +502,7 @@ def test_mistakes_in_the_problem():
         make(found.accepting, found.reward, environment="kind")
     with pytest.raises(ValueError, match="environment: the row of state"):
         make(found.accepting, found.reward, environment=np.zeros((144, 6)))
-    with pytest.raises(ValueError, match="start is no distribution"):
+    with pytest.raises(ValueError, match="start is not a distribution"):
         make(found.accepting, found.reward, start=np.ones(144))
     with pytest.raises(ValueError, match="needs 3 priorities"):
         rmax.make_problem(post_offices(), "G F p1 -> G F p2", np.zeros((36, 6)))

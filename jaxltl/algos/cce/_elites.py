@@ -100,7 +100,7 @@ def select(
     excess = jnp.max((cost - limit) / scale, axis=-1, initial=-jnp.inf)
     enough = jnp.sum(feasible) >= count
     rank = jnp.where(enough, objective, -excess)
-    # What cannot be used has to come after the worst that can, and -0 beside 0.
+    # Unusable samples rank after all usable ones, and -0 equals 0.
     most = jnp.finfo(rank.dtype).max
     rank = jnp.where(rank == 0, 0, jnp.clip(rank, -most, most))
     rank = jnp.where(jnp.where(enough, feasible, usable), rank, -jnp.inf)

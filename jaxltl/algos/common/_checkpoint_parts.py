@@ -140,7 +140,7 @@ def reading(path: str | os.PathLike[str]) -> Iterator[Parts]:
 
 
 def _ends(index: tuple[slice, ...], shape: Sequence[int]) -> tuple[list[int], list[int]]:
-    """Where a block begins and ends; axes that are not named are whole."""
+    """First and last indices of a block; axes that are not named are whole."""
     index = (*index, *(slice(None),) * (len(shape) - len(index)))
     each = [x.indices(int(n)) for x, n in zip(index, shape, strict=True)]
     return [x[0] for x in each], [x[1] for x in each]

@@ -308,8 +308,8 @@ def require_network(
         ) from problem
     if set(variables) - {"params"}:
         raise ValueError(
-            f"network keeps {sorted(set(variables) - {'params'})} beside its parameters; leave out "
-            "what is not learned by gradients."
+            f"network keeps {sorted(set(variables) - {'params'})} besides its parameters; remove "
+            "collections that are not learned by gradients."
         )
 
     def shapes(tree: PyTree) -> PyTree:

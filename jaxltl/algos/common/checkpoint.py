@@ -49,7 +49,7 @@ from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.models.protocols import PyTree
 
 _GIVEN = "given"  # the fingerprint's name in the file
-_PARTS = "parts"  # the name of what is in other files
+_PARTS = "parts"  # name of the index of arrays in other files
 
 
 @contextlib.contextmanager
@@ -245,7 +245,7 @@ def _require_same(path: str, before: dict[str, str], now: dict[str, str]) -> Non
             f"{path!r} does not belong to this run: {name} was "
             f"{before.get(name, 'not given')} and is {now.get(name, 'not given')}"
             + (f" ({len(other)} differences)" if len(other) > 1 else "")
-            + ". Delete the file to start afresh, or go on with what it was made with."
+            + ". Delete the file to start afresh, or continue with the original arguments."
         )
 
 

@@ -1,6 +1,6 @@
 """Runs of a learner in compiled chunks, on the host: reports, saved states, and resuming bitwise.
 
-Example: half of what is lacking in each step, for two runs side by side.
+Example: a contraction to a fixed point, for two lanes.
 
   >>> import jax, jax.numpy as jnp
   >>> from flax import struct

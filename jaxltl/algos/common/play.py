@@ -21,7 +21,7 @@ def explicit_game(game: Model) -> Game:
     game = as_padded_game(game)
     if not isinstance(game.mdp, MDP):
         raise ValueError(
-            f"the game's model is a {type(game.mdp).__name__}; learning plays in an explicit MDP: "
+            f"the game's model is a {type(game.mdp).__name__}; learners sample an explicit MDP: "
             "pass restrict(game).model, or convert it."
         )
     return game
@@ -76,10 +76,10 @@ def check_distributions(
     bad &= ~np.asarray(skip)
     if bad.any():
         raise ValueError(
-            f"{name}: the row of state {int(np.argmax(bad))} is no distribution over available "
+            f"{name}: the row of state {int(np.argmax(bad))} is not a distribution over available "
             "actions: entries must be at least 0, zero at other actions, and sum to 1."
             if len(rows) > 1
-            else f"{name} is no distribution: entries must be at least 0 and sum to 1."
+            else f"{name} is not a distribution: entries must be at least 0 and sum to 1."
         )
 
 

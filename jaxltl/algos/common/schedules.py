@@ -22,7 +22,7 @@ from flax import struct
 from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.pretty_print import brief
 
-# Products such as .07 * 100 come out a little above the integer that they are.
+# Products such as .07 * 100 round to slightly more than the exact integer.
 SLACK = 1e-9
 
 
@@ -185,7 +185,7 @@ def _polynomial(schedule: Schedule) -> tuple[float, float, float] | None:
     return None if callable(schedule) else (float(schedule), 0.0, 0.0)
 
 
-_FUNCTION = "it is a function; its limits cannot be told"
+_FUNCTION = "it is a function with unknown limits"
 
 
 def _samples_condition(hparams: PyTree, num_steps: int | None) -> tuple[float | None, Condition]:

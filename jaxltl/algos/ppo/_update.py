@@ -113,7 +113,7 @@ def improved(
     limits = Limits(at(hparams.clip, state.step), _at(hparams.value_clip, state.step))
     rate = at(hparams.learning_rate, state.step)
     recurrent, over = has_memory(problem), hparams.sharding
-    rows, begun = lanes.replicate((rows, begun), over)  # any device may be asked for any of them
+    rows, begun = lanes.replicate((rows, begun), over)  # a minibatch may contain any of them
     if not recurrent:
         rows = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rows)
 

@@ -123,7 +123,7 @@ def make_problem(
     actions = environment.actions
     if isinstance(actions, Box) and not jnp.issubdtype(jnp.dtype(actions.dtype), jnp.floating):
         raise ValueError(
-            f"environment.actions is a box of {actions.dtype}; number what is in it, Finite(n)."
+            f"environment.actions is a box of {actions.dtype}; enumerate its elements as Finite(n)."
         )
     network = default_network(actions) if network is None else network
     validation.instance("network", network, nn.Module, "a flax.linen.Module")

@@ -187,9 +187,8 @@ def _require_start_in(region: jax.Array, joint: _JointGame) -> None:
     ) + (", ..." if outside.size > 5 else "")
     raise ValueError(
         f"{outside.size} of the initial states lie outside of the almost-surely winning region: "
-        f"{named}. From there the task is lost, or the environment can keep the accepting states "
-        "from being visited again with positive probability (winning_region(...).counter_action "
-        "shows how); start elsewhere, or weaken the task."
+        f"{named}. From there no strategy satisfies the task almost surely "
+        "(winning_region(...).counter_action shows why); start elsewhere, or weaken the task."
     )
 
 
