@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from jaxltl.core.array_types import Array
 from jaxltl.core.games.objective import GR1
 from jaxltl.core.graphs.attractor import attract
 from jaxltl.core.graphs.graph import Graph
@@ -52,11 +53,11 @@ class _Arena(NamedTuple):
     """A game graph with its owners and its objective."""
 
     graph: Graph
-    system: Any
+    system: Array
     objective: GR1
 
 
-def solve_gr1(graph: Graph, system: Any, objective: GR1, moves: Any = None) -> Reactive:
+def solve_gr1(graph: Graph, system: Array, objective: GR1, moves: Array | None = None) -> Reactive:
     """Winning region of a GR(1) objective, and winning strategies of both players."""
     xp, arena = graph.xp, _Arena(graph, system, objective)
     num_guarantees, num_assumptions = len(objective.guarantees), len(objective.assumptions)
@@ -81,24 +82,24 @@ def solve_gr1(graph: Graph, system: Any, objective: GR1, moves: Any = None) -> R
     return Reactive(region, xp.stack(actions, axis=-1), xp.moveaxis(counters, 0, -1))
 
 
-def _keep(arena: _Arena, moves: Any, inside: Any, counters: Any) -> tuple[Any, Any]:
+def _keep(arena: _Arena, moves: Array, inside: Array, counters: Array) -> tuple[Array, Array]:
     """The subset in which the system can remain."""
     graph, system, _ = arena
     out = attract(graph, ~inside, moves, rule=~system, among=inside)
     return inside & ~out.region, graph.xp.where(inside & out.region, out.action, counters)
 
 
-def _within(arena: _Arena, moves: Any, inside: Any) -> Any:
+def _within(arena: _Arena, moves: Array, inside: Array) -> Any:
     """Moves of the system that surely stay inside, and all moves of the environment."""
     return moves & (arena.graph.forall(inside) | ~arena.graph.on_choices(arena.system))
 
 
-def _near(arena: _Arena, found: Any) -> Any:
+def _near(arena: _Arena, found: Array) -> Any:
     """The environment's moves that may lead to a set: ``bool[S, A]``. They help the system."""
     return arena.graph.exists(found) & ~arena.graph.on_choices(arena.system)
 
 
-def _pursue(arena: _Arena, j: int, inside: Any, allowed: Any) -> tuple[Any, Any]:
+def _pursue(arena: _Arena, j: int, inside: Array, allowed: Array) -> tuple[Array, Array]:
     """States from which the system, inside a set, meets guarantee j or an assumption fails."""
     graph, system, objective = arena
     xp = graph.xp
@@ -121,7 +122,9 @@ def _pursue(arena: _Arena, j: int, inside: Any, allowed: Any) -> tuple[Any, Any]
     return found, action
 
 
-def _waiting(arena: _Arena, i: int, inside: Any, allowed: Any, near: Any, found: Any) -> Any:
+def _waiting(
+    arena: _Arena, i: int, inside: Array, allowed: Array, near: Array, found: Array
+) -> Any:
     """States in which assumption i fails while the play is not near the set `found`."""
     missed = inside & ~near
     forced = attract(
@@ -134,7 +137,7 @@ def _waiting(arena: _Arena, i: int, inside: Any, allowed: Any, near: Any, found:
     return inside & ~forced.region
 
 
-def _prevent(arena: _Arena, inside: Any, allowed: Any, found: Any) -> Any:
+def _prevent(arena: _Arena, inside: Array, allowed: Array, found: Array) -> Any:
     """Moves of the environment, ``int32[M, S]``, that meet every assumption and avoid a set."""
     graph, system, objective = arena
     missed = inside & ~found
@@ -147,7 +150,7 @@ def _prevent(arena: _Arena, inside: Any, allowed: Any, found: Any) -> Any:
     return graph.xp.stack(moves)
 
 
-def gr1_layers(graph: Graph, system: Any, objective: GR1) -> Layers:
+def gr1_layers(graph: Graph, system: Array, objective: GR1) -> Layers:
     """Rounds of the triple fixpoint inside the region, one step each.
 
     In round r, with Y the states covered before, layer (r, i) is the greatest X from which the

@@ -14,6 +14,7 @@ import jax
 import numpy as np
 from flax import struct
 
+from jaxltl.core.array_types import Array
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.games import facts
 from jaxltl.core.games.generalized_reactivity import solve_gr1
@@ -251,19 +252,21 @@ def adversarial_chance(game: Game) -> tuple[Game, jax.Array]:
 class _Found(NamedTuple):
     """A winning region, with the system's moves inside and the environment's outside."""
 
-    region: Any
-    action: Any
+    region: Array
+    action: Array
 
 
 class _Arena(NamedTuple):
     """A game graph with its owners and its objective."""
 
     graph: Graph
-    system: Any
+    system: Array
     objective: Parity
 
 
-def solve_parity(graph: Graph, system: Any, objective: Parity, moves: Any = None) -> _Found:
+def solve_parity(
+    graph: Graph, system: Array, objective: Parity, moves: Array | None = None
+) -> _Found:
     """Winning region of a parity game, with moves of both players."""
     moves = graph.available if moves is None else moves & graph.available
     start = _Found(objective.won & ~objective.lost, graph.first(moves)[1])
@@ -271,7 +274,7 @@ def solve_parity(graph: Graph, system: Any, objective: Parity, moves: Any = None
     return _level(_Arena(graph, system, objective), 0, start, open_, moves)
 
 
-def _level(arena: _Arena, p: int, won: _Found, open_: Any, allowed: Any) -> _Found:
+def _level(arena: _Arena, p: int, won: _Found, open_: Array, allowed: Array) -> _Found:
     """The open states from which the system wins, if reaching `won` is winning too."""
     if p == arena.objective.num_priorities:
         return won
@@ -279,7 +282,7 @@ def _level(arena: _Arena, p: int, won: _Found, open_: Any, allowed: Any) -> _Fou
     return solve(arena, p, won, open_, allowed)
 
 
-def _even(arena: _Arena, p: int, won: _Found, open_: Any, allowed: Any) -> _Found:
+def _even(arena: _Arena, p: int, won: _Found, open_: Array, allowed: Array) -> _Found:
     """Greatest fixpoint: the system can remain, and meeting p infinitely often is winning."""
     graph, system, objective = arena
     xp = graph.xp
@@ -301,7 +304,7 @@ def _even(arena: _Arena, p: int, won: _Found, open_: Any, allowed: Any) -> _Foun
     return _Found(inside, xp.where(here & inside & system, stays, found.action))
 
 
-def _odd(arena: _Arena, p: int, won: _Found, open_: Any, allowed: Any) -> _Found:
+def _odd(arena: _Arena, p: int, won: _Found, open_: Array, allowed: Array) -> _Found:
     """Least fixpoint: the system can avoid meeting p infinitely often."""
     graph, system, objective = arena
     xp = graph.xp

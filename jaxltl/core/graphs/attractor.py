@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from jaxltl.core.array_types import Array
 from jaxltl.core.graphs.graph import Graph, graph_of, take
 from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.pretty_print import brief
@@ -98,12 +99,12 @@ def attractor(
 
 def attract(
     graph: Graph,
-    goal: Any,
-    allowed: Any = None,
+    goal: Array,
+    allowed: Array | None = None,
     *,
-    rule: Any = True,
+    rule: Array | bool = True,
     chance: str = "some",
-    among: Any = None,
+    among: Array | None = None,
 ) -> Attractor:
     """:func:`attractor` on a graph, with a rule ``bool[S]`` or ``bool[]``, True for exists."""
     xp, shape = graph.xp, graph.state_shape
@@ -144,7 +145,7 @@ def avoidable(model: Any, goal: jax.Array, allowed: jax.Array | None = None) -> 
     return to_jax(avoid(graph, *take(graph, (goal, allowed))))
 
 
-def avoid(graph: Graph, goal: Any, allowed: Any = None) -> Any:
+def avoid(graph: Graph, goal: Array, allowed: Array | None = None) -> Array:
     """:func:`avoidable` on a graph."""
     return ~attract(graph, goal, allowed, rule=False).region
 
@@ -187,12 +188,12 @@ def almost_surely_reaching(
 
 
 def surely(
-    graph: Graph, goal: Any, allowed: Any = None, *, reaching: Attractor | None = None
+    graph: Graph, goal: Array, allowed: Array | None = None, *, reaching: Attractor | None = None
 ) -> Attractor:
     """:func:`almost_surely_reaching` on a graph."""
     allowed = graph.available if allowed is None else allowed & graph.available
 
-    def inner(region: Any) -> Attractor:
+    def inner(region: Array) -> Attractor:
         # First all states that are forced out, then those that cannot reach the goal inside.
         outside = attract(graph, ~region, allowed, rule=False, among=~goal).region
         return attract(graph, goal, allowed & graph.forall(~outside))

@@ -5,12 +5,13 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import jax
+import numpy as np
 
+from jaxltl.core.array_types import Array
 from jaxltl.core.graphs.attractor import avoid
 from jaxltl.core.graphs.graph import Graph, graph_of, take
 from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.pretty_print import brief
-from jaxltl.core.sparse.graph.row_graph import RowGraph
 
 
 @brief
@@ -66,12 +67,11 @@ def end_components(
     return to_jax(components_within(graph, *take(graph, (region, allowed))))
 
 
-def components_within(graph: Graph, region: Any, allowed: Any = None) -> EndComponents:
+def components_within(graph: Graph, region: Array, allowed: Array | None = None) -> EndComponents:
     """:func:`end_components` of a graph."""
     allowed = graph.available if allowed is None else allowed & graph.available
-    if isinstance(graph, RowGraph):
-        found: Any = graph.components(region, allowed, closed=False)
-        return EndComponents(*found)
+    if graph.xp is np:
+        return EndComponents(*graph.components(region, allowed, closed=False))
     # Few states can stay in the region, as a rule.
     core = region & avoid(graph, ~region, allowed)
     allowed = allowed & graph.forall(core) & graph.on_choices(core)
@@ -84,7 +84,7 @@ def bottom_components(model: Any, allowed: jax.Array) -> EndComponents:
     return to_jax(closed_components(graph, take(graph, allowed)))
 
 
-def closed_components(graph: Graph, allowed: Any) -> EndComponents:
+def closed_components(graph: Graph, allowed: Array) -> EndComponents:
     """:func:`bottom_components` of a graph."""
     everywhere = graph.xp.ones(graph.state_shape, bool)
     return EndComponents(*graph.components(everywhere, allowed & graph.available, closed=True))

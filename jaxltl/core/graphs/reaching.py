@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from jaxltl.core.array_types import Array
 from jaxltl.core.graphs.attractor import attract, avoid, surely
 from jaxltl.core.graphs.graph import Graph
 
@@ -13,12 +14,12 @@ from jaxltl.core.graphs.graph import Graph
 class Sets(NamedTuple):
     """Prob1 states, prob0 states, and a policy that attains these probabilities."""
 
-    one: Any
-    zero: Any
-    action: Any
+    one: Array
+    zero: Array
+    action: Array
 
 
-def policy_sets(graph: Graph, target: Any, policy: Any) -> Sets:
+def policy_sets(graph: Graph, target: Array, policy: Array) -> Sets:
     """Prob0 and prob1 states of a policy, from its support."""
     allowed = graph.available & (policy > 0)
     zero = ~attract(graph, target, allowed).region
@@ -26,7 +27,7 @@ def policy_sets(graph: Graph, target: Any, policy: Any) -> Sets:
     return Sets(~doomed, zero, graph.xp.zeros(target.shape, np.int32))
 
 
-def max_sets(graph: Graph, target: Any) -> Sets:
+def max_sets(graph: Graph, target: Array) -> Sets:
     """Prob0 and prob1 states of the maximal probability, with a policy that attains it."""
     some = attract(graph, target)
     sure = surely(graph, target, reaching=some)
@@ -34,7 +35,7 @@ def max_sets(graph: Graph, target: Any) -> Sets:
     return Sets(sure.region, ~some.region, action)
 
 
-def min_sets(graph: Graph, target: Any) -> Sets:
+def min_sets(graph: Graph, target: Array) -> Sets:
     """Prob0 and prob1 states of the minimal probability, with a policy that attains it."""
     zero = avoid(graph, target)
     doomed = attract(graph, zero, among=~target).region

@@ -5,6 +5,7 @@ SciPy takes a tenth of a second to import, so below some size NumPy alone does t
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from jaxltl.core.array_types import Booleans, Integers
 
 SCIPY_SIZE = 100_000  # entries from which importing SciPy pays
+_READY = 20_000  # entries from which it is faster, once it is imported
 _FEW = 16  # columns up to which reducing them one by one beats a reduction over a short axis
 
 
@@ -76,12 +78,13 @@ class Rows:
     @cached_property
     def predecessors(self) -> tuple[Integers, Integers]:
         """The rows with successor t, one per entry and in order: ``row[start[t] : start[t + 1]]``."""
-        if self.successor.size > SCIPY_SIZE:
+        size = self.successor.size
+        if size > SCIPY_SIZE or (size > _READY and "scipy.sparse" in sys.modules):
             columns = self.matrix.tocsc()
             return columns.indptr, columns.indices
         order = np.argsort(self.successor, kind="stable")
         count = np.bincount(self.successor, minlength=self.num_states)
-        row = np.repeat(np.arange(self.num_rows), self.count)
+        row = np.repeat(np.arange(self.num_rows, dtype=np.int32), self.count)
         return np.concatenate([[0], count.cumsum()]), row[order]
 
 

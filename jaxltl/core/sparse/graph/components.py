@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from typing import Any
 
 import numpy as np
 
@@ -56,7 +57,8 @@ def forward_search(start: Integers, after: Integers, first: Booleans) -> Boolean
         order = csgraph.breadth_first_order(graph, first.size, return_predecessors=False)
         seen[order[1:]] = True
         return seen
-    begin, successor, mark = memoryview(start), memoryview(after), memoryview(seen)
+    arrays: tuple[Any, ...] = start, after, seen
+    begin, successor, mark = (memoryview(x) for x in arrays)
     todo = sources.tolist()
     while todo:
         node = todo.pop()

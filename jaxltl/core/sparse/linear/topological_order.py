@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Integers
-from jaxltl.core.sparse.rows import decrement, sorted_unique, concatenated_ranges
+from jaxltl.core.sparse.rows import Rows, concatenated_ranges, decrement, sorted_unique
 
 # Levels at most, and nodes for each further one: narrower levels are eliminated faster.
 _ROUNDS, _NODES = 16, 64
@@ -25,17 +25,7 @@ class Edges(NamedTuple):
 
     def reverse(self) -> Edges:
         """The graph with reversed edges."""
-        size = self.num_nodes
-        if self.target.size > 20_000:
-            from scipy import sparse
-
-            ones = np.ones(self.target.size, np.int8)
-            turned = sparse.csr_array((ones, self.target, self.start), shape=(size, size)).tocsc()
-            return Edges(turned.indptr, turned.indices)
-        order = np.argsort(self.target, kind="stable")
-        source = np.repeat(np.arange(size, dtype=np.int32), np.diff(self.start))
-        count = np.bincount(self.target, minlength=size)
-        return Edges(np.concatenate([[0], count.cumsum()]), source[order])
+        return Edges(*Rows(self.start, self.target, self.num_nodes).predecessors)
 
 
 class Levels(NamedTuple):
