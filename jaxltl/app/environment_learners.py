@@ -24,6 +24,7 @@ from jaxltl.core.environments.monitor import Verdict
 from jaxltl.core.values.evaluation.episode_scores import episode_evaluator
 from jaxltl.envs.networks import make_network, network_agent
 from jaxltl.app.wording import Record
+from jaxltl.core.models.protocols import PyTree
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,9 +32,9 @@ class Method:
     """A learner with its problem and hyperparameters."""
 
     algorithm: Any  # its module
-    problem: Any  # with `hparams`, arguments of its functions
-    hparams: Any
-    agent: Callable[[Any, bool], Agent]  # (state, likeliest) -> Agent, the policy of a state
+    problem: PyTree  # with `hparams`, arguments of its functions
+    hparams: PyTree
+    agent: Callable[[PyTree, bool], Agent]  # (state, likeliest) -> Agent, the policy of a state
     figures: tuple[str, ...]  # names of the metrics that are drawn
     kept: tuple[str, ...]  # names of the state's fields that determine a policy
     transitions: int  # bound of the environment's steps in a step of the learner
@@ -71,7 +72,7 @@ def _settings(task: EnvironmentTask) -> Record:
     return found
 
 
-def _size(shape: Any) -> int:
+def _size(shape: PyTree) -> int:
     return sum(
         math.prod(x.shape) for x in jax.tree.leaves(shape, is_leaf=lambda x: isinstance(x, Box))
     )
@@ -84,7 +85,7 @@ def _ppo(task: EnvironmentTask, environment: Environment, num_steps: int) -> Met
     problem = ppo.make_problem(environment, network=network)
     hparams = settings(ppo.Hparams, spec)
 
-    def agent(state: Any, likeliest: bool) -> Agent:
+    def agent(state: PyTree, likeliest: bool) -> Agent:
         return (ppo.greedy if likeliest else ppo.policy)(state, problem, hparams)
 
     return Method(
@@ -119,7 +120,7 @@ def _cce(task: EnvironmentTask, environment: Environment, num_steps: int) -> Met
     problem = cce.make_problem(score, first, limit=table.limit)
     hparams = settings(cce.Hparams, _settings(task))
 
-    def agent(state: Any, likeliest: bool) -> Agent:
+    def agent(state: PyTree, likeliest: bool) -> Agent:
         del likeliest
         return make(cce.policy(state, problem, hparams))
 
@@ -149,7 +150,7 @@ def _cpo(task: EnvironmentTask, environment: Environment, num_steps: int) -> Met
     problem = trust_region.make_problem(environment, horizon=num_steps, limit=table.limit)
     hparams = settings(trust_region.Hparams, _settings(task))
 
-    def agent(state: Any, likeliest: bool) -> Agent:
+    def agent(state: PyTree, likeliest: bool) -> Agent:
         return (trust_region.greedy if likeliest else trust_region.policy)(state, problem, hparams)
 
     return Method(
@@ -165,7 +166,7 @@ def _cpo(task: EnvironmentTask, environment: Environment, num_steps: int) -> Met
 
 
 def _costs_where_violated(
-    step: Callable[..., Timestep], world: Any, action: Any, key: chex.PRNGKey
+    step: Callable[..., Timestep], world: PyTree, action: PyTree, key: chex.PRNGKey
 ) -> Timestep:
     """Cost 1 where the formula is violated; its expected sum is the violation probability."""
     found = Timestep(*step(world, action, key))

@@ -26,6 +26,7 @@ from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.models.mesh.lanes import on_host, vmap_over_mesh
 from jaxltl.core.models.product import Product
 from jaxltl.app.wording import Record, Result
+from jaxltl.core.models.protocols import PyTree
 
 Hparams = TypeVar("Hparams")
 
@@ -38,8 +39,8 @@ def settings(kind: Callable[..., Hparams], given: Result) -> Hparams:
 
 def run_seeds(
     algorithm: Any,
-    problem: Any,
-    hparams: Any,
+    problem: PyTree,
+    hparams: PyTree,
     training: Training,
     *,
     chunk: int | None = None,
@@ -82,8 +83,8 @@ def run_seeds(
 
 @functools.partial(jax.jit, static_argnames=("init", "num_seeds"))
 def _first_states(
-    init: Callable[..., Any], seed: int, num_seeds: int, problem: Any, hparams: Any
-) -> Any:
+    init: Callable[..., PyTree], seed: int, num_seeds: int, problem: PyTree, hparams: PyTree
+) -> PyTree:
     """The initial states of N seeds, by one program."""
 
     def first(n: Any) -> Any:
@@ -95,10 +96,10 @@ def _first_states(
 
 
 @functools.cache  # the same function for each learner, so that it is compiled once
-def _first_of(init: Callable[..., Any]) -> Callable[..., Any]:
+def _first_of(init: Callable[..., PyTree]) -> Callable[..., PyTree]:
     """The initial state of lane n."""
 
-    def first(n: Any, seed: Any, problem: Any, hparams: Any) -> Any:
+    def first(n: Any, seed: Any, problem: PyTree, hparams: PyTree) -> Any:
         root = jax.random.fold_in(jax.random.key(seed), 1)
         return init(jax.random.fold_in(root, n), problem, hparams)
 

@@ -7,7 +7,6 @@ import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -60,6 +59,7 @@ from jaxltl.core.values.undiscounted.satisfaction import (
 )
 from jaxltl.core.values.undiscounted.total_reward import hitting_time
 from jaxltl.app.wording import Record, many
+from jaxltl.core.models.protocols import PyTree
 
 DOUBLE = True
 
@@ -228,7 +228,7 @@ def _compile_policy(problem: mlirl.Problem, hparams: mlirl.Hparams) -> Callable[
 
 @jax.jit
 def _softmax_policy(
-    parameters: Any, value: jax.Array, problem: mlirl.Problem, hparams: mlirl.Hparams
+    parameters: PyTree, value: jax.Array, problem: mlirl.Problem, hparams: mlirl.Hparams
 ) -> jax.Array:
     reward = problem.reward(parameters, problem.features)
     return softmax_policy(problem.model, reward, hparams.discount, value)
@@ -236,7 +236,7 @@ def _softmax_policy(
 
 @jax.jit
 def _solved(
-    parameters: Any, problem: mlirl.Problem, hparams: mlirl.Hparams
+    parameters: PyTree, problem: mlirl.Problem, hparams: mlirl.Hparams
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     solution = mlirl.solve(parameters, problem, hparams)
     log_policy = jnp.log(jnp.where(problem.counts > 0, solution.policy, 1))

@@ -10,7 +10,6 @@ import io
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -52,6 +51,7 @@ from jaxltl.core.values.evaluation.evaluation import (
     evaluate,
 )
 from jaxltl.app.wording import Record, many
+from jaxltl.core.models.protocols import PyTree
 
 DOUBLE = False  # environments are written for single precision
 _DRAWN = 4  # trajectories
@@ -74,7 +74,7 @@ class Outcome:
     """A finished job."""
 
     setup: Setup  # the task
-    states: Any  # of the learner, with a first axis of N seeds
+    states: PyTree  # of the learner, with a first axis of N seeds
     history: Mapping[str, np.ndarray]  # metrics [T, N] and step [T]
     chosen: int  # index of the kept seed
     evaluations: list[Evaluation]  # of every seed, from fresh episodes
@@ -136,7 +136,7 @@ def describe(setup: Setup) -> str:
     )
 
 
-def _shapes(setup: Setup) -> Any:
+def _shapes(setup: Setup) -> PyTree:
     made = setup.environment
     return jax.eval_shape(lambda key: made.observe(made.reset(key)), jax.random.key(0))
 
@@ -194,12 +194,12 @@ def learn(setup: Setup, training: Training) -> Outcome:
     return Outcome(setup, found.state, history, chosen, each, shown, seed)
 
 
-def _agent(setup: Setup, states: Any, i: int) -> Agent:
+def _agent(setup: Setup, states: PyTree, i: int) -> Agent:
     """The policy of a seed."""
     return _acting(setup, jax.tree.map(lambda x: x[i], states))
 
 
-def _acting(setup: Setup, state: Any) -> Agent:
+def _acting(setup: Setup, state: PyTree) -> Agent:
     return setup.method.agent(state, setup.task.evaluation.policy == "likeliest")
 
 
@@ -386,7 +386,7 @@ def save(out: Path, outcome: Outcome) -> None:
         file.write(page.encode())
 
 
-def _parts(method: Method, state: Any) -> list[tuple[str, Any]]:
+def _parts(method: Method, state: PyTree) -> list[tuple[str, PyTree]]:
     """Names and arrays of a state that determine a policy."""
     kept = {name: getattr(state, name) for name in method.kept}
     leaves, _ = jax.tree_util.tree_flatten_with_path(kept)

@@ -68,6 +68,7 @@ from jaxltl.core.models.construct.batch import (
 from jaxltl.core.models.construct.lifting import allowed_steps
 from jaxltl.core.models.construct.restrict import with_allowed
 from jaxltl.core.models.ops.operators import action_mean, expectation
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.models.product import Product, product
 from jaxltl.core.types import Solution, status_code
 from jaxltl.core.values.discounted.soft import soft_value
@@ -354,7 +355,7 @@ def _judge(
 def _plans(
     setup: Setup,
     network: Any,
-    parameters: Any,
+    parameters: PyTree,
     hparams: todirl.Hparams,
     count: int,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -381,7 +382,7 @@ def _plans(
 @partial(jax.jit, static_argnames=("network",))
 def _plan(
     network: todirl.RewardNetwork,
-    parameters: Any,
+    parameters: PyTree,
     model: Product,
     observation: jax.Array,
     hparams: todirl.Hparams,

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 import optax
 
 from jaxltl.algos import cce, trust_region as tr
@@ -21,6 +22,7 @@ from jaxltl.envs import lqr, navigation as nav
 from jaxltl.envs.navigation_steps import as_environment
 from jaxltl.envs.networks import apply, make_network
 from jaxltl.reproduce.experiment import Figures, svg_files
+from jaxltl.core.models.protocols import PyTree
 
 NETWORKS = ("2-2-1", "2-10-1", "2-10-10-1", "2-50-1")
 METHODS = ("CCE", "TRPO", "CPO", "penalised TRPO")
@@ -169,7 +171,7 @@ def _regulator(name: str, seeds: int, plan: Plan, optimum: lqr.Optimum) -> tuple
     return row, curves
 
 
-def _rounded(x: Any, digits: int = 4) -> np.ndarray:
+def _rounded(x: ArrayLike, digits: int = 4) -> np.ndarray:
     return np.round(np.asarray(x, float), digits)
 
 
@@ -195,8 +197,8 @@ class Search(NamedTuple):
     trajectories: jax.Array
     objective: jax.Array
     cost: jax.Array
-    state: Any
-    hparams: Any
+    state: PyTree
+    hparams: PyTree
 
 
 _NUM_TRAJECTORIES = 10  # of each sampled policy
@@ -239,7 +241,7 @@ def _scores(task: jax.Array, world: nav.Navigation, run: nav.Run) -> tuple[jax.A
     return tuple(jnp.stack(part)[task - 1] for part in zip(*every, strict=True))  # type: ignore
 
 
-def _search(robot: Robot, method: str, seeds: int, plan: Plan, pretrained: Any = None) -> Search:
+def _search(robot: Robot, method: str, seeds: int, plan: Plan, pretrained: PyTree = None) -> Search:
     """A search by a method, from scratch or from pretrained distributions of policies."""
     keys = _keys(seeds, robot.task)
     if method == "CCE":
@@ -247,7 +249,7 @@ def _search(robot: Robot, method: str, seeds: int, plan: Plan, pretrained: Any =
     return _trust_region(robot, method, keys, plan, pretrained)
 
 
-def _cross_entropy(robot: Robot, keys: jax.Array, plan: Plan, pretrained: Any) -> Search:
+def _cross_entropy(robot: Robot, keys: jax.Array, plan: Plan, pretrained: PyTree) -> Search:
     if pretrained is None:
         state, metrics = _train(keys, robot.problem, robot.hparams, plan.steps)
     else:
@@ -267,17 +269,17 @@ def _cross_entropy(robot: Robot, keys: jax.Array, plan: Plan, pretrained: Any) -
 
 @partial(jax.jit, static_argnums=4)
 def _train_from(
-    keys: jax.Array, family: Any, problem: cce.Problem, hparams: cce.Hparams, num_steps: int
-) -> Any:
+    keys: jax.Array, family: PyTree, problem: cce.Problem, hparams: cce.Hparams, num_steps: int
+) -> PyTree:
     """The search from an initial distribution for each seed."""
 
-    def one(key: jax.Array, family: Any) -> Any:
+    def one(key: jax.Array, family: PyTree) -> PyTree:
         return cce.train(key, replace(problem, family=family), hparams, num_steps=num_steps)
 
     return jax.vmap(one)(keys, family)
 
 
-def _feasible_policies(robot: Robot, seeds: int, plan: Plan) -> Any:
+def _feasible_policies(robot: Robot, seeds: int, plan: Plan) -> PyTree:
     """For each seed a distribution of feasible policies, found by minimising the cost alone.
 
     No policy satisfies the constraint with this margin, so the elites are those of the least cost.
@@ -288,7 +290,7 @@ def _feasible_policies(robot: Robot, seeds: int, plan: Plan) -> Any:
 
 
 def _trust_region(
-    robot: Robot, method: str, keys: jax.Array, plan: Plan, pretrained: Any
+    robot: Robot, method: str, keys: jax.Array, plan: Plan, pretrained: PyTree
 ) -> Search:
     hparams = replace(
         _TRUST,
@@ -305,17 +307,17 @@ def _trust_region(
 
 
 @partial(jax.jit, static_argnums=3)
-def _run(state: tr.State, problem: tr.Problem, hparams: tr.Hparams, num_steps: int) -> Any:
+def _run(state: tr.State, problem: tr.Problem, hparams: tr.Hparams, num_steps: int) -> PyTree:
     """Runs of all seeds in sequence: batched matrix products are slower."""
     return jax.lax.map(lambda s: tr.run(s, problem, hparams, num_steps=num_steps), state)
 
 
-def _imitate(state: tr.State, robot: Robot, hparams: tr.Hparams, families_: Any) -> tr.State:
+def _imitate(state: tr.State, robot: Robot, hparams: tr.Hparams, families_: PyTree) -> tr.State:
     """Policy networks fitted to the distributions' centers by least squares on their trajectories."""
     network = nav.policy_network(robot.world)
     descent = optax.adam(3e-3)
 
-    def imitate(state: tr.State, family: Any) -> tr.State:
+    def imitate(state: tr.State, family: PyTree) -> tr.State:
         policy = families.center(family)
         seen, _, _ = _drive(
             robot.environment,
@@ -327,11 +329,11 @@ def _imitate(state: tr.State, robot: Robot, hparams: tr.Hparams, families_: Any)
         seen = seen.reshape(-1, seen.shape[-1])
         goal = apply(network, policy, seen)
 
-        def loss(parameters: Any, chosen: jax.Array) -> jax.Array:
+        def loss(parameters: PyTree, chosen: jax.Array) -> jax.Array:
             mean, _ = tr.act(replace(state, parameters=parameters), hparams, seen[chosen])
             return jnp.mean((mean - goal[chosen]) ** 2)
 
-        def descend(carry: Any, key: jax.Array) -> Any:
+        def descend(carry: PyTree, key: jax.Array) -> PyTree:
             parameters, memory = carry
             chosen = jax.random.randint(key, (256,), 0, len(seen))
             updates, memory = descent.update(jax.grad(loss)(parameters, chosen), memory)
@@ -348,7 +350,7 @@ def _imitate(state: tr.State, robot: Robot, hparams: tr.Hparams, families_: Any)
 # --- trajectories of returned policies -------------------------------------------------------------
 
 
-def _by_network(network: Any, policy: jax.Array, seen: jax.Array, key: jax.Array) -> jax.Array:
+def _by_network(network: PyTree, policy: jax.Array, seen: jax.Array, key: jax.Array) -> jax.Array:
     del key
     return apply(network, policy, seen)
 
@@ -364,12 +366,12 @@ def _drive(
     key: jax.Array,
     number: int,
     horizon: int,
-) -> tuple[jax.Array, Any, tuple[jax.Array, jax.Array]]:
+) -> tuple[jax.Array, PyTree, tuple[jax.Array, jax.Array]]:
     """Observations ``[T, M, O]``, states ``[T, M]``, and J and Z ``[M]`` of M trajectories."""
     starts, noise = jax.random.split(key)
     places = jax.vmap(environment.reset)(jax.random.split(starts, number))
 
-    def move(places: Any, key: jax.Array) -> Any:
+    def move(places: PyTree, key: jax.Array) -> PyTree:
         seen = jax.vmap(environment.observe)(places)
         action = act(seen, key)
         found: Timestep = jax.vmap(lambda p, a: environment.step(p, a, None))(places, action)
@@ -381,8 +383,8 @@ def _drive(
 
 @partial(jax.jit, static_argnums=(2, 3))
 def _driven(
-    environment: Environment, policy: Any, number: int, horizon: int, key: jax.Array
-) -> Any:
+    environment: Environment, policy: PyTree, number: int, horizon: int, key: jax.Array
+) -> PyTree:
     if isinstance(policy, tuple):
         act = partial(_drawn, *policy)
     else:
@@ -391,9 +393,9 @@ def _driven(
     return path.state, scores
 
 
-def _policies(robot: Robot, run: Search, plan: Plan) -> list[Any]:
+def _policies(robot: Robot, run: Search, plan: Plan) -> list[PyTree]:
     """The returned policy of each seed; if none is feasible, the one of the least violation."""
-    policies: list[Any] = []
+    policies: list[PyTree] = []
     for i, key in enumerate(run.keys):
         state = jax.tree.map(lambda x, i=i: x[i], run.state)
         if run.method != "CCE":

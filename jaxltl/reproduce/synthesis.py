@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,9 +11,10 @@ import numpy as np
 
 from jaxltl.algos import maximin_q
 from jaxltl.app.job import plain
-from jaxltl.core.games.objective import buchi, gr1, safety
+from jaxltl.core.games.objective import GR1, Parity, buchi, gr1, safety
 from jaxltl.core.games.permissive import apply_strategy, permissive_strategy
 from jaxltl.core.games.winning import solve, task_game
+from jaxltl.core.models.construct.restrict import Restriction
 from jaxltl.core.models.game import Game
 from jaxltl.core.types import NotConverged, check
 from jaxltl.core.values.discounted.discounted import optimal_value
@@ -82,7 +82,7 @@ def figures(progress: Callable[[str], None] = lambda text: None) -> Figures:
     return plain(result)
 
 
-def _restricted(game: Game, objective: Any, bound: int | None = None) -> Any:
+def _restricted(game: Game, objective: Parity | GR1, bound: int | None = None) -> Restriction:
     return apply_strategy(permissive_strategy(game, objective, bound=bound))
 
 
@@ -97,7 +97,7 @@ def _value(game: Game) -> np.ndarray:
 def _example_1(size: int) -> tuple[Figures, Figures]:
     """A row of table 5, and the learning curve of size 4."""
 
-    def synthesize() -> Any:
+    def synthesize() -> Restriction:
         game = robots(size)
         return _restricted(game, safety(game, "!collision"))
 
@@ -141,7 +141,7 @@ def _learn(
 
 
 def _learning_curve(
-    size: int, strategy: Any, problem: maximin_q.Problem, learned: maximin_q.State
+    size: int, strategy: Restriction, problem: maximin_q.Problem, learned: maximin_q.State
 ) -> Figures:
     """Data of figure 13: the learned values, and their changes in steps of 10,000 moves."""
     hparams = maximin_q.Hparams(discount=DISCOUNT, num_chains=100, moves_per_step=100)

@@ -24,6 +24,7 @@ from jaxltl.core.values.undiscounted.performance import task_performances
 from jaxltl.envs import temporal_gridworld as grid
 from jaxltl.io.colored_world import read_world, write_world
 from jaxltl.reproduce.experiment import Figures, svg_files
+from jaxltl.core.models.protocols import PyTree
 
 METHODS = ("todirl", "incomplete", "patch5", "memoryless", "cloning")
 _MEMORY = {"incomplete": grid.INCOMPLETE, "memoryless": "true"}  # of the others, the task's
@@ -122,14 +123,14 @@ def _stacked(worlds: list[grid.World], memory: Automaton) -> Product:
     return _single(stack_products([w.mdp for w in worlds], memory, label_on="exit"))
 
 
-def _single(tree: Any) -> Any:
+def _single(tree: PyTree) -> PyTree:
     def one(x: jax.Array) -> jax.Array:
         return x.astype(jnp.float32) if jnp.issubdtype(x.dtype, jnp.floating) else x
 
     return jax.tree.map(one, tree)
 
 
-def _lane(tree: Any, number: int) -> Any:
+def _lane(tree: PyTree, number: int) -> PyTree:
     return jax.tree.map(lambda x: x[number], tree)
 
 
@@ -144,12 +145,12 @@ _CLONING = cloning.Hparams(learning_rate=3e-3, patience=500)
 
 
 @partial(jax.jit, static_argnums=0)
-def _begin(learner: Any, keys: jax.Array, problems: Any, hparams: Any) -> Any:
+def _begin(learner: Any, keys: jax.Array, problems: PyTree, hparams: PyTree) -> PyTree:
     return jax.vmap(lambda k, p: learner.init(k, p, hparams))(keys, problems)
 
 
 @partial(jax.jit, static_argnums=(0, 4))
-def _run(learner: Any, states: Any, problems: Any, hparams: Any, num_steps: int) -> Any:
+def _run(learner: Any, states: PyTree, problems: PyTree, hparams: PyTree, num_steps: int) -> PyTree:
     return jax.vmap(lambda s, p: learner.run(s, p, hparams, num_steps=num_steps, max_rows=1)[0])(
         states, problems
     )
@@ -202,7 +203,7 @@ class Performance(NamedTuple):
 
 
 def _evaluated(
-    setting: Setting, memory: Automaton, method: str, radius: int, parameters: Any
+    setting: Setting, memory: Automaton, method: str, radius: int, parameters: PyTree
 ) -> Performance:
     """The performance of each seed's parameters in its training world and in all test worlds."""
     seeds = len(setting.train)
@@ -221,7 +222,7 @@ def _evaluated(
 
 
 @partial(jax.jit, static_argnums=0)
-def _policies(method: str, parameters: Any, models: Product, seen: jax.Array) -> jax.Array:
+def _policies(method: str, parameters: PyTree, models: Product, seen: jax.Array) -> jax.Array:
     """Policies of each seed in its world: ``float[N, S, Q, A]``."""
     if method == "cloning":
         network = cloning.ConvolutionalPolicy(num_actions=models.num_actions)
@@ -232,10 +233,10 @@ def _policies(method: str, parameters: Any, models: Product, seen: jax.Array) ->
 
 
 @partial(jax.jit, static_argnums=0)
-def _everywhere(method: str, parameters: Any, models: Product, seen: jax.Array) -> jax.Array:
+def _everywhere(method: str, parameters: PyTree, models: Product, seen: jax.Array) -> jax.Array:
     """Policies of each seed in all worlds: ``float[N, M, S, Q, A]``."""
 
-    def one(parameters: Any) -> jax.Array:
+    def one(parameters: PyTree) -> jax.Array:
         copies = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(seen), *x.shape)), parameters)
         return _policies(method, copies, models, seen)
 
@@ -258,7 +259,7 @@ def _bounds(found: Any) -> Bounds:
     return Bounds(*(np.asarray(x, float) for x in (found.mean, (found.upper - found.lower) / 2)))
 
 
-def _row(found: Performance, states: Any) -> Figures:
+def _row(found: Performance, states: PyTree) -> Figures:
     each = found.test.mean.mean(1)
     return {
         "train_mean": found.train.mean.mean(),
@@ -287,7 +288,7 @@ def _curve(points: list[Performance]) -> Figures:
     return curve
 
 
-def _trajectories(setting: Setting, states: Any) -> list[Figures]:
+def _trajectories(setting: Setting, states: PyTree) -> list[Figures]:
     """Trajectories of the first seed's policy in its training world and in two test worlds."""
     parameters, drawn = jax.tree.map(lambda x: x[:1], states.best.parameters), []
     worlds = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import EllipsisType
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import jax
 import numpy as np
@@ -17,6 +17,7 @@ from jaxltl.core.models.product import Product
 from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.values.undiscounted.optimal_actions import OptimalActions
 from jaxltl.core.values.undiscounted.performance import Performance
+from jaxltl.core.models.protocols import PyTree
 
 TreeT = TypeVar("TreeT")
 
@@ -96,7 +97,7 @@ class Setup:
 class Learned:
     """Reward networks of N seeds."""
 
-    parameters: Any  # of the network, leading axis N
+    parameters: PyTree  # of the network, leading axis N
     held_out: np.ndarray  # float[N], negative log-likelihood of the average held-out pair
     best_step: np.ndarray  # int[N], after which the parameters were reached
     stopped: np.ndarray  # bool[N], whether learning ended by patience
