@@ -15,6 +15,7 @@ from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.models.compiled.compiled import compiled_form, reshape_solution
 from jaxltl.core.models.ops.choices import choices
 from jaxltl.core.models.ops.successor_tables import sweep_operator
+from jaxltl.core.models.protocols import Model
 from jaxltl.core.types import Solution, Status, status_code
 from jaxltl.core.values.discounted.discounted import (
     action_value,
@@ -113,23 +114,27 @@ def boltzmann_value(
     return reshape_solution(
         model,
         _boltzmann_value(
-            form, reward, discount, initial, tolerance, max_steps, adjoint=adjoint, method=method
+            form,
+            reward,
+            discount,
+            initial,
+            (tolerance, max_steps),
+            options=(adjoint, method),
         ),
     )
 
 
-@partial(jax.jit, static_argnames=("adjoint", "method"))
+@partial(jax.jit, static_argnames=("options",))
 def _boltzmann_value(
-    model: Any,
-    reward: Any,
-    discount: Any,
-    initial: Any,
-    tolerance: Any,
-    max_steps: Any,
+    model: Model,
+    reward: jax.Array,
+    discount: jax.Array | float,
+    initial: jax.Array | None,
+    limits: tuple[jax.Array | float | None, jax.Array | int],
     *,
-    adjoint: str,
-    method: str,
+    options: tuple[str, str],
 ) -> Solution:
+    (tolerance, max_steps), (adjoint, method) = limits, options
     discount = jnp.asarray(discount, model.dtype)
     given = _given(model, reward, discount, tolerance)
     reward, over = expected_reward(model, reward), choices(model)

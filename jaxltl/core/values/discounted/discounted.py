@@ -61,14 +61,7 @@ def action_value(
 
 
 def expected_reward(model: Any, reward: jax.Array) -> jax.Array:
-    """A reward on pairs ``[S, A]`` or transitions ``[S, A, K]`` as its expectation ``[S, A]``.
-
-    Zero at unavailable actions; values there and in padding are not read. For a sparse model see
-    :func:`~jaxltl.core.models.sparse.choice_reward`.
-
-    Raises:
-      ValueError: the reward has another shape.
-    """
+    """A reward on pairs ``[S, A]`` or transitions ``[S, A, K]`` as its expectation ``[S, A]``."""
     if isinstance(getattr(model, "mdp", model), SparseMDP):
         return jnp.asarray(choice_reward(getattr(model, "mdp", model), reward), model.dtype)
     actions = (*model.state_shape, model.num_actions)
@@ -83,32 +76,18 @@ def expected_reward(model: Any, reward: jax.Array) -> jax.Array:
 
 
 def reward_size(model: Any, reward: Any) -> jax.Array:
-    """Largest expected magnitude of a reward, by which rounding errors are bounded.
-
-    Large rewards of transitions may cancel in the expectation, their rounding does not.
-    """
+    """Largest expected magnitude of a reward: rounding of rewards that cancel does not cancel."""
     return jnp.max(expected_reward(model, jax.tree.map(jnp.abs, reward)))
 
 
-# --- shared by discounted solvers -----------------------------------------------------------
-
-
 class Parameters(NamedTuple):
-    """Numbers of a discounted problem, for :mod:`jaxltl.core.values.engine.newton`.
+    """Numbers of a discounted problem, for :mod:`jaxltl.core.values.engine.newton`."""
 
-    Attributes:
-      discount: a scalar.
-      size: the largest reward, see :func:`reward_size`.
-      unit: relative rounding of a backup.
-      tolerance: width of the enclosure, or None.
-      policy: a policy's weights, in columns, or None.
-    """
-
-    discount: jax.Array
-    size: jax.Array
-    unit: jax.Array
-    tolerance: jax.Array | None
-    policy: Any = None
+    discount: jax.Array  # a scalar
+    size: jax.Array  # the largest reward, see reward_size
+    unit: jax.Array  # relative rounding of a backup
+    tolerance: jax.Array | None  # width of the enclosure, or None
+    policy: Any = None  # a policy's weights, in columns, or None
 
 
 def judge(value: jax.Array, image: jax.Array, given: Parameters) -> tuple[jax.Array, jax.Array]:
@@ -176,9 +155,6 @@ def differentiable(
 
     value = implicit(backup, solution.value, solve=solve, transpose_solve=transpose_solve)
     return replace(solution, value=value)
-
-
-# --- a policy --------------------------------------------------------------------------------
 
 
 @validated()
@@ -276,9 +252,6 @@ def _policy_value(model, policy, reward, discount, tolerance, max_steps) -> Solu
         checked.valid,
         checked.representable,
     )
-
-
-# --- optimal values --------------------------------------------------------------------------
 
 
 @validated(method=_METHODS)

@@ -16,6 +16,7 @@ from jaxltl.core.models.compiled.compiled import compiled_form, reshape_solution
 from jaxltl.core.models.ops.choices import choices
 from jaxltl.core.models.ops.operators import expectation, pushforward
 from jaxltl.core.models.ops.successor_tables import PredecessorTable, sweep_operator
+from jaxltl.core.models.protocols import Model
 from jaxltl.core.types import Solution
 from jaxltl.core.values.discounted.discounted import (
     Parameters,
@@ -77,21 +78,21 @@ def soft_value(
     """
     form, reward = compiled_form(model, reward)
     return reshape_solution(
-        model, _soft_value(form, reward, discount, initial, tolerance, max_steps, method=method)
+        model, _soft_value(form, reward, discount, initial, (tolerance, max_steps), method=method)
     )
 
 
 @partial(jax.jit, static_argnames=("method",))
 def _soft_value(
-    model: Any,
-    reward: Any,
-    discount: Any,
-    initial: Any,
-    tolerance: Any,
-    max_steps: Any,
+    model: Model,
+    reward: jax.Array,
+    discount: jax.Array | float,
+    initial: jax.Array | None,
+    limits: tuple[jax.Array | float | None, jax.Array | int],
     *,
     method: str,
 ) -> Solution:
+    tolerance, max_steps = limits
     given = parameters(model, reward, discount, tolerance)
     reward, over = expected_reward(model, reward), choices(model)
     start = jnp.zeros(model.num_states, model.dtype) if initial is None else initial.ravel()
@@ -144,11 +145,7 @@ def with_softmax(
 def softmax_policy(
     model: Any, reward: jax.Array, discount: jax.Array | float, value: jax.Array
 ) -> jax.Array:
-    """The softmax of the action values of a value, ``float[S, A]`` or ``float[R]``.
-
-    Every available action has a positive probability, also where its exponential is too small for
-    the dtype: what a policy surely does depends on it.
-    """
+    """Softmax of action values; every available action has a positive normal probability."""
     q, over = policy_logits(model, reward, discount, value), choices(model)
     # As a constant: where the compiler rounds q otherwise elsewhere, no entry equals the maximum,
     # and its derivative is 0 / 0.

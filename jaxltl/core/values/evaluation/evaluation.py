@@ -84,11 +84,7 @@ def episode_totals(
     num_steps: int,
     discount: chex.Numeric = 1.0,
 ) -> EpisodeTotals:
-    """Summary of the episode that ``run_episode`` returns for the same key.
-
-    For ``jit`` and ``vmap``. Nothing is kept of a step, and it ends with the episode; side by side
-    with others, with the longest.
-    """
+    """Totals of the episode that ``run_episode`` returns for the same key, without its steps."""
     begin, path = begin_episode(key, environment, agent)
     task, number = task_world(begin.world), jnp.result_type(float)
     counted = hasattr(task, "accepted")
@@ -143,9 +139,6 @@ def task_world(world: Any) -> Any:
         return hasattr(x, "verdict")
 
     return next(filter(tells, jax.tree.leaves(world, is_leaf=tells)), None)
-
-
-# --- results --------------------------------------------------------------------------------------
 
 
 @brief(facts=facts.estimate)
@@ -403,9 +396,6 @@ def _batch(
 
     keys = jax.vmap(partial(jax.random.fold_in, key))(first + jnp.arange(batch.size))
     return vmap_split(one, batch.sharding, (0, None, None))(keys, players, discount)
-
-
-# --- on the host ----------------------------------------------------------------------------------
 
 
 def _decided(success: int, count: int, threshold: float, failure: float) -> bool | None:

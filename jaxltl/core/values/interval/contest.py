@@ -38,30 +38,20 @@ _EQUAL = 2.0**12  # roundings by which equal values may differ
 
 @struct.dataclass
 class Contest:
-    """Optimality equations of interval rows between open states.
+    """Optimality equations of interval rows between open states."""
 
-    Attributes:
-      target: ``int32[R, W]``, nodes; N is worth 0, N + 1 is worth 1.
-      owner: ``int32[R]``.
-      choice: ``int32[N, A]``, the rows of each node.
-      first: ``int32[N]``, rows by which the policy gets out, if it leads.
-      lower, upper: ``float[R, W]``, 0 where there is no entry.
-      cost: ``float[R]``, with the sign.
-      policy_leads, nature_leads: static.
-      relative: whether widths are asked for as a share of the value, static.
-      has_free_cycles: whether the leader may stay for ever for nothing, static.
-    """
-
-    target: Any
-    owner: Any
-    choice: Any
-    first: Any
-    lower: Any
-    upper: Any
-    cost: Any
+    target: jax.Array  # int32[R, W], nodes; N is worth 0, N + 1 is worth 1
+    owner: jax.Array  # int32[R]
+    choice: jax.Array  # int32[N, A], the rows of each node
+    first: jax.Array  # int32[N], rows by which the policy gets out, if it leads
+    lower: jax.Array  # float[R, W], 0 where there is no entry
+    upper: jax.Array
+    cost: jax.Array  # float[R], with the sign
     policy_leads: bool = struct.field(pytree_node=False)
     nature_leads: bool = struct.field(pytree_node=False)
+    # whether the tolerance is a share of the value
     relative: bool = struct.field(pytree_node=False)
+    # whether the leader may stay forever at no cost
     has_free_cycles: bool = struct.field(pytree_node=False)
 
     @property
@@ -101,25 +91,16 @@ class Contest:
 
 
 class Bounds(NamedTuple):
-    """Bounds of the nodes, and a pair of policy and nature.
+    """Bounds of the nodes, and a pair of policy and nature."""
 
-    Attributes:
-      near, far: ``float[N]``: what the leader attains, and what it cannot exceed.
-      attained, bounded: whether they are proven.
-      middle: ``float[N]``, the solution between them.
-      row: ``int32[N]``, rows of the policy.
-      probability: ``float[R, W]``, nature's distributions.
-      rounds: systems solved.
-    """
-
-    near: jax.Array
+    near: jax.Array  # float[N]: what the leader attains, and what it cannot exceed
     far: jax.Array
-    attained: jax.Array
+    attained: jax.Array  # whether they are proven
     bounded: jax.Array
-    middle: jax.Array
-    row: jax.Array
-    probability: jax.Array
-    rounds: jax.Array
+    middle: jax.Array  # float[N], the solution between them
+    row: jax.Array  # int32[N], rows of the policy
+    probability: jax.Array  # float[R, W], nature's distributions
+    rounds: jax.Array  # systems solved
 
 
 def _all(z: jax.Array) -> jax.Array:

@@ -31,10 +31,7 @@ def require_objective(objective: str) -> str:
 
 
 def nature_direction(nature: str | None, objective: str) -> str:
-    """``"max"`` or ``"min"``: what nature optimises under an objective of the policy.
-
-    An ``"adversarial"`` nature (the default) wants the opposite, a ``"cooperative"`` one the same.
-    """
+    """``"max"`` or ``"min"``, the direction in which nature optimises."""
     require_objective(objective)
     nature = "adversarial" if nature is None else nature
     validation.choice("nature", nature, ("adversarial", "cooperative"))
@@ -250,11 +247,7 @@ def robust_expectation(
 
 
 def entry_reward(model: IntervalMDP, reward: Any) -> np.ndarray:
-    """Reward of each entry, ``float64[T]``.
-
-    Raises:
-      ValueError: some of it is not finite.
-    """
+    """Finite reward of each entry, ``float64[T]``."""
     given = reward_structure(model.nominal, reward)
     host = model.nominal.host
     apart = choice_reward(model.nominal, Rewards(state=given.state, choice=given.choice))
@@ -271,11 +264,7 @@ def entry_reward(model: IntervalMDP, reward: Any) -> np.ndarray:
 
 
 def interval_reward(model: IntervalMDP, reward: Any) -> np.ndarray:
-    """The reward of each choice, ``float64[R]``.
-
-    Raises:
-      ValueError: it is negative or not finite, or depends on the successor that nature picks.
-    """
+    """Non-negative reward of each choice, ``float64[R]``, if it is independent of nature."""
     earned = choice_reward(model.nominal, reward)
     bad = ~((earned >= 0) & np.isfinite(earned))
     if bad.any():
@@ -327,21 +316,13 @@ def robust_solution(
 
 
 class Sides(NamedTuple):
-    """An uncertain MDP with the directions of policy and nature.
+    """An uncertain MDP with the directions of policy and nature."""
 
-    Attributes:
-      model: the model that was asked about.
-      host: the one that is solved, in which a policy and nature choose.
-      maximize, helpful: whether the policy, and nature, make a value large.
-      spread: how the one became the other, where they differ.
-      policy: the policy that was given.
-    """
-
-    model: Any
-    host: UncertainMDP
-    maximize: bool
-    helpful: bool
-    spread: EncodedChoices | None
+    model: Any  # the given model
+    host: UncertainMDP  # the solved one, in which a policy and nature choose
+    maximize: bool  # whether the policy maximises
+    helpful: bool  # whether nature maximises
+    spread: EncodedChoices | None  # of the given model in the solved one
     policy: Any
 
     def query(self, tolerance: float) -> Query:
@@ -389,11 +370,7 @@ def sides_of(model: Any, policy: Any, objective: str, nature: str | None) -> Sid
 
 
 def world_of(model: Any) -> tuple[IntervalMDP, np.ndarray | None]:
-    """The interval model, and in a game the states of the system.
-
-    Raises:
-      ValueError: the model, or what a game is on, is none.
-    """
+    """The interval model, and in a game the states of the system."""
     world = model.mdp if isinstance(model, Game) else model
     if isinstance(world, SparseMDP) and isinstance(model, Game):
         world = make_interval(world, world.probability, world.probability)

@@ -107,13 +107,7 @@ def robust_product_satisfaction(
     nature: str | None = None,
     tolerance: Any = None,
 ) -> Solution:
-    """Robust satisfaction probability from all states of a product of an interval MDP.
-
-    Raises:
-      ValueError: the product's actions are restricted, or a policy is none.
-
-    Concrete arrays only, on the host; not differentiable.
-    """
+    """Robust satisfaction probability from all states of a product of an interval MDP."""
     if not isinstance(model, Product) or not isinstance(model.mdp, IntervalMDP):
         raise ValueError(
             f"{type(model).__name__} is no product of an interval model; give "

@@ -64,41 +64,25 @@ class Objective:
 
 @brief
 class Part(NamedTuple):
-    """Place of an objective in a weighted problem.
+    """Place of an objective in a weighted problem."""
 
-    Attributes:
-      number: of the objective, from 0.
-      kind: ``"sure"`` for a probability, ``"gain"`` for a maximised reward, ``"cost"``.
-      place: its number among those of its kind.
-      sign: 1 to maximise, -1 to minimise.
-      open: ``bool[N]``, of a reward with a target, where that is not reached yet.
-    """
-
-    number: int
-    kind: str
-    place: int
-    sign: int
-    open: np.ndarray | None
+    number: int  # of the objective, from 0
+    kind: str  # "sure" for a probability, "gain" for a maximised reward, "cost"
+    place: int  # its number among those of its kind
+    sign: int  # 1 to maximise, -1 to minimise
+    open: np.ndarray | None  # bool[N], of a reward with a target, where that is not reached yet
 
 
 class _Tracker(NamedTuple):
-    """Deterministic monitor of an objective.
+    """Deterministic monitor of an objective."""
 
-    Attributes:
-      delta: ``int[Q, L]``.
-      letter: ``int[S]``.
-      first: the initial state, before anything is read.
-      decided: ``bool[Q]``, where the verdict is known.
-      priority: ``int[Q, L]`` of reading a letter, of the event to be maximised; None of a reward.
-      verdict: ``int[Q]``, the priority of decided states.
-    """
-
-    delta: np.ndarray
-    letter: np.ndarray
-    first: int
-    decided: np.ndarray
+    delta: np.ndarray  # int[Q, L]
+    letter: np.ndarray  # int[S]
+    first: int  # the initial state, before anything is read
+    decided: np.ndarray  # bool[Q], where the verdict is known
+    # int[Q, L] of reading a letter, of the event to be maximised; None of a reward
     priority: np.ndarray | None
-    verdict: np.ndarray | None
+    verdict: np.ndarray | None  # int[Q], the priority of decided states
 
 
 def weighted_problem(

@@ -31,22 +31,14 @@ _KEPT = 0.75  # of the extra cost: who gains less stays, and the rest is what pr
 
 
 class Problem(NamedTuple):
-    """The cyclic blocks of a system.
-
-    Attributes:
-      core: the blocks.
-      given: options of :func:`~jaxltl.core.values.engine.block_sweeps.sweep`.
-      unit, least: what a sum loses, as a share and besides.
-      tolerance: the width asked for.
-      relative: whether that is a share of the value.
-    """
+    """The cyclic blocks of a system."""
 
     core: Blocks
-    given: dict[str, Any]
-    unit: float
-    least: float
-    tolerance: jax.Array
-    relative: bool
+    given: dict[str, Any]  # options of block_sweeps.sweep
+    unit: float  # relative rounding error of a sum
+    least: float  # loss of a sum to underflow
+    tolerance: jax.Array  # width of the enclosure
+    relative: bool  # whether the tolerance is a share of the value
 
     @property
     def span(self) -> slice:

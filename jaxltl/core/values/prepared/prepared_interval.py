@@ -47,11 +47,10 @@ _LOOSE = 1e-6  # how far ends may miss a distribution, as in the models
 @brief(facts=facts.prepared)
 @struct.dataclass
 class PreparedInterval:
-    """A question about an interval model after preprocessing, for solves with other intervals.
+    """A preprocessed question about an interval model, see :class:`Prepared`.
 
-    Made by :func:`prepare_interval`, read by :func:`solve_prepared_interval`. Give it to a
-    compiled function as an argument. Open states are nodes, of which there are N; the node N is
-    worth 0, N + 1 is worth 1, and N + 2 infinity.
+    Undecided states are the nodes 0 to N - 1; the nodes N, N + 1 and N + 2 have the values 0, 1
+    and infinity.
 
     Attributes:
       table: ``int32[R', W]``, the entries of the rows that are left, T where there is none.
@@ -145,7 +144,7 @@ def prepare_interval(
     else:
         mine = cost if policy is None else cost[np.asarray(policy)]
         plan = plan_total_reward(host, mine, target, Query(up, large))
-    return _prepared(model, host, entry, plan, cost, policy, (objective, direction, up))
+    return _prepared(model, host, entry, plan, cost, policy, (objective, direction))
 
 
 def _prepared(
@@ -155,7 +154,7 @@ def _prepared(
     plan: IntervalPlan,
     cost: Any,
     policy: Any,
-    directions: tuple[str, str, bool],
+    directions: tuple[str, str],
 ) -> PreparedInterval:
     """The arrays."""
     mdp, whole = host.mdp, model.nominal.host
@@ -184,7 +183,7 @@ def _prepared(
     origin = np.arange(mdp.num_rows) if policy is None else np.asarray(policy)
     inside = np.ones(whole.num_transitions, bool)
     inside[entry] = plan.within
-    objective, direction, _ = directions
+    objective, direction = directions
     answers = plan.queries
     found = PreparedInterval(
         table=table,
@@ -273,7 +272,7 @@ def _solve(
     else:
         none, proven = jnp.zeros(0, lower.dtype), jnp.asarray(True)
         found = Bounds(none, none, proven, proven, none, contest.first, contest.lower, jnp.int32(0))
-    return _answer(prepared, contest, found, lower, upper, tolerance, finite, valid)
+    return _answer(prepared, contest, found, (lower, upper), tolerance, (finite, valid))
 
 
 def _checked(
@@ -348,13 +347,12 @@ def _answer(
     prepared: PreparedInterval,
     contest: Contest,
     found: Bounds,
-    lower: jax.Array,
-    upper: jax.Array,
+    ends: tuple[jax.Array, jax.Array],
     tolerance: jax.Array,
-    finite: jax.Array,
-    valid: jax.Array,
+    checks: tuple[jax.Array, jax.Array],
 ) -> Solution:
-    """The answer of the states."""
+    """The solution at the states."""
+    (lower, upper), (finite, valid) = ends, checks
     is_reward, dtype = contest.relative, contest.lower.dtype
     near, far, middle = found.near, found.far, found.middle
     most = jnp.inf if is_reward else 1.0
@@ -375,10 +373,10 @@ def _answer(
     status = status_code(proven & narrow, finite, proven, valid=valid)
     status = jnp.where(~proven & small & (status == Status.MAX_STEPS), Status.UNCERTIFIED, status)
     good = valid & finite
-    ends = jnp.asarray([0, 1, jnp.inf], dtype)
+    known = jnp.asarray([0, 1, jnp.inf], dtype)
 
     def everywhere(x: jax.Array, bad: float) -> jax.Array:
-        return jnp.where(good, jnp.concatenate([x, ends]), bad)[prepared.node]
+        return jnp.where(good, jnp.concatenate([x, known]), bad)[prepared.node]
 
     row, free = prepared.policy, upper - lower
     if prepared.size:

@@ -29,14 +29,7 @@ from jaxltl.core.values.multi_objective.multi_objective import (
 def solve_multi_objective(
     model: SparseMDP, prop: Property, tolerance: float
 ) -> Achievable | ConstrainedOptimum | Pareto:
-    """Solves ``multi(...)`` from the initial distribution.
-
-    One strategy is to meet all thresholds. A threshold that is not a double is tried rounded to
-    either side, so that the result holds for the fraction that was written.
-
-    Raises:
-      ValueError: an objective that cannot be combined with others, with the reason.
-    """
+    """Solution of ``multi(...)``; thresholds that are not doubles are rounded to either side."""
     strict = _solved(model, prop, tolerance, strict=True)
     exact = all(_rounded(x, True) == _rounded(x, False) for x in prop.parts)
     if exact or isinstance(strict, Pareto) or (isinstance(strict, Achievable) and strict.holds):

@@ -33,21 +33,15 @@ Bounds = tuple[jax.Array, jax.Array]
 
 @dataclass(frozen=True)
 class Question:
-    """A property of a sharded model, on its way.
-
-    Attributes:
-      prop: the property.
-      states: ``int[I]``, the initial states, by their numbers in the given model.
-      shape: of the bounds: ``(N,)``, of a product ``(N, Q)``.
-      advance: from bounds, half of the requested width and the greatest number of steps: the
-        next solution. Of rewards, where bounds are no help, it is the last.
-      taken: from quantities of `shape`, those of the initial states, ``float64[I]``.
-    """
+    """A property of a sharded model, with its solver."""
 
     prop: Property
-    states: np.ndarray
-    shape: tuple[int, ...]
+    states: np.ndarray  # int[I], the initial states, by their numbers in the given model
+    shape: tuple[int, ...]  # of the bounds: (N,), of a product (N, Q)
+    # The next solution from bounds, half the requested width and a number of steps; of rewards
+    # the last one.
     advance: Callable[[Bounds, float, int], Solution]
+    # Quantities of the initial states, float64[I], from those of all states.
     taken: Callable[[jax.Array], np.ndarray]
 
     @property
@@ -74,11 +68,7 @@ class Question:
 
 
 def question_on_mesh(model: ShardedMDP, prop: Property) -> Question:
-    """Solver of a property of a model on a mesh of devices.
-
-    Raises:
-      ValueError: an unknown label, a missing direction, or a property that is not answered there.
-    """
+    """Solver of a property of a model on a mesh of devices."""
     path = _path(prop)
     if prop.nature is not None:
         raise ValueError(f"{prop.text}: the model has no intervals from which nature could pick.")
