@@ -55,7 +55,7 @@ _MOVES = (
 class FlatState(NamedTuple):
     """State of a flat world: `place` is ``float32[2]``."""
 
-    place: Any
+    place: chex.Array
 
 
 @brief
@@ -70,10 +70,10 @@ class Discs:
       extent: half a side of the square.
     """
 
-    center: Any
-    radius: Any
-    color: Any
-    extent: Any
+    center: chex.Array
+    radius: chex.Array
+    color: chex.Array
+    extent: chex.Array
 
 
 def flat_world(

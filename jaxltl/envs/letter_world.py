@@ -12,7 +12,7 @@ symmetries, while their letters are drawn anew: the published drawing rejects 72
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple, TypedDict, Unpack
+from typing import NamedTuple, TypedDict, Unpack
 
 import chex
 import jax
@@ -47,8 +47,8 @@ class LetterState(NamedTuple):
       place: ``int32[]``, the agent's cell.
     """
 
-    letter: Any
-    place: Any
+    letter: chex.Array
+    place: chex.Array
 
 
 class Maps(TypedDict, total=False):
@@ -165,7 +165,7 @@ def _names(letters: int | Sequence[str]) -> tuple[str, ...]:
 
 
 def _given(
-    layout: str | ArrayLike, names: tuple[str, ...], letters: Any
+    layout: str | ArrayLike, names: tuple[str, ...], letters: int | Sequence[str]
 ) -> tuple[np.ndarray, int, tuple[str, ...]]:
     """Letters of the cells of a given map, its size, and the names."""
     if isinstance(layout, str):
@@ -307,7 +307,9 @@ def _starts(letter: chex.Array, places: chex.Array) -> tuple[LetterState, jax.Ar
     return LetterState(every, jnp.asarray(places)), jnp.full(count, 1 / count)
 
 
-def _move(neighbors: chex.Array, world: LetterState, action: Any, key: chex.PRNGKey) -> Timestep:
+def _move(
+    neighbors: chex.Array, world: LetterState, action: jax.Array, key: chex.PRNGKey
+) -> Timestep:
     del key
     place = jnp.asarray(neighbors)[world.place, action]
     return Timestep(world._replace(place=place), reward=0.0, terminated=False)

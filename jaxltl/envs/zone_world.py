@@ -16,7 +16,7 @@ proximities; and constant sensors are omitted.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import chex
 import jax
@@ -49,25 +49,25 @@ class ZoneState(NamedTuple):
       zone: ``float32[P, N, 2]``, the places of each colour's zones.
     """
 
-    place: Any
-    velocity: Any
-    heading: Any
-    acceleration: Any
-    turning: Any
-    zone: Any
+    place: jax.Array
+    velocity: jax.Array
+    heading: jax.Array
+    acceleration: jax.Array
+    turning: jax.Array
+    zone: jax.Array
 
 
 @struct.dataclass
 class _Numbers:
-    radius: Any
-    extent: Any
-    time_step: Any
-    thrust: Any  # the acceleration
-    saturation: Any  # the action from which on it is that
-    drag: Any  # what a second leaves of a velocity is exp(-drag)
-    turn: Any
-    most_turn: Any
-    gain: Any
+    radius: np.float32
+    extent: np.float32
+    time_step: np.float32
+    thrust: np.float32  # the acceleration
+    saturation: np.float32  # the action from which on it is that
+    drag: np.float32  # what a second leaves of a velocity is exp(-drag)
+    turn: np.float32
+    most_turn: np.float32
+    gain: np.float32
 
 
 def zone_world(
@@ -213,7 +213,7 @@ def _ahead(heading: jax.Array) -> jax.Array:
     return jnp.stack([jnp.cos(heading), jnp.sin(heading)])
 
 
-def _move(n: _Numbers, world: ZoneState, action: Any, key: chex.PRNGKey) -> Timestep:
+def _move(n: _Numbers, world: ZoneState, action: jax.Array, key: chex.PRNGKey) -> Timestep:
     del key
     action = jnp.clip(action, -1, 1).astype(jnp.float32)
     turning = jnp.clip(n.turn * action[1], -n.most_turn, n.most_turn)

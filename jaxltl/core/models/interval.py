@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -356,7 +356,7 @@ def interval_rows(
         ball = None if ball is None else (every[2], ball[1])
     lower, upper = _scaled(starts, entry_start, row, lower, upper)
     if ball is not None:
-        _check_ball(starts, entry_start, row, lower, upper, *ball)
+        _check_ball(_Intervals(starts, entry_start, row, lower, upper), *ball)
         lower, upper, ball = _around(entry_start, row, lower, upper, *ball)
     lower, upper = _pointed(entry_start, row, lower, upper, ball)
     ends = uncertainty_sets(
@@ -392,15 +392,18 @@ def _ball(
     return center, radius
 
 
-def _check_ball(
-    row_start: np.ndarray,
-    entry_start: np.ndarray,
-    row: np.ndarray,
-    lower: np.ndarray,
-    upper: np.ndarray,
-    center: np.ndarray,
-    radius: np.ndarray,
-) -> None:
+@dataclass(frozen=True)
+class _Intervals:
+    row_start: np.ndarray
+    entry_start: np.ndarray
+    row: np.ndarray  # of each entry
+    lower: np.ndarray
+    upper: np.ndarray
+
+
+def _check_ball(intervals: _Intervals, center: np.ndarray, radius: np.ndarray) -> None:
+    row_start, entry_start, row = intervals.row_start, intervals.entry_start, intervals.row
+    lower, upper = intervals.lower, intervals.upper
     total = np.add.reduceat(center, entry_start[:-1])
     bad = ~((radius >= 0) & (radius < np.inf))
     if bad.any():

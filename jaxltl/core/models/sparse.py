@@ -440,7 +440,6 @@ def check_entries(
     *,
     first: int = 0,
     num_states: int | None = None,
-    dtype: DTypeLike = np.float64,
 ) -> None:
     """Raises ValueError if a state, a row or an entry is invalid, by numbers of the whole model."""
     num_states = row_start.size - 1 if num_states is None else num_states
@@ -467,7 +466,7 @@ def check_entries(
             f"{placed(row_start, row, first)}: probability {probability[e]}; "
             "probabilities must be finite and not negative."
         )
-    refuse_underflow(row_start, entry_start, probability, dtype, first=first)
+    refuse_underflow(row_start, entry_start, probability, np.float64, first=first)
 
 
 def refuse_underflow(

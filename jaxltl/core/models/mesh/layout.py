@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -43,7 +43,7 @@ class StateLayout(NamedTuple):
     def sharding(self) -> NamedSharding:
         return NamedSharding(self.mesh, PartitionSpec(self.axis))
 
-    def devices(self, d: int) -> list[Any]:
+    def devices(self, d: int) -> list[jax.Device]:
         """The devices with the d-th range, more than one where the mesh has other axes."""
         along = self.mesh.axis_names.index(self.axis)
         return list(np.moveaxis(self.mesh.devices, along, 0)[d : d + 1].ravel())

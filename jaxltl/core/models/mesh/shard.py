@@ -28,6 +28,7 @@ from jaxltl.core.models.sparse import (
     check_entries,
     checked_starts,
     choice_reward,
+    refuse_underflow,
     scaled,
 )
 from jaxltl.core.pretty_print import brief
@@ -359,14 +360,9 @@ def _checked(part: Any, layout: StateLayout, d: int, num_labels: int) -> _Range:
         raise ValueError(f"part({start}, {stop}) has {count} states; it must have {stop - start}.")
     dtype = target_dtype(np.float64)
     check_entries(
-        row_start,
-        entry_start,
-        successor,
-        probability,
-        first=start,
-        num_states=layout.num_given,
-        dtype=dtype,
+        row_start, entry_start, successor, probability, first=start, num_states=layout.num_given
     )
+    refuse_underflow(row_start, entry_start, probability, dtype, first=start)
     probability = scaled(row_start, entry_start, probability, first=start)
     owner = np.repeat(np.arange(count), np.diff(row_start))
     action = np.arange(owner.size) - row_start[owner] if found.action is None else found.action

@@ -164,7 +164,7 @@ def seen_by(model: ShardedMDP, sent: tuple[jax.Array, ...], value: jax.Array) ->
 
 
 @operators.combined.register
-def _(model: ShardedMDP, value: jax.Array, term: Any, combine: Any) -> jax.Array:
+def _(model: ShardedMDP, value: jax.Array, term: kernels.Term, combine: kernels.Term) -> jax.Array:
     def one(tables: Any, place: Any, sent: Any, available: Any, value: jax.Array) -> jax.Array:
         seen = seen_by(model, sent, value)
         if place is None:
@@ -183,7 +183,7 @@ def _(model: ShardedMDP, value: jax.Array, term: Any, combine: Any) -> jax.Array
     )
 
 
-def _rows(table: RowTable, seen: jax.Array, term: Any, combine: Any) -> jax.Array:
+def _rows(table: RowTable, seen: jax.Array, term: kernels.Term, combine: kernels.Term) -> jax.Array:
     successor, weight = table
     width = successor.shape[1]
     if width > kernels.UNROLL:

@@ -35,6 +35,7 @@ from jaxltl.core.models.ops.kernels import where_positive
 from jaxltl.core.models.protocols import Model, base_model
 from jaxltl.core.models.ops.underflow import is_positive, is_subnormal, underflow_text, underflows
 from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.types import describe_row, row_tolerance
 from jaxltl.core import validation
 
@@ -256,7 +257,7 @@ def greatest_predecessor(model: Model, quantity: jax.Array) -> jax.Array:
 
 
 @combined.register
-def _(model: MDP, value: jax.Array, term: Any, combine: Any) -> jax.Array:
+def _(model: MDP, value: jax.Array, term: kernels.Term, combine: kernels.Term) -> jax.Array:
     weight = model.successor_probability
     return kernels.stacked(kernels.by_action(model.successor, weight, value, term, combine))
 
@@ -527,7 +528,7 @@ def row_weights(model: SparseMDP, policy: Any, where: Any = True) -> np.ndarray:
     return weight
 
 
-def require_weights(host: Any, weight: np.ndarray, tolerance: float, where: Any = True) -> None:
+def require_weights(host: HostMDP, weight: np.ndarray, tolerance: float, where: Any = True) -> None:
     """Raises ValueError unless row weights are a distribution in each state."""
     total = host.over_choices(np.add, weight)
     off = ~((np.abs(total - 1) <= tolerance) & (host.over_choices(np.minimum, weight) >= 0))
