@@ -7,11 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jaxltl.core.array_types import Integers
 from jaxltl.core.logic.ltl import Letter, as_letters
 from jaxltl.core.pretty_print import brief, truncate, batch_text, propositions_text, readable
 
@@ -32,7 +33,7 @@ CONDITIONS = {
 ACCEPTANCES = tuple(CONDITIONS)
 
 
-def _facts(automaton: Any) -> Iterator[str]:
+def _facts(automaton: Automaton) -> Iterator[str]:
     *more, count, width = automaton.delta.shape
     yield automaton.acceptance
     yield batch_text(more)
@@ -204,12 +205,12 @@ def make_automaton(
 
 
 def _priorities(
-    delta: NDArray[Any],
+    delta: Integers,
     final: ArrayLike | None,
     accepting: ArrayLike | None,
     priority: ArrayLike | None,
     acceptance: str | None,
-) -> tuple[str, NDArray[Any]]:
+) -> tuple[str, Integers]:
     """The acceptance and its priorities `[Q, L]`, from the one table that is given."""
     given = {"final": final, "accepting": accepting, "priority": priority}
     (name, *more) = [key for key, table in given.items() if table is not None] or [""]

@@ -18,9 +18,9 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxltl.core.array_types import Integers
 from jaxltl.core.sparse.graph.components import strong_components
 
-Integers: TypeAlias = NDArray[np.integer[Any]]
 Condition: TypeAlias = tuple[Any, ...]  # see `holds`
 
 MAX_COLORS = 62  # the bits of a set of colors

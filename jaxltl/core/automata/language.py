@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxltl.core.array_types import Integers
 from jaxltl.core.automata.automaton import Automaton, complement, make_automaton
 from jaxltl.core.automata.emerson_lei import to_parity
 from jaxltl.core.automata.parity import simplify
@@ -157,9 +158,7 @@ def _combine(a: Task, b: Task, connective: str) -> Automaton:
     )
 
 
-def _colored(
-    priority: NDArray[np.integer[Any]], first: int
-) -> tuple[NDArray[np.int64], tuple[Any, ...], int]:
+def _colored(priority: Integers, first: int) -> tuple[NDArray[np.int64], tuple[Any, ...], int]:
     """Priorities as sets of colours and a condition on the colours met infinitely often.
 
     Neighbouring priorities of one parity share a colour, and the greatest need none: they

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections import defaultdict
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxltl.core.array_types import Integers
 from jaxltl.core.automata.automaton import Automaton
 
 
@@ -63,7 +63,7 @@ def equivalence_classes(automaton: Automaton) -> NDArray[np.int32]:
     return classes
 
 
-def _breadth_first(delta: NDArray[np.integer[Any]], start: int) -> list[int]:
+def _breadth_first(delta: Integers, start: int) -> list[int]:
     order = {start: None}
     queue = [start]
     for state in queue:
@@ -74,9 +74,7 @@ def _breadth_first(delta: NDArray[np.integer[Any]], start: int) -> list[int]:
     return queue
 
 
-def _coarsest_partition(
-    delta: NDArray[np.integer[Any]], output: NDArray[np.integer[Any]]
-) -> NDArray[np.int64]:
+def _coarsest_partition(delta: Integers, output: Integers) -> NDArray[np.int64]:
     count, width = delta.shape
     before: list[list[list[int]]] = [[[] for _ in range(count)] for _ in range(width)]
     for q, row in enumerate(delta.tolist()):

@@ -9,16 +9,16 @@ is unique (Loeding 2001, "Efficient minimization of deterministic weak omega-aut
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxltl.core.array_types import Integers
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.emerson_lei import parity_condition, reached_from, to_parity
 from jaxltl.core.sparse.graph.components import strong_components
 
-Integers: TypeAlias = NDArray[np.integer[Any]]
 
 MAX_PAIRS = 3_000_000  # pair transitions up to which languages of states are compared
 MERGE_WORK = 20_000_000

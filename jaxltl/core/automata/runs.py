@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxltl.core.array_types import Integers
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.sparse.graph.components import forward_reachable, strong_components
 
@@ -244,7 +245,7 @@ def _graph(delta: NDArray[np.int32], allowed: NDArray[np.bool_]) -> Any:
     return graph
 
 
-def _components(delta: NDArray[np.int32], allowed: NDArray[np.bool_]) -> NDArray[np.integer[Any]]:
+def _components(delta: NDArray[np.int32], allowed: NDArray[np.bool_]) -> Integers:
     """int `[N]`, the strongly connected component of each node by allowed transitions."""
     source = np.repeat(np.arange(len(delta)), allowed.sum(axis=1))
     return strong_components(source, delta[allowed], len(delta))

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
 
 import numpy as np
 
-from jaxltl.core.automata.automaton import Automaton, make_automaton
+from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.runs import align
 from jaxltl.core.automata.translate import Task, as_automaton
 from jaxltl.core.logic.ltl import Letter
@@ -47,23 +46,12 @@ def synchronize(memory: Task, task: Task, *, alphabet: Iterable[Letter] | None =
     initial = int(first.initial) * num2 + int(second.initial)
     titles = [x.state_names or tuple(map(str, range(len(x.delta)))) for x in (first, second)]
     state_names = [f"{a} | {b}" for a in titles[0] for b in titles[1]]
-    if second.has_final_states:
-        final = np.tile(np.asarray(second.final), num1)
-        return make_automaton(
-            delta,
-            initial,
-            second.letters,
-            second.propositions,
-            final=final,
-            acceptance=second.acceptance,
-            state_names=state_names,
-        )
-    made = make_automaton(
-        delta,
-        initial,
-        second.letters,
-        second.propositions,
-        state_names=state_names,
+    return Automaton(
+        delta=delta.astype(np.int32),
+        initial=np.asarray(initial, np.int32),
         priority=np.tile(np.asarray(second.priority), (num1, 1)),
+        letters=second.letters,
+        propositions=second.propositions,
+        acceptance=second.acceptance,
+        state_names=tuple(state_names),
     )
-    return replace(made, acceptance=second.acceptance)

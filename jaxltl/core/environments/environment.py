@@ -95,7 +95,7 @@ def make_box(
       >>> make_box(-1.0, [1.0, 2.0]).shape
       (2,)
     """
-    bounds = {"low": _bounds(low), "high": _bounds(high)}
+    bounds = {"low": as_array(low), "high": as_array(high)}
     for name, bound in bounds.items():
         if bound.dtype.kind not in "biuf" or np.isnan(bound.astype(float)).any():
             raise ValueError(f"make_box: {name}={bound.tolist()!r}; give numbers.")
@@ -132,9 +132,10 @@ def make_box(
     return Box(least.astype(kind), most.astype(kind), full, kind.name)
 
 
-def _bounds(bound: ArrayLike) -> np.ndarray:
+def as_array(values: ArrayLike) -> np.ndarray:
+    """The array of nested sequences; one of None if they are ragged."""
     try:
-        return np.asarray(bound)
+        return np.asarray(values)
     except ValueError:  # ragged
         return np.asarray(None)
 

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from jaxltl.core import validation
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.environments.monitor import Monitor, Verdict, make_monitor, trace_verdicts
@@ -86,10 +87,7 @@ def make_finite_task(formula: Formula | str | Automaton, propositions: Sequence[
       >>> task.columns, task.monitor.delta.shape[1]
       ((1, 0), 4)
     """
-    names = list(propositions)
-    for name in names:
-        if names.count(name) > 1:
-            raise ValueError(f"propositions: {name!r} is given twice; give each column its name.")
+    names = validation.distinct_names("propositions", propositions)
     automaton = formula if isinstance(formula, Automaton) else to_automaton(formula)
     text = "the automaton" if isinstance(formula, Automaton) else f"the formula {str(formula)!r}"
     require_known(automaton.propositions, names, text)

@@ -7,7 +7,7 @@ episode.
 
 from __future__ import annotations
 
-from collections.abc import Sequence as Ordered
+from collections.abc import Callable, Sequence as Ordered
 from dataclasses import replace
 from itertools import combinations
 from typing import Any, NamedTuple
@@ -24,6 +24,7 @@ from jaxltl.core import validation
 from jaxltl.core.environments.environment import (
     Environment,
     Timestep,
+    as_array,
     make_box,
     require_environment,
 )
@@ -174,7 +175,7 @@ def sequence_sampler(
                 f"{name}={row.tolist()}; give weights of one axis, none of them "
                 "negative, some of them positive."
             )
-    groups = _booleans(sets)
+    groups = as_array(sets)
     if groups.dtype != np.bool_ or groups.ndim not in (1, 2):
         raise ValueError(
             f"sets has type {groups.dtype} and shape {list(groups.shape)}; give "
@@ -191,13 +192,6 @@ def sequence_sampler(
             f"{len(groups)}; give fewer weights."
         )
     return SequenceSampler(found["length"], found["reach"], found["avoid"], groups)
-
-
-def _booleans(table: ArrayLike) -> np.ndarray:
-    try:
-        return np.asarray(table)
-    except ValueError:  # ragged
-        return np.asarray(None)
 
 
 def draw_sequence(key: chex.PRNGKey, sampler: SequenceSampler) -> Sequence:
@@ -263,7 +257,7 @@ def sequence_environment(
       >>> jax.eval_shape(drawn.reset, jax.random.key(0)).sequence.reach.shape  # steps, events
       (1, 2)
     """
-    rows, inner = _booleans(events), require_environment(environment)
+    rows, inner = as_array(events), require_environment(environment)
     validation.instance("sampler", sampler, SequenceSampler, "one of sequence_sampler")
     count = len(inner.propositions)
     if rows.ndim != 2 or rows.dtype != np.bool_ or rows.shape[1] != count:
@@ -292,8 +286,8 @@ def sequence_environment(
         reset=Partial(_reset, inner, rows, sampler),
         step=Partial(_step, inner, rows, numbers),
         observe=Partial(_observe, inner),
-        labels=Partial(_labels, inner),
-        allowed=None if inner.allowed is None else Partial(_allowed, inner),
+        labels=Partial(_of_world, inner.labels),
+        allowed=None if inner.allowed is None else Partial(_of_world, inner.allowed),
         observations=SequenceObservation(inner.observations, spaces),
         starts=None,
         outcomes=None,
@@ -368,10 +362,5 @@ def _observe(inner: Environment, state: SequenceWorld) -> SequenceObservation:
     return SequenceObservation(inner.observe(state.world), remaining(state.sequence, state.stage))
 
 
-def _labels(inner: Environment, state: SequenceWorld) -> jax.Array:
-    return inner.labels(state.world)
-
-
-def _allowed(inner: Environment, state: SequenceWorld) -> jax.Array:
-    assert inner.allowed is not None
-    return inner.allowed(state.world)
+def _of_world(function: Callable[..., jax.Array], state: SequenceWorld) -> jax.Array:
+    return function(state.world)
