@@ -64,7 +64,7 @@ class PathProblem:
     cost: Floats  # float64[R], at least 0; NaN in rows that must not be taken
     component: Integers  # int[S], number of the end component that is one node
     maximize: bool  # whether the policy maximises
-    # whether nature wants the opposite; then no two states are in one component
+    # whether nature optimises the opposite; then no two states are in one component
     adversarial: bool = False
     first: Integers | None = None  # int[S], rows to begin with, by which all open states are left
     depth: int = 0  # roundings behind each number
@@ -192,7 +192,7 @@ class _Search:
         return float(size[size > 0].min(initial=np.inf)) if relative else 1.0
 
     def step_extra(self, pair: PolicyPair) -> float:
-        """Extra of a step: small beside the tolerance, and more than rounding."""
+        """Extra of a step: small compared with the tolerance, and more than rounding."""
         operator = self.operator
         most = np.abs(pair.steps).max(initial=1)
         size = max(np.abs(pair.value).max(initial=0), np.abs(operator.known).max(initial=0))

@@ -25,7 +25,7 @@ class Query:
 
     @property
     def cooperative(self) -> bool:
-        """Whether policy and nature want the same."""
+        """True if policy and nature optimise in the same direction."""
         return self.maximize == self.nature_maximizes
 
     @property

@@ -30,7 +30,7 @@ from jaxltl.core.sparse.rows import offsets_from_counts
 
 
 class RoomQueries(NamedTuple):
-    """Whether the upper ends of some entries of a row sum to at least one."""
+    """Queries if the upper ends of some entries of a row sum to at least one."""
 
     entry: Integers  # int[E], the entries and their query, ascending
     group: Integers

@@ -90,12 +90,12 @@ def bounded_cost(
     mdp: HostMDP,
     target: Booleans,
     stay: Booleans,
-    cost: Integers,
-    most: int,
+    budget: tuple[Integers, int],
     maximal: bool,
     by_level: bool = False,
 ) -> Level:
-    """Optimal probability of a target through states where one may stay, within a budget."""
+    """Optimal probability of a target through `stay`, within a budget of :func:`in_units`."""
+    cost, most = budget
     open_ = stay & ~target
     shape = _shape(mdp, target, open_, cost, maximal)
     parts = _parts(mdp, shape, target, cost, most)

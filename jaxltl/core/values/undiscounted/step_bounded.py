@@ -279,10 +279,10 @@ def reward_bounded_reachability(
             f"the reward is {cost[e]:.9g} from state {mdp.state[mdp.row[e]]} to "
             f"{mdp.successor[e]}; a bound on rewards needs rewards of at least 0."
         )
-    units, most = in_units(np.where((stay & ~target)[mdp.state[mdp.row]], cost, 0), bound)
-    found = bounded_cost(mdp, target, stay, units, most, operation is np.maximum, by_level)
+    budget = in_units(np.where((stay & ~target)[mdp.state[mdp.row]], cost, 0), bound)
+    found = bounded_cost(mdp, target, stay, budget, operation is np.maximum, by_level)
     error = np.where(found.open, found.error, 0)
-    return solution_from_error(found.value, error, found.row, most + 1, highest=1)
+    return solution_from_error(found.value, error, found.row, budget[1] + 1, highest=1)
 
 
 # --- what these and other host solvers share -----------------------------------------------------
