@@ -26,7 +26,7 @@ _TESTED = ((0, 7), (0, 11))
 
 
 def is_fresh() -> bool:
-    """Whether JAX has not been imported, so that its settings can still be made."""
+    """True if JAX has not been imported, so that its settings can still be made."""
     return "jax" not in sys.modules
 
 

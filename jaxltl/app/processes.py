@@ -146,7 +146,7 @@ class ProcessGroup:
 
     @property
     def is_first(self) -> bool:
-        """Whether this process writes and prints."""
+        """True if this process writes and prints."""
         return self.process == 0
 
     @property
@@ -199,7 +199,7 @@ class ProcessGroup:
                 )
 
     def sees(self, what: str, here: bool) -> bool:
-        """Whether a file is present, which must be the same in all processes."""
+        """True if a file is present, which must be the same in all processes."""
         every = self.exchanged(str(here))
         if len(set(every)) > 1:
             without = every.index("False")
@@ -418,6 +418,6 @@ def _read_apart(launch: Launch) -> None:
 
 
 def is_loss(error: Exception) -> bool:
-    """Whether an error is a lost connection to another process."""
+    """True if an error is a lost connection to another process."""
     text = str(error)
     return "Gloo" in text or "coordination" in text.lower() or "NCCL" in text

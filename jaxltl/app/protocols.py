@@ -90,7 +90,7 @@ class Job(Protocol[T, S, O]):
 
     @property
     def DOUBLE(self) -> bool:
-        """Whether figures are computed in double precision."""
+        """True if figures are computed in double precision."""
         ...
 
     @property

@@ -37,7 +37,7 @@ LARGEST_INT = 2**31 - 1  # int32 of compiled loops
 
 
 class Meta(NamedTuple):
-    """What a value must be beyond its type: in words, and as a predicate."""
+    """Requirement on a value beyond its type: in words, and as a predicate."""
 
     title: str
     holds: Callable[[Any], bool] = lambda value: True
@@ -261,7 +261,7 @@ def _table_of(kind: Any) -> type[Table] | None:
 
 
 def requirement(kind: Any) -> str:
-    """What a value of a type must be, for people.
+    """Requirement on values of a type, as text.
 
     Example:
       >>> requirement(Discount | None), requirement(Literal["a", "b"]), requirement(bool)

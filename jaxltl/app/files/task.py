@@ -140,7 +140,7 @@ ENVIRONMENT_METHODS = ("ppo", "cce", "cpo")
 
 
 def is_environment_task(path: str | Path) -> bool:
-    """Whether a task file is of a simulated world, by its world or by its method."""
+    """True if a task file is of a simulated world, by its world or by its method."""
     data = read_toml(Path(path), TaskFile.KIND)[0]
     world, learner = (data.get(name) for name in ("world", "learner"))
     simulated = isinstance(world, dict) and "environment" in world

@@ -171,7 +171,7 @@ class LearnerTable(OptimizerTable):
 
     @property
     def in_world(self) -> bool:
-        """Whether the reward is one of world states, without the automaton."""
+        """True if the reward is one of world states, without the automaton."""
         return self.in_ == "world"
 
 

@@ -194,7 +194,7 @@ class TodirlTask(Task):
 
     @property
     def is_colored(self) -> bool:
-        """Whether worlds are coloured grids, not text maps with a legend."""
+        """True if worlds are coloured grids, not text maps with a legend."""
         return self.world.legend is None
 
     @property

@@ -56,7 +56,7 @@ def table(result: Result) -> str:
 
 
 def _is_finite(result: Result) -> bool:
-    """Whether finite episodes can decide the formula, so that visits are of no interest."""
+    """True if finite episodes can decide the formula, so that visits are of no interest."""
     return result["acceptance"] in ("cosafe", "safety")
 
 

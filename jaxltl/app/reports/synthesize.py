@@ -87,7 +87,7 @@ def _about_play(found: Synthesis) -> Record | None:
 
 
 def is_confirmed(result: Result) -> bool:
-    """Whether the independent check confirms a :func:`summary`."""
+    """True if the independent check confirms a :func:`summary`."""
     strategy = result["strategy"]
     claims = result["verdict"]
     sound = strategy is None or strategy["confirmed"]

@@ -85,7 +85,7 @@ class _Tried:
 
 
 def is_weighable(setup: Setup) -> bool:
-    """Whether a weight has an effect: the uniform policy satisfies the formula sometimes.
+    """True if a weight has an effect: the uniform policy satisfies the formula sometimes.
 
     Soft policies have full support; else none of them satisfies it, for any reward.
     """

@@ -77,7 +77,7 @@ class Setup:
 
     @property
     def is_probability(self) -> bool:
-        """Whether the guarantee is a probability."""
+        """True if the guarantee is a probability."""
         return not isinstance(self.asked, str)
 
     @property
