@@ -50,12 +50,10 @@ def episode_evaluator(
 ) -> Partial:
     """``evaluate(parameters, key) -> (objective, costs)`` of a policy, means over episodes.
 
-    For ``cce.make_problem(evaluate, family, limit=...)`` and any other search. Scores are the
-    fields of :class:`~jaxltl.core.values.evaluation.evaluation.EpisodeTotals` by name (``"reward"``,
-    ``"cost"``, ``"length"``, ...); of an environment with a task also ``"success"``,
-    ``"violation"`` and ``"undecided"``, shares of episodes by the verdict at their end, and
-    ``"failure"``, which is ``1 - success``; or functions of the totals of one episode. A task to be
-    done with a chance of at least .9 is the cost ``"failure"`` with the limit .1.
+    Scores are fields of :class:`~jaxltl.core.values.evaluation.evaluation.EpisodeTotals` by name
+    (``"reward"``, ``"cost"``, ``"length"``, ...); with a task also the shares ``"success"``,
+    ``"violation"``, ``"undecided"`` and ``"failure"`` (``1 - success``); or functions of the totals
+    of one episode.
 
     Args:
       environment: plain or with a task; it travels as an argument.
@@ -75,8 +73,7 @@ def episode_evaluator(
       ValueError: an unknown score, one of a task without a task, episodes that never end, or no
         episodes.
 
-    Not made for derivatives: an episode is a loop that ends by itself, through which forward mode
-    goes alone; searches such as ``cce`` need none.
+    Differentiable in forward mode only: an episode is a ``while_loop``.
 
     Example:
       >>> from jaxltl import make_environment

@@ -43,7 +43,7 @@ class OptimalityGap(NamedTuple):
 
     Attributes:
       start: ``int32[N]``, their states in the table.
-      weight: ``float64[N]``, how likely an episode begins there.
+      weight: ``float64[N]``, their initial probabilities.
       value, optimum: of the agent, and the best: :class:`~jaxltl.core.types.Solution` whose
         `value`, `lower` and `upper` are ``float64[N]``.
       lower, upper: ``float64[N]``, bounds on the gap, optimum minus value.
@@ -146,17 +146,12 @@ def optimality_gap(
 ) -> OptimalityGap:
     """Optimality gap: the optimal satisfaction probability minus an agent's, with bounds.
 
-    Both are probabilities of surely satisfying the formula within n steps, ``P(some prefix of n steps at most is
-    such that every continuation satisfies it)``: what an episode of n steps at most of
-    :func:`~jaxltl.core.environments.task_environment.task_environment` counts as success. They are
-    step-bounded reachability in the product of the table and the task (Baier and Katoen 2008,
-    section 10.1.1), enclosed including rounding; exactly 0 or 1 where the graph decides. The agent
-    decides by the world and the automaton's state alone; the optimum is that of all policies, also
-    of those that know the time. Without a limit of steps both are the probabilities of the task, by
-    the exact solvers.
-
-    An episode that ends by itself stays where it is, and its last label repeats: that is then its
-    one continuation. One that the environment cuts off has had its steps.
+    Both are step-bounded reachability probabilities in the product of the table and the task (Baier
+    and Katoen 2008, section 10.1.1): that some prefix of at most n steps has only satisfying
+    continuations, which :func:`~jaxltl.core.environments.task_environment.task_environment` counts
+    as success. Bounds include rounding. The optimum is over all policies, also time-dependent ones.
+    Without a limit of steps both are satisfaction probabilities. The last label of a terminated
+    episode repeats forever.
 
     Args:
       table: from :func:`~jaxltl.core.environments.tabulate.tabulate`.
