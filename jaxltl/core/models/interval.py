@@ -501,7 +501,7 @@ def _scaled(
     upper: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     low, high = (np.add.reduceat(x, entry_start[:-1]) for x in (lower, upper))
-    rounding = (np.diff(entry_start) + 2) * np.finfo(np.float64).eps  # what is no miss
+    rounding = (np.diff(entry_start) + 2) * np.finfo(np.float64).eps  # of a row sum
     bad = (low > 1 + NEAR) | (high < 1 - NEAR)
     if bad.any():
         r = int(np.flatnonzero(bad)[0])

@@ -44,7 +44,7 @@ def package(name: str) -> Any:
     """Imports a module of another package; ImportError with the command that installs it."""
     root = name.partition(".")[0]
     try:
-        with warnings.catch_warnings():  # of what it imports itself
+        with warnings.catch_warnings():  # in its own imports
             warnings.simplefilter("ignore", DeprecationWarning)
             return importlib.import_module(name)
     except ImportError as problem:

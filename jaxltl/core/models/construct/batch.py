@@ -1,6 +1,6 @@
 """Batches of products with one task, and demonstrations in them.
 
-Models of one kind become one product whose arrays have a leading axis W, for one ``vmap``. They
+Models of one kind become one product with arrays of a leading axis W, for one ``vmap``. They
 share the automaton, over the letters of all models.
 """
 
@@ -39,7 +39,7 @@ def stack_products(worlds: Sequence[MDP], task: Task, *, label_on: str = "exit")
       label_on: ``"exit"`` or ``"entry"``, see :class:`~jaxltl.core.models.product.Product`.
 
     Returns:
-      A :class:`Product` whose arrays have the leading axis ``[W]``.
+      A :class:`Product` with arrays of the leading axis ``[W]``.
 
     Raises:
       ValueError: no model, or one (counted from 0) that is not an MDP, has other actions or

@@ -32,7 +32,7 @@ def with_allowed(model: ModelT, allowed: chex.Array) -> ModelT:
       allowed: ``bool[S, A]``, in a product ``bool[S, Q, A]``, of a sparse model ``bool[R]``.
 
     Returns:
-      A model of the same kind and states, whose available actions are the mask.
+      A model of the same kind and states; the mask is its available actions.
 
     Raises:
       ValueError: a mask of another shape or dtype; unless something is traced, an action that is not

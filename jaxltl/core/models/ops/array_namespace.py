@@ -30,7 +30,7 @@ def to_jax(tree: Any) -> Any:
     """A tree with JAX arrays, without compilation."""
 
     def one(x: Any) -> jax.Array:
-        # What is put on a device may share its memory with what it was made of.
+        # device_put may share memory with its argument, hence the copy.
         return x if isinstance(x, jax.Array) else jax.device_put(np.array(x))
 
     return jax.tree.map(one, tree)

@@ -36,7 +36,7 @@ _WIDEST = 6  # predecessor lists are at most this many times wider than successo
 class SuccessorTable(NamedTuple):
     """Successors of all state-action pairs, ``[A, K, N]``: an array ``[N]`` for each action and successor.
 
-    Separate arrays are contiguous whatever layout XLA chooses, which lets it vectorise the loops over
+    Separate arrays are contiguous in every layout of XLA, which lets it vectorise the loops over
     states. Small tables are one array, for smaller programs.
     """
 
