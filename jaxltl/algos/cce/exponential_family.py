@@ -192,20 +192,13 @@ def sufficient_statistics(family: PyTree, samples: jax.Array) -> tuple[jax.Array
 
     The second is ``float[..., D, D]`` for a full Gaussian, else ``float[..., D]``. Here and below a type
     that is not registered raises TypeError; differentiable in `samples`.
-
-    Raises:
-      TypeError: the family is not registered.
     """
     raise TypeError(_unknown(family))
 
 
 @singledispatch
 def mean_parameter(family: PyTree) -> tuple[jax.Array, jax.Array]:
-    """``m(v) = E_v[Gamma(x)]`` of a `family`, a pair of arrays; differentiable in its parameters.
-
-    Raises:
-      TypeError: the family is not registered.
-    """
+    """``m(v) = E_v[Gamma(x)]`` of a `family`, a pair of arrays; differentiable in its parameters."""
     raise TypeError(_unknown(family))
 
 
@@ -214,9 +207,6 @@ def from_mean_parameter(family: PyTree, eta: tuple[jax.Array, jax.Array]) -> PyT
     """The member of the type of `family` with mean parameter `eta`, ``m^{-1}(eta)``.
 
     Variances are differences here; :func:`project` moves a family without cancellation.
-
-    Raises:
-      TypeError: the family is not registered.
 
     Example:
       >>> start = diagonal_gaussian([1.0, 2.0], 0.5)
@@ -231,20 +221,13 @@ def log_density(family: PyTree, samples: jax.Array) -> jax.Array:
     """``log f_v(x)`` in nats, ``float[...]`` of `samples` ``float[..., D]``; differentiable in both.
 
     Here v is the natural parameter of `family`.
-
-    Raises:
-      TypeError: the family is not registered.
     """
     raise TypeError(_unknown(family))
 
 
 @singledispatch
 def sample(family: PyTree, key: chex.PRNGKey, num_samples: int) -> jax.Array:
-    """``float[num_samples, D]``, independent samples of a `family` by a `key`; `num_samples` is static.
-
-    Raises:
-      TypeError: the family is not registered.
-    """
+    """``float[num_samples, D]``, independent samples of a `family` by a `key`; `num_samples` is static."""
     raise TypeError(_unknown(family))
 
 
@@ -267,7 +250,7 @@ def project(
     ``m(v') = rate * sum_i w_i Gamma(x_i) / sum_i w_i + (1 - rate) * m(v)`` gives the member closest in
     cross entropy to the mixture of the weighted samples ``float[n, D]`` and ``f_v``. Variances are sums
     of squares. Weights have a positive sum; at rate 0 the family is unchanged, bit for bit except for a
-    full Gaussian. TypeError: the family is not registered.
+    full Gaussian.
 
     >>> start = diagonal_gaussian([0.0], 1.0)
     >>> moved = project(start, jnp.array([[1.0], [3.0]]), jnp.array([1.0, 1.0]), 0.5)
@@ -279,41 +262,25 @@ def project(
 
 @singledispatch
 def center(family: PyTree) -> jax.Array:
-    """``E_v[x]``, ``float[D]``, of a `family`.
-
-    Raises:
-      TypeError: the family is not registered.
-    """
+    """``E_v[x]``, ``float[D]``, of a `family`."""
     raise TypeError(_unknown(family))
 
 
 @singledispatch
 def standard_deviation(family: PyTree) -> jax.Array:
-    """``float[D]``, standard deviations of the entries under a `family`.
-
-    Raises:
-      TypeError: the family is not registered.
-    """
+    """``float[D]``, standard deviations of the entries under a `family`."""
     raise TypeError(_unknown(family))
 
 
 @singledispatch
 def widen(family: PyTree, variance: jax.Array | float) -> PyTree:
-    """A `family` with the same mean and a `variance` (a number or ``float[D]``) added to that of entries.
-
-    Raises:
-      TypeError: the family is not registered.
-    """
+    """A `family` with the same mean and a `variance` (a number or ``float[D]``) added to that of entries."""
     raise TypeError(_unknown(family))
 
 
 @singledispatch
 def at_least(family: PyTree, variance: jax.Array | float) -> PyTree:
-    """A `family` with the same mean and at least a `variance` in every direction.
-
-    Raises:
-      TypeError: the family is not registered.
-    """
+    """A `family` with the same mean and at least a `variance` in every direction."""
     raise TypeError(_unknown(family))
 
 
