@@ -97,7 +97,7 @@ def is_included(a: Task, b: Task) -> bool:
     """True if the language of the first automaton is included in that of the second, over joint letters.
 
     Args:
-      a: the automaton whose words are tested; or a formula, or its text.
+      a: the automaton of the tested words; or a formula, or its text.
       b: the one that should accept them, likewise; both are aligned first, see `align`.
 
     Returns:

@@ -208,7 +208,7 @@ def _weak_minimal(table: Table) -> tuple[Table, Integers]:
 
 
 def _early(table: Table) -> Table:
-    """A weak automaton whose verdicts come as early as they are certain, where that suffices.
+    """A weak automaton with verdicts as early as they are certain, where that suffices.
 
     Where every accepting cycle is among states that accept all words, only those are final: the
     language is co-safe. Where every rejecting cycle is among states that accept none, all

@@ -1,7 +1,7 @@
 """Rewards of temporal-logic tasks, as tables on the transitions of their automata.
 
 All have one form: a transition from an undecided state earns a reward and discounts later rewards;
-a decided verdict earns a reward of its own and ends the episode.
+a decided verdict earns a separate reward and ends the episode.
 """
 
 from __future__ import annotations
