@@ -128,10 +128,17 @@ class Learner(Protocol[ProblemIn, HparamsIn, StateT, MetricsOut]):
         num_steps: int,
         max_rows: int = 1000,
     ) -> tuple[StateT, MetricsOut]:
-        """The ``State`` after `num_steps` more steps, and ``Metrics`` with a leading axis of rows.
+        """`num_steps` steps from a state, compiled as one loop.
 
-        One compiled loop; another number of steps with as many rows does not recompile. At most `max_rows`
-        rows, evenly spaced steps that include the last, so that memory does not grow with `num_steps`.
+        Args:
+          state: from ``init`` or an earlier run.
+          problem, hparams: arrays; new values do not recompile.
+          num_steps: number of steps; another one with as many rows does not recompile.
+          max_rows: bound on the rows of metrics, evenly spaced steps that include the last, so that
+            memory does not grow with `num_steps`.
+
+        Returns:
+          The ``State`` after the last step, and ``Metrics`` with a leading axis of rows.
 
         Raises:
           ValueError: num_steps or max_rows is not positive, or a hyperparameter is out of range.
@@ -147,7 +154,15 @@ class Learner(Protocol[ProblemIn, HparamsIn, StateT, MetricsOut]):
         num_steps: int,
         max_rows: int = 1000,
     ) -> tuple[StateT, MetricsOut]:
-        """``init`` and ``run``; ``vmap`` it over keys for many seeds. Raises as they do."""
+        """``init`` and ``run``; ``vmap`` it over keys for many seeds. Raises as they do.
+
+        Args:
+          key: random key of ``init``; the state keeps it.
+          problem, hparams, num_steps, max_rows: as for ``run``.
+
+        Returns:
+          The ``State`` after the last step, and ``Metrics`` with a leading axis of rows.
+        """
         ...
 
     def run_until(
@@ -194,7 +209,15 @@ class Learner(Protocol[ProblemIn, HparamsIn, StateT, MetricsOut]):
         check_every: int = 1,
         keep: str = "after",
     ) -> Learned:
-        """``init`` and ``run_until``; ``vmap`` it over keys for many seeds. Raises as they do."""
+        """``init`` and ``run_until``; ``vmap`` it over keys for many seeds. Raises as they do.
+
+        Args:
+          key: random key of ``init``; the state keeps it.
+          problem, hparams, until, num_steps, check_every, keep: as for ``run_until``.
+
+        Returns:
+          :class:`~jaxltl.algos.common.loops.Learned`; :func:`~jaxltl.check` accepts it.
+        """
         ...
 
     def policy(self, state: StateT, problem: ProblemIn, hparams: HparamsIn) -> PyTree:
