@@ -181,7 +181,8 @@ class Learner(Protocol[ProblemIn, HparamsIn, StateT, MetricsOut]):
         Under ``vmap`` the state of a finished lane stays unchanged while others continue.
 
         Args:
-          state, problem, hparams: as for ``run``.
+          state: from ``init`` or an earlier run.
+          problem, hparams: arrays; new values do not recompile.
           until: ``(before, after, metrics) -> bool[]``: the states before and after `check_every` steps
             and the metrics of the last of them. Pass numbers by ``jax.tree_util.Partial(function,
             *numbers)``: new numbers do not recompile, a new function does.
