@@ -96,7 +96,8 @@ def problem_and_state() -> tuple[Any, Any, Any]:
     """A toy: what is to be approached, by steps that draw, and the first states of the lanes."""
     import jax
     import jax.numpy as jnp
-    from flax import struct
+
+    from jaxltl.core import struct
 
     @struct.dataclass
     class State:

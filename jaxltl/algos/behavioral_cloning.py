@@ -39,11 +39,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from flax import linen as nn, struct
+from flax import linen as nn
 
 from jaxltl.algos.common import learner, trees
 from jaxltl.algos.common.early_stopping import Best, stop_early
 from jaxltl.algos.common.settings import COUNT, Number, static, traced
+from jaxltl.core import struct
 from jaxltl.core.models.construct.batch import stack_models, stack_observations, training_counts
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import PyTree

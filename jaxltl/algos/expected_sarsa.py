@@ -29,7 +29,7 @@ from functools import partial
 import chex
 import jax
 import jax.numpy as jnp
-from flax import struct
+from jaxltl.core import struct
 from jax import lax
 from numpy.typing import ArrayLike
 

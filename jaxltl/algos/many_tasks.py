@@ -52,7 +52,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
+from jaxltl.core import struct
 from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 

@@ -16,7 +16,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
+from jaxltl.core import struct
 from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 

@@ -32,7 +32,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
+from jaxltl.core import struct
 from jax import lax
 from numpy.typing import ArrayLike
 

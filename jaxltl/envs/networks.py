@@ -14,7 +14,7 @@ from itertools import pairwise
 import chex
 import jax
 import jax.numpy as jnp
-from flax import struct
+from jaxltl.core import struct
 from jax.tree_util import Partial
 
 from jaxltl.core import validation

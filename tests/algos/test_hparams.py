@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from flax import struct
 
 from jaxltl import algos
 from jaxltl.algos.common.settings import flag_invalid
+from jaxltl.core import struct
 from jaxltl.core.types import Status
 
 LEARNERS = {

@@ -16,7 +16,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from flax import struct
 from jax.tree_util import Partial
 
 import jaxltl as jl
@@ -36,6 +35,7 @@ from jaxltl.algos import (
 from jaxltl.algos.cce.exponential_family import diagonal_gaussian
 from jaxltl.algos.common import checkpoint, learner, loops
 from jaxltl.algos.common.chunks import Options, run_in_chunks
+from jaxltl.core import struct
 from jaxltl.core.environments.environment import Timestep, make_box, make_environment
 from jaxltl.core.models.game import make_game
 from jaxltl.core.models.mdp import MDP

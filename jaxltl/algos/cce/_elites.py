@@ -6,7 +6,7 @@ import math
 
 import jax
 import jax.numpy as jnp
-from flax import struct
+from jaxltl.core import struct
 from jax import lax
 
 from jaxltl.algos.common.schedules import SLACK

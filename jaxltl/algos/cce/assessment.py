@@ -10,7 +10,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
+from jaxltl.core import struct
 
 from jaxltl.algos.cce import exponential_family as families
 from jaxltl.algos.cce._evaluation import scores

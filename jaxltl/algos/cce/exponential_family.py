@@ -46,7 +46,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
+from jaxltl.core import struct
 from jax import lax
 from jax.scipy.special import digamma, gammaln
 from numpy.typing import ArrayLike

@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 
 import jax
-from flax import struct
+from jaxltl.core import struct
 from jax.sharding import NamedSharding
 
 from jaxltl.algos.cce._elites import (

@@ -3,7 +3,7 @@
 Example: a contraction to a fixed point, for two lanes.
 
   >>> import jax, jax.numpy as jnp
-  >>> from flax import struct
+  >>> from jaxltl.core import struct
   >>> from jaxltl.algos.common.chunks import Options, run_in_chunks
   >>> @struct.dataclass
   ... class State:
@@ -177,7 +177,7 @@ def trace_lanes(step: Step, state: PyTree, problem: PyTree, hparams: PyTree) -> 
 
     Of `step`, `problem` and `hparams` as there, and the `state` of N runs, or its shapes.
 
-    >>> from flax import struct
+    >>> from jaxltl.core import struct
     >>> @struct.dataclass
     ... class State:
     ...     step: jax.Array

@@ -5,7 +5,7 @@ from __future__ import annotations
 import chex
 import jax
 import jax.numpy as jnp
-from flax import struct
+from jaxltl.core import struct
 
 from jaxltl.algos.common.trees import choose
 from jaxltl.core.models.protocols import PyTree

@@ -11,7 +11,7 @@ and ``init`` from ``init_key(key)``, a number that no step reaches.
 Example: a learner of the fixed point of ``x -> (1 - rate) x + rate * target``.
 
   >>> import jax, jax.numpy as jnp
-  >>> from flax import struct
+  >>> from jaxltl.core import struct
   >>> import jaxltl as jl
   >>> from jaxltl.algos.common import learner
   >>> from jaxltl.algos.common.settings import traced

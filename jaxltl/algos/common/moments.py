@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-from flax import struct
+from jaxltl.core import struct
 
 from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.pretty_print import brief

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from flax import struct
+from jaxltl.core import struct
 
 from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.pretty_print import brief

@@ -24,7 +24,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
+from jaxltl.core import struct
 
 from jaxltl.algos.common.schedules import at, is_schedule
 from jaxltl.core import validation

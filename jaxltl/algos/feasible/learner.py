@@ -47,7 +47,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from flax import struct
+from jaxltl.core import struct
 from jax import lax
 from jax.tree_util import Partial
 from numpy.typing import ArrayLike

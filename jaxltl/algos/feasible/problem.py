@@ -8,7 +8,7 @@ from typing import Any, cast
 
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
+from jaxltl.core import struct
 from numpy.typing import ArrayLike
 
 from jaxltl.core import validation

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-from flax import struct
+from jaxltl.core import struct
 from jax import lax
 
 from jaxltl.algos.common import learner, splitmix

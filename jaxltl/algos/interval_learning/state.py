@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 
 import jax
-from flax import struct
+from jaxltl.core import struct
 
 from jaxltl.algos.common.settings import COUNT, Number, static, traced
 from jaxltl.core.pretty_print import brief, history

@@ -47,7 +47,7 @@ from typing import Any
 import chex
 import jax
 import jax.numpy as jnp
-from flax import struct
+from jaxltl.core import struct
 from jax import lax
 from jax.tree_util import Partial
 

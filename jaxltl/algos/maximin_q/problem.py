@@ -8,7 +8,7 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
+from jaxltl.core import struct
 from numpy.typing import ArrayLike, NDArray
 
 from jaxltl.algos.common.play import (

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
-from flax import struct
+from jaxltl.core import struct
 from jax import lax
 
 from jaxltl.algos.common import trees

@@ -42,7 +42,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from flax import struct
+from jaxltl.core import struct
 from jax.flatten_util import ravel_pytree
 
 from jaxltl.algos.common import learner, optimizers, trees

@@ -6,7 +6,7 @@ from functools import partial
 
 import flax.linen as nn
 import jax
-from flax import struct
+from jaxltl.core import struct
 from jax.sharding import NamedSharding
 
 from jaxltl.algos.common import action_distributions as actions_of

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
-from flax import struct
+from jaxltl.core import struct
 
 from jaxltl.algos.common import splitmix
 from jaxltl.algos.common.play import draw, observed_reward, successor_slot, take

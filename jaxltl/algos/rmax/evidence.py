@@ -7,7 +7,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
+from jaxltl.core import struct
 from numpy.typing import ArrayLike, NDArray
 
 from jaxltl.algos.common import pac

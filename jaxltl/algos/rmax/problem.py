@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
+from jaxltl.core import struct
 from numpy.typing import ArrayLike, NDArray
 
 from jaxltl.algos.common.play import (

@@ -45,13 +45,14 @@ import chex
 import jax
 import jax.numpy as jnp
 import optax
-from flax import linen as nn, struct
+from flax import linen as nn
 from jax import lax
 
 from jaxltl.algos.common import learner, optimizers, trees
 from jaxltl.algos.common.early_stopping import Best, stop_early
 from jaxltl.algos.todirl.planning import backward_induction, plan, reward, soft_plan
 from jaxltl.algos.todirl.problem import Hparams, Problem, network_inputs
+from jaxltl.core import struct
 from jaxltl.core.models.ops.successor_tables import PredecessorTable
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import PyTree

@@ -7,10 +7,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from flax import linen as nn, struct
+from flax import linen as nn
 
 from jaxltl.algos.common.settings import COUNT, Number, static, traced
 from jaxltl.algos.todirl.networks import RewardNetwork
+from jaxltl.core import struct
 from jaxltl.core.models.construct.batch import (
     restrict_stacked_actions,
     stack_models,

@@ -8,7 +8,7 @@ from typing import Any
 import chex
 import jax
 import jax.numpy as jnp
-from flax import struct
+from jaxltl.core import struct
 
 from jaxltl.core import validation
 from jaxltl.core.environments.environment import (

@@ -16,7 +16,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
+from jaxltl.core import struct
 
 from jaxltl.core.automata.automaton import Automaton, run
 from jaxltl.core.automata.runs import live_states, universal_states

@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 import chex
 import jax
 import numpy as np
-from flax import struct
+from jaxltl.core import struct
 
 from jaxltl.core.games import facts
 from jaxltl.core.logic.labels import satisfying

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import chex
 import jax
 import numpy as np
-from flax import struct
+from jaxltl.core import struct
 
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.games import facts

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from flax import struct
+from jaxltl.core import struct
 
 from jaxltl.core.array_types import Array
 from jaxltl.core.automata.automaton import Automaton

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxltl.core import struct
 from jaxltl.core.graphs.colouring import components_by_sweeps
 from jaxltl.core.models.compiled.compiled import compiled_form
 from jaxltl.core.models.game import Game
@@ -115,7 +116,7 @@ class TracedGraph:
         return lax.fori_loop(0, count, body, start)
 
 
-jax.tree_util.register_dataclass(TracedGraph, data_fields=["model"], meta_fields=[])
+struct.register(TracedGraph, ["model"])
 
 Graph: TypeAlias = Any  # a RowGraph with NumPy's arrays, or a TracedGraph with JAX's
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,9 +14,9 @@ from jaxltl.core.graphs.graph import Graph
 class Sets(NamedTuple):
     """Prob1 states, prob0 states, and a policy that attains these probabilities."""
 
-    one: Array
-    zero: Array
-    action: Array
+    one: Any  # arrays of the graph's namespace
+    zero: Any
+    action: Any
 
 
 def policy_sets(graph: Graph, target: Array, policy: Array) -> Sets:

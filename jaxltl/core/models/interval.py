@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from flax import struct
+from jaxltl.core import struct
 
 from jaxltl.core.models import facts
 from jaxltl.core.models.mdp import MDP

@@ -14,7 +14,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
+from jaxltl.core import struct
 
 from jaxltl.core import validation
 from jaxltl.core.automata.automaton import Automaton, letter_index

@@ -11,7 +11,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
+from jaxltl.core import struct
 from numpy.typing import DTypeLike
 
 from jaxltl.core.models import facts

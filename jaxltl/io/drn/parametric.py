@@ -13,7 +13,7 @@ from hashlib import sha256
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
+from jaxltl.core import struct
 from numpy.typing import ArrayLike
 
 from jaxltl.core.models.parametric.parametric import Ends, ParametricMDP, box_of, point_inside

@@ -7,7 +7,7 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
+from jaxltl.core import struct
 
 from jaxltl.core.models import facts
 from jaxltl.core.models.ops import operators

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
+from jaxltl.core import struct
 from jax import lax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 

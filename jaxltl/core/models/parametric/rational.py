@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
+from jaxltl.core import struct
 
 from jaxltl.core.pretty_print import brief
 

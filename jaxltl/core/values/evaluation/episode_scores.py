@@ -9,7 +9,7 @@ from typing import Any
 import chex
 import jax
 import jax.numpy as jnp
-from flax import struct
+from jaxltl.core import struct
 from jax.tree_util import Partial
 
 from jaxltl.core import validation

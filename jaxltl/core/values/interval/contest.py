@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from flax import struct
+from jaxltl.core import struct
 from jax import lax
 
 from jaxltl.core.values.engine.linear import DENSE_LIMIT, inverse, solve_linear

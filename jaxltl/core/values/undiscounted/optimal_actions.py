@@ -12,7 +12,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from flax import struct
+from jaxltl.core import struct
 from numpy.typing import NDArray
 
 from jaxltl.core.graphs.end_components import components_within

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
+from jaxltl.core import struct
 from jax import lax
 
 from jaxltl.core.graphs.acceptance import accepting_bottom_components

@@ -212,7 +212,7 @@ def _positive(reward: jax.Array) -> jax.Array:
 
 
 def _largest(graph: TracedGraph, reward: jax.Array, target: jax.Array) -> _Problem:
-    never = avoid(graph, target)
+    never = jnp.asarray(avoid(graph, target))
     doomed = attract(graph, never, among=~target)
     finite = ~doomed.region
     first = graph.first(graph.available)[1]
