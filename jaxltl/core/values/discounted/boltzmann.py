@@ -140,7 +140,7 @@ def _boltzmann_value(
     reward, over = expected_reward(model, reward), choices(model)
     start = jnp.zeros(model.num_states, model.dtype) if initial is None else initial.ravel()
     damping = jnp.where(given.contracts | (method == "newton"), 0.0, 0.5).astype(model.dtype)
-    value, image, n = newton.solve(
+    value, image, n, _ = newton.solve(
         sweep_operator(model),
         softmax_mean,
         _judge,

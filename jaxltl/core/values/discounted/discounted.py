@@ -232,7 +232,7 @@ def _policy_value(model, policy, reward, discount, tolerance, max_steps) -> Solu
     def combine(over: Any, q: Any, given: Parameters):
         return over.mean(given.policy, q), given.policy
 
-    value, image, n = newton.solve(
+    value, image, n, _ = newton.solve(
         rows,
         combine,
         judge,
@@ -356,7 +356,7 @@ def _optimal_value(
             model, reward, given, max_steps, evaluation_sweeps
         )
     else:
-        value, image, n = newton.solve(
+        value, image, n, _ = newton.solve(
             sweep_operator(model),
             best_action,
             judge,

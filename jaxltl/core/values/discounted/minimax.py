@@ -338,7 +338,7 @@ def _horizon(
             return (growth <= 2.0**-7) | ~jnp.isfinite(growth) | ~given[1], jnp.abs(growth)
 
         ones = jax.tree.map(lambda m: jnp.ones(m.shape, tau.dtype), moves)
-        tau, after, _ = newton.solve(
+        tau, after, *_ = newton.solve(
             rows,
             lambda over, q, given: _chosen(over, q, given[0]),
             judge,
@@ -470,7 +470,7 @@ def _approached(rows: Any, numbers: newton.Backup, zero: jax.Array, method: str,
     if method == "strategy_iteration":
         value, image, num_steps = _strategy_iteration(rows, numbers, zero, max_steps)
     else:
-        value, image, num_steps, *chosen = newton.solve(
+        value, image, num_steps, chosen = newton.solve(
             rows,
             _chosen,
             _judge,
@@ -480,11 +480,10 @@ def _approached(rows: Any, numbers: newton.Backup, zero: jax.Array, method: str,
             monotone=False,
             first_sweeps=_FIRST_SWEEPS if zero.size > DENSE_LIMIT else 0,
             max_steps=max_steps,
-            weights=policies,
         )
     rows, numbers = lax.stop_gradient((rows, numbers))
     if policies:
-        return value, image, num_steps, rows.choices.unpacked(*chosen)
+        return value, image, num_steps, rows.choices.unpacked(chosen)
     q = newton.action_values(rows.choices, numbers, rows.expectation(value))
     return value, image, num_steps, _chosen(rows.choices, q, numbers.extra)[1]
 

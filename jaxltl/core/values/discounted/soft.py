@@ -96,7 +96,7 @@ def _soft_value(
     given = parameters(model, reward, discount, tolerance)
     reward, over = expected_reward(model, reward), choices(model)
     start = jnp.zeros(model.num_states, model.dtype) if initial is None else initial.ravel()
-    value, image, n = newton.solve(
+    value, image, n, _ = newton.solve(
         sweep_operator(model),
         soft_maximum,
         judge,

@@ -78,9 +78,8 @@ def solve(
     monotone: bool = True,
     first_sweeps: int = 0,
     max_steps: jax.Array | int,
-    weights: bool = False,
 ) -> tuple[jax.Array, ...]:
-    """A value near the fixed point of a backup; nothing is proven here."""
+    """A value near a backup's fixed point, its image, number of steps and weights; unproven."""
     # Sweeps ``v <- v + (1 - damping) (T v - v)`` and steps of Newton's method, whose linear systems
     # are solved to a hundredth by BiCGSTAB, or where that fails, on small models with a monotone
     # backup, by elimination. A step is kept if it halves the error, and where the backup is
@@ -124,8 +123,7 @@ def solve(
     last, n = iterate(
         step, lambda k, _: k.done, table, start, backup, max_steps=max_steps, lanes=lanes
     )
-    found = (last.value, last.image, n)
-    return (*found, last.weight) if weights else found
+    return last.value, last.image, n, last.weight
 
 
 def _look(
