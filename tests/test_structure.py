@@ -22,9 +22,9 @@ MODULES = {
     for path in sorted(ROOT.rglob("*.py"))
     if path.name != "__init__.py"
 }
-# The storeys, lowest first: a module imports from its own folder and from those before it.
-STOREYS = (
-    ("core.array_types", "core.pretty_print", "core.validation"),
+# The layers, lowest first: a module imports from its own folder and from those before it.
+LAYERS = (
+    ("core.array_types", "core.pretty_print", "core.struct", "core.validation"),
     "core.types",
     "core.logic",
     "core.statistics",
@@ -74,9 +74,9 @@ def imports_any(name: str, roots: tuple[str, ...]) -> list[str]:
     )
 
 
-def storey(name: str) -> int | None:
+def layer(name: str) -> int | None:
     """The level of a module or package; None for the package itself, which shows all of them."""
-    for level, folders in enumerate(STOREYS):
+    for level, folders in enumerate(LAYERS):
         for folder in (folders,) if isinstance(folders, str) else folders:
             if f"{name}.".startswith(f"jaxltl.{folder}."):
                 return level
@@ -95,17 +95,17 @@ def below(name: str) -> frozenset[str]:
     return frozenset(found)
 
 
-def test_every_module_has_a_storey():
+def test_every_module_has_a_layer():
     top = ("jaxltl.__main__",)
-    homeless = [n for n in MODULES if storey(n) is None and n not in top]
+    homeless = [n for n in MODULES if layer(n) is None and n not in top]
     assert not homeless, "give it a folder of the tree"
 
 
 @pytest.mark.parametrize("name", MODULES)
 def test_imports_flow_down(name):
-    level = storey(name)
+    level = layer(name)
     if level is not None:
-        up = sorted(other for other in below(name) if (storey(other) or 0) > level)
+        up = sorted(other for other in below(name) if (layer(other) or 0) > level)
         assert not up, f"{name} imports {up}"
 
 

@@ -574,10 +574,10 @@ class WithAxis(nn.Module):
         (lambda: ppo.make_problem(WALK, network=walk_step), "network is function; give a flax"),
         (lambda: ppo.make_problem(WALK, network=Table(3)), r"\(\(3,\), \(\)\).* expected \(\(2,\)"),
         (lambda: ppo.make_problem(WALK, network=WithAxis()), r"\(\(2,\), \(1,\)\) for one obs"),
-        (lambda: ppo.make_problem(WALK, network=Counting()), r"keeps \['seen'\] beside its param"),
+        (lambda: ppo.make_problem(WALK, network=Counting()), r"keeps \['seen'\] besides its param"),
         (
             lambda: ppo.make_problem(WALK.replace(actions=make_box(0, 5, (2,), int))),
-            "box of int64; number",
+            "box of int64; enumerate",
         ),
     ],
 )

@@ -264,7 +264,9 @@ _SHARES = {
 }
 
 
-class Batch(NamedTuple):
+@brief
+@dataclass(frozen=True)
+class Batch:
     """Episodes simulated at a time, and the devices among which they are split.
 
     Attributes:
@@ -343,15 +345,15 @@ def evaluate(
     num_steps = checked_steps(require_environment(environment), num_steps)
     most = 2**31 - 1
     num_episodes = validation.integer("num_episodes", num_episodes, least=1, most=most)
-    size, sharding = batch if isinstance(batch, Batch) else (batch, None)
-    size = validation.integer("batch", size, least=1, most=most)
+    batch = batch if isinstance(batch, Batch) else Batch(batch)
+    size = validation.integer("batch", batch.size, least=1, most=most)
     confidence = validation.fraction("confidence", confidence, ends=(False, False))
     if threshold is not None:
         threshold = validation.fraction("threshold", threshold, ends=(False, False))
     if discount is not None:
         discount = validation.fraction("discount", discount, ends=(False, False))
     require_key(key)
-    require_split("sharding", sharding)
+    require_split("sharding", batch.sharding)
     agent, world = _checked_agent(agent, environment)
     if threshold is not None and task_world(world) is None:
         raise ValueError(
@@ -367,7 +369,7 @@ def evaluate(
                 jnp.int32(count),
                 1.0 if discount is None else discount,
                 num_steps=num_steps,
-                batch=Batch(min(size, num_episodes), sharding),
+                batch=Batch(min(size, num_episodes), batch.sharding),
             )
         )
         parts.append(jax.tree.map(lambda x, most=num_episodes - count: x[:most], found))
