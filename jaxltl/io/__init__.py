@@ -1,8 +1,7 @@
 """Readers and writers of external file formats.
 
 ``jaxltl.read_model`` and ``jaxltl.write_model`` detect the format of a model; the functions here
-have options of their own. Names are imported on first use. Only ``read_parametric`` is
-differentiable, in its parameters.
+have format-specific options. Only ``read_parametric`` is differentiable, in its parameters.
 """
 
 import lazy_loader

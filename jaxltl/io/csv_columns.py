@@ -29,7 +29,6 @@ class Lines:
     times: Counter[tuple[str, ...]]  # number of lines with the same fields
 
     def error(self, fields: tuple[str, ...], message: str) -> ValueError:
-        """ValueError for the first line with the given fields."""
         return _error(self.name, self.first + self.fields.index(fields), message)
 
 
@@ -38,10 +37,8 @@ def read_columns(
 ) -> Iterator[Lines]:
     """Requested columns of a UTF-8 CSV table with a header, in batches of lines.
 
-    At least two columns. Fields may be quoted, surrounding blanks are removed, all lines have as
-    many fields as the header, and empty lines are allowed at the end only. Yields the fields of
-    `columns`, then those of `optional` that exist; none is empty. ValueErrors name the file and the
-    line.
+    Fields may be quoted; blanks around them are removed. Yields the fields of `columns`, then those
+    of `optional` that exist; an empty field is an error.
     """
     name, empty = str(path), 0
     place: tuple[int, ...] = ()
@@ -87,7 +84,6 @@ def _whole_lines(name: str, parts: Iterable[bytes]) -> Iterator[tuple[int, bytes
 
 
 def _rows(name: str, first: int, data: bytes) -> list[list[str]]:
-    """Parses complete lines into fields."""
     if first == 1:
         data = data.removeprefix(_BOM)
     if b"\r" in data:

@@ -31,7 +31,7 @@ def read_bytes(path: str | os.PathLike[str], limit: int = MAX_BYTES) -> bytes:
     """Contents of a file, decompressed if it starts with the magic number of gzip or xz.
 
     The size is bounded by `limit` and, for compressed files, by 256 MiB plus 300 times the file
-    size. Errors are ValueErrors with the file name.
+    size.
     """
     data = raw_bytes(path, limit)
     return b"".join(pieces(data, str(path), limit)) if compression_of(data) else data
@@ -105,10 +105,7 @@ def pieces(data: bytes | FileBytes, name: str, limit: int = MAX_BYTES) -> Iterat
 
 
 def streamed(path: str | os.PathLike[str], limit: int = MAX_BYTES) -> Iterator[bytes]:
-    """Decompressed contents of a file in pieces; only compressed input is held in memory.
-
-    Of a compressed file, what it holds compressed is in memory.
-    """
+    """Decompressed contents of a file in pieces; only compressed input is held in memory."""
     _check_path(path)
     packed: list[bytes] = []
     name, size = str(path), 0
@@ -163,7 +160,6 @@ def read_text(path: str | os.PathLike[str], expected: str) -> str:
 
 
 def compression_of(data: bytes | FileBytes) -> Compression | None:
-    """Compression by magic number."""
     return next((kind for kind in _BEGINS if _begins(data, 0, kind)), None)
 
 
@@ -172,7 +168,6 @@ def _begins(data: bytes | FileBytes, place: int, kind: Compression) -> bool:
 
 
 def compression_by_name(path: str | os.PathLike[str]) -> Compression | None:
-    """Compression by file suffix."""
     return _SUFFIX.get(Path(path).suffix.lower())
 
 
@@ -220,10 +215,7 @@ def _stream(data: bytes | FileBytes, place: int, kind: Compression) -> Iterator[
 def write_bytes(
     path: str | os.PathLike[str], compression: Compression | Literal["by name"] | None = "by name"
 ) -> Iterator[BinaryIO]:
-    """Context manager of a binary output file, compressed and atomic; the output is deterministic.
-
-    The same bytes give the same file: no time is written.
-    """
+    """Context manager of an atomic binary output file; equal bytes give equal files."""
     if compression == "by name":
         compression = compression_by_name(path)
     with atomic_write(path) as file:

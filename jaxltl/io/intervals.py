@@ -30,10 +30,7 @@ def has_bracket(block: Block, token: Integers) -> bool:
 
 
 def with_whole_brackets(block: Block, column: int, lines: Booleans | None = None) -> Block:
-    """Merges the tokens of each bracketed interval in a column into one token.
-
-    Shorter lines and unclosed brackets are unchanged; `lines` restricts the lines, ``bool[L]``.
-    """
+    """Merges the tokens of each bracketed interval in a column; `lines` restricts the lines."""
     looked_at = block.count > column
     if lines is not None:
         looked_at &= lines
@@ -126,11 +123,7 @@ def _number(text: Text, match: re.Match[bytes], point: re.Match[bytes]) -> bytes
 
 
 def first_without_distribution(total: Floats) -> tuple[int, str, str] | None:
-    """First choice whose probabilities or bounds have an infeasible sum, or None.
-
-    `total` has the sums of each choice, ``float64[R]``, or of its bounds, ``float64[R, 2]``.
-    Returns the choice, the subject of the message and the problem.
-    """
+    """First choice with an infeasible sum ``[R]`` or ``[R, 2]``, subject and problem; or None."""
     ends = total.reshape(len(total), -1)
     above, below = ends[:, 0] > 1 + NEAR, ends[:, -1] < 1 - NEAR
     if not (above | below).any():

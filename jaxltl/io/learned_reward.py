@@ -47,14 +47,14 @@ class LearnedReward:
     Attributes:
       parameters: of ``RewardNetwork(hidden)``, ``{"params": ...}``.
       hidden: widths of the hidden layers.
-      memory: automaton whose state is an input of the network.
+      memory: automaton; its state is an input of the network.
       label_on: label that a product step reads.
       discount, horizon: of the learner; the horizon may be None.
       radius: radius of the observed neighbourhood.
       formula: task formula.
       kinds: names of the one-hot components of an observed cell.
-      guarantee: ``"best"`` restricts plans to optimal actions for the task; a probability mixes in
-        as much of them as it takes; ``"none"``.
+      guarantee: ``"best"`` restricts plans to optimal actions for the formula; a probability mixes
+        in the least sufficient share of them; ``"none"``.
       over: initial states that a probability refers to, ``"mean"`` or ``"worst"``.
     """
 
@@ -88,8 +88,8 @@ def plan_in(learned: LearnedReward, world: MDP, observation: ArrayLike) -> tuple
 
     Args:
       learned: the reward.
-      world: a model whose labels include the propositions of the memory automaton.
-      observation: ``float[S, O]``, the observation in each state, such as
+      world: a model with labels for all propositions of the memory automaton.
+      observation: ``float[S, O]``, such as the result of
         ``temporal_gridworld.observations(world, learned.radius)``.
 
     Returns:
@@ -142,10 +142,9 @@ _ABOUT = (
 def save_reward(path: str | Path, learned: LearnedReward) -> None:
     """Writes a learned reward as ``.npz``, atomically.
 
-    The arrays are the parameters by path, such as ``params/kernel``, and ``about``, JSON text.
-
     Args:
-      path: the file.
+      path: the file; its arrays are the parameters by path, such as ``params/kernel``, and
+        ``about``, JSON text.
       learned: the reward.
 
     Raises:

@@ -42,21 +42,16 @@ def read_log(
 ) -> TransitionCounts:
     """Transition counts of a CSV log.
 
-    A log is UTF-8 text (RFC 4180), plain or compressed by gzip or xz, such as::
-
-        state,action,next
-        hall,left,kitchen
-
-    The header names the columns, in any order and among others. An optional column `count` has the
-    number of occurrences; 0 marks a possible transition that was not observed. The file is
-    streamed; memory is proportional to the number of names and distinct transitions.
+    A log is UTF-8 text (RFC 4180), plain or compressed by gzip or xz. Its header names the columns,
+    in any order and among others. In the column of counts, 0 marks a possible transition that was
+    not observed. Memory is proportional to the number of names and distinct transitions.
 
     Args:
       path: the file.
       model: a model that must contain every transition; its names are the variable `state` or the
         state numbers, and the names or numbers of actions.
       columns: names of the columns of state, action and next state.
-      count: name of the column of counts.
+      count: name of the optional column of counts.
       states, actions: all names, in order. Default: those of the log, sorted (as numbers if all
         are).
 
@@ -216,7 +211,6 @@ def _numbers(
 
 
 def _count(lines: Lines, fields: tuple[str, ...]) -> int:
-    """Validated count of a line."""
     if _COUNT.fullmatch(fields[3]) and (count := int(fields[3])) <= _MOST:
         return count
     raise lines.error(

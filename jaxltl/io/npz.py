@@ -84,7 +84,7 @@ def parse_arrays(raw: bytes, name: str, more: Sequence[str] = ()) -> dict[str, A
 
 
 def _check_size(raw: bytes, name: str) -> None:
-    """Raises ValueError for archives whose decompressed size exceeds the limit."""
+    """Raises ValueError for archives with a decompressed size above the limit."""
     try:
         with zipfile.ZipFile(io.BytesIO(raw)) as archive:
             size = sum(entry.file_size for entry in archive.infolist())

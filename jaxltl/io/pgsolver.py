@@ -1,8 +1,7 @@
 """Parity games in the PGSolver text format.
 
-Friedmann and Lange, "The PGSolver collection of parity game solvers" (2010), also read by Oink and
-Knor. Max-even: player 0, here the system, wins if the largest priority visited infinitely often is
-even.
+Friedmann and Lange, "The PGSolver collection of parity game solvers" (2010). Max-even: player 0,
+here the system, wins if the largest priority visited infinitely often is even.
 """
 
 from __future__ import annotations
@@ -69,12 +68,7 @@ def read_pgsolver(path: str | os.PathLike[str]) -> ParityGame:
 
 
 def min_even(priority: Integers, neutral: NDArray[np.bool_] | None = None) -> Integers:
-    """Converts max-even to min-even priorities, compressed to the fewest values.
-
-    Example:
-      >>> min_even(np.array([7, 4, 2, 5, 0, 1])).tolist()
-      [1, 2, 2, 1, 4, 3]
-    """
+    """Converts max-even to min-even priorities, compressed to the fewest values."""
     decides = np.ones(priority.shape, bool) if neutral is None else ~neutral
     values = np.unique(priority[decides])[::-1]
     number = np.concatenate([values[:1] % 2, (np.diff(values) % 2 != 0).astype(np.int64)]).cumsum()
@@ -356,10 +350,7 @@ def edges_of(game: Game, place: str) -> tuple[Integers, Integers]:
 def max_even(
     valuation: Mapping[str, NDArray[np.generic]], objective: Parity | None
 ) -> tuple[Integers, NDArray[np.bool_]]:
-    """Max-even priorities of an objective, and the mask of decided states.
-
-    The priorities of the valuation are kept if they are equivalent, and are the default objective.
-    """
+    """Max-even priorities of an objective, by default the valuation's, and decided states."""
     stored = valuation.get("priority")
     if objective is None:
         if stored is None:

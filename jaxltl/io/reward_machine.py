@@ -1,8 +1,7 @@
 """Reward machines: automata with rewards on transitions, in their text format.
 
-Toro Icarte, Klassen, Valenzano and McIlraith, "Using reward machines for high-level task
-specification and decomposition in reinforcement learning" (ICML 2018) and "Reward machines:
-exploiting reward function structure in reinforcement learning" (JAIR 2022).
+Toro Icarte, Klassen, Valenzano and McIlraith, "Reward machines: exploiting reward function
+structure in reinforcement learning" (JAIR 2022).
 """
 
 from __future__ import annotations
@@ -52,8 +51,8 @@ def read_reward_machine(
     The first line has the initial state, the second the list of terminal states, each other line a
     transition ``(u, v, 'e&!n', ConstantRewardFunction(1))``; ``#`` starts a comment. Guards are
     Boolean formulas over propositions, ``True`` and ``False`` with ``! & |`` and parentheses. The
-    first transition whose guard holds is taken; if none holds the machine ends, in a state named
-    "ended", with reward 0. Terminal states earn nothing, and their transitions are ignored.
+    first transition with a satisfied guard is taken; without one the machine ends, in a state named
+    "ended", with reward 0. Terminal states have reward 0, and their transitions are ignored.
 
     Args:
       source: a file, or the text itself.
@@ -68,16 +67,12 @@ def read_reward_machine(
         than 12 propositions without `letters`.
 
     Example:
-      >>> machine = read_reward_machine('''
-      ... 0      # without coffee
-      ... [2]    # done
-      ... (0, 1, 'c', ConstantRewardFunction(0))
-      ... (0, 0, 'True', ConstantRewardFunction(0))
-      ... (1, 2, 'o', ConstantRewardFunction(1))
-      ... (1, 1, '!o', ConstantRewardFunction(0))
-      ... ''')
+      >>> machine = read_reward_machine('''0
+      ... [1]
+      ... (0, 1, 'goal', ConstantRewardFunction(2))
+      ... (0, 0, '!goal', ConstantRewardFunction(0))''')
       >>> machine.automaton.propositions, machine.reward.max(axis=1).tolist()
-      (('c', 'o'), [0.0, 1.0, 0.0])
+      (('goal',), [2.0, 0.0])
     """
     is_text = isinstance(source, str) and "\n" in source
     place = "read_reward_machine" if is_text else str(source)
@@ -172,7 +167,6 @@ class _Reader:
 
 
 def _quoted(name: str) -> str:
-    """Quoted proposition name, which the LTL parser cannot take for an operator."""
     text = proposition_text(name)
     return text if text.startswith('"') else f'"{text}"'
 

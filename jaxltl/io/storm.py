@@ -25,8 +25,7 @@ def from_stormpy(model: StormModel) -> SparseMDP | IntervalMDP | Game:
     """Model of a sparse stormpy model, bit for bit.
 
     Keeps the order of states and choices, labels (``"init"`` becomes the initial distribution),
-    rewards, choice labels as action names, and state valuations; exact probabilities become the
-    nearest doubles.
+    rewards, choice labels as action names, and state valuations; exact probabilities are rounded.
 
     Args:
       model: a `SparseDtmc`, `SparseMdp` or `SparseSmg`, or one of the first two with intervals.
@@ -85,7 +84,9 @@ def to_stormpy(model: Model) -> StormModel:
     base = model.mdp if isinstance(model, Game) else model
     sparse = to_sparse(base.nominal if isinstance(base, IntervalMDP) else base)
     options = storm.io.UmbImportOptions()
-    options.build_state_valuations = bool(sparse.valuation)  # else Storm warns that there are none
+    options.build_state_valuations = bool(
+        sparse.valuation
+    )  # else Storm warns of missing valuations
     options.build_choice_labeling = sparse.action is not None
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "model.umb"

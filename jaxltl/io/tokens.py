@@ -1,6 +1,6 @@
-"""Vectorised tokenizer of text files, in blocks of a few megabytes.
+"""Vectorised tokenizer of text files, in blocks of whole lines of a few megabytes.
 
-Blocks consist of whole lines. Bytes up to the blank separate tokens; lines end with a line feed.
+Bytes up to the blank separate tokens; lines end with a line feed.
 """
 
 from __future__ import annotations
@@ -35,7 +35,6 @@ class Text:
     line: int = 1
 
     def error(self, line: int, message: str) -> ValueError:
-        """ValueError with the file name and line."""
         return ValueError(f"{self.name!r}, line {line}: {message}")
 
     def first_line(self, comment: bytes) -> tuple[bytes, int, Text]:
@@ -82,11 +81,9 @@ class Block:
 
     @property
     def count(self) -> Integers:
-        """Number of tokens of each line, ``int[L]``."""
         return np.diff(self.first)
 
     def error(self, token: int, expected: str) -> ValueError:
-        """ValueError for an unexpected token."""
         actual = (
             self.data[self.start[token] : self.end[token]][:60].tobytes().decode(errors="replace")
         )
@@ -98,7 +95,6 @@ class Block:
         )
 
     def whole(self, line: int) -> bytes:
-        """Bytes of a line."""
         begin, end = self.start[self.first[line]], self.end[self.first[line + 1] - 1]
         return self.data[begin:end].tobytes()
 
@@ -110,7 +106,6 @@ class Block:
         return joined
 
     def texts(self, token: Integers) -> list[bytes]:
-        """Tokens as bytes."""
         return self.joined(token).tobytes().split(b" ")[:-1]
 
     def integers(self, token: Integers, expected: str, below: int = 2**31 - 1) -> Integers:
@@ -156,7 +151,6 @@ class Block:
     def probabilities(
         self, token: Integers, other: Callable[[bytes], float | None] | None = None
     ) -> Floats:
-        """Tokens as probabilities."""
         values = self.floats(token, "a probability", other)
         self.require((values >= 0) & (values <= 1 + 1e-6), token, "a probability from 0 to 1")
         return values
@@ -178,7 +172,6 @@ class Block:
             raise self.malformed(i if lines is None else int(lines[i]), form)
 
     def malformed(self, line: int, form: str) -> ValueError:
-        """ValueError for a malformed line."""
         actual = self.whole(line)[:60].decode(errors="replace")
         return self.text.error(int(self.line[line]), f"{actual!r}; expected {form}.")
 
@@ -219,7 +212,6 @@ def numbered(texts: list[bytes], index_of_name: dict[bytes, int]) -> Integers:
 
 
 def decoded(text: Text, names: dict[bytes, int]) -> list[str]:
-    """Names decoded as UTF-8."""
     try:
         return [name.decode() for name in names]
     except UnicodeDecodeError as error:
@@ -302,5 +294,4 @@ def truncated(announced: int, count: int, items: str) -> str:
 
 
 def refuse(name: str, message: str) -> NoReturn:
-    """Raises ValueError for a file."""
     raise ValueError(f"{name!r}: {message}")

@@ -281,11 +281,7 @@ def _read_actions(
 def _rewards(
     block: Block, body: Body, lines: Integers, numbers: Values, form: str
 ) -> tuple[Numbers | None, Integers, dict[int, bytes]]:
-    """Rewards ``[n, rewards]`` or None, index of the next token, and the rest of irregular lines.
-
-    Regular lines have rewards ``[1, 2]``, one token each with a bracket or comma. Irregular lines,
-    with other spacing or with quotation marks, are parsed one by one.
-    """
+    """Rewards ``[n, rewards]`` or None, next token index, and the rest of irregular lines."""
     at, count = block.first[:-1][lines], block.count[lines]
     third = np.minimum(at + 2, block.start.size - 1)
     has = (count > 2) & (block.data[block.start[third]] == ord("["))
@@ -389,7 +385,6 @@ class Names(TypedDict):
 
 
 def names_of(header: Header, body: Body) -> Names:
-    """Labels, initial states and actions as arguments of ``make_sparse``."""
     text = header.body
     holds = label_matrix(text, body.num_states, len(body.label_names))
     for state, column in zip(body.labelled, body.label, strict=True):

@@ -51,23 +51,12 @@ def read_drn(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP:
     Example:
       >>> import pathlib, tempfile
       >>> path = pathlib.Path(tempfile.mkdtemp()) / "coin.drn"
-      >>> _ = path.write_text('''@type: DTMC
-      ... @reward_models
-      ... tosses
-      ... @nr_states
-      ... 2
-      ... @model
-      ... state 0 [1] init
-      ...     action 0 [0]
-      ...         0 : 1/2
-      ...         1 : 1/2
-      ... state 1 [0] heads
-      ...     action 0 [0]
-      ...         1 : 1
-      ... ''')
+      >>> _ = path.write_text("@type: DTMC\\n@nr_states\\n2\\n@model\\n"
+      ...     "state 0 init\\n\\taction 0\\n\\t\\t0 : 1/2\\n\\t\\t1 : 1/2\\n"
+      ...     "state 1 heads\\n\\taction 0\\n\\t\\t1 : 1\\n")
       >>> model = read_drn(path)
-      >>> model.probability.tolist(), model.propositions, model.rewards["tosses"].state.tolist()
-      ([0.5, 0.5, 1.0], ('heads',), [1.0, 0.0])
+      >>> model.probability.tolist(), model.propositions
+      ([0.5, 0.5, 1.0], ('heads',))
     """
     name, data = str(path), read_bytes(path)
     header = read_header(Text(name, data, 0, len(data)))

@@ -74,10 +74,10 @@ class RationalFunction:
 @brief
 @dataclass(frozen=True)
 class ParametricModel:
-    """Markov chain or MDP whose probabilities and rewards are rational functions.
+    """Markov chain or MDP with rational functions as probabilities and rewards.
 
-    The layout is that of :class:`~jaxltl.core.models.sparse.SparseMDP`, with the successors of a
-    row in the order of the file.
+    Same layout as :class:`~jaxltl.core.models.sparse.SparseMDP`, with the successors of a row in
+    the order of the file.
 
     Attributes:
       parameters: names of the parameters.
@@ -424,7 +424,6 @@ def _divide(a: RationalFunction, b: RationalFunction) -> RationalFunction:
 def _parsed(
     text: bytes, parameters: tuple[str, ...], placeholders: Mapping[str, RationalFunction]
 ) -> RationalFunction:
-    """Parses a rational function."""
     try:
         string = text.decode()
     except UnicodeDecodeError:

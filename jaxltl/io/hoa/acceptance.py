@@ -53,7 +53,6 @@ def condition_given(condition: Tree, number: int, visited: bool) -> Tree:
 
 
 def _sets_of(condition: Tree) -> list[int]:
-    """Acceptance sets of a condition, sorted."""
     sets: set[int] = set()
     stack = [condition]
     while stack:
@@ -69,7 +68,7 @@ def decisive_sets(condition: Tree) -> tuple[list[tuple[int, bool]], bool] | None
     """Order of acceptance sets by importance if the condition is a parity condition, else None.
 
     A set is decisive if visiting it infinitely often settles acceptance, given that the more
-    important sets are not. Buchi, co-Buchi and all styles of parity have such an order.
+    important sets are not.
     """
     order = []
     while condition not in (TRUE, FALSE):

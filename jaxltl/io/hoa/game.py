@@ -1,8 +1,7 @@
-"""Synthesis games in the extended HOA format.
+"""Synthesis games in the extended HOA format of SYNTCOMP.
 
 A deterministic automaton with `controllable-AP:` (Pérez 2019, "The extended HOA format for
-synthesis"): in each step the environment chooses the inputs and then the system, observing them,
-the outputs. Used by SYNTCOMP, Strix, Knor and ltlsynt.
+synthesis"): in each step the environment chooses the inputs, then the system the outputs.
 """
 
 from __future__ import annotations
@@ -66,10 +65,9 @@ def read_hoa_game(source: str | os.PathLike[str]) -> HoaGame:
 
     The environment moves in the automaton's states, one copy per priority of an incoming edge.
     Inputs with the same residual guards form a class; each class leads to a state of the system,
-    whose moves are the classes of outputs. Action names are the conditions. The `valuation` holds
-    in ``"state"`` the automaton state (-1 for the losing sink of missing edges) and in
-    ``"priority"`` max-even priorities. Guards are decision diagrams, so the cost depends on the
-    number of classes, not of propositions. Unreachable states are removed.
+    with the classes of outputs as moves. Action names are the conditions. The `valuation` holds in
+    ``"state"`` the automaton state (-1 for the losing sink of missing edges) and in ``"priority"``
+    max-even priorities. Unreachable states are removed.
 
     Args:
       source: a file, plain or compressed, or HOA text.
@@ -85,8 +83,8 @@ def read_hoa_game(source: str | os.PathLike[str]) -> HoaGame:
       >>> text = '''HOA: v1 States: 1 Start: 0 AP: 2 "request" "grant" controllable-AP: 1
       ...   acc-name: parity max even 3 Acceptance: 3 Inf(2) | (Fin(1) & Inf(0))
       ...   --BODY-- State: 0 [0 & 1] 0 {2} [0 & !1] 0 {1} [!0] 0 {0} --END--'''
-      >>> found = read_hoa_game(text)
-      >>> found.inputs, found.outputs, found.game.mdp.action_names
+      >>> game = read_hoa_game(text)
+      >>> game.inputs, game.outputs, game.game.mdp.action_names
       (('request',), ('grant',), ('!request', 'request', 'true', 'grant', '!grant'))
     """
     if isinstance(source, str) and ("\n" in source or source.lstrip()[:4] in ("HOA:", "/*")):
@@ -360,10 +358,9 @@ def write_hoa_game(
     """Text of a deterministic game in the extended HOA format, with max-even parity acceptance.
 
     If the players alternate and the system's states have neutral priority, each pair of moves is an
-    edge; else each game state is an automaton state whose edges read the owner's propositions.
-    Action names that form a partition, as :func:`read_hoa_game` makes them, are the guards;
-    otherwise moves are numbered in binary by ``i0, i1, ...`` (environment) and ``o0, o1, ...``
-    (system).
+    edge; else each game state is an automaton state, with edges over the owner's propositions.
+    Action names that form a partition are the guards; otherwise moves are numbered in binary by
+    ``i0, i1, ...`` (environment) and ``o0, o1, ...`` (system).
 
     Args:
       game: a Game over an MDP, DenseMDP or SparseMDP with one initial state.

@@ -21,7 +21,6 @@ FALSE: Tree = ("false",)
 
 
 def unquoted(token: str) -> str:
-    """Unescapes a quoted token."""
     return re.sub(r"(?s)\\(.)", r"\1", token[1:-1])
 
 
@@ -75,7 +74,6 @@ _TERMINAL = {
 
 
 def error_at(line: int | None, message: str) -> ValueError:
-    """ValueError with a line number."""
     return ValueError(f"read_hoa: line {line}: {message}")
 
 
@@ -171,8 +169,6 @@ marks: _BEGIN INT* _FINISH
 
 @dataclass(frozen=True)
 class Edge:
-    """Parsed edge."""
-
     label: Tree | None
     targets: list[Token]
     marks: list[Token]

@@ -22,7 +22,7 @@ MAX_PRIORITIES = 256  # nesting depth of the acceptance formula
 
 @dataclass(frozen=True)
 class Header:
-    """Header fields; `states` is None without ``States:``."""
+    """Header fields; `states` may be None, for a header without ``States:``."""
 
     states: int | None
     start: Token
@@ -120,10 +120,7 @@ def only_target(targets: Sequence[Token], place: str) -> Token:
 
 
 def _condition(tree: Tree, sets: int) -> Tree:
-    """Acceptance formula over set indices, with `sets + x` for the complement of x.
-
-    It has the operators `true`, `false`, `and`, `or`, and `inf` and `fin` with a number.
-    """
+    """Acceptance formula over set indices, with `sets + x` for the complement of x."""
     if tree[0] in ("and", "or"):
         return (tree[0], *[_condition(part, sets) for part in tree[1:]])
     if tree[0] != "atom":

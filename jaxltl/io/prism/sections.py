@@ -19,8 +19,6 @@ _STEP = 2**17  # lines per piece
 
 @dataclass(frozen=True)
 class Written:
-    """Section of the output."""
-
     kind: str  # "tra", "lab", "sta", "srew" or "trew"
     number: str  # number of the reward if there are several
     header: list[bytes]  # lines that introduce the section in a single file
@@ -216,5 +214,4 @@ def _transition_rewards(
 
 
 def _infinity(lines: bytes, storm: bool) -> bytes:
-    """Spells infinity as PRISM does."""
     return lines if storm else lines.replace(b"inf", b"Infinity")

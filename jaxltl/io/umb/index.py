@@ -33,8 +33,6 @@ _MOST_RECORD = 2**16  # bytes of one state's valuation
 
 @dataclass(frozen=True)
 class Type:
-    """Value type: name and size in bits."""
-
     name: str
     size: int
 
@@ -62,8 +60,6 @@ class Annotation:
 
 @dataclass(frozen=True)
 class Variable:
-    """State variable."""
-
     name: str  # name, type: as in the file
     type: Type
     offset: int  # added to the encoded value
@@ -89,7 +85,6 @@ class Items:
     more: int = 0  # additional elements
 
     def size(self, count: int) -> int:
-        """Size of the member in bytes."""
         return bit_bytes(count) if self.bits == 1 else (count + self.more) * self.bits // 8
 
     def span(self, begin: int, end: int) -> tuple[int, int]:

@@ -72,7 +72,6 @@ def check_memory(size: int, place: str) -> None:
 
 
 def needed(contents: dict[str, Bytes], member: str, place: str) -> Bytes:
-    """Contents of a required member."""
     if member not in contents:
         raise ValueError(f"{place}{member} is missing.")
     return contents[member]
@@ -122,7 +121,6 @@ def labels_of(
 
 
 def rewards_of(contents: dict[str, Bytes], index: Index, place: str) -> dict[str, Rewards]:
-    """Reward structures by name."""
     rewards, begins = {}, dict(zip(PARTS, index.begins, strict=True))
     for one in index.annotations:
         if one.group == "rewards":

@@ -49,11 +49,11 @@ _Span = tuple[int, int]
 def read_sharded(
     path: str | os.PathLike[str], mesh: Mesh, *, axis: str | None = None
 ) -> ShardedMDP:
-    """UMB model on a device mesh; each process reads the states of its own devices.
+    """UMB model on a device mesh; each process reads only the states of its devices.
 
-    Equals ``shard(read_model(path), mesh)`` up to the last bit of the initial distribution, for
-    models that need not fit into one process. Compressed archives are read as a whole. Rewards
-    become expected rewards of choices; state variables and action names are dropped.
+    Equals ``shard(read_model(path), mesh)`` up to the last bit of the initial distribution, without
+    holding the model in one process. Compressed archives are read as a whole. Rewards become
+    expected rewards of choices; state variables and action names are dropped.
 
     Args:
       path: the file of a Markov chain or MDP, plain or compressed by gzip or xz.
@@ -63,8 +63,7 @@ def read_sharded(
       A ShardedMDP.
 
     Raises:
-      ValueError: as ``shard`` for the mesh and ``read_model`` for the file; for games and interval
-        models.
+      ValueError: as ``shard`` and ``read_model``; for games and interval models.
 
     Example:
       >>> import tempfile, jax, jaxltl as jl
@@ -180,7 +179,7 @@ def _taken(stream: Stream, member: str, spans: Sequence[_Span]) -> _Runs:
     return _Runs(runs, arrays)
 
 
-# --- what is read ---------------------------------------------------------------------------
+# --- members in memory ----------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -193,11 +192,7 @@ class _Held:
 
 
 def _read(archive: _Archive, index: Index, ranges: list[_Span]) -> _Held:
-    """Reads all members of some ranges of states, with as few passes over the archive as possible.
-
-    With as many choices as states (branches as choices) a one-to-one map is presumed; members read
-    at wrong ranges are read again.
-    """
+    """Reads all members of some ranges of states, with as few passes as possible."""
     items, held = index.items(), _Held({"states": ranges}, {}, {})
     _presume(index, held)
     goes_on = True

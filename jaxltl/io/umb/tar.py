@@ -1,7 +1,6 @@
-"""Streaming reader of tar archives, and a deterministic writer.
+"""Streaming reader of POSIX tar archives (ustar, long names, large sizes), and a writer.
 
-POSIX (ustar) archives with the usual extensions for long names and large sizes. Member sizes are
-not trusted beyond the available bytes, and nothing is extracted to disk.
+Member sizes are not trusted beyond the available bytes, and nothing is extracted to disk.
 """
 
 from __future__ import annotations
@@ -28,12 +27,7 @@ _STEP = 2**20  # bytes of a file that are read at a time
 
 
 class Stream:
-    """Sequential reader of a file or of byte pieces; skipped bytes of a file are not read.
-
-    Attributes:
-      place: prefix of error messages.
-      position: number of bytes consumed.
-    """
+    """Sequential reader of a file or of byte pieces; skipped bytes of a file are not read."""
 
     def __init__(self, source: Iterator[bytes] | FileBytes, place: str):
         self._source, self._held, self.place, self.position = source, memoryview(b""), place, 0
@@ -256,10 +250,7 @@ _PROBED = 2**15
 
 
 def write_gzip(file: BinaryIO, pieces: Iterator[memoryview], threads: int = 4) -> None:
-    """Writes a gzip stream, compressed in blocks by several threads.
-
-    Blocks have fixed boundaries and no time stamp: the output does not depend on the threads.
-    """
+    """Writes a gzip stream, compressed by threads in fixed blocks: the output is deterministic."""
     file.write(b"\x1f\x8b\x08\0\0\0\0\0\0\xff")
     checksum = size = 0
     with ThreadPoolExecutor(threads) as pool:

@@ -181,7 +181,7 @@ def _owners(
             f"{place}{member}: a state is of player {player.max()}; expected 0 to "
             f"{index.players - 1}."
         )
-    # Storm assigns states with one choice, whose owner is irrelevant, to a third player.
+    # Storm assigns states with one choice to a third player; their owner is irrelevant.
     more = np.flatnonzero((player > 1) & (np.diff(row_start) > 1))
     if more.size:
         names = ", ".join(map(repr, index.player_names[:9])) or "no names"
@@ -210,8 +210,8 @@ def write_umb(
 
     Args:
       path: the file.
-      model: a model that ``to_sparse`` takes, an interval model, whose rewards are written as point
-        intervals, or a game.
+      model: a model that ``to_sparse`` takes, a game, or an interval model; its rewards are written
+        as point intervals.
       compression: "gzip", "xz", None for none, or by suffix: xz for ``.xz``, else gzip.
 
     Raises:
@@ -314,7 +314,6 @@ def _contents(model: Model, place: str) -> Members:
 
 
 def _packed(array: ArrayLike, dtype: str) -> Bytes:
-    """Array as bytes."""
     return np.ascontiguousarray(array, np.dtype(dtype)).view(np.uint8)
 
 
@@ -327,7 +326,6 @@ def _written_texts(texts: Sequence[str], folder: str, place: str) -> Members:
 
 
 def _pairs(lower: NDArray[np.float64], upper: NDArray[np.float64]) -> Bytes:
-    """Intervals as bytes."""
     return _packed(np.stack([lower, upper], 1).ravel(), "<f8")
 
 

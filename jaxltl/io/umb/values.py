@@ -136,10 +136,10 @@ def read_variables(
     texts: Sequence[str],
     place: str,
 ) -> dict[str, Values]:
-    """State variables by name, ``[S]`` each.
+    """State variables by name, ``[S]`` each; absent values are NaN (as doubles) or empty strings.
 
-    Integers become int32, int64 or uint64 by type, and are dropped beyond 64 bits. Variables absent
-    in some states are doubles (NaN) or strings (empty). Strings over 1 GB in total are objects.
+    Integers become int32, int64 or uint64, and are dropped beyond 64 bits. Strings over 1 GB in
+    total are objects.
     """
     if of_class is None:
         of_class = np.zeros(count, np.uint32)
@@ -208,7 +208,6 @@ def _read_variable(
 
 
 def _texts(number: Values, texts: Sequence[str], subject: str) -> Values:
-    """Strings by index."""
     used, which = np.unique(number, return_inverse=True)
     if used[0] < 0 or used[-1] >= len(texts):
         raise ValueError(f"{subject}has the text {used[-1]}; there are {len(texts)}.")
