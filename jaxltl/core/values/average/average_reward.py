@@ -29,28 +29,24 @@ def average_reward(
     """Optimal expected long-run average reward per step: ``lim 1/n E[r_1 + ... + r_n]``.
 
     For multichain models too (Puterman 1994, chapter 9): the best expected gain of the end
-    component in which a run ends. Gains are enclosed by the span of ``T v - v``, from value
-    iteration and policy iteration, and are the terminal rewards of an optimal stopping problem.
-    Solved in double precision; bounds include all rounding. Games have
-    :func:`~jaxltl.core.values.average.mean_payoff.mean_payoff`.
+    component in which a trajectory ends. Gains are enclosed by the span of ``T v - v`` and are the
+    terminal rewards of an optimal stopping problem. Games have :func:`mean_payoff`.
 
     Args:
       model: a SparseMDP, or any concrete model that :func:`to_sparse` takes.
       reward: as for :func:`~jaxltl.core.models.sparse.choice_reward`; finite.
       objective: ``"max"`` or ``"min"``; irrelevant for chains.
-      tolerance: the width of the enclosure, relative to the value; for small values relative to a
+      tolerance: width of the enclosure, relative to the value; for small values relative to a
         millionth of the largest reward (a thousandth, if some are negative).
       max_steps: sweeps of value iteration at most.
 
     Returns:
-      :class:`Solution`; `value` is ``float64[S]``, `policy` rows ``int32[S]`` that attain the
-      bound on the safe side (`lower` of a maximum). `residual` is half the width of the gain's
-      widest enclosure.
+      :class:`Solution`; `value` is ``float64[S]``, `policy` rows ``int32[S]`` that attain the bound
+      on the safe side (`lower` of a maximum). `residual` is half the width of the gain's widest
+      enclosure. Concrete arrays only; not differentiable.
 
     Raises:
       ValueError: the reward, the objective, or a model with intervals.
-
-    Concrete arrays only, on the host; not differentiable.
 
     Example:
       >>> from jaxltl import make_sparse

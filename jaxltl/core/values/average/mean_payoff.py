@@ -34,29 +34,24 @@ def mean_payoff(game: Model | Game, reward: chex.Array, *, max_steps: int = 100_
     """Mean payoff: the exact average reward that the system secures in a deterministic game.
 
     The value of ``liminf (r_1 + ... + r_n) / n`` under optimal play (Ehrenfeucht and
-    Mycielski 1979): the mean of a cycle, from each state. Found on the host by policy iteration
-    with gains and biases, the environment answering best before the system improves, where a
-    bias that a new strategy leaves open is taken over from the old one so that degenerate games
-    end too (Cochet-Terrasson and Gaubert 2006). All arithmetic is exact, on integers with the
-    rewards' common denominator, so ties are decided as they are.
+    Mycielski 1979), by policy iteration with gains and biases (Cochet-Terrasson and Gaubert 2006)
+    in exact arithmetic, on integers with the rewards' common denominator.
 
     Args:
       game: a deterministic Game; any other model is the game in which the system always moves.
       reward: ``float[S, A]`` or ``float[S, A, K]``, finite; moves of both players count. In a game
         on a sparse model, which is padded for it, as of
         :func:`~jaxltl.core.models.sparse.choice_reward`.
-      max_steps: pairs of strategies to look at at most.
+      max_steps: maximal number of pairs of strategies.
 
     Returns:
       :class:`Solution`; `policy` is ``int32[S]``, optimal for both players; rows in a game on a
-      sparse model. `lower` and `upper` are `value`, or its neighbours among the floats where the
-      mean is not a float. Where max_steps did not suffice they are infinite.
+      sparse model. `lower` and `upper` are the neighbouring floats where the mean is not a float,
+      and infinite where `max_steps` did not suffice. Concrete arrays only; not differentiable.
 
     Raises:
       ValueError: a move has several successors, the reward has a wrong shape or is not finite,
         or the values are traced.
-
-    Concrete arrays only, on the host; not differentiable.
 
     Example:
       >>> from jaxltl import from_dense, make_game
@@ -183,7 +178,7 @@ def _mean_iteration(
 
 
 def _evaluate(successor: Integers, weight: Integers, old: _Biases) -> _Biases:
-    """Gains and biases of fixed choices, whose paths all end in cycles, by doubling of steps."""
+    """Gains and biases of fixed choices, for which all paths end in cycles, by step doubling."""
     # On each cycle the bias of its first state is the old one where the gain is, and else zero.
     states = np.arange(len(successor))
     doublings = len(states).bit_length()

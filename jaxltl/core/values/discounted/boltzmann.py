@@ -34,13 +34,11 @@ from jaxltl.core.values.engine.linear import System
 def boltzmann_expansion(num_actions: Any) -> Any:
     """Largest row sum of the Jacobian of ``sum_a softmax(q)_a q_a`` over all q.
 
-    The Boltzmann operator contracts for discounts below its inverse. The supremum is
-    attained where one action stands above the rest, which are equal: by g, of which it is half,
-    the root of ``g tanh((g - log(n - 1)) / 2) = 2``.
+    The Boltzmann operator contracts for discounts below its inverse. The supremum is ``g / 2``,
+    attained where one action exceeds the equal others by g: ``g tanh((g - log(n - 1)) / 2) = 2``.
 
-    Example:
-      >>> [round(boltzmann_expansion(n), 2) for n in (1, 2, 3, 4)]
-      [1.0, 1.2, 1.33, 1.42]
+    >>> [round(boltzmann_expansion(n), 2) for n in (1, 2, 3, 4)]
+    [1.0, 1.2, 1.33, 1.42]
     """
     xp: Any = jnp if isinstance(num_actions, jax.Array) else np
     n = xp.asarray(num_actions, float)
@@ -76,33 +74,27 @@ def boltzmann_value(
 ) -> Solution:
     """Boltzmann value: the value of a policy that is the softmax of its action values (2.1)-(2.3).
 
-    ``V = sum_a softmax(Q)_a Q_a`` with ``Q = R + discount * P V``. This operator
-    contracts only while ``discount * boltzmann_expansion(A) < 1``. Beyond, it can cycle or
-    have several fixed points: damped steps of one half are polished by Newton's method,
-    the enclosure is infinite, and the status is not UNCERTIFIED if no fixed point was reached. See
-    :func:`boltzmann_fixed_points`.
+    ``V = sum_a softmax(Q)_a Q_a`` with ``Q = R + discount * P V``. This operator contracts only
+    while ``discount * boltzmann_expansion(A) < 1``. Beyond, it can have several fixed points (see
+    :func:`boltzmann_fixed_points`): damped steps of one half are polished by Newton's method, the
+    enclosure is infinite, and the status is not UNCERTIFIED if no fixed point was reached.
 
     Args:
-      model: the model.
-      reward: ``float[S, A]`` or ``float[S, A, K]``; of a sparse model a name or as of
-        :func:`~jaxltl.core.models.sparse.choice_reward`.
-      discount: scalar in [0, 1).
-      initial: ``float[S]``, where to start; default zero.
-      adjoint: ``"exact"``, or ``"approximate"`` for the sensitivity (2.7) that holds the
-        policy constant.
-      method: ``"damped"``, or ``"newton"`` for Newton steps from the start on, which may
-        also find fixed points that repel.
+      model, reward, discount: as in :func:`~jaxltl.core.values.discounted.discounted.optimal_value`.
+      initial: ``float[S]``, the first iterate; default zero.
+      adjoint: ``"exact"``, or ``"approximate"``: the sensitivity (2.7), with the policy constant.
+      method: ``"damped"``, or ``"newton"`` for Newton steps only, which may also find repelling
+        fixed points.
       tolerance: width of the enclosure where the operator contracts, of the residual elsewhere;
         default: what the dtype allows.
       max_steps: damped steps at most.
 
     Returns:
       :class:`Solution`; `policy` is ``float[S, A]``, of a sparse model ``float[R]``, the softmax.
+      Value and policy are differentiable in the reward, the discount and the probabilities.
 
     Raises:
       ValueError: the reward has the wrong shape, or an unknown method or adjoint.
-
-    Value and policy are differentiable in the reward, the discount and the probabilities.
 
     Example:
       >>> from jaxltl import from_dense
@@ -245,23 +237,22 @@ def boltzmann_fixed_points(
 ) -> list[Solution]:
     """Distinct fixed points of the Boltzmann operator, searched from many starts.
 
-    Damped and Newton iterations from zero, from the optimal and the worst value, and from
-    random values between. A search, not a proof that there are no others.
+    Damped and Newton iterations from zero, from the optimal and the worst value, and from random
+    values between them. Not a proof that there are no others.
 
     Args:
       model, reward, discount: as in :func:`boltzmann_value`.
-      key: a PRNG key, consumed.
+      key: random key.
       num_starts: starts for each of the two methods.
       tolerance: fixed points nearer than this (sup norm) are one; the residual allowed is a
         tenth of it times ``1 - discount``.
 
     Returns:
       Solutions with status ``CONVERGED`` or ``UNCERTIFIED``, ordered by the sum of their values.
+      Not differentiable; :func:`boltzmann_value` with one of these as `initial` is.
 
     Raises:
       ValueError: the reward has the wrong shape.
-
-    Not differentiable; :func:`boltzmann_value` with one of these as `initial` is.
 
     Example:
       >>> from jaxltl import make_mdp

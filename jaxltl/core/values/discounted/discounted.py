@@ -1,10 +1,9 @@
 """Discounted values of policies, and optimal discounted values.
 
-Every solver stops on a certified error, returns the enclosure that certifies it, and is
-differentiable by the implicit function theorem in the reward, the discount and the
-transition probabilities. A ``model`` is an MDP, a DenseMDP, a SparseMDP or a Product; shapes are
-written for an MDP, and a product's values have ``[S, Q]`` for ``[S]``. Of a sparse model quantities
-on actions are ``[R]``, and actions of policies are rows.
+Solvers return certified enclosures and are differentiable by the implicit function theorem. A
+``model`` is an MDP, a DenseMDP, a SparseMDP or a Product; shapes are written for an MDP, and a
+product's values have ``[S, Q]`` for ``[S]``. Of a sparse model quantities on actions are ``[R]``,
+and actions of policies are rows.
 """
 
 from __future__ import annotations
@@ -170,29 +169,22 @@ def policy_value(
 ) -> Solution:
     """Expected discounted reward of a policy.
 
-    ``V = r_pi + discount * P_pi V`` (dissertation, section 2.2.1). Solved by BiCGSTAB, with
-    elimination on small models and sweeps on others where that stalls; the enclosure holds for
-    any iterate.
+    ``V = r_pi + discount * P_pi V`` (dissertation, section 2.2.1). Solved by BiCGSTAB; where it
+    stalls, by elimination on small models and by sweeps on others.
 
     Args:
-      model: the model.
+      model, reward, discount, nature, tolerance: as in :func:`optimal_value`.
       policy: ``float[S, A]`` or ``int32[S]``.
-      reward: ``float[S, A]`` or ``float[S, A, K]``; of a sparse model a name or as of
-        :func:`~jaxltl.core.models.sparse.choice_reward`.
-      discount: scalar in [0, 1).
-      nature: of an IntervalMDP, ``"adversarial"`` (default) or ``"cooperative"``.
-      tolerance: width of the enclosure; default: what the dtype allows.
       max_steps: sweeps at most; default 100,000. Concrete sparse models are solved on the host,
         without sweeps, unless it is given.
 
     Returns:
-      :class:`Solution`; `value` is ``float[S]``.
+      :class:`Solution`; `value` is ``float[S]``. Differentiable in the policy, the reward, the
+      discount and the probabilities.
 
     Raises:
-      ValueError: policy or reward has the wrong shape, or a row of the policy is no distribution
-        over available actions (under ``jit`` the status is then INVALID).
-
-    Differentiable in the policy, the reward, the discount and the probabilities.
+      ValueError: policy or reward has the wrong shape, or a row of the policy is not a distribution
+        over available actions (under ``jit``: the status INVALID).
 
     Example:
       >>> from jaxltl import from_dense
@@ -268,7 +260,7 @@ def optimal_value(
 ) -> Solution:
     """Largest expected discounted reward, ``V = max_a R + discount * P V``.
 
-    Stops on MacQueen's bounds, so a tolerance met is a certified error.
+    Certified by MacQueen's bounds.
 
     Args:
       model: the model.
@@ -280,22 +272,19 @@ def optimal_value(
         ``"modified_policy_iteration"`` (Puterman and Shin 1978: after each sweep of the
         optimality operator, `evaluation_sweeps` cheap ones under the greedy policy),
         ``"value_iteration"``, or ``"auto"``, the first up to 512 states, then the second.
-      tolerance: width of the enclosure; default: what the dtype allows.
-      max_steps: applications of the optimality operator or of the linear one at most; default
-        100,000.
+      tolerance: width of the enclosure; default: as narrow as the dtype allows.
+      max_steps: applications of the optimality or the linear operator at most; default 100,000.
       evaluation_sweeps: sweeps under a fixed policy, in modified policy iteration; default 24.
         Concrete sparse models are solved on the host, by policy iteration, unless `method`,
         `max_steps` or this is given.
 
     Returns:
-      :class:`Solution`; `value` is ``float[S]``, `policy` ``int32[S]`` is greedy and its
-      own value is at least `lower`.
+      :class:`Solution`; `value` is ``float[S]``, `policy` ``int32[S]`` is greedy, with a value of
+      at least `lower`. Differentiable in the reward, the discount and the probabilities, wherever
+      the greedy policy is unique.
 
     Raises:
       ValueError: the reward has the wrong shape, or an unknown method.
-
-    Differentiable in the reward, the discount and the probabilities, wherever the
-    greedy policy is unique.
 
     Example:
       >>> from jaxltl import from_dense

@@ -1,9 +1,8 @@
 """Discounted values of zero-sum games, and of one strategy in the worst case.
 
-The system maximises and the environment minimises. Values come with a certified
-enclosure, and are differentiable by the implicit function theorem. Shapes are written for
-states ``[S]``; a game on a Product has ``[S, Q]``. In a game on a sparse model quantities on
-actions are ``[R]``, and an action is a row.
+The system maximises and the environment minimises. Derivatives are by the implicit function
+theorem. Shapes are written for states ``[S]``; a game on a Product has ``[S, Q]``. In a game on a
+sparse model quantities on actions are ``[R]``, and an action is a row.
 """
 
 from __future__ import annotations
@@ -67,11 +66,9 @@ def minimax_value(
 
     ``V(s) = max_a R(s, a) + g(s) * sum_t P(t | s, a) V(t)`` where the system moves, the same
     with min where the environment does (Shapley 1953; dissertation, section 5.2.4). With
-    ``per="move"``, g is the discount; with ``per="system_move"`` it is the discount at the
-    system's states and 1 at the environment's, so that time is counted in moves of the system.
-
-    The bounds rest on a function h with ``h >= 1 + g P h`` for all moves of both players, the
-    maximal discounted time: ``|T v - v| <= e`` puts the value within ``e * h`` of v.
+    ``per="move"``, g is the discount; with ``per="system_move"``, 1 at the environment's states.
+    With the maximal discounted time ``h >= 1 + g P h``, ``|T v - v| <= e`` bounds the error by
+    ``e * h``.
 
     Args:
       game: a Game; any other model is the game in which the system always moves.
@@ -79,35 +76,30 @@ def minimax_value(
         a game on a sparse model as of :func:`~jaxltl.core.models.sparse.choice_reward`.
       discount: scalar in [0, 1).
       per: ``"move"`` or ``"system_move"``, which moves are discounted.
-      method: ``"policy_iteration"``: linear solves for both players' greedy choices (Pollatschek
-        and Avi-Itzhak 1969), kept where they halve the error, and sweeps where they do not;
-        ``"value_iteration"``, sweeps alone; or ``"strategy_iteration"`` (Hoffman and Karp 1966),
-        the environment answering best before the system improves, which always ends.
-      allowed: ``bool[S, A]``, the moves that may be made, such as a permissive strategy's;
-        default the available ones. A state without any has the value minus infinity.
-      tolerance: width of the enclosure; default: what the dtype allows.
-      max_steps: maximal number of backups; in strategy iteration, of strategies. As many again may
-        go into h with ``per="system_move"``; they are not counted.
+      method: ``"policy_iteration"`` (Pollatschek and Avi-Itzhak 1969, with sweeps where a step does
+        not halve the error), ``"value_iteration"`` or ``"strategy_iteration"`` (Hoffman and Karp
+        1966), which always ends.
+      allowed: ``bool[S, A]``, the action mask, such as a permissive strategy; default the available
+        moves. A state without any has the value minus infinity.
+      tolerance: width of the enclosure; default: as narrow as the dtype allows.
+      max_steps: maximal number of backups, or of strategies in strategy iteration, without those
+        for h.
 
     Returns:
       :class:`Solution`; `policy` is ``int32[S]``, greedy for both players: the system's part
       secures at least `lower`, the environment's concedes at most `upper`, where these are finite.
+      Differentiable in the reward, the discount and the probabilities, where greedy choices are
+      unique.
 
     Raises:
-      ValueError: a wrong shape, an unknown method or `per`, or, with ``per="system_move"``,
-        an environment that can move for ever without the system, which leaves the value
-        undefined. (Under ``jit`` the status is then NONFINITE.)
-
-    Differentiable in the reward, the discount and the probabilities, wherever the greedy
-    choices are unique.
+      ValueError: a wrong shape, an unknown method or `per`, or, with ``per="system_move"``, an
+        environment that can move for ever without the system (under ``jit``: status NONFINITE).
 
     Example:
       >>> from jaxltl import from_dense, make_game
       >>> world = from_dense([[[0, 1.0], [0, 1.0]], [[1.0, 0], [1.0, 0]]])
       >>> game = make_game(world, [True, False])
       >>> reward = jnp.array([[1.0, 2.0], [0.0, 1.0]])
-      >>> [round(v, 4) for v in minimax_value(game, reward, 0.5).value.tolist()]
-      [2.6667, 1.3333]
       >>> best = minimax_value(game, reward, 0.5, per="system_move")
       >>> [round(v, 4) for v in best.value.tolist()], best.policy.tolist()
       ([4.0, 4.0], [1, 0])
@@ -151,22 +143,19 @@ def strategy_value(
 
     Args:
       game, reward, discount, per, method, tolerance, max_steps: as in :func:`minimax_value`.
-      strategy: ``int32[S]`` or ``float[S, A]``, distributions over available moves; read at
-        the system's states only. Where no move is available play gets stuck, which is worth
-        minus infinity, as is each state from which it can come to that.
-      environment: ``"adversarial"``, or a policy ``int32[S]`` or ``float[S, A]``, read at the
-        environment's states only.
+      strategy: ``int32[S]`` or ``float[S, A]``, distributions over available moves at the system's
+        states. A deadlock, and each state from which it can be reached, has the value minus
+        infinity.
+      environment: ``"adversarial"``, or a policy ``int32[S]`` or ``float[S, A]``.
 
     Returns:
-      :class:`Solution`; `policy` is ``float[S, A]``, both players' choices.
+      :class:`Solution`; `policy` is ``float[S, A]``, both players' choices. Differentiable in the
+      reward, the discount, the probabilities and stochastic strategies, wherever the environment's
+      best answer is unique.
 
     Raises:
-      ValueError: as :func:`minimax_value`; or a row of the strategy or of the environment's
-        policy that is read is no distribution over available moves (under ``jit`` the status is
-        then INVALID).
-
-    Differentiable in the reward, the discount, the probabilities and stochastic strategies,
-    wherever the environment's best answer is unique.
+      ValueError: as :func:`minimax_value`; or a row of the strategy or of the environment's policy
+        is not a distribution over available moves (under ``jit``: status INVALID).
 
     Example:
       >>> from jaxltl import from_dense, make_game
@@ -176,10 +165,6 @@ def strategy_value(
       >>> worst = strategy_value(game, jnp.array([0, 0]), reward, 0.5, per="system_move")
       >>> [round(v, 4) for v in worst.value.tolist()]
       [2.0, 2.0]
-      >>> mild = jnp.array([[0.0, 0.0], [0.5, 0.5]])
-      >>> met = strategy_value(game, jnp.array([0, 0]), reward, 0.5, environment=mild)
-      >>> [round(v, 4) for v in met.value.tolist()]
-      [1.6667, 1.3333]
     """
     asked = as_game(game)
     game, reward = compiled_form(asked, reward)
@@ -257,7 +242,7 @@ def _joint(game: Game, strategy: chex.Array, environment: chex.Array | None) -> 
 
 
 def _returns(graph: Graph, per: str, goal: Any, moves: Any, drawn: Any) -> Any:
-    """Whether the environment always returns to a goal, so that values per system move exist."""
+    """True if the environment always returns to a goal, so that values per system move exist."""
     if per == "move":
         return np.True_
     back = attract(graph, goal, moves, rule=drawn).region
@@ -321,9 +306,8 @@ def _horizon(
 ) -> jax.Array:
     """A function h with ``h >= 1 + g P h`` for all moves; infinite or NaN without one.
 
-    With tau the expected number of undiscounted moves before the next discounted one, at most,
-    and L its maximum: ``h = (1 + discount * L) / (1 - discount) + tau``. It is the value of the
-    play in which both players want it long. Where each move is discounted it is one number.
+    With tau the maximal expected number of undiscounted moves before the next discounted one, and
+    L its maximum over states: ``h = (1 + discount * L) / (1 - discount) + tau``.
     """
     tau, live, defined = jnp.zeros((), play.discount.dtype), problem.live.ravel(), problem.defined
     if per == "system_move":

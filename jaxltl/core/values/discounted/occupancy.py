@@ -38,20 +38,16 @@ def occupancy_measure(
     1994, section 6.9). Its sum is ``1 / (1 - discount)``.
 
     Args:
-      model: the model.
-      policy: ``float[S, A]`` or ``int32[S]``; of a sparse model ``float[R]``, or rows ``int32[S]``.
-      discount: scalar in [0, 1).
-      initial: ``float[S]``, mass to start from; default the model's distribution.
-      tolerance: width of the enclosure; default: what the dtype allows.
+      model, policy, discount, tolerance: as in
+        :func:`~jaxltl.core.values.discounted.discounted.policy_value`.
+      initial: ``float[S]``, initial mass; default the model's initial distribution.
 
     Returns:
       :class:`Solution`; `value`, `lower` and `upper` are ``float[S, A]``, of a sparse model
-      ``float[R]``.
+      ``float[R]``. Differentiable in the policy, the discount, `initial` and the probabilities.
 
     Raises:
       ValueError: the policy has the wrong shape or is invalid (inside ``jit``: a status).
-
-    Differentiable in the policy, the discount, `initial` and the probabilities.
 
     Example:
       >>> from jaxltl import from_dense
@@ -148,7 +144,7 @@ def feature_expectation(occupancy: jax.Array, features: jax.Array) -> jax.Array:
       ``float[F]``; linear in both, and differentiable in them.
 
     Raises:
-      TypeError: shapes that do not fit.
+      TypeError: the shapes do not match.
 
     Example:
       >>> visits = jnp.array([[1.0, 0.5], [0.0, 2.5]])

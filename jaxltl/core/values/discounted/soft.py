@@ -49,26 +49,19 @@ def soft_value(
     """Soft (maximum-entropy) value, ``V = log sum_a exp(R + discount * P V)`` (3.4).
 
     Args:
-      model: the model.
-      reward: ``float[S, A]`` or ``float[S, A, K]``; of a sparse model a name or as of
-        :func:`~jaxltl.core.models.sparse.choice_reward`.
-      discount: scalar in [0, 1).
-      initial: ``float[S]``, where to start; default zero. It changes the number of steps only.
-      method: ``"newton"`` (soft policy iteration, few linear solves, for any discount)
-        or ``"value_iteration"`` (cheap sweeps).
-      tolerance: width of the enclosure; default: what the dtype allows.
-      max_steps: steps of the method at most.
+      model, reward, discount, tolerance: as in
+        :func:`~jaxltl.core.values.discounted.discounted.optimal_value`.
+      initial: ``float[S]``, the first iterate; default zero.
+      method: ``"newton"`` (soft policy iteration) or ``"value_iteration"``.
+      max_steps: maximal number of steps of the method.
 
     Returns:
       :class:`Solution`; `policy` is ``float[S, A]``, ``exp(Q - V)``, of a sparse model
-      ``float[R]``.
+      ``float[R]``. Value and policy are differentiable in the reward, the discount and the
+      probabilities.
 
     Raises:
       ValueError: the reward has the wrong shape, or an unknown method.
-
-    Value and policy are differentiable in the reward, the discount and the
-    probabilities. The bounds are certified: the soft operator is monotone and commutes
-    with constants up to the discount, as MacQueen's bounds need.
 
     Example:
       >>> from jaxltl import from_dense
@@ -165,7 +158,7 @@ def soft_policy_adjoint(
     predecessors: PredecessorTable | None = None,
     max_steps: jax.Array | int = 100_000,
 ) -> jax.Array:
-    """The derivative of ``sum c log pi`` in the reward, for the soft policy pi of that reward.
+    """Derivative of ``sum c log pi`` in the reward, for the soft policy pi of that reward.
 
     With ``g = c - pi sum_a c`` and x the solution of ``x = discount * P'(g + pi x)``, it is
     ``g + pi x``: the transpose of the sensitivity (3.6), one linear system for any number of

@@ -1,9 +1,8 @@
 """Warm-started discounted values of many models of one game.
 
-For learners that solve a model again and again as it changes. Under ``vmap`` over models of one
-graph the lanes become the last axis of every array, so that whole rows of lanes are read at
-each successor, several times faster than lane by lane. The loop is its own: lanes that are not
-active are left out of its condition, and it ends on the width of the bounds alone.
+For learners that solve a model repeatedly as it changes. Under ``vmap`` over models of one graph
+the lanes become the last axis of every array, so that a gather reads whole rows of lanes. The loop
+ends on the width of the bounds of the active lanes.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from jaxltl.core.models.game import Game
 from jaxltl.core.values.engine.iterate import fill_row
 
 _MOST_SWEEPS = 100_000
-_FEWEST = 16  # lanes that are worth a loop of their own, and fill its rows
+_FEWEST = 16  # lanes from which a separate loop is faster, and which fill its rows
 _WRITTEN_OUT = 16  # successors up to which a sum over them is written out
 
 
@@ -56,8 +55,7 @@ def span_iteration(
 
     Sweeps ``v <- T v + c`` with ``T v(s) = max_a gain(s, a) + discount * P v`` (min where the
     environment moves), where c is the middle of MacQueen's (1966) bounds ``discount / (1 -
-    discount) * [min, max](T v - v)``. A constant changes no choice, so that it is the width of
-    the bounds that counts, which shrinks faster than their distance from zero.
+    discount) * [min, max](T v - v)``. A constant changes no choice, so only their width matters.
     """
     dtype = game.dtype
     graph = _Graph(game.mdp.successor, allowed, jnp.where(game.system, 1, -1).astype(dtype))
@@ -160,7 +158,7 @@ def _quantities(graph: _Graph, models: _Models, value: jax.Array) -> list[jax.Ar
 
     columns = []
     for a in range(num_actions):
-        if width == 1:  # what is certain need not be weighed
+        if width == 1:  # a certain successor needs no weight
             mean = reached(a, 0)
         elif width > _WRITTEN_OUT:
             mean = jnp.sum(models.probability[:, a] * reached(a), axis=1)

@@ -90,11 +90,9 @@ def optimal_actions(
 
     With V the optimal probability, the conserving actions satisfy ``(P V)(s, a) = V(s)``. **Every
     policy that gives positive probability to exactly the actions of the mask attains V from every
-    state.** V along its trajectory is a martingale, and the trajectory ends in an end component of
-    the mask, in which V is constant; if V > 0, that component contains an accepting one. The mask
-    therefore excludes only those conserving actions by which a trajectory could leave an accepting
-    end component, meet a smaller odd priority and return. For co-safe and safety tasks, and for
-    maxima of Buchi tasks, it excludes none; nor outside of accepting end components.
+    state.** The mask excludes only those conserving actions by which a trajectory could leave an
+    accepting end component, meet a smaller odd priority and return: none for co-safe and safety
+    tasks, and for maxima of Buchi tasks. Proofs: docs/optimal-actions.md.
 
     Args:
       model: the product, concrete.
@@ -105,14 +103,12 @@ def optimal_actions(
 
     Returns:
       :class:`OptimalActions`. The mask contains every action that can be conserving within the
-      bounds and the rounding of the model's numbers. If the loss of its uniform policy is above the
-      tolerance, the mask contains, where the probability is between 0 and 1, the actions that are
-      proven to conserve a lower bound, or else the action of the optimal policy.
+      bounds. If the loss of its uniform policy is above the tolerance, it contains, where the
+      probability is between 0 and 1, the actions that are proven to conserve a lower bound, or else
+      the action of the optimal policy. Concrete arrays only; not differentiable.
 
     Raises:
       ValueError: the model is traced, or the objective is unknown.
-
-    Concrete arrays only, on the host; not differentiable.
 
     Example:
       >>> from jaxltl import from_dense, product
@@ -170,7 +166,7 @@ def _on_graph(problem: Reaching) -> tuple[Booleans, Booleans, Booleans]:
 
 
 def _by_bounds(model: Product, solution: Solution, objective: str) -> Booleans:
-    """The actions whose optimistic bound is not worse than their state's pessimistic bound."""
+    """Actions with an optimistic bound not worse than the pessimistic bound of the state."""
     near, far = np.asarray(solution.lower, float), np.asarray(solution.upper, float)
     sign = 1
     if objective == "min":

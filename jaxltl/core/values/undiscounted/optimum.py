@@ -170,7 +170,7 @@ class _Search(NamedTuple):
 
     @property
     def cheap(self) -> bool:
-        """Whether sweeps under a fixed policy gather single states; a product gathers rows."""
+        """True if sweeps under a fixed policy gather single states; a product gathers rows."""
         return self.components is None and not isinstance(self.model, Product)
 
     @property
@@ -218,7 +218,7 @@ def _tighter(sign: int, finest: bool, table: None, carry: _Bounds, search: _Sear
     """One round: a sweep and some under the greedy policy for `near`, a guess or sweeps for `far`."""
     # A value that the operator does not carry away from the optimum is a bound, because the fixed
     # point is unique where end components are collapsed; so `far` is guessed, and where the guess
-    # fails, plain interval iteration goes on. Where the bounds are to be the finest, this goes on
+    # fails, plain interval iteration continues. Where the bounds are to be the finest, this continues
     # beyond the goal: a guess is then a bound of the same shape that is `_FINER` times as near.
     near, far, failed, *_ = carry
     image, action = search.best(sign, near)

@@ -59,7 +59,7 @@ class Performance:
       worst_lower, worst_upper: a certified enclosure of the minimum.
       worst_state: ``int32[]``, the initial state of the minimum.
       value: ``float[S]``, the probability from each world state with the initial memory.
-      status: whether the enclosures at all initial states are as narrow as the tolerance.
+      status: CONVERGED if the enclosures at all initial states are within the tolerance.
 
     Example:
       >>> from jaxltl import from_dense, product
@@ -93,23 +93,20 @@ def task_performance(
     Args:
       model: one product; ``vmap`` over stacked ones, or :func:`task_performances`.
       policy: ``float[S, Q, A]`` or ``int32[S, Q]``.
-      method: ``"blocks"`` (one inverse for each memory state, of co-safe and safety
-        tasks), ``"general"`` (:func:`~jaxltl.core.values.undiscounted.satisfaction.satisfaction_probability`,
-        for any task), or ``"auto"``, blocks up to 1024 world states.
+      method: ``"blocks"`` (one inverse for each memory state; co-safe and safety tasks),
+        ``"general"`` (:func:`satisfaction_probability`), or ``"auto"``, blocks up to 1024 states.
       tolerance: width of the enclosures; default twice the square root of the dtype's precision.
 
     Returns:
       :class:`Performance`. If a policy hardly ever leaves a set, rounding may prevent a
-      certificate: the bounds are then 0 and 1 and the status is PRECISION; use
-      :func:`task_performances`.
+      certificate: bounds 0 and 1, status PRECISION; use :func:`task_performances`. Differentiable
+      in the policy and in the world's probabilities, with the support held fixed: in forward mode,
+      and with ``method="general"`` in reverse mode too.
 
     Raises:
       ValueError: the policy has the wrong shape or a row that is not a distribution over available
         actions (INVALID_POLICY under ``jit``), the method is unknown, or it is ``"blocks"`` for
         a Buchi or parity task.
-
-    Differentiable in the policy and in the world's probabilities, with the support held fixed: in
-    forward mode, and with ``method="general"`` in reverse mode too.
 
     Example:
       >>> from jaxltl import from_dense, product
@@ -270,10 +267,9 @@ def task_performances(
     """:func:`task_performance` in each of several worlds, on the host.
 
     Co-safe and safety tasks are evaluated by one compiled program, other tasks one world after the
-    other. Worlds that this does not certify in the models' precision, because the policy hardly
-    ever leaves some set, are evaluated again in double precision by an elimination without
-    subtractions (Grassmann, Taksar and Heyman 1985), whose relative error is bounded for every
-    chain (O'Cinneide 1993).
+    other. Worlds without a certificate in the models' precision are evaluated again in double
+    precision by an elimination without subtractions (Grassmann, Taksar and Heyman 1985), with a
+    bounded relative error for every chain (O'Cinneide 1993).
 
     Args:
       models: stacked products, see :func:`~jaxltl.core.models.construct.batch.stack_products`.
@@ -282,12 +278,10 @@ def task_performances(
       batch: number of worlds in memory at once.
 
     Returns:
-      :class:`Performance` with a leading axis W.
+      :class:`Performance` with a leading axis W. Not differentiable; :func:`task_performance` is.
 
     Raises:
       ValueError: the models are not stacked or the policies have the wrong shape.
-
-    Not differentiable; :func:`task_performance` is.
 
     Example:
       >>> from jaxltl import from_dense, stack_products
@@ -441,7 +435,7 @@ class Summary(NamedTuple):
     # the figures unless they are excluded
     infeasible: tuple[str, ...]
     left_out: tuple[str, ...]  # names of the excluded worlds
-    uncertain: tuple[str, ...]  # names of the worlds whose enclosures are wider than the tolerance
+    uncertain: tuple[str, ...]  # names of the worlds with enclosures wider than the tolerance
 
 
 def summarize(

@@ -64,10 +64,9 @@ def reachability_probability(
 
     The least solution of ``y = 1`` on the target and ``y = sum_a pi(s, a) (P y)(s, a)`` elsewhere
     (2.5); for optima with the maximum or minimum over available actions (Baier and Katoen 2008,
-    section 10.6). Concrete models are solved on sparse rows by policy iteration
-    (:mod:`jaxltl.core.sparse.solvers.reachability`) and nothing is compiled. Traced and sharded
-    models are solved by interval iteration (Haddad and Monmege 2018), and policies by a linear
-    system (:mod:`jaxltl.core.values.undiscounted.optimum`).
+    section 10.6). Concrete models are solved on the host by policy iteration
+    (:mod:`jaxltl.core.sparse.solvers.reachability`), traced and sharded ones by interval iteration
+    (Haddad and Monmege 2018), and policies by a linear system.
 
     Args:
       model: any model.
@@ -77,34 +76,31 @@ def reachability_probability(
       policy: ``float[S, A]`` or ``int32[S]``: evaluate this policy. Default: optimise. For a sparse
         model ``float[R]``, or rows ``int32[S]``.
       objective: ``"max"`` or ``"min"``; ignored when a policy is given.
-      nature: for interval models only, see
-        :func:`~jaxltl.core.values.interval.robust.robust_reachability`.
+      nature: for interval models only, see :func:`robust_reachability`.
       method: for a given policy: ``"direct"`` (elimination), ``"iterative"`` (Krylov) or
         ``"auto"``, direct on the host and for small traced models.
       tolerance: width of the enclosure. Default: twice the square root of the dtype's precision
         must be met, and an optimum is enclosed as closely as the dtype allows; for a sparse model,
         or with `stay`, 1e-6 (1e-3 in single precision).
-      max_steps: number of sweeps of interval iteration at most, which it selects; default 10^6.
-      start: lower and upper bounds from which interval iteration starts, which it selects, such as
-        those of a solution that ended after `max_steps`. They are not checked.
+      max_steps: maximal number of sweeps of interval iteration, which it selects; default 10^6.
+      start: lower and upper bounds from which interval iteration starts, which it selects. They are
+        not checked.
 
     Returns:
       :class:`Solution`; `value` is ``float[S]``, exactly 0 or 1 where the graph decides. An
       optimum's `policy` is ``int32[S]`` and attains its bound on the safe side (`lower` for a
-      maximum, `upper` for a minimum). On a concrete padded model it is the fastest such policy, see
-      :func:`~jaxltl.core.values.undiscounted.satisfaction.optimal_satisfaction`.
+      maximum, `upper` for a minimum); on a concrete padded model it is the fastest such policy, see
+      :func:`optimal_satisfaction`. Differentiable in the policy and in the probabilities, with the
+      support held fixed.
 
     Raises:
       ValueError: a shape is wrong, the objective or method is unknown, or `stay` or a sparse model
         is traced.
 
-    Differentiable in the policy and in the probabilities, with the support held fixed.
-
     Example:
-      >>> import jax.numpy as jnp
       >>> from jaxltl import from_dense
       >>> mdp = from_dense([[[0.5, 0.25, 0.25]], [[0, 1.0, 0]], [[0, 0, 1.0]]])
-      >>> round(reachability_probability(mdp, jnp.array([False, True, False])).value[0].item(), 3)
+      >>> round(reachability_probability(mdp, np.array([False, True, False])).value[0].item(), 3)
       0.5
     """
     if method not in ("auto", "direct", "iterative"):
@@ -253,7 +249,7 @@ def conserving_rows(mdp: HostMDP, objective: str, found: Enclosure) -> Booleans:
 
 
 def attained_by_ties(mdp: HostMDP, objective: str, found: Enclosure) -> Enclosure | None:
-    """The enclosure with a bound that tied rows may attain, whatever policy takes them."""
+    """Enclosure with a bound that every policy of tied rows may attain."""
     # The value less a few roundings for each step that the slowest policy of tied rows takes; it is
     # not proven, except by :func:`conserving_rows`. None if such policies may never decide.
     largest, undecided = objective == "max", found.lower != found.upper

@@ -67,7 +67,7 @@ def satisfaction_probability(
 
     For a co-safe task, the probability of reaching a final state (2.5); for a safety task, of never
     leaving the final states; for Buchi and parity, of reaching a bottom strongly connected
-    component whose least priority is even.
+    component with an even least priority.
 
     Args:
       model: the product.
@@ -78,15 +78,14 @@ def satisfaction_probability(
 
     Returns:
       :class:`Solution`; `value` is ``float[S, Q]``. The probability from the initial distribution
-      is ``jnp.sum(model.initial * solution.value)``.
+      is ``jnp.sum(model.initial * solution.value)``. Differentiable in the policy and in the
+      world's transition probabilities, with the support held fixed; not for products of sparse and
+      of interval models, which are solved on the host.
 
     Raises:
       ValueError: the model is not a product, the policy has the wrong shape or a row that is not a
         distribution over available actions (INVALID_POLICY under ``jit``), `nature` is given for a
         model without intervals, or the method is unknown.
-
-    Differentiable in the policy and in the world's transition probabilities, with the support held
-    fixed; not for products of sparse and of interval models, which are solved on the host.
 
     Example:
       >>> from jaxltl import from_dense, product
@@ -159,54 +158,39 @@ def optimal_satisfaction(
 ) -> Solution | Satisfaction:
     """Maximal or minimal satisfaction probability of a product, or of a model and a task.
 
-    For a co-safe task, the probability of reaching a final state; for a safety task, of never
-    leaving them; for Buchi and parity, of reaching an accepting end component, in which the policy
-    is accepted almost surely (Baier and Katoen 2008, section 10.6.4). The minimal probability of a
-    Buchi or parity task is one minus the maximal one of its negation.
+    For Buchi and parity tasks, the probability of reaching an accepting end component, in which the
+    policy is accepted almost surely (Baier and Katoen 2008, section 10.6.4); for other tasks as in
+    :func:`satisfaction_probability`.
 
-    Of all optimal policies of a concrete padded model, the result is the **fastest**: it has the
-    least expected number of steps, from every state,
+    Of all optimal policies of a concrete padded model with up to 10^5 states, the result is the
+    **fastest**: it has the least expected number of steps, from every state, until the set or an
+    accepting end component is reached (a set to be avoided: almost surely) or cannot be reached;
+    inside the component, until its least priority is read next. This is a stochastic shortest path
+    (Bertsekas and Tsitsiklis 1991) over the conserving actions; ties go to the first action.
 
-    - if a set is to be reached (the final states of a co-safe task, or the other states of a safety
-      task with ``"min"``): until it is reached or cannot be reached;
-    - if a set is to be avoided (with the other objective): until it cannot be reached or is reached
-      almost surely;
-    - for Buchi and parity: until an accepting end component is reached or cannot be; and inside,
-      by its actions, until its least priority is read next.
-
-    Optimal policies decide almost surely, so that this is a stochastic shortest path (Bertsekas and
-    Tsitsiklis 1991) over the conserving actions. Of equally fast actions it takes the first. Under
-    ``jit`` and ``vmap``, and beyond 10^5 states, the policy attains the same optimum but may take
-    longer.
-
-    A model with a `task` is solved on the host, on the reachable part of its product. In interval
-    models, policy and nature that want the same reach the end components that both can keep to;
-    where they want the opposite, it is a stochastic parity game, in which nature may cut edges with
-    lower ends of 0.
+    A model with a `task` is solved on the host, on the reachable part of its product; an interval
+    model with adversarial nature is a stochastic parity game.
 
     Args:
       model: a product; or with `task` a concrete model, an interval model or a game on one.
       task: a formula, its text, or an automaton over the letters that occur in the model.
       objective: ``"max"`` or ``"min"``.
-      nature: for interval models only: ``"adversarial"`` (default), against the objective, or
-        ``"cooperative"``.
-      states: with `task`, ``int[I]``, the states asked for; default the initial ones.
+      nature: for interval models, ``"adversarial"`` (default) or ``"cooperative"``.
+      states: with `task`, ``int[I]``, the requested states; default the initial ones.
       label_on: with `task`, ``"entry"`` (default) or ``"exit"``, when the policy's memory reads a
         state's label; the probability is the same. Interval models read on exit.
       tolerance: as for :func:`reachability_probability`.
       max_steps, start: of a product, as for :func:`reachability_probability`.
 
     Returns:
-      Of a product, a :class:`Solution`; `value` is ``float[S, Q]``, `policy` ``int32[S, Q]``,
-      memoryless in the product: its memory is the automaton's state. For a sparse world it consists
-      of rows. With a task, a :class:`Satisfaction`, a finite-memory policy of rows.
+      Of a product, a :class:`Solution`; `value` is ``float[S, Q]``, `policy` ``int32[S, Q]``, rows
+      for a sparse world. With a task, a :class:`Satisfaction`, a finite-memory policy of rows.
+      Differentiable in a product's transition probabilities, with the support and the optimal
+      policy held fixed; not for sparse and interval models, which are solved on the host.
 
     Raises:
       ValueError: neither a product nor a task, an unknown label, state or objective, an option that
         is not for this model, or a product of a sparse world with restricted actions.
-
-    Differentiable in a product's transition probabilities, with the support and the optimal policy
-    held fixed; not for sparse and interval models, which are solved on the host.
 
     Example:
       >>> from jaxltl import from_dense, product
@@ -215,8 +199,6 @@ def optimal_satisfaction(
       >>> best = optimal_satisfaction(product(world, "F goal"))
       >>> best.value[0, 0].item(), best.policy[0, 0].item()
       (0.75, 1)
-      >>> optimal_satisfaction(world, "G F goal", objective="min").solution.value.tolist()
-      [0.5]
     """
     if task is not None:
         if max_steps is not None or start is not None:
@@ -300,7 +282,7 @@ class Reaching(NamedTuple):
 
 
 def as_reachability(model: Product, objective: str) -> Reaching:
-    """The reachability problem whose optimum is the optimal satisfaction probability."""
+    """Reachability problem with the optimal satisfaction probability as its optimum."""
     reduction_for(objective)
     task = model.automaton
     if task.is_cosafe:

@@ -42,21 +42,15 @@ def next_probability(
 ) -> Solution:
     """Probability that the next state is in a set: ``opt_a P(target | s, a)``.
 
-    (Baier and Katoen 2008, section 10.6.1.)
-
     Args:
-      model: a SparseMDP, or any concrete model that :func:`to_sparse` takes.
-      target: ``bool[S]``, or the name of a label.
-      objective: ``"max"`` or ``"min"``; irrelevant for chains.
-      nature: of an IntervalMDP, ``"adversarial"`` (default) or ``"cooperative"``.
+      model, target, objective, nature: as for :func:`bounded_reachability`.
 
     Returns:
       :class:`Solution`; `value` is ``float64[S]``, `policy` the row of each state ``int32[S]``.
+      Concrete arrays only; not differentiable.
 
     Raises:
       ValueError: the shape of the target or the objective.
-
-    Concrete arrays only, on the host; not differentiable.
 
     Example:
       >>> from jaxltl import make_sparse
@@ -94,11 +88,11 @@ def bounded_reachability(
     nature: str | None = None,
     by_step: bool = False,
 ) -> Solution:
-    """Probability of reaching a set within n steps through states where one may stay.
+    """Step-bounded reachability probability, within n steps through the states of `stay`.
 
-    ``x_0 = [s in target]``, and ``x_{k+1}(s) = 1`` in the target, ``opt_a (P x_k)(s, a)`` where
-    one may stay, else 0 (Baier and Katoen 2008, section 10.1.1). Where n is large, what further
-    steps change is bounded, so that they need not be taken.
+    ``x_0 = [s in target]``, and ``x_{k+1}(s) = 1`` in the target, ``opt_a (P x_k)(s, a)`` in
+    `stay`, else 0 (Baier and Katoen 2008, section 10.1.1). For large n the iteration ends once the
+    effect of further steps is bounded.
 
     Args:
       model: a SparseMDP, or any concrete model that :func:`to_sparse` takes.
@@ -110,14 +104,13 @@ def bounded_reachability(
       by_step: return the choices of all steps.
 
     Returns:
-      :class:`Solution`; `value` is ``float64[S]``, exactly 0 or 1 where the graph decides. `policy` is
-      the first choice, as a row, ``int32[S]``; with `by_step` the choices of all steps, the first
-      step's first, ``int32[n, S]``. `num_steps` is the number of steps that were taken.
+      :class:`Solution`; `value` is ``float64[S]``, exactly 0 or 1 where the graph decides. `policy`
+      is the first choice, as a row, ``int32[S]``; with `by_step` the choices of all steps in order,
+      ``int32[n, S]``. `num_steps` is the number of computed steps. Concrete arrays only; not
+      differentiable.
 
     Raises:
       ValueError: a shape, the objective, or a negative number of steps.
-
-    Concrete arrays only, on the host; not differentiable.
 
     Example:
       >>> from jaxltl import make_sparse
@@ -156,12 +149,11 @@ def cumulative_reward(
       reward: as for :func:`~jaxltl.core.models.sparse.choice_reward`; finite.
 
     Returns:
-      :class:`Solution`, as of :func:`bounded_reachability`.
+      :class:`Solution`, as of :func:`bounded_reachability`. Concrete arrays only; not
+      differentiable.
 
     Raises:
       ValueError: the reward, the objective, or a negative number of steps.
-
-    Concrete arrays only, on the host; not differentiable.
 
     Example:
       >>> from jaxltl import make_sparse
@@ -196,17 +188,16 @@ def instantaneous_reward(
 
     Args:
       model, objective, nature, by_step: as for :func:`bounded_reachability`.
-      reward: the name of a reward, a structure, or an array ``[S]``; of a structure only the
-        rewards of states count. None is the only reward of the model.
+      reward: the name of a reward, a structure, of which only the rewards of states count, or an
+        array ``[S]``. None is the only reward of the model.
       num_step: n.
 
     Returns:
-      :class:`Solution`, as of :func:`bounded_reachability`.
+      :class:`Solution`, as of :func:`bounded_reachability`. Concrete arrays only; not
+      differentiable.
 
     Raises:
       ValueError: the reward has no part on states, or as for :func:`cumulative_reward`.
-
-    Concrete arrays only, on the host; not differentiable.
 
     Example:
       >>> from jaxltl import make_sparse
@@ -253,13 +244,11 @@ def reward_bounded_reachability(
     Returns:
       :class:`Solution`; `value` is ``float64[S]``. `policy` is the first choice, ``int32[S]``; with
       `by_level`, row l has the choices with l units left, ``int32[L + 1, S]``. `num_steps` is the
-      number of levels, L + 1.
+      number of levels, L + 1. Concrete arrays only; not differentiable.
 
     Raises:
       ValueError: a shape, the objective, a negative reward, or rewards without a common unit of
         which the bound has at most 10^7.
-
-    Concrete arrays only, on the host; not differentiable.
 
     Example:
       >>> from jaxltl import make_sparse

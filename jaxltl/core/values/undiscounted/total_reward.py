@@ -55,38 +55,30 @@ def total_reward(
     The least solution of ``x = 0`` on the target, ``x = opt_a (r(s, a) + (P x)(s, a))`` elsewhere
     (Puterman 1994, chapter 7; Baier and Katoen 2008, section 10.5.1). It is infinite where the
     target is not reached almost surely: for ``"max"`` under some policy, for ``"min"`` under every
-    policy; without a target, where reward is earned for ever. The graph decides this, and end
-    components of zero reward are collapsed.
-
-    Concrete models are solved on sparse rows. Inside ``jit``, and over a mesh, inexact policy
-    iteration is used, see :mod:`~jaxltl.core.values.undiscounted.traced_total_reward`.
+    policy; without a target, where reward is earned for ever.
 
     Args:
       model: an MDP, DenseMDP, SparseMDP or product of one, or an IntervalMDP; inside ``jit`` an
         MDP, DenseMDP, ShardedMDP or product of one.
       reward: at least 0. For a sparse model as of
-        :func:`~jaxltl.core.models.sparse.choice_reward`: a name, a structure, or an array on states,
-        choices or transitions; else ``float[S]`` or ``float[S, A]``, what a step earns, or of a
-        ShardedMDP the name of one.
-      target: ``bool[S]``; inside ``jit`` and over a mesh there has to be one.
+        :func:`~jaxltl.core.models.sparse.choice_reward`; else ``float[S]`` or ``float[S, A]``, the
+        reward of a step, or of a ShardedMDP the name of one.
+      target: ``bool[S]``; required inside ``jit`` and over a mesh.
       policy: evaluate this policy; default: optimise.
       objective: ``"max"`` or ``"min"``; ignored when a policy is given.
-      nature: for interval models only, see
-        :func:`~jaxltl.core.values.interval.robust.robust_total_reward`.
+      nature: for interval models only, see :func:`robust_total_reward`.
       tolerance: relative width of the enclosure; default 1e-6 in double precision, 1e-3 in single.
 
     Returns:
       :class:`Solution`; `value` is ``float[S]``, infinite or 0 exactly where the graph decides. An
       optimum's `policy` attains its bound on the safe side: ``int32[S]``, rows of a sparse model,
       else actions. Inside ``jit`` bad rewards give the status ``NONFINITE``, a bad policy
-      ``INVALID``.
+      ``INVALID``. Inside ``jit`` and over a mesh differentiable in the reward, the probabilities
+      and the policy, with the support held fixed.
 
     Raises:
       ValueError: a shape, the objective or a policy is wrong, a reward is negative, or inside
         ``jit`` the model is sparse or there is no target.
-
-    Inside ``jit`` and over a mesh differentiable in the reward, the probabilities and the policy,
-    with the support held fixed.
 
     Example:
       >>> from jaxltl import make_sparse
@@ -152,13 +144,11 @@ def hitting_time(model: Model, policy: Array, target: Array) -> NDArray[np.float
       target: ``bool[S]`` (``[S, Q]``).
 
     Returns:
-      ``float64[S]``; NaN where six digits could not be certified, as the policy takes longer than
-      double precision can represent.
+      ``float64[S]``; NaN where six digits could not be certified. Concrete arrays only; not
+      differentiable.
 
     Raises:
       ValueError: something is traced, or the policy is invalid.
-
-    Concrete arrays only, on the host; not differentiable.
 
     Example:
       >>> from jaxltl import from_dense

@@ -97,7 +97,7 @@ class Found(NamedTuple):
     lower: jax.Array
     upper: jax.Array
     policy: jax.Array  # ``int32[S]``, attains the bound on the safe side
-    leaves: jax.Array  # ``int32[S]``, the state whose action gives a state's value
+    leaves: jax.Array  # ``int32[S]``, the state with the action that gives the value
     open: jax.Array  # open, finite: as in the problem
     finite: jax.Array
     residual: jax.Array  # residual, num_steps, status: as in a Solution
@@ -174,7 +174,7 @@ def _enclosed(
     return _solution(problem, jnp.asarray(tolerance, model.dtype))
 
 
-# --- what the graph decides -------------------------------------------------------------------
+# --- qualitative preprocessing ----------------------------------------------------------------
 
 
 def _of_policy(
@@ -206,7 +206,7 @@ def _earning(
 
 
 def _positive(reward: jax.Array) -> jax.Array:
-    """Whether a reward is positive, also if it is subnormal, which arithmetic flushes to 0."""
+    """True if a reward is positive, also if it is subnormal, which arithmetic flushes to 0."""
     kind = jnp.int64 if reward.dtype.itemsize == 8 else jnp.int32
     return lax.bitcast_convert_type(reward, kind) > 0
 
@@ -388,7 +388,7 @@ class _Search(NamedTuple):
     share: jax.Array  # e
     bounds: tuple[jax.Array, jax.Array]  # the proven bounds
     shares: tuple[jax.Array, jax.Array]  # the e of each proven bound, else infinity
-    safe: _Point  # the point whose policy attains the bound on the safe side
+    safe: _Point  # the point with a policy that attains the bound on the safe side
     tries: jax.Array  # tries, num_steps: numbers of trials, and of applications of P
     num_steps: jax.Array
     ended: jax.Array  # whether other shares would not help
