@@ -40,10 +40,7 @@ from jaxltl.core.types import require_shape
 @brief
 @struct.dataclass
 class Finite:
-    """A finite action space, ``0 .. num - 1``.
-
-    Attributes:
-      num: the number of actions; static.
+    """The finite action space of the actions 0 to `num` - 1; `num` is static.
 
     Example:
       >>> Finite(4).num
@@ -60,8 +57,7 @@ class Box:
 
     Attributes:
       low, high: arrays that broadcast to the shape, infinite where unbounded.
-      shape: static.
-      dtype: its name; static.
+      shape, dtype: the shape and the name of the dtype; static.
 
     Example:
       >>> space = make_box([-1.0, 0.0], 1.0)
@@ -196,8 +192,6 @@ class Environment:
       ...     lambda world: world[None], actions=2)
       >>> coin.actions.num, coin.propositions, coin.horizon
       (2, (), None)
-      >>> coin.step(0, 1, jax.random.key(0)).world
-      1
     """
 
     reset: Callable[..., PyTree]

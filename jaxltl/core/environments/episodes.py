@@ -102,16 +102,11 @@ class Episode(NamedTuple):
       discount: ``float[T]`` of the steps; one after the end.
 
     Example:
-      >>> import jaxltl as jl
-      >>> coin = jl.environments.make_environment(
-      ...     lambda key: jnp.int32(0),
-      ...     lambda world, action, key: Timestep(action, 1.0, action == 1),
-      ...     lambda world: world[None], actions=2)
-      >>> seen = jax.eval_shape(
-      ...     lambda key: run_episode(key, coin, make_agent(lambda seen, key: 1), num_steps=5),
-      ...     jax.random.key(0))
-      >>> seen.world.shape, seen.reward.shape, seen.terminated.shape
-      ((6,), (5,), ())
+      >>> seen = Episode(world=[0, 1], observation=[0], action=[1], reward=[1.0], cost=[0.0],
+      ...                label=[[False], [True]], valid=[True], terminated=True, truncated=False,
+      ...                discount=[1.0])
+      >>> seen.world[-1], sum(seen.reward)
+      (1, 1.0)
     """
 
     world: PyTree
@@ -134,9 +129,7 @@ def run_episode(
     Runs under ``jit`` and ``vmap``; the compiler drops fields that the caller does not use.
 
     Args:
-      key: the random key.
-      environment: the environment.
-      agent: the agent.
+      key, environment, agent: the random key, the environment and the :class:`Agent`.
       num_steps: T; static.
 
     Returns:
@@ -244,14 +237,11 @@ def auto_reset_step(
     """A step that resets the environment where an episode ends.
 
     Args:
-      environment: the environment.
-      world: the state before the step.
-      action: the action.
-      key: the random key of the step and of the reset.
+      environment, world, action, key: as for ``environment.step``; the key serves the reset too.
 
     Returns:
-      The next state, after a reset if the episode ended, and the :class:`Timestep`, whose `world` is
-      the state before the reset.
+      The next state, after a reset if the episode ended, and the :class:`Timestep` with the state
+      before the reset.
 
     Example:
       >>> import jaxltl as jl

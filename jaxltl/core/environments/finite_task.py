@@ -1,9 +1,7 @@
 """Temporal logic on finite trajectories, for objectives and constraints of black-box optimisation.
 
-A finite trajectory satisfies a formula, violates it, or leaves it undecided (see ``monitor``). The
-frequencies of the three verdicts among sampled trajectories are maximised or bounded: reaching a
-goal with probability .9 is ``-frequencies.satisfied <= -.9``, and leaving a corridor with
-probability at most .01 is ``frequencies.violated <= .01``.
+The frequencies of the verdicts among sampled trajectories are maximised or bounded: reaching a
+goal with probability .9 is ``-frequencies.satisfied <= -.9``.
 """
 
 from __future__ import annotations
@@ -79,8 +77,8 @@ def make_finite_task(formula: Formula | str | Automaton, propositions: Sequence[
       :class:`FiniteTask`.
 
     Raises:
-      ValueError: a proposition without a column, a name twice, an automaton that cannot read
-        every subset, or a formula that no automaton is made of.
+      ValueError: a proposition without a column, a name twice, or an automaton that does not read
+        every subset.
 
     Example:
       >>> task = make_finite_task("!wet U dry", ["wet", "dry"])

@@ -29,9 +29,8 @@ def model_environment(
 ) -> Environment:
     """The simulated environment of a finite MDP, or of a game against a given opponent.
 
-    The environment's states are those of the model, ``int32[]``; labels and available actions are the
-    model's. Episodes have no end. In a game each move is a step, and on the opponent's turn its policy
-    replaces the action.
+    States ``int32[]``, labels and available actions are the model's. Episodes have no end. In a game
+    each move is a step, and on the opponent's turn its policy replaces the action.
 
     Args:
       model: an MDP, a DenseMDP, a SparseMDP, which is padded, or a Game on one of them.
@@ -43,8 +42,8 @@ def model_environment(
       :class:`~jaxltl.core.environments.environment.Environment`.
 
     Raises:
-      ValueError: rewards or an opponent of another shape, an opponent without a game, or a product;
-        simulate its model and give the task to ``task_environment``.
+      ValueError: rewards or an opponent of another shape, an opponent without a game, or a product
+        (use ``task_environment`` on its model).
 
     Example:
       >>> from jaxltl import from_dense

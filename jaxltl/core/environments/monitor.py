@@ -1,9 +1,8 @@
 """Three-valued verdicts on finite traces: satisfied, violated or undecided.
 
 A verdict is decided if all infinite continuations agree (Bauer, Leucker & Schallhart 2011, "Runtime
-verification for LTL and TLTL"). A terminal state is an absorbing state whose letter repeats for
-ever, so that `accepts_lasso` decides its trace. A truncated trace stays undecided: an unmet
-"eventually" is not violated, and an "always" is not satisfied.
+verification for LTL and TLTL"). The letter of a terminal state repeats for ever, so that
+`accepts_lasso` decides its trace; a truncated trace stays undecided.
 """
 
 from __future__ import annotations
@@ -75,7 +74,7 @@ def verdict(automaton: Automaton, word: Iterable[Letter]) -> Verdict:
       word: T letters, each the collection of the propositions that hold.
 
     Returns:
-      :class:`Verdict`: whether every, none or some of the word's continuations satisfy the task.
+      :class:`Verdict`.
 
     Raises:
       ValueError: a letter is not among the automaton's.
@@ -97,10 +96,7 @@ def verdicts(automaton: Automaton) -> np.ndarray:
 
 
 def lasso_verdicts(automaton: Automaton) -> np.ndarray:
-    """``int32[Q, L]``: the verdict on a word that leads to a state and then repeats one letter for ever.
-
-    For terminal states: the automaton state after the last label, and its letter. Never undecided.
-    """
+    """``int32[Q, L]``: the verdict, never undecided, if a letter repeats for ever from a state on."""
     delta, least = np.asarray(automaton.delta), np.asarray(automaton.priority)
     # The state after 2^n readings of one letter, and the least priority among them. After as many
     # as there are states the run is on its cycle, and as many more read all of it.
@@ -158,11 +154,10 @@ def monitor_step(monitor: Monitor, state: chex.Array, letter: chex.Array) -> jax
 
 
 def monitor_verdict(monitor: Monitor, state: chex.Array) -> jax.Array:
-    """The verdict in each of the given states of a monitor, for ``jit``, ``vmap`` and ``scan``.
+    """The verdict in given states of a monitor, for ``jit``, ``vmap`` and ``scan``.
 
     Args:
-      monitor: from :func:`make_monitor`.
-      state: ``int32[...]``, of :func:`monitor_step`.
+      monitor, state: as for :func:`monitor_step`.
 
     Returns:
       ``int32[...]``, of :class:`Verdict`. Integers: there is no derivative.
@@ -185,15 +180,14 @@ def trace_verdicts(
     Args:
       monitor: from :func:`make_monitor`.
       letters: ``int[..., T]`` in 0..L-1 as far as `length` reaches.
-      length: ``int[...]``, how many letters of each trace count; default all T.
+      length: ``int[...]``, the number of letters of each trace; default: T.
 
     Returns:
       ``int32[..., T + 1]``. Integers: there is no derivative.
 
     Raises:
       TypeError: letters or lengths that are not integers.
-      ValueError: a letter or a length that does not exist (on concrete arrays; a traced
-        letter is not looked at).
+      ValueError: a concrete letter or length out of range.
 
     Example:
       >>> from jaxltl import to_automaton

@@ -1,8 +1,7 @@
 """Environments with random sequences of reach-avoid subtasks, for zero-shot generalisation.
 
-A policy that follows all such sequences satisfies any formula, whose automaton gives the sequences
-that lead to acceptance (see ``core/automata/sequences.py``). Training draws a new sequence for each
-episode.
+A policy for all sequences satisfies any formula by following sequences of its automaton that lead
+to acceptance (``core/automata/sequences.py``).
 """
 
 from __future__ import annotations
@@ -35,13 +34,7 @@ from jaxltl.core.pretty_print import brief
 
 @brief
 class Sequence(NamedTuple):
-    """A sequence of reach-avoid steps; rows from `length` on are False.
-
-    Attributes:
-      reach: ``bool[D, E]``, the events that complete each step.
-      avoid: ``bool[D, E]``, the events that must not occur before.
-      length: ``int32[]``, the number of steps; above D if later steps are hidden.
-    """
+    """D reach-avoid steps over E events; `length` exceeds D if later steps are hidden."""
 
     reach: jax.Array
     avoid: jax.Array
@@ -76,14 +69,7 @@ class SequenceSampler:
 
 @brief(codes={"verdict": Verdict})
 class SequenceWorld(NamedTuple):
-    """A state of an environment with its sequence and the progress on it.
-
-    Attributes:
-      world: the environment's state.
-      sequence: the sequence of the episode.
-      stage: ``int32[]``, the number of completed steps.
-      verdict: ``int32[]``, a :class:`~jaxltl.core.environments.monitor.Verdict`.
-    """
+    """A state with its sequence, the number of completed steps, and the verdict."""
 
     world: PyTree
     sequence: Sequence
@@ -195,11 +181,7 @@ def sequence_sampler(
 
 
 def draw_sequence(key: chex.PRNGKey, sampler: SequenceSampler) -> Sequence:
-    """A random sequence: disjoint sets to reach and to avoid in each step.
-
-    Events to reach are removed from the sets to avoid, as in automata. A set with an event that may
-    have completed the step before is not drawn: avoiding it would be impossible.
-    """
+    """A random sequence of disjoint sets to reach and to avoid in each step."""
     keys = jax.random.split(key, 4)
     depth, count = sampler.length.shape[0], sampler.sets.shape[0]
     sets = jnp.asarray(sampler.sets)
@@ -226,14 +208,14 @@ def sequence_environment(
     violation: float = -1.0,
     progress: float = 0.0,
 ) -> Environment:
-    """An environment whose task is a random sequence, drawn at the start of each episode.
+    """An environment with a random sequence of subtasks in each episode.
 
     The event of each state is read, that of the initial state included. An event to reach completes
     the step, and an event to avoid ends the episode, as does the last step. With T steps in all, the
     rewards are 1 for completing all, `violation`, and ``progress / T`` for each completed step.
 
     Args:
-      environment: the environment, whose rewards are replaced.
+      environment: the environment; its rewards are replaced.
       events: ``bool[E, P]``, the labels that occur, as of :func:`make_events`.
       sampler: the distribution of sequences over these events.
       violation, progress: rewards.
@@ -246,14 +228,12 @@ def sequence_environment(
       ValueError: events or a sampler that do not fit.
 
     Example:
-      >>> import jaxltl as jl
-      >>> coin = jl.environments.make_environment(
-      ...     lambda key: jnp.int32(0), lambda world, action, key: Timestep(action, 0.0, False),
-      ...     lambda world: world[None], actions=2,
-      ...     labels=lambda world: world == jnp.array([1]), propositions=["a"])
+      >>> from jaxltl import environments, from_dense
+      >>> walk = environments.model_environment(from_dense(
+      ...     [[[.5, .5]], [[.5, .5]]], label=[[0], [1]], propositions=["a"]))
       >>> events = make_events(["a"])
-      >>> drawn = sequence_environment(
-      ...     coin, events, sequence_sampler([1], [1], [1], proposition_sets(events)))
+      >>> sampler = sequence_sampler([1], [1], [1], proposition_sets(events))
+      >>> drawn = sequence_environment(walk, events, sampler)
       >>> jax.eval_shape(drawn.reset, jax.random.key(0)).sequence.reach.shape  # steps, events
       (1, 2)
     """

@@ -40,20 +40,19 @@ class Table:
     """A tabulated environment; see :func:`tabulate`.
 
     Attributes:
-      model: one state for each reachable state of the environment and each way in which the episode
-        continues or ends there; ended states are absorbing. Row actions are the environment's, and the
-        rewards ``"reward"`` and ``"cost"`` its own; discounts are left out.
+      model: a state for each reachable state of the environment and each way in which the episode
+        continues or ends there (ended states are absorbing), with the environment's actions and the
+        rewards ``"reward"`` and ``"cost"``, without discounts.
       world: the environment's states, a tree with a leading axis of S.
       start: ``int32[N]``, the initial states.
       terminated, truncated: ``bool[S]``, the absorbing states. Truncated states would continue:
         properties hold for the time before truncation, as in
         :func:`~jaxltl.core.values.evaluation.optimality_gap.optimality_gap`.
-      num_steps: the limit of :func:`~jaxltl.core.environments.time_limit.with_time_limit`, which is not
-        part of the states, or None; static.
-      evidence: the justification of the probabilities; static. ``"keyless"``: the program does not
-        read the key; ``"told"``: `starts` and `outcomes`, which agreed with samples; ``"keys"``: all
-        sampled keys gave the same result; ``"distinct"``: the caller's claim about `distinct`, which the
-        program does not imply. The weakest, in this order, of all parts.
+      num_steps: the time limit, which is not part of the states, or None; static.
+      evidence: the weakest justification of the probabilities, in this order; static. ``"keyless"``:
+        the program does not read the key; ``"told"``: `starts` and `outcomes` agreed with samples;
+        ``"keys"``: all sampled keys gave the same result; ``"distinct"``: the caller's `distinct`,
+        which the program does not imply.
 
     Example:
       >>> over = Table(
@@ -83,22 +82,19 @@ def tabulate(
 ) -> Table:
     """The reachable states of an environment and their transition probabilities, as a model.
 
-    Breadth-first search by a vmapped program on batches of states; states are equal if their bytes
-    are. A time limit is removed and reported as `num_steps`, so that time is not part of the states.
-    A random environment gives its distributions as `starts` and `outcomes`; any other must be
-    deterministic, which is proven if no result depends on the key, and otherwise tested with several
-    keys. (The test misses rare differences: `evidence` of the table reports it.)
+    Breadth-first search on batches of states, which are equal if their bytes are. A time limit is
+    removed and reported as `num_steps`. A random environment needs `starts` and `outcomes`; any other
+    must be deterministic: proven if no result depends on the key, else tested with several keys, which
+    may miss rare differences (see `evidence`).
 
     Args:
       environment: with finitely many actions.
       worlds: initial states, equally likely, instead of those of `reset`: a tree with a leading axis,
-        such as ``vmap(environment.reset)(keys)``. Different maps are tabulated side by side.
+        such as ``vmap(environment.reset)(keys)``.
       max_states: an upper bound on the number of states.
-      num_keys: the number of keys for the test.
-      key: of these keys; default ``jax.random.key(0)``.
+      num_keys, key: the number of keys for the test, and their source; default ``jax.random.key(0)``.
       distinct: ``world -> tree``, the part of a state that distinguishes it; default: all of it. It may
-        leave out parts without influence on later steps, such as counters or unused keys; `evidence`
-        is ``"distinct"`` if the program does not show that.
+        omit parts without influence on later steps, such as counters or unused keys.
 
     Returns:
       :class:`Table`.
@@ -108,18 +104,12 @@ def tabulate(
         samples, more than `max_states` states, or a state without an available action.
 
     Example:
-      >>> from jaxltl.core.environments.environment import make_environment
-      >>> def step(place, action, key):
-      ...     place = jnp.clip(place + 2 * action - 1, 0, 4)
-      ...     return Timestep(place, reward=1.0, terminated=place == 4)
-      >>> corridor = make_environment(
-      ...     lambda key: jnp.int32(2), step, lambda place: place[None], actions=2,
-      ...     labels=lambda place: jnp.array([place == 4]), propositions=["goal"])
-      >>> table = tabulate(corridor)
+      >>> from jaxltl import environments, from_dense
+      >>> walk = environments.model_environment(
+      ...     from_dense([[[0, 1]], [[0, 1]]], initial=[1, 0]))
+      >>> table = tabulate(walk)
       >>> table.world.tolist(), table.model.num_rows, table.evidence
-      ([2, 1, 3, 0, 4], 9, 'keyless')
-      >>> table.terminated.tolist()
-      [False, False, False, False, True]
+      ([0, 1], 2, 'told')
     """
     inner, limit = without_time_limit(environment)
     max_states = validation.integer("max_states", max_states, least=1)
@@ -336,15 +326,7 @@ def _left_out_is_idle(kind: _Kind) -> bool:
 
 
 class _Followers(NamedTuple):
-    """Successors of a batch of B states; the axes are B, A and K outcomes.
-
-    Attributes:
-      world: the successor states.
-      seen: ``uint8[B, A, K, W + 1]``, their bytes, and the way in which the episode continues or ends.
-      probability, reward, cost: ``float[B, A, K]``.
-      allowed: ``bool[B, A]``.
-      drawn: ``uint8[B, A, N, W']``, bytes of the samples by key; without `outcomes` also of the rewards.
-    """
+    """Successors of a batch ``[B, A, K]``, with bytes of states `seen` and of samples `drawn` by key."""
 
     world: PyTree
     seen: Any

@@ -61,14 +61,8 @@ class TaskWorld(NamedTuple):
       visits: ``int32[]``, the number of accepting transitions so far, the first label included.
 
     Example:
-      >>> import jaxltl as jl
-      >>> coin = jl.environments.make_environment(
-      ...     lambda key: jnp.int32(0), lambda world, action, key: Timestep(action, 0.0, False),
-      ...     lambda world: world[None], actions=2,
-      ...     labels=lambda world: world == jnp.array([1]), propositions=["a"])
-      >>> begun = jax.eval_shape(jl.environments.task_environment(coin, "F a").reset, jax.random.key(0))
-      >>> begun.world.dtype.name, begun.memory.shape, begun.visits.dtype.name
-      ('int32', (), 'int32')
+      >>> TaskWorld(world=7, memory=1, verdict=0, accepted=False, visits=0).memory
+      1
     """
 
     world: PyTree
@@ -87,14 +81,8 @@ class TaskObservation(NamedTuple):
       memory: ``float[Q]``, the automaton state one-hot, or its row of an embedding.
 
     Example:
-      >>> import jaxltl as jl
-      >>> coin = jl.environments.make_environment(
-      ...     lambda key: jnp.int32(0), lambda world, action, key: Timestep(action, 0.0, False),
-      ...     lambda world: world[None], actions=2,
-      ...     labels=lambda world: world == jnp.array([1]), propositions=["a"])
-      >>> task = jl.environments.task_environment(coin, "F a")
-      >>> task.observations.world.shape, task.observations.memory.shape  # the automaton has 2 states
-      ((1,), (2,))
+      >>> TaskObservation(world=[0.5], memory=[0.0, 1.0]).memory  # in state 1 of 2
+      [0.0, 1.0]
     """
 
     world: PyTree
@@ -220,42 +208,32 @@ def task_environment(
 ) -> Environment:
     """The product of an environment and a temporal-logic task, as an environment.
 
-    Its states are :class:`TaskWorld`, its observations :class:`TaskObservation`. Costs, discounts,
-    actions and masks are the environment's, and its rewards are replaced by those of the task, whose
-    discounts come as ``Timestep.discount``: the learner's own discount is 1. Episodes terminate where
-    the environment's do and as soon as the verdict is decided; a task that the first label decides
-    ends with the first step. Truncation leaves the verdict undecided.
-
-    The rewards are named by the option `reward`; see
-    :func:`~jaxltl.core.environments.task_reward.make_task_reward` for equations and theorems.
+    Its states are :class:`TaskWorld`, its observations :class:`TaskObservation`. The rewards and
+    discounts of the task (``Timestep.discount``; the learner's own discount is 1) replace the
+    environment's rewards; see :func:`~jaxltl.core.environments.task_reward.make_task_reward`. Episodes
+    terminate where the environment's do, and at the first step with a decided verdict. Truncation
+    leaves the verdict undecided.
 
     Args:
       environment: the environment.
       formula: a formula, its text, an automaton over all subsets of its propositions, or the tables
         of :func:`make_task_tables`, which take no further options.
-      labels: ``world -> bool[P]``; default: the environment's.
-      propositions: names of the labels; default: the environment's.
-      options: rewards, terminal states and observations of the task, see :class:`TaskOptions`.
+      labels, propositions: ``world -> bool[P]`` and its names; default: the environment's.
+      options: see :class:`TaskOptions`.
 
     Returns:
       :class:`~jaxltl.core.environments.environment.Environment`.
 
     Raises:
-      ValueError: functions that are not pure or return other shapes, labels that are not ``bool[P]``,
-        a formula over unknown propositions, a reward that does not fit the task, a discount out of
-        range, or a potential or an embedding of another shape.
+      ValueError: labels that are not ``bool[P]``, unknown propositions, a reward that does not fit the
+        task, a discount out of range, or a potential or an embedding of another shape.
 
     Example:
-      >>> def reset(key):
-      ...     return jnp.int32(0)
-      >>> def step(place, action, key):
-      ...     place = jnp.clip(place + 2 * action - 1, 0, 2)
-      ...     return Timestep(place, reward=0.0, terminated=False)
-      >>> corridor = make_environment(reset, step, lambda place: place[None], actions=2,
-      ...     labels=lambda place: place == jnp.array([0, 2]), propositions=["home", "goal"])
+      >>> from jaxltl import environments, gridworld
+      >>> corridor = environments.model_environment(gridworld("home . goal", initial="home"))
       >>> task = task_environment(corridor, "F (goal & F home)")
       >>> world = task.reset(jax.random.key(0))
-      >>> for action in (1, 1, 0, 0):
+      >>> for action in (3, 3, 2, 2):  # right, left
       ...     print(residual_formula(task, world.memory))
       ...     found = task.step(world, action, jax.random.key(0))
       ...     world = found.world
@@ -315,10 +293,7 @@ def task_tables(environment: Environment) -> TaskTables:
 
 
 def stack_tables(tables: Sequence[TaskTables]) -> TaskTables:
-    """Tasks of different formulas, padded to one shape, with a leading axis; for ``vmap``.
-
-    States in padding are violated and unreachable.
-    """
+    """Tasks padded to one shape with a leading axis; states in padding are violated and unreachable."""
     tables = validation.sequence("tables", tables)
     if not tables:
         raise ValueError("there is no task; give at least one.")
@@ -368,8 +343,7 @@ def stack_tasks(environments: Sequence[Environment]) -> Environment:
 def residual_formula(task: Environment | TaskTables | Automaton, memory: PyTree) -> str:
     """The residual formula in a state of a task's automaton: the obligation on the remaining word.
 
-    States of automata from files, very large automata, stacks and results of ``jit`` have no text, and
-    are numbered instead.
+    Automata from files, very large ones, stacks and results of ``jit`` have state numbers instead.
 
     Args:
       task: a task environment, its tables, or an automaton.

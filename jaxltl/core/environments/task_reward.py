@@ -24,15 +24,10 @@ _DEFAULT = 0.99
 
 @brief
 class TaskReward(NamedTuple):
-    """The reward of a task on the transitions of its automaton.
+    """The named reward of a task, as arrays over states and letters of its automaton.
 
-    Attributes:
-      name: of the reward, with ``"auto"`` resolved.
-      accepting: ``bool[Q, L]``, the accepting transitions: of even priority, or for a co-safe or safety
-        task into a final state.
-      reward, discount: ``float[Q, L]``.
-      decided: ``float[3]``, the reward at each :class:`~jaxltl.core.environments.monitor.Verdict`.
-      potential: ``float[Q]``.
+    `accepting` transitions are of even priority, or for a co-safe or safety task into a final state;
+    `decided` is the reward at each :class:`~jaxltl.core.environments.monitor.Verdict`.
     """
 
     name: str
@@ -69,15 +64,15 @@ def make_task_reward(
 
     The learner maximises ``E[sum_t (d_0 ... d_{t-1}) r_t]`` of the rewards r and discounts d below; its
     own discount is 1. Let g be `discount` and P the satisfaction probability. Limits hold for finite
-    environments, whose optimal policies are optimal for P from some g below 1 on.
+    environments: from some g below 1 on, optimal policies are optimal for P.
 
     - ``"reach"``, for co-safe tasks: r = 1 where the verdict becomes satisfied, d = g. The value is P
       for g = 1, and ``E[g^(T - 1)]`` with T steps until satisfaction for g < 1.
     - ``"keep"``, for safety tasks: r = -1 where the verdict becomes violated, d = g. The value is P - 1
       for g = 1, which is the limit for g < 1.
     - ``"eventual"``, for two priorities (Voloshin, Verma & Yue 2023, "Eventual discounting temporal
-      logic counterfactual experience replay"): r = 1 - g and d = g on accepting transitions, r = 0 and
-      d = 1 on others. With K accepting transitions the return is ``1 - g^K``, hence
+      logic counterfactual experience replay"): r = 1 - g, d = g on accepting transitions, else r = 0,
+      d = 1. With K accepting transitions the return is ``1 - g^K``, hence
       ``P <= value <= P + (1 - g) E[K; K finite]``, and the optimal policy loses at most
       ``(1 - g) max E[K; K finite]``.
     - ``"two-discount"``, for two priorities (Bozkurt, Wang, Zavlanos & Pajic 2020, "Control synthesis

@@ -20,8 +20,7 @@ from jaxltl.core.environments.environment import Environment, Timestep, require_
 def with_time_limit(environment: Environment, num_steps: int) -> Environment:
     """The environment with episodes truncated after `num_steps` steps.
 
-    Its states are pairs ``(world, time)``. Observations do not include the time: where the optimal
-    action depends on it, add it in `observe`.
+    Its states are pairs ``(world, time)``; observations do not include the time.
 
     Args:
       environment: the environment.
@@ -34,11 +33,8 @@ def with_time_limit(environment: Environment, num_steps: int) -> Environment:
       ValueError: a limit below 1.
 
     Example:
-      >>> import jaxltl as jl
-      >>> coin = jl.environments.make_environment(
-      ...     lambda key: jnp.int32(0), lambda world, action, key: Timestep(action, 0.0, False),
-      ...     lambda world: world[None], actions=2)
-      >>> with_time_limit(coin, 10).horizon
+      >>> from jaxltl import environments, gridworld
+      >>> with_time_limit(environments.model_environment(gridworld("a b")), 10).horizon
       10
     """
     num_steps = validation.integer("num_steps", num_steps, least=1, most=2**31 - 1)
