@@ -32,20 +32,17 @@ def automaton(
     names: bool = True,
     layout: Literal["auto", "graphviz", "matplotlib"] = "auto",
 ) -> Figure:
-    """Graph of an automaton, from left to right.
+    """The graph of an automaton, from left to right.
 
-    Final states have a double circle. Accepting transitions of a Buchi automaton are coloured, with
-    a dot before their guard; guards of a parity automaton have their priority there, filled if
-    even. States in which the word is already rejected are grey.
+    Final states have a double circle, rejecting ones are grey. Accepting transitions of a Buchi
+    automaton are coloured, with a dot before their guard; guards of a parity automaton have their
+    priority there, filled if even.
 
     Args:
       automaton: the automaton.
-      names: list the remaining formula of each state under the graph.
+      names: list the residual formula of each state under the graph.
       layout: ``"graphviz"``, ``"matplotlib"`` for the built-in layout, or ``"auto"``: graphviz if
         its program ``dot`` is installed.
-
-    Returns:
-      The figure.
 
     Raises:
       ValueError: ``layout="graphviz"`` and graphviz cannot be run.
@@ -135,12 +132,7 @@ def pretty_guard(text: str) -> str:
 
 
 def edge_texts(table: Automaton, doomed: NDArray[np.bool_]) -> dict[drawing.Key, drawing.Rows]:
-    """The marks and guards on each curve.
-
-    Two states have one curve from one to the other, with a guard for each priority; but
-    accepting transitions of a Buchi automaton have their own. The longest guard of each state
-    says "else", which is shorter and exact.
-    """
+    """Marks and guards of each curve: one for each pair of states, and one for accepting transitions."""
     # No word is accepted after a transition to a rejecting state, for any priority.
     priority = np.where(doomed[table.delta], 1, table.priority)
     texts = {k: pretty_guard(t) for k, t in edge_guards(replace(table, priority=priority)).items()}

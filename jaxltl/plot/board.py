@@ -142,7 +142,7 @@ def draw_arrows(
     limits: tuple[float, float],
     actions: Sequence[str],
 ) -> None:
-    """Draws a policy: triangles whose length is the probability of the action."""
+    """Draws a policy: triangles with lengths proportional to the probabilities of the actions."""
     shapes: list[list[NDArray[np.float64]]] = []
     colors: list[str] = []
     for state, chances in enumerate(policy):

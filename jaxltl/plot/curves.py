@@ -40,15 +40,13 @@ def curves(
     steps: ArrayLike | None = None,
     show: Sequence[str] | None = None,
 ) -> Figure:
-    """Learning curves, one panel per figure: the median and range over seeds.
+    """The learning curves of a run, one panel per figure: the median and range over seeds.
 
     Args:
       metrics: figures ``[T]`` or ``[N, T]`` by name, or a learner's ``Metrics``.
       steps: ``[T]``, the step of each figure; default 1, 2, ...
       show: names in order; default all that are not wholly NaN.
 
-    Returns:
-      The figure. The band is the range over seeds.
 
     Raises:
       ValueError: there is nothing to show.
@@ -106,7 +104,7 @@ def bands(
     limits: Mapping[str, Mapping[str, float]] | None = None,
     label: str = "step",
 ) -> Figure:
-    """Learning curves of several methods: a row of panels for each task.
+    """The learning curves of several methods: a row of panels for each task.
 
     Args:
       rows: by the titles of row and column and the name of the series, the horizontal places
@@ -114,8 +112,6 @@ def bands(
       limits: by the titles of row and column, a number at which a dashed line is drawn.
       label: of the horizontal axis.
 
-    Returns:
-      The figure.
 
     Raises:
       ValueError: there is nothing to show.
@@ -151,8 +147,7 @@ def sweep(
     steps: ArrayLike | None = None,
     show: Sequence[str] | None = None,
 ) -> Figure:
-    """Learning curves of several settings, one panel per figure: mean and standard deviation over
-    seeds.
+    """The learning curves of several settings, one panel per figure: mean and deviation over seeds.
 
     Args:
       metrics: figures ``[H, N, T]`` of H settings and N seeds by name, or a learner's ``Metrics``
@@ -162,7 +157,7 @@ def sweep(
       show: names of figures in order; default all that are not wholly NaN.
 
     Returns:
-      The figure; seeds that are not finite at a step are excluded there.
+      The figure, without seeds that are not finite at a step.
 
     Raises:
       ValueError: there is nothing to show, or figures of another number of axes or settings.
@@ -198,15 +193,13 @@ def lines(
     labels: Sequence[str] = (),
     names: tuple[str, str] = ("found", "reference"),
 ) -> Figure:
-    """Many runs over time beside a reference run: a row of panels for each setting.
+    """The runs of each setting over time, with a reference run: a row of panels for each setting.
 
     Args:
       rows: by the titles of row and column, runs ``[K, T]`` and a reference ``[T]`` or None.
       labels: of the horizontal axes, one for each column.
       names: of the runs and of the reference.
 
-    Returns:
-      The figure.
 
     Raises:
       ValueError: there is nothing to show.
@@ -244,7 +237,7 @@ def guarantees(
     reference: float | None = None,
     names: tuple[str, str] = ("transitions", "probability"),
 ) -> Figure:
-    """Bounds over the number of samples, on a logarithmic axis.
+    """The bounds over the number of samples, on a logarithmic axis.
 
     Args:
       samples: ``[T]``, positive.
@@ -252,8 +245,6 @@ def guarantees(
       reference: the exact value, drawn as a line.
       names: of the axes.
 
-    Returns:
-      The figure.
 
     Raises:
       ValueError: there is nothing to show.
@@ -293,7 +284,7 @@ def paths(
     bounds: ArrayLike,
     columns: int = 4,
 ) -> Figure:
-    """Trajectories in the plane, a map for each title.
+    """The trajectories in the plane, a map for each title.
 
     Args:
       maps: by title, coordinates x and y of M trajectories, ``[M, T]`` each.
@@ -301,8 +292,6 @@ def paths(
       bounds: the box that is shown.
       columns: of maps.
 
-    Returns:
-      The figure.
 
     Raises:
       ValueError: there is nothing to show.

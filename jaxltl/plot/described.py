@@ -41,15 +41,13 @@ class Described(NamedTuple):
 
 
 def described(figure: Figure, text: str, *, page: str | None = None) -> Described:
-    """Figure with a text alternative, shown as a picture by notebooks.
+    """A figure with a text alternative, shown as a picture by notebooks.
 
     Args:
       figure: the figure.
       text: the text alternative: the objects in the figure and its main result.
       page: HTML of an animation, such as that of :func:`~jaxltl.plot.episodes.play_episode`.
 
-    Returns:
-      The figure with its text and page.
 
     Raises:
       ValueError: the text is empty or has brackets or line breaks.

@@ -63,7 +63,7 @@ class Scene(NamedTuple):
 
 
 def draw_episode(environment: Environment, episode: Episode, *, title: str | None = None) -> Figure:
-    """Map of a letter world, a flat world or a zone world with one episode as a line.
+    """The map of a letter world, a flat world or a zone world with one episode as a line.
 
     Other worlds need a ``place``, ``float[2]``, as an attribute or key; marks show where a
     proposition begins to hold.
@@ -73,8 +73,6 @@ def draw_episode(environment: Environment, episode: Episode, *, title: str | Non
       episode: of :func:`~jaxltl.core.environments.episodes.run_episode`, of one trajectory.
       title: default the propositions that held, in order.
 
-    Returns:
-      The figure.
 
     Raises:
       ValueError: another world, or many trajectories.
@@ -90,15 +88,10 @@ def draw_episode(environment: Environment, episode: Episode, *, title: str | Non
 def draw_episodes(
     environment: Environment, episodes: Sequence[Episode], *, titles: Sequence[str] | None = None
 ) -> Figure:
-    """Several episodes as :func:`draw_episode` draws one, side by side.
+    """The maps of several episodes, each as in :func:`draw_episode`, side by side.
 
     Args:
-      environment: as there.
-      episodes: at least one, each of one trajectory.
-      titles: of each; default what held on the way, in order.
-
-    Returns:
-      The figure.
+      environment, episodes, titles: one or more episodes of the environment, and their titles.
 
     Raises:
       ValueError: no episode, another world, or many trajectories in one.
@@ -351,9 +344,6 @@ def play_episode(environment: Environment, episode: Episode, *, title: str | Non
 
     Args:
       environment, episode, title: as for :func:`draw_episode`.
-
-    Returns:
-      The HTML.
 
     Raises:
       ValueError: another world, or many trajectories.

@@ -58,7 +58,7 @@ def game_values(
     limits: tuple[float, float] | None = None,
     wall: str = "#",
 ) -> Figure:
-    """Values on the system's turns: one map of the system's cell per cell of the environment.
+    """The values on the system's turns: one map of the system's cell per cell of the environment.
 
     Args:
       values: ``float[2 * C * C]``, of the states of :func:`jaxltl.envs.robots.robots` or
@@ -71,8 +71,6 @@ def game_values(
       limits: values at the ends of the scale; default the data's.
       wall: the kind of cell that is not a place.
 
-    Returns:
-      The figure, with one scale for all maps.
 
     Raises:
       ValueError: values or policy do not fit the board, or an action has no direction.
@@ -111,14 +109,11 @@ def game_region(
     environment: Sequence[int] | None = None,
     wall: str = "#",
 ) -> Figure:
-    """Winning region on the system's turns: one map per cell of the environment.
+    """The winning region on the system's turns: one map per cell of the environment.
 
     Args:
-      region: ``bool[2 * C * C]``, see :func:`game_values`.
-      board, environment, wall: as there; or a board as :mod:`jaxltl.plot.board` has it.
-
-    Returns:
-      The figure.
+      region: ``bool[2 * C * C]``.
+      board, environment, wall: as for :func:`game_values`; or a :class:`~jaxltl.plot.board.Board`.
 
     Raises:
       ValueError: the region does not fit the board.
@@ -157,20 +152,18 @@ def game_moves(
     titles: Sequence[str] | str = "",
     wall: str = "#",
 ) -> Figure:
-    """Allowed moves of the system in each cell, for one cell of the environment.
+    """The allowed moves of the system in each cell (a triangle, or a dot for staying).
 
     Args:
       allowed: ``bool[2 * C * C, A]`` over the states of :func:`game_values`, or with M panels
         first, such as one for each memory state of a strategy.
-      board, actions, wall: as there.
+      board, actions, wall: as for :func:`game_values`.
       environment: the number of the environment's place.
-      region: ``bool[2 * C * C]``, or with M panels first: where the system wins.
-      available: ``bool[2 * C * C, A]``: those that are not allowed get a hollow mark.
-      system: the number of the system's place, to be ringed.
+      region: ``bool[2 * C * C]``, or with M panels first: the winning region.
+      available: ``bool[2 * C * C, A]``: actions that are not allowed get a hollow mark.
+      system: the number of the system's place, marked by a ring.
       titles: one per panel.
 
-    Returns:
-      The figure. A triangle is an allowed move, a dot is staying.
 
     Raises:
       ValueError: an array does not fit the board, or an action has no direction.
@@ -307,16 +300,14 @@ def compare(
     groups: Sequence[str] | None = None,
     label: str = "value",
 ) -> Figure:
-    """Values of the same states under several strategies, one column per state.
+    """The values of the same states under several strategies, one column per state.
 
     Args:
       values: ``float[S]`` by the name of the strategy, first on top. States are sorted by the
         first, then by the second, and so on.
-      groups: the name of each state's group, which stand side by side as they first occur.
+      groups: the name of each state's group; groups are ordered by their first states.
       label: of the values.
 
-    Returns:
-      The figure.
 
     Raises:
       ValueError: there is nothing to show, or lengths differ.

@@ -1,7 +1,6 @@
-"""Layered graph layout of automata: positions of states, curves and labels.
+"""Layered graph layout of automata: positions of states, curves and labels, in inches.
 
-Lengths are inches. Positions are found by trying a few candidates and scoring each against
-what is already there.
+Each position is the candidate of the best score with respect to the parts placed before.
 """
 
 from __future__ import annotations
@@ -91,15 +90,7 @@ def arrange(
     texts: Mapping[Key, Rows],
     position: Points | None = None,
 ) -> Graph:
-    """The layout of a transition graph.
-
-    Args:
-      delta: ``int[Q, L]``.
-      initial: the state on the left.
-      doomed: ``bool[Q]``, states that stand below the others.
-      texts: the label of each curve; long guards are broken into lines.
-      position: ``float[Q, 2]``, where the states stand; default our own choice.
-    """
+    """The layout of a transition graph, with `doomed` states below the others."""
     texts = {key: _wrapped(rows) for key, rows in texts.items()}
     if position is None:
         position = _positions(delta, initial, doomed, texts)

@@ -1,8 +1,7 @@
-"""SVG drawings for interactive pages: parts have classes and data attributes for scripts.
+"""SVG drawings for interactive pages; lengths are pixels.
 
-Each part has a class and data attributes for what it stands for (``data-memory``, ``data-from`` and
-``data-to``, ``data-state``, ``data-run``), and takes its colours from the page's style. Lengths are
-pixels at their natural size.
+Each part has a class and data attributes (``data-memory``, ``data-from`` and ``data-to``,
+``data-state``, ``data-run``) for scripts, and takes its colours from the page's style.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ _INCH = 96.0
 
 
 def live_automaton(automaton: Automaton, name: str) -> str:
-    """Graph of an automaton as SVG in which each state is a button.
+    """The graph of an automaton as SVG in which each state is a button.
 
     A state is ``g.state#NAME-qQ`` with ``data-memory``, an arrow ``g.edge`` with ``data-from`` and
     ``data-to``; classes ``final`` and ``doomed`` are as in :func:`jaxltl.plot.automaton`.
@@ -41,8 +40,6 @@ def live_automaton(automaton: Automaton, name: str) -> str:
       automaton: the automaton.
       name: prefix of the ids.
 
-    Returns:
-      The text of an SVG.
 
     Example:
       >>> from jaxltl import to_automaton
@@ -168,7 +165,7 @@ def live_map(
     wall: str = "#",
     pieces: int = 1,
 ) -> str:
-    """Map as SVG, with one layer per memory state, the first of which is visible.
+    """A map as SVG, with one layer per memory state, the first of which is visible.
 
     Args:
       place: the cells of a text map, ``str[rows, columns]``, or a coloured world.
@@ -181,8 +178,6 @@ def live_map(
       wall: the kind of cell that is not a place.
       pieces: number of moving pieces, ``circle.token``.
 
-    Returns:
-      The text of an SVG.
 
     Example:
       >>> text = live_map(np.array([[".", "g"]]), "map", {"0": ([0.5, 1.0], None)}, runs=[[0, 1]])
@@ -274,7 +269,7 @@ def _layer(
 
 
 def _triangle(row: int, column: int, action: str, chance: float) -> str:
-    """SVG of an arrow head whose length is the probability of its action."""
+    """SVG of an arrow head with a length proportional to the probability of its action."""
     step = np.array(STEPS[action], float)
     side = step[::-1] * (0.055 + 0.085 * chance)
     middle = np.array([column + 0.5, row + 0.5])
@@ -300,15 +295,12 @@ def _track(number: int, cells: Sequence[int], columns: int) -> str:
 
 
 def live_curve(name: str, values: ArrayLike, steps: ArrayLike) -> str:
-    """A learning curve: the median over seeds as a line, their range as a band.
+    """A learning curve as SVG: the median over seeds as a line, their range as a band.
+
+    The scale is logarithmic where positive values span more than a hundredfold.
 
     Args:
-      name: what the id begins with.
-      values: ``float[T, N]``.
-      steps: ``int[T]``.
-
-    Returns:
-      The SVG; its scale is logarithmic where positive values span more than a hundredfold.
+      name, values, steps: the prefix of the id, ``float[T, N]`` and ``int[T]``.
 
     Example:
       >>> live_curve("loss", [[4.0, 5.0], [2.0, 3.0]], [1, 2]).startswith("<svg")

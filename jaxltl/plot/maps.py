@@ -63,13 +63,10 @@ def grid(
       policy: ``float[S, A]`` or ``int[S]``, or with M panels first; the length of an arrow is the
         probability of its action, and a row of NaN has none.
       titles: one per panel.
-      label: of the colour scale.
-      limits: values at the ends of the scale; None takes the data's.
+      label, limits: of the colour scale; limits None are those of the data.
       actions: the name of each action, of up, down, left and right.
       wall: the kind of cell that is not a place.
 
-    Returns:
-      The figure.
 
     Raises:
       ValueError: values or policy do not fit the map, or an action has no direction.
@@ -236,22 +233,20 @@ def strategies(
     actions: Sequence[str] = ("up", "down", "left", "right"),
     wall: str = "#",
 ) -> Figure:
-    """Mixed strategies on a map: large arrows for likely moves, small ones for rare moves.
+    """The mixed strategies on a map: large arrows for likely moves, small ones for rare moves.
 
     Args:
       cells: a text map (see :func:`jaxltl.envs.text_map.parse_map`) or its cells.
       play: ``float[S, A]``, or ``float[M, S, A]`` for M panels: the probability of each move;
-        zero draws nothing, and a cell whose row is NaN is grey (never reached).
-      marked: ``bool[S]``, or with M panels first: cells with a coloured background.
-      mark: the legend of that colour.
+        zero draws nothing, and a cell with a row of NaN is grey (never reached).
+      marked, mark: cells ``bool[S]`` (or with M panels first) with a coloured background, and the
+        legend of that colour.
       titles: one per panel.
-      across: panels in a row, at most.
+      across: the maximal number of panels in a row.
       seldom: moves of a smaller probability get a small arrow.
       actions: the name of each action, of up, down, left, right and stay.
       wall: the kind of cell that is not a place.
 
-    Returns:
-      The figure.
 
     Raises:
       ValueError: an array does not fit the map, or an action has no direction.

@@ -1,7 +1,6 @@
 """Pictures of models and solutions: grid maps, or graphs of small models.
 
-Kinds of models are recognised by their fields: importing their types would load JAX, and a caller
-that draws in a process apart need not wait.
+Models are recognised by their fields, since importing their types would load JAX.
 """
 
 from __future__ import annotations
@@ -32,12 +31,11 @@ _WALL = "#"
 
 
 def model(model: Any) -> Figure:
-    """Grid map of a model whose moves lie on one, else its graph.
+    """The grid map of a model with moves between adjacent cells, else its graph.
 
-    Moves lie on a map if there are four actions, the likeliest successor of each is one cell up,
-    down, left or right, or the cell itself, and states are numbered in rows from the top left.
-    Cells without moves in or out are walls. Games of two robots (:func:`~jaxltl.envs.grid_game`)
-    have the map of both.
+    A map needs four actions, each with its likeliest successor one cell up, down, left or right, or
+    the cell itself, and states numbered in rows from the top left. Cells without moves in or out are
+    walls. Games of two robots (:func:`~jaxltl.envs.grid_game`) have the map of both.
 
     Args:
       model: an MDP, a DenseMDP, a SparseMDP, or a Game or a Product of one of them.
@@ -67,17 +65,14 @@ def model(model: Any) -> Figure:
 
 
 def solution(solution: Solution, model: Any = None, *, memories: Any = None) -> Figure:
-    """Values and policy of a solution on the map or graph of a model, or values alone.
+    """The values and policy of a solution on the map or graph of a model, or values alone.
 
     Args:
       solution: of one lane; without a model also of several.
       model: the solved model. Without it the values are drawn in ascending order, with
         their certified bounds.
-      memories: of a product, the memory states to show; default those whose values differ, at
-        most nine.
-
-    Returns:
-      The figure, with a panel for each memory state of a product.
+      memories: of a product, the memory states to show, a panel each; default: those of different
+        values, at most nine.
 
     Raises:
       ValueError: the model has no map and is too large for a graph, or the solution

@@ -29,7 +29,7 @@ def playback(
     times: int = 3,
     wall: str = "#",
 ) -> str:
-    """Animated SVG of a trajectory on a map, next to the state of the task's automaton.
+    """An animated SVG of a trajectory on a map, next to the state of the task's automaton.
 
     It plays `times` times and then shows the whole way; at once if reduced motion is preferred.
 
@@ -38,12 +38,9 @@ def playback(
       states: ``int[T]``, the cells of the run, in order.
       automaton, memory: an automaton and ``int[T]``, its state at each of the steps; or neither.
       label: the text alternative; default the number of steps.
-      wait: seconds for each step.
-      times: number of repetitions.
+      wait, times: seconds for each step, and the number of repetitions.
       wall: the kind of cell that is not a place.
 
-    Returns:
-      The text of an SVG.
 
     Raises:
       ValueError: the run is empty or leaves the map, or the automaton and its states do not fit.

@@ -28,15 +28,10 @@ SCALE = LinearSegmentedColormap.from_list(
 
 
 def to_bytes(figure: Figure, kind: str = "svg", dpi: int = 150) -> bytes:
-    """Bytes of a figure's file; the same figure gives the same bytes.
+    """The bytes of a figure's file; the same figure gives the same bytes.
 
     Args:
-      figure: the figure.
-      kind: ``"svg"``, ``"png"`` or ``"pdf"``.
-      dpi: dots per inch of a PNG.
-
-    Returns:
-      The contents of the file.
+      figure, kind, dpi: the figure, ``"svg"``, ``"png"`` or ``"pdf"``, and dots per inch of a PNG.
 
     Raises:
       ValueError: a kind that matplotlib does not write.

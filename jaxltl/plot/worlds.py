@@ -46,7 +46,7 @@ def temporal_gridworld(
     limits: tuple[float, float] | None = None,
     actions: Sequence[str] = ("up", "down", "left", "right"),
 ) -> Figure:
-    """Map of a coloured world and its objects, with a policy as arrows and trajectories as lines.
+    """The map of a coloured world and its objects, with a policy as arrows and trajectories as lines.
 
     Args:
       world: a :class:`jaxltl.envs.temporal_gridworld.World`.
@@ -55,12 +55,9 @@ def temporal_gridworld(
       trajectories: of the world, drawn from a dot to a square, side by side where they overlap.
       value: ``float[S]`` or ``float[S, Q]``, as colours in a second row of panels.
       title: one per panel.
-      label: the name of the value.
-      limits: values at the ends of the scale; default the data's.
+      label, limits: of the colour scale; default limits are those of the data.
       actions: the name of each action, of up, down, left and right.
 
-    Returns:
-      The figure.
 
     Raises:
       ValueError: policy, value, memory or trajectories do not fit the world.

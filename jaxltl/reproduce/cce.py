@@ -54,20 +54,7 @@ def figures(
     seeds: int | None = None,
     plan: Plan | None = None,
 ) -> Figures:
-    """Figures 8, 10 and 11.
-
-    Args:
-      progress: called with a line before each part.
-      seeds: repetitions of each search; default 50 for the regulator, 5 for the robot.
-      plan: sizes of the experiment.
-
-    Returns:
-      ``lqr_optimum``; ``lqr`` for each network, with the costs of feasible policies above the
-      optimum; ``navigation`` for each task and method, with the trajectories until the sampled
-      policies first satisfied the constraint on average, and scores of fresh trajectories of the
-      returned policies; ``navigation_feasible_start``, the same with feasible initial policies;
-      ``seconds``; and data of the pictures.
-    """
+    """Figures 8, 10 and 11; `seeds` default to 50 for the regulator and 5 for the robot."""
     begin = time.perf_counter()
     plan = plan or Plan()
     optimum = lqr.optimum(lqr.lqr())
@@ -280,10 +267,7 @@ def _train_from(
 
 
 def _feasible_policies(robot: Robot, seeds: int, plan: Plan) -> PyTree:
-    """For each seed a distribution of feasible policies, found by minimising the cost alone.
-
-    No policy satisfies the constraint with this margin, so the elites are those of the least cost.
-    """
+    """For each seed a distribution of feasible policies, found by minimising the cost alone."""
     hparams = replace(robot.hparams, margin=1e3)
     state, _ = _train(_keys(seeds, 100 + robot.task), robot.problem, hparams, plan.steps // 2)
     return state.family

@@ -78,14 +78,7 @@ def two_goals() -> tuple[MDP, Trajectories]:
 def learn_cases(
     problem: irl.Problem, mus: tuple[float | None, ...]
 ) -> list[tuple[np.ndarray, jax.Array, float]]:
-    """Weights ``[F]``, policy and negative log-likelihood for each mu, from the best of three starts.
-
-    All starts and weights `mus` of the satisfaction term are one vmapped call; ``(None,)`` leaves
-    the term out.
-
-    Raises:
-      NotConverged: a gradient did not vanish, or a solver failed.
-    """
+    """Weights ``[F]``, policy and negative log-likelihood for each mu, from the best of three starts."""
     starts = jnp.tile(jnp.asarray(STARTS, problem.features.dtype), (len(mus), 1))
     mu = None if None in mus else jnp.repeat(jnp.asarray(mus), len(STARTS))
     hparams = irl.Hparams(discount=DISCOUNT, mu=mu, l2=L2, start_scale=0.0)
@@ -151,10 +144,7 @@ def _case(model: Product, learned: tuple[np.ndarray, jax.Array, float]) -> Figur
 
 
 def _missing_safety(world: MDP, shown: Trajectories, mu: float | None) -> Figures:
-    """A policy learned with a task that does not forbid red, evaluated under the true task.
-
-    Its memory is the automaton of the incomplete task; the product of both automata evaluates it.
-    """
+    """A policy learned with a task that does not forbid red, evaluated under the true task."""
     incomplete = product(world, TASK_WITHOUT_SAFETY)
     features = irl.task_features(incomplete, shown, avoid=["r"])
     [(_, policy, _)] = learn_cases(irl.make_problem(incomplete, features.values, shown), (mu,))
@@ -168,16 +158,7 @@ def _missing_safety(world: MDP, shown: Trajectories, mu: float | None) -> Figure
 
 
 def figures(progress: Callable[[str], None] = lambda text: None) -> Figures:
-    """Section 2.5: three cases, the sweep of mu, and the task without its safety part.
-
-    Returns:
-      ``case1``, ``case2``, ``case3`` (``mean``, ``min``, ``theta``, ``neg_log_likelihood``, and
-      the widest certified ``bound``), ``mu_sweep`` (for each ``mu``), ``missing_safety`` and
-      ``seconds``.
-
-    Raises:
-      NotConverged: a solver or the optimiser did not converge.
-    """
+    """Section 2.5: three cases, the sweep of mu, and the task without its safety part."""
     begin = time.perf_counter()
     world, shown = two_goals()
     model = product(world, TASK)

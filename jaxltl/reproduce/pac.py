@@ -49,18 +49,7 @@ _HPARAMS = rmax.Hparams(
 
 
 def figures(progress: Callable[[str], None] = lambda text: None, *, seeds: int = SEEDS) -> Figures:
-    """Section 6.7: the game, its optimal and initial values, and learned strategies.
-
-    Returns:
-      Sizes of the game and the number of system states by optimal value; ``initial_strategy`` and
-      ``winning_strategy``: worst-case values; the losses of the strategies of algorithm 4 in the
-      true model; ``learned`` and ``learned_without_restarts`` for each seed, with the states that
-      are optimal up to eps in the worst case and against the environment that was played; medians
-      of ``seconds`` of single runs and of one vmapped call; and data of the pictures.
-
-    Raises:
-      NotConverged: a value or a learner did not converge.
-    """
+    """Section 6.7: the game, its optimal and initial values, and learned strategies."""
     begin = time.perf_counter()
     progress("the game and its optimal values")
     model = patrol()
@@ -194,10 +183,7 @@ def _single_run_seconds(
 def _evaluated(
     found: loops.Learned, problem: rmax.Problem, hparams: rmax.Hparams
 ) -> tuple[list[Figures], rmax.Evidence]:
-    """A row for each seed, and the evidence of the first one.
-
-    All strategies of a run have the same support, so the last one represents them qualitatively.
-    """
+    """A row for each seed, and the evidence of the first; all strategies of a run have one support."""
     rows, every = [], []
     for seed in range(len(found.num_steps)):
         one = jax.tree.map(lambda x, i=seed: x[i], found)
@@ -305,10 +291,7 @@ _DIFFERENCES = (
 
 
 def _figure_17(model: Patrol, quantity: jax.Array) -> Figures:
-    """Optimal actions without the task for each light, on first, and cell.
-
-    They do not depend on the automaton state, since the reward does not.
-    """
+    """Optimal actions without the task for each light, on first, and cell, for any automaton state."""
     best = pac.near_optimal(quantity, model.game.available, 1e-9)
     here = np.asarray(model.game.system & (model.memory == 0))
     moves = np.zeros((2, 9, len(ACTIONS)), bool)

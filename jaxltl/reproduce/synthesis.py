@@ -42,19 +42,7 @@ MEMORYLESS = 5.7368
 
 
 def figures(progress: Callable[[str], None] = lambda text: None) -> Figures:
-    """Section 5.5: tables 5 and 6, example 2, and the game of figure 12.
-
-    Returns:
-      ``table5`` (for each ``n``: ``states``, ``system_states``, ``synthesis_seconds``,
-      ``learning_seconds``, ``learning_moves``, ``max_error`` and ``values``, the number of system
-      states by value), ``table6`` (for each ``bound``: ``states``, ``max_value``),
-      ``memoryless_permissive_max``, ``example2`` (``max``, ``min``, ``mean`` for ``n`` 4),
-      ``figure12`` (``supremum``, ``attained``, and values for bounded delays of the task),
-      ``figure13`` and ``figure14`` (data of the pictures), and ``seconds``.
-
-    Raises:
-      NotConverged: a value or a learner did not converge.
-    """
+    """Section 5.5: tables 5 and 6, example 2, and the game of figure 12."""
     begin = time.perf_counter()
     table5, curve = [], None
     for size in SIZES:
@@ -191,11 +179,7 @@ def _example_2() -> Figures:
 
 
 def _figure_12() -> Figures:
-    """The value without a task, and with the task satisfied within m visits.
-
-    No winning strategy attains the supremum if the task cannot be satisfied by actions of optimal
-    value, which is decided on the graph.
-    """
+    """The value without a task, and with the task satisfied within m visits."""
     game, reward = reward_against_task()
     best = check(optimal_value(game.mdp, reward, DISCOUNT))
     action = reward + DISCOUNT * best.value[game.mdp.successor[..., 0]]

@@ -51,20 +51,7 @@ def figures(
     seeds: int | None = None,
     plan: Plan | None = None,
 ) -> Figures:
-    """Figures 6 and 7.
-
-    Args:
-      progress: called with a line before each part.
-      seeds: repetitions of learning, each with other training worlds, demonstrations and initial
-        parameters; default 10. The test worlds stay the same.
-      plan: sizes of the experiment.
-
-    Returns:
-      ``by_demonstrations``: for each number of demonstrations and each method, L_phi (3.9) in
-      training and test worlds over the seeds, the steps until the returned parameters, and the
-      ``half_width`` of the widest certified bounds; ``reference``: L_phi of the expert and of a
-      random policy; ``seeds``, ``seconds``; and ``figure6``, learning curves and trajectories.
-    """
+    """Figures 6 and 7; the test worlds are the same for all `seeds` (default 10) of learning."""
     begin = time.perf_counter()
     plan, num_seeds = plan or Plan(), seeds or 10
     setting = _setting(num_seeds, plan)
