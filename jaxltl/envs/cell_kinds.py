@@ -23,14 +23,7 @@ FREE = -1  # a cell without a colour yet
 
 
 def many_objects(num: int) -> dict[str, dict[str, int]]:
-    """Distinct colour counts for `num` objects ``o1``, ``o2``, ..., at most 16.
-
-    The first three are those of the dissertation. Each has an X of one colour on another.
-
-    Example:
-      >>> many_objects(4)["o4"]
-      {'purple': 5, 'black': 4}
-    """
+    """Distinct colour counts for `num` objects ``o1``, ``o2``, ..., at most 16."""
     pairs = [
         (inside, around)
         for around in reversed(COLORS)
@@ -88,16 +81,10 @@ def categories(
     obstacles: Counts = OBSTACLES,
     margin: int = 1,
 ) -> NDArray[np.int32]:
-    """Category of each cell by the colours of its 3 x 3 patch: ``int32[rows, columns]``.
+    """Category ``int32[rows, columns]`` of each cell by the colours of its 3 x 3 patch.
 
-    The category is the place among the objects and then the obstacles, -1 for a distractor. `colors`
-    is ``int[rows + 2 * margin, columns + 2 * margin]``, indices into ``COLORS``; ValueError for another
-    shape, an unknown colour, or ambiguous kinds.
-
-    Example:
-      >>> x = [[0, 4, 0], [4, 0, 4], [0, 4, 0]]  # red where an X is, black elsewhere
-      >>> categories(x).tolist(), categories(np.full((3, 3), 4)).tolist()
-      ([[0]], [[3]])
+    The index among the objects and then the obstacles, -1 for a distractor. `colors` is
+    ``int[rows + 2 * margin, columns + 2 * margin]``, indices into ``COLORS``.
     """
     kinds = make_kinds(objects, obstacles)
     colors = check_colors(colors, margin)

@@ -2,8 +2,7 @@
 
 As in the authors' program and in Jackermeier and Abate (2025): nine discs of seven colours in
 ``[-2, 2]^2``, which may overlap; a velocity in ``[-1, 1]^2`` moves the point by .08 of it; leaving
-the square ends the episode with a reward of -1. The observation is the position. Initial positions
-are uniform outside of all discs, from a precomputed table.
+the square ends the episode with a reward of -1.
 """
 
 from __future__ import annotations
@@ -61,14 +60,7 @@ class FlatState(NamedTuple):
 @brief
 @struct.dataclass
 class Discs:
-    """Discs and their colours.
-
-    Attributes:
-      center: ``float32[D, 2]``.
-      radius: ``float32[D]``.
-      color: ``bool[D, P]``, the proposition of each disc, one-hot.
-      extent: half a side of the square.
-    """
+    """Centres, radii and one-hot colours of D discs in a square of half a side `extent`."""
 
     center: chex.Array
     radius: chex.Array
@@ -90,14 +82,14 @@ def flat_world(
     """FlatWorld as an environment.
 
     Args:
-      discs: ``(colour, x, y, radius)`` of each; the colours, sorted, are the propositions.
+      discs: ``(colour, x, y, radius)``; the propositions are the sorted colours.
       extent: half a side of the square.
       time_step: distance of a step at velocity one.
       horizon: number of steps after which an episode is truncated; None: never.
       discrete: nine actions (up, right, down, left, the four diagonals, each with velocity one, and
         rest) instead of a box.
       start: the initial position; default: uniform outside of all discs.
-      num_starts, seed: size of the table of initial positions, and the seed of its drawing.
+      num_starts, seed: size and seed of the table of initial positions.
 
     Returns:
       :class:`~jaxltl.core.environments.environment.Environment` with states :class:`FlatState`, or with
@@ -111,9 +103,6 @@ def flat_world(
       >>> world = flat_world()
       >>> world.propositions
       ('aqua', 'blue', 'green', 'magenta', 'orange', 'red', 'yellow')
-      >>> here = world.reset(jax.random.key(0))
-      >>> world.labels(here).tolist()
-      [False, False, False, False, False, False, False]
     """
     rows = [tuple(validation.sequence("discs", row)) for row in validation.sequence("discs", discs)]
     if not all(len(row) == 4 and isinstance(row[0], str) for row in rows):
@@ -165,12 +154,7 @@ def flat_world(
 
 
 def discs_of(environment: Environment) -> Discs:
-    """The discs of an environment made by :func:`flat_world`.
-
-    Example:
-      >>> discs_of(flat_world(discs=[("red", 0.5, 0.0, 0.25)], start=[0, 0])).center.tolist()
-      [[0.5, 0.0]]
-    """
+    """The discs of an environment made by :func:`flat_world`."""
     return without_time_limit(environment)[0].labels.args[0]  # type: ignore[attr-defined]
 
 
@@ -208,14 +192,11 @@ def events_around(
     radii: Sequence[float] = (0.08, 0.16, 0.28, 0.45, 0.7, 1.0, 1.4, 1.9, 2.5),
     directions: int = 16,
 ) -> EventsAround:
-    """Egocentric event encoding from known discs: ``observation -> float[X, E]``.
+    """Egocentric event encoding from known discs, ``observation -> float[X, E]``.
 
-    It states which of the `events` ``bool[E, P]`` holds at the position and at distances `radii` in
-    evenly spaced `directions`; outside of the square none does. For
+    The `events` ``bool[E, P]``, one-hot, at the position and at distances `radii` in evenly spaced
+    `directions`; outside of the square none holds. For
     :class:`~jaxltl.algos.many_tasks.SequenceNetwork`'s `events_seen`.
-
-    Returns:
-      :class:`EventsAround`, a hashable function.
 
     Raises:
       ValueError: events of another shape, distances that are not positive, or no direction.

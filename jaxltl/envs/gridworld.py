@@ -27,18 +27,17 @@ def gridworld(
 ) -> MDP:
     """Gridworld MDP with labels and the actions up, down, left, right.
 
-    State ``row * columns + column``, both from 0 at the top left. A move off the map or into a wall
-    stays. With probability `slip` a move goes to one of the two sides instead, half each.
+    State ``row * columns + column``, both from 0 at the top left. A move off the map or into a wall is
+    a self-loop. With probability `slip` a move goes to one of the two sides instead, half each.
 
     Args:
       text: the map, see :func:`parse_map`.
       slip: probability in [0, 1] of moving sideways.
-      absorbing: propositions; cells where one holds are absorbing.
-      legend: the propositions of each kind of cell; default: ``.`` has none and any other cell has the
-        proposition of its name.
+      absorbing: propositions of absorbing cells.
+      legend: the propositions of each kind of cell; default: none for ``.``, else that of its name.
       wall: the kind of cell that is a wall.
-      initial: a propositional formula over the labels (``"!r & !y"``), whose cells are equally likely,
-        or a distribution ``float[S]``; default: uniform over all cells.
+      initial: a propositional formula over the labels (``"!r & !y"``), for a uniform distribution on
+        its cells, or a distribution ``float[S]``; default: uniform over all cells.
 
     Returns:
       :class:`MDP` with ``rows * columns`` states and four actions.

@@ -22,9 +22,8 @@ def from_gymnasium(
     """The MDP of the transition table of a Gymnasium environment.
 
     `env.unwrapped.P[s][a]` lists branches ``(probability, next state, reward, terminated)``. A branch
-    that terminates leads to an added absorbing state without reward: states from S on, one for each
-    state in which an episode can end, labelled ``"terminated"`` and with the labels of that state.
-    Limits on the number of steps are not in the table.
+    that terminates leads to an absorbing copy of its state without reward, from S on, with the
+    additional label ``"terminated"``. Limits on the number of steps are not in the table.
 
     Args:
       env: an environment, or its id, for which the package gymnasium is needed.
@@ -32,8 +31,8 @@ def from_gymnasium(
       initial: ``float[S]``; default: the environment's `initial_state_distrib`, or uniform.
 
     Returns:
-      A :class:`~jaxltl.core.models.sparse.SparseMDP` with the reward ``"reward"`` on transitions,
-      the environment's actions by number, and the variable ``"state"``, the environment's state.
+      A :class:`~jaxltl.core.models.sparse.SparseMDP` with the reward ``"reward"`` and the variable
+      ``"state"``.
 
     Raises:
       ValueError: the environment has no table, or the table is malformed: naming state and action.

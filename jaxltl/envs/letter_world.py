@@ -1,12 +1,8 @@
 """LetterWorld: letters on a torus of cells (Vaezipoor et al. 2021, section 5.1).
 
-As used by Jackermeier and Abate (2025, appendix): 7 x 7 cells on a torus, each of 12 letters on two
-of them, four moves that always succeed, and 75 steps. Each episode has a new map, with an initial
-empty cell from which every cell is reachable across empty ones.
-
-Two readings. The agent starts in any empty cell instead of the upper left one, which on a torus
-seen from the agent is the same. And the cells with letters come from a precomputed table with its
-symmetries, while their letters are drawn anew: the published drawing rejects 72 of 73 maps.
+As used by Jackermeier and Abate (2025, appendix), but with any empty initial cell, which on a torus
+seen from the agent is the same, and with cells of letters from a precomputed table with its
+symmetries (the published drawing rejects 72 of 73 maps). Letters are drawn in each episode.
 """
 
 from __future__ import annotations
@@ -56,9 +52,7 @@ class Maps(TypedDict, total=False):
 
     Attributes:
       connected: draw maps in which all cells are reachable across empty ones; default: True.
-      num_maps: the number of sets of cells in the table of connected maps, before symmetries;
-        default: 1024.
-      seed: of the drawing of the table; default: 0.
+      num_maps, seed: size (default: 1024, before symmetries) and seed (0) of the table of such maps.
     """
 
     connected: bool
@@ -84,16 +78,14 @@ def letter_world(
 
     Args:
       size: cells along a side.
-      letters: the number of letters, named a, b, c, ...; or their names.
+      letters: the number of letters a, b, c, ...; or their names.
       copies: the number of cells of each letter.
       horizon: number of steps after which an episode is truncated; None: never.
       layout: the map of every episode: a text (see :func:`~jaxltl.envs.text_map.parse_map`) with
-        ``.`` for empty cells, or ``int[size, size]``, numbers of letters, -1 for none. It determines
-        the size.
+        ``.`` for empty cells, or ``int[size, size]``, numbers of letters, -1 for none.
       start: the initial cell in a given layout; default: any empty one.
       flat: flatten the observations.
-      maps: of random maps: `connected` (default True), `num_maps` (1024) and `seed` (0), see
-        :class:`Maps`.
+      maps: see :class:`Maps`.
 
     Returns:
       :class:`~jaxltl.core.environments.environment.Environment` with states :class:`LetterState`, or
@@ -201,15 +193,7 @@ def _given(
 
 
 def connected_cells(size: int, used: int, count: int, seed: int = 0) -> np.ndarray:
-    """Uniform sets of `used` cells of the torus whose complement is connected, ``bool[count, C]``.
-
-    Every cell is reachable through cells outside of the set; ValueError if such sets are too rare.
-
-    Example:
-      >>> sets = connected_cells(4, 3, 2)
-      >>> sets.shape, sets.sum(1).tolist()
-      ((2, 16), [3, 3])
-    """
+    """Uniform sets ``bool[count, C]`` of `used` cells of the torus, with a connected complement."""
     random, found, tries = np.random.default_rng(seed), [np.zeros((0, size * size), bool)], 0
     while (have := sum(map(len, found))) < count:
         if (tries := tries + 1) > 200 + 200 * have:
@@ -223,12 +207,7 @@ def connected_cells(size: int, used: int, count: int, seed: int = 0) -> np.ndarr
 
 
 def is_connected(used: np.ndarray) -> np.ndarray:
-    """``bool[N]``, the condition of :func:`connected_cells` for sets ``bool[N, size, size]``.
-
-    Example:
-      >>> is_connected(np.array([[[1, 0], [0, 0]], [[0, 1], [1, 0]]], bool)).tolist()
-      [True, False]
-    """
+    """``bool[N]``, the condition of :func:`connected_cells` for sets ``bool[N, size, size]``."""
 
     def beside(x: np.ndarray) -> np.ndarray:
         return np.roll(x, 1, 1) | np.roll(x, -1, 1) | np.roll(x, 1, 2) | np.roll(x, -1, 2)
@@ -332,16 +311,6 @@ def _labels(numbers: chex.Array, world: LetterState) -> jax.Array:
 
 
 def events_seen(observation: jax.Array) -> jax.Array:
-    """One-hot events of the cells of an observation, ``float32[size, size, letters + 1]``.
-
-    The event without a letter is first, as in
-    :func:`~jaxltl.core.environments.sequence_task.make_events`.
-
-    Example:
-      >>> world = letter_world(size=2, letters=["x"], copies=1, connected=False)
-      >>> seen = events_seen(world.observe(world.reset(jax.random.key(0))))
-      >>> seen.shape, float(seen[..., 1].sum())
-      ((2, 2, 2), 1.0)
-    """
+    """One-hot events of an observation, ``float32[size, size, letters + 1]``, the empty event first."""
     letters = observation[..., :-1]
     return jnp.concatenate([1 - letters.sum(-1, keepdims=True), letters], -1)

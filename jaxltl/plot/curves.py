@@ -147,7 +147,7 @@ def sweep(
     steps: ArrayLike | None = None,
     show: Sequence[str] | None = None,
 ) -> Figure:
-    """The learning curves of several settings, one panel per figure: mean and deviation over seeds.
+    """The learning curves of several settings: mean and standard deviation over seeds.
 
     Args:
       metrics: figures ``[H, N, T]`` of H settings and N seeds by name, or a learner's ``Metrics``

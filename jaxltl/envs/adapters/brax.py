@@ -33,19 +33,18 @@ def from_brax(
     """A Brax environment without its auto-reset and batch wrappers.
 
     Its ``done`` terminates. Limit episodes by ``with_time_limit(from_brax(env), 1000)``, or by Brax's
-    ``EpisodeWrapper``, whose ``info["truncation"]`` truncates. States are Brax's ``State``.
+    ``EpisodeWrapper``, which truncates by ``info["truncation"]``.
 
     Args:
       env: as ``brax.envs.get_environment(name)`` returns it. Actions are in [-1, 1].
-      labels: ``state -> bool[P]``, of Brax's ``State`` (`obs`, `pipeline_state`).
-      propositions: the names of the labels.
+      labels, propositions: ``state -> bool[P]``, of Brax's ``State`` (`obs`, `pipeline_state`), and
+        its names.
 
     Returns:
-      :class:`~jaxltl.core.environments.environment.Environment`.
+      :class:`~jaxltl.core.environments.environment.Environment` with Brax's states.
 
     Raises:
-      ValueError: not a Brax environment, an auto-reset or batch wrapper, or labels that are not
-        ``bool[P]``.
+      ValueError: not a Brax environment, or an auto-reset or batch wrapper.
       ImportError: brax is not installed.
 
     Example:

@@ -38,14 +38,13 @@ def from_craftax(
     Args:
       env: as ``make_craftax_env_from_name(name, auto_reset=False)`` returns it.
       params: default: the environment's own; arrays of the result.
-      labels: ``state -> bool[P]``, of Craftax's state.
-      propositions: the names of the labels.
+      labels, propositions: ``state -> bool[P]``, of Craftax's state, and its names.
 
     Returns:
       :class:`~jaxltl.core.environments.environment.Environment`.
 
     Raises:
-      ValueError: not a Craftax environment, one with auto-reset, or labels that are not ``bool[P]``.
+      ValueError: not a Craftax environment, or one with auto-reset.
       ImportError: craftax is not installed.
 
     Example:

@@ -46,15 +46,13 @@ def from_gymnax(
     Args:
       env, params: as ``gymnax.make(name)`` returns them; `params` (default: the environment's own)
         are arrays of the result: other ones do not recompile.
-      labels: ``state -> bool[P]``, of gymnax's state.
-      propositions: the names of the labels.
+      labels, propositions: ``state -> bool[P]``, of gymnax's state, and its names.
 
     Returns:
       :class:`~jaxltl.core.environments.environment.Environment`.
 
     Raises:
-      ValueError: not a gymnax environment, or a wrapper; actions that are neither finite nor in a box;
-        labels that are not ``bool[P]``.
+      ValueError: not a gymnax environment, a wrapper, or actions that are neither finite nor in a box.
       ImportError: gymnax is not installed.
 
     Example:

@@ -1,7 +1,7 @@
-"""Factored actions whose components are chosen sequentially.
+"""Sequential choice of the components of factored actions.
 
-For N components with too many combinations to be numbered: a step of the package's environment is N
-steps here, each of which chooses one component; the last one moves the environment.
+A step of the package's environment is N steps here, each with a choice of one component; the last
+one moves the environment. For N components with too many combinations.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class PartObservation(NamedTuple):
 
 @dataclass(frozen=True)
 class Inner:
-    """Functions of the environment whose actions are vectors of components."""
+    """Functions of an environment with vectors of components as actions."""
 
     reset: Callable[..., Any]
     step: Callable[..., Timestep]  # (world, int32[N], key)

@@ -59,18 +59,16 @@ def from_jumanji(
     Args:
       env: as ``jumanji.make(name)`` returns it. An action of several components is numbered, with the
         last component fastest. An `action_mask` in the observation determines `allowed`.
-      in_turn: choose the components one after the other, each in a step; the last of them moves the
-        environment. For components with too many combinations.
-      labels: ``state -> bool[P]``, of Jumanji's state.
-      propositions: the names of the labels.
+      in_turn: choose one component in each step, the last of which moves the environment. For
+        components with too many combinations.
+      labels, propositions: ``state -> bool[P]``, of Jumanji's state, and its names.
 
     Returns:
       :class:`~jaxltl.core.environments.environment.Environment`.
 
     Raises:
-      ValueError: not a Jumanji environment, an auto-reset or batch wrapper, or a reward for each of
-        several agents; actions that are neither finite nor in a box, have too many combinations, or
-        no components to choose sequentially; labels that are not ``bool[P]``.
+      ValueError: not a Jumanji environment, an auto-reset or batch wrapper, rewards of several agents,
+        or actions that are neither finite nor in a box, or have too many combinations.
       ImportError: jumanji is not installed.
 
     Example:

@@ -32,18 +32,18 @@ def from_navix(
     """A Navix environment.
 
     Its step types distinguish termination and truncation; where both hold, the episode is terminated.
-    States are Navix's timesteps, whose state contains its key; the key of a step is not used.
+    States are Navix's timesteps, which contain a key; the key of a step is not used.
 
     Args:
       env: as ``navix.make(name)`` returns it.
-      labels: ``state -> bool[P]``, of Navix's state with the events of the last step.
-      propositions: the names of the labels.
+      labels, propositions: ``state -> bool[P]``, of Navix's state with the events of the last step,
+        and its names.
 
     Returns:
       :class:`~jaxltl.core.environments.environment.Environment`.
 
     Raises:
-      ValueError: not a Navix environment, or labels that are not ``bool[P]``.
+      ValueError: not a Navix environment.
       ImportError: navix is not installed.
 
     Example:

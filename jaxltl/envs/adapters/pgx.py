@@ -50,20 +50,17 @@ def from_pgx(
 
     Args:
       env: as ``pgx.make(name)`` returns it.
-      opponent: ``(state, key) -> action``, of Pgx's state, with the `observation` and the
-        `legal_action_mask` of the current player; a function, or a ``Partial`` with arrays such as
-        weights. None for games of one player.
+      opponent: ``(state, key) -> action``, of Pgx's state with the view of the current player; a
+        function or a ``Partial``. None for games of one player.
       player: the index of the learning player. The first player may be random.
-      labels: ``state -> bool[P]``, of Pgx's state at the player's turn.
-      propositions: the names of the labels.
+      labels, propositions: ``state -> bool[P]``, of Pgx's state at the player's turn, and its names.
 
     Returns:
       :class:`~jaxltl.core.environments.environment.Environment`; its states are pairs of Pgx's
       ``state`` and the reward ``owed`` for moves before the player's first.
 
     Raises:
-      ValueError: not a Pgx environment; no opponent, or no such player; labels that are not
-        ``bool[P]``.
+      ValueError: not a Pgx environment, no opponent, or no such player.
       ImportError: pgx is not installed.
 
     Example:

@@ -39,15 +39,13 @@ def from_xminigrid(
     Args:
       env, params: as ``xminigrid.make(name)`` returns them; a ruleset in `params` is arrays of the
         result: other ones do not recompile.
-      labels: ``state -> bool[P]``, of the package's state.
-      propositions: the names of the labels.
+      labels, propositions: ``state -> bool[P]``, of the package's state, and its names.
 
     Returns:
       :class:`~jaxltl.core.environments.environment.Environment`.
 
     Raises:
-      ValueError: not an xminigrid environment, or one with auto-reset; no limit of steps
-        in `params`; labels that are not ``bool[P]``.
+      ValueError: not an xminigrid environment, one with auto-reset, or no limit of steps in `params`.
       ImportError: xminigrid is not installed.
 
     Example:
