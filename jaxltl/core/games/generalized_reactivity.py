@@ -1,9 +1,7 @@
 """GR(1) games: triple fixpoint, its layers, and strategies of both players.
 
 Piterman, Pnueli and Sa'ar (2006), "Synthesis of reactive(1) designs", with chance as in
-:mod:`jaxltl.core.games.winning`: within what the system can remain in, and for each guarantee, sets
-grow round by round from which the system comes nearer to the guarantee or an assumption fails
-for ever.
+:mod:`jaxltl.core.games.winning`.
 """
 
 from __future__ import annotations
@@ -20,30 +18,18 @@ from jaxltl.core.graphs.graph import Graph
 
 
 class Reactive(NamedTuple):
-    """The region of a GR(1) game with strategies of both players.
+    """The region of a GR(1) game with strategies of both players."""
 
-    Attributes:
-      region: ``bool[S]``.
-      action: ``int32[S, J]``, the system's moves towards each guarantee.
-      counter_action: ``int32[S, M]``, the environment's towards each assumption.
-    """
-
-    region: jax.Array
-    action: jax.Array
-    counter_action: jax.Array
+    region: jax.Array  # bool[S]
+    action: jax.Array  # int32[S, J], the system's moves towards each guarantee
+    counter_action: jax.Array  # int32[S, M], the environment's towards each assumption
 
 
 class Layers(NamedTuple):
-    """Rounds of the triple fixpoint in which states are first covered.
-
-    Attributes:
-      region: ``bool[S]``.
-      round: ``int32[J, M, S]``; in the region least over M at the layer that covers the
-        state, and :data:`NEVER` outside.
-    """
+    """Rounds ``int32[J, M, S]`` of the triple fixpoint in which states of the region are first covered."""
 
     region: jax.Array
-    round: jax.Array
+    round: jax.Array  # least over M at the layer that covers the state; NEVER outside
 
 
 NEVER = np.iinfo(np.int32).max
@@ -151,13 +137,11 @@ def _prevent(arena: _Arena, inside: Array, allowed: Array, found: Array) -> Any:
 
 
 def gr1_layers(graph: Graph, system: Array, objective: GR1) -> Layers:
-    """Rounds of the triple fixpoint inside the region, one step each.
-
-    In round r, with Y the states covered before, layer (r, i) is the greatest X from which the
-    system, moving within the region, is at guarantee j, or comes into Y with positive
-    probability, or stays in X where assumption i does not hold.
-    """
+    """Rounds of the triple fixpoint inside the region, one step each."""
     xp, arena = graph.xp, _Arena(graph, system, objective)
+    # In round r, with Y the states covered before, layer (r, i) is the greatest X from which the
+    # system, moving within the region, is at guarantee j, or enters Y with positive probability, or
+    # stays in X where assumption i does not hold.
     region = solve_gr1(graph, system, objective).region
     allowed = _within(arena, graph.available, region)
     rows = []

@@ -1,8 +1,6 @@
 """Objectives of games: parity and GR(1) conditions on states.
 
-Every objective is one of two: :class:`Parity`, of which safety, reachability, Buchi and
-co-Buchi are cases, and :class:`GR1`, of which generalised Buchi is one. Sets of states are
-Boolean arrays, or Boolean formulas over the propositions of the game.
+Sets of states are Boolean arrays, or Boolean formulas over the propositions of the game.
 """
 
 from __future__ import annotations
@@ -28,13 +26,12 @@ States: TypeAlias = chex.Array | Formula | str  # a set of states
 @brief(facts=facts.parity)
 @struct.dataclass
 class Parity:
-    """The least priority met infinitely often is even; some states decide the run at once.
+    """Parity objective: the least priority met infinitely often is even.
 
     Attributes:
       priority: ``int32[S]``, at least 0.
-      won: ``bool[S]``: the objective is achieved on entering.
-      lost: ``bool[S]``: the objective is failed on entering.
-      num_priorities: priorities are below it; static.
+      won, lost: ``bool[S]``: the objective is achieved, or failed, on entering.
+      num_priorities: a strict upper bound on the priorities; static.
 
     Example:
       >>> import jaxltl as jl
@@ -59,8 +56,7 @@ class GR1:
     of `lost` is ever entered.
 
     Attributes:
-      assumptions: ``bool[M, S]``, at least one.
-      guarantees: ``bool[J, S]``, at least one.
+      assumptions, guarantees: ``bool[M, S]`` and ``bool[J, S]``, at least one of each.
       lost: ``bool[S]``.
 
     Example:
@@ -81,8 +77,8 @@ def states_with_label(model: Any, condition: States, place: str = "condition") -
 
     Args:
       model: an MDP, a DenseMDP, a Product or a Game.
-      condition: ``bool[S]``, or a formula without temporal operators. In a product it
-        speaks of the world's states.
+      condition: ``bool[S]``, or a formula without temporal operators, in a product on the states of
+        the world.
       place: beginning of the error message.
 
     Returns:
@@ -93,8 +89,7 @@ def states_with_label(model: Any, condition: States, place: str = "condition") -
 
     Example:
       >>> from jaxltl import from_dense
-      >>> world = from_dense([[[1.0, 0]], [[0, 1.0]]], label=[[0], [1]], propositions=["a"])
-      >>> states_with_label(world, "!a").tolist()
+      >>> states_with_label(from_dense([[[1.0, 0]], [[0, 1.0]]], label={"a": [1]}), "!a").tolist()
       [True, False]
     """
     if isinstance(condition, str) and condition in ("true", "false"):
@@ -118,7 +113,7 @@ def states_with_label(model: Any, condition: States, place: str = "condition") -
 
 
 def safety(game: Any, safe: States) -> Parity:
-    """Stay in `safe` for ever: ``G safe``.
+    """Safety objective: stay in `safe` for ever, ``G safe``.
 
     Args:
       game: the game.
@@ -133,8 +128,6 @@ def safety(game: Any, safe: States) -> Parity:
     Example:
       >>> import jaxltl as jl
       >>> path = jl.from_dense(np.roll(np.eye(3), 1, 1)[:, None], label={"a": [0], "b": [1, 2]})
-      >>> jl.winning_region(path, safety(path, "!a")).region.tolist()
-      [False, False, False]
       >>> jl.winning_region(path, safety(path, "a | b")).region.tolist()
       [True, True, True]
     """
@@ -142,12 +135,11 @@ def safety(game: Any, safe: States) -> Parity:
 
 
 def reach(game: Any, goal: States, *, safe: States = "true") -> Parity:
-    """Reach `goal`, through `safe` states until then: ``safe U goal``.
+    """Reachability objective: reach `goal` through `safe` states, ``safe U goal``.
 
     Args:
       game: the game.
-      goal: ``bool[S]`` or a Boolean formula over propositions.
-      safe: states to remain in until then.
+      goal, safe: ``bool[S]`` or a Boolean formula over propositions.
 
     Returns:
       :class:`Parity`.
@@ -158,22 +150,18 @@ def reach(game: Any, goal: States, *, safe: States = "true") -> Parity:
     Example:
       >>> import jaxltl as jl
       >>> path = jl.from_dense(np.roll(np.eye(3), 1, 1)[:, None], label={"a": [0], "b": [1, 2]})
-      >>> jl.winning_region(path, reach(path, "a", safe="b")).region.tolist()
-      [True, True, True]
-      >>> middle = np.array([False, True, False])
-      >>> jl.winning_region(path, reach(path, middle, safe="b")).region.tolist()
+      >>> jl.winning_region(path, reach(path, np.arange(3) == 1, safe="b")).region.tolist()
       [False, True, False]
     """
     return _parity(game, 1, 2, safe, won=states_with_label(game, goal, "goal"))
 
 
 def buchi(game: Any, accepting: States, *, safe: States = "true") -> Parity:
-    """Meet `accepting` infinitely often and stay in `safe`: ``G F accepting & G safe``.
+    """Buchi objective: meet `accepting` infinitely often, ``G F accepting & G safe``.
 
     Args:
       game: the game.
-      accepting: ``bool[S]`` or a Boolean formula over propositions.
-      safe: states never to leave.
+      accepting, safe: ``bool[S]`` or a Boolean formula over propositions.
 
     Returns:
       :class:`Parity`.
@@ -184,8 +172,6 @@ def buchi(game: Any, accepting: States, *, safe: States = "true") -> Parity:
     Example:
       >>> import jaxltl as jl
       >>> path = jl.from_dense(np.roll(np.eye(3), 1, 1)[:, None], label={"a": [0], "b": [1, 2]})
-      >>> buchi(path, "a").priority.tolist()
-      [0, 1, 1]
       >>> jl.winning_region(path, buchi(path, "a")).region.tolist()
       [True, True, True]
     """
@@ -194,12 +180,11 @@ def buchi(game: Any, accepting: States, *, safe: States = "true") -> Parity:
 
 
 def cobuchi(game: Any, persistent: States, *, safe: States = "true") -> Parity:
-    """Stay in `persistent` from some point on: ``F G persistent & G safe``.
+    """Co-Buchi objective: finally stay in `persistent`, ``F G persistent & G safe``.
 
     Args:
       game: the game.
-      persistent: ``bool[S]`` or a Boolean formula over propositions.
-      safe: states never to leave.
+      persistent, safe: ``bool[S]`` or a Boolean formula over propositions.
 
     Returns:
       :class:`Parity`.
@@ -210,8 +195,6 @@ def cobuchi(game: Any, persistent: States, *, safe: States = "true") -> Parity:
     Example:
       >>> import jaxltl as jl
       >>> path = jl.from_dense(np.roll(np.eye(3), 1, 1)[:, None], label={"a": [0], "b": [1, 2]})
-      >>> cobuchi(path, "b").priority.tolist()
-      [1, 2, 2]
       >>> jl.winning_region(path, cobuchi(path, "b")).region.tolist()
       [False, False, False]
     """
@@ -222,14 +205,13 @@ def cobuchi(game: Any, persistent: States, *, safe: States = "true") -> Parity:
 def parity(
     game: Any, priority: chex.Array, *, safe: States = "true", num_priorities: int | None = None
 ) -> Parity:
-    """The least priority met infinitely often is even.
+    """Parity objective: the least priority met infinitely often is even, and ``G safe``.
 
     Args:
       game: the game.
       priority: ``int[S]``, at least 0.
       safe: states never to leave.
-      num_priorities: an upper bound on ``1 + priority``; needed only where the
-        priorities are traced.
+      num_priorities: an upper bound on ``1 + priority``; needed only for traced priorities.
 
     Returns:
       :class:`Parity`.
@@ -240,9 +222,8 @@ def parity(
     Example:
       >>> import jaxltl as jl
       >>> path = jl.from_dense(np.roll(np.eye(3), 1, 1)[:, None], label={"a": [0], "b": [1, 2]})
-      >>> spec = parity(path, np.array([3, 2, 3]))
-      >>> spec.num_priorities, jl.winning_region(path, spec).region.tolist()
-      (4, [True, True, True])
+      >>> jl.winning_region(path, parity(path, np.array([3, 2, 3]))).region.tolist()
+      [True, True, True]
     """
     if num_priorities is None:
         values = np.asarray(priority)
@@ -260,7 +241,7 @@ def parity(
 
 
 def _parity(game: Any, priority: Any, num_priorities: int, safe: States, won: Any = None) -> Parity:
-    """A parity objective whose unsafe states are lost unless won."""
+    """A parity objective with unsafe states lost, except for won ones."""
     priority = priority if is_traced(priority) else np.asarray(priority)
     won = np.zeros(game.state_shape, bool) if won is None else won
     xp, priority, won, safe = namespace(priority, won, states_with_label(game, safe, "safe"))
@@ -273,7 +254,7 @@ def _parity(game: Any, priority: Any, num_priorities: int, safe: States, won: An
 
 
 def generalized_buchi(game: Any, sets: Sequence[States], *, safe: States = "true") -> GR1:
-    """Meet each of several sets infinitely often and stay in `safe`.
+    """Generalised Buchi objective: meet each of several sets infinitely often, and ``G safe``.
 
     Args:
       game: the game.
@@ -302,12 +283,11 @@ def gr1(
     *,
     safe: States = "true",
 ) -> GR1:
-    """``G safe & ((G F A_1 & ... & G F A_M) -> (G F G_1 & ... & G F G_J))``.
+    """GR(1) objective ``G safe & ((G F A_1 & ... & G F A_M) -> (G F G_1 & ... & G F G_J))``.
 
     Args:
       game: the game.
-      assumptions, guarantees: sets of states, arrays or Boolean formulas, each of which is
-        to be met infinitely often; G and F are not written.
+      assumptions, guarantees: sets of states, arrays or Boolean formulas, without G and F.
       safe: states never to leave.
 
     Returns:

@@ -1,8 +1,4 @@
-"""Permissive strategies: many ways to win at once, as a mask of moves (dissertation, 5.4.1).
-
-A permissive strategy leaves the system several moves, and every choice among them wins. Learning inside
-its mask is therefore correct from the first move on.
-"""
+"""Permissive strategies: masks of moves of which every choice wins (dissertation, 5.4.1)."""
 
 from __future__ import annotations
 
@@ -38,16 +34,16 @@ METHODS = ("auto", "stay", "rank", "counter", "parity")
 @brief(facts=facts.permissive, drawn=True)
 @struct.dataclass
 class Permissive:
-    """A permissive strategy: the moves it allows, on the game with the memory it needs.
+    """A permissive strategy: its allowed moves, on the game with its memory.
 
     Attributes:
       game: the game itself, or a Game on a Product with the strategy's memory.
-      region: ``bool[S]`` (``[S, Q]``): where the strategy wins.
-      allowed: ``bool[S, A]``: the moves it allows in the region, all of the environment's
-        among them; nothing elsewhere.
+      region: ``bool[S]`` (``[S, Q]``), the winning region of the strategy.
+      allowed: ``bool[S, A]``: in the region the allowed moves, with all of the environment's;
+        False elsewhere.
       base_state, automaton_state: ``int32[S]``, the state of the world and of the task's
-        automaton that each of the game's world states stands for.
-      maximal: whether it includes every winning strategy; static.
+        automaton for each of the game's world states.
+      maximal: True if it includes every winning strategy; static.
       reason: the strategies that it includes, in words; static.
 
     Example:
@@ -55,10 +51,8 @@ class Permissive:
       >>> fork = jl.from_dense([[[1.0, 0], [0, 1.0]], [[0, 1.0], [0, 0]]], initial=[1, 0],
       ...                      label={"crash": [1]})
       >>> found = jl.permissive_strategy(fork, "G !crash")
-      >>> found.region[0].tolist(), found.allowed[0].any(0).tolist()
-      ([True, False], [True, False])
-      >>> found.maximal
-      True
+      >>> found.region[0].tolist(), found.allowed[0].any(0).tolist(), found.maximal
+      ([True, False], [True, False], True)
     """
 
     game: Game
@@ -79,17 +73,15 @@ def permissive_strategy(
 ) -> Permissive:
     """Permissive strategy: a mask of moves of which every choice wins; on the host.
 
-    - ``"stay"``: every move that surely stays in the winning region. Wins only where
-      staying does, as for safety; it then includes every winning strategy (dissertation,
-      proposition 1), and otherwise no strategy does.
+    - ``"stay"``: every move that surely stays in the winning region. Wins if staying does, as for
+      safety, and then includes every winning strategy (dissertation, proposition 1).
     - ``"rank"``, for Buchi and GR(1): away from the goal, moves that come nearer to it.
     - ``"counter"``, for Buchi: paths that meet the accepting states again within `bound` of
       the system's moves (dissertation, example 3).
     - ``"parity"``: paths that meet a state of odd priority at most `bound` times before one of
-      a lower even priority (Bernet, Janin and Walukiewicz 2002); without `bound` as many
-      times as there are such states, which includes every memoryless winning strategy. Its
-      memory is the product of the counts.
-    - ``"auto"``: ``"stay"`` where it wins; else ``"counter"`` if there is a bound and the
+      a lower even priority (Bernet, Janin and Walukiewicz 2002); default: the number of such
+      states, which includes every memoryless winning strategy.
+    - ``"auto"``: ``"stay"`` if it wins; else ``"counter"`` if there is a bound and the
       objective is Buchi; else ``"rank"``, or ``"parity"`` for other objectives.
 
     Args:
@@ -108,12 +100,11 @@ def permissive_strategy(
         does not fit the objective.
 
     Example:
-      >>> from jaxltl import from_dense, make_game
+      >>> from jaxltl import from_dense
       >>> world = from_dense([[[1.0, 0], [0, 1.0]], [[0, 1.0], [0, 0]]],
-      ...                    label=[[0], [1]], propositions=["crash"], initial=[1, 0])
-      >>> shield_ = permissive_strategy(world, "G !crash")
-      >>> shield_.maximal, shield_.allowed[0].any(0).tolist()
-      (True, [True, False])
+      ...                    label={"crash": [1]}, initial=[1, 0])
+      >>> permissive_strategy(world, "G !crash").allowed[0].any(0).tolist()
+      [True, False]
     """
     if method not in METHODS:
         raise ValueError(f"method={method!r}; choose one of {', '.join(METHODS)}.")
@@ -160,10 +151,9 @@ def permissive_strategy(
 
 
 def apply_strategy(strategy: Permissive) -> Restriction:
-    """The game restricted to the moves of a permissive strategy.
+    """The game restricted to the moves of a permissive strategy (dissertation, algorithm 3, step 2).
 
-    The part reachable from initial states in the winning region, as an ordinary game
-    (dissertation, algorithm 3, step 2). Every run of it wins.
+    The part reachable from initial states in the winning region; every run of it wins.
 
     Args:
       strategy: of :func:`permissive_strategy`, winning from some initial state.
@@ -179,9 +169,8 @@ def apply_strategy(strategy: Permissive) -> Restriction:
       >>> import jaxltl as jl
       >>> fork = jl.from_dense([[[1.0, 0], [0, 1.0]], [[0, 1.0], [0, 0]]], initial=[1, 0],
       ...                      label={"crash": [1]})
-      >>> inside = apply_strategy(permissive_strategy(fork, "G !crash")).model
-      >>> inside.available.tolist(), inside.mdp.label.tolist()
-      ([[True, False]], [[False]])
+      >>> apply_strategy(permissive_strategy(fork, "G !crash")).model.available.tolist()
+      [[True, False]]
     """
     region, initial = np.asarray(strategy.region), np.asarray(strategy.game.initial)
     initial = np.where(region, initial, 0)
@@ -196,10 +185,9 @@ def shield_policy(policy: jax.Array, allowed: jax.Array) -> jax.Array:
       allowed: ``bool[S, A]``, a mask of moves.
 
     Returns:
-      A policy of the same kind: a distribution is scaled to the allowed moves, and uniform
-      over them where it had none of them; a deterministic policy changes to the first allowed
-      move where its own is not. Where nothing is allowed, outside of the winning region, the
-      policy is left as it is: no move is right there. Differentiable in the policy.
+      A policy of the same kind. Distributions are scaled to the allowed moves, uniform if their mass
+      there is zero; a deterministic move that is not allowed becomes the first allowed one. States
+      without allowed moves are unchanged. Differentiable in the policy.
 
     Raises:
       ValueError: the mask allows nothing at all, or the shapes differ.
@@ -281,7 +269,7 @@ def _require_start(game: Game, region: np.ndarray) -> None:
 
 
 def _always_wins(arena: _Arena, region: np.ndarray, mask: np.ndarray) -> bool:
-    """Whether every path within a mask achieves the objective."""
+    """True if every path within a mask achieves the objective."""
     _, graph, objective = arena
     if isinstance(objective, Parity) and objective.num_priorities == 1:
         return True  # nothing but safety

@@ -1,9 +1,4 @@
-"""Shielded environments: the action mask of a permissive strategy of a model.
-
-What a finite model of the world says of a task, a permissive strategy, becomes the mask of allowed
-actions. A learner that takes none but allowed actions is right from its first step on, whatever
-its network holds.
-"""
+"""Shielded environments: the action mask of a permissive strategy of a model."""
 
 from __future__ import annotations
 
@@ -38,9 +33,9 @@ class ShieldedWorld(NamedTuple):
     """State of an environment and of its shielding strategy.
 
     Attributes:
-      world: the inner one.
-      state: ``int32[]``, the state that the strategy is in, -1 where it has lost its way: the run
-        began outside of the region where it wins, or did what it does not allow.
+      world: the state of the environment.
+      state: ``int32[]``, the state of the strategy; -1 after a start outside of the winning region or
+        after an action that the strategy does not allow.
 
     Example:
       >>> lost = ShieldedWorld(world=3, state=-1)
@@ -54,19 +49,12 @@ class ShieldedWorld(NamedTuple):
 
 @struct.dataclass
 class _Guide:
-    """A permissive strategy as tables over its G reachable states.
+    """A permissive strategy as tables over its G reachable states."""
 
-    Attributes:
-      base: ``int32[G]``, the state of the world's model.
-      initial: ``bool[G]``.
-      after: ``int32[G, N]``, the states to which its moves may lead; -1 is padding.
-      allowed: ``bool[G, A]``.
-    """
-
-    base: Any
-    initial: Any
-    after: Any
-    allowed: Any
+    base: Any  # int32[G], the state of the world's model
+    initial: Any  # bool[G]
+    after: Any  # int32[G, N], the possible successors; -1 is padding
+    allowed: Any  # bool[G, A]
 
 
 def shield_environment(
@@ -74,25 +62,20 @@ def shield_environment(
     strategy: Permissive | Winning | ArrayLike,
     state_of: Callable[..., Any] | None = None,
 ) -> Environment:
-    """The environment with the action mask of a strategy of its model.
+    """Environment with the action mask of a strategy of its model, ``allowed(world)``.
 
     With a :class:`~jaxltl.core.games.permissive.Permissive` strategy its worlds are
-    :class:`ShieldedWorld`: what the strategy remembers runs beside the world, whichever automaton
-    or counter that is. A :class:`~jaxltl.core.games.winning.Winning` region allows whatever surely
-    stays in it, from where winning remains possible; for safety that is enough to win. A mask is
-    looked up and changes no world.
-
-    The mask binds those who look at it, as ``allowed(world)``. Where the strategy allows nothing
-    (outside of the region where it wins) all that the world allows may be done, and the state is
-    -1.
+    :class:`ShieldedWorld`, with the memory of the strategy. A
+    :class:`~jaxltl.core.games.winning.Winning` region allows the moves that surely stay in it, which
+    suffices for safety. Where the strategy allows nothing (outside of its winning region) all
+    actions of the environment are allowed, and the state is -1.
 
     Args:
       environment: the world, with finitely many actions, those of the model.
-      strategy: of a model or a game of which every step of the world is one move; or a mask
+      strategy: of a model or a game with one move for each step of the world; or a mask
         ``bool[S, A]``, or ``bool[S, Q, A]``.
       state_of: ``world -> int``, the model's state of a world; of a mask with more axes a tuple of
-        them. Default: the world itself, as for
-        :func:`~jaxltl.core.environments.model_environment.model_environment`.
+        them. Default: the world itself.
 
     Returns:
       The environment.
@@ -105,7 +88,7 @@ def shield_environment(
       >>> from jaxltl import from_dense, permissive_strategy
       >>> from jaxltl.core.environments import model_environment
       >>> model = from_dense([[[1.0, 0], [0, 1.0]], [[0, 1.0], [0, 0]]],
-      ...                    label=[[0], [1]], propositions=["crash"], initial=[1, 0])
+      ...                    label={"crash": [1]}, initial=[1, 0])
       >>> safe = shield_environment(model_environment(model), permissive_strategy(model, "G !crash"))
       >>> safe.allowed(safe.reset(jax.random.key(0))).tolist()
       [True, False]
@@ -252,8 +235,8 @@ def _outcomes(
 def _follow(
     guide: _Guide, place: Callable[..., Any], state: jax.Array, world: Any
 ) -> ShieldedWorld:
-    # What is remembered follows from the state that is left and that of the world: any move that
-    # leads there leads to the same.
+    # The previous state and the new state of the world determine the memory: all moves between them
+    # lead to the same memory state.
     after = jnp.asarray(guide.after)[jnp.maximum(state, 0)]
     fits = (after >= 0) & (jnp.asarray(guide.base)[after] == place(world)) & (state >= 0)
     return ShieldedWorld(world, _some(fits, after))

@@ -1,8 +1,8 @@
-"""An independent check of winning regions and strategies, by end components on the host.
+"""Independent verification of winning regions and strategies, by end components on the host.
 
-With one player's strategy fixed, what is left is the other player's problem, and its
-qualitative answers are read off end components. No nested fixed point of the game is
-computed, so that the check shares nothing with the way in which a region was found.
+With the strategy of one player fixed, the game is a decision process of the other player, and its
+end components decide it. No nested fixed point is computed, so that the check is independent of the
+solver.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Verification(NamedTuple):
     Attributes:
       system: the system's strategy wins almost surely in the region.
       environment: the environment's strategy prevents that outside of the region.
-      reason: for each claim that fails what goes wrong, and in which state; else empty.
+      reason: the error and its state for each claim that fails; else empty.
 
     Example:
       >>> import jaxltl as jl
@@ -49,27 +49,24 @@ class Verification(NamedTuple):
 
 
 def verify(winning: Any) -> Verification:
-    """Accepts or refutes a winning region with the strategies of both players; on the host.
+    """Verifies a winning region and the strategies of both players, on the host.
 
-    *The system's claim.* Its actions are fixed, the environment and chance are free. The
-    run stays in the region until it is won, and no end component in the region fails the
-    objective: one whose least priority is odd, or one that meets every assumption and
-    misses a guarantee. With positive probability a run stays in some end component for
-    ever, and every other set of states is left almost surely (de Alfaro 1997).
+    *The system's claim.* With its actions fixed, every run stays in the region until it is won, and no
+    end component in the region fails the objective (by an odd least priority, or by meeting every
+    assumption and missing a guarantee). Almost every run stays in an end component for ever
+    (de Alfaro 1997).
 
-    *The environment's claim.* Its actions are fixed, the system and chance are free, and
-    entering the region counts as the system's success. From no state outside does
-    the system reach the region, or an end component that achieves the objective, with
-    probability one. Both claims together prove that the region is exactly the one in which
-    the system wins almost surely.
+    *The environment's claim.* With its actions fixed, the system does not reach the region, or an end
+    component that achieves the objective, with probability one from any state outside. Both claims
+    together prove that the region is the almost-sure winning region.
 
-    For :class:`GR1` the strategies have memory, and the claims are checked from every memory.
-    Every search is linear in the transitions times memories, and is repeated for each
-    priority, assumption or guarantee, and while components split.
+    For :class:`GR1` the claims are checked from every memory state. Searches are linear in the
+    transitions times memory states; there is one for each priority, assumption or guarantee, and
+    while components split.
 
     Args:
-      winning: an object with the fields of ``Winning``: `game`, `objective`, `region`,
-        `action` and `counter_action`.
+      winning: an object with the fields `game`, `objective`, `region`, `action` and `counter_action`
+        of ``Winning``.
 
     Returns:
       :class:`Verification`.
@@ -78,19 +75,12 @@ def verify(winning: Any) -> Verification:
       ValueError: the region or an action has the wrong shape, such as a batch of them.
 
     Example:
-      >>> from types import SimpleNamespace
+      >>> from jaxltl.core.games import reach, winning_region
       >>> from jaxltl import from_dense
-      >>> from jaxltl.core.games import reach
       >>> world = from_dense([[[1.0, 0], [0, 1.0]], [[0, 1.0], [0, 1.0]]])
-      >>> found = SimpleNamespace(
-      ...     game=world, objective=reach(world, np.array([False, True])),
-      ...     region=np.array([True, True]), action=np.array([1, 0]),
-      ...     counter_action=np.array([0, 0]))
-      >>> bool(verify(found))
-      True
-      >>> found.action = np.array([0, 0])
-      >>> verify(found).reason
-      'around state 0 the run can stay for ever with least priority 1, which is odd'
+      >>> found = winning_region(world, reach(world, np.array([False, True])))
+      >>> bool(verify(found)), verify(found.replace(action=np.array([0, 0]))).reason
+      (True, 'around state 0 the run can stay for ever with least priority 1, which is odd')
     """
     claim = _claim(winning)
     system, environment = _refute_system(claim), _refute_environment(claim)
@@ -99,16 +89,11 @@ def verify(winning: Any) -> Verification:
 
 
 class _Moves(NamedTuple):
-    """The moves of a game over flat states, in order of states and actions.
+    """The moves of a game over flat states, in order of states and actions."""
 
-    Attributes:
-      state, action: of each move.
-      move, successor: of each edge, which are in order of moves.
-    """
-
-    state: Integers
+    state: Integers  # of each move
     action: Integers
-    move: Integers
+    move: Integers  # of each edge, ascending
     successor: Integers
 
 
@@ -284,13 +269,10 @@ def _unavailable(claim: _Claim, action: Integers, where: Booleans) -> str:
 
 
 class _Play(NamedTuple):
-    """The graph that one player faces: edges from nodes ``state * memories + memory`` by numbered pairs.
-
-    The pair ``move * memories + memory`` is a choice; all its edges are possible at once.
-    """
+    """The graph of the free player: edges from nodes ``state * memories + memory`` by numbered pairs."""
 
     source: Integers
-    pair: Integers
+    pair: Integers  # move * memories + memory, a choice; all its edges are possible at once
     target: Integers
     into: Integers  # the pairs with an edge into node n are into[start[n]:start[n + 1]]
     start: Integers

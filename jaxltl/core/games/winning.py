@@ -1,9 +1,7 @@
 """Winning regions and strategies of both players in stochastic games, exact on supports.
 
 The system wins almost surely, or the environment wins with positive probability; without chance
-both win surely. Regions are fixpoints of attractors
-(:mod:`jaxltl.core.graphs.attractor`), which work inside ``jit`` and ``vmap``; on concrete
-arrays the host finds them in time linear in the transitions, and compiles nothing.
+both win surely. Regions are fixpoints of attractors (:mod:`jaxltl.core.graphs.attractor`).
 """
 
 from __future__ import annotations
@@ -36,19 +34,16 @@ from jaxltl.core.pretty_print import brief
 class Winning:
     """Winning regions of both players, and a winning strategy of each.
 
-    A strategy for GR(1) has memory: the system pursues guarantee j, at first the one of
-    number 0, and after a state of that guarantee the next one, cyclically; the
-    environment does the same with its assumptions.
+    A strategy for GR(1) has memory: the system pursues the guarantees cyclically, from number 0 on, and
+    the environment its assumptions.
 
     Attributes:
       game: the game that was solved; of a formula, the product with its automaton.
       objective: the system's objective.
       region: ``bool[S]``, the system's almost-sure winning region; elsewhere the environment
         prevents the objective with positive probability.
-      action: ``int32[S]``, for GR(1) ``int32[S, J]``: the system's winning moves, at its
-        own states in the region.
-      counter_action: ``int32[S]``, for GR(1) ``int32[S, M]``: the environment's, at its own
-        states outside the region.
+      action: ``int32[S]``, for GR(1) ``int32[S, J]``: the system's winning moves in the region.
+      counter_action: ``int32[S]``, for GR(1) ``int32[S, M]``: the environment's outside.
 
     Example:
       >>> import jaxltl as jl
@@ -67,7 +62,7 @@ class Winning:
 
     @property
     def realizable(self) -> jax.Array:
-        """``bool[]``: whether the system wins from every initial state."""
+        """``bool[]``: True if the system wins from every initial state."""
         xp, region, initial = namespace(self.region, self.game.initial)
         return to_jax(xp.all(region | (initial <= 0)))
 
@@ -77,35 +72,29 @@ def winning_region(
 ) -> Winning:
     """Winning region of the system, and winning strategies of both players.
 
-    Parity by nested fixpoints in the manner of Zielonka (1998) and, where chance takes
-    part, of Banerjee, Majumdar, Mallik, Schmuck and Soudjani (2022); GR(1) by the triple
-    fixpoint of Piterman, Pnueli and Sa'ar (2006). With few priorities the cost is that
-    of few attractors.
+    Parity by nested fixpoints (Zielonka 1998; with chance Banerjee, Majumdar, Mallik, Schmuck and
+    Soudjani 2022); GR(1) by the triple fixpoint of Piterman, Pnueli and Sa'ar (2006).
 
     Args:
       game: a Game; any other model is the game in which the system always moves. Actions in one
         on a sparse model are rows, in its product with a task those of
         :func:`~jaxltl.core.models.construct.convert.to_sparse`.
       spec: an objective on the game's states (see :mod:`jaxltl.core.games.objective`), or a
-        formula or an automaton, whose product with the game is solved (``label_on="exit"``).
+        formula or an automaton, solved on its product with the game (``label_on="exit"``).
       chance: ``"random"``: by the model's probabilities; ``"adversarial"``: the environment
-        decides where a random move leads, so that winning is sure. States from S on are
-        then the moves that it decides (on the host only; sparse models are padded).
+        chooses random successors, so that winning is sure. States from S on are then those choices
+        (on the host only; sparse models are padded).
 
     Returns:
-      :class:`Winning`. :func:`~jaxltl.core.games.verify.verify` checks it independently.
-      Exact and Boolean: there is no derivative, but regions and moves may be computed under ``jit``
-      and ``vmap``.
+      :class:`Winning`; see :func:`~jaxltl.core.games.verify.verify`. Boolean: there is no derivative;
+      regions and moves may be computed under ``jit`` and ``vmap``.
 
     Raises:
       ValueError: a formula over unknown propositions, or an unknown `chance`.
 
     Example:
       >>> from jaxltl import from_dense, make_game
-      >>> world = from_dense([[[0, 1.0], [1.0, 0]], [[1.0, 0], [0, 1.0]]],
-      ...                    label=[[0], [1]], propositions=["a"])
-      >>> winning_region(make_game(world, [True, True]), buchi(world, "a")).region.tolist()
-      [True, True]
+      >>> world = from_dense([[[0, 1.0], [1.0, 0]], [[1.0, 0], [0, 1.0]]], label={"a": [1]})
       >>> winning_region(make_game(world, [False, True]), buchi(world, "a")).region.tolist()
       [False, True]
     """
@@ -159,10 +148,9 @@ def almost_sure_buchi(game: Any, accepting: States) -> Winning:
 
     Example:
       >>> from jaxltl import from_dense
-      >>> world = from_dense([[[1.0, 0, 0, 0]], [[0.5, 0.5, 0, 0]], [[0.5, 0, 0, 0.5]],
-      ...                     [[0, 0, 0, 1.0]]])
-      >>> almost_sure_buchi(world, np.arange(4) == 0).region.tolist()
-      [True, True, False, False]
+      >>> world = from_dense([[[1.0, 0, 0]], [[0.5, 0.5, 0]], [[0, 0, 1.0]]])
+      >>> almost_sure_buchi(world, np.arange(3) == 0).region.tolist()
+      [True, True, False]
     """
     return winning_region(game, buchi(game, accepting))
 
@@ -175,11 +163,7 @@ def on_states(
 
 
 def task_game(game: Game, spec: Automaton | Formula | str) -> tuple[Game, Parity]:
-    """The product of a game with a task, and the task as an objective on its states.
-
-    In a state ``(s, q)`` the automaton has read the labels before s; its priority is that of
-    reading s.
-    """
+    """The product of a game with a task, and the task as a parity objective on its states."""
     joint = product(game, spec, label_on="exit")
     automaton, letter = joint.mdp.automaton, joint.mdp.letter
     none = to_jax(np.zeros(joint.state_shape, bool))
@@ -209,13 +193,7 @@ def objective_at(objective: Parity | GR1, origin: jax.Array | np.ndarray) -> Any
 
 
 def adversarial_chance(game: Game) -> tuple[Game, jax.Array]:
-    """The game in which the environment decides where each random move leads, on the host.
-
-    The system wins this deterministic game where it wins the stochastic one surely.
-
-    Raises:
-      ValueError: the world has no successor lists.
-    """
+    """The deterministic game in which the environment chooses random successors, on the host."""
     everywhere = np.full(game.num_states, 1 / game.num_states)
     explicit = restrict(game, everywhere).model
     successor, used = np.asarray(explicit.mdp.successor), support(explicit.mdp)
@@ -275,7 +253,7 @@ def solve_parity(
 
 
 def _level(arena: _Arena, p: int, won: _Found, open_: Array, allowed: Array) -> _Found:
-    """The open states from which the system wins, if reaching `won` is winning too."""
+    """The undecided states from which the system wins, if reaching `won` is winning too."""
     if p == arena.objective.num_priorities:
         return won
     solve = _even if p % 2 == 0 else _odd

@@ -1,8 +1,4 @@
-"""Accepting end components and bottom strongly connected components of products.
-
-Almost every trajectory ends in one end component and takes all of its transitions infinitely often
-(de Alfaro 1997), so the graph decides acceptance.
-"""
+"""Accepting end components and bottom strongly connected components of products."""
 
 from __future__ import annotations
 
@@ -19,31 +15,20 @@ from jaxltl.core.models.product import Product
 
 
 class Accepting(NamedTuple):
-    """A region where acceptance is almost sure, with a policy that stays in it.
+    """A region where acceptance is almost sure, with a policy that stays in it."""
 
-    Attributes:
-      region: ``bool[S, Q]``.
-      action: ``int32[S, Q]``: in the region, a policy that is accepted almost surely.
-      inside: ``bool[S, Q, A]``: in the region, the actions of the state's end component; a policy
-        that takes them all infinitely often reads its least priority, which is even, infinitely
-        often. False elsewhere.
-      least: ``int32[S, Q]``: in the region, that priority; -1 elsewhere.
-    """
-
-    region: jax.Array
-    action: jax.Array
-    inside: jax.Array
-    least: jax.Array
+    region: jax.Array  # bool[S, Q]
+    action: jax.Array  # int32[S, Q], in the region a policy that is accepted almost surely
+    inside: jax.Array  # bool[S, Q, A], the actions of the state's end component; False elsewhere
+    least: jax.Array  # int32[S, Q], the least priority of the component, even; -1 elsewhere
 
 
 def accepting_end_components(model: Product) -> Accepting:
-    """The union of accepting end components of a product, with a policy that is accepted there.
-
-    For each even p: the maximal end components of the actions that read no priority below p, with
-    an action that reads p (Baier and Katoen 2008, section 10.6.4, for Rabin pairs). The policy
-    takes that action infinitely often. The maximal satisfaction probability is that of reaching the
-    region. Components of different p do not overlap: the first p counts.
-    """
+    """The union of accepting end components of a product, with a policy that is accepted there."""
+    # For each even p: the maximal end components of the actions that read no priority below p, with
+    # an action that reads p (Baier and Katoen 2008, section 10.6.4, for Rabin pairs), which the
+    # policy takes infinitely often. Almost every trajectory ends in one end component and takes all
+    # of its transitions infinitely often (de Alfaro 1997). The first p of a state counts.
     graph = graph_of(model)
     xp, available = graph.xp, graph.available
     priority = take(graph, model.automaton.priority)
@@ -74,10 +59,7 @@ def accepting_end_components(model: Product) -> Accepting:
 
 
 def accepting_bottom_components(model: Product, policy: jax.Array) -> jax.Array:
-    """The states ``bool[S, Q]`` of accepting bottom strongly connected components of a policy.
-
-    The satisfaction probability of the policy is that of reaching them.
-    """
+    """States ``bool[S, Q]`` of accepting bottom strongly connected components of a policy."""
     graph = graph_of(model, policy)
     xp = graph.xp
     priority, policy = take(graph, (model.automaton.priority, policy))

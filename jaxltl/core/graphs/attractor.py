@@ -1,10 +1,8 @@
-"""Exact questions about supports: attractors and almost-sure sets.
+"""Attractors and almost-sure sets: exact analyses of the graph of a model.
 
-Regions are Boolean, and only whether a probability is positive matters. There is one
-answer and two ways to it (:mod:`jaxltl.core.graphs.graph`). Sweeps of the primitives work inside
-``jit`` and ``vmap`` and are fast where regions grow in few steps. On concrete arrays the host
-answers, in time linear in the transitions, so that depth costs nothing, and compiles nothing. Of a
-sparse model allowed actions are ``bool[R]``, and an action is a row.
+Only the supports of the probabilities matter. Inside ``jit`` and ``vmap`` regions grow by sweeps,
+which are fast where few are needed; on concrete arrays they are computed on the host, in time linear
+in the transitions. Of a sparse model allowed actions are ``bool[R]``, and an action is a row.
 """
 
 from __future__ import annotations
@@ -26,18 +24,16 @@ class Attractor(NamedTuple):
 
     Attributes:
       region: ``bool[S]``.
-      action: ``int32[S]``: in the region outside the goal, an allowed action with a
-        successor that is nearer to the goal (the first of all allowed ones where all of them
-        lead nearer); elsewhere the first available one.
-      rank: ``int32[S]``: the round in which the state joined, 0 in the goal; meaningless
-        outside of the region.
+      action: ``int32[S]``: in the region outside the goal, an allowed action with a successor nearer to
+        the goal (the first allowed one if all lead nearer); elsewhere the first available one.
+      rank: ``int32[S]``: the round in which the state joined, 0 in the goal; undefined outside of
+        the region.
 
     Example:
       >>> import jaxltl as jl
       >>> fork = jl.from_dense([[[0, 0.5, 0.5], [1, 0, 0]], [[0, 1, 0], [0, 0, 0]],
       ...                       [[0, 0, 1], [0, 0, 0]]])
-      >>> goal = np.array([False, True, False])
-      >>> found = jl.graphs.attractor(fork, goal)
+      >>> found = jl.graphs.attractor(fork, np.array([False, True, False]))
       >>> found.region.tolist(), found.action[0].tolist(), found.rank[:2].tolist()
       ([True, True, False], 0, [1, 0])
     """
@@ -56,24 +52,22 @@ def attractor(
     chance: str = "some",
     among: jax.Array | None = None,
 ) -> Attractor:
-    """States that a goal attracts: the least R with ``goal <= R`` closed under a rule.
+    """Attractor of a goal: the least R with ``goal <= R`` closed under a rule.
 
-    With a rule for each state it is the attractor of a player in a game: ``"exists"`` where
-    that player moves, ``"forall"`` where the other does.
+    With a rule for each state it is the attractor of a player in a game: ``"exists"`` in the states
+    of that player, ``"forall"`` in the others.
 
     Args:
       model: the model.
       goal: ``bool[S]``.
-      allowed: ``bool[S, A]``, the actions that count; default the available ones.
+      allowed: ``bool[S, A]``, the actions that count; default: the available ones.
       rule: ``"exists"``: some allowed action leads to R; ``"forall"``: every allowed
         action does (so a state without any is attracted). Or ``bool[S]``: True for exists.
-      chance: what leading to R means: ``"some"`` successor lies in R, so that chance
-        helps, or ``"all"`` do, so that it does not.
-      among: ``bool[S]``, the states outside the goal that may join; default all.
+      chance: an action leads to R if ``"some"`` successor lies in R, or if ``"all"`` do.
+      among: ``bool[S]``, the states outside the goal that may join; default: all.
 
     Returns:
-      :class:`Attractor`. With ``"exists"`` the action is the one that makes progress. Exact and
-      Boolean: there is no derivative.
+      :class:`Attractor`. Boolean: there is no derivative.
 
     Raises:
       ValueError: unknown rule or chance.
@@ -122,13 +116,10 @@ def attract(
 def avoidable(model: Any, goal: jax.Array, allowed: jax.Array | None = None) -> jax.Array:
     """States from which some policy surely never reaches the goal: ``bool[S]``.
 
-    The complement of the ``"forall"`` attractor; the minimal reachability probability is
-    zero exactly there.
+    The complement of the ``"forall"`` attractor: the minimal reachability probability is zero there.
 
     Args:
-      model: the model.
-      goal: ``bool[S]``.
-      allowed: ``bool[S, A]``, the actions that count; default the available ones.
+      model, goal, allowed: as of :func:`attractor`.
 
     Returns:
       ``bool[S]``. Boolean: there is no derivative.
@@ -137,8 +128,7 @@ def avoidable(model: Any, goal: jax.Array, allowed: jax.Array | None = None) -> 
       >>> import jaxltl as jl
       >>> fork = jl.from_dense([[[0, 0.5, 0.5], [1, 0, 0]], [[0, 1, 0], [0, 0, 0]],
       ...                       [[0, 0, 1], [0, 0, 0]]])
-      >>> goal = np.array([False, True, False])
-      >>> avoidable(fork, goal).tolist()
+      >>> avoidable(fork, np.array([False, True, False])).tolist()
       [True, False, True]
     """
     graph = graph_of(model, goal, allowed)
@@ -163,9 +153,7 @@ def almost_surely_reaching(
     reachable (de Alfaro 1997).
 
     Args:
-      model: the model.
-      goal: ``bool[S]``.
-      allowed: ``bool[S, A]``, the actions that count; default the available ones.
+      model, goal, allowed: as of :func:`attractor`.
       reaching: ``attractor(model, goal, allowed)``, if it is known already.
 
     Returns:
@@ -176,11 +164,8 @@ def almost_surely_reaching(
       >>> import jaxltl as jl
       >>> fork = jl.from_dense([[[0, 0.5, 0.5], [1, 0, 0]], [[0, 1, 0], [0, 0, 0]],
       ...                       [[0, 0, 1], [0, 0, 0]]])
-      >>> goal = np.array([False, True, False])
-      >>> almost_surely_reaching(fork, goal).region.tolist()
+      >>> almost_surely_reaching(fork, np.array([False, True, False])).region.tolist()
       [False, True, False]
-      >>> almost_surely_reaching(fork, np.array([False, True, True])).region.tolist()
-      [True, True, True]
     """
     graph = graph_of(model, goal, allowed, reaching)
     goal, allowed, reaching = take(graph, (goal, allowed, reaching))

@@ -1,9 +1,9 @@
 """Strongly connected components by sweeps, for models over a mesh.
 
 Colouring (Orzan 2004): each state takes the least number that it can reach. A state with its own
-number is the root of a component, which consists of the states of its colour that it can reach. The
-other states are coloured again with numbers in the reverse order, so that no order of the states
-along a path is always bad. The number of sweeps is at most the length of a longest shortest path.
+number is the root of a component: the states of its colour that it can reach. The other states are
+coloured again with numbers in the reverse order, so that no order of the states along a path is
+always bad. The number of sweeps is at most the length of a longest shortest path.
 """
 
 from __future__ import annotations
@@ -20,10 +20,7 @@ from jaxltl.core.models.ops import operators
 def components_by_sweeps(
     graph: Any, core: jax.Array, allowed: jax.Array, closed: bool
 ) -> tuple[jax.Array, jax.Array]:
-    """Components among some states, and the actions inside: ``int32[S]``, ``bool[S, A]``.
-
-    Arguments as of ``RowGraph.components``; unless `closed`, allowed actions stay in `core`.
-    """
+    """Components ``int32[S]`` and inner actions ``bool[S, A]``, as ``RowGraph.components``."""
     stay = allowed & graph.available & core[..., None]
 
     def prune(carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[Any, ...]:
@@ -47,10 +44,7 @@ def components_by_sweeps(
 
 
 def strong_components(graph: Any, states: jax.Array, moves: jax.Array) -> jax.Array:
-    """The least state of each state's component under some actions: ``int32[S]``.
-
-    States outside of `states` are components by themselves.
-    """
+    """The least state of the component of each state under some actions; itself outside of `states`."""
     number = _numbers(states.shape)
     none = jnp.int32(number.size)
 

@@ -21,16 +21,14 @@ class EndComponents(NamedTuple):
     Attributes:
       component: ``int32[S]``: the smallest (flat) state number of the state's component; the
         state's own number outside of all components.
-      inside: ``bool[S, A]``: the actions all of whose successors are in the state's component.
+      inside: ``bool[S, A]``: the actions with all successors in the state's component.
 
     Example:
-      >>> import numpy as np
       >>> import jaxltl as jl
       >>> fork = jl.from_dense([[[0, 0.5, 0.5], [1, 0, 0]], [[0, 1, 0], [0, 0, 0]],
       ...                       [[0, 1, 0], [0, 0, 0]]])
-      >>> found = jl.graphs.end_components(fork, np.array([True, False, True]))
-      >>> found.component.tolist(), found.inside.tolist()
-      ([0, 1, 2], [[False, True], [False, False], [False, False]])
+      >>> jl.graphs.end_components(fork, np.array([True, False, True])).component.tolist()
+      [0, 1, 2]
     """
 
     component: jax.Array
@@ -43,20 +41,17 @@ def end_components(
     """Maximal end components that lie within a region (de Alfaro 1997).
 
     An end component is a set of states with actions that never leave it and connect it. Computed on
-    the host by strongly connected components of the states that can stay in the region; under
-    ``jit`` by a callback.
+    the host; under ``jit`` by a callback.
 
     Args:
       model: the model.
       region: ``bool[S]``.
-      allowed: ``bool[S, A]``; default the available actions. For a sparse model ``bool[R]``, as is
-        `inside`.
+      allowed: ``bool[S, A]``, of a sparse model ``bool[R]``; default: the available actions.
 
     Returns:
-      :class:`EndComponents`. Exact and Boolean: there is no derivative.
+      :class:`EndComponents`. Boolean: there is no derivative.
 
     Example:
-      >>> import numpy as np
       >>> import jaxltl as jl
       >>> fork = jl.from_dense([[[0, 0.5, 0.5], [1, 0, 0]], [[0, 1, 0], [0, 0, 0]],
       ...                       [[0, 1, 0], [0, 0, 0]]])

@@ -1,8 +1,7 @@
 """Graph operations of models, with NumPy on the host or with JAX inside ``jit``.
 
-Graph algorithms are written once, for both. On concrete arrays the graph consists of sparse rows
-(:class:`~jaxltl.core.sparse.graph.row_graph.RowGraph`), and nothing is compiled; where anything is
-traced it is a :class:`TracedGraph`, made of the primitives. Both give the same answers, bit for bit.
+Concrete arrays use sparse rows (:class:`~jaxltl.core.sparse.graph.row_graph.RowGraph`) and compile
+nothing; traced ones use a :class:`TracedGraph` of the primitives. The results are equal bit for bit.
 """
 
 from __future__ import annotations
@@ -56,11 +55,11 @@ class TracedGraph:
         return choices(self.model).spread(states)
 
     def exists(self, region: jax.Array) -> jax.Array:
-        """Whether some successor lies in a region: ``bool[S, A]``; False where unavailable."""
+        """Mask of choices with some successor in a region: ``bool[S, A]``; False where unavailable."""
         return self.available & operators.exists_successor(self.model, region)
 
     def forall(self, region: jax.Array) -> jax.Array:
-        """Whether all successors lie in a region: ``bool[S, A]``; True where unavailable."""
+        """Mask of choices with all successors in a region: ``bool[S, A]``; True where unavailable."""
         return ~self.exists(~region)
 
     def least(self, value: jax.Array) -> jax.Array:
@@ -69,11 +68,11 @@ class TracedGraph:
         return jnp.where(self.available, found, kernels.dtype_max(value.dtype))
 
     def reads(self, marked: jax.Array) -> jax.Array:
-        """Whether an action can make the automaton read a marked transition: ``bool[S, Q, A]``."""
+        """Mask of actions that may read a marked transition of the automaton: ``bool[S, Q, A]``."""
         return self.available & reads(self.model, marked)
 
     def first(self, mask: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Whether a mask ``bool[S, A]`` holds for some action, and the first one (or 0)."""
+        """Mask of states with an action in a mask ``bool[S, A]``, and the first such action (or 0)."""
         return choices(self.model).first(mask)
 
     def attract(self, goal, allowed, rule, among, chance: str):
@@ -103,7 +102,7 @@ class TracedGraph:
         return lax.cond(core.any(), callback, trivial)
 
     def anywhere(self, mark: jax.Array, component: jax.Array) -> jax.Array:
-        """Whether a state of the same component is marked: ``bool[S]``."""
+        """Mask of states with a marked state in their component: ``bool[S]``."""
         label = component.ravel()
         return jnp.zeros(label.size, bool).at[label].max(mark.ravel())[component]
 
@@ -153,7 +152,7 @@ def graph_of(model: Any, *arguments: Any) -> Graph:
 
 
 def is_table(model: Any) -> bool:
-    """Whether a model is an MDP or DenseMDP, or a product or game of one."""
+    """True for an MDP or DenseMDP, or a product or game of one."""
     lazy = model.mdp if isinstance(model, Game) else model
     world = lazy.mdp if isinstance(lazy, Product) else lazy
     return isinstance(world, MDP | DenseMDP)
