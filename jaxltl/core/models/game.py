@@ -117,7 +117,7 @@ def make_game(model: Model, system: Sequence[bool] | chex.Array) -> Game:
     owner = _owners(system, model.state_shape)
     if isinstance(base := base_model(model), MDP | DenseMDP) and not is_traced(base):
         support(base)  # refuses probabilities that underflow
-    if not isinstance(model, SparseMDP | IntervalMDP):  # whose every state has a choice
+    if not isinstance(model, SparseMDP | IntervalMDP):  # their states all have a choice
         check_moves(np.asarray(choices(model).available), owner)
     return Game(model, to_jax(owner))
 

@@ -461,11 +461,9 @@ def _pointed(
     upper: np.ndarray,
     ball: tuple[np.ndarray, np.ndarray] | None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Ends made equal in rows that hold no distribution because of rounding.
-
-    To the upper ends where these sum to less than one, to the lower ones where these sum to more,
-    and to the center of a ball that is farther from all distributions than its radius.
-    """
+    """Ends made equal in rows that hold no distribution because of rounding."""
+    # To the upper ends where these sum to less than one, to the lower ones where these sum to more,
+    # and to the center of a ball that is farther from all distributions than its radius.
     one = np.ones(entry_start.size - 1)
     short = row_sums(upper, entry_start, -one) < 0
     full = row_sums(lower, entry_start, -one) > 0

@@ -1,7 +1,7 @@
 """Lazy products of a model and an automaton.
 
-Nothing is copied: a value on the product has the shape ``[S, Q]``, and the automaton determines the
-memory state at which the value of a successor is read.
+A value on the product has the shape ``[S, Q]``; the automaton determines the memory state at which
+the value of a successor is read.
 """
 
 from __future__ import annotations
@@ -258,11 +258,9 @@ _SELECT = 16  # memory states up to which reading at a memory is a selection
 
 
 def _through(model: Product, operator, value: jax.Array, term, combine, empty=0) -> jax.Array:
-    """Applies an operator of the base model at every memory state: ``[S, Q, A]`` from ``[S, Q]``.
-
-    On entry the value of t is read at delta(q, L(t)), before the base operator; on exit at
-    delta(q, L(s)), after it. Disallowed actions have the result `empty`.
-    """
+    """Applies an operator of the base model at every memory state: ``[S, Q, A]`` from ``[S, Q]``."""
+    # On entry the value of t is read at delta(q, L(t)), before the base operator; on exit at
+    # delta(q, L(s)), after it.
     if model.label_on == "entry":
         value = _read_at(value, model.next_memory)
         result = _each_memory(model.mdp, operator, value, term, combine)
@@ -293,10 +291,7 @@ def reads(model: Product, marked: jax.Array) -> jax.Array:
 
 
 def read_probability(model: Product, marked: jax.Array) -> jax.Array:
-    """The probability ``float[S, Q, A]`` that a choice makes a marked transition of the automaton.
-
-    `marked` is ``bool[Q, L]``, or numbers on transitions, for their expectation.
-    """
+    """Expectation ``float[S, Q, A]`` of numbers ``[Q, L]``, or a mask, on the transition of the automaton."""
     here = jnp.asarray(marked)[:, model.letter].T.astype(model.dtype)
     if model.label_on == "exit":
         return here[:, :, None] * model.available
@@ -305,10 +300,7 @@ def read_probability(model: Product, marked: jax.Array) -> jax.Array:
 
 
 def _read_at(value: jax.Array, memory: jax.Array) -> jax.Array:
-    """``value[s, memory[s, q]]``, by selection for few memory states.
-
-    The transpose is then a sum, which is faster than the scatter that transposes a gather.
-    """
+    """``value[s, memory[s, q]]``; selection for few memory states avoids a transposed scatter."""
     num_memory = value.shape[1]
     if num_memory > _SELECT:
         return jnp.take_along_axis(value, memory, axis=1)

@@ -45,7 +45,7 @@ class Model(Protocol):
 
 
 class LabelledModel(Model, Protocol):
-    """A model whose states are labelled with atomic propositions."""
+    """A model with atomic propositions as labels of its states."""
 
     @property
     def label(self) -> Array:
@@ -81,7 +81,7 @@ class SuccessorModel(ActionModel, Protocol):
 
 
 class RowModel(LabelledModel, Protocol):
-    """A model whose choices are rows without padding."""
+    """A model with choices as rows without padding."""
 
     @property
     def num_rows(self) -> int:

@@ -340,10 +340,7 @@ def sparse_part(
     begins: tuple[int, int, int] = (0, 0, 0),
     num_states: int | None = None,
 ) -> SparseMDP:
-    """The validated states of a range of a larger model, without initial probabilities.
-
-    `begins` are the numbers of its first state, choice and transition in the whole model.
-    """
+    """Validated states of a larger model, from the state, choice and transition numbers `begins` on."""
     successor, probability = (
         np.asarray(successor),
         validation.float_array("probability", probability),
@@ -579,7 +576,7 @@ def _sorted(entry_start: np.ndarray, successor: np.ndarray, row: np.ndarray) -> 
 def scaled(
     row_start: np.ndarray, entry_start: np.ndarray, probability: np.ndarray, *, first: int = 0
 ) -> np.ndarray:
-    """Normalised rows; ValueError for a row whose sum is not within 1e-6 of one."""
+    """Normalised rows; ValueError for a row with a sum that is not within 1e-6 of one."""
     total = np.add.reduceat(probability, entry_start[:-1])
     off = np.abs(total - 1)
     if off.max() > validation.ROW_SUM_TOLERANCE:

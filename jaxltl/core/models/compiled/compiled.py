@@ -27,12 +27,9 @@ def is_sparse(model: Model) -> bool:
 
 
 def compiled_form(model: Model, reward: Any = None) -> tuple[Any, Any]:
-    """A model and a reward for compiled solvers; only sparse models change.
-
-    A product of a sparse model becomes a sparse model with the rows of
-    :func:`~jaxltl.core.models.construct.convert.to_sparse`, inside ``jit`` too. A sparse model loses its
-    names, rewards and variables, for which programs would be recompiled.
-    """
+    """A model and a reward for compiled solvers; only sparse models change."""
+    # A product becomes a sparse model with the rows of `to_sparse`, inside `jit` too. Names, rewards
+    # and variables, for which programs would be recompiled, are dropped.
     if isinstance(model, Game):
         form, reward = compiled_form(model.mdp, reward)
         system = jnp.asarray(model.system).reshape(form.state_shape)

@@ -1,8 +1,4 @@
-"""Batches of products with one task, and demonstrations in them.
-
-Models of one kind become one product with arrays of a leading axis W, for one ``vmap``. They
-share the automaton, over the letters of all models.
-"""
+"""Batches of products with one task, and demonstrations in them."""
 
 from __future__ import annotations
 
@@ -28,14 +24,13 @@ from jaxltl.core.models.trajectories import Trajectories, make_trajectories, req
 
 
 def stack_products(worlds: Sequence[MDP], task: Task, *, label_on: str = "exit") -> Product:
-    """The products of several models with one task, stacked along a leading axis.
+    """The products of several models with one task, stacked along a leading axis for ``vmap``.
 
-    Smaller models are padded with unreachable states, and so are successor lists. A formula is
-    translated over the letters of all models.
+    Smaller models are padded with unreachable states, and so are successor lists.
 
     Args:
       worlds: W models with the same actions and the same propositions, in any order.
-      task: an automaton, a formula, or its text.
+      task: an automaton, or a formula, translated over the letters of all models.
       label_on: ``"exit"`` or ``"entry"``, see :class:`~jaxltl.core.models.product.Product`.
 
     Returns:
@@ -47,9 +42,8 @@ def stack_products(worlds: Sequence[MDP], task: Task, *, label_on: str = "exit")
 
     Example:
       >>> from jaxltl import from_dense
-      >>> one = from_dense([[[0, 1.0]], [[0, 1.0]]], label=[[0], [1]], propositions=["goal"])
-      >>> two = from_dense([[[1.0]]], label=[[1]], propositions=["goal"])
-      >>> stack_products([one, two], "F goal").letter.tolist()
+      >>> one = from_dense([[[0, 1.0]], [[0, 1.0]]], label={"goal": [1]})
+      >>> stack_products([one, from_dense([[[1.0]]], label={"goal": [0]})], "F goal").letter.tolist()
       [[0, 1], [1, 1]]
     """
     worlds = [_like_first(world, i, worlds[0]) for i, world in enumerate(worlds)]
@@ -106,12 +100,7 @@ def _like_first(world: Model, number: int, first: MDP) -> MDP:
 
 
 def pad_states(mdp: MDP, num_states: int) -> MDP:
-    """The model with unreachable absorbing states appended, labelled like state 0.
-
-    >>> from jaxltl import from_dense
-    >>> pad_states(from_dense([[[1.0]]]), 3).successor[:, 0, 0].tolist()
-    [0, 1, 2]
-    """
+    """The model with unreachable absorbing states appended, labelled like state 0."""
     extra = num_states - mdp.num_states
     if extra < 0:
         raise ValueError(
@@ -281,11 +270,7 @@ def demonstration_counts(
     *,
     horizon: int | None = None,
 ) -> jax.Array:
-    """State-action counts of demonstrations in each product, ``float[W, S, Q, A]``.
-
-    With a horizon they are counted by time step, ``float[W, T, S, Q, A]``. Trajectories are those of the
-    base models; disallowed pairs do not count.
-    """
+    """State-action counts ``float[W, S, Q, A]`` in each product; ``[W, T, S, Q, A]`` with a horizon T."""
     given, count = _of_each_world(trajectories), num_worlds(models)
     if len(given) != count:
         raise ValueError(f"there are demonstrations in {len(given)} worlds; expected {count}.")
@@ -348,10 +333,7 @@ def training_counts(
     *,
     horizon: int | None = None,
 ) -> tuple[jax.Array, jax.Array]:
-    """The :func:`demonstration_counts` of training and of held-out trajectories.
-
-    `held_out` is the fraction of each model's trajectories, its last ones, or held-out trajectories.
-    """
+    """Counts of training and of held-out trajectories, or of the last fraction `held_out`."""
     test: Any = held_out
     if held_out is None or isinstance(held_out, int | float):
         demonstrations, test = split_trajectories(demonstrations, held_out or 0.0)

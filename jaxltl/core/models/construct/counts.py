@@ -119,11 +119,7 @@ def make_counts(
 
 
 def merged(table: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Sorted columns of state, action, successor and count, with repeated transitions added up.
-
-    >>> merged(np.array([[1, 0, 1], [0, 0, 0], [2, 1, 2], [5, 6, 7]])).tolist()
-    [[0, 1], [0, 0], [1, 2], [6, 12]]
-    """
+    """Sorted columns of state, action, successor and count, with repeated transitions added up."""
     table = table[:, np.lexsort(table[2::-1])]
     new = np.append(True, (table[:3, 1:] != table[:3, :-1]).any(0))
     table[3, new] = np.add.reduceat(table[3], np.flatnonzero(new))
@@ -145,11 +141,7 @@ def _checked_names(what: str, names: Sequence[str] | None, least: int) -> tuple[
 
 
 def in_order(names: Iterable[str]) -> tuple[str, ...]:
-    """Names sorted by number if all are integers, else alphabetically.
-
-    >>> in_order(["10", "9"]), in_order(["10", "9", "a"])
-    (('9', '10'), ('10', '9', 'a'))
-    """
+    """Names sorted by number if all are integers, else alphabetically."""
     names = list(names)
     if all(map(_INTEGER.fullmatch, names)):
         return tuple(sorted(names, key=int))
@@ -317,11 +309,7 @@ def _renumbered(
 
 
 def listed(names: Sequence[str], most: int = 8) -> str:
-    """The number of names and the first `most`, for messages.
-
-    >>> listed("abcd", 2)
-    "4: 'a', 'b', ..."
-    """
+    """The number of names and the first `most`, for messages."""
     shown = ", ".join(map(repr, names[:most]))
     return f"{len(names)}: {shown}{', ...' if len(names) > most else ''}"
 

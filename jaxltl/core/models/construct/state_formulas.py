@@ -14,11 +14,7 @@ BUILT_IN = ("init", "deadlock")  # what every model of PRISM and Storm has
 
 
 def label_columns(model: SparseMDP, names: Collection[str], place: str) -> np.ndarray:
-    """The states in which labels hold, ``bool[S, len(names)]``; ValueError for an unknown label.
-
-    The built-in label ``init`` holds in initial states, and ``deadlock`` where the only choice is a
-    self-loop with probability 1.
-    """
+    """Masks ``bool[S, n]`` of n labels, with the built-in ``init`` and ``deadlock`` (certain self-loops)."""
     known = (*model.propositions, *(x for x in BUILT_IN if x not in model.propositions))
     require_known(names, known, place)
     found = np.zeros((model.num_states, len(names)), bool)
@@ -43,13 +39,7 @@ def _deadlocks(model: SparseMDP) -> np.ndarray:
 def states_satisfying(
     model: SparseMDP, condition: Formula | str, place: str = "the condition"
 ) -> np.ndarray:
-    """The states that satisfy a Boolean formula of labels, ``bool[S]``; ValueError for other formulas.
-
-    >>> from jaxltl import make_sparse
-    >>> model = make_sparse(None, [0, 1, 2], [1, 1], [1.0, 1.0], initial=[1, 0], label={"a": [0]})
-    >>> states_satisfying(model, "!a | init").tolist(), states_satisfying(model, "deadlock").tolist()
-    ([True, True], [False, True])
-    """
+    """States ``bool[S]`` that satisfy a Boolean formula of labels; ValueError for other formulas."""
     condition = as_formula(condition)
     names = condition.propositions
     if condition.operator == "ap":

@@ -1,8 +1,4 @@
-"""Distribution of models and of quantities over the devices of a mesh.
-
-Each process builds the parts of its own devices. Counts of rows by width and lists of halo states
-are exchanged once.
-"""
+"""Distribution of models and of quantities over the devices of a mesh."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Pytrees annotated with text that compiled programs do not depend on.
 
-Formulas whose automata have one shape share a compiled program. Text is therefore equal to any other
-text in the pytree's structure, and is dropped wherever the arrays are traced.
+Text is equal to any other text in the pytree's structure and is dropped in traced arrays, so that
+formulas with automata of one shape share a compiled program.
 """
 
 from __future__ import annotations
@@ -30,17 +30,7 @@ class _Text:
 def register_annotated_pytree(
     cls: type[ClassT], arrays: Iterable[str], static: Iterable[str], text: Mapping[str, Any]
 ) -> type[ClassT]:
-    """Registers a dataclass as a pytree with text.
-
-    >>> from dataclasses import dataclass
-    >>> @dataclass
-    ... class Task:
-    ...     value: float
-    ...     formula: str
-    >>> _ = register_annotated_pytree(Task, ["value"], [], {"formula": ""})
-    >>> jax.tree.map(lambda x: 2 * x, Task(1.0, "F a")), jax.jit(lambda x: x)(Task(1.0, "F a")).formula
-    (Task(value=2.0, formula='F a'), '')
-    """
+    """Registers a dataclass as a pytree with text, given by field with the value when traced."""
     arrays, static, names = tuple(arrays), tuple(static), tuple(text)
 
     def flatten(tree: ClassT) -> tuple[list[Any], Any]:

@@ -1,7 +1,7 @@
 """Choices of a model's states, and reductions over them.
 
-Quantities on choices have the shape ``[S, A]`` for padded models (``[S, Q, A]`` for products) and
-``[R]`` for sparse models. :class:`Actions` and :class:`Rows` have the same methods.
+:class:`Actions` (padded models, ``[S, A]``) and :class:`Rows` (sparse models, ``[R]``) have the same
+methods.
 """
 
 from __future__ import annotations
@@ -144,10 +144,7 @@ class Actions(NamedTuple):
 
 @brief
 class Columns(NamedTuple):
-    """Padded choices in column layout: an array ``[N, ...]`` for each action.
-
-    Unavailable actions have weight zero, and minus infinity in maxima.
-    """
+    """Padded choices as an array ``[N, ...]`` for each action; weight 0 and value -inf where unavailable."""
 
     def spread(self, x: jax.Array, like: list[jax.Array]) -> list[jax.Array]:
         """Broadcasts a quantity on states to choices."""

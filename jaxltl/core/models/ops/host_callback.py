@@ -12,11 +12,9 @@ from jax import lax
 
 
 def host_callback(function: Callable[..., Any], result: Any, *arguments: Any) -> Any:
-    """``function(*arguments)`` on NumPy arrays, inside ``jit``; sequential under ``vmap``.
-
-    JAX rounds the arrays of a callback to single precision if double precision is enabled for the
-    calling thread only. 64-bit numbers are therefore passed as pairs of 32-bit words.
-    """
+    """``function(*arguments)`` on NumPy arrays, inside ``jit``; sequential under ``vmap``."""
+    # JAX rounds the arrays of a callback to single precision if double precision is enabled for the
+    # calling thread only. 64-bit numbers are therefore passed as pairs of 32-bit words.
     arguments = jax.tree.map(jnp.asarray, arguments)
     given = jax.tree.map(lambda x: np.dtype(x.dtype), arguments)
     kinds = jax.tree.map(lambda x: np.dtype(jax.dtypes.canonicalize_dtype(x.dtype)), result)

@@ -16,8 +16,8 @@ from jaxltl.core.models.ops.underflow import is_positive
 # Transitions of a state up to which sums over them are unrolled, so that XLA fuses them into one
 # pass; beyond, programs would grow too large.
 WRITTEN_OUT = 64
-# Transitions in all up to which one gather is as fast as an unrolled loop, whose passes take the
-# compiler some ten milliseconds each.
+# Transitions in all up to which one gather is as fast as an unrolled loop; the compiler takes
+# some ten milliseconds for each of its passes.
 FEW = 2**15
 # Length of the last axis up to which a reduction over it is unrolled.
 UNROLL = 16
@@ -37,10 +37,7 @@ def fold(
     term: Term = jnp.multiply,
     combine: Term = jnp.add,
 ) -> jax.Array:
-    """Reduces, over the K successors of an action, terms of a weight and the value there: ``[N, ...]``.
-
-    `successor` and `weight` are K arrays ``[N]``; trailing axes of `value` are a batch.
-    """
+    """Reduces terms ``[N, ...]`` of weights and values over K successors, given as K arrays ``[N]`` each."""
     terms = []
     for target, w in zip(successor, weight, strict=True):
         rows = gather(value, target)

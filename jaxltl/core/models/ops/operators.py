@@ -1,11 +1,8 @@
 """Operators of a model: expectation, predecessors, sampling and induced chains.
 
-Algorithms see a model through these functions and through the reductions of
-:func:`~jaxltl.core.models.ops.choices.choices`. Values have the shape of the model's states, ``[S]``
-or ``[S, Q]``; quantities on choices have one more axis, A, and for a sparse model the shape ``[R]``.
-The functions are open (``functools.singledispatch``): a new representation registers
-``combined``, or ``expectation`` and ``exists_successor``, and ``least_successor`` for ranks; and
-``sample_successor``.
+Values have the shape of the model's states, ``[S]`` or ``[S, Q]``; quantities on choices have one
+more axis, A, and for a sparse model the shape ``[R]``. A new representation registers ``combined``,
+or ``expectation`` and ``exists_successor``; ``least_successor`` for ranks; and ``sample_successor``.
 """
 
 from __future__ import annotations
@@ -45,20 +42,17 @@ def expectation(model: Model, value: jax.Array) -> jax.Array:
     """Expected value of the next state, ``(P v)(s, a) = sum_t P(t | s, a) v(t)``.
 
     Args:
-      model: the model.
-      value: ``float[S]``.
+      model, value: the model, and ``float[S]``.
 
     Returns:
-      ``float[S, A]``, zero at unavailable actions. Linear and differentiable in `value` and in the
-      transition probabilities.
+      ``float[S, A]``, zero at unavailable actions; differentiable in `value` and the probabilities.
 
     Raises:
       TypeError: `model` is not a model.
 
     Example:
       >>> from jaxltl import from_dense
-      >>> mdp = from_dense([[[0.5, 0.5]], [[0.0, 1.0]]])
-      >>> expectation(mdp, jnp.array([0.0, 4.0])).tolist()
+      >>> expectation(from_dense([[[0.5, 0.5]], [[0.0, 1.0]]]), jnp.array([0.0, 4.0])).tolist()
       [[2.0], [4.0]]
     """
     return combined(model, value, jnp.multiply, jnp.add)
@@ -69,12 +63,10 @@ def exists_successor(model: Model, region: jax.Array) -> jax.Array:
     """Existential predecessors: choices with a possible successor in a region.
 
     Args:
-      model: the model.
-      region: ``bool[S]``.
+      model, region: the model, and ``bool[S]``.
 
     Returns:
-      ``bool[S, A]``, of a sparse model ``bool[R]``; False at unavailable actions. There is no
-      derivative.
+      ``bool[S, A]``, of a sparse model ``bool[R]``; False at unavailable actions; no derivative.
 
     Raises:
       TypeError: `model` is not a model.
@@ -93,12 +85,10 @@ def forall_successor(model: Model, region: jax.Array) -> jax.Array:
     """Universal predecessors: choices with all possible successors in a region.
 
     Args:
-      model: the model.
-      region: ``bool[S]``.
+      model, region: the model, and ``bool[S]``.
 
     Returns:
-      ``bool[S, A]``, of a sparse model ``bool[R]``; True at unavailable actions. There is no
-      derivative.
+      ``bool[S, A]``, of a sparse model ``bool[R]``; True at unavailable actions; no derivative.
 
     Raises:
       TypeError: `model` is not a model.
@@ -122,12 +112,10 @@ def least_successor(model: Model, value: jax.Array) -> jax.Array:
 def sample_successor(
     model: Model, key: chex.PRNGKey, state: jax.Array, action: jax.Array
 ) -> jax.Array:
-    """A random successor, drawn from ``P(. | state, action)``.
-
-    The states of a product are numbered ``s * Q + q``, the order of a flattened value.
+    """Random successor, drawn from ``P(. | state, action)``.
 
     Args:
-      model: the model.
+      model: the model; the states of a product are numbered ``s * Q + q``.
       key: the random key.
       state, action: ``int32[]``.
 
@@ -154,10 +142,7 @@ def induced_chain(model: Model, policy: jax.Array) -> MDP | DenseMDP:
 
 @singledispatch
 def transition_matrix(model: Model, policy: jax.Array) -> jax.Array:
-    """``P_pi(s, t) = sum_a pi(s, a) P(t | s, a)`` as a dense matrix ``float[S, S]``, for small models.
-
-    The states of a product are numbered ``s * Q + q``.
-    """
+    """``P_pi(s, t) = sum_a pi(s, a) P(t | s, a)`` as a dense matrix ``float[S, S]``, for small models."""
     raise TypeError(_unknown(model))
 
 
@@ -176,11 +161,10 @@ def pushforward(model: Model, mass: jax.Array) -> jax.Array:
     """Mass flow into each state, ``(P' x)(t) = sum_{s, a} P(t | s, a) x(s, a)``: the transposed expectation.
 
     Args:
-      model: the model.
-      mass: ``float[S, A]``.
+      model, mass: the model, and ``float[S, A]``.
 
     Returns:
-      ``float[S]``. Linear and differentiable in `mass` and in the transition probabilities.
+      ``float[S]``; differentiable in `mass` and the probabilities.
 
     Raises:
       TypeError: `model` is not a model.
@@ -209,10 +193,7 @@ def _unknown(model: Model) -> str:
 def combined(
     model: Model, value: jax.Array, term: kernels.Term, combine: kernels.Term
 ) -> jax.Array:
-    """A reduction over the successors of each choice, ``[S, ..., A]`` from values ``[S, ...]``.
-
-    `term` and `combine` are those of :func:`~jaxltl.core.models.ops.kernels.fold`.
-    """
+    """A reduction :func:`~jaxltl.core.models.ops.kernels.fold` over the successors of each choice."""
     raise TypeError(_unknown(model))
 
 
@@ -223,10 +204,7 @@ def unpadded_states(model: Model) -> jax.Array | bool:
 
 
 def is_representable(model: Model) -> jax.Array:
-    """``bool[]``: no transition probability is subnormal, and none of a sparse row is zero.
-
-    Constructors refuse such models; a model that enters ``jit`` in lower precision may be one.
-    """
+    """``bool[]``: no transition probability is subnormal, and none of a sparse row is zero."""
     return jnp.all(_representable(base_model(model)))
 
 
@@ -249,10 +227,7 @@ def _(model: SparseMDP) -> jax.Array:
 
 @singledispatch
 def greatest_predecessor(model: Model, quantity: jax.Array) -> jax.Array:
-    """Largest quantity among the choices that lead to a state, ``[S, ...]`` from ``[S, ..., A]``.
-
-    Integers of at least 0, and 0 for states without predecessors; of a product ``[S, Q, A]``.
-    """
+    """Largest natural number on the choices that lead to a state, ``[S, ...]``; 0 without any."""
     raise TypeError(_unknown(model))
 
 

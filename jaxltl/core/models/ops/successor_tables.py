@@ -34,12 +34,10 @@ _WIDEST = 6  # predecessor lists are at most this many times wider than successo
 
 @brief
 class SuccessorTable(NamedTuple):
-    """Successors of all state-action pairs, ``[A, K, N]``: an array ``[N]`` for each action and successor.
+    """Successors of all state-action pairs, ``[A, K, N]``: an array ``[N]`` for each action and successor."""
 
-    Separate arrays are contiguous in every layout of XLA, which lets it vectorise the loops over
-    states. Small tables are one array, for smaller programs.
-    """
-
+    # Separate arrays are contiguous in every layout of XLA, which lets it vectorise the loops over
+    # states. Small tables are one array, for smaller programs.
     successor: list[list[jax.Array]] | jax.Array
     probability: list[list[jax.Array]] | jax.Array
 

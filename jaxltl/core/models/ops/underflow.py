@@ -1,8 +1,7 @@
-"""Probabilities too small for a floating-point format: zero or subnormal after conversion.
+"""Probabilities that are zero or subnormal after conversion to a floating-point format.
 
-NumPy computes with subnormal numbers, and XLA flushes them to zero, so that a transition of such a
-probability would exist for one and not for the other. Constructors and conversions refuse them;
-inside ``jit``, where nothing raises, solvers end with the status ``INVALID``.
+NumPy computes with subnormal numbers and XLA flushes them to zero. Constructors and conversions
+refuse such probabilities; inside ``jit`` solvers end with the status ``INVALID``.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ def target_dtype(dtype: np.typing.DTypeLike) -> np.dtype:
 
 
 def underflows(probability: np.ndarray, dtype: np.typing.DTypeLike) -> np.ndarray | None:
-    """Mask of the positive entries that are zero or subnormal in a dtype; None if there is none."""
+    """Mask of the positive entries that are zero or subnormal in a dtype, or None."""
     tiny = jnp.finfo(dtype).tiny
     if probability.dtype == np.float64 and probability.size and probability.min() >= tiny:
         return None

@@ -1,7 +1,7 @@
 """Ranges of polynomials and rational functions over a box, with rounding errors.
 
-A multiaffine polynomial attains its extrema at corners of the box, which are enumerated; other
-polynomials are bounded term by term.
+Multiaffine polynomials attain extrema at corners of the box, which are enumerated; others are
+bounded term by term.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from jaxltl.core.models.parametric.rational import Polynomials, Rationals
 
 _EPS = float(np.finfo(np.float64).eps)
-_MOST = 10  # parameters of a polynomial whose 2^n corners are enumerated
+_MOST = 10  # parameters of a polynomial up to which its 2^n corners are enumerated
 
 
 class Ends(NamedTuple):

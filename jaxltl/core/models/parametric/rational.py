@@ -46,12 +46,7 @@ class Polynomials:
 
 
 def make_polynomials(polynomials: Sequence[Terms], num_parameters: int) -> Polynomials:
-    """Polynomials from exact coefficients by the powers of the D parameters; each is rounded once.
-
-    >>> p_plus_2pq2 = {(1, 0): Fraction(1), (1, 2): Fraction(2)}
-    >>> make_polynomials([p_plus_2pq2, {}], 2)(jnp.array([0.5, 3.0])).tolist()
-    [9.5, 0.0]
-    """
+    """Polynomials from exact coefficients by the powers of the D parameters; each is rounded once."""
     number: dict[tuple[int, ...], int] = {}
     owner, monomial, coefficient = [], [], []
     for i, terms in enumerate(polynomials):
@@ -87,7 +82,7 @@ def make_polynomials(polynomials: Sequence[Terms], num_parameters: int) -> Polyn
 @brief
 @struct.dataclass
 class Rationals:
-    """Quotients of polynomials; the denominator is None where all are constants."""
+    """Quotients of polynomials; no denominator if all are constants."""
 
     numerator: Polynomials
     denominator: Polynomials | None
