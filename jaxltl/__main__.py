@@ -44,8 +44,7 @@ _UNSAFE = ("__del__", "_xla_gc_callback")  # exceptions in these functions are l
 def _interrupt(number: int, frame: FrameType | None) -> None:
     """Raises KeyboardInterrupt, but not within an import or a finaliser.
 
-    Some imports catch all exceptions and leave half-initialised modules, and exceptions of
-    finalisers are lost; there the interrupt is delayed.
+    Some imports catch all exceptions, and exceptions of finalisers are lost.
     """
     while frame is not None:
         code = frame.f_code

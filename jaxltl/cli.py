@@ -221,7 +221,6 @@ def synthesize(
 
 
 def _place(out: Path | None, name: str) -> Path:
-    """The directory of results."""
     return out or Path("out") / name.replace(" ", "_")
 
 
@@ -542,7 +541,7 @@ _EXPERIMENTS = {
 @compiling(fast=False)
 @plain_errors
 def reproduce(what: str, out: Path | None, seeds: int | None, as_json: bool) -> None:
-    """Print published figures beside measured ones."""
+    """Print published and measured figures side by side."""
     _begin(f"reproducing {what}")
     experiment = importlib.import_module(f"jaxltl.reproduce.{what}")
     options = {} if seeds is None else {"seeds": seeds}

@@ -73,17 +73,12 @@ class Source:
 
 @dataclass(frozen=True)
 class Outputs:
-    """Files that the command writes: the policy, and the picture of the curve."""
-
     policy: Path | None = None
     curve: Path | None = None
 
 
 def read_evidence(log: Path, source: Source, option: str = "--{} ") -> Evidence:
-    """The transition counts of a log, with a given model or one of the log's frequencies.
-
-    `option` is the format of an option's name in errors.
-    """
+    """Transition counts of a log and their model; `option` formats option names in errors."""
     from jaxltl.io.log import read_labels, read_log
 
     labels, model, initial, terminal = source.labels, source.model, source.initial, source.terminal
@@ -127,11 +122,7 @@ def read_evidence(log: Path, source: Source, option: str = "--{} ") -> Evidence:
 def graph_of_options(
     graph: str | None, least_probability: float | None, confidence: float
 ) -> Graph | None:
-    """The assumption that two options name; a least probability takes a tenth of the failures.
-
-    Raises:
-      ValueError: both options are given, or the probability is out of range.
-    """
+    """Graph assumption by options; a least probability takes a tenth of the failures."""
     if least_probability is None:
         return graph  # type: ignore[return-value]
     if graph is not None:
@@ -158,21 +149,7 @@ def _named(model: SparseMDP, counts: np.ndarray, graph: Graph) -> Evidence:
 
 
 def certify(evidence: Evidence, query: Query) -> DataGuarantee:
-    """The guarantee of a log, by :func:`~jaxltl.core.values.evaluation.data_guarantee.learn_guarantee`.
-
-    Example:
-      >>> import tempfile
-      >>> path = Path(tempfile.mkdtemp()) / "log.csv"
-      >>> _ = path.write_text("state,action,next,count\\ndock,go,bay,900\\ndock,go,pit,100\\n")
-      >>> labels = path.with_name("labels.csv")
-      >>> _ = labels.write_text("state,label\\nbay,bay\\n")
-      >>> source = Source(labels=labels, initial=["dock"], terminal=["bay", "pit"],
-      ...                 graph="seen")
-      >>> seen = read_evidence(path, source)
-      >>> found = certify(seen, Query("F bay", 0.95, "anytime", "max"))
-      >>> 0.85 < found.bound < 0.9
-      True
-    """
+    """Guarantee of a log and a query, see :func:`jaxltl.learn_guarantee`."""
     return learn_guarantee(
         evidence.model,
         evidence.counts,
@@ -185,7 +162,6 @@ def certify(evidence: Evidence, query: Query) -> DataGuarantee:
 
 
 def text(evidence: Evidence, query: Query, found: DataGuarantee, seconds: float) -> str:
-    """The guarantee as text."""
     side, other = (">=", "more") if query.objective == "max" else ("<=", "less")
     lines = [
         f"P {side} {_outward(found.bound, side == '<=')} with confidence {found.confidence:g}",
@@ -225,7 +201,6 @@ def _state(evidence: Evidence, row: int) -> str:
 
 
 def entry(evidence: Evidence, query: Query, found: DataGuarantee, seconds: float) -> Record:
-    """The guarantee as a JSON object."""
     return {
         "formula": query.formula,
         "objective": query.objective,
@@ -245,7 +220,6 @@ def entry(evidence: Evidence, query: Query, found: DataGuarantee, seconds: float
 
 
 def sample_next(evidence: Evidence, found: DataGuarantee) -> list[Record]:
-    """:func:`most_helpful` as JSON objects."""
     return [
         {
             "state": _state(evidence, r),
@@ -310,7 +284,7 @@ def curve(evidence: Evidence, query: Query) -> tuple[list[int], list[float]]:
 
 
 def timed(evidence: Evidence, query: Query) -> tuple[DataGuarantee, float]:
-    """:func:`certify`, and how long it took."""
+    """Result of :func:`certify`, and its wall time."""
     begin = time.perf_counter()
     return certify(evidence, query), time.perf_counter() - begin
 
@@ -323,10 +297,7 @@ def certify_and_write(
     as_json: bool,
     say: Callable[[str], None],
 ) -> bool:
-    """Runs the command; returns whether some bound did not converge.
-
-    Opens its output files first, since they may not be writable.
-    """
+    """Runs the command, output files opened first; True if some bound did not converge."""
     from jaxltl.algos.common.checkpoint import atomic_write
 
     check_confidence(query.confidence)

@@ -43,10 +43,9 @@ def plain_errors(command: Callable[..., None]) -> Callable[..., None]:
 
 @contextlib.contextmanager
 def float64() -> Iterator[None]:
-    """Double precision for a command; the library itself leaves JAX's settings alone.
+    """Double precision in a command, set for all threads.
 
-    Set for all threads: `jax.enable_x64` is local to a thread, and callbacks run in others, where
-    JAX would convert their arrays to single precision.
+    `jax.enable_x64` is local to a thread, and callbacks in others would get single precision.
     """
     import jax
 

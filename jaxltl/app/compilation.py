@@ -1,7 +1,6 @@
 """Compilation settings of the command line: fast compilation, and a persistent cache.
 
-All are environment variables that are set before JAX is imported; variables that the user has set
-stay. The library itself leaves the settings of JAX and Python alone.
+All are environment variables, set before JAX is imported unless the user has set them.
 """
 
 from __future__ import annotations
@@ -31,14 +30,7 @@ def is_fresh() -> bool:
 
 
 def xla_flags(flags: Mapping[str, str], version: str | None = None) -> str:
-    """The value of ``XLA_FLAGS``; empty for versions of jaxlib without tested flags.
-
-    Example:
-      >>> xla_flags({"xla_backend_optimization_level": "1"}, "0.10.1")
-      '--xla_backend_optimization_level=1'
-      >>> xla_flags({"xla_backend_optimization_level": "1"}, "0.12.0")
-      ''
-    """
+    """Value of ``XLA_FLAGS``; empty for versions of jaxlib without tested flags."""
     version = version or metadata.version("jaxlib")
     first, end = _TESTED
     if not first <= tuple(int(part) for part in re.findall(r"\d+", version)[:2]) < end:
@@ -55,18 +47,14 @@ def compile_fast() -> None:
 def use_one_thread() -> None:
     """Makes NumPy solve linear systems in one thread.
 
-    Systems of some hundred rows gain nothing from more, and their spinning threads delay the
-    compiler and the processes that draw.
+    More threads do not help with some hundred rows, and delay the compiler by spinning.
     """
     if "numpy" not in sys.modules:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 def collect_rarely() -> None:
-    """Makes Python collect garbage less often, which saves a tenth of a short command's time.
-
-    Imports and traces make many objects that stay.
-    """
+    """Makes Python collect garbage less often, which saves a tenth of a short command's time."""
     gc.set_threshold(20_000, 50, 100)
 
 

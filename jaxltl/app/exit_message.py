@@ -1,7 +1,7 @@
 """Reports in one line why the JAX runtime ended a process.
 
-Runs as another program, since the runtime ends its process at once: the process's number is the
-argument, and its error output the standard input. Imports nothing of the package.
+Runs as another program, with the process's number as argument and its error output as standard
+input, since the runtime ends its process at once. Imports nothing of the package.
 """
 
 from __future__ import annotations
@@ -23,13 +23,7 @@ _WAIT = 1.0  # seconds for the rest of a message
 
 
 def explain(text: str, process: int) -> str:
-    """One line for the runtime's last message.
-
-    Example:
-      >>> explain("Terminating process ...: UNAVAILABLE: The following tasks are unhealthy "
-      ...      "(stopped sending heartbeats):\\n1\\nThe tasks have crashed.", 0)[:44]
-      'process 0 stops: process 1 does not respond.'
-    """
+    """One-line explanation of the last message of the runtime."""
     if (own := re.search(f"^{END}(.+)$", text, re.MULTILINE)) is not None:
         return own[1]
     silent = re.search(r"stopped sending heartbeats\):\n([\d,\s]+)", text)

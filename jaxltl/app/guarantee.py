@@ -58,7 +58,7 @@ def ask(
     asked: str | float,
     over: str = "mean",
 ) -> Guarantee:
-    """The guarantee that is asked for a product."""
+    """Guarantee for a product, as the task file requests it."""
     nothing = np.zeros(np.shape(shown.state), bool)
     if asked == "none":
         return Guarantee(asked, over, best, None, nothing, None)
@@ -184,23 +184,22 @@ Train = Callable[[float, Learned], Learned]
 
 @dataclass(frozen=True)
 class Search(Generic[Learned]):
-    """Search for the most likely policy whose certified probability is at least a given one."""
+    """Search for the most likely policy with at least a given certified probability."""
 
     model: Product  # the product
     guarantee: Guarantee  # the probability
     counts: np.ndarray  # float[S, Q, A], the number of demonstrations of each pair
-    # learns with a weight mu of the satisfaction probability (2.6), starting from what was learned
-    # before
+    # learns with a weight mu of the satisfaction probability (2.6), starting from the previous
+    # result
     train: Train[Learned]
-    policy_of: Callable[[Learned], np.ndarray]  # the policy float[S, Q, A] of what was learned
+    policy_of: Callable[[Learned], np.ndarray]  # the policy float[S, Q, A] of a result
 
     def at_least(self, free: Learned, inside: Callable[[], tuple[np.ndarray, Learned]]) -> Attempt:
-        """The most likely policy found.
+        """Most likely policy found, by a search for the least sufficient weight mu.
 
-        The least weight mu that attains the probability is searched for. Where the probability
-        jumps with the weight, or no weight attains it, policies of both sides are mixed; and the
-        likeliest policy is mixed with the likeliest one of optimal actions or, if that gives no
-        probability near the asked one, with the quickest of these.
+        Where the probability jumps with the weight, or no weight attains it, policies of both sides
+        are mixed; and the likeliest policy is mixed with the likeliest one of optimal actions or,
+        if that gives no probability near the requested one, with the quickest of these.
         """
         asked = float(self.guarantee.asked)
         first = self._attempt(self.policy_of(free), free, 0.0, 0.0)

@@ -46,11 +46,7 @@ def run_seeds(
     chunk: int | None = None,
     **options: Any,
 ) -> tuple[Chunks, dict[str, np.ndarray]]:
-    """Runs a learner from N seeds in parallel; returns its chunks and metrics ``[T, N]`` by name.
-
-    `chunk` is the number of steps between reports; `options` are other keywords of
-    :func:`~jaxltl.algos.common.chunks.run_in_chunks`.
-    """
+    """Runs a learner from N seeds in parallel; returns chunks and metrics ``[T, N]`` by name."""
     mesh = training.mesh if training.num_seeds > 1 else None
     first = (algorithm.init, training.seed, training.num_seeds, problem, hparams)
     if mesh is None:
@@ -114,7 +110,6 @@ def one_seed(learned: Any, i: int) -> Any:
 
 
 def postfix(figures: Mapping[str, np.ndarray]) -> dict[str, str]:
-    """Loss and gradient norm for the progress bar."""
     return {
         "loss": f"{figures['loss'].min():.4f}",
         "gradient": f"{figures['gradient_norm'].max():.1e}",
@@ -203,5 +198,4 @@ def over_seeds(count: int) -> str:
 
 
 def short_name(text: str, width: int = 44) -> str:
-    """A text, shortened to a width."""
     return text if len(text) <= width else text[: width - 1] + "…"

@@ -248,8 +248,6 @@ def _solved(
 
 @dataclass(frozen=True)
 class Setup:
-    """A task file's contents as the library's objects; see :func:`prepare`."""
-
     task: MlirlTask
     world: World
     model: Product
@@ -271,8 +269,6 @@ class Setup:
 
 @dataclass
 class Outcome:
-    """A finished job."""
-
     setup: Setup  # setup, learned: the task, and the results of learning
     learned: Learned
     chosen: int  # index of the kept seed, that of least loss
@@ -289,7 +285,6 @@ class Outcome:
 
 
 def prepare(task: MlirlTask, seed: int) -> Setup:
-    """The world, product and demonstrations of a task."""
     world = load_world(task)
     with errors_in(f"{task.path}: [task] "):
         model = product(world.mdp, task.formula, label_on=task.label_on)
@@ -310,7 +305,6 @@ def prepare(task: MlirlTask, seed: int) -> Setup:
 
 
 def describe(setup: Setup) -> str:
-    """Sizes of a setup, in one line."""
     lengths = np.asarray(setup.demonstrations.length)
     logged = setup.world.logged
     return (
@@ -352,7 +346,6 @@ def learn(setup: Setup, training: Training) -> Outcome:
 
 
 def summary(outcome: Outcome) -> Record:
-    """The outcome for ``result.json``; NaN becomes None."""
     setup, learned, i = outcome.setup, outcome.learned, outcome.chosen
     task, world, model = setup.task, setup.world, setup.model
     starts = np.flatnonzero(np.asarray(model.mdp.initial) > 0)

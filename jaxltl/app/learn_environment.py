@@ -1,7 +1,7 @@
 """Reinforcement learning in a simulated environment: the jobs of ppo, cce and cpo.
 
-With several seeds one is kept by episodes that are used for nothing else, so that its intervals,
-which are from fresh episodes, have no selection bias.
+The kept seed is selected by separate episodes, so that its intervals, which are from fresh
+episodes, have no selection bias.
 """
 
 from __future__ import annotations
@@ -59,8 +59,6 @@ _DRAWN = 4  # trajectories
 
 @dataclass(frozen=True)
 class Setup:
-    """A task file's contents as the library's objects; see :func:`prepare`."""
-
     task: EnvironmentTask  # the file
     automaton: Automaton  # of the formula
     environment: Environment  # the world with the task
@@ -71,8 +69,6 @@ class Setup:
 
 @dataclass
 class Outcome:
-    """A finished job."""
-
     setup: Setup  # the task
     states: PyTree  # of the learner, with a first axis of N seeds
     history: Mapping[str, np.ndarray]  # metrics [T, N] and step [T]
@@ -84,7 +80,6 @@ class Outcome:
 
 
 def prepare(task: EnvironmentTask, seed: int, world: Environment | None = None) -> Setup:
-    """The environment with the formula, and the learner."""
     del seed
     world = load_environment(task, world)
     with errors_in(f"{task.path}: [task] formula: "):
@@ -115,7 +110,6 @@ def prepare(task: EnvironmentTask, seed: int, world: Environment | None = None) 
 
 
 def describe(setup: Setup) -> str:
-    """Sizes of a setup, in one line."""
     task, made = setup.task, setup.environment
     actions = made.actions
     seen = sum(x.size for x in jax.tree.leaves(_shapes(setup)))
@@ -146,14 +140,13 @@ def _num_episodes(task: EnvironmentTask) -> int:
 
 
 def postfix(figures: Mapping[str, np.ndarray]) -> dict[str, str]:
-    """Two of the newest metrics for the progress bar."""
     names = ("episode_return", "objective", "reward", "cost")
     known = [n for n in names if n in figures and np.isfinite(figures[n]).any()]
     return {n: f"{np.nanmedian(figures[n]):.3g}" for n in known[:2]}
 
 
 def learn(setup: Setup, training: Training) -> Outcome:
-    """Learns with N seeds, keeps the best by episodes of its own, and evaluates all of them."""
+    """Learns with N seeds, selects the best by separate episodes, and evaluates all of them."""
     method, seed, num_seeds = setup.method, training.seed, training.num_seeds
     found, history = run_seeds(
         method.algorithm,
@@ -232,7 +225,6 @@ def _merit(setup: Setup, found: Evaluation) -> tuple[float, float, float]:
 
 
 def summary(outcome: Outcome) -> Record:
-    """The outcome for ``result.json``; NaN becomes None."""
     setup, history = outcome.setup, outcome.history
     task, made, kept = setup.task, setup.environment, outcome.evaluations[outcome.chosen]
     last = {name: history[name][-1, outcome.chosen] for name in _drawn(outcome)}
@@ -305,12 +297,10 @@ def _drawn(outcome: Outcome) -> list[str]:
 
 
 def task_pictures(setup: Setup) -> list[Picture]:
-    """The pictures that need no outcome."""
     return [automaton_picture(setup.automaton, "")]
 
 
 def pictures(outcome: Outcome) -> list[Picture]:
-    """The pictures of an outcome."""
     history, names = outcome.history, _drawn(outcome)
     found = [
         Picture(
@@ -326,7 +316,6 @@ def pictures(outcome: Outcome) -> list[Picture]:
 
 
 def live(outcome: Outcome) -> list[Curves]:
-    """The learning curves."""
     caption = "Metrics of each step of the learner" + over_seeds(len(outcome.evaluations))
     return [curves("learning", "Learning", caption, outcome.history, _drawn(outcome))]
 
@@ -361,11 +350,7 @@ def _pictured(outcome: Outcome) -> Picture | None:
 
 
 def save(out: Path, outcome: Outcome) -> None:
-    """Writes ``policy.npz`` and, if the world has positions, ``episode.html`` into a directory.
-
-    ``policy.npz`` has the arrays of the learner's state that determine the kept policy, and the
-    text and path of the task file; :func:`load_policy` reads it.
-    """
+    """Writes ``policy.npz`` and, if the world has positions, ``episode.html`` into a directory."""
     from jaxltl.plot.episodes import play_episode
 
     one = jax.tree.map(lambda x: x[outcome.chosen], outcome.states)
@@ -399,19 +384,17 @@ def load_policy(
     environment: Environment | None = None,
     task_file: str | Path | None = None,
 ) -> tuple[Environment, Agent]:
-    """A policy that ``jaxltl learn`` wrote, and its environment with the formula.
+    """Policy that ``jaxltl learn`` wrote, and its environment with the formula.
 
     The file has the text of its task file, but no code: the function that makes the environment is
-    imported and called as the task names it. Files of functions are looked up in the directory of
-    the task file, and in that of the policy. Load only policies that you trust, or give
-    `environment`: then nothing is imported.
+    imported, from a package or from the directory of the task file or of the policy. Load only
+    policies that you trust, or give `environment`: then nothing is imported.
 
     Raises:
       ValueError: a missing file, or one that is no policy of this task; an invalid task, or
         missing functions.
 
-    Example: ``environment, agent = load_policy("out/policy.npz")``, and ``evaluate(key, agent,
-    environment)`` repeats the evaluation.
+    Example: ``environment, agent = load_policy("out/policy.npz")``.
     """
     policy_file = Path(policy_file)
     with errors_in(f"{policy_file}: "):

@@ -1,8 +1,8 @@
 """Task-oriented deep inverse reinforcement learning: the job of ``method = "todirl"``.
 
 A reward network is learned in the training worlds (dissertation, chapter 3). Its soft-optimal
-policies are evaluated there and in test worlds, beside an expert that knows the formula and the
-uniform policy.
+policies are compared there and in test worlds with an expert for the formula and the uniform
+policy.
 """
 
 from __future__ import annotations
@@ -93,7 +93,6 @@ _EXPERT_DISCOUNT = 0.99  # largest default
 
 
 def prepare(task: TodirlTask, seed: int) -> Setup:
-    """The worlds, products and demonstrations of a task."""
     judge, memory = load_automata(task)
     shown = task.demonstrations
     require_cosafe(task.path, shown, judge)
@@ -169,10 +168,7 @@ def _narrowed(setup: Setup) -> Setup:
 def _experts(
     task: TodirlTask, scenes: list[Scene], judge: Automaton, *, soft: bool
 ) -> tuple[np.ndarray, list[Solution]]:
-    """Policies ``[W, S, Q, A]`` of the expert, and optimal solutions unless it is soft.
-
-    The expert is soft-optimal for a reward of the formula, or the quickest optimal policy.
-    """
+    """Policies ``[W, S, Q, A]`` of the expert, and optimal solutions unless it is soft-optimal."""
     if soft:
         shown = task.demonstrations
         discount = shown.discount
@@ -210,7 +206,6 @@ def _observations(scenes: list[Scene], model: Product) -> jax.Array:
 
 
 def describe(setup: Setup) -> str:
-    """Sizes of a setup, in one line."""
     pairs = sum(int(np.sum(shown.length)) for shown in setup.demonstrations)
     number = sum(len(shown.length) for shown in setup.demonstrations)
     tests = len(setup.worlds.scenes) - setup.num_training
@@ -359,10 +354,7 @@ def _plans(
     hparams: todirl.Hparams,
     count: int,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Plans of all actions and of optimal ones in the first worlds, and statuses.
-
-    Worlds are planned in one at a time, so that one program serves all.
-    """
+    """Plans of all and of optimal actions in the first worlds, one at a time, and statuses."""
     worlds, masks = setup.worlds, np.stack([x.allowed for x in setup.sure or ()])
     found, codes = [], np.zeros(count, np.int32)
     for mask in (np.asarray(jax.vmap(lambda model: model.available)(worlds.model)), masks):
@@ -420,10 +412,7 @@ def _within_each(judged: Product, policy: jax.Array) -> Performance:
 
 
 def _within(model: Product, policy: jax.Array) -> Performance:
-    """Step-bounded satisfaction probability of a policy ``[T, S, Q, A]``.
-
-    For a safety formula, the probability of no violation within T steps.
-    """
+    """Probability of satisfaction (for safety, of no violation) in T steps, of ``[T, S, Q, A]``."""
     done = model.final.astype(model.dtype)
     kept = jnp.minimum if model.automaton.is_safety else jnp.maximum
 

@@ -38,12 +38,10 @@ class Logged:
 
     @property
     def states(self) -> tuple[str, ...]:
-        """S names."""
         return self.evidence.states
 
     @property
     def num_samples(self) -> int:
-        """The number of logged transitions."""
         return int(self.evidence.counts.sum())
 
 
@@ -72,12 +70,10 @@ def load_logged(folder: Path, table: WorldTable) -> tuple[MDP, tuple[str, ...], 
 def guaranteed(logged: Logged, model: Product, formula: str, policy: Any) -> Record:
     """Guaranteed satisfaction probability of a policy, from the log alone.
 
-    The policy may depend on the log: with the given confidence all sets hold the true
-    distributions at once, so that the worst case over them bounds every policy.
-
-    Returns, for ``result.json``: ``guaranteed``, a lower bound of the policy's satisfaction
-    probability, ``best_guaranteed``, the greatest such bound of any policy, and ``optimistic``, an
-    upper bound for all policies; all with one ``confidence``, under the ``assumption``.
+    The policy may depend on the log: with the given confidence all sets hold the true distributions
+    at once, so that the worst case over them bounds every policy. In the result, ``guaranteed`` is
+    a lower bound for the policy, ``best_guaranteed`` the greatest one of any policy, and
+    ``optimistic`` an upper bound for all policies.
     """
     evidence = logged.evidence
     best = certify(evidence, Query(formula, logged.confidence, logged.method, "max"))

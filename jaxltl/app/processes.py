@@ -1,9 +1,8 @@
 """Devices and distributed processes of the command line.
 
 Processes of one run are connected by ``jax.distributed``, configured by the environment of Slurm
-or Open MPI, or by the options ``--coordinator``, ``--process`` and ``--processes``. All execute the
-same program, each on its own devices; only the first writes and prints. When one ends early the
-others end too, with a line that explains it.
+or Open MPI, or by options. All execute the same program on different devices; only the first
+writes and prints. When one ends early the others end too, with an explanation.
 """
 
 from __future__ import annotations
@@ -68,17 +67,7 @@ class Launch:
 
 
 def launched(options: DeviceOptions, environment: Mapping[str, str] = os.environ) -> Launch:
-    """The launch of this process by its options, else by a launcher's environment.
-
-    Without a mesh there is one process.
-
-    Example:
-      >>> launched(DeviceOptions(mesh=0, coordinator="10.0.0.1:1234", process=1, processes=2), {})
-      Launch(process=1, processes=2, coordinator='10.0.0.1:1234')
-      >>> launched(DeviceOptions(mesh=0), {"SLURM_NTASKS": "4", "SLURM_PROCID": "3", "SLURM_JOB_ID": "7",
-      ...                          "SLURM_STEP_NODELIST": "n[1-4]", "SLURM_LOCALID": "0"})
-      Launch(process=3, processes=4, coordinator=None)
-    """
+    """Launch of this process by its options, else by a launcher's environment."""
     names = {
         "--coordinator": options.coordinator,
         "--process": options.process,
@@ -381,8 +370,7 @@ def _leave() -> None:
 def _read_apart(launch: Launch) -> None:
     """Redirects the runtime's output to a process that explains an early end in one line.
 
-    The runtime ends a process at once when another has died, and writes to the file descriptors;
-    Python's streams get others. All processes but the first print nothing else.
+    The runtime writes to the file descriptors and ends at once; Python's streams get others.
     """
     out, err = os.dup(1), os.dup(2)
     source, sink = os.pipe()

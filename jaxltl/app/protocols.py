@@ -56,7 +56,7 @@ class Outcome(Protocol):
 
 @dataclass(frozen=True)
 class Training:
-    """How a job is run."""
+    """Settings of a run of a job."""
 
     seed: int  # seed, num_seeds: the first seed, and the number of seeds, which learn in parallel
     num_seeds: int

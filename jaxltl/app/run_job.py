@@ -44,7 +44,7 @@ class Request:
 
 @dataclass(frozen=True)
 class Console:
-    """Where a job draws, reports its progress, and runs."""
+    """Output of a job: drawing, progress reports, and the processes of the run."""
 
     artist: Artist
     say: Callable[[str], None]
@@ -79,7 +79,6 @@ def finished(out: Path, mark: str) -> Result | None:
 
 
 def make_directory(out: Path) -> Path:
-    """Makes a directory for results."""
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -30,7 +30,7 @@ from jaxltl.app.wording import Record
 Found = Answer | Achievable | ConstrainedOptimum | Pareto
 
 PROPERTY_FILES = (".props", ".prop", ".pctl")
-SHOWN = 10  # initial states whose values are printed
+SHOWN = 10  # initial states with printed values
 MAX_FILE = 2**24  # bytes of a property file
 
 SOLVED, NOT_CONVERGED, INVALID = 0, 1, 2  # exit statuses
@@ -63,12 +63,7 @@ class Result:
 
 
 def parse_queries(arguments: Sequence[str]) -> list[Query]:
-    """Parses arguments: properties, or names of property files; errors are kept by property.
-
-    Example:
-      >>> [one.parsed is not None for one in parse_queries(['P=? [ F "a" ]; P=? [ X "a" ]', 'Q=?'])]
-      [True, True, False]
-    """
+    """Parses arguments: properties, or names of property files; errors are kept by property."""
     found = []
     for argument in arguments:
         place, text = "", argument
@@ -115,16 +110,7 @@ def load(path: Path) -> SparseMDP | IntervalMDP:
 def solve(
     model: SparseMDP | IntervalMDP, queries: Sequence[Query], tolerance: float
 ) -> Iterator[Result]:
-    """Yields the result of each property in order; errors of one do not end the others.
-
-    Example:
-      >>> from jaxltl import make_sparse
-      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1],
-      ...                    initial=[1, 0, 0], label={"a": [1]})
-      >>> first, second = solve(coin, parse_queries(['P=? [ F "a" ]', 'P=? [ F "b" ]']), 1e-6)
-      >>> first.answer.value.tolist(), first.exit_status, "b" in second.error
-      ([0.5], 0, True)
-    """
+    """Yields the result of each property in order; errors of one do not end the others."""
     from scipy.sparse import csgraph, linalg  # noqa: F401 - not in the first property's time
 
     for one in queries:
@@ -144,7 +130,7 @@ def solve(
         yield Result(one, found, time.perf_counter() - begin, error, fault)
 
 
-# --- what is shown ----------------------------------------------------------------------------
+# --- output -----------------------------------------------------------------------------------
 
 
 def model_entry(model: SparseMDP | IntervalMDP, seconds: float) -> Record:
@@ -160,7 +146,6 @@ def model_entry(model: SparseMDP | IntervalMDP, seconds: float) -> Record:
 
 
 def result_entry(result: Result) -> Record:
-    """A result as its JSON object."""
     found = result.answer
     entry: Record = {
         "property": result.query.text,
@@ -225,7 +210,6 @@ def _number(x: Any) -> Any:
 
 
 def text(result: Result) -> str:
-    """A result as text."""
     lines = [result.query.text]
     parsed, found = result.query.parsed, result.answer
     if parsed is not None and parsed.name is not None:
@@ -335,11 +319,7 @@ def _strategy(given: SparseMDP | IntervalMDP, strategy: PropertyStrategy) -> Rec
 def _nature(
     host: HostMDP, successor: np.ndarray, probability: np.ndarray, still: np.ndarray | None = None
 ) -> list[list[dict[str, float]]]:
-    """Nature's distribution of each choice of each state, by the numbers of successors.
-
-    `successor` ``int[T]`` numbers the successors of entries; states where `still` ``bool[N]`` are
-    empty.
-    """
+    """Nature's distribution of each choice by numbers of successors; empty in states of `still`."""
     names, mass = list(map(str, successor.tolist())), probability.tolist()
     starts = host.entry_start.tolist()
     rows = [{names[t]: mass[t] for t in range(a, b) if mass[t]} for a, b in pairwise(starts)]

@@ -57,10 +57,7 @@ def on_mesh(model: SparseMDP | IntervalMDP, group: ProcessGroup) -> ShardedMDP:
 def read(
     path: Path, queries: Sequence[Query], group: ProcessGroup
 ) -> tuple[ShardedMDP, dict[str, str], Record]:
-    """Reads a model file over the devices; of a UMB file each process reads its own states.
-
-    If a property has built-in labels, each process reads the whole file.
-    """
+    """Reads a model over the devices: UMB by states, unless properties use built-in labels."""
     begin, mesh = time.perf_counter(), group.mesh
     assert mesh is not None
     formulas = [one.parsed.path for one in queries if one.parsed is not None]

@@ -60,8 +60,6 @@ class Play:
 
 @dataclass(frozen=True)
 class Synthesis:
-    """The result of a synthesis."""
-
     file: GameFile  # file, world, nodes: the game
     world: World
     nodes: Nodes
@@ -80,7 +78,6 @@ class Synthesis:
 
     @property
     def starts(self) -> np.ndarray:
-        """The initial states of the world."""
         return np.flatnonzero(np.asarray(self.world.game.initial) > 0)
 
 
@@ -163,10 +160,10 @@ def check_strategy(nodes: Nodes, strategy: Permissive, restricted: Restriction) 
 
 
 def lost_play(nodes: Nodes, winning: Winning, node: int, actions: tuple[str, ...]) -> Play:
-    """A play from a node of the losing region, until a violation or a repetition.
+    """Play from a node of the losing region, until a violation or a repetition.
 
-    The environment follows its strategy. The system delays a certain violation as long as
-    possible, else takes its first move; random moves are resolved against it.
+    The system delays a certain violation as long as possible, else takes its first move; random
+    moves are resolved against it.
     """
     game, objective = nodes.game, winning.objective
     failed = _failed(nodes, objective)
@@ -218,7 +215,7 @@ def _failed(nodes: Nodes, objective: Parity | GR1) -> np.ndarray:
 
 
 def demand(found: Synthesis) -> None:
-    """Raises ValueError if the file demands a strategy and there is none."""
+    """Raises ValueError if the file demands a strategy and the task is unrealizable."""
     if found.file.demanded and found.strategy is None:
         where = found.world.describe(int(found.starts[0]))
         raise ValueError(

@@ -25,10 +25,5 @@ def place(where: Result) -> str:
 
 
 def many(number: int, noun: str) -> str:
-    """A number with its noun, in the plural unless the number is 1.
-
-    Example:
-      >>> many(1, "state"), many(12, "state")
-      ('1 state', '12 states')
-    """
+    """Number with its noun, in the plural unless the number is 1."""
     return f"{number} {noun}{'' if number == 1 else 's'}"

@@ -32,13 +32,11 @@ def load_demonstrations(task: MlirlTask, world: World) -> Trajectories:
 
 
 def read_demonstrations(path: Path, world: World) -> Trajectories:
-    """The demonstrations of a file.
+    """Demonstrations of a JSON file, ``{"demonstrations": [...]}``.
 
-    The file is JSON, ``{"demonstrations": [...]}``. Each demonstration is an object with
-    ``"cells"``, ``[row, column]`` counted from 1 at the top left (or ``"states"``, numbers
-    counted from 0), and ``"actions"``, names or numbers from 0, one per cell. A final cell
-    without an action is where the demonstration ended. In the world of a log, states and actions
-    have the names of the log.
+    Each is an object with ``"cells"``, ``[row, column]`` counted from 1 at the top left (or
+    ``"states"``, numbers from 0), and ``"actions"``, names or numbers from 0, one per cell; a final
+    cell may have no action. In the world of a log, states and actions have the names of the log.
     """
     try:
         data = json.loads(read_bytes(path, "the demonstrations"))
@@ -160,10 +158,9 @@ def synthetic_demonstrations(
 ) -> tuple[Trajectories, int]:
     """Rollouts of the quickest optimal policy, in the world.
 
-    With a discount in ``[demonstrations]``, rollouts of a policy that maximises the discounted
-    reward of satisfying a co-safe formula. A rollout of a co-safe formula ends where it is
-    satisfied, and is dropped if that takes longer than the given length, or no step. Rollouts of
-    other formulas have the given length, and are dropped where the formula is violated.
+    With a discount, the policy maximises the discounted reward of a co-safe formula. Rollouts of a
+    co-safe formula end where it is satisfied, and are dropped if they need no step or too many;
+    others have the given length, and are dropped if they violate the formula.
     """
     # Import here: tasks with a file of demonstrations compile no rollout.
     from jaxltl.core.models.trajectories import rollout

@@ -1,8 +1,7 @@
 """Game files: a game, and the objective of the system player.
 
-A game file is TOML with the tables ``[game]`` and ``[task]``, and ``[strategy]`` where one is
-demanded; ``examples/robots.toml`` and ``examples/patrol.toml`` show the keys. Names of files are
-relative to it.
+A game file is TOML with the tables ``[game]``, ``[task]`` and optionally ``[strategy]``; see
+``examples/robots.toml`` and ``examples/patrol.toml``. Names of files are relative to it.
 """
 
 from __future__ import annotations
@@ -124,8 +123,6 @@ class StrategyTable(Table):
 
 @table
 class GameFileSchema(File):
-    """Schema of the file."""
-
     KIND: ClassVar[str] = "the game file"
     game: Key[GameTable, "The game."]
     task: Key[TaskTable, "The objective of the system."]
@@ -134,8 +131,6 @@ class GameFileSchema(File):
 
 @dataclass(frozen=True)
 class GameFile:
-    """A checked game file."""
-
     path: Path  # the file; `name` is its stem, unless the file gives one
     name: str
     game: GameTable  # game, task, strategy: the tables
@@ -172,7 +167,6 @@ class World:
         }
 
     def describe(self, state: int) -> str:
-        """:meth:`where` as text."""
         where = self.where(state)
         if self.places is None:
             return f"state {where['state']}"
@@ -182,7 +176,6 @@ class World:
 
 
 def read_game(path: str | Path) -> GameFile:
-    """Reads a game file."""
     path = Path(path)
     data, _ = schema.read_toml(path, GameFileSchema.KIND)
     file = schema.convert(path, GameFileSchema, data)
@@ -235,7 +228,7 @@ def _cell(given: tuple[int, int], key: str, cells: np.ndarray, wall: str) -> tup
 
 
 def load_objective(file: GameFile, world: World) -> tuple[Game, Parity | GR1]:
-    """The objective, and the game on whose states it is defined."""
+    """Objective, and the game with the states on which it is defined."""
     task, game = file.task, world.game
     with errors_in(f"{file.path}: [task] "):
         if task.formula is not None:

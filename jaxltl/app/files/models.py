@@ -34,7 +34,7 @@ class ReadModel:
 
 
 def read_padded(path: Path, more: Sequence[str] = ()) -> ReadModel:
-    """The model of a file, of a format of ``read_model`` or an ``.npz`` of padded arrays.
+    """Model of a file, of a format of ``read_model`` or an ``.npz`` of padded arrays.
 
     Actions have the names of choices if these are distinct in each state and at most 100, else
     the rank of a choice in its state.

@@ -151,14 +151,7 @@ def cell_kinds(world: WorldTable) -> list[str]:
 
 
 def cell_observations(cells: np.ndarray, kinds: Sequence[str], radius: int) -> np.ndarray:
-    """One-hot kinds of the cells around each cell: ``float[S, O]``.
-
-    ``O = (2 * radius + 1)**2 * (K + 1)`` for K kinds, and one for cells off the map.
-
-    Example:
-      >>> cell_observations(np.array([["a", "b"]]), ["a", "b"], 0).tolist()
-      [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
-    """
+    """One-hot kinds around each cell, ``[S, (2 radius + 1)^2 (K + 1)]``; the last is off the map."""
     number = np.full(tuple(n + 2 * radius for n in cells.shape), len(kinds))
     inside = tuple(slice(radius, radius + n) for n in cells.shape)
     number[inside] = np.searchsorted(sorted(kinds), cells)
@@ -207,11 +200,7 @@ def _generate(task: TodirlTask, number: int, first: Scene, judge: Automaton) -> 
 
 
 def load_automata(task: TodirlTask) -> tuple[Automaton, Automaton]:
-    """The automaton of the formula, and that of the learner's memory.
-
-    Both are over the labels of all kinds of cells, so that memory states mean the same in every
-    world.
-    """
+    """Automata of the formula and the memory, over the labels of all kinds of cells."""
     alphabet = _alphabet(task)
     judge = _translate(task, "[task] formula", task.formula, alphabet)
     if task.learner.horizon is not None and not judge.has_final_states:

@@ -1,7 +1,7 @@
 """Schemas of TOML files, and errors that name the file, table, key, value and fix.
 
-A table is a :class:`Table`: each key has a type, whose title says what a value must be, one line
-of help and a default. ``None`` stands for a key that a file leaves out.
+A table is a :class:`Table`: each key has a type with a title that states the requirement on
+values, one line of help and a default. ``None`` stands for a key that a file leaves out.
 """
 
 from __future__ import annotations
@@ -134,7 +134,6 @@ class File(Table):
 
 @contextlib.contextmanager
 def errors_in(place: str) -> Iterator[None]:
-    """Prepends a place to the message of a ValueError."""
     try:
         yield
     except ValueError as error:
@@ -171,7 +170,7 @@ def read_map(path: Path, given: str | Mapping[str, str]) -> str:
 
 
 def digest(path: Path, raw: bytes, names: Iterable[str]) -> str:
-    """SHA-256 of a file's bytes and of the files that it names, which lie beside it."""
+    """SHA-256 of the bytes of a file and of the files that it names, in its directory."""
     found = hashlib.sha256(raw)
     for name in names:
         found.update(read_bytes(path.parent / name, f"{path} names a file that"))
@@ -187,11 +186,7 @@ def off_map(shape: Sequence[int]) -> str:
 
 
 def convert(path: Path, schema: type[_Table], data: Mapping[str, Any], name: str = "") -> _Table:
-    """A table of a file as an instance of its schema.
-
-    Raises:
-      ValueError: a key is unknown, with the nearest known one; has a wrong value; or is missing.
-    """
+    """Table of a file as an instance of its schema; ValueError for invalid or missing keys."""
     where = f"{path}: [{name}]" if name else f"{path}:"
     fields = {key_name(field): field for field in _fields(schema)}
     for key in data:
@@ -283,7 +278,7 @@ def requirement(kind: Any) -> str:
 
 
 class KeyHelp(NamedTuple):
-    """A key of a table, for the reference: its name, what it must be, its default, its help."""
+    """Entry of a key in the reference: name, requirement on values, default, help."""
 
     name: str
     requirement: str

@@ -1,4 +1,4 @@
-"""Tables that task files of learning from demonstrations share, whatever the method."""
+"""Tables common to the task files of all methods of learning from demonstrations."""
 
 from __future__ import annotations
 
@@ -86,8 +86,6 @@ class OptimizerTable(Table):
 
 @table
 class TaskFile(File):
-    """Schema of a task file."""
-
     KIND: ClassVar[str] = "the task file"
     task: Key[TaskTable, "The formula, and the guarantee."]
 
@@ -108,7 +106,6 @@ class Task:
 def common_fields(
     path: Path, file: TaskFile, hidden: str | None, digest: str, label_on: str
 ) -> Record:
-    """The fields of :class:`Task`."""
     task = file.task
     guarantee = task.guarantee or ("none" if hidden else "best")
     where = f"{path}: [task]"
@@ -131,7 +128,7 @@ def common_fields(
 
 
 def method_of(path: str | Path) -> object:
-    """``[learner] method`` of a task file, unchecked; None if there is none."""
+    """``[learner] method`` of a task file, unchecked; None without one."""
     learner = read_toml(Path(path), TaskFile.KIND)[0].get("learner")
     return learner.get("method") if isinstance(learner, dict) else None
 

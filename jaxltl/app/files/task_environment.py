@@ -197,8 +197,6 @@ class EvaluationTable(Table):
 
 @table
 class EnvironmentFile(File):
-    """Schema of the file."""
-
     KIND: ClassVar[str] = "the task file"
     world: Key[WorldTable, "The environment."]
     task: Key[TaskTable, "The formula and its reward."]
@@ -211,8 +209,6 @@ class EnvironmentFile(File):
 
 @dataclass(frozen=True)
 class EnvironmentTask:
-    """A checked task file of a simulated world."""
-
     path: Path  # the file; `name` is its stem, unless the file gives one
     name: str
     world: WorldTable  # world, task, learner, evaluation: the tables
@@ -226,12 +222,10 @@ class EnvironmentTask:
 
     @property
     def formula(self) -> str:
-        """The formula of the task."""
         return self.task.formula
 
 
 def read_task(path: str | Path, raw: bytes | None = None) -> EnvironmentTask:
-    """Reads a task file of a simulated world."""
     path = Path(path)
     data, found = schema.read_toml(path, EnvironmentFile.KIND, raw)
     file = schema.convert(path, EnvironmentFile, data)

@@ -177,8 +177,6 @@ class LearnerTable(OptimizerTable):
 
 @table
 class MlirlFile(TaskFile):
-    """Schema of the file."""
-
     world: Key[WorldTable, "Where demonstrations were made."]
     demonstrations: Key[DemonstrationsTable, "What was demonstrated."]
     learner: Key[LearnerTable, "The learner and its hyperparameters."]
@@ -186,15 +184,12 @@ class MlirlFile(TaskFile):
 
 @dataclass(frozen=True, kw_only=True)
 class MlirlTask(Task):
-    """A checked task file; see :class:`~jaxltl.app.files.task.Task`."""
-
     world: WorldTable
     demonstrations: DemonstrationsTable
     learner: LearnerTable
 
 
 def read_task(path: str | Path) -> MlirlTask:
-    """Reads a task file."""
     path = Path(path)
     data, raw = schema.read_toml(path, MlirlFile.KIND)
     file = schema.convert(path, MlirlFile, data)

@@ -1,8 +1,8 @@
 """Task files with ``method = "todirl"``: rewards that transfer to other worlds.
 
-Table ``[test]`` has the worlds in which the learned reward is evaluated;
-``examples/in_order.toml`` shows every key. Worlds are coloured grids, as
-:func:`jaxltl.io.colored_world.read_world` reads them, or text maps with a legend.
+Table ``[test]`` has the worlds in which the learned reward is evaluated; see
+``examples/in_order.toml``. Worlds are coloured grids (:func:`jaxltl.io.colored_world.read_world`)
+or text maps with a legend.
 """
 
 from __future__ import annotations
@@ -170,8 +170,6 @@ class TestTable(Table):
 
 @table
 class TodirlFile(TaskFile):
-    """Schema of the file."""
-
     world: Key[WorldTable, "The training worlds."]
     demonstrations: Key[DemonstrationsTable, "What was demonstrated."]
     learner: Key[LearnerTable, "The learner and its hyperparameters."]
@@ -180,8 +178,6 @@ class TodirlFile(TaskFile):
 
 @dataclass(frozen=True, kw_only=True)
 class TodirlTask(Task):
-    """A checked task file; see :class:`~jaxltl.app.files.task.Task`."""
-
     world: WorldTable
     demonstrations: DemonstrationsTable
     learner: LearnerTable
@@ -189,7 +185,7 @@ class TodirlTask(Task):
 
     @property
     def memory(self) -> str:
-        """The formula whose automaton is the learner's memory."""
+        """Formula of the learner's memory automaton."""
         return self.learner.memory or self.formula
 
     @property
@@ -204,7 +200,6 @@ class TodirlTask(Task):
 
 
 def read_task(path: str | Path) -> TodirlTask:
-    """Reads a task file."""
     path = Path(path)
     data, raw = schema.read_toml(path, TodirlFile.KIND)
     file = schema.convert(path, TodirlFile, data)

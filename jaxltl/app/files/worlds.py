@@ -38,7 +38,6 @@ class World:
         return found if self.logged is None else {**found, "name": self.logged.states[state]}
 
     def place(self, state: int) -> str:
-        """:meth:`where` as text."""
         return place(self.where(state))
 
 

@@ -29,10 +29,7 @@ class Drawing:
 
 @dataclasses.dataclass(frozen=True)
 class Picture:
-    """A picture of a report: file name, title, drawing, and caption.
-
-    A page leaves it out if it has the interactive part with the name `live`.
-    """
+    """Picture of a report, left out of a page with the interactive part `live`."""
 
     name: str
     title: str
@@ -101,10 +98,7 @@ def artist(apart: bool) -> Iterator[Artist]:
 
 @contextlib.contextmanager
 def _interrupts_blocked() -> Iterator[None]:
-    """Blocks interrupts; a process that is started here inherits the block.
-
-    Else it would print a traceback, where the command itself prints one line.
-    """
+    """Blocks interrupts, also in processes started here, which would print a traceback."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return

@@ -213,11 +213,7 @@ def demonstrated_runs(model: Product, shown: Trajectories) -> list[Run]:
 
 
 def learned_runs(model: Product, policy: np.ndarray, seed: int, count: int = 3) -> list[Run]:
-    """Rollouts of a policy ``[S, Q, A]`` or ``[T, S, Q, A]`` until the formula is decided.
-
-    A rollout also ends after :data:`LONGEST_RUN` steps, and where the policy is not finite, as
-    after a solver that failed.
-    """
+    """Rollouts of a policy until the formula is decided, or :data:`LONGEST_RUN` steps."""
     rng, world = np.random.default_rng(seed), _dynamics(model)
     decided = verdicts(model.automaton) != Verdict.UNDECIDED
     initial = np.asarray(model.mdp.initial, float)

@@ -55,7 +55,6 @@ def certified(entry: Result) -> str:
 
 
 def number(value: float | None) -> str:
-    """A number to four digits."""
     if value is None:
         return "unknown"
     return f"{value:.1e}" if value != 0 and abs(value) < 1e-3 else f"{value:.4g}"

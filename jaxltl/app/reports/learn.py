@@ -33,7 +33,6 @@ def page(
     pictures: Sequence[tuple[Picture, bytes]],
     task_text: str,
 ) -> str:
-    """The HTML report of :func:`jaxltl.app.learn.summary`."""
     return render_page(
         "mlirl.html",
         result,
@@ -48,7 +47,6 @@ def page(
 
 
 def table(result: Result) -> str:
-    """The report as text for the terminal."""
     shown, training, seeds = result["demonstrations"], result["training"], result["seeds"]
     dropped = f", {shown['dropped']} unfinished dropped" if shown["dropped"] else ""
     kind = "synthetic demonstration" if shown["synthetic"] else "demonstration"
@@ -164,7 +162,6 @@ def meaning(name: str, weight: float | None) -> str:
 
 
 def remarks(result: Result) -> list[Remark]:
-    """The remarks at the beginning of the page."""
     data = result.get("data")
     first = [] if data is None else _log_remarks(data)
     return [*first, *(("warning", text) for text in warnings(result)), *_guarantees(result)]
@@ -272,7 +269,7 @@ def _nearly_best(lower: float | None, best: Result) -> Remark:
 
 
 def _attained(guarantee: Result) -> str:
-    """How an asked probability was attained."""
+    """Sentence on the certified and the requested probability."""
     over = "on average" if guarantee["over"] == "mean" else "from the worst initial state"
     text = (
         f"Asked for {probability(guarantee['asked'])} {over}, certified "
@@ -292,7 +289,6 @@ def _attained(guarantee: Result) -> str:
 
 
 def warnings(result: Result) -> list[str]:
-    """Reasons to distrust the policy or the figures, as sentences."""
     found = []
     learned, best = (result[k]["mean"]["value"] for k in ("satisfaction", "best_achievable"))
     if learned < (1 - _SHORTFALL) * best:

@@ -19,7 +19,6 @@ def page(
     pictures: Sequence[tuple[Picture, bytes]],
     task_text: str,
 ) -> str:
-    """The HTML report of :func:`jaxltl.app.learn_environment.summary`."""
     visits = [] if _is_finite(result) else ["visits"]
     return render_page(
         "environment.html",
@@ -38,7 +37,6 @@ def page(
 
 
 def table(result: Result) -> str:
-    """The report as text for the terminal."""
     lines = [f"{result['task']}: {_sentence(result)}", "", _evaluation(result)]
     lines += [
         f"  {name:18} {value:>10}  {interval:24} {method}"
@@ -132,7 +130,6 @@ def _seeds(result: Result) -> list[tuple[str, ...]]:
 
 
 def remarks(result: Result) -> list[Remark]:
-    """The remarks at the beginning of the page."""
     found, training = result["evaluation"], result["training"]
     remarks: list[Remark] = [("note", result["trivial"])] if result["trivial"] else []
     if found["threshold"] is not None:

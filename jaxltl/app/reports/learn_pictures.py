@@ -31,7 +31,6 @@ LIVE = "policy"  # name of the interactive part
 
 
 def task_pictures(setup: Any) -> list[Picture]:
-    """The pictures that need no outcome."""
     return [automaton_picture(setup.model.automaton, LIVE)]
 
 
@@ -39,7 +38,6 @@ _FIGURES = ("loss", "neg_log_likelihood", "satisfaction", "gradient_norm")
 
 
 def pictures(outcome: Any) -> list[Picture]:
-    """The pictures of an outcome."""
     cells, history = outcome.setup.world.cells, outcome.learned.history
     return [
         *([] if cells is None else _maps(outcome, cells)),
@@ -59,7 +57,6 @@ def pictures(outcome: Any) -> list[Picture]:
 
 
 def live(outcome: Any) -> list[Explorer | TooLarge | Curves]:
-    """The interactive parts of the report."""
     setup, model = outcome.setup, outcome.setup.model
     policy = np.asarray(outcome.learned.policy[outcome.chosen])
     caption = _CURVES + over_seeds(len(outcome.learned.loss))

@@ -35,7 +35,6 @@ def page(
     pictures: Sequence[tuple[Picture, bytes]],
     task_text: str,
 ) -> str:
-    """The HTML report of :func:`jaxltl.app.learn_todirl.summary`."""
     titles = (("test", "Test worlds"), ("training", "Training worlds"))
     return render_page(
         "todirl.html",
@@ -63,7 +62,6 @@ def _mean_value(world: Result) -> float:
 
 
 def table(result: Result) -> str:
-    """The report as text for the terminal."""
     learning, seeds = result["learning"], result["seeds"]
     lines = [
         f"{result['task']}: {_sentence(result)}",
@@ -186,7 +184,6 @@ def _evidence(result: Result) -> list[tuple[str, ...]]:
 
 
 def remarks(result: Result) -> list[Remark]:
-    """The remarks at the beginning of the page."""
     guarantee = result["guarantee"]
     found: list[Remark] = [("warning", text) for text in warnings(result)]
     if guarantee["asked"] == "best":
@@ -208,7 +205,7 @@ def remarks(result: Result) -> list[Remark]:
 
 
 def _attained(result: Result) -> str:
-    """How an asked probability was attained."""
+    """Sentence on the certified and the requested probability."""
     asked = result["guarantee"]
     over = (
         "on average over initial states"
@@ -242,7 +239,6 @@ def _attained(result: Result) -> str:
 
 
 def warnings(result: Result) -> list[str]:
-    """Reasons to distrust the policy or the figures, as sentences."""
     found = [text for kind, about in _groups(result) for text in _world_warnings(kind, about)]
     learning = result["learning"]
     if learning["solver"] != "CONVERGED":

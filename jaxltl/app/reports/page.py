@@ -22,7 +22,7 @@ from jaxltl.app.wording import Record, Result, many, place, where
 
 Part = tuple[Explorer | Curves | TooLarge, Mapping[str, str]]  # with its drawings as SVG
 
-_NARROW = 24  # columns of the widest map that is shown beside the automaton
+_NARROW = 24  # columns of the widest map that is shown next to the automaton
 _CURVE_ROWS = 12  # of a table of learning curves
 _ARROWS = {"up": "↑", "down": "↓", "left": "←", "right": "→", "stay": "•"}
 _MARKS = {

@@ -135,7 +135,6 @@ def table(result: Result, found: Synthesis) -> str:
 
 
 def verdict(result: Result) -> str:
-    """The result of the independent check."""
     if is_confirmed(result):
         what = "both players' strategies" + (
             " and the permissive strategy" if result["strategy"] else ""
@@ -209,9 +208,7 @@ def save(out: Path, found: Synthesis) -> None:
     the restricted game of N states: ``successor``, ``probability``, ``initial``, ``system``,
     ``label``, ``propositions`` and ``actions`` as in a game file's model; the allowed moves
     ``mask [N, A]``; ``world_state``, ``automaton_state`` and ``memory [N]`` of each state; and the
-    winning region of the world, ``region [S]``. To follow the strategy, keep a state of the
-    restricted game, take an allowed move, and move to the successor with the observed
-    ``world_state``.
+    winning region of the world, ``region [S]``.
 
     ``counter_strategy.npz``, if the environment wins from some: ``counter_action [N]``, or for
     GR(1) ``[N, M]`` with ``assumptions [M, N]``, which advance its memory; and its game of N

@@ -35,7 +35,6 @@ def page(
     pictures: Iterable[tuple[str, bytes]],
     file_text: str,
 ) -> str:
-    """The HTML report."""
     part = play_explorer(found)
     drawn = {key: draw(each).decode() for key, each in part.drawings.items()}
     shown = [
@@ -74,7 +73,6 @@ def _tiles(result: Result) -> list[tuple[str, str]]:
 
 
 def remarks(result: Result) -> list[Remark]:
-    """The remarks at the beginning of the page."""
     kinds = {"realizable": "good", "partly realizable": "note", "unrealizable": "warning"}
     return [
         (kinds[result["outcome"]], f"The task is {result['outcome']}."),

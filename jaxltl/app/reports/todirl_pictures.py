@@ -42,7 +42,6 @@ _FIGURES = ("per_pair", "held_out", "gradient_norm")
 
 
 def task_pictures(setup: Setup) -> list[Picture]:
-    """The pictures that need no outcome."""
     same = setup.memory is setup.judge
     found = [automaton_picture(setup.judge, "training-1" if same else "")]
     if not same:
@@ -59,7 +58,6 @@ def task_pictures(setup: Setup) -> list[Picture]:
 
 
 def pictures(outcome: Outcome) -> list[Picture]:
-    """The pictures of an outcome."""
     history = outcome.learned.history
     found = [
         Picture(
@@ -76,7 +74,6 @@ def pictures(outcome: Outcome) -> list[Picture]:
 
 
 def live(outcome: Outcome) -> list[Explorer | TooLarge | Curves]:
-    """The interactive parts of the report."""
     found: list[Explorer | TooLarge | Curves] = [
         _look_into(outcome, one) for one in _drawn_worlds(outcome)
     ]

@@ -1,9 +1,9 @@
-"""Attains an asked satisfaction probability in every world of a todirl job.
+"""Attains a requested satisfaction probability in every world of a todirl job.
 
-In each world the policy is the plan of the learned reward, mixed with the least share of optimal
-actions for which the probability is certified; the same holds in new worlds. Among the rewards
-that are learned with increasing weights of the satisfaction probability, the one is kept for which
-the demonstrations are then most likely.
+In each world, also in new ones, the policy is the plan of the learned reward, mixed with the least
+share of optimal actions for which the probability is certified. Among the rewards learned with
+increasing weights of the satisfaction probability, the one with the most likely demonstrations is
+kept.
 """
 
 from __future__ import annotations

@@ -37,7 +37,6 @@ class Worlds:
 
     @property
     def names(self) -> list[str]:
-        """Names of the worlds."""
         return [scene.name for scene in self.scenes]
 
     def part(self, chosen: slice) -> Worlds:
@@ -53,8 +52,6 @@ def part_of(tree: TreeT, chosen: int | slice | EllipsisType) -> TreeT:
 
 @dataclass(frozen=True)
 class Setup:
-    """A task file's contents as the library's objects; see :func:`prepare`."""
-
     task: TodirlTask  # the file
     judge: Automaton  # judge, memory: the automata of the formula and of the learner's memory
     memory: Automaton
@@ -77,12 +74,10 @@ class Setup:
 
     @property
     def is_probability(self) -> bool:
-        """True if the guarantee is a probability."""
         return not isinstance(self.asked, str)
 
     @property
     def training(self) -> Worlds:
-        """The training worlds."""
         return self.worlds.part(slice(self.num_training))
 
     @property
@@ -128,12 +123,10 @@ class Judged:
 
 @dataclass
 class Outcome:
-    """A finished job."""
-
     setup: Setup  # setup, learned: the task, and the results of learning
     learned: Learned
     chosen: int  # index of the kept seed, by held-out likelihood or loss
-    training: Judged  # training, test: evaluations; test is None without test worlds
+    training: Judged  # training, test: evaluations (test: None without test worlds)
     test: Judged | None
     seed: int  # the first seed
     seconds: float = 0.0  # wall time

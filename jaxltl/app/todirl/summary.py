@@ -15,7 +15,6 @@ from jaxltl.app.wording import Record
 
 
 def summary(outcome: Outcome) -> Record:
-    """The outcome for ``result.json``; NaN becomes None."""
     setup, learned, i = outcome.setup, outcome.learned, outcome.chosen
     task, history, count = setup.task, learned.history, setup.num_training
     infeasible = np.array(
