@@ -16,25 +16,17 @@ _SLICE, _ENTRY, _REDUCTION, _SPAN, _REDUCED = 1000, 0.25, 2000, 20, 0.15
 
 
 class Choices(NamedTuple):
-    """The choices of N states, states with the most choices first.
+    """The choices of N states, states with the most choices first, for reductions over slices.
 
     The first choices of all states come first, in order, then the second ones of states that have
-    two, and so on, so that an optimum goes over slices. Where few states have further choices,
-    these are listed state by state, for one reduction.
-
-    Attributes:
-      states: ``int[N]``, the number of each state in the original order.
-      order: ``int[R]``, the number of each choice in the original order, state by state.
-      owner: ``int[R]``, the state of each choice, among `states`.
-      starts: where the first, second, ... choices begin, and where the last of these end.
-      further: ``int[W]``, where after that the further choices of the first W states begin.
+    two, and so on. Where few states have further choices, these are listed state by state.
     """
 
-    states: Integers
-    order: Integers
-    owner: Integers
-    starts: list[int]
-    further: Integers
+    states: Integers  # int[N], the number of each state in the original order
+    order: Integers  # int[R], each choice's original number, state by state
+    owner: Integers  # int[R], the state of each choice, among `states`
+    starts: list[int]  # starts of the first, second, ... choices, and the end
+    further: Integers  # int[W], starts of the further choices of W states
 
     @property
     def is_chain(self) -> bool:
@@ -67,14 +59,7 @@ class Choices(NamedTuple):
 
 
 def choices_of(count: Integers) -> Choices:
-    """The order of choices, from the number of choices of each state ``int[N]``, at least one.
-
-    >>> choices = choices_of(np.array([1, 2]))
-    >>> choices.states.tolist(), choices.order.tolist()
-    ([1, 0], [1, 0, 2])
-    >>> choices.best(np.array([5.0, 7.0, 6.0]), np.maximum).tolist()
-    [6.0, 7.0]
-    """
+    """The order of choices, from the number of choices of each state ``int[N]``, at least one."""
     states = np.argsort(-count, kind="stable")
     base, sizes = (count.cumsum() - count)[states], count[states]
     # How many states have a choice of each rank, and up to which rank slices are faster.

@@ -16,23 +16,14 @@ _WORTH = 8  # a model is contracted if more than one in that many of its states 
 
 @dataclass(frozen=True)
 class Contraction:
-    """A model in which some states stand for several.
+    """A smaller model with one node for several states."""
 
-    Attributes:
-      mdp: the smaller model of N nodes; its rows may be unsorted and repeat successors.
-      node: ``int[S]``, the node that stands for a state.
-      row: ``int[R']``, the model's row of each row of the smaller model.
-      earned: ``float64[S]``, the reward between a state and its node.
-      cost: ``float64[R']``, the expected reward of a row up to the next node.
-      depth: the number of sums behind one of these numbers.
-    """
-
-    mdp: HostMDP
-    node: Integers
-    row: Integers
-    earned: Floats
-    cost: Floats
-    depth: int = 0
+    mdp: HostMDP  # of N nodes; its rows may be unsorted and repeat successors
+    node: Integers  # int[S], the node of each state
+    row: Integers  # int[R'], the model's row of each row of the smaller model
+    earned: Floats  # float64[S], the reward between a state and its node
+    cost: Floats  # float64[R'], the expected reward of a row up to the next node
+    depth: int = 0  # the number of sums behind one of these numbers
 
     def region(self, states: Booleans) -> Booleans:
         """The nodes of some states, ``bool[N]``."""
@@ -135,10 +126,7 @@ def quotient(mdp: HostMDP, component: Integers, inside: Booleans, cost: Floats) 
 def with_stops(
     mdp: HostMDP, row: Integers, node: Integers, stops: tuple[Integers, Integers], num_nodes: int
 ) -> tuple[HostMDP, Integers]:
-    """Some rows on the nodes of their states, and then rows that lead from one node to another.
-
-    Returns the place of each row in that list, too.
-    """
+    """Some rows on the nodes of their states, then rows between nodes; and the place of each row."""
     owner = np.concatenate([node[mdp.state[row]], stops[0]])
     width = np.concatenate([np.diff(mdp.entry_start)[row], np.ones(stops[0].size, np.int64)])
     entry = concatenated_ranges(mdp.entry_start[row], width[: row.size])

@@ -21,17 +21,13 @@ class HostGraph:
     """Successors of the choices of a Markov decision process, without padding.
 
     The choices of state s are the rows ``row_start[s]`` to ``row_start[s + 1] - 1``, and the
-    successors of row r the entries ``entry_start[r]`` to ``entry_start[r + 1] - 1``.
-
-    Attributes:
-      row_start: ``int32[S + 1]``, strictly ascending: every state has a choice.
-      entry_start: ``int[R + 1]``; an unavailable action of a padded model is a row without entries.
-      successor: ``int32[T]``.
+    successors of row r the entries ``entry_start[r]`` to ``entry_start[r + 1] - 1``. An unavailable
+    action of a padded model is a row without entries.
     """
 
-    row_start: Integers
-    entry_start: Integers
-    successor: Integers
+    row_start: Integers  # int32[S + 1], strictly ascending: every state has a choice
+    entry_start: Integers  # int[R + 1]
+    successor: Integers  # int32[T]
 
     @property
     def num_states(self) -> int:
@@ -100,14 +96,10 @@ class HostGraph:
 class HostMDP(HostGraph):
     """Transitions of a Markov decision process: a graph without empty rows, and probabilities.
 
-    Attributes:
-      row_start: ``int32[S + 1]``, strictly ascending.
-      entry_start: ``int[R + 1]``, strictly ascending.
-      successor: ``int32[T]``, ascending and without repetition within a row.
-      probability: ``float64[T]``, positive; a row sums to one up to rounding.
+    Successors are ascending and without repetition within a row.
     """
 
-    probability: Floats
+    probability: Floats  # float64[T], positive; a row sums to one up to rounding
 
     @cached_property
     def matrix(self) -> Any:

@@ -21,29 +21,17 @@ _MAX_EDGES = 2**27  # of the whole product, that are written down for the search
 
 @brief
 class SparseProduct(NamedTuple):
-    """Reachable states of a product, ordered by model state first and automaton state next.
+    """Reachable states of a product, ordered by model state first and automaton state next."""
 
-    Attributes:
-      host: the product MDP, N states.
-      base_state: ``int32[N]``, the model's state.
-      memory: ``int32[N]``, the automaton's state.
-      base_row: ``int32[R']``, the model's row of each row; of an absorbing state, its first.
-      start: ``int64[I]``, the product state of each start.
-      still: ``bool[N]``, states whose verdict is known, made absorbing.
-    """
-
-    host: HostMDP
-    base_state: Integers
-    memory: Integers
-    base_row: Integers
-    start: Integers
-    still: Booleans
+    host: HostMDP  # the product MDP, N states
+    base_state: Integers  # int32[N], the model's state
+    memory: Integers  # int32[N], the automaton's state
+    base_row: Integers  # int32[R'], the model's row of each row; its first where absorbing
+    start: Integers  # int64[I], the product state of each start
+    still: Booleans  # bool[N], states with a known verdict, made absorbing
 
     def entry_letter(self, letter: Integers, on_entry: bool) -> Integers:
-        """The letter that each entry reads, ``int[T']``, from the letters of the model's states.
-
-        It is the letter of the state that is entered if `on_entry`, else of the state that is left.
-        """
+        """Letter of each entry ``int[T']``: of the entered state if `on_entry`, else of the left."""
         if on_entry:
             return letter[self.base_state[self.host.successor]]
         return letter[self.base_state[self.host.state[self.host.row]]]
@@ -63,16 +51,6 @@ def sparse_product(
 
     A step leads from ``(s, q)`` to ``(t, delta[q, letter[t]])``, or to ``(t, delta[q, letter[s]])``
     where letters are read on exit.
-
-    Raises:
-      ValueError: there are more than 2^31 pairs.
-
-    Example:
-      >>> from jaxltl import make_sparse
-      >>> ring = make_sparse(None, [0, 1, 2], [1, 0], [1.0, 1.0]).host
-      >>> found = sparse_product(ring, np.array([[0, 1], [1, 1]]), np.array([0, 1]), [0], [0])
-      >>> found.base_state.tolist(), found.memory.tolist(), found.host.successor.tolist()
-      ([0, 0, 1], [0, 1, 1], [2, 2, 1])
     """
     num_memory = delta.shape[0]
     if host.num_states * num_memory > MAX_PAIRS:

@@ -22,17 +22,11 @@ _FEW = 16  # columns up to which reducing them one by one beats a reduction over
 
 @dataclass(frozen=True)
 class Rows:
-    """Support of a transition function: row r has successors ``successor[entry_start[r] : ...]``.
+    """Support of a transition function: row r has successors ``successor[entry_start[r] : ...]``."""
 
-    Attributes:
-      entry_start: ``int[R + 1]``.
-      successor: ``int32[T]``, by row.
-      num_states: S, above every successor.
-    """
-
-    entry_start: Integers
-    successor: Integers
-    num_states: int
+    entry_start: Integers  # int[R + 1]
+    successor: Integers  # int32[T], by row
+    num_states: int  # S, above every successor
 
     @property
     def num_rows(self) -> int:

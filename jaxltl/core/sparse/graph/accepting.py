@@ -12,30 +12,17 @@ from jaxltl.core.sparse.mdp import HostMDP
 
 
 class AcceptingRegion(NamedTuple):
-    """States of end components in which the least recurring priority can be even.
+    """States of end components in which the least recurring priority can be even."""
 
-    Attributes:
-      region: ``bool[S]``.
-      row: ``int32[S]``, in the region a policy by which almost every run is accepted; elsewhere a
-        state's first row.
-    """
-
-    region: Booleans
-    row: Integers
+    region: Booleans  # bool[S]
+    row: Integers  # int32[S], an almost surely accepted policy; elsewhere the first row
 
 
 def accepting_region(mdp: HostMDP, priority: Integers) -> AcceptingRegion:
     """Accepting end components under the min-even parity condition.
 
     For each even p: the maximal end components of the rows that read no priority below p, with a
-    row that reads p (Baier and Katoen 2008, section 10.6.4, for Rabin pairs). The largest
-    probability of acceptance is that of reaching them.
-
-    Example:
-      >>> from jaxltl import make_sparse
-      >>> ring = make_sparse(None, [0, 1, 2, 3], [1, 0, 2], [1.0, 1.0, 1.0]).host
-      >>> accepting_region(ring, np.array([1, 0, 1])).region.tolist()
-      [True, True, False]
+    row that reads p (Baier and Katoen 2008, section 10.6.4, for Rabin pairs).
     """
     least = np.minimum.reduceat(priority, mdp.entry_start[:-1])
     region = np.zeros(mdp.num_states, bool)

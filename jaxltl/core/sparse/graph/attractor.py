@@ -15,18 +15,11 @@ _MANY = 64  # transitions into one of them from which it does not
 
 
 class Attraction(NamedTuple):
-    """An attractor.
+    """An attractor."""
 
-    Attributes:
-      region: ``bool[S]``.
-      row: ``int32[S]``: where one row suffices, the first that led nearer when the state joined;
-        elsewhere the first of the state.
-      rank: ``int32[S]``, the round in which a state joined; 0 in the goal.
-    """
-
-    region: Booleans
-    row: Integers
-    rank: Integers
+    region: Booleans  # bool[S]
+    row: Integers  # int32[S], the first row nearer if one suffices, else the first row
+    rank: Integers  # int32[S], the round in which a state joined; 0 in the goal
 
 
 def attracted(
@@ -79,23 +72,14 @@ def attracted(
 
 
 class _Search(NamedTuple):
-    """A growing region.
-
-    Attributes:
-      waiting: ``bool[R]``, rows that count and do not lead to the region yet.
-      lacking: ``int32[R]``, entries outside of the region if all must be inside, else None.
-      left: ``int32[S]``, waiting rows of a state.
-      open: ``bool[S]``, states that may still join.
-      rule: ``bool[S]``, True where one row suffices.
-      region, row, rank: as of :class:`Attraction`.
-    """
+    """A growing region; region, row and rank as of :class:`Attraction`."""
 
     graph: HostGraph
-    waiting: Booleans
-    lacking: Integers | None
-    left: Integers
-    open: Booleans
-    rule: Booleans
+    waiting: Booleans  # bool[R], rows that count and do not lead to the region yet
+    lacking: Integers | None  # int32[R], entries outside if all must be inside, else None
+    left: Integers  # int32[S], waiting rows of a state
+    open: Booleans  # bool[S], states that may still join
+    rule: Booleans  # bool[S], True where one row suffices
     region: Booleans
     row: Integers
     rank: Integers

@@ -1,8 +1,4 @@
-"""Qualitative reachability in large products, with a bit set of memory states for each world state.
-
-One bit operation treats all memory states: the predecessors of a set are unions of words. Sweeps go
-through blocks of states, and each block uses the results of those before it.
-"""
+"""Qualitative reachability in large products: a bit set of memory states for each world state."""
 
 from __future__ import annotations
 
@@ -23,22 +19,13 @@ Words = NDArray[np.unsignedinteger[Any]]
 
 @dataclass(frozen=True)
 class BitGraph:
-    """The graph of a product that reads labels of states that are entered.
+    """The graph of a product that reads labels of states that are entered."""
 
-    Attributes:
-      columns: for each action and successor ``int32[S]``; S in padding.
-      permitted: for each action the memory states in which it is available, ``word[S]``.
-      after: ``word[L * 256]`` for each byte of a word: the memory states from which a letter leads
-        to one of its memory states.
-      letter: ``int64[S]``, 256 times the letter of each state.
-      full: the word of all memory states.
-    """
-
-    columns: list[list[Integers]]
-    permitted: list[Words]
-    after: list[Words]
-    letter: Integers
-    full: Any
+    columns: list[list[Integers]]  # for each action and successor int[S]; S in padding
+    permitted: list[Words]  # for each action word[S], the memory states in which it is available
+    after: list[Words]  # per byte word[L * 256], the predecessors of its memory states by letter
+    letter: Integers  # int64[S], 256 times the letter of each state
+    full: Any  # the word of all memory states
 
     @property
     def num_states(self) -> int:
@@ -149,11 +136,7 @@ def _first(action: Integers, words: Words, kept: list[Words]) -> None:
 
 
 def pack(mask: Booleans) -> Words:
-    """Words of bits, the q-th of which is ``mask[..., q]``.
-
-    >>> pack(np.array([[True, False, True]])).tolist()
-    [5]
-    """
+    """Words of bits, the q-th of which is ``mask[..., q]``."""
     size = mask.shape[-1]
     kind: Any = next(
         k for k in (np.uint8, np.uint16, np.uint32, np.uint64) if np.iinfo(k).bits >= size
@@ -172,10 +155,7 @@ def bit_graph(
     letter: Integers,
     allowed: Booleans | None = None,
 ) -> BitGraph:
-    """The graph of a padded world and an automaton with at most 64 states.
-
-    `used` is ``bool[S, A, K]``, `allowed` a mask ``bool[S, Q, A]`` or None.
-    """
+    """The graph of a padded world (`used` is ``bool[S, A, K]``) and at most 64 automaton states."""
     num_states, num_actions, width = successor.shape
     num_memory = delta.shape[0]
     every = used.all()
@@ -206,18 +186,12 @@ def bit_graph(
 
 
 class BitSets(NamedTuple):
-    """Prob0 and prob1 states of an optimum.
+    """Prob0 and prob1 states of an optimum."""
 
-    Attributes:
-      one, zero: ``word[S]``, where the probability is 1 and where it is 0.
-      stays: ``word[S]``, the other pairs that can be kept for ever: candidates of end components.
-      action: ``int32[S, Q]``, a policy that attains 0 and 1.
-    """
-
-    one: Words
-    zero: Words
-    stays: Words
-    action: Integers
+    one: Words  # word[S], probability 1
+    zero: Words  # word[S], probability 0
+    stays: Words  # word[S], the other pairs that can be kept for ever
+    action: Integers  # int32[S, Q], a policy that attains 0 and 1
 
 
 def decided(graph: BitGraph, target: Words, num_memory: int, *, maximize: bool) -> BitSets | None:

@@ -14,11 +14,7 @@ _READY = 500  # edges from which SciPy's search is faster, once it is imported
 
 
 def strong_components(source: Integers, target: Integers, num_nodes: int) -> Integers:
-    """The smallest node of every node's strongly connected component: ``int[N]``.
-
-    >>> strong_components(np.array([0, 1, 1]), np.array([1, 0, 2]), 3).tolist()
-    [0, 0, 2]
-    """
+    """The smallest node of every node's strongly connected component: ``int[N]``."""
     if _is_quick(max(source.size, num_nodes)):
         from scipy.sparse import csgraph, csr_array
 

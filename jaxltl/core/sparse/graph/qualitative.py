@@ -27,11 +27,7 @@ def backward_reachable(mdp: HostGraph, goal: Booleans, rows: Booleans | None = N
 def positive_under_all_policies(
     mdp: HostGraph, goal: Booleans, rows: Booleans | None = None, among: Booleans | None = None
 ) -> Booleans:
-    """States from which every policy reaches a goal with positive probability.
-
-    The least set with the goal and all states each of whose rows has a successor in it (the
-    complement of Prob0E). From all other states some policy avoids the goal.
-    """
+    """States from which every policy reaches a goal with positive probability (not Prob0E)."""
     if mdp.is_chain and rows is None and among is None:
         return backward_reachable(mdp, goal)
     return attracted(mdp, goal, rows, exists=False, among=among).region
@@ -40,11 +36,7 @@ def positive_under_all_policies(
 def almost_sure_reachability(
     mdp: HostGraph, goal: Booleans, rows: Booleans | None = None
 ) -> tuple[Booleans, Booleans]:
-    """States from which some policy reaches a goal almost surely (Prob1E), ``bool[S]``.
-
-    Also the rows ``bool[R]`` of these states that never leave them; `rows` are those that may be
-    taken.
-    """
+    """Prob1E states ``bool[S]`` among `rows`, and their rows ``bool[R]`` that never leave them."""
     kept = np.ones(mdp.num_rows, bool) if rows is None else rows.copy()
     inside = backward_reachable(mdp, goal, rows)
     while True:
@@ -58,23 +50,15 @@ def almost_sure_reachability(
 
 
 def shortest_path_rows(mdp: HostGraph, goal: Booleans, rows: Booleans) -> Integers:
-    """The first row of each state on a shortest path to a goal among some rows: ``int32[S]``.
-
-    The first row of all for states in the goal, and for those that cannot reach it.
-    """
+    """Rows of shortest paths to a goal: ``int32[S]``; the first row where there is no path."""
     return attracted(mdp, goal, rows).row
 
 
 class EndComponents(NamedTuple):
-    """Maximal end components.
+    """Maximal end components."""
 
-    Attributes:
-      component: ``int64[S]``, the least state of a state's end component; its own number elsewhere.
-      inside: ``bool[R]``, the rows of end components that stay inside.
-    """
-
-    component: Integers
-    inside: Booleans
+    component: Integers  # int64[S], least state of the component; own number elsewhere
+    inside: Booleans  # bool[R], the rows of end components that stay inside
 
     def region(self, mdp: HostGraph) -> Booleans:
         """The states of end components, ``bool[S]``."""
@@ -88,14 +72,8 @@ def end_components(
 ) -> EndComponents:
     """Maximal end components within some states and rows (Baier and Katoen 2008, section 10.6.3).
 
-    States that cannot stay are removed first, so that strongly connected components are computed
-    on few. Self-loops connect nothing and are added at the end; otherwise each state at the rim of
-    a transient region would be removed in a round by itself.
-
-    Args:
-      mdp: the model.
-      states: ``bool[S]``; default all.
-      rows: ``bool[R]``; default all.
+    Self-loops connect nothing and are added at the end; otherwise each state at the rim of a
+    transient region would be removed in a round by itself.
     """
     kept = np.ones(mdp.num_rows, bool) if rows is None else rows.copy()
     if states is not None:

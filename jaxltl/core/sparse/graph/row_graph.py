@@ -21,21 +21,14 @@ class RowGraph:
     """Graph operations on rows; ``TracedGraph`` is their JAX form.
 
     A mask of choices has the shape of `available`. Rows of a padded model are numbered
-    ``s * A + a``; of a sparse one an action is a row.
-
-    Attributes:
-      host: the rows, without entries where an action is unavailable.
-      state_shape: ``(S,)``, or ``(S, Q)`` of a product.
-      available: ``bool[S, A]``, or ``bool[R]`` of a sparse model.
-      letter: ``int[S]`` of a product, the letter of each world state.
-      on_entry: whether the automaton reads the label of the state that is entered.
+    ``s * A + a``; an action of a sparse model is a row.
     """
 
-    host: HostGraph
-    state_shape: tuple[int, ...]
-    available: Booleans
-    letter: Integers | None = None
-    on_entry: bool = True
+    host: HostGraph  # without entries where an action is unavailable
+    state_shape: tuple[int, ...]  # (S,), or (S, Q) of a product
+    available: Booleans  # bool[S, A], or bool[R] of a sparse model
+    letter: Integers | None = None  # int[S] of a product, the letter of each world state
+    on_entry: bool = True  # the automaton reads the label of the entered state
 
     xp = np
 
@@ -102,10 +95,7 @@ class RowGraph:
     def components(
         self, core: Booleans, allowed: Booleans, closed: bool
     ) -> tuple[Integers, Booleans]:
-        """Components among some states, ``int32[S]``, and the choices inside.
-
-        Maximal end components; or, if `closed`, bottom strongly connected components.
-        """
+        """Maximal end components, or BSCCs if `closed`, ``int32[S]``, and the choices inside."""
         host = self.host
         rows = (allowed & self.available).reshape(-1)
         if not closed:
@@ -155,10 +145,7 @@ def product_graph(
     on_entry: bool,
     allowed: Booleans | None,
 ) -> RowGraph:
-    """The graph of a padded world with a memory, ``int[S, Q]`` after a state's label is read.
-
-    `allowed` is a mask ``bool[S, Q, A]`` of actions, or None.
-    """
+    """The graph of a padded world with a memory, ``int[S, Q]`` after a state's label is read."""
     (num_states, num_memory), num_actions = memory.shape, available.shape[-1]
     shape = (num_states, num_memory, num_actions)
     count = np.broadcast_to(np.diff(world.entry_start).reshape(num_states, 1, -1), shape)

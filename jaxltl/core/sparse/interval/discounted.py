@@ -48,10 +48,7 @@ class DiscountedModel:
 
 
 def discounted_value(problem: DiscountedModel, query: Query) -> RobustValues:
-    """The optimal discounted value.
-
-    Enclosure by ``V +- |Phi V - V| / (1 - discount)``, with rounding.
-    """
+    """Optimal discounted value, enclosed by ``V +- |Phi V - V| / (1 - discount)`` and rounding."""
     model, mdp, discount = problem.model, problem.model.mdp, problem.discount
     label = ordered_components(Edges(mdp.entry_start[mdp.row_start], mdp.successor))
     rate = float(discount[discount < 1].max(initial=0))

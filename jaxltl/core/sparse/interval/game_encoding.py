@@ -1,8 +1,8 @@
 """Encodes the choices of a second player, or of a mixed policy, in uncertainty sets.
 
-A player that wants the same as nature is part of nature: its choice among rows is a distribution
-with ends 0 and 1 over auxiliary states that have one of the rows each. The rows of a mixed policy
-are such a distribution with equal ends.
+A player that optimises in nature's direction is part of nature: its choice among rows is a
+distribution with ends 0 and 1 over auxiliary states that have one of the rows each. The rows of a
+mixed policy are such a distribution with equal ends.
 """
 
 from __future__ import annotations
@@ -48,10 +48,7 @@ class EncodedChoices:
 def let_nature_choose(
     model: UncertainMDP, states: Booleans, lower: Floats, upper: Floats
 ) -> EncodedChoices:
-    """The model in which nature chooses the rows of some states between ends ``float64[R]``.
-
-    Rows of these states with an upper end of 0 are left out.
-    """
+    """The model in which nature chooses the rows of some states between ends ``float64[R]``."""
     mdp = model.mdp
     moved = np.flatnonzero(states[mdp.state] & (upper > 0))
     own = np.flatnonzero(~states[mdp.state])

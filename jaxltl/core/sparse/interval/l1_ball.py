@@ -42,10 +42,7 @@ class BallLimits:
 def narrow_intervals(
     lower: Floats, upper: Floats, center: Floats, used: Booleans | None, limits: BallLimits
 ) -> tuple[Floats, Floats]:
-    """Ends ``float64[N, W]`` between which the greedy distribution is extreme in the ball.
-
-    Columns are sorted, best successor first; `used` is False in padding.
-    """
+    """Ends ``float64[N, W]`` of extreme greedy distributions in the ball; best successor first."""
     rise, fall = upper - center, center - lower
     if used is not None:
         rise, fall = np.where(used, rise, 0), np.where(used, fall, 0)

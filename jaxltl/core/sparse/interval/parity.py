@@ -126,9 +126,8 @@ def _class_game(model: UncertainMDP, value: Floats, gain: Floats) -> ClassGame:
 def optimal_face(model: UncertainMDP, rank: Integers) -> UncertainMDP:
     """The face of distributions that minimise ``sum_t p_t rank_t`` in each row; ranks ``int[T]``.
 
-    Between intervals, mass goes to lesser ranks first and is free within the last rank that gets
-    any. In a ball that binds, one rank is the last that gains over the center and a greater one the
-    first that loses; mass is free within each of the two.
+    In intervals, mass is free within the last rank that gets any. In a ball that binds, it is free
+    within the last rank that gains over the center and within the first that loses.
     """
     start, row = model.mdp.entry_start[:-1], model.mdp.row
     p = model.extreme_distributions(rank.astype(np.float64), maximize=False)

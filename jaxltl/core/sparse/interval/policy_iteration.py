@@ -229,10 +229,7 @@ class _Search:
     def evaluate_with_steps(
         self, pair: PolicyPair, extra: float, full: Booleans | None = None
     ) -> tuple[PolicyPair, float] | None:
-        """The pair with its values and steps, and the extra of a step, at most `extra`.
-
-        Nodes of `full` have the value of the ceiling.
-        """
+        """The pair with its values and steps, and the extra of a step; `full` is at the ceiling."""
         system = self.operator.system(pair)
         self.rounds += 1
         if system is None:
@@ -296,8 +293,7 @@ class _Search:
     def upper_bound(self, pair: PolicyPair) -> PolicyPair | None:
         """A pair with a bound that no pair exceeds.
 
-        Nodes that are nearly worth the ceiling count as worth the ceiling: optimal pairs may
-        linger among them for the extra alone.
+        Nodes near the ceiling count as the ceiling: optimal pairs may linger there for the extra.
         """
         operator, factor = self.operator, 1.0
         full = np.zeros(operator.size, bool)
@@ -340,8 +336,7 @@ class _Search:
     def proportional_bound(self, pair: PolicyPair) -> PolicyPair | None:
         """An attained bound by steps that cost a share of the distance from the ceiling.
 
-        A pair that lingers where values are nearly the ceiling then pays nearly nothing. The
-        distance from the ceiling is what is computed.
+        A pair that lingers where values are nearly the ceiling then pays nearly nothing.
         """
         operator, top = self.operator, self.operator.ceiling
         if self.accuracy.relative or operator.mixes or not np.isfinite(top):
@@ -382,11 +377,7 @@ class _Search:
     def long_runs(
         self, beyond: PolicyPair | None, attained: PolicyPair | None
     ) -> tuple[PolicyPair | None, PolicyPair | None]:
-        """The bounds where optimal pairs take very long to leave, or never do.
-
-        First a refinement beyond double precision; then a pair that is optimal if every step may
-        be the last one, so that it leaves soon, improved from there.
-        """
+        """Bounds of long runs: refinement in two floats, then a pair with a chance to stop."""
         operator, last = self.operator, attained or self.last
         tolerance = self.accuracy.tolerance * self.scale(
             np.zeros(0) if last is None else last.value

@@ -27,10 +27,7 @@ from jaxltl.core.sparse.rows import decrement, sorted_unique, concatenated_range
 def attractor_against_nature(
     model: UncertainMDP, goal: Booleans, *, all_rows: bool, rows: Booleans | None = None
 ) -> Booleans:
-    """States that reach a goal with positive probability whatever nature picks.
-
-    With `all_rows`, under every policy; else under some policy of `rows` (default all).
-    """
+    """Positive-probability attractor of a goal against nature, under some or all policies."""
     if model.has_fixed_support:
         if all_rows and rows is None:
             return positive_under_all_policies(model.mdp, goal)
@@ -97,11 +94,7 @@ def zero_one_states(model: UncertainMDP, goal: Booleans, query: Query) -> ZeroOn
 def certain_choices(
     model: UncertainMDP, target: Booleans, known: ZeroOneStates, *, maximize: bool
 ) -> tuple[Integers, Booleans]:
-    """Choices of opposed players that keep the probability where it is 0 or 1.
-
-    Returns rows ``int[S]`` of the policy, and ``bool[T]``: the entries to which nature keeps, all
-    unless the state is decided in its favour.
-    """
+    """Rows ``int[S]`` of the policy and entries ``bool[T]`` of nature that keep values 0 or 1."""
     mdp = model.mdp
     mine, other = (known.one, known.zero) if maximize else (known.zero, known.one)
     rows = ~mdp.support.some_successor_in(~mine) & mine[mdp.state]
@@ -113,7 +106,7 @@ def certain_choices(
 def almost_sure_states(
     model: UncertainMDP, goal: Booleans, inside: Booleans, query: Query
 ) -> tuple[Booleans, Booleans]:
-    """States from which a goal is reached almost surely, and the rows that stay among them.
+    """Almost-sure states of a goal, and the rows that stay among them.
 
     The greatest set that can be kept and in which the goal is reached with positive probability, by
     the players that maximise against those that minimise (de Alfaro, Henzinger and Kupferman
@@ -180,11 +173,7 @@ class RobustRegion(NamedTuple):
 
 
 def joint_accepting_region(model: UncertainMDP, priority: Integers) -> RobustRegion:
-    """The joint end components whose least priority can be even.
-
-    As :func:`~jaxltl.core.sparse.graph.accepting.accepting_region` with priorities ``int[T]``, but
-    nature may drop entries that read a lesser priority.
-    """
+    """Joint end components with an even least priority; nature may drop entries of lesser ones."""
     mdp = model.mdp
     region = np.zeros(mdp.num_states, bool)
     row = mdp.row_start[:-1].astype(np.int64)

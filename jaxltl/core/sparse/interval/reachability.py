@@ -1,8 +1,7 @@
 """Certified reachability probabilities of uncertain MDPs.
 
 A policy and a cooperative nature are one player: policy iteration on the quotient by joint end
-components. Against an adversarial nature the same iteration bounds the value from both sides, or
-strategy improvement where that is not narrow enough.
+components. An adversarial nature adds strategy improvement where these bounds are too wide.
 """
 
 from __future__ import annotations
@@ -52,8 +51,7 @@ def reachability(
 ) -> RobustValues:
     """Optimal probability of reaching a target through states of `stay` (default all).
 
-    Where sums of ends within rounding of one decide which states have value 0 or 1, the bounds
-    enclose the values for both readings.
+    The bounds enclose both readings of sums of ends that are one up to rounding.
     """
     stop = target if stay is None else target | ~stay
     return hull_of_readings(

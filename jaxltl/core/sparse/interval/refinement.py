@@ -3,11 +3,10 @@
 A value in one float satisfies no optimality equation more accurately than its own rounding
 ``u |x|``, so a proof by one application of the operator needs an extra of at least ``u |x|`` in
 each step, which costs ``u |x| T`` in a run of T steps. Here values are kept in two floats (as in
-:mod:`jaxltl.core.sparse.linear.extended_precision`), found by iterative refinement (Wilkinson 1963). Their
-differences are right to two roundings, so the operator errs only by a share of the flows
+:mod:`jaxltl.core.sparse.linear.extended_precision`), found by iterative refinement (Wilkinson 1963).
+Their differences are right to two roundings, so the operator errs only by a share of the flows
 ``p_t |x_t - x_s|``, and these are small wherever a run lingers. The extra of a step is a multiple of
-that error, plus a tiny share of the distance from the largest possible value: so a run may linger
-for ages where nothing more can be gained.
+that error, plus a tiny share of the distance from the largest possible value.
 """
 
 from __future__ import annotations

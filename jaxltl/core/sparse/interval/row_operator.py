@@ -302,10 +302,10 @@ class RowOperator:
     # --- certificates -------------------------------------------------------------------------
 
     def proves_upper_bound(self, z: Floats | TwoFloats) -> Distributions | None:
-        """Nature's answers if no row gains at z, rounding included; else None.
+        """Nature's answers if no row gains at z, rounding included: z is an upper bound; else None.
 
-        Then z bounds the values from above. With an adversarial nature every row must lose, so
-        that all nodes are left. Nodes at the ceiling need no proof.
+        With an adversarial nature every row must lose, so that all nodes are left. Nodes at the
+        ceiling need no proof.
         """
         values, p = self.values(z), []
         for block in self.blocks:
@@ -319,11 +319,7 @@ class RowOperator:
         return p
 
     def proves_attained(self, z: Floats | TwoFloats, pair: PolicyPair) -> bool:
-        """Whether the chosen rows gain in every node, rounding included.
-
-        Then all nodes are left, and the pair attains z; the policy alone does where nature is
-        adversarial.
-        """
+        """True if the chosen rows gain in every node, rounding included, so the pair attains z."""
         values = self.values(z)
         taken = np.zeros(self.row.size, bool)
         taken[pair.chosen] = True
@@ -340,8 +336,7 @@ class RowOperator:
     ) -> Floats:
         """Certified upper (side 1) or lower (-1) bound of the gains of rows, ``float64[N]``.
 
-        With `over_all`, over all distributions, of which p is the computed extreme one; else for
-        a distribution next to p.
+        With `over_all`, over all distributions, with p the computed extreme one; else near p.
         """
         table, size, cost = block.table, np.abs(gain), self.cost[block.table.row]
         terms = 3 * (np.diff(self.part.mdp.entry_start)[table.row]) + self.depth + 12

@@ -119,11 +119,7 @@ class RowTable:
     # --- certified means ----------------------------------------------------------------------
 
     def mean_error(self, p: Floats, gain: Floats, *, over_all: bool) -> Floats:
-        """Upper bound of ``sum (q - p) gain`` in each row, ``float64[N]``.
-
-        With `over_all`, q ranges over all distributions of the row and p is the computed maximiser;
-        otherwise q is one fixed distribution next to p.
-        """
+        """Upper bound of ``sum (q - p) gain`` in each row: q is near p or, with `over_all`, any."""
         if self.center is not None:
             return self._dual_bound(p, gain) if over_all else self._nearest_bound(p, gain)
         room = np.minimum(p - self.lower, self.upper - p)
@@ -248,11 +244,7 @@ def _upward(x: Floats) -> Floats:
 
 
 def exact_greedy(lower: Floats, upper: Floats) -> Floats:
-    """Greedy masses of sorted rows, ``float64[N, W]``, each right to its last digits.
-
-    The mass of an entry is one minus the upper ends before it and the lower ends after it, kept in
-    two floats.
-    """
+    """Greedy masses of sorted rows, ``float64[N, W]``, each right to its last digits."""
     high, low = np.ones(len(lower)), np.zeros(len(lower))
 
     def subtract(x: Floats) -> None:
@@ -275,10 +267,9 @@ def exact_greedy(lower: Floats, upper: Floats) -> Floats:
 
 
 def exact_sum(terms: Floats, share: float = SUM_ERROR) -> Floats:
-    """Sums over the first axis with relative error `share`, whatever cancels.
+    """Sums over the first axis with relative error `share`, for finite terms of at most 1e100.
 
-    Error-free additions (Knuth; Ogita, Rump and Oishi 2005), and :func:`math.fsum` where the sum
-    is too near zero for these. Terms are finite and at most 1e100.
+    Error-free additions (Knuth; Ogita, Rump and Oishi 2005); :func:`math.fsum` near zero.
     """
     high = terms[0].copy()
     low, size = np.zeros_like(high), np.zeros_like(high)

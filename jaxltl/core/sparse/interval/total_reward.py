@@ -40,8 +40,8 @@ def total_reward(
     """Optimal expected reward until a target is reached; rewards ``float64[R]`` are at least 0.
 
     Infinite where the target is not reached almost surely: under every pair of choices of the sides
-    that minimise, and some choice of those that maximise. Where sums of ends within rounding of one
-    decide that, the bounds enclose the values for both readings.
+    that minimise, and some choice of those that maximise. The bounds enclose both readings of sums
+    of ends that are one up to rounding.
     """
     return hull_of_readings(
         model,
@@ -124,11 +124,7 @@ def _joint(
 
 
 def _first_policy(model: UncertainMDP, goal: Booleans, solve: Subproblems) -> Integers:
-    """A policy that reaches a goal almost surely whatever nature picks, cheap where possible.
-
-    Any such policy is correct, but one that arrives by slips alone may take longer than floats
-    resolve.
-    """
+    """A policy that reaches a goal almost surely against nature, and cheaply where possible."""
     row = solve.fixed_nature(model.mdp, solve.cost, False).row
     chain, against = model.under_policy(row)[0], Query(maximize=True, nature_maximizes=False)
     sure, _ = almost_sure_states(chain, goal, np.ones(goal.size, bool), against)
@@ -138,10 +134,7 @@ def _first_policy(model: UncertainMDP, goal: Booleans, solve: Subproblems) -> In
 def _restrict(
     model: UncertainMDP, inside: Booleans, rows: Booleans
 ) -> tuple[UncertainMDP, Integers, Integers]:
-    """The model with some rows, whose entries stay in a set; other states become absorbing.
-
-    Returns the original rows and entries, too.
-    """
+    """The model of some rows in a set, others absorbing; and its original rows and entries."""
     mdp = model.mdp
     if inside.all() and rows.all():
         return model, np.arange(mdp.num_rows), np.arange(mdp.num_transitions)

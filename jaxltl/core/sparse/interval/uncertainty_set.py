@@ -1,4 +1,4 @@
-"""Sparse MDPs whose rows are uncertainty sets: intervals, intersected with L1 balls.
+"""Sparse MDPs with uncertainty sets as rows: intervals, intersected with L1 balls.
 
 A row is the set of all distributions p with ``lower <= p <= upper``, and with
 ``sum_t |p_t - center_t| <= radius`` where there is a ball. Nature picks one each time that the row
@@ -65,11 +65,7 @@ class UncertainMDP:
 
     @cached_property
     def enlarged(self) -> UncertainMDP | None:
-        """The model with upper ends and balls enlarged by `_DECIMALS`.
-
-        In it nature may drop all successors that it may drop if sums within rounding of one count
-        as one. None if these are clearly those that it may drop anyway.
-        """
+        """The model with ends and balls enlarged by `_DECIMALS`; None if that changes nothing."""
         if self.has_fixed_support:
             return None
         start = self.mdp.entry_start
@@ -167,10 +163,7 @@ class UncertainMDP:
         return possible & (forced | ~room)
 
     def interior_distributions(self, entries: Booleans) -> Floats:
-        """Distributions with support `entries` where nature may keep to these, ``float64[T]``.
-
-        Other rows have a distribution with full support.
-        """
+        """Distributions with support `entries` where nature may keep to these; full elsewhere."""
         entries = entries | ~self.can_stay_on(entries)[self.mdp.row]
         free = np.where(entries, self.upper - self.lower, 0)
         share = share_of(self.free_mass, self.sum_rows(free))
@@ -195,10 +188,7 @@ class UncertainMDP:
         return np.where(outside, nearest + (p - nearest) * share[row], p)
 
     def nearest_distributions(self, probability: Floats) -> tuple[Floats, bool]:
-        """Distributions next to computed ones, with masses right to their last digits.
-
-        Also whether all rows have one.
-        """
+        """Distributions near computed ones, right to their last digits; and if all rows have one."""
         found, able = probability.copy(), True
         for table in self.tables:
             p, fits = table.nearest(probability[table.entry])
@@ -273,15 +263,6 @@ def l1_expectation(
 
     Half of the radius is moved from the worst successors to the best one (Strehl and Littman 2008,
     section 3.2).
-
-    Raises:
-      ValueError: shapes do not match, a row is empty, or a radius is negative.
-
-    Example:
-      >>> least, chosen = l1_expectation(np.array([0.0, 1.0, 2.0]), np.array([0.5, 0.25, 0.25]),
-      ...                                np.array([0.8]), np.array([0, 3]), maximize=False)
-      >>> least.round(9).tolist(), chosen.round(9).tolist()
-      ([0.1], [0.9, 0.1, 0.0])
     """
     value, center, radius = (
         validation.float_array(name, x)

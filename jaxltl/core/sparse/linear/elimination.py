@@ -38,37 +38,22 @@ _LEFT = 1e-14  # residual relative to the right side
 
 
 class _Block(NamedTuple):
-    """Some components, which no earlier block depends on.
+    """Some components, on which no earlier block depends."""
 
-    Attributes:
-      order: ``int[B]``, the states in the order of elimination; ascending for a Krylov method.
-      inner: ``float64[B, B]``, the policy's matrix on these.
-      outer: ``float64[B, M]``, on earlier blocks; None without any.
-      factor: of SuperLU; None for a Krylov method.
-      fill: entries of the first factors in this order.
-      min_degree: whether states of least degree are eliminated first, wherever that may help.
-    """
-
-    order: Integers
-    inner: Any
-    outer: Any
-    factor: Any
-    fill: int
-    min_degree: bool = False
+    order: Integers  # int[B], states in elimination order; ascending for a Krylov method
+    inner: Any  # float64[B, B], the policy's matrix on these
+    outer: Any  # float64[B, M], on earlier blocks; None without any
+    factor: Any  # of SuperLU; None for a Krylov method
+    fill: int  # entries of the first factors in this order
+    min_degree: bool = False  # states of least degree first, wherever that may help
 
 
 class Factors(NamedTuple):
-    """The system of a policy, ready to be solved.
+    """The system of a policy, ready to be solved."""
 
-    Attributes:
-      rows: SciPy's ``float64[R, M]``, all rows.
-      label: ``int[M]``, components in topological order.
-      blocks: in the order of solution.
-    """
-
-    rows: Any
-    label: Integers
-    blocks: tuple[_Block, ...]
+    rows: Any  # SciPy's float64[R, M], all rows
+    label: Integers  # int[M], components in topological order
+    blocks: tuple[_Block, ...]  # in the order of solution
 
     @property
     def method(self) -> str:

@@ -46,22 +46,14 @@ _THREADS = 2**20  # transitions from which two blocks are swept at once
 
 @dataclass(frozen=True)
 class RowBlocks:
-    """Rows in blocks of states, in both precisions.
+    """Rows in blocks of states, in both precisions."""
 
-    Attributes:
-      row_start: ``int[N + 1]``, the first row of each node, and R.
-      matrix: SciPy's ``float64[R, M]``.
-      node: the first node of each block, and N.
-      single, double: the rows of each block.
-      width: the number of rows of every node; 0 where they differ.
-    """
-
-    row_start: Integers
-    matrix: Any
-    node: list[int]
-    single: list[Any]
-    double: list[Any]
-    width: int
+    row_start: Integers  # int[N + 1], the first row of each node, and R
+    matrix: Any  # SciPy's float64[R, M]
+    node: list[int]  # the first node of each block, and N
+    single: list[Any]  # the rows of each block
+    double: list[Any]  # the same in double precision
+    width: int  # the number of rows of every node; 0 where they differ
 
 
 def row_blocks(
@@ -93,61 +85,37 @@ def row_blocks(
 
 @dataclass(frozen=True)
 class BlockProblem:
-    """``x = opt_r (c_r + P_r y)`` on some nodes, where y is x or known.
+    """``x = opt_r (c_r + P_r y)`` on some nodes, where y is x or known."""
 
-    Attributes:
-      blocks: the rows P; they sum to one at most, up to rounding.
-      interior: ``bool[N]``, the nodes to solve for, which every policy that counts leaves.
-      live: ``bool[M]``, the columns that read the interior node of their number; M is at least N.
-      attained, outer: ``float64[M]``, at least 0: bounds of the other columns, as of `SweptBounds`.
-      cost: ``float64[R]``, at least 0, or None for zero.
-      allowed: ``bool[R]``, the rows that may be taken; None for all.
-    """
-
-    blocks: RowBlocks
-    interior: Booleans
-    live: Booleans
-    attained: Floats
-    outer: Floats
-    cost: Floats | None = None
-    allowed: Booleans | None = None
+    blocks: RowBlocks  # the rows P; they sum to one at most, up to rounding
+    interior: Booleans  # bool[N], nodes to solve for, which every policy that counts leaves
+    live: Booleans  # bool[M], M >= N, columns that read the interior node of their number
+    attained: Floats  # float64[M], >= 0, bound of the other columns, as of SweptBounds
+    outer: Floats  # float64[M], >= 0, likewise
+    cost: Floats | None = None  # float64[R], at least 0, or None for zero
+    allowed: Booleans | None = None  # bool[R], the rows that may be taken; None for all
 
 
 @dataclass(frozen=True)
 class SweepSettings:
-    """Settings of sweeps.
+    """Settings of sweeps."""
 
-    Attributes:
-      sign: 1 to maximise, -1 to minimise.
-      tolerance: the width of the bounds beyond that of the known values.
-      relative: whether that is a share of the value.
-      unit: the relative rounding of one backup.
-      max_sweeps: at most.
-    """
-
-    sign: int
-    tolerance: float
-    relative: bool
-    unit: float
+    sign: int  # 1 to maximise, -1 to minimise
+    tolerance: float  # the width of the bounds beyond that of the known values
+    relative: bool  # True if the tolerance is a share of the value
+    unit: float  # the relative rounding of one backup
     max_sweeps: int = 150
 
 
 @dataclass(frozen=True)
 class SweptBounds:
-    """Bounds of the interior nodes.
+    """Bounds of the interior nodes."""
 
-    Attributes:
-      attained, outer: ``float64[N]``, the bound that the rows attain, and the other one.
-      row: ``int64[N]``.
-      sweeps: how many there were.
-      time: the longest truncated time of the policy.
-    """
-
-    attained: Floats
-    outer: Floats
-    row: Integers
-    sweeps: int
-    time: float
+    attained: Floats  # float64[N], the bound that the rows attain
+    outer: Floats  # float64[N], the other bound
+    row: Integers  # int64[N]
+    sweeps: int  # the number of sweeps
+    time: float  # the longest truncated time of the policy
 
 
 def solve_by_sweeps(
@@ -336,10 +304,7 @@ class _Search:
         return self.problem.blocks.matrix[row], cost
 
     def truncated_time(self, chain: Any) -> tuple[Values, float] | None:
-        """A lower bound t on a chain's expected time, and the least of ``t - P t``.
-
-        ``float32[M]``, zero in columns that are not live; None where the chain stays too long.
-        """
+        """Lower bound of a chain's expected time, and min ``t - P t``; None if it stays too long."""
         from scipy import sparse
 
         live = self.problem.live[: self.problem.interior.size]

@@ -20,21 +20,13 @@ _RELATIVE_GAIN = 0.01
 
 @dataclass(frozen=True)
 class OptimalityEquation:
-    """``x_i = opt_r (c_r + sum_j P_rj x_j)`` over the rows r of unknown i.
+    """``x_i = opt_r (c_r + sum_j P_rj x_j)`` over the rows r of unknown i."""
 
-    Attributes:
-      matrix: SciPy's ``float64[R, M]``, without self-loops.
-      cost: ``float64[R]``, at least 0, with what terminal states add.
-      leaving: ``float64[R]``, the probability of leaving the unknowns.
-      choices: the order of the unknowns and of their rows.
-      sign: 1 to maximise, -1 to minimise.
-    """
-
-    matrix: Any
-    cost: Floats
-    leaving: Floats
-    choices: Choices
-    sign: int
+    matrix: Any  # SciPy's float64[R, M], without self-loops
+    cost: Floats  # float64[R], at least 0, with the share of terminal states
+    leaving: Floats  # float64[R], the probability of leaving the unknowns
+    choices: Choices  # the order of the unknowns and of their rows
+    sign: int  # 1 to maximise, -1 to minimise
 
     @property
     def size(self) -> int:
@@ -72,11 +64,9 @@ def propagate_improvements(
 ) -> Integers:
     """Improves a policy and propagates the improvements to predecessors, as ``int[M]``.
 
-    Along a chain of n states plain policy iteration may need n linear systems, one for each state
-    that learns of an improvement. Asynchronous value iteration, of predecessors of improved states
-    alone, takes the news all the way (Bertsekas and Tsitsiklis 1989, section 2.6). Values improve
-    monotonically, so no row that was chosen gets worse, and the new policy is better than the old
-    one wherever it differs.
+    Asynchronous value iteration of predecessors of improved states (Bertsekas and Tsitsiklis 1989,
+    section 2.6). Values improve monotonically, so no row that was chosen gets worse, and the new
+    policy is better than the old one wherever it differs.
     """
     matrix, owner, sign = equation.matrix, equation.owner, equation.sign
     back = matrix.tocsc()

@@ -24,17 +24,11 @@ _STEPS = 200  # of BiCGSTAB without factors
 
 @dataclass
 class SystemSequence:
-    """Solver of systems of one size.
+    """Solver of systems of one size."""
 
-    Attributes:
-      label: computes ``int[M]``, strongly connected components in topological order.
-      mixes: whether few steps lead to many unknowns.
-      factors: of the earlier system `matrix`.
-    """
-
-    label: Callable[[], Integers]
-    mixes: bool
-    factors: Factors | None = None
+    label: Callable[[], Integers]  # SCCs int[M] in topological order
+    mixes: bool  # True if few steps lead to many unknowns
+    factors: Factors | None = None  # of the earlier system `matrix`
     matrix: Any = None
 
     def solve(self, matrix: Any, b: Floats, start: Floats, residual: float) -> Floats | None:

@@ -29,15 +29,10 @@ class Edges(NamedTuple):
 
 
 class Levels(NamedTuple):
-    """Nodes in an order in which each has only earlier successors.
+    """Nodes in an order in which each has only earlier successors."""
 
-    Attributes:
-      node: ``int[M]``.
-      start: where each level starts in it, and M. Nodes of one level are not connected.
-    """
-
-    node: Integers
-    start: list[int]
+    node: Integers  # int[M]
+    start: list[int]  # starts of levels in it, and M; nodes of a level are not connected
 
 
 def topological_levels(back: Edges, number: Integers, among: Booleans) -> Levels:

@@ -1,10 +1,10 @@
 """Optimal weighted sums of probabilities and total rewards, as optimal stopping.
 
-A run ends in an end component, and there in one whose least priorities are even for the set of
-probability objectives that it satisfies. A weighted sum is therefore an optimal stopping problem:
-rewards on the way, and on stopping in a component the weight of the best set of objectives that can
-be satisfied together in it (Etessami, Kwiatkowska, Vardi and Yannakakis 2008; Forejt, Kwiatkowska,
-Norman, Parker and Qu 2011).
+A run ends in an end component with even least priorities for the probability objectives that it
+satisfies. A weighted sum is therefore an optimal stopping problem: rewards until stopping, and on
+stopping in a component the weight of the best set of objectives that can be satisfied together in
+it (Etessami, Kwiatkowska, Vardi and Yannakakis 2008; Forejt, Kwiatkowska, Norman, Parker and Qu
+2011).
 """
 
 from __future__ import annotations
@@ -74,10 +74,7 @@ def final_components(sums: WeightedProblem) -> FinalComponents | None:
 
 
 def _satisfying(mdp: HostMDP, priority: Integers, rows: Booleans) -> Booleans:
-    """The rows of end components whose least priorities are all even.
-
-    A component whose least priority is odd is searched again without the rows that read it.
-    """
+    """Rows of end components with even least priorities; others are searched without odd rows."""
     while True:
         found = end_components(mdp, rows=rows)
         leader = found.component[mdp.state]
@@ -195,10 +192,7 @@ def _signed(
     first: Integers,
     tolerance: float,
 ) -> tuple[Floats, Integers]:
-    """The same with rewards of both signs, by policy iteration (Howard 1960).
-
-    Every step earns a small extra, so that the value is one that no step exceeds.
-    """
+    """Upper bound for rewards of both signs: policy iteration (Howard 1960) with a small extra."""
     from jaxltl.core.sparse.linear.elimination import factorize
     from jaxltl.core.sparse.linear.topological_order import Edges, ordered_components
 

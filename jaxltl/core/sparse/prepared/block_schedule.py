@@ -1,9 +1,9 @@
 """Topological block schedule of a sparse system, with blocks padded to equal shape.
 
-Nodes stand in an order in which most lead to earlier ones. A node has at most A rows, whose optimum
-it is, and a row at most W entries; what is wider is split among nodes of its own. Blocks of B nodes
-are evaluated one after the other. Where nodes lie on cycles, layers nearer to where a strongly
-connected component is left come first, and entries that lead on read what was found before.
+Nodes stand in an order in which most lead to earlier ones. The value of a node is the optimum of
+at most A rows of at most W entries; wider ones are split among auxiliary nodes. Blocks of B nodes
+are evaluated one after the other. Where nodes lie on cycles, layers nearer to the exits of a
+strongly connected component come first, and entries that lead on read the previous values.
 """
 
 from __future__ import annotations

@@ -125,10 +125,7 @@ class _Stopping:
     def solve(
         self, gain: Floats, tolerance: float, width: float, sign: int
     ) -> tuple[Floats, Floats, Integers, int]:
-        """Bounds on the best expected gain, rows that attain the lower one, and linear systems.
-
-        A smallest average of nonnegative rewards is minimised as it is, to a relative tolerance.
-        """
+        """Bounds on the best expected gain, rows that attain the lower one, and linear systems."""
         mdp = self.mdp
         size, worth = mdp.num_states - gain.size, sign * gain
         shift = min(float(worth.min()), 0.0)
@@ -351,10 +348,7 @@ def _gains(whole: _Submodel, tolerance: float, max_steps: int) -> _Gains:
 def _value_iteration(
     known: _Gains, rest: _Unsettled, tolerance: float, num_steps: int, patience: float = np.inf
 ) -> _Unsettled:
-    """Value iteration of all components at once, until each is narrow.
-
-    After `patience` sweeps it also ends where the steps are too few at the rate of convergence.
-    """
+    """Value iteration of all components at once, until each is narrow or convergence is slow."""
     before: Floats | None = None
     done = 0
     while rest.which.size and done <= num_steps:
@@ -390,8 +384,7 @@ def _steps_needed(known: _Gains, rest: _Unsettled, before: Floats, tolerance: fl
 def _policy_iteration(known: _Gains, rest: _Unsettled, tolerance: float) -> Floats | None:
     """Policy iteration (Howard 1960) on one component, over policies with one recurrent class.
 
-    Returns None if it ended, so that only rounding can be better; otherwise the bias of one of the
-    best policies, where policies of equal gain and different recurrent classes alternate.
+    Returns None at its end; the bias of a best policy where recurrent classes alternate.
     """
     part = rest.part
     chosen, best, idle = part.first_best(part.gain(rest.v)[0]), rest.v, 0
@@ -425,10 +418,7 @@ def _policy_iteration(known: _Gains, rest: _Unsettled, tolerance: float) -> Floa
 
 
 def _evaluated(part: _Submodel, chosen: Integers) -> tuple[_Bias, Integers] | None:
-    """A policy's gain and bias, and the policy.
-
-    If it has several recurrent classes, it is first led to the one of the largest gain.
-    """
+    """A policy's gain and bias, and the policy, led to its recurrent class of the largest gain."""
     mdp, size = part.mdp, part.mdp.num_states
     chain = mdp.matrix[chosen]
     source = np.repeat(np.arange(size), np.diff(chain.indptr))
@@ -459,8 +449,7 @@ def _gain_and_bias(
 ) -> _Bias | None:
     """Gain and bias of a chain with one recurrent class, by renewal at a frequent state.
 
-    The gain is the expected reward between two visits by the expected time. The bias is refined in
-    two floats (Wilkinson 1963), as it may exceed rewards by more than one float resolves.
+    The bias is refined in two floats (Wilkinson 1963): it may exceed the resolution of one float.
     """
     mdp = part.mdp
     matrix = mdp.matrix[chosen[states]]

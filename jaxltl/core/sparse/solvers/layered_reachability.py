@@ -100,10 +100,7 @@ class _Rows:
 def layered_reachability(
     world: PaddedProduct, target: Booleans, *, maximize: bool, tolerance: float
 ) -> LayeredBounds | None:
-    """Optimal probability of reaching a target ``bool[S, Q]``, with bounds of width `tolerance`.
-
-    None where sweeps would take long, or could not prove the bounds.
-    """
+    """Bounds of reaching ``bool[S, Q]`` of width `tolerance`; None if slow or unproven."""
     num_memory = world.delta.shape[0]
     if num_memory > LARGEST or not _mixes(world):
         return None

@@ -84,18 +84,11 @@ def total_reward(
     tolerance: float = 1e-6,
     depth: int = 0,
 ) -> Enclosure:
-    """Optimal expected reward until a target is reached.
+    """Optimal expected reward until a target, to a tolerance relative to the value.
 
     Infinite where the target is not reached almost surely: for a maximum under some policy, for a
-    minimum under every policy.
-
-    Args:
-      mdp: the model.
-      reward: ``float64[R]``, at least 0; infinite for rows that must not be taken.
-      target: ``bool[S]``.
-      maximize: the largest or the smallest reward.
-      tolerance: the width of the enclosure, relative to the value.
-      depth: the number of roundings behind each number of the model.
+    minimum under every policy. Rewards ``float64[R]`` are at least 0, and infinite for rows that
+    must not be taken; `depth` is the number of roundings behind each number of the model.
     """
     reduced = reduce_total_reward(mdp, reward, target, maximize=maximize, depth=depth)
     return _solve(reduced, tolerance)
@@ -104,13 +97,11 @@ def total_reward(
 def reward_forever(
     mdp: HostMDP, reward: Floats, *, maximize: bool, tolerance: float = 1e-6, depth: int = 0
 ) -> Enclosure:
-    """Optimal expected reward over the infinite horizon.
+    """Optimal expected reward over the infinite horizon; arguments as of :func:`total_reward`.
 
-    The maximum is infinite where an end component with positive reward is reachable; all other end
-    components earn nothing and are left at most once. The minimum is the reward until a state from
-    which some policy earns nothing more, and infinite where that is not reached almost surely.
-
-    Arguments as of :func:`total_reward`, with finite rewards.
+    The maximum is infinite where an end component with positive reward is reachable. The minimum
+    is the reward until a state from which some policy earns nothing more, infinite where that is
+    not reached almost surely.
     """
     if not maximize or mdp.is_chain:
         earning = reward > 0
@@ -350,10 +341,7 @@ def _solve_nodes(reduced: ReducedProblem, tolerance: float) -> Enclosure:
 def quotient_policy(
     mdp: HostMDP, components: EndComponents, row: Integers, otherwise: Integers | None = None
 ) -> Integers:
-    """The policy that stays in an end component up to the state of the row by which it is left.
-
-    Where `row` is -1 the component is not left, and `otherwise` has the rows.
-    """
+    """The policy that leaves end components by some rows; `otherwise` where `row` is -1."""
     found: Integers = mdp.row_start[:-1].astype(np.int64) if otherwise is None else otherwise
     moves = row >= 0
     own = moves & (mdp.state[np.maximum(row, 0)] == np.arange(mdp.num_states))
@@ -366,10 +354,7 @@ def quotient_policy(
 def solve_shortest_path(
     problem: ShortestPathProblem, *, maximize: bool, tolerance: float, relative: bool
 ) -> Enclosure:
-    """Certified optimum by sweeps where the model mixes well, by policy iteration otherwise.
-
-    Arguments as of :func:`~jaxltl.core.sparse.solvers.policy_iteration.policy_iteration`.
-    """
+    """Certified optimum by sweeps where the model mixes well, by policy iteration otherwise."""
     size = int(np.count_nonzero(problem.interior))
     if size >= _SOME and mixes(problem, size):
         found = sweep_shortest_path(

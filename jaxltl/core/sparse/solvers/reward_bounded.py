@@ -198,13 +198,8 @@ def _policy(mdp: HostMDP, shape: _Shape, chosen: Integers) -> Integers:
 class _System:
     """``x = opt (b + P x)``, which every policy leaves.
 
-    Attributes:
-      shape: the nodes.
-      matrix: ``P``, of the rows without cost.
-      maximal: whether to maximise.
-      chosen: ``int[N]``, the row of each node.
-      factors: of these rows; None where ``P`` is zero.
-      longest: a bound on the expected number of consecutive steps without cost.
+    `chosen` ``int[N]`` is the row of each node, `factors` are those of these rows (None where ``P``
+    is zero), and `longest` bounds the expected number of consecutive steps without cost.
     """
 
     shape: _Shape

@@ -1,7 +1,4 @@
-"""Stochastic shortest paths: the least expected number of steps until a goal, and its policy.
-
-See Bertsekas and Tsitsiklis 1991. Where every step costs 1, this is a total reward.
-"""
+"""Stochastic shortest paths (Bertsekas and Tsitsiklis 1991): least expected steps until a goal."""
 
 from __future__ import annotations
 
@@ -17,10 +14,7 @@ _TIE = 1e-10  # relative difference up to which expected times are equal
 
 
 def fastest_rows(mdp: HostMDP, rows: Booleans, goal: Booleans, row: Integers) -> Integers:
-    """The rows ``int[S]`` that reach a goal in the least expected number of steps.
-
-    Of equally fast rows the first one.
-    """
+    """The first rows ``int[S]`` that reach a goal in the least expected number of steps."""
     if goal.all():
         return row
     cost = np.where(rows | goal[mdp.state], 1.0, np.inf)
@@ -40,11 +34,7 @@ def fastest_rows(mdp: HostMDP, rows: Booleans, goal: Booleans, row: Integers) ->
 
 
 def expected_steps(mdp: HostMDP, row: Integers, goal: Booleans) -> Floats | None:
-    """Expected number of steps of a policy ``int[S]`` until a goal: ``float64[S]``.
-
-    Infinite where the goal is not reached almost surely; None if the times are so long that double
-    precision does not certify six digits of them.
-    """
+    """Expected steps to a goal, ``float64[S]`` or infinity; None without six certified digits."""
     rows = np.zeros(mdp.num_rows, bool)
     rows[row] = True
     cost = np.where(rows | goal[mdp.state], 1.0, np.inf)

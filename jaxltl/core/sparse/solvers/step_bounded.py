@@ -120,10 +120,7 @@ class Backup(NamedTuple):
 
 @dataclass(frozen=True)
 class Iterate:
-    """The last two values of an iteration, ``float64[N]``, and the number of backups.
-
-    `is_fixed` says that further backups change nothing in floating point.
-    """
+    """Last two values ``float64[N]``, and number of backups; `is_fixed` if more change nothing."""
 
     before: Floats
     value: Floats

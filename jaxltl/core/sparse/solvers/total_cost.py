@@ -23,8 +23,7 @@ TINY = 1e-290  # products that underflow: relative errors do not count them
 class ShortestPathProblem:
     """``x = opt_r (c_r + P_r x)`` on interior states, which every policy that counts leaves.
 
-    Self-loops are eliminated: the other successors of a row are taken to be all of them, in these
-    proportions.
+    Self-loops are eliminated by normalising the other successors of a row.
     """
 
     mdp: HostMDP  # the model; its rows may be unsorted and repeat successors
