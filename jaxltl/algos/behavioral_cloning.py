@@ -4,7 +4,6 @@ A network classifies the demonstrated action by a local observation and the stat
 automaton. It uses no model of the world.
 
 Example: a policy of the state and the automaton state.
-
   >>> import jax, jax.numpy as jnp
   >>> import jaxltl as jl
   >>> from jaxltl.algos import behavioral_cloning as cloning

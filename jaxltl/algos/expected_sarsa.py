@@ -9,7 +9,6 @@ It is the smallest learner of the library, and a template for others. Of a task 
 product, ``restrict(product).model``, and as `allowed` the actions that keep the task's probability.
 
 Example: to stay in the second state pays, and one action leads there.
-
   >>> import jax, jax.numpy as jnp
   >>> import jaxltl as jl
   >>> from jaxltl.algos import expected_sarsa
@@ -84,8 +83,7 @@ class State:
     """A table and the end of the trajectory.
 
     Attributes:
-      key: random key of the run.
-      step: ``int32[]``, number of steps.
+      key, step: root key, and steps made, ``int32[]``.
       q: ``float[S, A]``; 0 at actions that are not allowed.
       position: ``int32[]``, the state of the model.
     """

@@ -146,7 +146,7 @@ class Plan:
 
     Attributes:
       reach, avoid: ``bool[Q, M, D, E]``.
-      length: ``int32[Q, M]``; 0 where there is none.
+      length: ``int32[Q, M]``; 0 for padding.
     """
 
     reach: chex.Array
@@ -231,12 +231,11 @@ def sequence_agent(
 
     At each new automaton state it selects the sequence with the highest value, and follows it until the
     state changes, or until the value of another exceeds the recent mean of this one's values (with a
-    memory of some 16 steps). So it abandons sequences that turn out infeasible, without alternating
-    between two of nearly equal value.
+    memory of some 16 steps).
 
     Args:
-      network: ``observation -> (parameters of the action, value)`` of a trained network; a
-        ``Partial`` whose arrays are its parameters, such as :func:`trained` makes.
+      network: ``observation -> (parameters of the action, value)``, a ``Partial`` such as
+        :func:`trained` makes.
       plan: of the formula; a lane of :func:`stack_plans` under ``vmap``.
       actions: ``environment.actions``; required for a box.
       squash: map of a Gaussian action into its box, ``"clip"`` or ``"tanh"``, as in training.
@@ -244,8 +243,7 @@ def sequence_agent(
 
     Returns:
       An :class:`~jaxltl.core.environments.episodes.Agent` for observations
-      :class:`~jaxltl.core.environments.task_environment.TaskObservation` of that formula, one-hot in the
-      automaton's state.
+      :class:`~jaxltl.core.environments.task_environment.TaskObservation` of that formula.
 
     Raises:
       ValueError: not a plan or a function, or at the first step Gaussian actions without `actions`.
@@ -421,14 +419,14 @@ def train_in_stages(
 
     Args:
       key: of ``init``.
-      problems: from easy to hard, of the same shapes, such as PPO's of environments whose samplers
-        draw longer and longer sequences; then no stage recompiles.
+      problems: from easy to hard, of the same shapes, so that no stage recompiles, such as PPO's of
+        environments that draw longer and longer sequences.
       hparams: of the learner.
       init, run: the learner's, ``ppo.init`` and ``ppo.run``.
       num_chunks: number of calls of `run`.
       num_steps: steps of the learner in each.
-      enough: mean return of the episodes that ended in a chunk at which the next problem begins; a
-        number, or one for each problem but the last.
+      enough: mean return of a chunk's episodes at which the next problem begins; a number, or one for
+        each problem but the last.
       report: called after each chunk with its number, its stage and its metrics.
 
     Raises:

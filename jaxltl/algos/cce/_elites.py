@@ -40,12 +40,7 @@ class Pool:
 
 
 def num_elites(rho: float, num_samples: int) -> int:
-    """``k = ceil(rho n)``, where a product that should be an integer is one.
-
-    Example:
-      >>> num_elites(0.07, 100), math.ceil(0.07 * 100)
-      (7, 8)
-    """
+    """``k = ceil(rho n)``, where a product that should be an integer is one."""
     return math.ceil(rho * num_samples - SLACK)
 
 
@@ -84,15 +79,6 @@ def select(
 
     Ties go to the earlier sample, so that there are always k, where the indicator of (4.4) takes all
     of them. Samples with an objective NaN or plus infinity, or a cost NaN, are last and never taken.
-    `num` is the static number of indices returned and `count` is k_l, at most `num`.
-
-    Example:
-      >>> cost = jnp.array([[0.0], [2.0], [1.0], [0.0]])
-      >>> objective = jnp.array([1.0, 9.0, 9.0, 2.0])
-      >>> select(objective, cost, jnp.zeros(1), num=2).index.tolist()
-      [3, 0]
-      >>> select(objective, cost, jnp.zeros(1), num=3).index.tolist()
-      [0, 3, 2]
     """
     count = num if count is None else count
     usable = active & (objective < jnp.inf) & ~jnp.isnan(cost).any(-1)
@@ -117,13 +103,7 @@ def elite_weights(
     weighting: str = "until_feasible",
     temperature: jax.Array | float = 1.0,
 ) -> jax.Array:
-    """Weights of the elites, with sum 1, or 0 if none is taken; see :class:`Hparams`.
-
-    Example:
-      >>> half = jnp.log(jnp.array([3.0, 1.0]))
-      >>> [round(x, 6) for x in elite_weights(half, jnp.ones(2, bool), jnp.bool_(True)).tolist()]
-      [0.75, 0.25]
-    """
+    """Weights of the elites, with sum 1, or 0 if none is taken; see :class:`Hparams`."""
     least = jnp.finfo(objective.dtype).min
     logit = jnp.clip(objective / temperature, least, -least)
     if weighting != "literal":

@@ -12,7 +12,6 @@ Gaussian with mean 3 and standard deviation 1e-3 is negative in single precision
 variance is a sum of squares.
 
 Example:
-
   >>> import jax, jax.numpy as jnp
   >>> from jaxltl.algos.cce import exponential_family as families
   >>> start = families.diagonal_gaussian(jnp.zeros(2), 1.0)
@@ -491,7 +490,7 @@ def _(family: Gamma, samples: jax.Array) -> jax.Array:
 def _(family: Gamma, key: chex.PRNGKey, num_samples: int) -> jax.Array:
     dtype = family.shape.dtype
     draws = jax.random.gamma(key, family.shape, (num_samples, *family.shape.shape), dtype)
-    # Tiny shapes draw numbers that round to zero, whose logarithm is not finite.
+    # Tiny shapes draw numbers that round to zero; their logarithm is not finite.
     return jnp.maximum(draws / family.rate, jnp.finfo(dtype).tiny)
 
 

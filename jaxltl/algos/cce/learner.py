@@ -17,7 +17,6 @@ feasible. For environments see
 :func:`~jaxltl.core.values.evaluation.episode_scores.episode_evaluator`.
 
 Example: the point nearest to (1, 1) with a first coordinate of at most 0.5.
-
   >>> import jax, jax.numpy as jnp
   >>> from jaxltl.algos import cce
   >>> from jaxltl.algos.cce.exponential_family import diagonal_gaussian

@@ -52,8 +52,8 @@ class Hparams:
       noise: variance added after each step, a schedule (Szita and Lorincz 2006); default None.
       restart_below: the search restarts from the first distribution when all standard deviations are
         below this number, and keeps the best samples. Default None.
-      sharding: a ``NamedSharding`` whose spec names the mesh axis that splits the population, such as
-        ``NamedSharding(mesh, PartitionSpec("population"))``; static; default None.
+      sharding: of the population, such as ``NamedSharding(mesh, PartitionSpec("population"))``; static;
+        default None.
     """
 
     rate: Schedule = traced(Range(0, 1, open_below=True), default=0.1, schedule=True)
@@ -78,8 +78,7 @@ class State:
     """A distribution of policies, and the best samples.
 
     Attributes:
-      key: random key of the run.
-      step: ``int32[]``, number of steps.
+      key, step: root key, and steps made, ``int32[]``.
       family: the distribution.
       best: the feasible sample with the highest objective by its one evaluation: parameters
         ``float[D]``, objective ``float[]`` and cost ``float[C]``.

@@ -31,12 +31,7 @@ def is_apart(x: object) -> bool:
 
 
 class Stored(NamedTuple):
-    """An array in parts.
-
-    Attributes:
-      shape, dtype: of all of it.
-      pieces: where each begins and ends, the name of its file, and its name there.
-    """
+    """An array in parts: bounds, file and name in the file of each of its `pieces`."""
 
     shape: list[int]
     dtype: str

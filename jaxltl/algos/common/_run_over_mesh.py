@@ -18,10 +18,7 @@ Run = Callable[..., tuple[PyTree, PyTree]]
 def run_over_mesh(
     mesh: Mesh, run: Run, step: Callable[..., PyTree]
 ) -> Callable[..., tuple[PyTree, PyTree]]:
-    """Runs of lanes by ``run(step, state, problem, hparams, lengths)``, with metrics on the host.
-
-    States stay on their devices; hyperparameters have shared values as a second part.
-    """
+    """Runs of lanes by ``run(step, state, problem, hparams, lengths)``, with metrics on the host."""
     lanes = vmap_over_mesh(_lane(run, step), mesh, in_axes=(0, None, (0, None), None))
 
     def advance(

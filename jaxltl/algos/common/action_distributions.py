@@ -86,10 +86,7 @@ def log_density(
 def entropy(
     actions: Actions, parameters: PyTree, allowed: jax.Array | None, squash: str
 ) -> jax.Array:
-    """Entropy of an action, over allowed ones.
-
-    For a squashed Gaussian by Gauss-Hermite quadrature; for a clipped one, that of the Gaussian.
-    """
+    """Entropy over allowed actions; of a squashed Gaussian by Gauss-Hermite quadrature."""
     if isinstance(actions, Finite):
         log = jax.nn.log_softmax(_masked(parameters, allowed))
         log = log if allowed is None else jnp.where(allowed, log, 0)

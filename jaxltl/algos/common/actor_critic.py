@@ -1,7 +1,6 @@
 """Actor-critic networks for finitely many actions or a box, with or without memory.
 
 Example:
-
   >>> import jax, jax.numpy as jnp
   >>> import jaxltl as jl
   >>> from jaxltl.algos.common import actor_critic as networks
@@ -147,8 +146,8 @@ class ActorCritic(nn.Module):
 
     Attributes:
       num_actions: A, or 0 for a box.
-      shape: of an action of a box, whose log standard deviation is a parameter that does not depend
-        on the observation.
+      shape: of an action of a box; its log standard deviation is a parameter that does not depend on
+        the observation.
       hidden: widths of the hidden layers of each.
       activation: its name in ``flax.linen``.
       initial_deviation: of a box's actions, in units of half its width where it has bounds.
@@ -166,7 +165,7 @@ class ActorCritic(nn.Module):
 
 
 class RecurrentActorCritic(nn.Module):
-    """A dense layer and a gated recurrent unit, whose memory the heads of :class:`ActorCritic` read.
+    """A dense layer and a gated recurrent unit, with the heads of :class:`ActorCritic` on its memory.
 
     Attributes:
       num_actions, shape, hidden, activation, initial_deviation: as there.
@@ -232,7 +231,7 @@ def initial_memory(network: nn.Module, memory: PyTree = None) -> PyTree:
 
 
 def has_memory(problem: HasNetwork) -> bool:
-    """Whether the network of a `problem` is recurrent: the problem's ``memory`` has arrays.
+    """``True`` if the network of a `problem` is recurrent: the problem's ``memory`` has arrays.
 
     >>> from types import SimpleNamespace
     >>> has_memory(SimpleNamespace(memory=())), has_memory(SimpleNamespace(memory=np.zeros(2)))

@@ -175,7 +175,7 @@ def load(
     """The state saved by :func:`save` at `path`, bit for bit, as a tree like `like`.
 
     `like` is a state of the same learner and problem, for example from ``init``; a first axis of length
-    zero matches any length. Arrays are placed on its devices, and each process reads what it needs.
+    zero matches any length. Arrays are placed on its devices, and each process reads its parts.
     `given` is as for :func:`save`.
 
     Raises:
@@ -250,7 +250,7 @@ def _require_same(path: str, before: dict[str, str], now: dict[str, str]) -> Non
 
 
 def _named(tree: PyTree) -> list[tuple[str, Any]]:
-    """Leaves with distinct file-safe names, whose numbers distinguish nested paths."""
+    """Leaves with distinct file-safe names, numbered to distinguish nested paths."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
     return [
         (f"{i}{jax.tree_util.keystr(path)}".replace("/", "_"), _array_of(leaf))
@@ -330,7 +330,7 @@ def _function(name: str, value: types.FunctionType) -> Iterator[tuple[str, str]]
     for free, cell in zip(value.__code__.co_freevars, value.__closure__ or (), strict=True):
         with contextlib.suppress(ValueError):  # a cell that is empty yet
             held = inspect.unwrap(cell.cell_contents)
-            if isinstance(held, types.FunctionType):  # whose own cells may lead back here
+            if isinstance(held, types.FunctionType):  # its own cells may lead back here
                 yield f"{name}.{free}", _code(held.__code__)
             else:
                 yield from _described(f"{name}.{free}", held)

@@ -1,7 +1,6 @@
 """Runs of a learner in compiled chunks, on the host: reports, saved states, and resuming bitwise.
 
 Example: a contraction to a fixed point, for two lanes.
-
   >>> import jax, jax.numpy as jnp
   >>> from jaxltl.core import struct
   >>> from jaxltl.algos.common.chunks import Options, run_in_chunks
@@ -168,7 +167,7 @@ def _metrics_of(
     one = (state, hparams)
     if num_lanes is not None:
         one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), one)
-    # As a program, whose trace is kept for the next run.
+    # As a program, so that its trace is kept for the next run.
     return jax.eval_shape(jax.jit(step), one[0], problem, one[1])[1]
 
 
@@ -214,7 +213,7 @@ def _lane_steps(step: Step, keep: str, num_lanes: int | None) -> Step:
         return jax.vmap(one, in_axes=(0, None, (0, None)))
 
     def alone(now: Progress, problem: PyTree, given: PyTree) -> tuple[Progress, PyTree]:
-        # Without vmap, whose loops and branches take several times as long to compile.
+        # Without vmap: its loops and branches take several times as long to compile.
         first, hparams = jax.tree.map(lambda x: x[0], (now, given[0]))
         return jax.tree.map(lambda x: x[None], one(first, problem, (hparams, given[1])))
 

@@ -84,14 +84,8 @@ def generalized_advantages(
 ) -> jax.Array:
     """Generalised advantages (Schulman et al. 2016, equation 16) of consecutive episodes.
 
-    ``A_t = d_t + discount_t lambda A_{t+1}`` with ``d_t = r_t + discount_t V'_t - V_t``, and A = 0 after
-    the last of T steps and after the end of an episode. V' is the value after each step, also where
-    an episode is truncated; zero after a termination. All arrays are ``[T, ...]``.
-
-    >>> ones, zeros = jnp.ones(3), jnp.zeros(3)
-    >>> ended = jnp.array([False, True, False])
-    >>> generalized_advantages(ones, zeros, zeros, 0.5, 1.0, ended).tolist()
-    [1.5, 1.0, 1.0]
+    ``A_t = d_t + discount_t lambda A_{t+1}`` with ``d_t = r_t + discount_t V'_t - V_t``, V' the value
+    after each step, and A = 0 after the last step and after the end of an episode.
     """
     error = reward + discount * following - value
     kept = jnp.broadcast_to(jnp.where(ended, 0, discount * gae_lambda), error.shape)
@@ -112,14 +106,7 @@ def masked_advantages(
     gae_lambda: chex.Numeric,
     last: chex.Numeric = 0.0,
 ) -> jax.Array:
-    """Generalised advantages of one trajectory for each column; zero where `valid` is false.
-
-    The value after the last valid step is `last`.
-
-    >>> ones, zeros = jnp.ones(3), jnp.zeros(3)
-    >>> masked_advantages(ones, zeros, jnp.array([True, True, False]), 0.5, 1.0).tolist()
-    [1.5, 1.0, 0.0]
-    """
+    """Generalised advantages, a trajectory for each column; zero where `valid` is false."""
     value = jnp.where(valid, value, 0)
     following = jnp.concatenate([value[1:], jnp.zeros_like(value[:1])])
     continues = jnp.concatenate([valid[1:], jnp.zeros_like(valid[:1])])

@@ -9,7 +9,6 @@ The root key stays in the state: step n draws from ``step_key(state)``, the key 
 and ``init`` from ``init_key(key)``, a number that no step reaches.
 
 Example: a learner of the fixed point of ``x -> (1 - rate) x + rate * target``.
-
   >>> import jax, jax.numpy as jnp
   >>> from jaxltl.core import struct
   >>> import jaxltl as jl

@@ -59,13 +59,7 @@ def run(
 
 
 def block_lengths(num_steps: int, max_rows: int) -> np.ndarray:
-    """Lengths ``int32[rows]`` of at most `max_rows` blocks of `num_steps` steps in total.
-
-    All blocks but the first have equal lengths.
-
-    >>> block_lengths(7, 3).tolist()
-    [1, 3, 3]
-    """
+    """Lengths of at most `max_rows` blocks of `num_steps` steps, equal but for the first."""
     stride = -(-num_steps // max_rows)
     lengths = np.full(-(-num_steps // stride), stride, np.int32)
     lengths[0] = num_steps - (num_steps - 1) // stride * stride
@@ -134,10 +128,7 @@ def run_until(
     keep: str = "after",
     idle: bool = False,
 ) -> Learned:
-    """:meth:`~jaxltl.algos.common.learner.Learner.run_until` of a learner with this `step`.
-
-    With `idle`, the step takes a fourth argument ``bool[]`` and keeps the state where it is False.
-    """
+    """The ``run_until`` of a learner; with `idle`, a fourth argument False keeps the state."""
     if keep not in ("after", "before"):
         raise ValueError(f'keep={keep!r}; choose "after" or "before".')
     if idle and (check_every, keep) != (1, "after"):
@@ -211,12 +202,6 @@ def while_active(
 
     A vmapped ``lax.while_loop`` copies all arrays of finished lanes in every iteration. Here `body`
     must return the carry of an inactive lane unchanged, so that only written entries are touched.
-
-    >>> def half(x, bound):  # small numbers are unchanged
-    ...     return jnp.where(x > bound, x / 2, x)
-    >>> run = jax.vmap(lambda x: while_active(lambda x, bound: x > bound, half, x, 1.0))
-    >>> run(jnp.array([0.5, 4.0])).tolist()
-    [0.5, 1.0]
     """
     carry, given = jax.tree.map(jnp.asarray, (carry, given))
 

@@ -29,13 +29,7 @@ def no_moments(shape: tuple[int, ...], dtype: jax.typing.DTypeLike | None = None
 def updated_moments(
     moments: Moments, numbers: jax.Array, valid: jax.Array | None = None
 ) -> Moments:
-    """The moments with a batch ``[..., *shape]``, or its `valid` entries, added (Chan et al. 1979).
-
-    >>> now = updated_moments(no_moments(()), jnp.array([1.0, 5.0]))
-    >>> now = updated_moments(now, jnp.array([3.0]))
-    >>> float(now.mean), float(now.squares)
-    (3.0, 8.0)
-    """
+    """The moments with a batch ``[..., *shape]``, or its `valid` entries, added (Chan et al. 1979)."""
     numbers = numbers.astype(moments.mean.dtype)
     axes = tuple(range(numbers.ndim - moments.mean.ndim))
     if valid is None:
@@ -68,10 +62,7 @@ def standardized(moments: Moments, numbers: jax.Array) -> jax.Array:
 
 
 def normalized(moments: PyTree, observation: PyTree) -> PyTree:
-    """A tree of observations with floats :func:`standardized` and clipped to ten deviations.
-
-    `moments` is a tree of :class:`Moments`, or None for no change.
-    """
+    """A tree of observations with floats :func:`standardized` and clipped to ten deviations."""
     if moments is None:
         return observation
 

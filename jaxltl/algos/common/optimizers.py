@@ -13,12 +13,7 @@ _SCALINGS = {
 
 
 def optimizer(name: str, learning_rate: chex.Numeric) -> optax.GradientTransformationExtraArgs:
-    """An optimizer of optax: ``"lbfgs"``, which ignores the rate, ``"adam"``, ``"rmsprop"`` or ``"sgd"``.
-
-    >>> import jax.numpy as jnp
-    >>> optimizer("adam", 1e-3).init(jnp.zeros(2))[0].mu.shape
-    (2,)
-    """
+    """An optimizer of optax; ``"lbfgs"`` ignores the rate."""
     if name == "lbfgs":
         return optax.lbfgs()
     if name not in _SCALINGS:

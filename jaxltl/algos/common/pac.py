@@ -10,7 +10,6 @@ the dtype if the constant does. Arguments broadcast and may be traced; constants
 differentiable in them where they are not clipped.
 
 Example: the visits of each pair that theorem 6 requires in a game of 144 states.
-
   >>> from jaxltl.algos.common import pac
   >>> numbers = dict(epsilon=1e-4, discount=0.6, reward_bound=1.0)
   >>> print(f"{float(pac.visits(**numbers, failure=0.1, num_states=144, num_actions=6)):.4e}")

@@ -78,7 +78,7 @@ Schedule = Any  # a number, a Polynomial, or a pytree that is called with l = 1,
 
 
 def is_schedule(given: object) -> bool:
-    """Whether `given` is a schedule of the step, in a pytree so that it is traced, and not a number.
+    """``True`` if `given` is a schedule of the step, a pytree that is traced, and not a number.
 
     >>> import math
     >>> [is_schedule(x) for x in (Linear(1.0, 0.0, 4), Polynomial(1.0, -1.0), 0.5, math.exp)]

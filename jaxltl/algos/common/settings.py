@@ -9,7 +9,7 @@ A learner's ``Hparams`` declares each field with its valid values::
         method: str = static(("trpo", "cpo"), default="cpo")
         num_envs: int = static(Range(1, integer=True), default=8)
 
-A field whose default is None may be None. The functions made by
+A field with default None may be None. The functions made by
 :func:`~jaxltl.algos.common.learner.bind` call :func:`require_hparams` and :func:`flag_invalid`.
 """
 
@@ -59,7 +59,7 @@ class _Valid(NamedTuple):
 def traced(valid: Range, *, default: Any = dataclasses.MISSING, schedule: bool = False) -> Any:
     """A dataclass field with a traced number in the range `valid`, or if `schedule` a schedule of them.
 
-    A field whose `default` is None may be None.
+    A field with `default` None may be None.
     """
     metadata = {"valid": _Valid(valid, False, schedule)}
     return struct.field(default=default, metadata=metadata)
@@ -68,7 +68,7 @@ def traced(valid: Range, *, default: Any = dataclasses.MISSING, schedule: bool =
 def static(valid: Range | tuple[str, ...] | type[bool], *, default: Any) -> Any:
     """A dataclass field with a static integer (or a tuple of them), word or truth value.
 
-    `valid` is the range, the words, or bool; a field whose `default` is None may be None.
+    `valid` is the range, the words, or bool; a field with `default` None may be None.
 
     >>> @struct.dataclass
     ... class Hparams:
@@ -82,7 +82,7 @@ def static(valid: Range | tuple[str, ...] | type[bool], *, default: Any) -> Any:
 
 
 def _declared(hparams: object) -> Iterator[tuple[str, Any, _Valid]]:
-    """Name, value and valid values of all fields but those that are None by their default."""
+    """Name, value and valid values of all fields except those with a default of None and no value."""
     if not dataclasses.is_dataclass(hparams):
         return
     for field in dataclasses.fields(hparams):

@@ -32,12 +32,7 @@ def words(stream: Stream, i: jax.Array) -> jax.Array:
 
 
 def mix32(x: jax.Array) -> jax.Array:
-    """A bijection of 32-bit words in which each input bit flips half of the output bits.
-
-    Example:
-      >>> [f"{int(mix32(jnp.uint32(x))):08x}" for x in (1, 2, 0xFFFFFFFF)]
-      ['06d3fa73', '0da7f4e7', 'd9b56683']
-    """
+    """A bijection of 32-bit words in which each input bit flips half of the output bits."""
     x = (x ^ (x >> 16)) * jnp.uint32(0x21F0AAAD)
     x = (x ^ (x >> 15)) * jnp.uint32(0xD35A2D97)
     return x ^ (x >> 15)

@@ -16,12 +16,7 @@ def _is_key(x: jax.Array) -> bool:
 
 
 def strong(tree: TreeT) -> TreeT:
-    """The same arrays without weak types, so that all chunks of a run share one program.
-
-    >>> number = jnp.asarray(1.0)
-    >>> number.weak_type, strong({"x": number})["x"].weak_type
-    (True, False)
-    """
+    """The same arrays without weak types, so that all chunks of a run share one program."""
     return jax.tree.map(lambda x: x if _is_key(x) else lax.convert_element_type(x, x.dtype), tree)
 
 
@@ -31,9 +26,5 @@ def either(condition: jax.Array, one: TreeT, other: TreeT) -> TreeT:
 
 
 def choose(condition: jax.Array, one: TreeT, other: TreeT) -> TreeT:
-    """``jnp.where`` on trees; random keys, which steps do not change, are those of `one`.
-
-    >>> choose(jnp.bool_(False), {"x": jnp.zeros(2)}, {"x": jnp.ones(2)})["x"].tolist()
-    [1.0, 1.0]
-    """
+    """``jnp.where`` on trees; random keys, which steps do not change, are those of `one`."""
     return jax.tree.map(lambda x, y: x if _is_key(x) else jnp.where(condition, x, y), one, other)

@@ -1,7 +1,7 @@
 """Feasible parameters of parametric Markov models by gradient ascent (Heck et al. 2022).
 
-For a model whose probabilities and rewards are functions of parameters in a box: is there a point
-at which a reachability probability or an expected total reward meets a threshold? Projected
+For a model with probabilities and rewards that are functions of parameters in a box: is there a
+point at which a reachability probability or an expected total reward meets a threshold? Projected
 gradient ascent from many starts, with implicit derivatives of a prepared solve. The objective is
 the logarithm of the value, or of the odds of a probability, and coordinates are shares of the box,
 so that a learning rate means the same for every model.
@@ -10,7 +10,6 @@ Gradients find local optima, in floating point: failure proves nothing, and :fun
 every point that meets the threshold certified by the sparse engine, on the model at that point.
 
 Example: a head of one coin, then a tail of another; their biases are parameters.
-
   >>> import jax, jax.numpy as jnp, numpy as np
   >>> import jaxltl as jl
   >>> from jaxltl.algos import feasible as search
@@ -197,7 +196,7 @@ def _is_chain(prepared: Prepared) -> bool:
 
 
 def _has_variable_cost(prepared: Prepared) -> bool:
-    """Whether the work of a solve depends on the numbers."""
+    """True if the work of a solve depends on the numbers."""
     return not is_direct(prepared) if _is_chain(prepared) else prepared.cyclic
 
 
@@ -269,10 +268,7 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
 
 
 def _unit(problem: Problem, value: jax.Array) -> jax.Array:
-    """The divisor of a gradient that makes it that of the logarithm of the value, or of the odds.
-
-    It keeps steps of a reasonable size at values such as 1e-30 or 1 - 1e-9.
-    """
+    """The divisor that makes a gradient that of the logarithm of the value, or of the odds."""
     limits = jnp.finfo(value.dtype)
     unit = jnp.abs(value)
     if problem.reward is None:

@@ -7,15 +7,14 @@ optimistic one, and explores with a small probability; where the task can be sat
 surely, every policy on the way satisfies it, by the graph.
 
 Qualitative preprocessing (:func:`make_problem`) finds the almost-sure winning region, the losing
-region, and the maximal end components between them, whose states share the value of their best
+region, and the maximal end components between them; the states of each share the value of its best
 exit. Hence both values are the unique solutions of their Bellman equations, and value iteration may
-continue from the last values however the intervals have moved.
+continue from the last values.
 
 The world is read through ``sample_successor`` only. Values have shape ``[S, Q]``: S states of the
 world, Q of the task's automaton, which reads the label of a state on exit.
 
 Example: to reach the goal ``g`` and never ``r``.
-
   >>> import jax
   >>> import jaxltl as jl
   >>> from jaxltl.algos import interval_learning
@@ -200,7 +199,7 @@ def guarantee(state: State, problem: Problem, confidence: float, **options: Any)
 
 
 def wins_almost_surely(problem: Problem, policy: jax.Array) -> bool:
-    """Whether a memoryless `policy` satisfies the task almost surely wherever that is possible.
+    """``True`` if a memoryless `policy` satisfies the task almost surely wherever that is possible.
 
     Qualitative, on the host, by the graph of the `problem` and the support of the policy,
     ``float[S, Q, A]``: it stays in the winning region, and all its bottom strongly connected
@@ -250,10 +249,7 @@ def _value_iteration(state: State, problem: Problem, hparams: Hparams) -> State:
 def _expectations(
     problem: Problem, values: jax.Array, lower: jax.Array, upper: jax.Array, nature: jax.Array
 ) -> jax.Array:
-    """Expectations ``float[V, S, Q, A]`` of V values ``[V, S, Q]`` under intervals ``[V, S, A, K]``.
-
-    `nature`, ``float[V]``, is 1 where it maximises and -1 where it minimises.
-    """
+    """Expectations of V values under intervals; `nature` is 1 to maximise, -1 to minimise."""
     next_memory = problem.model.next_memory[:, :, None, None]
     reached = values[:, problem.model.mdp.successor[:, None], next_memory]
     shape, width = reached.shape, reached.shape[-1]
@@ -279,11 +275,7 @@ def _with_decided(problem: Problem, value: jax.Array) -> jax.Array:
 def _soonest(
     problem: Problem, hparams: Hparams, moves: jax.Array, value: jax.Array, ahead: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """The discounted probability of winning by optimistically optimal actions, and its best ones.
-
-    It uses frequencies instead of optimistic probabilities, by which a run might never get to
-    where there is something to learn.
-    """
+    """Discounted probability of winning by optimistic actions and frequencies; its best ones."""
     slack = 64 * jnp.finfo(moves.dtype).eps
     near = problem.allowed & (problem.staying | (moves >= value[..., None] - slack))
     near = jnp.where((problem.winning | problem.losing)[..., None], problem.allowed, near)

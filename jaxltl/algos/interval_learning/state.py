@@ -59,8 +59,7 @@ class State:
     """Counts, intervals and values.
 
     Attributes:
-      key: root key of the run.
-      step: ``int32[]``, steps made.
+      key, step: root key, and steps made, ``int32[]``.
       samples: ``int32[]``, observed transitions; near 2^31 further steps sample none.
       counts: ``int32[S, A, K]``, observations of each transition.
       lower, upper: ``float[S, A, K]``, intervals; 0 in padding.

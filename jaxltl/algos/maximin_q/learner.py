@@ -20,7 +20,6 @@ Both converge to the minimax value if every allowed action is taken infinitely o
 game is deterministic and ``alpha = 1``, or ``alpha`` decays as usual in stochastic approximation.
 
 Example: in one state the system may stay or move to the other state, where it is paid.
-
   >>> import jax
   >>> import jaxltl as jl
   >>> from jaxltl.algos import maximin_q
@@ -114,8 +113,7 @@ class State:
     """The table, and the chains that update it.
 
     Attributes:
-      key: root key of the run.
-      step: ``int32[]``, steps made.
+      key, step: root key, and steps made, ``int32[]``.
       q: ``float[S, A]``, or ``float[S, A, A]`` over the system's states, actions and answers;
         minus infinity where the system and plus infinity where the environment has no allowed
         action, the neutral elements of maxima and minima.
@@ -287,7 +285,7 @@ def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
 
 # --- one move of all chains -------------------------------------------------------------------
 
-_Chains = tuple[State, jax.Array]  # a state whose tables are flat, and where the system moves
+_Chains = tuple[State, jax.Array]  # a state with flat tables, and where the system moves
 
 
 @struct.dataclass
@@ -388,10 +386,7 @@ def _greedy(chains: _Chains, problem: Problem) -> tuple[jax.Array, jax.Array]:
 
 
 def _value_at(q: jax.Array, state: jax.Array, is_system: jax.Array, problem: Problem) -> jax.Array:
-    """Values of the chains' states by a flat table, without computing those of all states.
-
-    The player differs from chain to chain at random: multiplying by signs is faster than selecting.
-    """
+    """Values of the chains' states by a flat table; multiplying by signs is faster than selecting."""
     num_actions = problem.game.num_actions
     if problem.is_maximin:
         block = take(q.reshape(-1, num_actions, num_actions), state)

@@ -59,7 +59,7 @@ class Problem:
 
     @property
     def is_maximin(self) -> bool:
-        """Whether the table has an entry for each answer of the environment."""
+        """True if the table has an entry for each answer of the environment."""
         return self.method == "maximin"
 
 

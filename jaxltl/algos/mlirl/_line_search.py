@@ -31,14 +31,7 @@ class Point:
 
 @struct.dataclass
 class Search:
-    """The state of the search between steps.
-
-    Attributes:
-      point: the end of the last step.
-      direction: of the next step.
-      memory: optax's, of the last steps and gradients.
-      known: whether the point was evaluated.
-    """
+    """State of the search; `known` is True if the point was evaluated."""
 
     point: Point
     direction: PyTree

@@ -1,7 +1,6 @@
 """Named features of state-action pairs for linear rewards: Table 1, generalised to any task.
 
 Example: one step leads to the goal.
-
   >>> import jaxltl as jl
   >>> from jaxltl.algos import mlirl
   >>> world = jl.from_dense([[[0, 1.0]], [[0, 1.0]]], label=[[0], [1]], propositions=["g"])
@@ -144,11 +143,7 @@ _TOO_LONG = (
 
 
 def _nearer(model: Product, best: Solution) -> np.ndarray | None:
-    """Decrease ``float[S, Q, A]`` of the expected steps to the goal; None if these are too many.
-
-    The goal is a final state, or an accepting component and there its next accepting visit. Losing
-    states count as the farthest ones.
-    """
+    """Decrease ``float[S, Q, A]`` of the expected steps to the goal; None if these are too many."""
     problem, lost = as_reachability(model, "max"), np.asarray(best.upper).ravel() <= 0
     reached = np.asarray(problem.target).ravel()
     sparse = rows_of_model(model)

@@ -1,12 +1,11 @@
 """Maximum-likelihood inverse RL with temporal-logic side information (dissertation, chapter 2).
 
-Given demonstrations, find a reward whose softmax policy maximises their likelihood (2.4), in the
+Given demonstrations, find a reward with a softmax policy that maximises their likelihood (2.4), in the
 world or in its product with a task, plus ``mu`` times the probability that the policy satisfies the
 task (2.6). The model with side information is a product, ``jl.product(world, "!r U g")``; its
 features have shape ``[S, Q, A, F]``, such as those of :func:`task_features`.
 
 Example: two demonstrations that reach the goal, and two features.
-
   >>> import jax, numpy as np
   >>> import jaxltl as jl
   >>> from jaxltl.algos import mlirl

@@ -24,11 +24,7 @@ from jaxltl.core.models.protocols import PyTree
 
 
 class Rows(NamedTuple):
-    """Transitions ``[T, N, ...]``, flattened, or a minibatch.
-
-    Normalised observations, `start` of an episode with the transition, the action mask or None, the
-    `raw` action and its density under the collecting policy, and the value before it.
-    """
+    """Transitions ``[T, N, ...]``, flattened, or a minibatch; observations are normalised."""
 
     observation: PyTree
     start: jax.Array
@@ -58,11 +54,7 @@ class _Record(NamedTuple):
 def collected(
     key: chex.PRNGKey, state: State, problem: Problem, hparams: Hparams
 ) -> tuple[State, PyTree, Rows, dict[str, jax.Array]]:
-    """T transitions of N environments: the next state, initial memories, transitions, and figures.
-
-    Figures are those of ``Metrics``, whether every mask allows an action, ``permitted``, and whether all
-    advantages are finite, ``finite``.
-    """
+    """T transitions of N environments: the next state, initial memories, transitions, and figures."""
     walkers, record = _walked(key, state, problem, hparams)
     path = record.of
     dtype = walkers.discounted.dtype
@@ -221,10 +213,7 @@ def _evaluated_all(
 
 
 def _at_ends(cut: jax.Array, following: jax.Array, ends: PyTree, judge: PyTree) -> jax.Array:
-    """Next values, with those at truncated observations inserted.
-
-    Truncations are rare, so only these observations are evaluated, a batch at a time.
-    """
+    """Next values, with those at truncated observations, which are rare, inserted batch by batch."""
     size, some = cut.size, min(cut.size, max(cut.shape[1], 32))
     problem, parameters, moments = judge
     flat = jax.tree.map(lambda x: x.reshape(size, *x.shape[2:]), ends)

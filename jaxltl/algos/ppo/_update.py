@@ -105,11 +105,7 @@ class _Going(NamedTuple):
 def improved(
     key: chex.PRNGKey, state: State, rows: Rows, begun: PyTree, problem: Problem, hparams: Hparams
 ) -> tuple[PyTree, PyTree, Figures]:
-    """Parameters and the optimiser's state after the epochs, and mean figures.
-
-    Updates with a gradient that is not finite are skipped and counted, as are all after the first
-    minibatch whose divergence exceeds `target_kl`.
-    """
+    """Parameters and optimiser state after the epochs, up to `target_kl`, and mean figures."""
     limits = Limits(at(hparams.clip, state.step), _at(hparams.value_clip, state.step))
     rate = at(hparams.learning_rate, state.step)
     recurrent, over = has_memory(problem), hparams.sharding

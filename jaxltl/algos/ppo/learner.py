@@ -166,7 +166,7 @@ def _check(problem: Problem, hparams: Hparams) -> None:
     )
 
 
-# --- what was learned -----------------------------------------------------------------------------
+# --- learned policies -----------------------------------------------------------------------------
 
 
 def policy(state: State, problem: Problem, hparams: Hparams) -> Agent:

@@ -74,10 +74,9 @@ class Hparams:
         every possible end: fast, and takes memory. 0: N in each transition, with the same results.
         Another number: that many, used cyclically; fastest where resets are costly and episodes
         long. Default None.
-      sharding: a ``NamedSharding`` whose spec names the mesh axis that splits the environments and
-        each minibatch, such as ``NamedSharding(mesh, PartitionSpec("environments"))``; static. Runs
-        are equal up to the order of sums. Collected transitions are replicated once for each step,
-        since a minibatch may contain any of them. Default None.
+      sharding: of the environments and of each minibatch, such as
+        ``NamedSharding(mesh, PartitionSpec("environments"))``; static. Runs are equal up to the order
+        of sums; collected transitions are replicated once for each step. Default None.
     """
 
     discount: Number = traced(Range(0, 1))
@@ -120,8 +119,7 @@ class State:
     """A policy, its optimiser, and the environments.
 
     Attributes:
-      key: random key of the run.
-      step: ``int32[]``, number of steps.
+      key, step: root key, and steps made, ``int32[]``.
       parameters: of the network, a pytree.
       optimizer: optax's state.
       walkers: the N environments.

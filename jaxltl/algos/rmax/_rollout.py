@@ -22,8 +22,7 @@ _BEST, _KNOWN = 1, 2
 
 @struct.dataclass
 class Rules:
-    """Constants of one step: `flags` are :func:`pair_flags`, `explore` the exploration probability,
-    `enough` the visits of a known pair, and `every` whether every reward enters the model."""
+    """Constants of one step; `every`: every reward enters the model."""
 
     problem: Problem
     flags: jax.Array
@@ -48,11 +47,7 @@ class Transition:
 
 @struct.dataclass
 class Rollout:
-    """The variables of a rollout, which ends with a change of the model or after `remaining` moves.
-
-    `pair` and `last_reward` are of the last move, `known` is whether the pair became known by it,
-    and `fresh` whether a known pair showed a transition for the first time.
-    """
+    """The variables of a rollout, which ends with a change of the model or after `remaining` moves."""
 
     moves: jax.Array
     remaining: jax.Array
@@ -67,10 +62,7 @@ class Rollout:
 
 
 def pair_flags(best: jax.Array, known_at: jax.Array) -> jax.Array:
-    """Near-optimal and known pairs as two bits of one byte, ``uint8[S, A]``.
-
-    A move reads both, in each lane elsewhere: two arrays would be two cache misses.
-    """
+    """Near-optimal and known pairs as two bits of one byte, ``uint8[S, A]``: one cache miss a move."""
     return best * jnp.uint8(_BEST) + (known_at >= 0) * jnp.uint8(_KNOWN)
 
 

@@ -121,11 +121,11 @@ def evidence(
 
 @jax.jit
 def wins_almost_surely(problem: Problem, strategy: jax.Array) -> jax.Array:
-    """Whether a memoryless `strategy` wins almost surely from every state of the region.
+    """``True`` if a memoryless `strategy` wins almost surely from every state of the region.
 
     Qualitative, by the graph of the `problem` and the support of the strategy, ``float[S, A]``: it
     never leaves the region, and from each state an accepting one is reached with positive
-    probability whatever the environment does, hence almost surely again and again.
+    probability against every environment, hence infinitely often almost surely.
     """
     game = problem.game
     used = jnp.where(game.system[:, None], strategy > 0, problem.allowed)

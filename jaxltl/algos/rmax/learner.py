@@ -1,7 +1,7 @@
 """R-max in the almost-sure winning region of a stochastic game (dissertation, chapter 6).
 
 Algorithm 5: PAC learning of an epsilon-optimal strategy among those that satisfy a Buchi objective
-almost surely, in a turn-based game whose graph is known and whose probabilities and rewards are not
+almost surely, in a turn-based game with a known graph and unknown probabilities and rewards
 (after Brafman and Tennenholtz 2002). At every moment the strategy wins almost surely: with a small
 probability it draws any action that stays in the winning region, else one that is near-optimal in
 an optimistic model. A state-action pair becomes known after enough visits; then its frequencies and
@@ -11,7 +11,6 @@ The true game is read through ``sample_successor`` and the rewards of observed t
 Arrays cover the S states of ``problem.game``; states outside of the region are never entered.
 
 Example: to come home again and again, with a reward for staying away.
-
   >>> import jax
   >>> import jaxltl as jl
   >>> from jaxltl.algos import rmax

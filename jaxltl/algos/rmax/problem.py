@@ -73,8 +73,8 @@ def make_problem(
 
     Args:
       game: a Game, or an MDP, in which the system always moves.
-      spec: accepting states ``bool[S]``, an objective, or a formula or automaton, whose product
-        with the game reads labels on exit. A deterministic Buchi condition or weaker.
+      spec: accepting states ``bool[S]``, an objective, or a formula or automaton; its product with
+        the game reads labels on exit. A deterministic Buchi condition or weaker.
       reward: ``float[S, A]`` or ``float[S, A, K]`` on the given game, for actions of both players.
       environment: ``"random"``; ``"adversarial"``: optimal against an optimal system, by the
         `discount`; or a policy ``int32[S]`` or ``float[S, A]`` on the given game.

@@ -52,8 +52,7 @@ class State:
     """Observations, the optimistic model, and its near-optimal actions.
 
     Attributes:
-      key: root key of the run.
-      step: ``int32[]``, steps made.
+      key, step: root key, and steps made, ``int32[]``.
       moves: ``int32[]``, moves made, at most 2^31 - 1; further steps make none.
       position: ``int32[]``, the current state of the game.
       counts: ``int32[S, A, K]``, observations of each transition; in a deterministic game at most 1.

@@ -1,12 +1,11 @@
 """Task-oriented deep inverse RL (dissertation, chapter 3).
 
-Maximum-entropy inverse RL with a reward network whose inputs are a local observation, the state of
-the task's automaton, and the action: find parameters for which the soft policy of the product makes
+Maximum-entropy inverse RL with a reward network that reads a local observation, the state of the
+task's automaton, and the action: find parameters for which the soft policy of the product makes
 the demonstrations likely (3.3). Such a reward is local, so :func:`plan` computes policies in unseen
 worlds.
 
 Example: a reward of the state, and the policy that it gives in another world.
-
   >>> import jax, jax.numpy as jnp
   >>> import jaxltl as jl
   >>> from jaxltl.algos import todirl

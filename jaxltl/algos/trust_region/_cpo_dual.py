@@ -32,22 +32,14 @@ def cpo_dual(
 ) -> Dual:
     """Multipliers ``(lambda, nu)`` of ``max g.x`` where ``c + b.x <= 0``, ``x.Hx / 2 <= delta``.
 
-    The dual is ``max over lambda, nu >= 0`` of (Achiam et al. 2017, equation 12, whose delta
-    is twice this one)::
+    The dual is ``max over lambda, nu >= 0`` of (Achiam et al. 2017, equation 12, with half its delta)::
 
         -(q - 2 r nu + s nu^2) / (2 lambda) + nu c - lambda delta,
 
-    and the solution ``x = H^-1 (g - nu b) / lambda``. The paper compares the best multipliers
-    with ``nu = 0`` (its case b) with the best with ``nu > 0`` (case a). As the dual is concave,
-    one test decides: the limit is active if and only if the best step without it breaks it.
-
-    Where the limit cannot be kept in the trust region the dual is unbounded, and the multipliers
-    returned are those of the paper's recovery, ``max -b.x``: ``x = -H^-1 b / lambda``, nu = 1.
-
-    Example:
-      >>> dual = cpo_dual(q=1.0, r=0.0, s=1.0, c=0.6, delta=0.5)
-      >>> [round(float(x), 3) for x in dual[:2]], Case(int(dual.case)).name
-      ([1.25, 0.75], 'ACTIVE')
+    and the solution ``x = H^-1 (g - nu b) / lambda``. As the dual is concave, one test replaces the
+    paper's two cases: the limit is active if and only if the best step without it breaks it. Where
+    the limit cannot be kept in the trust region the dual is unbounded, and the multipliers are those
+    of the paper's recovery, ``max -b.x``: ``x = -H^-1 b / lambda``, nu = 1.
     """
     q, r, s, c, delta = _floats(q, r, s, c, delta)
     room, rest, _ = _plane(q, r, s, c, delta)
@@ -104,10 +96,7 @@ def ratio(x: jax.Array, y: jax.Array) -> jax.Array:
 def _plane(
     q: jax.Array, r: jax.Array, s: jax.Array, c: jax.Array, delta: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Squared lengths, in H: what of the trust region is left on the limit, and of H^-1 g on it.
-
-    The third is the distance to the limit, infinite if `b` is zero.
-    """
+    """Squared H-lengths of the trust region on the limit and of H^-1 g on it; distance to the limit."""
     distance = jnp.where(
         s > 0, c / jnp.sqrt(jnp.where(s > 0, s, 1)), jnp.where(c == 0, 0, jnp.sign(c) * jnp.inf)
     )

@@ -89,10 +89,7 @@ def normalized(moments: Moments, hparams: Hparams, observation: jax.Array) -> ja
 
 
 def refolded(network: PyTree, old: Moments, new: Moments) -> PyTree:
-    """Parameters of the same function of observations under new moments.
-
-    Without this the policy would change with the moments, outside of any trust region.
-    """
+    """Parameters of the same function of observations under new moments."""
     first = "hidden_0" if "hidden_0" in network else "out"
     kernel, bias = network[first]["kernel"], network[first]["bias"]
     size, spread = old.mean.shape[0], scale_of(old)

@@ -43,10 +43,7 @@ def surrogate(
     valid: jax.Array,
     hparams: Hparams,
 ) -> tuple[jax.Array, jax.Array]:
-    """Gains ``float[V]`` over the sampling policy, and the mean divergence ``mean_i KL(old || pi)``.
-
-    ``sum_i (pi(a_i) / old(a_i) - 1) A_i`` for `weighted` advantages ``float[V, B]``.
-    """
+    """Gains ``sum_i (pi(a_i) / old(a_i) - 1) A_i``, ``float[V]``, and the mean divergence."""
     new = gaussian(parameters, hparams, inputs)
     log_ratio = log_density(action, *new) - log_density(action, *old)
     gains = weighted @ jnp.where(valid, jnp.expm1(log_ratio), 0)

@@ -31,7 +31,7 @@ class Problem:
 
     Attributes:
       environment: with a box of actions; actions outside are clipped.
-      limit: ``float[]``, on the expected cost of a trajectory; None: there is none.
+      limit: ``float[]``, on the expected cost of a trajectory, or None.
       horizon: T, maximal number of steps of a trajectory; static.
     """
 

@@ -74,8 +74,7 @@ class State:
     """A policy, value networks and moments of observations.
 
     Attributes:
-      key: random key of the run.
-      step: ``int32[]``, number of steps.
+      key, step: root key, and steps made, ``int32[]``.
       parameters: of the policy: ``{"mean": network, "log_deviation": float[A]}``.
       values: parameters of the value networks with a leading axis [V]: of rewards, and with CPO of
         costs. They also read the time, on which sums over a finite horizon depend.
