@@ -2,16 +2,13 @@
 
 A learner has ``Problem``, ``Hparams``, ``State`` and ``Metrics``; ``make_problem``, then
 ``train(key, problem, hparams, num_steps=...)``, or ``init``, ``step`` and ``run``; and
-``policy(state, problem, hparams)``. A module is imported at its first use, as
-``jaxltl.algos.ppo`` or by ``from jaxltl.algos import ppo``. Steps and runs support ``jit`` and
-``vmap``; they are not differentiable unless their documentation says so.
+``policy(state, problem, hparams)``. Steps and runs support ``jit`` and ``vmap``; they are not
+differentiable unless their documentation says so.
 
 From demonstrations: ``mlirl``, ``todirl``, ``behavioral_cloning``. From interaction with a model:
-``expected_sarsa``, ``maximin_q``, ``rmax``, ``interval_learning``. From interaction with a simulator: ``ppo``,
-``many_tasks``, ``cce``, ``trust_region``. Parameters of a parametric model: ``feasible``,
-``regions``. Shared parts are in ``common``: ``learner`` (training loops), ``chunks`` (progress
-reports and resumption), ``checkpoint`` (files), ``early_stopping``, ``schedules``,
-``actor_critic`` (networks) and ``pac`` (constants and bounds of ``rmax``).
+``expected_sarsa``, ``maximin_q``, ``rmax``, ``interval_learning``. From interaction with a
+simulator: ``ppo``, ``many_tasks``, ``cce``, ``trust_region``. Parameters of a parametric model:
+``feasible``, ``regions``. Shared parts are in ``common``.
 """
 
 import lazy_loader

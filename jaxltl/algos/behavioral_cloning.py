@@ -68,10 +68,9 @@ class ConvolutionalPolicy(nn.Module):
       hidden: widths of the dense layers.
 
     Example:
-      >>> shape, _ = jax.eval_shape(
-      ...     ConvolutionalPolicy().init_with_output, jax.random.key(0), jnp.zeros((7, 45)),
-      ...     jnp.zeros((7, 2)))
-      >>> shape.shape
+      >>> read = jnp.zeros((7, 45)), jnp.zeros((7, 2))
+      >>> jax.eval_shape(
+      ...     ConvolutionalPolicy().init_with_output, jax.random.key(0), *read)[0].shape
       (7, 4)
     """
 
@@ -92,9 +91,7 @@ class ConvolutionalPolicy(nn.Module):
 class DensePolicy(nn.Module):
     """A multilayer perceptron with ReLU: ``float[..., O]`` and ``float[..., Q]`` to scores.
 
-    Attributes:
-      num_actions: number of scores.
-      hidden: widths of the hidden layers.
+    `num_actions` is the number of scores, and `hidden` the widths of the hidden layers.
     """
 
     num_actions: int = 4
@@ -272,9 +269,8 @@ def policy_in_world(
 ) -> jax.Array:
     """The policy ``float[S, Q, A]`` in any world, zero at unavailable actions.
 
-    Of a `network` with `parameters`, such as ``state.best.parameters``, in a `model`, the product
-    of the world and the task, by the `observation` ``float[S, O]``. Differentiable in the
-    parameters.
+    Of a `network` with `parameters` in a `model`, the product of the world and the task, by the
+    `observation` ``float[S, O]``. Differentiable in the parameters.
     """
     memory = jnp.eye(model.num_memory, dtype=observation.dtype)[None]
     scores: Any = network.apply(parameters, observation[:, None], memory)

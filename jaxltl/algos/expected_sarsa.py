@@ -48,9 +48,7 @@ from jaxltl.core.validation import Range
 class Problem:
     """A model with a reward; made by :func:`make_problem`.
 
-    Attributes:
-      model: of which allowed actions are available.
-      reward: ``float[S, A]``.
+    `model` has the allowed actions as its available ones, and `reward` is ``float[S, A]``.
     """
 
     model: MDP

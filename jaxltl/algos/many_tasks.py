@@ -142,11 +142,9 @@ class SequenceNetwork(nn.Module):
 @brief
 @struct.dataclass
 class Plan:
-    """For each state of an automaton the sequences that lead to acceptance, shortest first.
+    """For each automaton state the sequences that lead to acceptance, shortest first.
 
-    Attributes:
-      reach, avoid: ``bool[Q, M, D, E]``.
-      length: ``int32[Q, M]``; 0 for padding.
+    `reach` and `avoid` are ``bool[Q, M, D, E]``, and `length` ``int32[Q, M]``, 0 for padding.
     """
 
     reach: chex.Array

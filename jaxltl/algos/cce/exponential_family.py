@@ -59,12 +59,7 @@ from jaxltl.core.pretty_print import brief
 @brief
 @struct.dataclass
 class DiagonalGaussian:
-    """Independent normal entries; ``Gamma(x) = (x, x^2)``.
-
-    Attributes:
-      mean: ``float[D]``.
-      variance: ``float[D]``.
-    """
+    """Independent normal entries, `mean` and `variance` ``float[D]``; ``Gamma(x) = (x, x^2)``."""
 
     mean: jax.Array
     variance: jax.Array
@@ -75,10 +70,8 @@ class DiagonalGaussian:
 class FullGaussian:
     """Normal vectors with any covariance; ``Gamma(x) = (x, x x')``.
 
-    Attributes:
-      mean: ``float[D]``.
-      factor: ``float[D, D]``, lower triangular with covariance ``factor @ factor.T``, which rounding
-        cannot make indefinite.
+    `mean` is ``float[D]``, and `factor` ``float[D, D]`` lower triangular with covariance
+    ``factor @ factor.T``, which rounding cannot make indefinite.
     """
 
     mean: jax.Array
@@ -88,12 +81,7 @@ class FullGaussian:
 @brief
 @struct.dataclass
 class Gamma:
-    """Independent gamma entries, which are positive; ``Gamma(x) = (x, log x)``.
-
-    Attributes:
-      shape: ``float[D]``.
-      rate: ``float[D]``; the mean is ``shape / rate``.
-    """
+    """Independent gamma entries, mean `shape` / `rate`, ``float[D]``; ``Gamma(x) = (x, log x)``."""
 
     shape: jax.Array
     rate: jax.Array

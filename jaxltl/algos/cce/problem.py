@@ -59,11 +59,9 @@ def make_problem(
       ValueError: evaluate returns other shapes, or a limit or scale is invalid.
 
     Example:
-      >>> def evaluate(x, key):
-      ...     return -jnp.sum((x - 1.0) ** 2), x[0]
-      >>> problem = make_problem(evaluate, families.diagonal_gaussian(jnp.zeros(2), 1.0), limit=0.5)
-      >>> problem.limit.tolist(), problem.scale.tolist()
-      ([0.5], [0.5])
+      >>> family = families.diagonal_gaussian(jnp.zeros(2), 1.0)
+      >>> make_problem(lambda x, key: (-jnp.sum(x**2), x[0]), family, limit=0.5).scale.tolist()
+      [0.5]
     """
     evaluate = as_partial(evaluate, "evaluate")
     try:

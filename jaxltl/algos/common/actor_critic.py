@@ -141,13 +141,12 @@ def _heads(module: Any, x: jax.Array) -> tuple[PyTree, jax.Array]:
 class ActorCritic(nn.Module):
     """Two multilayer perceptrons of the flattened observation: an actor and a critic.
 
-    Initialisation is orthogonal, of scale sqrt(2) in hidden layers, .01 for the actor's output, so that
+    Orthogonal initialisation has scale sqrt(2) in hidden layers, .01 for the actor's output, so that
     all actions are alike at first, and 1 for the critic's (Huang et al. 2022, details 2 and 3).
 
     Attributes:
       num_actions: A, or 0 for a box.
-      shape: of an action of a box; its log standard deviation is a parameter that does not depend on
-        the observation.
+      shape: of an action of a box; its log standard deviation is a parameter.
       hidden: widths of the hidden layers of each.
       activation: its name in ``flax.linen``.
       initial_deviation: of a box's actions, in units of half its width where it has bounds.
@@ -249,10 +248,8 @@ def evaluated(
 
     >>> from types import SimpleNamespace
     >>> problem = SimpleNamespace(network=ActorCritic(num_actions=2, hidden=()), memory=())
-    >>> def first(key, seen):
-    ...     parameters = fresh_parameters(key, problem.network, (), seen)
-    ...     return evaluated(problem, parameters, (), seen)
-    >>> jax.eval_shape(first, jax.random.key(0), jnp.zeros(3)).action.shape
+    >>> jax.eval_shape(lambda key, seen: evaluated(problem, fresh_parameters(
+    ...     key, problem.network, (), seen), (), seen), jax.random.key(0), jnp.zeros(3)).action.shape
     (2,)
     """
     if has_memory(problem):

@@ -1,9 +1,9 @@
 """Checkpoints: a learner's state in a file, written atomically and read bit for bit.
 
-A fingerprint of what the state was learned from is stored with it: shape, dtype and hash of every
-array of the problem and of the hyperparameters, and every static field. A checkpoint of another
-problem is refused even if shapes agree. Arrays on the devices of several processes are written in
-parts, one by each process, and read onto any other mesh by any number of processes.
+A fingerprint of the problem and of the hyperparameters is stored with it: shape, dtype and hash of
+every array, and every static field. A checkpoint of another problem is refused even if shapes
+agree. Arrays on the devices of several processes are written in parts, one by each process, and
+read onto any other mesh by any number of processes.
 
 Example:
   >>> import os, tempfile
@@ -14,14 +14,7 @@ Example:
   >>> checkpoint.save(path, state, given)
   >>> checkpoint.load(path, {"step": np.int32(0)}, given)["step"].item()
   3
-  >>> try:
-  ...     checkpoint.load(path, state, checkpoint.fingerprint(problem=np.ones(2)))
-  ... except ValueError as error:
-  ...     print("does not belong to this run" in str(error))
-  True
   >>> checkpoint.remove(path)
-  >>> os.path.exists(path)
-  False
 """
 
 from __future__ import annotations
@@ -63,11 +56,8 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
       >>> import pathlib, tempfile
       >>> path = pathlib.Path(tempfile.mkdtemp()) / "note"
       >>> with atomic_write(path) as file:
-      ...     _ = file.write(b"complete")
       ...     path.exists()
       False
-      >>> path.read_bytes()
-      b'complete'
     """
     path = Path(path)
     try:
@@ -92,12 +82,11 @@ def read_arrays(file: BinaryIO) -> dict[str, np.ndarray]:
     """The arrays of an ``.npz`` `file`, by name; nothing in it is executed.
 
     Raises:
-      ValueError: another format, or damaged; the message describes the fault without the file's name.
+      ValueError: another format, or damaged; the message omits the file's name.
 
     Example:
       >>> import io
-      >>> file = io.BytesIO()
-      >>> np.savez(file, x=np.arange(3))
+      >>> np.savez(file := io.BytesIO(), x=np.arange(3))
       >>> _ = file.seek(0)
       >>> read_arrays(file)["x"].tolist()
       [0, 1, 2]

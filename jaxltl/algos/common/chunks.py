@@ -53,15 +53,13 @@ class Options:
       chunk: steps between reports; default `max_rows`, or a hundredth of the steps.
       max_rows: bound on the rows of metrics of a chunk.
       report: called with the number of steps and the newest metrics after each chunk.
-      checkpoint: a file written atomically after each chunk. If it exists, the run resumes from it
-        and ends with the same bits.
+      checkpoint: a file written atomically after each chunk, from which a run resumes bitwise.
       mesh: devices of the lanes (:mod:`~jaxltl.core.models.mesh.lanes`). With several processes each
         passes the same arguments and receives the whole result except the state, which stays where
         it is. Checkpoints of other devices, or of none, are resumed too.
 
-    Example:
-      >>> Options(chunk=50).max_rows
-      10
+    >>> Options(chunk=50).max_rows
+    10
     """
 
     chunk: int | None = None

@@ -18,9 +18,8 @@ class Best:
     """The parameters with the best held-out likelihood; without held-out data the newest.
 
     Attributes:
-      parameters: of the network, a pytree.
+      parameters, step: of the network, a pytree, and steps made until then, ``int32[]``.
       neg_log_likelihood: ``float[]``, held out, in nats a pair; NaN without held-out data.
-      step: ``int32[]``, the number of steps after which they were reached.
     """
 
     parameters: PyTree
@@ -35,15 +34,14 @@ def stop_early(
 
     Of the `state` before a step, with ``parameters``, ``step``, ``best`` and ``stopped``; the
     parameters `after` it; their predecessors' negative log-likelihood `held_out`, ``float[]``; `judged`,
-    whether there is held-out data; and `patience`, in steps.
+    True with held-out data; and `patience`, in steps.
 
     >>> from types import SimpleNamespace
     >>> best = Best(jnp.zeros(1), jnp.array(0.5), jnp.int32(2))
     >>> state = SimpleNamespace(
     ...     parameters=jnp.ones(1), step=jnp.int32(9), best=best, stopped=jnp.bool_(False))
-    >>> best, stopped = stop_early(state, jnp.full(1, 2.0), jnp.array(0.6), jnp.bool_(True), 5)
-    >>> best.parameters.tolist(), stopped.item()  # nothing better for seven steps
-    ([0.0], True)
+    >>> stop_early(state, jnp.full(1, 2.0), jnp.array(0.6), jnp.bool_(True), 5)[1].item()
+    True
     """
     better = judged & (held_out < state.best.neg_log_likelihood) & ~state.stopped
     best = choose(better, Best(state.parameters, held_out, state.step), state.best)

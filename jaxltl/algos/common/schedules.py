@@ -31,10 +31,8 @@ SLACK = 1e-9
 class Polynomial:
     """The schedule ``scale * (l + offset) ** power`` of the steps l = 1, 2, ...
 
-    A negative power decays. Numbers are traced.
-
     Attributes:
-      scale, power: the numbers.
+      scale, power: the numbers; a negative power decays.
       offset: added to the step; default 0.
 
     Example:
@@ -50,13 +48,7 @@ class Polynomial:
 @brief
 @struct.dataclass
 class Linear:
-    """Linear interpolation from `first` in the first step to `last` after `num_steps` steps, then constant.
-
-    Numbers are traced.
-
-    Attributes:
-      first, last: the ends.
-      num_steps: of the interpolation.
+    """Linear interpolation from `first` in the first step to `last` after `num_steps`, then constant.
 
     Example:
       >>> [float(at(Linear(1.0, 0.0, 4), step)) for step in range(6)]

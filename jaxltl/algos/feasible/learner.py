@@ -113,15 +113,10 @@ class Budget:
 @brief
 @struct.dataclass
 class Best:
-    """The best point so far; NaN before there is one.
+    """The best point so far: `parameters`, ``float[D]``, and its `value`; NaN before there is one.
 
-    Attributes:
-      parameters: ``float[D]``.
-      value: ``float[]``, a probability, or in units of the reward.
-
-    Example:
-      >>> Best(jnp.full(2, jnp.nan), jnp.array(jnp.nan)).parameters.shape
-      (2,)
+    >>> Best(jnp.full(2, jnp.nan), jnp.array(jnp.nan)).parameters.shape
+    (2,)
     """
 
     parameters: jax.Array

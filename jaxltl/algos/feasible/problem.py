@@ -151,7 +151,6 @@ def require_problem(problem: object) -> None:
     Example:
       >>> require_problem(0.5)
       Traceback (most recent call last):
-        ...
       ValueError: problem is 0.5; give what make_problem returns.
     """
     if not isinstance(problem, Problem):

@@ -63,15 +63,11 @@ def make_problem(world: Model, task: Task) -> Problem:
       ValueError: the world is a game or no model, or the formula has unknown labels.
 
     Example:
-      >>> from jaxltl import make_mdp
-      >>> world = make_mdp([[[1, 2], [0, 1]], [[1, 0], [1, 0]], [[2, 0], [2, 0]]],
-      ...                  [[[.7, .3], [.5, .5]], [[1, 0], [1, 0]], [[1, 0], [1, 0]]],
-      ...                  initial=[1, 0, 0], label=[[0], [1], [0]], propositions=["home"])
-      >>> problem = make_problem(world, "F home")
-      >>> problem.winning[0].tolist()  # by repeating the second action
+      >>> from jaxltl import from_dense
+      >>> world = from_dense([[[1.0, 0], [0, 1.0]], [[0, 1.0], [0, 1.0]]], initial=[1, 0],
+      ...                    label=[[0], [1]], propositions=["home"])
+      >>> make_problem(world, "F home").winning[0].tolist()
       [True, True]
-      >>> problem.allowed[0, 0].tolist()
-      [False, True]
     """
     system = np.asarray(as_game(world).system)
     if hasattr(world, "system") and not system.all():

@@ -99,9 +99,8 @@ Reward = Callable[[PyTree, jax.Array], jax.Array]
 def linear_reward(weights: jax.Array, features: jax.Array) -> jax.Array:
     """``R(s, a) = sum_f theta_f F_f(s, a)`` (section 2.2) for `weights` theta and `features` F.
 
-    Example:
-      >>> linear_reward(jnp.array([1.0, 2.0]), jnp.array([[[3.0, 4.0]]])).tolist()
-      [[11.0]]
+    >>> linear_reward(jnp.array([1.0, 2.0]), jnp.array([[[3.0, 4.0]]])).tolist()
+    [[11.0]]
     """
     return features @ weights
 

@@ -48,10 +48,8 @@ class Concatenated(nn.Module):
 
     Example:
       >>> import jax
-      >>> network = Concatenated(nn.Dense(1))
       >>> read = jnp.zeros((5, 3)), jnp.zeros((5, 2)), jnp.zeros((5, 4))
-      >>> shape, _ = jax.eval_shape(network.init_with_output, jax.random.key(0), *read)
-      >>> shape.shape
+      >>> jax.eval_shape(Concatenated(nn.Dense(1)).init_with_output, jax.random.key(0), *read)[0].shape
       (5,)
     """
 

@@ -25,11 +25,10 @@ def reward(
     Example:
       >>> from jaxltl import from_dense, product
       >>> world = from_dense([[[0, 1.0]], [[0, 1.0]]], label=[[0], [1]], propositions=["g"])
-      >>> model = product(world, "F g")
       >>> class Late(nn.Module):  # a reward of 1 in the final automaton state
       ...     def __call__(self, observation, memory, action):
       ...         return 0 * observation[..., 0] + memory[..., 1] + 0 * action[..., 0]
-      >>> jax.eval_shape(lambda seen: reward(Late(), {}, model, seen), jnp.eye(2)).shape
+      >>> reward(Late(), {}, product(world, "F g"), jnp.eye(2)).shape
       (2, 2, 1)
     """
     return jnp.asarray(network.apply(parameters, *network_inputs(model, observation)))

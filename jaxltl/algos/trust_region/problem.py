@@ -55,13 +55,10 @@ def make_problem(
     Example:
       >>> from jaxltl import make_environment
       >>> from jaxltl.core.environments.environment import Timestep, make_box
-      >>> def reset(key):
-      ...     return jax.random.uniform(key, (1,))
-      >>> def move(place, action, key):
-      ...     place = place + jnp.clip(action, -1, 1)
-      ...     return Timestep(place, -abs(place[0]), place[0] > 9, cost=action[0] ** 2)
       >>> world = make_environment(
-      ...     reset, move, lambda place: place, actions=make_box(-jnp.inf, jnp.inf, (1,)))
+      ...     lambda key: jax.random.uniform(key, (1,)),
+      ...     lambda place, action, key: Timestep(place, place[0], place[0] > 9, cost=action[0]),
+      ...     lambda place: place, actions=make_box(-jnp.inf, jnp.inf, (1,)))
       >>> float(make_problem(world, horizon=5, limit=1.0).limit)
       1.0
     """
