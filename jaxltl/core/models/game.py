@@ -31,7 +31,7 @@ class Game:
     """Turn-based stochastic game of the system against the environment; see :func:`make_game`.
 
     Attributes:
-      mdp: the model: an MDP, a DenseMDP, a SparseMDP, an IntervalMDP or a Product.
+      mdp: an MDP, a DenseMDP, a SparseMDP, an IntervalMDP or a Product.
       system: ``bool[S]`` (``[S, Q]`` in a product), True in the states of the system, the maximiser.
 
     Example:
@@ -99,8 +99,7 @@ def make_game(model: Model, system: Sequence[bool] | chex.Array) -> Game:
     """Validated :class:`Game` on a model.
 
     Args:
-      model: an MDP, a DenseMDP, a SparseMDP, an IntervalMDP or a Product.
-      system: the player of each state: True for the system, False for the environment.
+      model, system: as the attributes of :class:`Game`.
 
     Returns:
       :class:`Game`.
@@ -110,8 +109,7 @@ def make_game(model: Model, system: Sequence[bool] | chex.Array) -> Game:
 
     Example:
       >>> from jaxltl import from_dense
-      >>> game = make_game(from_dense([[[0, 1.0]], [[1.0, 0]]]), [True, False])
-      >>> game.system.tolist()
+      >>> make_game(from_dense([[[0, 1.0]], [[1.0, 0]]]), [True, False]).system.tolist()
       [True, False]
     """
     owner = _owners(system, model.state_shape)

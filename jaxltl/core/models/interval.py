@@ -42,8 +42,7 @@ class IntervalMDP:
 
     A row stands for all distributions p with ``lower <= p <= upper`` and, where there is a radius,
     ``sum_t |p_t - center_t| <= radius``. In each step nature picks one of them, against the policy
-    (`nature="adversarial"`) or with it (`"cooperative"`). :func:`make_interval` and
-    :func:`interval_rows` build validated models.
+    (`nature="adversarial"`) or with it (`"cooperative"`).
 
     Attributes:
       nominal: the graph, labels, rewards and names; its probabilities are one distribution of
@@ -54,15 +53,10 @@ class IntervalMDP:
 
     Example:
       >>> import jaxltl as jl
-      >>> coin = jl.make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1],
-      ...                       label={"heads": [1]})
+      >>> coin = jl.make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
       >>> rough = jl.make_interval(coin, [0.4, 0.3, 1, 1], [0.7, 0.6, 1, 1])
       >>> rough.num_transitions, rough.lower.tolist(), rough.is_chain
       (4, [0.4, 0.3, 1.0, 1.0], True)
-      >>> heads = rough.states_with_label("heads")
-      >>> found = jl.reachability_probability(rough, heads, nature="adversarial")
-      >>> round(float(found.value[0]), 6)
-      0.4
     """
 
     nominal: SparseMDP
@@ -216,18 +210,13 @@ def make_interval(
 
     Raises:
       ValueError: naming the state and the choice: ends that are crossed, negative or above 1, or
-        between which there is no distribution; an invalid center or radius; only one of both.
+        without a distribution between them; an invalid center or radius; only one of both.
 
     Example:
       >>> from jaxltl import make_sparse
       >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
-      >>> model = make_interval(coin, [0.4, 0.3, 1, 1], [0.7, 0.6, 1, 1])
-      >>> model.lower.tolist(), model.upper.tolist()
-      ([0.4, 0.3, 1.0, 1.0], [0.7, 0.6, 1.0, 1.0])
-      >>> ball = make_interval(coin, [0, 0, 0, 0], [1, 1, 1, 1], center=[0.5, 0.5, 1, 1],
-      ...                      radius=[0.5, 0, 0])
-      >>> ball.lower.tolist(), ball.upper.tolist()
-      ([0.25, 0.25, 1.0, 1.0], [0.75, 0.75, 1.0, 1.0])
+      >>> make_interval(coin, [0] * 4, [1] * 4, center=[0.5, 0.5, 1, 1], radius=[0.5, 0, 0]).lower.tolist()
+      [0.25, 0.25, 1.0, 1.0]
     """
     if not isinstance(model, MDP | SparseMDP):
         raise ValueError(
@@ -301,12 +290,9 @@ def interval_rows(
     than 1e-6 are scaled.
 
     Args:
-      row_start, entry_start, successor: as of :func:`~jaxltl.core.models.sparse.make_sparse`.
-      lower, upper: ``float[T]``.
-      center, radius: ``float[T]`` and ``float[R]``, as of :func:`make_interval`.
+      row_start, entry_start, successor, rest: as of :func:`~jaxltl.core.models.sparse.make_sparse`.
+      lower, upper, center, radius: as of :func:`make_interval`, ``float[T]`` and ``float[R]``.
       rewards: named structures.
-      rest: `initial`, `label`, `propositions`, `action`, `action_names` and `valuation` of
-        :func:`~jaxltl.core.models.sparse.make_sparse`.
 
     Returns:
       :class:`IntervalMDP`.
@@ -316,8 +302,7 @@ def interval_rows(
 
     Example:
       >>> rough = interval_rows(
-      ...     None, [0, 2, 3, 4], [1, 2, 1, 2], [0.4, 0.3, 1, 1], [0.7, 0.6, 1, 1],
-      ...     label={"heads": [1]})
+      ...     None, [0, 2, 3, 4], [1, 2, 1, 2], [0.4, 0.3, 1, 1], [0.7, 0.6, 1, 1])
       >>> rough.num_states, rough.upper.tolist()
       (3, [0.7, 0.6, 1.0, 1.0])
     """

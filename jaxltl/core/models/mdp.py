@@ -57,10 +57,7 @@ class MDP(_PaddedShape):
 
     Example:
       >>> import jaxltl as jl
-      >>> chain = jl.make_mdp([[[0, 1]], [[1, 0]]], [[[0.5, 0.5]], [[1.0, 0.0]]],
-      ...                     label={"goal": [1]})
-      >>> chain.num_states, chain.num_actions, chain.label.tolist()
-      (2, 1, [[False], [True]])
+      >>> chain = jl.make_mdp([[[0, 1]], [[1, 0]]], [[[0.5, 0.5]], [[1.0, 0.0]]])
       >>> chain.replace(initial=np.array([1.0, 0.0])).initial.tolist()  # a modified copy
       [1.0, 0.0]
     """
@@ -91,7 +88,7 @@ class MDP(_PaddedShape):
 @brief(facts=facts.padded, drawn=True)
 @struct.dataclass
 class DenseMDP(_PaddedShape):
-    """The same process with a full matrix, ``transition[s, a, t]``, for small batched problems.
+    """Labelled Markov decision process with a full matrix, for small batched problems.
 
     Attributes:
       transition: ``float[S, A, S]``; rows of unavailable actions are zero.
@@ -99,8 +96,7 @@ class DenseMDP(_PaddedShape):
 
     Example:
       >>> import jaxltl as jl
-      >>> chain = jl.models.to_dense(jl.from_dense([[[0.5, 0.5]], [[0, 1.0]]]))
-      >>> chain.transition.shape
+      >>> jl.models.to_dense(jl.from_dense([[[0.5, 0.5]], [[0, 1.0]]])).transition.shape
       (2, 1, 2)
     """
 
@@ -158,11 +154,9 @@ def make_mdp(
 ) -> MDP:
     """Validated :class:`MDP` from arrays, in JAX's current default dtype.
 
-    Rows that sum to one within 1e-6 are scaled to do so; any other row is refused.
-
     Args:
       successor: ``int[S, A, K]``, in ``[0, S)`` wherever the probability is positive.
-      probability: ``float[S, A, K]``.
+      probability: ``float[S, A, K]``; rows that sum to one within 1e-6 are scaled to do so.
       available: ``bool[S, A]``; default: the actions with a positive probability.
       initial: ``float[S]``, a distribution; default: uniform.
       label: ``bool[S, P]``, or the states of each proposition by its name, such as
@@ -271,7 +265,7 @@ def from_dense(
 
 
 def to_dense(mdp: MDP) -> DenseMDP:
-    """The same process as a :class:`DenseMDP`; memory grows with S squared.
+    """A model as a :class:`DenseMDP`; memory grows with S squared.
 
     Args:
       mdp: concrete or traced; differentiable in the probabilities.
@@ -283,8 +277,7 @@ def to_dense(mdp: MDP) -> DenseMDP:
       ValueError: a sparse or an interval model.
 
     Example:
-      >>> mdp = from_dense([[[0.5, 0.5]], [[0.0, 1.0]]])
-      >>> to_dense(mdp).transition.tolist()
+      >>> to_dense(from_dense([[[0.5, 0.5]], [[0.0, 1.0]]])).transition.tolist()
       [[[0.5, 0.5]], [[0.0, 1.0]]]
     """
     if not hasattr(mdp, "num_actions") or not hasattr(mdp, "successor"):

@@ -183,13 +183,11 @@ def product(
 def product(
     world: LabelledModel, task: Automaton | Formula | str, *, label_on: str = "entry"
 ) -> Product | Game:
-    """The lazy product of a model and a task.
-
-    A formula is translated over the letters that occur in the model.
+    """Lazy product of a model and a task.
 
     Args:
       world: an MDP, a DenseMDP, a SparseMDP, a ShardedMDP or a Game, with concrete labels.
-      task: an automaton, a formula, or its text.
+      task: an automaton, or a formula, translated over the letters that occur in the model.
       label_on: ``"entry"`` or ``"exit"``, see :class:`Product`.
 
     Returns:
@@ -200,7 +198,7 @@ def product(
 
     Example:
       >>> from jaxltl import from_dense
-      >>> world = from_dense([[[0, 1.0]], [[0, 1.0]]], label=[[0], [1]], propositions=["goal"])
+      >>> world = from_dense([[[0, 1.0]], [[0, 1.0]]], label={"goal": [1]})
       >>> product(world, "F goal").state_shape
       (2, 2)
     """

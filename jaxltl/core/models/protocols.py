@@ -1,8 +1,5 @@
 """Protocols of models: the attributes that operators, solvers and learners read.
 
-A function states in its signature how much of a model it needs. The protocols, and the models of
-the package that satisfy them:
-
 =======================  ========================================================================
 :class:`Model`           states and initial distribution: every model
 :class:`LabelledModel`    and propositions: every model but a product

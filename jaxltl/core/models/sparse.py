@@ -76,8 +76,7 @@ class SparseMDP:
 
     The choices of state s are the rows ``row_start[s]`` to ``row_start[s + 1] - 1``, and row r leads
     to ``successor[e]`` with ``probability[e]`` for the entries e from ``entry_start[r]`` to
-    ``entry_start[r + 1] - 1``. Quantities on choices have the shape ``[R]``, and an action of a
-    policy is a row. A Markov chain has one row in each state.
+    ``entry_start[r + 1] - 1``. An action of a policy is a row; a Markov chain has one in each state.
 
     Attributes:
       row_start: ``int32[S + 1]``.
@@ -95,10 +94,8 @@ class SparseMDP:
     Example:
       >>> model = make_sparse([0, 2, 3, 4], [0, 1, 3, 4, 5], [1, 1, 2, 1, 2], [1, 0.5, 0.5, 1, 1],
       ...                     label={"goal": [1]}, rewards={"steps": Rewards(state=[1, 0, 0])})
-      >>> model.num_states, model.num_rows, model.num_transitions, model.is_chain
-      (3, 4, 5, False)
-      >>> model.states_with_label("goal").tolist()
-      [False, True, False]
+      >>> model.num_rows, model.num_transitions, model.states_with_label("goal").tolist()
+      (4, 5, [False, True, False])
     """
 
     row_start: Array
@@ -273,15 +270,7 @@ def _shaped(model: SparseMDP, reward: Any) -> Rewards:
 
 
 class Annotations(TypedDict, total=False):
-    """Optional parts of a sparse model.
-
-    Attributes:
-      label, propositions: as for :func:`~jaxltl.core.models.mdp.make_mdp`.
-      rewards: named :class:`Rewards`.
-      action: ``int[R]``, the action number of each choice.
-      action_names: names of the actions.
-      valuation: values of named variables, ``[S]`` each.
-    """
+    """Optional parts of a sparse model, described at :func:`make_sparse`."""
 
     label: chex.Array | Mapping[str, Sequence[int]] | None
     propositions: Sequence[str]
@@ -312,7 +301,8 @@ def make_sparse(
       successor: ``int[T]``, in ``[0, S)``.
       probability: ``float[T]``.
       initial: ``float[S]``, a distribution; default: uniform.
-      annotations: labels, rewards and names, see :class:`Annotations`.
+      annotations: `label` and `propositions` as for :func:`~jaxltl.core.models.mdp.make_mdp`, and
+        `rewards`, `action`, `action_names` and `valuation` as in :class:`SparseMDP`.
 
     Returns:
       :class:`SparseMDP`.

@@ -153,8 +153,7 @@ def rollout(
       model: an MDP, a DenseMDP or a Product (states then numbered ``s * Q + q``).
       policy: ``float[S, A]`` or ``int32[S]``; ``[S, Q, A]`` or ``[S, Q]`` in a product.
       key: a PRNG key, consumed.
-      num_trajectories: N, static under ``jit``.
-      num_steps: T, the longest; static under ``jit``.
+      num_trajectories, num_steps: N, and the length T of the longest; static under ``jit``.
       stop: ``bool[S]`` (or ``bool[S, Q]``): a trajectory ends with the pair that enters such a state,
         and has length 0 if it starts in one.
 
@@ -167,9 +166,8 @@ def rollout(
     Example:
       >>> import jaxltl as jl
       >>> path = jl.make_mdp([[[1]], [[0]]], [[[1.0]], [[1.0]]], initial=[1, 0])
-      >>> runs = rollout(path, jnp.zeros(2, jnp.int32), jax.random.key(0),
-      ...                num_trajectories=2, num_steps=3)
-      >>> runs.state.tolist()
+      >>> policy, key = jnp.zeros(2, jnp.int32), jax.random.key(0)
+      >>> rollout(path, policy, key, num_trajectories=2, num_steps=3).state.tolist()
       [[0, 1, 0], [0, 1, 0]]
     """
     distribution = policy_distribution(model, policy).reshape(-1, model.num_actions)

@@ -31,12 +31,10 @@ def to_sparse(model: Model) -> SparseMDP:
       ValueError: a model of another kind.
 
     Example:
-      >>> from jaxltl import make_mdp
-      >>> mdp = make_mdp([[[0, 1], [1, 0]], [[1, 0], [0, 0]]],
-      ...                [[[0.5, 0.5], [1, 0]], [[1, 0], [0, 0]]])
-      >>> sparse = to_sparse(mdp)
+      >>> from jaxltl import from_dense
+      >>> sparse = to_sparse(from_dense([[[0.5, 0.5], [1, 0]], [[1, 0], [0, 0]]]))
       >>> sparse.row_start.tolist(), sparse.action.tolist(), sparse.successor.tolist()
-      ([0, 2, 3], [0, 1, 0], [0, 1, 1, 1])
+      ([0, 2, 3], [0, 1, 0], [0, 1, 0, 0])
     """
     if isinstance(model, SparseMDP):
         return model

@@ -340,7 +340,7 @@ def model_from_counts(
     labels: Mapping[str, Iterable[Any]] | None = None,
     terminal: Iterable[Any] = (),
 ) -> tuple[SparseMDP, NDArray[np.int64]]:
-    """Empirical model of the choices that were counted, and the counts of its transitions.
+    """Empirical model of the counted choices, and the counts of its transitions.
 
     Probabilities are the frequencies, or, in rows with a count of 0, those after one more sample of
     each transition. A state without samples that is not terminal has one choice, `any`, which may lead
@@ -366,10 +366,9 @@ def model_from_counts(
 
     Example:
       >>> counts = make_counts([0, 0, 1], [0, 0, 0], [0, 1, 1], [7, 3, 9], states=["a", "b"])
-      >>> model, count = model_from_counts(
-      ...     counts, initial="a", graph="seen", labels={"done": ["b"]})
-      >>> model.probability.tolist(), count.tolist(), model.states_with_label("done").tolist()
-      ([0.7, 0.3, 1.0], [7, 3, 9], [False, True])
+      >>> model, count = model_from_counts(counts, initial="a", graph="seen")
+      >>> model.probability.tolist(), count.tolist()
+      ([0.7, 0.3, 1.0], [7, 3, 9])
     """
     _require_counts(counts)
     require_graph(graph, ("seen", "complete"))

@@ -33,14 +33,10 @@ def lift_trajectories(model: Product, trajectories: Trajectories) -> Trajectorie
 
     Example:
       >>> import jaxltl as jl
-      >>> path = jl.make_mdp([[[1]], [[2]], [[2]]], [[[1.0]], [[1.0]], [[1.0]]], initial=[1, 0, 0],
-      ...                    label={"a": [1]})
-      >>> prod = jl.product(path, "F a")
-      >>> shown = jl.models.make_trajectories(path, [[(0, 0), (1, 0), (2, 0)]])
-      >>> lift_trajectories(prod, shown).state.tolist()  # s * Q + q
+      >>> path = jl.make_mdp([[[1]], [[2]], [[2]]], [[[1.0]], [[1.0]], [[1.0]]], label={"a": [1]})
+      >>> runs = jl.models.make_trajectories(path, [[(0, 0), (1, 0), (2, 0)]])
+      >>> lift_trajectories(jl.product(path, "F a"), runs).state.tolist()  # s * Q + q
       [[0, 3, 5]]
-      >>> project_trajectories(prod, lift_trajectories(prod, shown)).state.tolist()
-      [[0, 1, 2]]
     """
     require_states(trajectories, model.mdp)
     if is_traced((model, trajectories)):
@@ -75,11 +71,10 @@ def project_trajectories(model: Product, trajectories: Trajectories) -> Trajecto
     """Trajectories of a product without the memory; the inverse of :func:`lift_trajectories`.
 
     Args:
-      model: the product.
-      trajectories: of the product, such as those of a rollout in it.
+      model, trajectories: the product, and trajectories in it.
 
     Returns:
-      :class:`Trajectories` of the world.
+      :class:`Trajectories` of the base model.
 
     Raises:
       ValueError: trajectories of another model.

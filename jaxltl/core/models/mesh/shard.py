@@ -73,13 +73,12 @@ def shard(
 ) -> ShardedMDP:
     """A model distributed over the devices of a mesh axis.
 
-    Solvers of discounted and soft values, reachability, satisfaction and total rewards accept it, inside
-    ``jit`` too. All processes give the same model; :func:`model_from_parts` is for larger ones.
+    Accepted by solvers of discounted and soft values, reachability, satisfaction and total rewards,
+    inside ``jit`` too. All processes give the same model.
 
     Args:
       model: a concrete MDP, DenseMDP or SparseMDP.
-      mesh: the devices, such as ``jax.make_mesh((4,), ("states",))``.
-      axis: the mesh axis of the states; default: the only one.
+      mesh, axis: the devices, and the mesh axis of the states; default: the only one.
       order: ``"given"``: contiguous ranges of state numbers; ``"near"``: reverse Cuthill-McKee order
         (1969), which reduces communication; or a permutation ``int[S]``.
 
@@ -93,8 +92,7 @@ def shard(
 
     Example:
       >>> from jaxltl import from_dense
-      >>> mesh = jax.make_mesh((1,), ("states",))
-      >>> sharded = shard(from_dense([[[0.5, 0.5]], [[0.0, 1.0]]]), mesh)
+      >>> sharded = shard(from_dense([[[0.5, 0.5]], [[0.0, 1.0]]]), jax.make_mesh((1,), ("states",)))
       >>> from_mesh(sharded, to_mesh(sharded, np.array([1.0, 2.0]))).tolist()
       [1.0, 2.0]
     """
@@ -135,7 +133,7 @@ def model_from_parts(
     axis: str | None = None,
     propositions: tuple[str, ...] = (),
 ) -> ShardedMDP:
-    """A distributed model from parts, for models that are too large for one process.
+    """Distributed model from parts, for models that are too large for one process.
 
     Args:
       part: the :class:`ModelPart` of a range of states ``(start, stop)``; each process calls it for
@@ -154,9 +152,8 @@ def model_from_parts(
       >>> def cycle(start, stop):  # from each state to the next
       ...     state = np.arange(start, stop)
       ...     return ModelPart(np.arange(state.size + 1), (state + 1) % 10, np.ones(state.size))
-      >>> model = model_from_parts(cycle, 10, jax.make_mesh((1,), ("states",)))
-      >>> model.num_states, model.num_successors
-      (10, 1)
+      >>> model_from_parts(cycle, 10, jax.make_mesh((1,), ("states",))).num_states
+      10
     """
     if not isinstance(num_states, int | np.integer) or num_states < 1:
         raise ValueError(

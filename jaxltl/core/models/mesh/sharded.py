@@ -1,9 +1,7 @@
 """Models distributed over the devices of a mesh, and their operators.
 
-A device holds a range of the states with the rows of their choices. Rows refer to local places: the
-device's own states first, then the states that it receives before a sweep. A sweep is one exchange,
-of a halo or of all values, followed by the local sweep; all other operations of solvers are
-elementwise or reductions, which JAX partitions.
+A device holds a range of the states with the rows of their choices, by local places: its own states
+first, then those received before a sweep by one exchange, of a halo or of all values.
 """
 
 from __future__ import annotations
@@ -39,8 +37,7 @@ class ShardedMDP:
     """Labelled MDP distributed over the devices of a mesh axis; see :func:`~jaxltl.models.shard`.
 
     All devices have the same number of the N places for states; padded places hold absorbing states
-    without reward and initial probability. Quantities on choices are ``[N, A]``; `to_mesh` and
-    `from_mesh` convert them.
+    without reward and initial probability.
 
     Attributes:
       tables: the rows by width; those of a device are contiguous.
@@ -49,11 +46,10 @@ class ShardedMDP:
       available: ``bool[N, A]``.
       sent: for each round of an exchange ``int32[D * H]``, the local states that a device sends.
       initial: ``float[N]``, the initial distribution.
-      kind: ``int32[N]``, the row of `shown` that is the label of each state.
-      shown: ``bool[U, P]``, the labels that occur.
+      kind, shown: ``int32[N]`` and ``bool[U, P]``; ``shown[kind]`` are the labels of the states.
       rewards: expected rewards of choices by name, ``float[N, A]``.
-      number: ``int32[N]``, the state of the original model, or -1.
-      row: ``int32[N, A]``, the row of the original sparse model, or -1; None without such a model.
+      number, row: ``int32[N]`` and ``int32[N, A]``, the state and the row of the original model, or -1;
+        `row` only for a sparse original model, else None.
       propositions: the P names; static.
       num_given: S, the states of the original model; static.
       mesh, axis: the devices, and the mesh axis of the states; static.

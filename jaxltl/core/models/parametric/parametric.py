@@ -29,8 +29,6 @@ _TRIALS = 64  # candidate points for a valid model
 class ParametricMDP:
     """Markov chain or MDP with probabilities that depend on parameters in a box, with a constant graph.
 
-    Built by :func:`make_parametric`, or by ``read_parametric(path).over(low, high)``.
-
     Attributes:
       model: the model at the point `inside`.
       numbers: ``float[D] -> (float[T], {name: float[R]})``, the probabilities and the rewards of
@@ -39,8 +37,7 @@ class ParametricMDP:
       inside: ``float64[D]``, a point at which the probabilities are valid.
       parameters: the D names; static.
       exact: ``float64[D] -> SparseMDP`` with at most `roundings` roundings of each number; None if only
-        `numbers` are known. Static.
-      roundings: static.
+        `numbers` are known. Static, as is `roundings`.
 
     Example:
       >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1])
