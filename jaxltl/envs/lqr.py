@@ -28,7 +28,7 @@ from jaxltl.envs.networks import Network, apply_lanes, make_network, weighted
 @brief
 @struct.dataclass
 class LQR:
-    """A regulator problem; made by :func:`lqr`.
+    """A regulator problem, see :func:`lqr`.
 
     Attributes:
       dynamics, control: A ``float[n, n]`` and B ``float[n, m]``.
@@ -54,11 +54,8 @@ class LQR:
 class Run(NamedTuple):
     """A trajectory of a policy; axes of lanes of parameters are last.
 
-    Attributes:
-      state: ``float[N + 1, n]``.
-      control: ``float[N, m]``.
-      total: J.
-      violation: ``max_t max(low - u_t, u_t - high, 0)``.
+    `state` is ``float[N + 1, n]``, `control` ``float[N, m]``, `total` J, and `violation` the maximum
+    of ``low - u_t``, ``u_t - high`` and 0.
     """
 
     state: jax.Array
@@ -71,11 +68,8 @@ class Run(NamedTuple):
 class Optimum(NamedTuple):
     """Optimal controls in float64 NumPy arrays.
 
-    Attributes:
-      total: J.
-      control: ``float[N, m]``.
-      state: ``float[N + 1, n]``.
-      residual: the largest violation of the optimality conditions (Karush, Kuhn and Tucker).
+    `total` is J, `control` ``float[N, m]``, `state` ``float[N + 1, n]``, and `residual` the largest
+    violation of the Karush-Kuhn-Tucker conditions.
     """
 
     total: float
@@ -99,11 +93,9 @@ def lqr(
     """A regulator problem, equation (4.17); the defaults are the dissertation's.
 
     Args:
-      dynamics, control: A ``[n, n]`` and B ``[n, m]``.
+      dynamics, control, start, horizon: A, B, the initial state and N.
       state_cost, control_cost: Q, positive semidefinite, and R, positive definite.
       low, high: ``[m]``, or one bound for all controls.
-      start: ``[n]``.
-      horizon: N.
       scale: the unit of J in the objective; default: J of zero controls if positive, else 1.
 
     Raises:
@@ -154,12 +146,12 @@ def _check_definite(q: np.ndarray, r: np.ndarray) -> None:
 def evaluator(world: LQR, network: Network | str = "2-2-1") -> jax.tree_util.Partial:
     """The function ``evaluate(parameters, key) -> (objective, cost)`` of policies of a `network`.
 
-    The objective is ``log G = -J / scale``, the cost the largest violation of the bounds. Nothing is
-    random. After an overflow they are ``-inf`` and ``inf``. Under any number of ``vmap`` over
-    parameters ``float[D]``, all of them become one last axis of every array.
+    The objective is ``log G = -J / scale``, the cost the largest violation of the bounds; ``-inf`` and
+    ``inf`` after an overflow. The key is not used. All ``vmap`` over parameters ``float[D]`` become one
+    last axis of every array.
 
     Raises:
-      ValueError: a network whose inputs and outputs are not those of `world`.
+      ValueError: a network with inputs or outputs other than those of `world`.
 
     Example:
       >>> evaluate = evaluator(lqr(), "2-2-1")
@@ -193,8 +185,7 @@ def simulate(world: LQR, network: Network | str, parameters: jax.Array) -> Run:
     """The trajectories of one or many policies.
 
     Args:
-      world: from :func:`lqr`.
-      network: from the n states to the m controls; or its sizes, then with biases.
+      world, network: the problem and the network, or the sizes of one with biases.
       parameters: ``float[D]``, or ``float[D, lanes]`` with any number of axes of lanes.
 
     Example:
@@ -302,10 +293,7 @@ def _lanes_last(
 class Plant(NamedTuple):
     """State of the regulator as an environment.
 
-    Attributes:
-      state: ``float[n]``.
-      violation: the largest so far.
-      time: ``int32[]``, the number of steps made.
+    `state` is ``float[n]``, `violation` the largest so far, and `time` the number of steps.
 
     Example:
       >>> begun = as_environment(lqr()).reset(None)
@@ -367,8 +355,8 @@ def _controlled(world: LQR, plant: Plant, control: jax.Array, key: Any) -> Times
 def optimum(world: LQR) -> Optimum:
     """The optimal control sequence of a `world` over all policies, and its cost, in float64.
 
-    With the states written in terms of the controls, J is a sum of squares ``|M u + c|^2`` under
-    bounds: a strictly convex problem, solved by an active-set method (Stark and Parker 1995).
+    In terms of the controls, J is a sum of squares ``|M u + c|^2`` under bounds: a strictly convex
+    problem, solved by an active-set method (Stark and Parker 1995).
 
     Raises:
       ValueError: the method did not finish.

@@ -50,15 +50,14 @@ Scores = Callable[..., tuple[jax.Array, jax.Array]]
 @brief
 @struct.dataclass
 class Navigation:
-    """A map, a robot and its sensors; made by :func:`navigation`.
+    """A map, a robot and its sensors, see :func:`navigation`.
 
     Boxes are ``float[2, 2]``: the lower left corner ``(x, y)``, then the upper right one.
 
     Attributes:
       goal, obstacle, bounds: boxes.
       start: the box of the initial positions; headings are uniform.
-      speed, turn: the largest speed, and the largest turn in one step, in radians.
-      time_step: duration of a step.
+      speed, turn, time_step: the largest speed and turn (radians) of a step, and its duration.
       offset: ``float[M, 2]``, the sensor's points, ahead being (1, 0).
       strip: ``float[2]``, the least and largest y that earn ``2 |y|``.
       weight: of the distance in tasks 2 and 3.
@@ -85,12 +84,7 @@ class Navigation:
 
 @brief
 class State(NamedTuple):
-    """Positions and headings, in arrays of one shape.
-
-    Attributes:
-      x, y: ``float[...]``, positions.
-      heading: ``float[...]``, radians in [-pi, pi).
-    """
+    """Positions `x`, `y` and `heading` (radians in [-pi, pi)), in arrays of one shape."""
 
     x: jax.Array
     y: jax.Array
@@ -99,12 +93,7 @@ class State(NamedTuple):
 
 @brief
 class Run(NamedTuple):
-    """Trajectories.
-
-    Attributes:
-      state: arrays ``float[M, N]``.
-      action: ``float[M, N, 2]``, speed and turn as shares of the largest, in [-1, 1].
-    """
+    """Trajectories: `state`, and `action` ``float[M, N, 2]``, speed and turn as shares of the largest."""
 
     state: State
     action: jax.Array
@@ -206,9 +195,7 @@ def _box(name: str, corners: ArrayLike) -> np.ndarray:
 
 
 def policy_network(world: Navigation, hidden: Sequence[int] = (30, 30)) -> Network:
-    """The policy network of the dissertation for a `world`: ReLU layers, tanh to speed and turn.
-
-    `hidden` are the widths of the hidden layers.
+    """The policy network for a `world`: ReLU layers of widths `hidden`, and tanh to speed and turn.
 
     Example:
       >>> policy_network(navigation()).sizes
@@ -223,9 +210,9 @@ def policy_network(world: Navigation, hidden: Sequence[int] = (30, 30)) -> Netwo
 def start_states(
     world: Navigation, key: chex.PRNGKey, shape: tuple[int, ...] = (), dtype: Any = None
 ) -> State:
-    """The initial states: uniform in the start box of `world` and in the heading.
+    """The initial states, uniform in the start box of `world` and in the heading, drawn from `key`.
 
-    They are drawn from `key`, as arrays of a `shape` and a `dtype` (default: JAX's).
+    They are arrays of a `shape` and a `dtype` (default: JAX's).
 
     Example:
       >>> drawn = jax.eval_shape(
@@ -272,8 +259,8 @@ def _wrapped(angle: jax.Array) -> jax.Array:
 def observe(world: Navigation, state: State) -> jax.Array:
     """The sensor readings of the robot in a `state` of a `world`, ``float[..., M + 2]``.
 
-    The labels of the M points, circle by circle, and then the direction of the goal's centre (ahead, to
-    the left) as a unit vector, or zeros in the centre. Differentiable in the direction.
+    The labels of the M points, circle by circle, then the unit vector to the goal's centre (ahead, to
+    the left), zero in the centre. Differentiable in the direction.
 
     Example:
       >>> seen = observe(navigation(), State(*jnp.array([1.0, 1.5, 0.0])))
@@ -357,9 +344,8 @@ def scores(world: Navigation, state: State, task: int) -> tuple[jax.Array, jax.A
     """The objective J and cost Z of trajectories in one of the four tasks, ``float[...]`` each.
 
     Args:
-      world: from :func:`navigation`.
+      world, task: the map, and 1 to 4, static.
       state: arrays ``float[..., N]``; of task 1 with the goal absorbing.
-      task: static.
 
     Raises:
       ValueError: an unknown task.
@@ -398,11 +384,9 @@ def simulate(
     """The trajectories of a policy; differentiable in its parameters.
 
     Args:
-      world: from :func:`navigation`.
-      network: from the observations to two shares, see :func:`policy_network`; ValueError for other
-        sizes.
+      world, network: as of :func:`navigation` and :func:`policy_network`.
       parameters: ``float[D]``, in the precision of the simulation.
-      key: of the initial states; nothing else is random.
+      key: of the initial states.
       num_trajectories: M, static.
       absorbing: make the goal absorbing; static.
 
@@ -454,14 +438,12 @@ def evaluator(
 ) -> jax.tree_util.Partial:
     """The function ``evaluate(parameters, key) -> (objective, cost)``, means over trajectories.
 
-    The objective is the mean of J, as a logarithm of G to be divided by a temperature such as the
-    horizon, since ``exp(J)`` overflows in float32.
+    The objective is the mean of J = log G, since ``exp(J)`` overflows in float32.
 
     Args:
-      world: from :func:`navigation`.
+      world, network: as of :func:`navigation` and :func:`policy_network`.
       task: 1 to 4; or a function ``(world, run) -> (J float[M], Z float[M] or [M, C])``, which may be a
         ``jax.tree_util.Partial`` with arrays.
-      network: default :func:`policy_network`.
       num_trajectories: M.
       absorbing: make the goal absorbing; default: only in task 1.
 

@@ -1,8 +1,7 @@
 """The navigation tasks as environments with a reward in every step.
 
-Rewards and costs are the increments of J and Z of :mod:`~jaxltl.envs.navigation` along the
-trajectory, so that their sums are J and Z for all four tasks. The state includes the quantities on
-which increments depend (least distance so far, visits); observations do not.
+Rewards and costs are the increments of J and Z of :mod:`~jaxltl.envs.navigation`. The state
+includes the quantities on which increments depend (least distance, visits); observations do not.
 """
 
 from __future__ import annotations
@@ -22,14 +21,10 @@ from jaxltl.envs.navigation import Navigation, State
 
 
 class Place(NamedTuple):
-    """State of the environment, in scalars.
+    """State of the environment: the `state` of the robot and `time`, the number of steps.
 
-    Attributes:
-      state: of the robot; its increments are paid in the next step.
-      first: True in the first state.
-      nearest: the least distance from the obstacle before it.
-      goal, obstacle: True if visited before it.
-      time: the number of steps made.
+    `first` is True in the first state; `nearest` is the least distance from the obstacle before it, and
+    `goal` and `obstacle` are True if visited before it.
 
     Example:
       >>> task = as_environment(nav.navigation(), 1)
@@ -59,13 +54,12 @@ def as_environment(
 ) -> Environment:
     """An environment of one of the four tasks, with episodes of ``world.horizon`` steps.
 
-    A step pays for the state that it leaves, so that N steps pay for the N states of
-    :func:`~jaxltl.envs.navigation.scores`; the last action has no effect, and the episode is then
-    terminated. Observations are those of :func:`~jaxltl.envs.navigation.observe`.
+    The reward of a step is that of the state before it, so that N steps have the sums of
+    :func:`~jaxltl.envs.navigation.scores`; the last action has no effect. Observations are those of
+    :func:`~jaxltl.envs.navigation.observe`.
 
     Args:
-      world: from :func:`~jaxltl.envs.navigation.navigation`.
-      task: 1 to 4; another one does not recompile.
+      world, task: the map, and 1 to 4; another task does not recompile.
       absorbing: make the goal absorbing; default: only in task 1.
       dtype: of all numbers; default: JAX's.
 
@@ -75,12 +69,9 @@ def as_environment(
     Example:
       >>> task = as_environment(nav.navigation(start=((2, 1.5), (2, 1.5))), 2)
       >>> place = task.reset(jax.random.key(0))
-      >>> total = []
-      >>> for _ in range(3):
-      ...     place, reward, _, _, cost, _ = task.step(place, jnp.zeros(2), None)
-      ...     total.append((float(reward), float(cost)))
-      >>> total
-      [(30.0, -1.0), (0.0, 0.0), (0.0, 0.0)]
+      >>> made = task.step(place, jnp.zeros(2), None)
+      >>> float(made.reward), float(made.cost)
+      (30.0, -1.0)
     """
     if np.ndim(task) or task not in nav.TASKS:
         raise ValueError(f"task={task!r}; choose 1, 2, 3 or 4.")

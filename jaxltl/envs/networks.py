@@ -1,8 +1,7 @@
 """Small fully connected networks on flat parameter vectors, for populations of policies.
 
-A policy is a vector ``float[D]``. :func:`apply` evaluates one policy on many inputs, and is mapped
-over policies by ``vmap``; :func:`apply_lanes` has the policies, the *lanes*, as last axes, which
-is far faster for networks of a few nodes.
+A policy is a vector ``float[D]``. :func:`apply` evaluates one policy on many inputs;
+:func:`apply_lanes` has policies (*lanes*) as last axes, which is far faster for a few nodes.
 """
 
 from __future__ import annotations
@@ -39,12 +38,10 @@ ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {
 @brief
 @struct.dataclass
 class Network:
-    """Sizes and activations of a network without its parameters; made by :func:`make_network`.
+    """A network without parameters, see :func:`make_network`.
 
-    Attributes:
-      sizes: the inputs, the nodes of each hidden layer, and the outputs.
-      hidden, output: names of activations, see :data:`ACTIVATIONS`.
-      biases: True if the layers have biases.
+    `sizes` are the inputs, the nodes of each hidden layer, and the outputs; `hidden` and `output` name
+    :data:`ACTIVATIONS`; `biases` is True if the layers have biases.
     """
 
     sizes: tuple[int, ...] = struct.field(pytree_node=False)
@@ -111,12 +108,9 @@ def layers(network: Network, parameters: jax.Array) -> Layers:
     """The weights ``[inputs, outputs, lanes]`` and biases ``[outputs, lanes]`` of each layer.
 
     Args:
-      network: from :func:`make_network`.
+      network: from :func:`make_network`; without biases, those of the result are None.
       parameters: ``float[D, lanes]``, with any number of axes of lanes: layer by layer, the weights row
         by row (a row for each input) and then the biases.
-
-    Returns:
-      A pair for each layer; without biases the second is None.
 
     Raises:
       ValueError: another number of parameters than the network has.
@@ -211,7 +205,7 @@ def apply_lanes(network: Network, parameters: jax.Array, inputs: jax.Array) -> j
       inputs: ``float[I, ..., lanes]``: each lane's policy reads all inputs of its lane.
 
     Returns:
-      ``float[O, ..., lanes]``; differentiable in both.
+      ``float[O, ..., lanes]``.
 
     Raises:
       ValueError: incompatible shapes.
@@ -247,8 +241,8 @@ def _activations(network: Network) -> list[Callable[[jax.Array], jax.Array]]:
 def weighted(weight: jax.Array, inputs: jax.Array) -> jax.Array:
     """The sums ``sum_i w(i, o) x(i)`` in each lane, unrolled over i.
 
-    A reduction over a leading axis would be compiled to a loop with strided memory access. `weight` is
-    ``float[I, O, lanes]``, with the lanes of the `inputs` ``float[I, lanes]`` or 1.
+    A reduction would be a loop with strided memory access. `weight` is ``float[I, O, lanes]``, with the
+    lanes of the `inputs` ``float[I, lanes]`` or 1.
 
     Example:
       >>> weighted(jnp.array([[1.0, 2.0], [3.0, 4.0]]), jnp.array([1.0, 10.0])).tolist()
@@ -266,8 +260,8 @@ def weighted(weight: jax.Array, inputs: jax.Array) -> jax.Array:
 def network_agent(network: Network, environment: Environment) -> Partial:
     """The policies of a `network` in an `environment`: ``parameters float[D] -> Agent``, a pytree.
 
-    The network reads the flattened observation. Its outputs are the action, clipped to the box, or one
-    number for each action, of which the largest allowed one is chosen.
+    From the flattened observation, the outputs are the action, clipped to the box, or one number for
+    each action, with a choice of the largest allowed one.
 
     Raises:
       ValueError: sizes that do not fit the observations or the actions.

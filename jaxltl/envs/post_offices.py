@@ -1,4 +1,4 @@
-"""Two post offices and a signal light: a game whose reward conflicts with its task.
+"""Two post offices and a signal light: a game with a reward that conflicts with its task.
 
 The example of the dissertation's section 6.7. State ``(cell * 2 + light) * 2 + turn``: cells
 are numbered in rows from the upper left, 0 to 8; `light` is 1 where the light is on, and
@@ -102,7 +102,7 @@ def patrol_reward(game: Any) -> jax.Array:
 
     1 for a move into the dangerous block, and for a move inside it that goes round it counterclockwise
     where the light is on, clockwise where it is off; else 0, also for the moves inside in the other
-    sense, which the dissertation leaves open. `game` is :func:`post_offices`, or a product of it, for
+    sense, which the dissertation does not define. `game` is :func:`post_offices`, or a product of it, for
     which the reward is ``[S, Q, A]``; of ``restrict(game)`` take the rows at ``base_state``.
 
     Raises:
@@ -146,10 +146,9 @@ class Patrol(NamedTuple):
     """The product of the game with its task; states are ``world * 4 + memory``.
 
     Attributes:
-      game: an explicit game of all 144 states; runs start in any cell under any light, the
-        system to move and the memory in q1. 108 states are reachable.
-      accepting: ``bool[144]``, to be visited infinitely often: the memory is in q4.
-      reward: ``float[144, 6]``.
+      game: an explicit game of all 144 states; initially any cell and light, the system to move, and
+        the memory in q1. 108 states are reachable.
+      accepting, reward: ``bool[144]`` (the memory is in q4, infinitely often), and ``float[144, 6]``.
       cell, light, memory: ``int32[144]``, see this module and :func:`surveillance`.
     """
 
@@ -164,8 +163,8 @@ class Patrol(NamedTuple):
 def patrol() -> Patrol:
     """The product of the post office game with the automaton of its task (dissertation, 6.7).
 
-    The automaton reads the label of the state that is left, at both turns. The task is won from every
-    state; the reward-optimal patrol visits neither post office.
+    The automaton reads the label of the state before each move, at both turns. The task is winning from
+    every state; the reward-optimal patrol visits neither post office.
 
     Example:
       >>> model = patrol()

@@ -1,4 +1,4 @@
-"""Turn-based games of two robots on a grid, and a game whose reward conflicts with its task.
+"""Turn-based games of two robots on a grid, and a game with a reward that conflicts with its task.
 
 State ``(environment * C + system) * 2 + turn``, where `environment` and `system` are the
 robots' places, 0 to C - 1, and `turn` is 1 where the system moves: the inverse of
@@ -86,17 +86,16 @@ def grid_game(
 ) -> Game:
     """The game of two robots on a text map, in turns.
 
-    A robot moves up, down, left or right to a cell that is not a wall, or stays where that is permitted;
-    other moves are unavailable. With probability `slip` a move of the system goes to one of the two
-    sides instead, half each, or stays if that is blocked. Places are the cells that are not walls, see
-    :func:`places`. Propositions: ``collision``, ``diagonal`` and ``system_turn`` as in :func:`robots`,
+    A robot moves up, down, left or right between :func:`places`, the cells that are not walls, or stays
+    where that is permitted. With probability `slip` a move of the system goes to one of the two sides
+    instead, half each, or stays if that is blocked. Propositions: those of :func:`robots` but corners,
     and ``system_p`` and ``environment_p`` for each proposition p of the map.
 
     Args:
       text: the map, see :func:`~jaxltl.envs.text_map.parse_map`.
       system_start, environment_start: a propositional formula over the map's propositions, or a cell's
-        row and column, from 0 at the top left; default: any place. Initial states are uniform over
-        pairs of different cells, the system to move.
+        row and column, from 0 at the top left; default: any place. Initial states are as in
+        :func:`robots`.
       slip: probability in [0, 1] of moving sideways.
       system_stays, environment_stays: permit the robot to stay.
       legend, wall: as in :func:`~jaxltl.envs.gridworld.gridworld`.
@@ -114,8 +113,6 @@ def grid_game(
       ... ''', system_start="a", environment_start=(1, 2))
       >>> game.num_states
       50
-      >>> [p for p, holds in zip(game.propositions, game.label[game.initial.argmax()]) if holds]
-      ['system_turn', 'environment_b', 'system_a']
     """
     world = gridworld(text, slip=slip, legend=legend, wall=wall)
     system_stays = validation.boolean("system_stays", system_stays)
@@ -181,9 +178,7 @@ def arrival_reward(game: Any, condition: States) -> jax.Array:
 
 
 def diagonal_reward(game: Any) -> jax.Array:
-    """The reward of a `game` of robots for moves of the system to a cell diagonal to the environment.
-
-    The instantaneous reward of the dissertation, section 5.5; see :func:`arrival_reward`.
+    """The :func:`arrival_reward` of ``diagonal`` in a `game` of robots (dissertation, section 5.5).
 
     Example:
       >>> game = robots(3)
@@ -195,7 +190,7 @@ def diagonal_reward(game: Any) -> jax.Array:
 
 
 def reward_against_task() -> tuple[Game, jax.Array]:
-    """A game, with its reward, whose optimal policies violate the task (dissertation, figure 12).
+    """A game and a reward with optimal policies that violate the task (dissertation, figure 12).
 
     The system alone moves. In state 0 the action 0 stays and the action 1 goes to state 1, each for a
     reward of 10; in state 1, where ``b2`` holds, the action 2 stays for nothing. The task ``F b2`` is

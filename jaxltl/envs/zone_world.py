@@ -2,8 +2,8 @@
 
 Two zones of each of four colours lie in a walled square of 5 x 5; the robot accelerates and turns,
 and observes the proximity of the zones in each of 16 directions. Zones and robot are placed anew for
-each episode. Sizes, sensors and colours are those of Jackermeier and Abate (2025), whose robot is
-the point of Safety Gym, simulated by MuJoCo.
+each episode. Sizes, sensors and colours are those of Jackermeier and Abate (2025), with the point
+of Safety Gym as the robot, simulated by MuJoCo.
 
 The robot here is a formula for that point. Its thrust is limited to ``.3 * .05``, against a damping
 of .01 and its mass, ``4/3 pi .1^3 + .1^3`` at density one: it tends to 1.5 units a second with a
@@ -39,14 +39,9 @@ _BINS = 16
 
 @brief
 class ZoneState(NamedTuple):
-    """State of a zone world.
+    """State of a zone world: `place`, `velocity` and `zone` ``float32[P, N, 2]`` in the frame of the walls.
 
-    Attributes:
-      place, velocity: ``float32[2]``, in the frame of the walls.
-      heading: ``float32[]``, radians.
-      acceleration: ``float32[2]``, of the last step.
-      turning: ``float32[]``, radians a second, of the last step.
-      zone: ``float32[P, N, 2]``, the places of each colour's zones.
+    `heading` is in radians, and `acceleration` and `turning` (radians a second) are of the last step.
     """
 
     place: jax.Array
@@ -92,12 +87,10 @@ def zone_world(
     Args:
       colors: the propositions, each true in the zones of its colour.
       zones: the number of zones of each colour.
-      radius: of a zone.
-      extent: half a side.
+      radius, extent: of a zone, and half a side of the square.
       horizon: number of steps after which an episode is truncated; None: never.
       saturation: the action from which on the thrust is full; as published, .05.
-      num_maps: the number of placements in a precomputed table, before symmetries and colours.
-      seed: of that table.
+      num_maps, seed: size of the table of placements, before symmetries and colours, and its seed.
 
     Returns:
       :class:`~jaxltl.core.environments.environment.Environment` with states :class:`ZoneState`, or
@@ -163,12 +156,8 @@ def zone_world(
 def draw_places(count: int, extent: float, num_maps: int, seed: int = 0) -> np.ndarray:
     """Random places of zones, and of the robot last, ``float64[M, count + 1, 2]``.
 
-    Each is uniform in the square except for its keepout (.55 of a zone, .4 of the robot), and redrawn
-    where it is nearer to an earlier one than both keepouts; maps without a place for all are dropped.
-
-    Example:
-      >>> draw_places(2, 2.5, 3).shape
-      (3, 3, 2)
+    Uniform with a keepout of .55 of a zone and .4 of the robot; maps without a place for all are
+    dropped.
     """
     random, found, rounds = np.random.default_rng(seed), [np.zeros((0, count + 1, 2))], 0
     while (have := sum(map(len, found))) < num_maps:
