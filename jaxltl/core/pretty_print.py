@@ -343,10 +343,7 @@ def _leaves(value: Any) -> list[Any]:
 
 
 def history(value: Any, codes: Mapping[str, Any] | None = None) -> Iterator[str]:
-    """Fields of histories: the last row of each, and the counts of all statuses.
-
-    The axes of ``status [...]`` are the rows, with batch axes before the last one.
-    """
+    """Fields of histories: the last row of each, and the counts of all statuses ``[..., rows]``."""
     shape = tuple(value.status.shape)
     if not shape or readable(value.status) is None:
         yield from fields(value, codes)

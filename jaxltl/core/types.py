@@ -157,8 +157,8 @@ def check(solution: SolutionT, *, certified: bool = True) -> SolutionT:
     """Returns `solution` if every lane converged; on the host, not inside ``jit``.
 
     Args:
-      solution: one solution or a batch; or what a learner's run returns.
-      certified: whether to insist on bounds; if False, ``UNCERTIFIED`` is accepted too.
+      solution: one solution or a batch; or the result of a learner's run.
+      certified: True to insist on bounds; if False, ``UNCERTIFIED`` is accepted too.
 
     Returns:
       The solution itself; it is differentiable where the solver's own call is traced, not here.

@@ -66,7 +66,7 @@ RANGES = {
 
 
 def is_concrete(value: Any) -> bool:
-    """Whether a scalar's value is known: it is not traced by JAX."""
+    """True if a scalar's value is known: it is not traced by JAX."""
     try:
         np.asarray(value)
     except TypeError:  # what JAX raises for tracers

@@ -55,9 +55,8 @@ class Automaton:
     A word is accepted iff the least priority that its run reads infinitely often is even
     (min-even parity, on transitions). The acceptance determines the priorities:
 
-    - `"cosafe"`: state q has priority 0 if it is final, else 1, and final states are absorbing:
-      the run must reach one.
-    - `"safety"`: the same, and non-final states are absorbing: the run must avoid them.
+    - `"cosafe"`: 0 in final states, which are absorbing, else 1: the run must reach one.
+    - `"safety"`: the same, with absorbing non-final states: the run must avoid them.
     - `"buchi"`: 0 on accepting transitions, else 1.
     - `"parity"`: any.
 
@@ -65,7 +64,7 @@ class Automaton:
       delta: int32 `[Q, L]`, the state after reading letter l in state q.
       initial: int32 scalar, the state before anything is read.
       priority: int32 `[Q, L]`, of reading letter l in state q.
-      letters: bool `[L, P]`, whether proposition p holds in letter l.
+      letters: bool `[L, P]`, True if proposition p holds in letter l.
       propositions: `[P]` names.
       acceptance: `"cosafe"`, `"safety"`, `"buchi"` or `"parity"`.
       state_names: `[Q]` readable names, one formula per state, or empty.
@@ -307,10 +306,7 @@ def _read(automaton: Automaton, word: Iterable[Letter], place: str) -> list[int]
 
 
 def run(automaton: Automaton, word: Iterable[Letter]) -> NDArray[np.int32]:
-    """The states passed while reading a finite word, from `initial` on.
-
-    `q[0] = initial` and `q[t+1] = delta[q[t], w[t]]`.
-    """
+    """States ``q[t+1] = delta[q[t], w[t]]`` while reading a finite word, from ``q[0] = initial``."""
     states = [int(automaton.initial)]
     for letter in _read(automaton, word, "run: letter"):
         states.append(int(automaton.delta[states[-1], letter]))
@@ -326,7 +322,7 @@ def accepts_lasso(automaton: Automaton, prefix: Iterable[Letter], cycle: Iterabl
       cycle: `[m]` letters, at least one.
 
     Returns:
-      Whether the word is accepted.
+      True if the word is accepted.
 
     Raises:
       ValueError: if the cycle is empty, or a letter is not among the automaton's.
@@ -361,14 +357,14 @@ def accepts_lasso(automaton: Automaton, prefix: Iterable[Letter], cycle: Iterabl
 def complement(automaton: Automaton) -> Automaton:
     """The automaton that accepts exactly the words that `automaton` rejects.
 
-    The run is the same. Final states become the others, which turns co-safe into safety
-    acceptance; other priorities grow by one, which turns Buchi into parity.
+    Final states become non-final and vice versa, which turns co-safe into safety acceptance; other
+    priorities grow by one, which turns Buchi into parity.
 
     Args:
       automaton: with any acceptance.
 
     Returns:
-      The automaton of the other words, over the same letters.
+      The complement, over the same letters.
 
     Example:
       >>> from jaxltl import to_automaton

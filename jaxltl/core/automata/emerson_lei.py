@@ -125,10 +125,7 @@ def reached_from(delta: Integers, initial: int) -> NDArray[np.bool_]:
 
 @dataclass
 class _Tree:
-    """The nodes of a decomposition; node 0 is the root and parents come before children.
-
-    `edges[n]` holds numbers q * K + k of transitions, `states[n]` their sources.
-    """
+    """Nodes of a decomposition, parents first; `edges[n]` are numbers q * K + k, `states[n]` sources."""
 
     accepting: bool = False
     edges: list[frozenset[int]] = field(default_factory=list)
@@ -214,9 +211,9 @@ class _Parts:
     def maximal(self, part: Integers, accepting: bool) -> list[Integers]:
         """The maximal strongly connected subsets with the other verdict.
 
-        A rejecting subset of an accepting part lacks a color that the condition asks for
-        (`inf`), an accepting subset of a rejecting part one that it forbids (`fin`). So it lies
-        in a component of what is left without the transitions of that color.
+        A rejecting subset of an accepting part lacks a color of an `inf` condition, an accepting
+        subset of a rejecting part one of a `fin` condition. So it lies in a component of the part
+        without the transitions of that color.
         """
         key = part.tobytes()
         if key not in self.known:

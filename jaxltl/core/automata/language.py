@@ -1,8 +1,4 @@
-"""Questions about the languages of automata, and operations on them.
-
-A language is the set of the infinite words that an automaton accepts. Every answer is exact, and
-every answer that a word can prove comes with one: a lasso, which is prefix·cycle^ω.
-"""
+"""Emptiness, inclusion and equivalence of automata, with lassos prefix·cycle^ω as witnesses."""
 
 from __future__ import annotations
 
@@ -24,9 +20,8 @@ _MAX_COLORS = 62  # the bits of an int64 that are surely positive
 def find_accepted(automaton: Automaton) -> Lasso | None:
     """A word that the automaton accepts, as a short lasso.
 
-    For each even p: a cycle that reads p and nothing less, that is a strongly connected part of
-    the transitions of priority p or more, with one of priority p (Baier & Katoen 2008, section
-    4.4, for one priority).
+    For each even p: a strongly connected part of the transitions of priority p or more, with one of
+    priority p (Baier & Katoen 2008, section 4.4, for one priority).
     """
     return find_lasso([automaton], [(EVEN,)])
 
@@ -85,11 +80,7 @@ def is_equivalent(a: Task, b: Task) -> bool:
 
 
 def find_not_included(a: Task, b: Task) -> Lasso | None:
-    """A word that the first automaton accepts and the second rejects, as a short lasso.
-
-    On the runs of both, for each even p and odd r: a cycle on which the least priorities are p
-    and r. Neither acceptance has to be converted.
-    """
+    """A short lasso that the first automaton accepts and the second rejects, from their joint run."""
     return find_lasso(_aligned(a, b), [(EVEN, ODD)])
 
 
@@ -97,11 +88,11 @@ def is_included(a: Task, b: Task) -> bool:
     """True if the language of the first automaton is included in that of the second, over joint letters.
 
     Args:
-      a: the automaton of the tested words; or a formula, or its text.
-      b: the one that should accept them, likewise; both are aligned first, see `align`.
+      a: an automaton, a formula or its text.
+      b: another; both are aligned first, see `align`.
 
     Returns:
-      Whether it does; :func:`find_not_included` gives a word that `a` accepts and `b` does not.
+      True if it is; :func:`find_not_included` gives a word that `a` accepts and `b` does not.
 
     Raises:
       ValueError: if there is no joint letter, or too many.
@@ -159,11 +150,7 @@ def _combine(a: Task, b: Task, connective: str) -> Automaton:
 
 
 def _colored(priority: Integers, first: int) -> tuple[NDArray[np.int64], tuple[Any, ...], int]:
-    """Priorities as sets of colours and a condition on the colours met infinitely often.
-
-    Neighbouring priorities of one parity share a colour, and the greatest need none: they
-    decide when no other is met infinitely often.
-    """
+    """Priorities as sets of colours and a condition on the colours met infinitely often."""
     values, place = np.unique(priority, return_inverse=True)
     level_of = np.concatenate([[0], np.cumsum(np.diff(values % 2) != 0)])
     level = level_of[place.reshape(priority.shape)]

@@ -13,11 +13,9 @@ from jaxltl.core.automata.automaton import Automaton
 
 
 def minimize(automaton: Automaton) -> Automaton:
-    """Minimal automaton with the same priorities along every run.
+    """Minimal automaton with the same priorities along every run, by `equivalence_classes`.
 
-    Unreachable states are dropped and equivalent ones merged, by `equivalence_classes`. Co-safe
-    and safety automata of one language, over the same letters, give identical tables. A merged
-    state keeps the shortest of the names.
+    Co-safe and safety automata of one language, over the same letters, give identical tables.
     """
     return quotient(automaton, equivalence_classes(automaton))
 
@@ -43,10 +41,8 @@ def quotient(automaton: Automaton, classes: NDArray[np.int32]) -> Automaton:
 def equivalence_classes(automaton: Automaton) -> NDArray[np.int32]:
     """The state of `minimize(automaton)` that each state becomes, -1 if it is unreachable.
 
-    Two states are equivalent when every finite word reads the same priorities from both.
-    The coarsest such partition is found by refinement, always queueing the smaller half of a
-    split block (Hopcroft 1971, "An n log n algorithm for minimizing states in a finite
-    automaton"), and numbered breadth first from the initial state.
+    Partition refinement by the smaller half of a split block (Hopcroft 1971, "An n log n algorithm
+    for minimizing states in a finite automaton"), numbered breadth first.
     """
     reached = _breadth_first(automaton.delta, int(automaton.initial))
     position = np.full(len(automaton.delta), -1)

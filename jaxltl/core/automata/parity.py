@@ -35,9 +35,8 @@ class Table(NamedTuple):
 def simplify(automaton: Automaton) -> Automaton:
     """A small automaton with the same language and the simplest acceptance that it allows.
 
-    Co-safe and safety where a finite prefix proves or refutes (then the automaton is minimal),
-    else Buchi where the language has a deterministic Buchi automaton, else parity. If every
-    cycle's verdict is that of its component, the automaton is minimal too.
+    Co-safe or safety (then minimal), else Buchi where the language has a deterministic Buchi
+    automaton, else parity. If every cycle's verdict is that of its component, it is minimal too.
     """
     table = Table(automaton.delta, automaton.priority, int(automaton.initial))
     small, kind, base = reduce_table(table)
@@ -53,10 +52,7 @@ def simplify(automaton: Automaton) -> Automaton:
 
 
 def reduce_table(table: Table, thorough: bool = True) -> tuple[Table, str, Integers]:
-    """The small table, its acceptance and, for each new state, an old one of its language.
-
-    `thorough` also tries to merge states one by one, which takes most of the time.
-    """
+    """The small table, its acceptance, and an old state of each new one; `thorough` is slow."""
     columns, inverse = _distinct_columns(table)
     base: Integers = np.arange(len(table.delta))
     few = Table(table.delta[:, columns], table.priority[:, columns], table.initial)
@@ -208,12 +204,7 @@ def _weak_minimal(table: Table) -> tuple[Table, Integers]:
 
 
 def _early(table: Table) -> Table:
-    """A weak automaton with verdicts as early as they are certain, where that suffices.
-
-    Where every accepting cycle is among states that accept all words, only those are final: the
-    language is co-safe. Where every rejecting cycle is among states that accept none, all
-    others are: it is safe.
-    """
+    """A weak automaton with the earliest verdicts, if its language is co-safe or safe."""
     component = components(table)
     inside = component[table.delta] == component[:, None]
     good, bad = ((inside & (table.priority % 2 == parity)).any(axis=1) for parity in (0, 1))
@@ -232,9 +223,8 @@ def _early(table: Table) -> Table:
 def language_classes(table: Table) -> Integers | None:
     """The states grouped by language, int `[Q]`; None where that is too much work.
 
-    Two states differ iff some word leads, from one, to a cycle of even least priority p and,
-    from the other, of odd least priority r: to a component of the pairs, without priorities
-    below p and r, that has transitions of both.
+    Two states differ iff some word leads to cycles of even least priority p from one and of odd
+    least priority r from the other: to a component of the pairs without priorities below these.
     """
     columns, _ = _distinct_columns(table)
     delta, priority = table.delta[:, columns], table.priority[:, columns]

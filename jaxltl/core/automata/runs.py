@@ -1,7 +1,4 @@
-"""Runs of several automata on the same word, and the words on which they loop as wanted.
-
-Loops are strongly connected parts of the joint transitions; a word through one is a lasso.
-"""
+"""Runs of several automata on the same word, and lassos through cycles of their joint transitions."""
 
 from __future__ import annotations
 
@@ -35,11 +32,9 @@ def universal_states(automaton: Automaton) -> NDArray[np.bool_]:
 
 
 def align(a: Automaton, b: Automaton) -> tuple[Automaton, Automaton]:
-    """Two automata over the same propositions and letters.
+    """Two automata over the same propositions, sorted, and the same letters, by binary number.
 
-    The propositions are those of either, sorted. The letters are what a letter of `a` and a
-    letter of `b` that agree on the shared propositions say together, by binary number: all
-    2^P if both have all of theirs, and the common letters if the propositions are the same.
+    The letters combine a letter of `a` and one of `b` that agree on the shared propositions.
     """
     shared = [name for name in a.propositions if name in b.propositions]
     read_by_a, read_by_b = _agreeing(_columns(a, shared), _columns(b, shared))
@@ -102,17 +97,12 @@ def _reading(
 
 
 class Runs(NamedTuple):
-    """K automata that read the same word, as one graph that starts in node 0.
+    """K automata that read the same word, as one graph that starts in node 0."""
 
-    Attributes:
-      delta: `[N, L]`, the node after reading a letter; nodes are numbered breadth first.
-      priorities: k tables `[N, L]`, what each automaton reads.
-      states: `[N, K]`, the state of each automaton.
-    """
-
+    # [N, L], the node after reading a letter; nodes are numbered breadth first
     delta: NDArray[np.int32]
-    priorities: tuple[NDArray[np.int32], ...]
-    states: NDArray[np.int64]
+    priorities: tuple[NDArray[np.int32], ...]  # K tables [N, L], of each automaton
+    states: NDArray[np.int64]  # [N, K], the state of each automaton
 
 
 _Loops = tuple[NDArray[np.bool_], list[NDArray[np.bool_]]]

@@ -1,9 +1,8 @@
 """Reach-avoid sequences of an automaton: letters to reach, and letters to avoid until then.
 
-A finite word leads to a state of the automaton; a continuation satisfies the task along a
-path from there into acceptance. Each move of such a path says: read one of *these* letters next,
-and none of *those* before it. Such sequences look the same for every formula, so that one agent
-that can follow them does formulas that it never saw (Jackermeier and Abate 2025, "DeepLTL").
+A continuation of a finite word satisfies the task along a path into acceptance. Each move reads a
+letter to reach, and none to avoid before it. An agent that follows such sequences generalises to
+unseen formulas (Jackermeier and Abate 2025, "DeepLTL").
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ class Sequences:
     """For each state of an automaton at most M sequences of at most D steps, shortest first.
 
     Attributes:
-      reach: bool `[Q, M, D, E]`, the events of which a step asks for one.
+      reach: bool `[Q, M, D, E]`, alternative events to reach in a step.
       avoid: bool `[Q, M, D, E]`, those that set back the task before it.
       length: int32 `[Q, M]`, how many steps there are in all, also beyond D; for an infinite
         task, up to and with the first accepting round. 0: there is no such sequence.
@@ -69,25 +68,23 @@ def reach_avoid_sequences(
     depth: int = 6,
     most: int = 16,
 ) -> Sequences:
-    """The sequences that lead from each state of an automaton to acceptance.
+    """Reach-avoid sequences that lead from each state of an automaton to acceptance.
 
-    A step from state q to state r of a path asks for an event that leads from q to r. It avoids
-    those that lead to a state from which nothing is accepted, or from which acceptance is no nearer
-    than from q, counted in moves; an event that is progress of another kind is neither. The path of
-    an infinite task runs into a cycle whose least priority is even, and round it until the depth is
-    full; on it, what has a smaller odd priority is avoided too. States where every word is
+    A step from state q to state r reaches events that lead from q to r. It avoids those that lead to
+    a state from which nothing is accepted, or from which acceptance is no nearer than from q,
+    counted in moves. The path of an infinite task ends in a cycle with an even least priority,
+    repeated up to the depth, and avoids smaller odd priorities on it. States where every word is
     accepted, or none is, have no sequence.
 
     Args:
       automaton: the task, with any acceptance.
-      events: bool `[E, P]`, the labels that occur in the world; others are not looked at.
+      events: bool `[E, P]`, the labels that occur in the world.
       propositions: names of the P columns; the automaton need not use all.
-      depth: d, the steps that are kept.
-      most: m, the sequences that are kept; they differ within their first D steps, or in
-        their length.
+      depth: D, the number of steps that are kept.
+      most: M, the number of sequences that are kept; they differ within D steps, or in length.
 
     Returns:
-      `Sequences`, whose tables are arrays of the host.
+      `Sequences` of arrays on the host.
 
     Raises:
       ValueError: an event that the automaton cannot read, an unknown proposition, or a size

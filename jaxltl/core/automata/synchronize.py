@@ -13,21 +13,19 @@ from jaxltl.core.logic.ltl import Letter
 
 
 def synchronize(memory: Task, task: Task, *, alphabet: Iterable[Letter] | None = None) -> Automaton:
-    """An automaton that runs two others side by side and accepts as the second does.
+    """Synchronous product of two automata, with the acceptance of the second.
 
-    So a policy with the memory of one automaton is judged by the task of another: make
-    the product with this automaton, and lift the policy by :func:`lift_memory_policy`. The pair
-    of memory state q1 and task state q2 is the state ``q1 * Q2 + q2``.
+    A policy with the memory of one automaton is judged by the task of another: make the product
+    with this automaton, and lift the policy by :func:`lift_memory_policy`. The pair of memory state
+    q1 and task state q2 is the state ``q1 * Q2 + q2``.
 
     Args:
       memory: Q1 states; an automaton, a formula or its text.
       task: Q2 states, likewise.
-      alphabet: what formulas are translated over, see
-        :func:`~jaxltl.core.automata.translate.to_automaton`.
+      alphabet: the letters for formulas, see `to_automaton`.
 
     Returns:
-      An automaton of Q1 * Q2 states over the joint letters of both, see
-      :func:`~jaxltl.core.automata.runs.align`.
+      An automaton of Q1 * Q2 states over the joint letters, see `align`.
 
     Raises:
       ValueError: there is no joint letter, or too many.

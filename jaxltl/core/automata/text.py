@@ -17,9 +17,7 @@ from jaxltl.core.logic.ltl import proposition_text
 def guards(automaton: Automaton) -> dict[tuple[int, int], str]:
     """A short condition on the propositions for each pair of states joined by a letter.
 
-    A guard is true of the letters that make the transition and false of the other letters; what
-    it says of combinations that are no letter is left to brevity. It is an irredundant
-    disjunction of prime cubes, not always the shortest.
+    An irredundant disjunction of prime cubes; combinations that are no letter may be on either side.
     """
     same = np.zeros_like(np.asarray(automaton.priority))
     return {(q, end): text for (q, end, _), text in _guards(automaton, same).items()}
@@ -56,10 +54,7 @@ def _guards(automaton: Automaton, marks: NDArray[Any]) -> dict[tuple[int, int, i
 
 
 def prime_cover(chosen: set[int], others: set[int], width: int) -> list[Cube]:
-    """Prime cubes, none to spare, that together hold in the chosen letters and in no other.
-
-    Letters that are in neither set may fall on either side; see `diagram.prime_cubes`.
-    """
+    """Irredundant prime cubes of the chosen letters; letters of neither set are free."""
     if len(chosen) + len(others) < 1 << width:
         # Where few letters occur, a few propositions tell, and guards of others would be long.
         kept = _telling(chosen, others, width)
@@ -109,11 +104,7 @@ def _state_labels(automaton: Automaton) -> list[str]:
 
 
 def to_text(automaton: Automaton) -> str:
-    """The automaton for reading: `>` marks the initial state and `*` the final ones.
-
-    In a Buchi automaton `*` marks the accepting transitions instead, and in a parity automaton
-    each transition is followed by its priority in braces.
-    """
+    """Readable automaton: `>` marks the initial state, `*` final states or Buchi transitions."""
     lines = [f"{automaton.acceptance} automaton: {extent_text(automaton)}"]
     final = _final_states(automaton)
     edges = defaultdict(list)
@@ -141,11 +132,7 @@ def _mark(automaton: Automaton, priority: int, accepting: str) -> str:
 
 
 def to_dot(automaton: Automaton) -> str:
-    """The automaton as a graph in the DOT language, final states double circled.
-
-    The accepting transitions of a Buchi automaton are bold and have a dot after their condition,
-    and those of a parity automaton have their priority in braces there.
-    """
+    """Automaton in DOT: final states double circled, accepting transitions bold."""
     lines = ["rankdir=LR;", 'start [shape=point, label=""];', f"start -> {automaton.initial};"]
     final = _final_states(automaton)
     for q, label in enumerate(_state_labels(automaton)):

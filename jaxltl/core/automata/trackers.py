@@ -24,10 +24,7 @@ _PROVEN, _REFUTED, _IDLE = -1, -2, -3
 
 
 class Tracker:
-    """The run for one formula, or for its negation: `often` if it must mark infinitely often.
-
-    States are numbered from 0 as they are met; `_PROVEN` and `_REFUTED` are constant.
-    """
+    """The run for one formula, or for its negation: `often` if it must mark infinitely often."""
 
     def __init__(self, part: Part) -> None:
         limits = limit_parts(part.formula) if part.kind == "limit" else ()

@@ -1,9 +1,9 @@
-"""From linear temporal logic to deterministic automata.
+"""Translation of linear temporal logic to deterministic automata.
 
 A syntactically co-safe or safety formula becomes the automaton of its progression. Any other is
 a combination of Sigma-2 and Pi-2 formulas and limits (`normal_form`), each followed by one
-tracker; the trackers side by side are an automaton with an Emerson-Lei condition, which turns
-into parity (`emerson_lei`) and is then made small (`parity`).
+tracker; their synchronous product has an Emerson-Lei condition, which becomes parity
+(`emerson_lei`), and is then reduced (`parity`).
 """
 
 from __future__ import annotations
@@ -58,24 +58,21 @@ def to_automaton(
     """A small complete deterministic automaton of a formula of linear temporal logic.
 
     It accepts exactly the infinite words over `letters` that satisfy the formula. For co-safe
-    and safety languages it is minimal, and a state is final as early as the letters allow: for
-    co-safe as soon as every continuation satisfies the formula, for safety until no continuation
-    does. Where the verdict of a word depends on more, acceptance is on transitions.
+    and safety languages it is minimal, and the verdict comes as early as the letters allow.
 
     Args:
       formula: a formula or its text (see `parse_ltl`).
       letters: the letters that occur, each a collection of proposition names; names that are
         not in the formula are ignored. None stands for all 2^P subsets of its propositions.
-      max_states: the number of states, at any stage, at which to give up.
-      acceptance: `"auto"`, the simplest that the language has: `"cosafe"` or `"safety"`, where
-        a finite prefix proves or refutes; else `"buchi"`, where a deterministic Buchi
-        automaton exists; else `"parity"`. `"dfa"`, `"buchi"` and `"parity"` ask for that
-        form, by `"dfa"` either of the first two.
+      max_states: limit of the number of states at any stage.
+      acceptance: `"auto"`, the first that the language has of `"cosafe"` or `"safety"`,
+        `"buchi"` (deterministic) and `"parity"`; `"dfa"` (either of the first two), `"buchi"` and
+        `"parity"` require that form.
 
     Returns:
       An automaton over the sorted propositions of the formula. Letters are in the order of the
       binary numbers with proposition p as bit p, states in breadth-first order, and each state
-      is named by the formula that is left to satisfy there.
+      is named by its residual formula.
 
     Raises:
       ValueError: for a language without the requested acceptance, more than 12 propositions

@@ -72,10 +72,7 @@ class Earned:
 
 
 def unfolded(path: Bounded) -> Formula:
-    """The equivalent formula without bounds, for a bound on steps.
-
-    `a U[l,u] b` is `a & X(a U[l-1,u-1] b)`, and `a U<=u b` is `b | a & X(a U<=u-1 b)`; `R` dually.
-    """
+    """Unfolds step bounds: `a U[l,u] b = a & X(a U[l-1,u-1] b)`, `a U<=u b = b | a & X(a U<=u-1 b)`."""
     if path.operator == "R":
         left = TRUE if path.left == FALSE else ~path.left
         return ~unfolded(replace(path, operator="U", left=left, right=~path.right))

@@ -66,10 +66,7 @@ class Diagrams:
 
 
 def prime_cubes(lower: int, upper: int, diagrams: Diagrams) -> tuple[list[Cube], int]:
-    """An irredundant disjunction of prime cubes between two diagrams, and its own diagram.
-
-    Minato 1993, "Fast generation of prime-irredundant covers from binary decision diagrams".
-    """
+    """Irredundant prime cubes between two diagrams (Minato 1993), and the diagram of their union."""
     if lower == FALSE:
         return [], FALSE
     if upper == TRUE:

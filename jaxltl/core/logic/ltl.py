@@ -326,11 +326,7 @@ _DUAL |= {dual: operator for operator, dual in _DUAL.items()}
 
 
 def negation_normal_form(formula: Formula) -> Formula:
-    """The equivalent formula with `!` on propositions only and no `-> <-> xor`.
-
-    Negation is pushed inwards by the dualities `!X f = X !f`, `!F f = G !f`,
-    `!(f U g) = !f R !g` and `!(f W g) = !f M !g` (Baier & Katoen 2008, section 5.1.5).
-    """
+    """Negation normal form: `!` on propositions only, no `-> <-> xor` (Baier & Katoen 2008, 5.1.5)."""
     forms: dict[Formula, tuple[Formula, Formula]] = {}  # the normal forms of f and of !f
     for node in subformulas(formula):
         positive = tuple(forms[operand][0] for operand in node.operands)
@@ -393,9 +389,8 @@ def holds_on_lasso(
 ) -> bool:
     """True if the infinite word prefix·cycle^ω satisfies the formula.
 
-    The truth of each subformula is computed at every position of the lasso, `U F M` as least and
-    `R G W` as greatest solutions of their expansion laws, such as
-    `f U g = g | (f & X(f U g))` (Baier & Katoen 2008, section 5.1.4).
+    Subformulas are evaluated at every position of the lasso, `U F M` as least and `R G W` as
+    greatest solutions of their expansion laws (Baier & Katoen 2008, section 5.1.4).
 
     Args:
       formula: a formula or its text.
@@ -403,7 +398,7 @@ def holds_on_lasso(
       cycle: `[m]` letters, at least one.
 
     Returns:
-      Whether it does.
+      True if the word satisfies the formula.
 
     Raises:
       ValueError: for an empty cycle or a letter that is a bare string.

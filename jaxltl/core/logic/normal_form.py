@@ -228,10 +228,7 @@ class Rewriter:
 
 @dataclass(frozen=True)
 class Part:
-    """A leaf of a combination: `kind` is `"sigma2"`, `"pi2"` or `"limit"`.
-
-    A limit is one `G F f` or `F G f`, or a conjunction of the former or disjunction of the latter.
-    """
+    """A leaf of a combination, of `kind` `"sigma2"`, `"pi2"` or `"limit"` (joined `G F` or `F G`)."""
 
     kind: str
     formula: Formula
@@ -334,8 +331,7 @@ def _same(operator: str, parts: Combination) -> tuple[Combination, ...]:
 def _joined_limits(operator: str, parts: list[Combination], grouped: bool) -> list[Combination]:
     """The parts, with limits joined that one tracker can follow.
 
-    Those of propositional formulas need no state, so only `G F f | G F g = G F (f | g)` and its
-    dual join them; others of the dual kinds are tracked round-robin.
+    `G F f | G F g = G F (f | g)` and its dual for propositional formulas; others round-robin.
     """
     outer, turning = ("F", "G") if operator == "&" else ("G", "F")
     inner = "G" if outer == "F" else "F"

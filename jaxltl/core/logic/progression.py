@@ -27,15 +27,8 @@ _TEMPORAL = frozenset("XFGURWM")
 class Progression:
     """Diagrams of formulas in negation normal form, and their successors under letters.
 
-    Args:
-      formulas: all formulas to progress.
-      letters: bool `[L, P]`.
-      propositions: `[P]` names.
-      max_nodes: the number of diagrams at which to give up.
-
-    Attributes:
-      representative: one letter of each class of equivalent letters.
-      class_of: int `[L]`, the class of each letter.
+    `letters` is bool `[L, P]`, `max_nodes` the limit of the number of diagrams. `representative` has
+    one letter of each class of equivalent letters, and `class_of` int `[L]` the class of each letter.
     """
 
     def __init__(
@@ -105,10 +98,7 @@ class Progression:
         return inverse.ravel(), first
 
     def _step(self, letter: set[str]) -> Callable[[int], int]:
-        """The function from the diagram of a formula to that of the residual formula after a letter.
-
-        It replaces each variable by its own successor: `af(f U g) = af(g) | (af(f) & f U g)`.
-        """
+        """Successors of diagrams after a letter: `af(f U g) = af(g) | (af(f) & f U g)` in each variable."""
         diagrams, of = self.diagrams, self.diagram_of
         both, either, nodes = diagrams.both, diagrams.either, diagrams.nodes
         successors: dict[int, int] = {}

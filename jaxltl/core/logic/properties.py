@@ -110,7 +110,7 @@ def parse_properties(text: str) -> tuple[Property, ...]:
 
 
 def parse_property(text: str) -> Property:
-    """The one property that a text writes; see :func:`parse_properties`.
+    """The one property in a text; see :func:`parse_properties`.
 
     Args:
       text: one property.
@@ -256,7 +256,7 @@ class _Parser:
         if operator == "R" and self.accept("{"):
             reward = self.quoted()
             self.expect("}")
-        if objective is None:  # R{"name"}max, and max apart from its operator
+        if objective is None:  # R{"name"}max, with max after the name
             both = self.accept(*_DIRECTIONS) or ""
             objective, nature = both[:3] or None, both[3:] or None
         relation, threshold = self.comparison(operator)

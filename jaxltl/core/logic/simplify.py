@@ -62,10 +62,7 @@ def _without_implied(operator: str, pieces: list[Formula]) -> list[Formula] | No
 
 @lru_cache(maxsize=1 << 16)
 def implies(one: Formula, two: Formula) -> bool:
-    """True if simple rules on normal forms show that every word of `one` satisfies `two`.
-
-    The rules are those of Somenzi & Bloem 2000, "Efficient Buchi automata from LTL formulae".
-    """
+    """True if syntactic rules (Somenzi & Bloem 2000) show that every word of `one` satisfies `two`."""
     if one in (two, FALSE) or two == TRUE:
         return True
     if one.operator == "|" or two.operator == "&":

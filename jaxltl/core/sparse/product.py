@@ -135,7 +135,7 @@ def _reached(world: _World, start: Integers) -> Booleans:
 
 
 def _searched(world: _World, start: Integers) -> Booleans:
-    """The same by SciPy's search of the whole product, whose time does not grow with its depth."""
+    """The same by SciPy's search of the whole product, in time independent of its depth."""
     from scipy.sparse import csgraph, csr_array
 
     host, (num_states, num_memory) = world.host, (world.host.num_states, world.num_memory)

@@ -26,16 +26,13 @@ def clopper_pearson(count: Integers, total: Integers, failure: float) -> Ends:
     """Clopper-Pearson interval (1934), from one binomial test on each side.
 
     ``P(Bin(n, lower) >= k) = P(Bin(n, upper) <= k) = failure / 2``. Each side misses with a chance
-    of at most ``failure / 2``, whatever the probability, if n does not depend on what came.
+    of at most ``failure / 2`` for every probability, if n does not depend on earlier outcomes.
     """
     return _of_distinct(_tails, count, total, failure)
 
 
 def hoeffding(count: Integers, total: Integers, failure: float) -> Ends:
-    """Hoeffding interval (1963, theorem 1) around the frequency.
-
-    ``k / n -+ sqrt(log(2 / failure) / (2 n))``, if n does not depend on what came.
-    """
+    """Hoeffding interval (1963, theorem 1): ``k / n -+ sqrt(log(2 / failure) / (2 n))`` for fixed n."""
     return around(frequency(count, total), hoeffding_deviation(total, failure))
 
 
@@ -45,8 +42,7 @@ def anytime(count: Integers, total: Integers, failure: float) -> Ends:
     ``p^k (1 - p)^(n - k) >= failure B(k + 1/2, n - k + 1/2) / B(1/2, 1/2)``: the likelihood of
     Jeffreys' mixture over that of p is a martingale, so the chance that it ever exceeds
     ``1 / failure`` is at most `failure` (Ville; Robbins 1970; Waudby-Smith and Ramdas 2020). The
-    intervals of all n hold at once: n may depend on what came, as where one tries until
-    something happens, or looks at the intervals in order to go on.
+    intervals of all n hold at once: n may depend on outcomes and on the intervals.
     """
     return _of_distinct(_mixed, count, total, failure)
 
@@ -129,8 +125,8 @@ def _climbed(
 ) -> Floats:
     """Newton's method for the root of an increasing concave function of log x, from the left.
 
-    Newton's steps end left of the zero, where the function is below its tangents; so they climb to
-    it, and what is found does not depend on what else is looked for.
+    Newton's steps end left of the zero, where the function is below its tangents, so they climb to
+    it; the root does not depend on the other elements.
     """
     # The lower end of Wilson's interval.
     share, half = k / n, deviance / n
@@ -144,7 +140,7 @@ def _climbed(
         found[active[below]] = np.maximum(found[active], at)[below]
         with np.errstate(invalid="ignore"):
             step = (-5 * _MARGIN - above) / slope
-        lost = ~np.isfinite(step)  # so far left that it is not told from zero
+        lost = ~np.isfinite(step)  # so far left that it rounds to zero
         step = np.where(lost, np.log(share[active] / at) / 2, np.maximum(step, -100))
         new = np.minimum(at * np.exp(step), 1 - _EPS)
         new = np.where(below, new, np.minimum(new, np.nextafter(at, 0)))

@@ -1,8 +1,7 @@
 """Simultaneous confidence sets of transition probabilities from counts.
 
-Every row (state and action) is a die with its own probabilities. What is known of it after n throws
-is an interval for each outcome, or a ball in the L1 norm around the frequencies. A union bound
-makes all of them hold together.
+A row (state and action) has an interval for each outcome, or an L1 ball around the frequencies of
+its samples. A union bound makes all of them hold together.
 """
 
 from __future__ import annotations
@@ -55,15 +54,14 @@ class ConfidenceSets:
 
     Attributes:
       lower, upper: ``float64[T]`` or ``float64[..., K]`` as the counts, ends of intervals; 0 at
-        what is no successor. Of a ball, the smallest intervals around it.
-      center: of the same shape, the frequencies; a row that was never seen has equal ones.
+        entries that are no successors. Of a ball, the smallest intervals around it.
+      center: of the same shape, the frequencies; equal in a row without samples.
       radius: ``float64[R]`` or ``float64[...]``, the ball ``sum_t |p_t - center_t| <= radius`` of
         the method of Weissman et al.; None for the others.
-      rest: of a row each, an upper bound of what goes to outcomes that are not listed; 0 where all
-        are.
-      num_samples: of a row each, ``int64``.
-      num_claims: M, how many claims share the chance ``1 - confidence`` to be wrong.
-      confidence, method: as asked for.
+      rest: of each row, an upper bound of the probability of unlisted outcomes.
+      num_samples: of each row, ``int64``.
+      num_claims: M, the number of claims that share the failure probability ``1 - confidence``.
+      confidence, method: the arguments.
 
     Example:
       >>> import jaxltl as jl
@@ -101,8 +99,7 @@ def intervals_from_counts(
     ``"weissman"`` is the ball ``sum_t |p_t - k_t / n| <= sqrt(2 / n log((2^J - 2) M / (1 -
     confidence)))`` (Weissman et al. 2003, theorem 2.1); the others are intervals of
     :mod:`~jaxltl.core.statistics.binomial`. All but ``"anytime"`` require that the number of samples
-    of a row does not depend on outcomes, as with a simulator. In an agent's log it depends on them;
-    ``"anytime"`` holds for any way to gather data, at all times at once.
+    of a row does not depend on outcomes, as with a simulator; in an agent's log it does.
 
     Args:
       counts: observed successors, integers: ``[..., K]``, or ``[T]`` by rows with `entry_start`.
@@ -177,10 +174,7 @@ def intervals_from_counts(
 
 
 def l1_radius(total: Integers, num_outcomes: Integers, failure: float) -> Floats:
-    """L1 deviation of frequencies from probabilities at failure probability `failure`.
-
-    ``sqrt(2 / n log((2^J - 2) / failure))`` (Weissman et al. 2003, theorem 2.1), at most 2.
-    """
+    """L1 radius ``sqrt(2 / n log((2^J - 2) / failure))`` (Weissman et al. 2003, theorem 2.1), at most 2."""
     many = np.maximum(num_outcomes, 2)
     with np.errstate(divide="ignore"):
         log_events = many * np.log(2) + np.log1p(-np.exp2(1.0 - many))
@@ -197,10 +191,7 @@ def samples_needed(
     num_claims: int = 1,
     num_outcomes: int = 2,
 ) -> int:
-    """Number of samples of a row after which every interval has at most a given width.
-
-    The widest interval is that of an outcome which comes half of the time.
-    """
+    """Number of samples of a row after which even the widest interval has at most a given width."""
     _check_method(method)
     check_confidence(confidence)
     if not 0 < validation.finite_number("width", width) < 1:
@@ -229,7 +220,7 @@ def samples_needed(
     return high
 
 
-# --- what is given ----------------------------------------------------------------------------
+# --- arguments --------------------------------------------------------------------------------
 
 
 def _check_method(method: str) -> None:

@@ -2,13 +2,13 @@
 
 The predictable plug-in empirical-Bernstein confidence sequence (Waudby-Smith and Ramdas 2024,
 "Estimating means of bounded random variables by betting", theorem 2): of numbers ``X_i`` in [0, 1]
-that each have the mean m, whatever came before, with weights ``w_i`` in [0, 1) that may depend on
-what came before::
+that each have the conditional mean m given the past, with weights ``w_i`` in [0, 1) and guesses
+``c_i`` of m that may depend on the past::
 
     sum_i w_i X_i / sum_i w_i  -+  (log(2 / failure) + sum_i (X_i - c_i)^2 psi(w_i)) / sum_i w_i,
 
-where ``c_i`` is a guess of m from what came before and ``psi(w) = -log(1 - w) - w``. All intervals
-of one sequence hold at once but for a chance of `failure`, so that one may stop when one likes.
+where ``psi(w) = -log(1 - w) - w``. All intervals of one sequence hold at once with probability
+``1 - failure``, so that the stopping time may depend on them.
 """
 
 from __future__ import annotations

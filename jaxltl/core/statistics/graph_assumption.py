@@ -1,7 +1,7 @@
 """Assumptions on the graph of a model that is estimated from counted transitions.
 
-Counts bound probabilities of known transitions. They do not show that a transition which was never
-observed is impossible, so that every guarantee names what it assumes of the graph.
+Counts do not show that a transition without observations is impossible, so every guarantee names
+its assumption on the graph.
 """
 
 from __future__ import annotations
@@ -66,11 +66,7 @@ def require_graph(graph: object, known: tuple[str, ...] = ("given", "seen", "com
 
 
 def describe_graph(graph: Graph) -> str:
-    """The assumption in words, to be printed beside every guarantee.
-
-    >>> describe_graph("seen")
-    'only transitions that the log contains are possible'
-    """
+    """The assumption in words, to be printed with every guarantee."""
     if isinstance(graph, LeastProbability):
         return f"no possible transition is less likely than {graph.value:g}, and {_STATES}"
     return _DESCRIPTION[graph]

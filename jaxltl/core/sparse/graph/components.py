@@ -66,7 +66,7 @@ def forward_search(start: Integers, after: Integers, first: Booleans) -> Boolean
 
 
 def _is_quick(size: int) -> bool:
-    """Whether SciPy's searches are faster, its import included."""
+    """True if SciPy's searches are faster, its import included."""
     return size > SCIPY_SIZE // 4 or (size > _READY and "scipy.sparse.csgraph" in sys.modules)
 
 

@@ -34,7 +34,7 @@ class RowGraph:
 
     @property
     def is_padded(self) -> bool:
-        """Whether choices are actions."""
+        """True if choices are actions."""
         return self.available.ndim > len(self.state_shape)
 
     def on_choices(self, states: Booleans) -> Booleans:
@@ -42,12 +42,12 @@ class RowGraph:
         return states[..., None] if self.is_padded else states[self.host.state]
 
     def exists(self, region: Booleans) -> Booleans:
-        """Whether some successor lies in a region; False where unavailable."""
+        """Tests if some successor lies in a region; False where unavailable."""
         found = self.host.support.some_successor_in(region.reshape(-1))
         return found.reshape(self.available.shape)
 
     def forall(self, region: Booleans) -> Booleans:
-        """Whether all successors lie in a region; True where unavailable."""
+        """Tests if all successors lie in a region; True where unavailable."""
         return ~self.exists(~region)
 
     def least(self, value: Integers) -> Integers:
@@ -56,7 +56,7 @@ class RowGraph:
         return found.reshape(self.available.shape)
 
     def reads(self, marked: Booleans) -> Booleans:
-        """Whether an action can read a marked transition ``bool[Q, L]``: ``bool[S, Q, A]``."""
+        """Tests if an action can read a marked transition ``bool[Q, L]``: ``bool[S, Q, A]``."""
         assert self.letter is not None
         here = marked[:, self.letter].T  # [S, Q]
         if not self.on_entry:
@@ -68,7 +68,7 @@ class RowGraph:
         return found.reshape(self.available.shape)
 
     def first(self, mask: Booleans) -> tuple[Booleans, Integers]:
-        """Whether a mask holds for some choice of a state, and the first one (or the first of all)."""
+        """Tests if a mask holds for some choice of a state; and the first one (or first of all)."""
         return first_action(mask) if self.is_padded else self.host.first_choice(mask)
 
     def attract(
@@ -116,7 +116,7 @@ class RowGraph:
         )
 
     def anywhere(self, mark: Booleans, component: Integers) -> Booleans:
-        """Whether a state of the same component is marked: ``bool[S]``."""
+        """Tests if a state of the same component is marked: ``bool[S]``."""
         found = np.zeros(component.size, bool)
         found[component[mark]] = True
         return found[component]

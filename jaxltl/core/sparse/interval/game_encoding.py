@@ -39,7 +39,7 @@ class EncodedChoices:
         return found
 
     def nature(self, probability: Floats, otherwise: Floats) -> Floats:
-        """Nature's distributions in the original entries, `otherwise` where there are none."""
+        """Nature's distributions in the original entries, `otherwise` elsewhere."""
         found, original = otherwise.copy(), self.entry >= 0
         found[self.entry[original]] = probability[original]
         return found

@@ -234,7 +234,7 @@ def _policy_step(
 def _nature_step(
     fixpoint: _Fixpoint, odd: bool, ys: list[Booleans], xs: list[Booleans]
 ) -> tuple[Booleans, Integers, Floats]:
-    """States in whose every row nature satisfies the step, and its distributions."""
+    """States where nature satisfies the step in every row, and its distributions."""
     model, mdp = fixpoint.game.model, fixpoint.game.model.mdp
     able_rows, p = np.zeros(mdp.num_rows, bool), mdp.probability
     for i, (y, x) in enumerate(zip(ys, xs, strict=True)):

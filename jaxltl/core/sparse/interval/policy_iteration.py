@@ -206,7 +206,7 @@ class _Search:
         return bool(((beyond.bound - attained.bound) <= width).all())
 
     def _is_near(self, pair: PolicyPair | None) -> bool:
-        """Whether a bound is near the value of its pair."""
+        """True if a bound is near the value of its pair."""
         if pair is None or pair.bound is None:
             return False
         width = 0.5 * self.accuracy.tolerance * self.scale(pair.value)
@@ -358,7 +358,7 @@ class _Search:
             z = value - cost
             holds = shifted.proves_attained(z, pair)
             if not holds and operator.adversarial:
-                # Steps that cost next to nothing hide what nature still gains there.
+                # Steps that cost next to nothing hide remaining gains of nature there.
                 steps = solve(system.matrix, np.ones(operator.size))
                 if steps is None:
                     return None

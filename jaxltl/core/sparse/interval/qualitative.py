@@ -37,7 +37,7 @@ def attractor_against_nature(
 
 
 def attracting_rows(model: UncertainMDP, goal: Booleans, rows: Booleans | None = None) -> Integers:
-    """Rows that lead towards a goal whatever nature picks, ``int[S]``; elsewhere any row."""
+    """Rows that lead towards a goal against nature, ``int[S]``; elsewhere any row."""
     if model.has_fixed_support:
         rows = np.ones(model.mdp.num_rows, bool) if rows is None else rows
         return shortest_path_rows(model.mdp, goal, rows).astype(np.int64)

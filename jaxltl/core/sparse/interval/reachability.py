@@ -206,7 +206,7 @@ def move_to_exits(
     inside: Booleans,
     used: Booleans,
 ) -> tuple[Integers, Floats]:
-    """A pair that moves inside each end component to the state whose row leaves it."""
+    """A pair that moves inside each end component to the state of the row that leaves it."""
     (row, chance), mdp = pair, model.mdp
     exits = mdp.state[row] == np.arange(mdp.num_states)
     inner = np.zeros(mdp.num_states, bool)

@@ -15,10 +15,10 @@ _EPS = float(np.finfo(np.float64).eps)
 
 @dataclass(frozen=True)
 class Query:
-    """Who makes the value large, and how accurately it is enclosed."""
+    """Optimisation directions of policy and nature, and accuracy of the enclosure."""
 
-    maximize: bool  # whether the policy maximises the value, else it minimises it
-    nature_maximizes: bool  # whether nature does
+    maximize: bool  # True if the policy maximises the value, else it minimises it
+    nature_maximizes: bool  # the same of nature
     # requested width of the enclosure, of expected rewards relative to the value
     tolerance: float = 1e-6
     depth: int = 0  # roundings behind each number of the model

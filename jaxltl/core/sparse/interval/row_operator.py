@@ -148,7 +148,7 @@ class RowOperator:
 
     @cached_property
     def mixes(self) -> bool:
-        """Whether few steps lead to many nodes."""
+        """True if few steps lead to many nodes."""
         if self.size < _FEW:
             return False
         first, to = self.part.mdp.entry_start[self.part.mdp.row_start], self.part.mdp.successor

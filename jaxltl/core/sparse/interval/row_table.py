@@ -35,7 +35,7 @@ class RowTable:
 
     row: Integers  # int[N]
     entry: Integers  # int[W, N]; padding repeats the first entry of the row
-    used: Booleans | None  # bool[W, N], False in padding; None if there is none
+    used: Booleans | None  # bool[W, N], False in padding; None without padding
     lower: Floats  # float64[W, N], 0 in padding
     upper: Floats
     free_mass: Floats  # float64[N], one minus the sum of the lower ends
@@ -46,7 +46,7 @@ class RowTable:
 
     @cached_property
     def fine(self) -> Integers:
-        """Rows in which a tiny mass is possible, whose distributions are computed exactly."""
+        """Rows with a possible tiny mass; their distributions are computed exactly."""
         lower, upper = self.lower, self.upper
         loose = (lower < upper).any(0)
         if lower.shape[0] == 1 or (lower.min() >= _FINE and upper.max() <= 1 - _FINE):

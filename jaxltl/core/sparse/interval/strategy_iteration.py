@@ -103,7 +103,7 @@ def improve_nature(
 
 
 def _tests_bounds(rounds: int) -> bool:
-    """Whether bounds are computed before the last round: after 4, 8, 16, ... rounds."""
+    """True if bounds are computed before the last round: after 4, 8, 16, ... rounds."""
     return rounds >= 4 and rounds & (rounds - 1) == 0
 
 

@@ -60,7 +60,7 @@ class UncertainMDP:
 
     @cached_property
     def has_fixed_support(self) -> bool:
-        """Whether nature must give every successor some mass."""
+        """True if nature must give every successor some mass."""
         return bool((self.lower > 0).all())
 
     @cached_property
@@ -126,7 +126,7 @@ class UncertainMDP:
         return found
 
     def can_stay_on(self, entries: Booleans) -> Booleans:
-        """Whether nature may put all mass on some entries: ``bool[R]`` from ``bool[T]``."""
+        """Tests if nature may put all mass on some entries: ``bool[R]`` from ``bool[T]``."""
         start = self.mdp.entry_start
         if self.has_fixed_support:
             return np.logical_and.reduceat(entries, start[:-1])
@@ -140,11 +140,11 @@ class UncertainMDP:
         return every | (able & ~needed)
 
     def can_stay_in(self, region: Booleans) -> Booleans:
-        """Whether nature may keep to a set of states: ``bool[R]`` from ``bool[S]``."""
+        """Tests if nature may keep to a set of states: ``bool[R]`` from ``bool[S]``."""
         return self.can_stay_on(region[self.mdp.successor])
 
     def must_enter(self, row: Integers, region: Booleans) -> Booleans:
-        """Whether every distribution of some rows enters a region: ``bool[N]``."""
+        """Tests if every distribution of some rows enters a region: ``bool[N]``."""
         if not row.size:
             return np.zeros(0, bool)
         mdp = self.mdp

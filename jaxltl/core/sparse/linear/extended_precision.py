@@ -41,7 +41,7 @@ Solver = Callable[[Floats], Floats]
 
 
 def perturbation_bound(share: float, num_unknowns: int) -> float:
-    """Relative error of a solution whose weights and costs err by a share: ``2.1 (n + 2)`` times it.
+    """Relative error of a solution if weights and costs err by a share: ``2.1 (n + 2)`` times it.
 
     The theorem's bound is ``((1 + e) / (1 - e))^n - 1`` for the weights and e for the costs; the
     factor covers its higher powers while the result is at most 1e-3.

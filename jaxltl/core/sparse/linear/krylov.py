@@ -71,5 +71,5 @@ def iterate(
 
 
 def _dot(x: Floats, y: Floats) -> float:
-    # Not BLAS, whose threads cost more than the sum.
+    # Not BLAS: its threads cost more than the sum.
     return float(np.einsum("i,i->", x, y))

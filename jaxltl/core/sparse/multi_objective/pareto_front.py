@@ -185,7 +185,7 @@ def _largest_mixtures(
         return [inner]
     best = np.maximum(found.x, 0)
     best /= best.sum()
-    # A program is rounded: a small share of an inner point makes up for what it misses.
+    # A program is rounded: a small share of an inner point makes up for its error.
     misses = (least - mixture(points, best))[asked] + 4 * _EPS * np.abs(least[asked])
     misses = np.maximum(misses, 0)
     spare = (mixture(points, inner) - least)[asked]

@@ -144,7 +144,7 @@ def _quotient(
     used[mdp.state[rows]] = True
     heads = np.unique(free.component[used])
     node = np.where(used, np.searchsorted(heads, free.component), 0)
-    # A component stops in the state whose end is worth the most.
+    # A component stops in the state with the largest stopping reward.
     candidates = np.flatnonzero(used & (best >= 0))
     order = candidates[np.argsort(-worth[best[candidates]], kind="stable")]
     stop = np.full(heads.size, -1)

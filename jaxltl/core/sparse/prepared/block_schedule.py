@@ -21,7 +21,7 @@ from jaxltl.core.sparse.linear.topological_order import (
 )
 from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
 
-# What entries lead to besides nodes: the value one, what is reached, and what is lost.
+# Targets of entries besides nodes: the value one, the goal, and the losing states.
 ONE, GOAL, LOST = -1, -2, -3
 _WIDTHS = (1, 2, 3, 4, 6, 8, 12, 16)
 _BLOCKS = (16, 32, 64, 128, 256, 512, 1024)
@@ -54,7 +54,7 @@ class Schedule(NamedTuple):
     segments: tuple[Segment, Segment, Segment]  # three of them, maybe empty
     place: Integers  # int[M], where each of the M nodes stands among the N
     size: int  # N
-    levels: int  # what depends on what goes so far, where there are no cycles
+    levels: int  # depth of dependencies, where there are no cycles
     choices: int  # how often a choice may be split
 
 
@@ -141,7 +141,7 @@ def _narrow_rows(nodes: Nodes, width: int, one: int) -> Nodes:
 def _groups(of: Integers, size: Integers, most: int) -> tuple[Integers, int, Integers, Integers]:
     """Elements to move out of large groups, with the number, heads and ids of the new groups."""
     rank = _ranks(of, size.size)
-    alone = (rank % most == 0) & (rank == size[of] - 1)  # one that would be a group of its own
+    alone = (rank % most == 0) & (rank == size[of] - 1)  # one that would be a group alone
     moved = np.flatnonzero((size[of] > most) & ~alone)
     new = rank[moved] % most == 0
     group_of = np.cumsum(new) - 1

@@ -24,7 +24,7 @@ from jaxltl.core.sparse.solvers.reachability import ReducedProblem, quotient_pol
 
 
 class Loops(NamedTuple):
-    """Self-loops to eliminate: groups of rows whose other entries are normalised."""
+    """Self-loops to eliminate: groups of rows; their other entries are normalised."""
 
     entry: Integers  # int[E], the entries that lead elsewhere
     group: Integers  # int[E], their groups, ascending
@@ -48,7 +48,7 @@ class Plan(NamedTuple):
 
     schedule: Schedule  # the order of the nodes
     place: Integers  # int32[S], where the value of a state is, see `Schedule`
-    own: Integers  # int32[S], the place of the node whose row a state takes, or -1
+    own: Integers  # int32[S], the place of the node with the row of a state, or -1
     row: Integers  # int32[S], the row that it takes else
     loops: Loops | None  # rows that lead to where they are
     cycles: Cycles | None  # end components that are one node

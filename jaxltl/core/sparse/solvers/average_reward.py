@@ -295,14 +295,14 @@ class _Gains:
         self.upper[which] = min(self.upper[which], bounds[1])
 
     def too_wide(self, rest: _Unsettled, tolerance: float) -> Booleans:
-        """The components whose bounds are wider than the tolerance."""
+        """Components with bounds wider than the tolerance."""
         low, high = self.lower[rest.which], self.upper[rest.which]
         return high - low > rest.part.allowed_width(low, high, tolerance)
 
 
 @dataclass(frozen=True)
 class _Unsettled:
-    """Components whose bounds are too wide: their numbers, states, submodel, and a value."""
+    """Components with too wide bounds: their numbers, states, submodel, and a value."""
 
     which: Integers
     states: Integers

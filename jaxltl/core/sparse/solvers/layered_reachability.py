@@ -40,7 +40,7 @@ _MOST = 2**27  # transitions of a component that is written out, at most
 
 
 class PaddedProduct(NamedTuple):
-    """A padded MDP and an automaton, whose letters are read where states are entered."""
+    """A padded MDP and an automaton that reads the labels of entered states."""
 
     successor: Integers  # int[S, A, K]
     used: Booleans  # bool[S, A, K]

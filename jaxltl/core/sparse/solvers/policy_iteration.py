@@ -65,7 +65,7 @@ _SWEEPS = 12  # after each linear system, which propagate improvements
 _SWEPT_ROUNDS = 12  # after which improvements are strict, so that policy iteration ends
 _KEPT = 0.75  # of the extra cost: smaller gains are ignored, and the rest proves the bound
 _MAX_ROUNDS = 300
-_USEFUL = 0.1  # width of bounds whose policy is a start for extended precision
+_USEFUL = 0.1  # bounds of this width give a start policy for extended precision
 
 
 def policy_iteration(
@@ -153,7 +153,7 @@ class _CoreValues:
 def _core_solver(
     problem: ShortestPathProblem, rows: InteriorRows, core: Integers, value: Floats, sign: int
 ) -> _CoreSolver:
-    """The optimality equation of the core, whose other nodes have known values."""
+    """The optimality equation of the core; other nodes have known values."""
     from scipy import sparse
 
     count = np.diff(rows.row_start)[core]
@@ -270,7 +270,7 @@ class _CoreSolver:
             else:
                 time, margin = solver.solve(ones), _MARGIN
             other = self._extra_cost(time, value, margin)
-            # A better policy may have a value whose rounding needs a larger extra.
+            # The value of a better policy may need a larger extra for its rounding.
             if extra / 2 <= other <= (2 * extra if found is None else np.inf):
                 break
             extra = other

@@ -49,10 +49,10 @@ class ReducedProblem:
     known_row: Integers  # int[N], their policy
     # on the nodes of `quotient`, or else of `contraction`; None if nothing is left
     problem: ShortestPathProblem | None = None
-    # of `contraction.mdp`, the model whose end components are states; None without any
+    # of `contraction.mdp`, the model with end components as states; None without any
     quotient: Contraction | None = None
     components: EndComponents | None = None
-    # nodes of `contraction` whose rows are known in advance (fixed, fixed_row)
+    # nodes of `contraction` with rows known in advance (fixed, fixed_row)
     fixed: Booleans | None = None
     fixed_row: Integers | None = None
     mdp: Any = None

@@ -234,7 +234,7 @@ class _System:
         return value, float(residual + unit) * self.longest
 
     def _iterate(self, b: Floats) -> Floats:
-        """Policy iteration (Howard 1960) from the last policy, whose factors are known."""
+        """Policy iteration (Howard 1960) from the last policy and its factors."""
         for _ in range(_ROUNDS):
             value: Floats = self.factors.solve(b[self.chosen])
             image = b + self.matrix @ value

@@ -28,7 +28,7 @@ def fastest_rows(mdp: HostMDP, rows: Booleans, goal: Booleans, row: Integers) ->
     slack = np.maximum(_TIE * found.value, width)
     best = mdp.over_choices(np.minimum, ahead) + slack
     first = mdp.first_choice(ahead <= best[mdp.state])[1]
-    # A policy whose every step costs less than a whole one more still ends.
+    # A policy still ends if every step costs less than a whole one more.
     chosen = np.where(slack < 0.1, first, found.row)
     return np.where(goal, row, chosen)
 

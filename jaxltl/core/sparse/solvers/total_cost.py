@@ -57,7 +57,7 @@ class InteriorRows:
 
     row_start: Integers  # int[N + 1]
     entry_start: Integers  # int[R + 1]
-    target: Integers  # int32[T], nodes; N for the last one, whose weight is cost and known value
+    target: Integers  # int32[T], nodes; N for the last one, weighed by cost and known value
     weight: Floats  # float64[T]
     row: Integers  # int[R], int[N], rows and states of the model
     node: Integers
