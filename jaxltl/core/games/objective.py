@@ -36,9 +36,8 @@ class Parity:
     Example:
       >>> import jaxltl as jl
       >>> path = jl.from_dense(np.roll(np.eye(3), 1, 1)[:, None], label={"a": [0], "b": [1, 2]})
-      >>> never = safety(path, "b")
-      >>> never.lost.tolist(), never.num_priorities
-      ([True, False, False], 1)
+      >>> safety(path, "b").lost.tolist()
+      [True, False, False]
     """
 
     priority: jax.Array | np.ndarray
@@ -62,9 +61,8 @@ class GR1:
     Example:
       >>> import jaxltl as jl
       >>> path = jl.from_dense(np.roll(np.eye(3), 1, 1)[:, None], label={"a": [0], "b": [1, 2]})
-      >>> fair = gr1(path, ["a"], ["b"])
-      >>> fair.assumptions.tolist(), fair.guarantees.tolist()
-      ([[True, False, False]], [[False, True, True]])
+      >>> gr1(path, ["a"], ["b"]).guarantees.tolist()
+      [[False, True, True]]
     """
 
     assumptions: jax.Array | np.ndarray

@@ -220,7 +220,7 @@ def shield_policy(policy: jax.Array, allowed: jax.Array) -> jax.Array:
     return to_jax(xp.where(some[..., None], shielded, policy))
 
 
-# --- what all methods share -------------------------------------------------------------------
+# --- shared by all methods -------------------------------------------------------------------
 
 
 class _Arena(NamedTuple):

@@ -137,8 +137,7 @@ def almost_sure_buchi(game: Any, accepting: States) -> Winning:
     """Almost-sure winning region of a Buchi objective.
 
     Args:
-      game: the game.
-      accepting: ``bool[S]``, or a Boolean formula.
+      game, accepting: the game, and ``bool[S]`` or a Boolean formula.
 
     Returns:
       :class:`Winning`, of the objective :func:`buchi`.

@@ -26,16 +26,15 @@ class Attractor(NamedTuple):
       region: ``bool[S]``.
       action: ``int32[S]``: in the region outside the goal, an allowed action with a successor nearer to
         the goal (the first allowed one if all lead nearer); elsewhere the first available one.
-      rank: ``int32[S]``: the round in which the state joined, 0 in the goal; undefined outside of
-        the region.
+      rank: ``int32[S]``: the round in which the state joined, 0 in the goal; undefined outside.
 
     Example:
       >>> import jaxltl as jl
       >>> fork = jl.from_dense([[[0, 0.5, 0.5], [1, 0, 0]], [[0, 1, 0], [0, 0, 0]],
       ...                       [[0, 0, 1], [0, 0, 0]]])
       >>> found = jl.graphs.attractor(fork, np.array([False, True, False]))
-      >>> found.region.tolist(), found.action[0].tolist(), found.rank[:2].tolist()
-      ([True, True, False], 0, [1, 0])
+      >>> found.region.tolist(), found.rank[:2].tolist()
+      ([True, True, False], [1, 0])
     """
 
     region: jax.Array

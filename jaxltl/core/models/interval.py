@@ -200,7 +200,7 @@ def make_interval(
         are not. A successor in the padding of an MDP, with an upper end above 0, counts.
       lower, upper: shaped as ``model.probability``: ``float[T]``, or ``float[S, A, K]``.
       center: of the same shape, a distribution between them in each row.
-      radius: ``float[R]``, or ``float[S, A]``, at most 2: the largest L1 distance
+      radius: ``float[R]`` or ``float[S, A]``, at most 2: the largest L1 distance
         ``sum_t |p_t - center_t|``; default: bounded by the intervals only. For a ball alone give the
         ends 0 and 1.
 

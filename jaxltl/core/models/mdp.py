@@ -172,9 +172,8 @@ def make_mdp(
         without actions, or propositions without labels.
 
     Example:
-      >>> mdp = make_mdp([[[0, 1]], [[1, 0]]], [[[0.5, 0.5]], [[1.0, 0.0]]])
-      >>> mdp.num_states, mdp.num_actions
-      (2, 1)
+      >>> make_mdp([[[0, 1]], [[1, 0]]], [[[0.5, 0.5]], [[1.0, 0.0]]]).num_states
+      2
     """
     successor = np.asarray(successor)
     probability = validation.float_array("probability", probability)

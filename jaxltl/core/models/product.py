@@ -49,8 +49,7 @@ class Product:
     ``(s, q) -> (t, delta(q, L(s)))``, starting in ``q_I``: it reads the label of the current state.
 
     Attributes:
-      mdp: the base model.
-      automaton: the automaton of the task.
+      mdp, automaton: the base model, and the automaton of the task.
       letter: ``int32[S]``, the letter of each state of the base model.
       label_on: ``"entry"`` or ``"exit"``; static.
       allowed: ``bool[S, Q, A]``, a restriction of the actions, or None; see
@@ -58,8 +57,7 @@ class Product:
 
     Example:
       >>> import jaxltl as jl
-      >>> path = jl.make_mdp([[[1]], [[2]], [[2]]], [[[1.0]], [[1.0]], [[1.0]]], initial=[1, 0, 0],
-      ...                    label={"a": [1]})
+      >>> path = jl.make_mdp([[[1]], [[2]], [[2]]], [[[1.0]], [[1.0]], [[1.0]]], label={"a": [1]})
       >>> prod = jl.product(path, "F a")
       >>> prod.state_shape, prod.next_memory.tolist(), prod.final[1].tolist()
       ((3, 2), [[0, 1], [1, 1], [0, 1]], [False, True])
@@ -147,18 +145,17 @@ class Product:
 def occurring_letters(
     world: LabelledModel, propositions: Collection[str] | None = None
 ) -> list[frozenset]:
-    """The distinct letters of a model, for ``to_automaton``.
+    """Distinct letters of a model, for ``to_automaton``.
 
     Args:
-      world: the model.
-      propositions: the propositions of the letters; default: all.
+      world, propositions: the model, and the propositions of the letters; default: all.
 
     Returns:
       Sets of propositions.
 
     Example:
       >>> from jaxltl import from_dense
-      >>> world = from_dense([[[1.0, 0]], [[0, 1.0]]], label=[[0], [1]], propositions=["a"])
+      >>> world = from_dense([[[1.0, 0]], [[0, 1.0]]], label={"a": [1]})
       >>> [sorted(letter) for letter in occurring_letters(world)]
       [[], ['a']]
     """

@@ -38,9 +38,8 @@ class Rewards:
     """A reward structure, the sum of up to three parts; absent parts are zero.
 
     Attributes:
-      state: ``float[S]``, earned by each step from a state.
-      choice: ``float[R]``, earned by a choice.
-      transition: ``float[T]``, earned by a transition.
+      state, choice, transition: ``float[S]``, ``float[R]`` and ``float[T]``, earned by each step from
+        a state, by a choice and by a transition.
 
     Example:
       >>> import jaxltl as jl
@@ -536,7 +535,7 @@ def _canonical(
     for name, reward in rewards.items():
         if reward.transition is not None:
             earned = np.add.reduceat(weight * reward.transition[order], start) / merged
-            # What stands alone keeps its reward bit for bit.
+            # Entries that are not merged keep their rewards bit for bit.
             alone = np.diff(np.append(start, order.size)) == 1
             reward = replace(
                 reward, transition=np.where(alone, reward.transition[order][start], earned)

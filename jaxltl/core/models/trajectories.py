@@ -55,8 +55,7 @@ def make_trajectories(
     """Validated trajectories of a model from sequences of ``(state, action)`` pairs.
 
     Args:
-      model: the model in which they were recorded.
-      sequences: N sequences of at least one pair each.
+      model, sequences: a model, and N sequences of at least one pair each.
 
     Returns:
       :class:`Trajectories` with N rows.

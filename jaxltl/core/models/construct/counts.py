@@ -261,8 +261,7 @@ def align_counts(model: MDP | DenseMDP | SparseMDP, counts: TransitionCounts) ->
     """Counts aligned with a model's probabilities; states and actions are matched by name.
 
     Args:
-      model: a concrete model.
-      counts: of some of its transitions.
+      model, counts: a concrete model, and counts of some of its transitions.
 
     Returns:
       ``int64``, of the shape of the model's probabilities; 0 for unobserved transitions.

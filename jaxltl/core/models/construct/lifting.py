@@ -22,8 +22,7 @@ def lift_trajectories(model: Product, trajectories: Trajectories) -> Trajectorie
     """Trajectories of the base model with the automaton states along them.
 
     Args:
-      model: the product.
-      trajectories: of the base model.
+      model, trajectories: the product, and trajectories of the base model.
 
     Returns:
       Trajectories of the product, with states ``s * Q + q``.
@@ -127,8 +126,7 @@ def lift_policy(model: Product, policy: jax.Array) -> jax.Array:
     """Memoryless policy of the base model as a policy of the product.
 
     Args:
-      model: the product.
-      policy: ``[S, ...]``, of the base model.
+      model, policy: the product, and a policy ``[S, ...]`` of the base model.
 
     Returns:
       ``[S, Q, ...]``, the same in all memory states. Differentiable in the policy.
@@ -175,8 +173,7 @@ def project_policy(model: Product, policy: jax.Array) -> FiniteMemoryPolicy:
     """Product policy as a finite-memory policy of the base model.
 
     Args:
-      model: the product.
-      policy: ``float[S, Q, A]`` or ``int32[S, Q]``.
+      model, policy: the product, and ``float[S, Q, A]`` or ``int32[S, Q]``.
 
     Returns:
       :class:`FiniteMemoryPolicy`.

@@ -40,8 +40,7 @@ def with_allowed(model: ModelT, allowed: chex.Array) -> ModelT:
 
     Example:
       >>> from jaxltl import from_dense
-      >>> mdp = from_dense([[[1.0], [1.0]]])
-      >>> with_allowed(mdp, np.array([[False, True]])).available.tolist()
+      >>> with_allowed(from_dense([[[1.0], [1.0]]]), np.array([[False, True]])).available.tolist()
       [[False, True]]
     """
     return cast(ModelT, _with_allowed(model, allowed))
@@ -96,8 +95,7 @@ class Restriction(NamedTuple):
 
     Attributes:
       model: S' states, with the labels and propositions of the original.
-      base_state: ``int32[S']``, the original state, without the automaton state.
-      memory: ``int32[S']``, the automaton state in a product, else zero.
+      base_state, memory: ``int32[S']``, the original state, and the automaton state (or zero).
 
     Example:
       >>> import jaxltl as jl

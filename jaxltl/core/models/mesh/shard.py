@@ -186,8 +186,7 @@ def to_mesh(model: ShardedMDP, quantity: Any, fill: Any = 0) -> jax.Array:
     Example:
       >>> import jaxltl as jl
       >>> path = jl.make_sparse(None, [0, 1, 2], [1, 1], [1, 1])
-      >>> model = shard(path, jax.make_mesh((1,), ("states",)))
-      >>> to_mesh(model, np.array([1.0, 2.0])).shape
+      >>> to_mesh(shard(path, jax.make_mesh((1,), ("states",))), np.array([1.0, 2.0])).shape
       (2,)
     """
     quantity, index = np.asarray(quantity), model.number
@@ -232,8 +231,7 @@ def from_mesh(model: ShardedMDP, quantity: jax.Array) -> np.ndarray:
     """A quantity ``[N, ...]`` on the mesh as one of the original model, collected in every process.
 
     Args:
-      model: the distributed model.
-      quantity: ``[N, ...]``, such as a solution's value.
+      model, quantity: the distributed model, and an array ``[N, ...]``, such as a solution's value.
 
     Returns:
       A NumPy array ``[S, ...]``.

@@ -215,7 +215,7 @@ def _(model: ShardedMDP, quantity: jax.Array) -> jax.Array:
             seen = seen.at[successor].max(jnp.where(used, mine, 0))
             first += count
         if model.rounds is None:
-            # What all see of one another's, and of that the largest.
+            # The largest value from all devices at each state of this device.
             every = lax.all_to_all(
                 seen.reshape(model.num_devices, size, *wide), model.axis, 0, 0, tiled=False
             )

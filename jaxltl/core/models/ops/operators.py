@@ -115,8 +115,7 @@ def sample_successor(
     """Random successor, drawn from ``P(. | state, action)``.
 
     Args:
-      model: the model; the states of a product are numbered ``s * Q + q``.
-      key: the random key.
+      model, key: the model and the random key; states of a product are numbered ``s * Q + q``.
       state, action: ``int32[]``.
 
     Returns:
@@ -171,8 +170,7 @@ def pushforward(model: Model, mass: jax.Array) -> jax.Array:
 
     Example:
       >>> from jaxltl import from_dense
-      >>> mdp = from_dense([[[0.5, 0.5]], [[0.0, 1.0]]])
-      >>> pushforward(mdp, jnp.array([[1.0], [2.0]])).tolist()
+      >>> pushforward(from_dense([[[0.5, 0.5]], [[0.0, 1.0]]]), jnp.array([[1.0], [2.0]])).tolist()
       [0.5, 2.5]
     """
     value = jax.ShapeDtypeStruct(model.state_shape, mass.dtype)
