@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import jax
 import numpy as np
@@ -106,6 +106,8 @@ def reachability_probability(
     if method not in ("auto", "direct", "iterative"):
         raise ValueError(f"method={method!r}; choose auto, direct or iterative.")
     reduction_for(objective)
+    if isinstance(model, IntervalMDP) or is_sparse(model) or stay is not None:
+        refuse_iteration(max_steps, start)
     if isinstance(model, IntervalMDP):
         return robust_reachability(
             model,
@@ -141,6 +143,15 @@ def reachability_probability(
     if policy is None:
         found = _by_layers(model, target, tolerance, objective)
     return _on_host(model, target, None, policy, objective, tolerance) if found is None else found
+
+
+def refuse_iteration(max_steps: Any, start: Any) -> None:
+    """Raises ValueError if an option of interval iteration is given to a solver of sparse rows."""
+    if max_steps is not None or start is not None:
+        raise ValueError(
+            "max_steps and start are options of interval iteration on padded and dense models; "
+            "sparse and interval models, and stay, are solved without them. Leave them out."
+        )
 
 
 def _on_host(

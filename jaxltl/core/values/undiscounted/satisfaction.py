@@ -44,6 +44,7 @@ from jaxltl.core.values.undiscounted.reachability import (
     QUICK_LIMIT,
     on_rows,
     reachability_probability,
+    refuse_iteration,
     row_of_action,
     rows_of_model,
 )
@@ -201,8 +202,7 @@ def optimal_satisfaction(
       (0.75, 1)
     """
     if task is not None:
-        if max_steps is not None or start is not None:
-            raise ValueError("max_steps and start are options of products; leave task out.")
+        refuse_iteration(max_steps, start)
         if isinstance(model, IntervalMDP | Game):
             if label_on is not None:  # interval models read labels on exit
                 validation.choice("label_on", label_on, ("exit",))
@@ -221,12 +221,15 @@ def optimal_satisfaction(
     if states is not None or label_on is not None:
         raise ValueError("states and label_on are for a model and a task, not for a product.")
     model = _as_product(model)
+    by_rows = objective in ("max", "min") and is_sparse(model)
+    if by_rows or isinstance(model.mdp, IntervalMDP):
+        refuse_iteration(max_steps, start)
     if isinstance(model.mdp, IntervalMDP):
         return robust_product_satisfaction(
             model, objective=objective, nature=nature, tolerance=tolerance
         )
     refuse_nature(nature)
-    if objective in ("max", "min") and is_sparse(model):
+    if by_rows:
         return product_satisfaction(model, objective=objective, tolerance=tolerance)
     run = _over_mesh if is_sharded(model) else _optimal
     return run(model, tolerance, max_steps, start, objective=objective)

@@ -350,3 +350,18 @@ def test_errors_name_the_argument(cases):
         jl.reachability_probability(mdp, np.zeros(6, bool), objective="best")
     with pytest.raises(ValueError, match=r"policy has shape \(2,\)"):
         jl.reachability_probability(mdp, np.zeros(6, bool), policy=jnp.zeros(2, int))
+
+
+@pytest.mark.parametrize("option", [{"max_steps": 3}, {"start": (0.0, 1.0)}])
+def test_options_of_interval_iteration_are_refused_where_it_is_not_used(option):
+    coin = jl.make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1], label={"heads": [1]})
+    heads = coin.states_with_label("heads")
+    padded = jl.to_padded(coin)
+    for ask in (
+        lambda: jl.reachability_probability(coin, heads, **option),
+        lambda: jl.reachability_probability(padded, heads, stay=~heads, **option),
+        lambda: jl.optimal_satisfaction(jl.product(coin, "F heads"), **option),
+        lambda: jl.optimal_satisfaction(coin, "F heads", **option),
+    ):
+        with pytest.raises(ValueError, match="options of interval iteration"):
+            ask()
