@@ -1,4 +1,4 @@
-"""Selection between trees of arrays, and weak types removed."""
+"""Selection between pytrees of arrays, and removal of weak types."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Labels, state variables and rewards of PRISM's explicit files."""
+"""Reader of labels, state variables and rewards in PRISM's explicit files."""
 
 from __future__ import annotations
 

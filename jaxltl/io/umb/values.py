@@ -1,4 +1,4 @@
-"""Encoding of UMB values: bits, numbers, strings and state variables."""
+"""Encoding and decoding of UMB values: bits, numbers, strings and state variables."""
 
 from __future__ import annotations
 

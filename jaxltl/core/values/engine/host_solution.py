@@ -1,4 +1,4 @@
-"""Solutions from certified enclosures of the sparse engine, for sparse and padded models."""
+"""Solutions of the sparse engine: enclosures as `Solution`, induced chains, discounted values."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Satisfaction probabilities of formulas: of a policy, maximal and minimal."""
+"""Satisfaction probabilities of LTL formulas in MDPs, games and interval models."""
 
 from __future__ import annotations
 
