@@ -1,7 +1,8 @@
 """Winning regions and strategies of turn-based stochastic games: Büchi, parity and GR(1).
 
 The system wins almost surely, or the environment wins with positive probability; without chance
-both win surely. Regions are computed on supports, exactly: they are fixpoints of attractors (:mod:`jaxltl.core.graphs.attractor`).
+both win surely. Regions are computed on supports, exactly, as fixed points of attractors
+(:mod:`jaxltl.core.graphs.attractor`).
 """
 
 from __future__ import annotations
