@@ -178,7 +178,7 @@ def buchi(game: Any, accepting: States, *, safe: States = "true") -> Parity:
 
 
 def cobuchi(game: Any, persistent: States, *, safe: States = "true") -> Parity:
-    """Co-Buchi objective: finally stay in `persistent`, ``F G persistent & G safe``.
+    """Co-Buchi objective: eventually stay in `persistent`, ``F G persistent & G safe``.
 
     Args:
       game: the game.

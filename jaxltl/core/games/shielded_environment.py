@@ -38,9 +38,8 @@ class ShieldedWorld(NamedTuple):
         after an action that the strategy does not allow.
 
     Example:
-      >>> lost = ShieldedWorld(world=3, state=-1)
-      >>> lost.world, lost.state < 0
-      (3, True)
+      >>> ShieldedWorld(world=3, state=-1).world
+      3
     """
 
     world: Any

@@ -53,16 +53,15 @@ def verify(winning: Any) -> Verification:
 
     *The system's claim.* With its actions fixed, every run stays in the region until it is won, and no
     end component in the region fails the objective (by an odd least priority, or by meeting every
-    assumption and missing a guarantee). Almost every run stays in an end component for ever
+    assumption and missing a guarantee). Almost every run eventually stays in an end component
     (de Alfaro 1997).
 
     *The environment's claim.* With its actions fixed, the system does not reach the region, or an end
     component that achieves the objective, with probability one from any state outside. Both claims
     together prove that the region is the almost-sure winning region.
 
-    For :class:`GR1` the claims are checked from every memory state. Searches are linear in the
-    transitions times memory states; there is one for each priority, assumption or guarantee, and
-    while components split.
+    For :class:`GR1` the claims are checked from every memory state. Each search is linear in the
+    transitions times memory states.
 
     Args:
       winning: an object with the fields `game`, `objective`, `region`, `action` and `counter_action`

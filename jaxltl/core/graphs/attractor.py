@@ -115,7 +115,7 @@ def attract(
 def avoidable(model: Any, goal: jax.Array, allowed: jax.Array | None = None) -> jax.Array:
     """States from which some policy surely never reaches the goal: ``bool[S]``.
 
-    The complement of the ``"forall"`` attractor: the minimal reachability probability is zero there.
+    The complement of the ``"forall"`` attractor: the minimal reachability probability is zero exactly there.
 
     Args:
       model, goal, allowed: as of :func:`attractor`.

@@ -197,7 +197,7 @@ def _rollout(
             action_key, successor_key = jax.random.split(jax.random.fold_in(key, t))
             action = jax.random.categorical(action_key, logits[state]).astype(jnp.int32)
             successor = sample_successor(model, successor_key, state, action)
-            # A stopped run stays where it is; its pairs are cut off below.
+            # A stopped trajectory keeps its state; its pairs are cut off below.
             return jnp.where(stop[state], state, successor), (state, action, stop[state])
 
         _, (states, actions, ended) = jax.lax.scan(step, start, jnp.arange(num_steps))

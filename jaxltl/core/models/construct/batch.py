@@ -65,7 +65,7 @@ def stack_products(worlds: Sequence[MDP], task: Task, *, label_on: str = "exit")
         except ValueError as error:
             raise ValueError(f"world {i}: {error}") from error
         extra = num_states - world.num_states
-        # A padded state shows what state 0 does, so that it adds no letter.
+        # Padded states have the label of state 0, which adds no letter.
         shown_here = np.asarray(lane.letter)
         letter = np.concatenate([shown_here, np.repeat(shown_here[:1], extra)])
         padded = _pad_successors(pad_states(world, num_states), width)

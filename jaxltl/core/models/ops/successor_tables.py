@@ -28,7 +28,7 @@ from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief
 
-_LARGEST = 2**22  # transitions up to which a product's are written down, one by one
+_LARGEST = 2**22  # transitions up to which those of a product are tabulated
 _WIDEST = 6  # predecessor lists are at most this many times wider than successor lists
 
 

@@ -121,7 +121,7 @@ def make_parametric(
         by ``jax.tree_util.Partial(function, *arrays)``.
       low, high: ``float[D]``, one number for all, or a number for each name; no probability may
         become zero in the box.
-      parameters: the names; default those of `low`, else p0, p1 and so on.
+      parameters: the names; default: those of `low`, else p0, p1 and so on.
 
     Returns:
       :class:`ParametricMDP`.
