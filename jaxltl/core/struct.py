@@ -1,9 +1,10 @@
 """Frozen dataclasses that are pytrees, distinguished by their type; interface of ``flax.struct``.
 
-``jax.tree_util.register_dataclass``, on which ``flax.struct`` relies, compares structures without the
-type in JAX 0.10: two classes with as many arrays and equal static fields have equal structures but
-different hashes. A jitted function that is called with both then runs the program of the wrong one
-whenever the hashes share a slot of its cache. Nodes with custom flatten functions are compared by type.
+``jax.tree_util.register_dataclass``, on which ``flax.struct`` relies, compares structures without
+the type in JAX 0.10: two classes with as many arrays and equal static fields have equal structures
+but different hashes. A jitted function that is called with both then runs the program of the wrong
+one whenever the hashes share a slot of its cache. Nodes with custom flatten functions are compared
+by type.
 """
 
 from __future__ import annotations

@@ -306,7 +306,7 @@ def _read(automaton: Automaton, word: Iterable[Letter], place: str) -> list[int]
 
 
 def run(automaton: Automaton, word: Iterable[Letter]) -> NDArray[np.int32]:
-    """States ``q[t+1] = delta[q[t], w[t]]`` while reading a finite word, from ``q[0] = initial``."""
+    """States ``q[t+1] = delta[q[t], w[t]]`` of a finite word, from ``q[0] = initial``."""
     states = [int(automaton.initial)]
     for letter in _read(automaton, word, "run: letter"):
         states.append(int(automaton.delta[states[-1], letter]))

@@ -125,7 +125,7 @@ def reached_from(delta: Integers, initial: int) -> NDArray[np.bool_]:
 
 @dataclass
 class _Tree:
-    """Nodes of a decomposition, parents first; `edges[n]` are numbers q * K + k, `states[n]` sources."""
+    """Nodes of a decomposition, parents first; `edges[n]` are ``q * K + k``, `states[n]` sources."""
 
     accepting: bool = False
     edges: list[frozenset[int]] = field(default_factory=list)

@@ -80,7 +80,7 @@ def is_equivalent(a: Task, b: Task) -> bool:
 
 
 def find_not_included(a: Task, b: Task) -> Lasso | None:
-    """A short lasso that the first automaton accepts and the second rejects, from their joint run."""
+    """A short lasso that the first automaton accepts and the second rejects."""
     return find_lasso(_aligned(a, b), [(EVEN, ODD)])
 
 

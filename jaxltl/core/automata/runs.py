@@ -1,4 +1,4 @@
-"""Runs of several automata on the same word, and lassos through cycles of their joint transitions."""
+"""Runs of several automata on the same word, and lassos through joint cycles."""
 
 from __future__ import annotations
 

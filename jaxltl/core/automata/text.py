@@ -17,7 +17,7 @@ from jaxltl.core.logic.ltl import proposition_text
 def guards(automaton: Automaton) -> dict[tuple[int, int], str]:
     """A short condition on the propositions for each pair of states joined by a letter.
 
-    An irredundant disjunction of prime cubes; combinations that are no letter may be on either side.
+    An irredundant disjunction of prime cubes, free on combinations that are no letter.
     """
     same = np.zeros_like(np.asarray(automaton.priority))
     return {(q, end): text for (q, end, _), text in _guards(automaton, same).items()}

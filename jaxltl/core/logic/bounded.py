@@ -72,7 +72,7 @@ class Earned:
 
 
 def unfolded(path: Bounded) -> Formula:
-    """Unfolds step bounds: `a U[l,u] b = a & X(a U[l-1,u-1] b)`, `a U<=u b = b | a & X(a U<=u-1 b)`."""
+    """Unfolds step bounds: `a U[l,u] b = a & X(a U[l-1,u-1] b)`; likewise `U<=u`, and `R` dually."""
     if path.operator == "R":
         left = TRUE if path.left == FALSE else ~path.left
         return ~unfolded(replace(path, operator="U", left=left, right=~path.right))

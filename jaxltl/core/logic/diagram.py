@@ -66,7 +66,7 @@ class Diagrams:
 
 
 def prime_cubes(lower: int, upper: int, diagrams: Diagrams) -> tuple[list[Cube], int]:
-    """Irredundant prime cubes between two diagrams (Minato 1993), and the diagram of their union."""
+    """Irredundant prime cubes between two diagrams (Minato 1993), and their union's diagram."""
     if lower == FALSE:
         return [], FALSE
     if upper == TRUE:

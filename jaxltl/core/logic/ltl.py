@@ -326,7 +326,7 @@ _DUAL |= {dual: operator for operator, dual in _DUAL.items()}
 
 
 def negation_normal_form(formula: Formula) -> Formula:
-    """Negation normal form: `!` on propositions only, no `-> <-> xor` (Baier & Katoen 2008, 5.1.5)."""
+    """Negation normal form, `!` on propositions only (Baier & Katoen 2008, section 5.1.5)."""
     forms: dict[Formula, tuple[Formula, Formula]] = {}  # the normal forms of f and of !f
     for node in subformulas(formula):
         positive = tuple(forms[operand][0] for operand in node.operands)

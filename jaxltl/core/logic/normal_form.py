@@ -228,7 +228,7 @@ class Rewriter:
 
 @dataclass(frozen=True)
 class Part:
-    """A leaf of a combination, of `kind` `"sigma2"`, `"pi2"` or `"limit"` (joined `G F` or `F G`)."""
+    """A leaf of a combination; its kind is `"sigma2"`, `"pi2"` or `"limit"`, joined `G F` or `F G`."""
 
     kind: str
     formula: Formula

@@ -27,8 +27,8 @@ _TEMPORAL = frozenset("XFGURWM")
 class Progression:
     """Diagrams of formulas in negation normal form, and their successors under letters.
 
-    `letters` is bool `[L, P]`, `max_nodes` the limit of the number of diagrams. `representative` has
-    one letter of each class of equivalent letters, and `class_of` int `[L]` the class of each letter.
+    `letters` is bool `[L, P]`, `max_nodes` limits the number of diagrams. `representative` has one
+    letter of each class of equivalent letters, and `class_of` int `[L]` the class of each letter.
     """
 
     def __init__(
@@ -98,7 +98,7 @@ class Progression:
         return inverse.ravel(), first
 
     def _step(self, letter: set[str]) -> Callable[[int], int]:
-        """Successors of diagrams after a letter: `af(f U g) = af(g) | (af(f) & f U g)` in each variable."""
+        """Successors of diagrams after a letter: `af(f U g) = af(g) | (af(f) & f U g)`."""
         diagrams, of = self.diagrams, self.diagram_of
         both, either, nodes = diagrams.both, diagrams.either, diagrams.nodes
         successors: dict[int, int] = {}

@@ -62,7 +62,7 @@ def _without_implied(operator: str, pieces: list[Formula]) -> list[Formula] | No
 
 @lru_cache(maxsize=1 << 16)
 def implies(one: Formula, two: Formula) -> bool:
-    """True if syntactic rules (Somenzi & Bloem 2000) show that every word of `one` satisfies `two`."""
+    """True if rules (Somenzi & Bloem 2000) show that every word of `one` satisfies `two`."""
     if one in (two, FALSE) or two == TRUE:
         return True
     if one.operator == "|" or two.operator == "&":

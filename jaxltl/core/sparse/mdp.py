@@ -60,7 +60,7 @@ class HostGraph:
 
     @cached_property
     def is_self_loop(self) -> NDArray[np.bool_]:
-        """Self-loops with no other successor, ``bool[R]``."""
+        """Rows with their own state as the only successor, ``bool[R]``."""
         count = np.diff(self.entry_start)
         found: NDArray[np.bool_] = count > 0
         found[found] = self.successor[self.entry_start[:-1][found]] == self.state[found]

@@ -32,7 +32,7 @@ def clopper_pearson(count: Integers, total: Integers, failure: float) -> Ends:
 
 
 def hoeffding(count: Integers, total: Integers, failure: float) -> Ends:
-    """Hoeffding interval (1963, theorem 1): ``k / n -+ sqrt(log(2 / failure) / (2 n))`` for fixed n."""
+    """Hoeffding interval (1963, thm. 1) for fixed n: ``k / n -+ sqrt(log(2 / failure) / (2 n))``."""
     return around(frequency(count, total), hoeffding_deviation(total, failure))
 
 

@@ -174,7 +174,7 @@ def intervals_from_counts(
 
 
 def l1_radius(total: Integers, num_outcomes: Integers, failure: float) -> Floats:
-    """L1 radius ``sqrt(2 / n log((2^J - 2) / failure))`` (Weissman et al. 2003, theorem 2.1), at most 2."""
+    """L1 radius ``sqrt(2 / n log((2^J - 2) / failure))`` (Weissman et al. 2003), at most 2."""
     many = np.maximum(num_outcomes, 2)
     with np.errstate(divide="ignore"):
         log_events = many * np.log(2) + np.log1p(-np.exp2(1.0 - many))

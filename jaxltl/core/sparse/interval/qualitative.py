@@ -1,6 +1,6 @@
 """Qualitative analysis of uncertain MDPs: fixed points on supports that nature may change.
 
-Nature may drop an edge whose lower end is 0 if the others can carry all mass, so the graph is a
+Nature may drop an edge with lower end 0 if the others can carry all mass, so the graph is a
 game: nature *can stay* in a set of states (some distribution does), or a row *must enter* one
 (every distribution does with positive probability).
 """
