@@ -195,10 +195,9 @@ def from_mean_parameter(family: PyTree, eta: tuple[jax.Array, jax.Array]) -> PyT
 
     Variances are differences here; :func:`project` moves a family without cancellation.
 
-    Example:
-      >>> start = diagonal_gaussian([1.0, 2.0], 0.5)
-      >>> from_mean_parameter(start, mean_parameter(start)).variance.tolist()
-      [0.25, 0.25]
+    >>> start = diagonal_gaussian([1.0, 2.0], 0.5)
+    >>> from_mean_parameter(start, mean_parameter(start)).variance.tolist()
+    [0.25, 0.25]
     """
     raise TypeError(_unknown(family))
 

@@ -42,12 +42,11 @@ class Hparams:
         .2, the search can rest .84 s above a limit without margin. Default 0.0.
       population: the largest n_l; static; default 100.
       rho: share of elites; static; default 0.2.
-      weighting: static. ``"until_feasible"``: elites have equal weights until k are feasible, then
-        weights by G, since weights by G narrow the search before anything is feasible;
-        ``"literal"``: always by G; ``"uniform"``: always equal. Default ``"until_feasible"``.
+      weighting: static. ``"until_feasible"``: equal weights until k elites are feasible, then weights
+        by G; ``"literal"``: always by G; ``"uniform"``: always equal. Default ``"until_feasible"``.
       elite_reuse: not in the theorem, like all further options: the last elites compete again with
-        their old values; static. Random values favour lucky ones. Default False.
-      antithetic: whether samples are mirrored pairs; static; default False.
+        their old values; static. Default False.
+      antithetic: mirrored pairs of samples; static; default False.
       variance_floor: lower bound of the variance in every direction; default None.
       noise: variance added after each step, a schedule (Szita and Lorincz 2006); default None.
       restart_below: the search restarts from the first distribution when all standard deviations are

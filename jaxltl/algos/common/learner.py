@@ -41,9 +41,6 @@ Example: a learner of the fixed point of ``x -> (1 - rate) x + rate * target``.
   ...                       until=lambda before, after, metrics: metrics.error < 1e-3)
   >>> jl.Status(int(learned.status)).name, learned.num_steps.item() < 20
   ('COMPLETED', True)
-  >>> train(jax.random.key(0), 5.0, Hparams(rate=1.5), num_steps=4)
-  Traceback (most recent call last):
-  ValueError: rate=1.5; it must be at least 0 and at most 1.
 """
 
 from __future__ import annotations
@@ -183,12 +180,10 @@ class Learner(Protocol[ProblemIn, HparamsIn, StateT, MetricsOut]):
           state: from ``init`` or an earlier run.
           problem, hparams: arrays; new values do not recompile.
           until: ``(before, after, metrics) -> bool[]``: the states before and after `check_every` steps
-            and the metrics of the last of them. Pass numbers by ``jax.tree_util.Partial(function,
-            *numbers)``: new numbers do not recompile, a new function does.
+            and the metrics of the last of them; a ``Partial`` of numbers does not recompile for new ones.
           num_steps: maximal number of steps; traced.
           check_every: steps between `before` and `after`; static.
-          keep: which state is returned when the condition holds, ``"after"`` or ``"before"`` (the one
-            that the learner's metrics describe); static.
+          keep: which state is returned when the condition holds, ``"after"`` or ``"before"``; static.
 
         Returns:
           :class:`~jaxltl.algos.common.loops.Learned`; :func:`~jaxltl.check` accepts it.

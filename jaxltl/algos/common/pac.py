@@ -42,9 +42,8 @@ def horizon(epsilon: chex.Numeric, discount: chex.Numeric, reward_bound: chex.Nu
     ``N = log(epsilon (1 - g)^2 / (6 R)) / log g`` for the `discount` g and the `reward_bound` R
     (section 6.6.2), not rounded, at least 1. In the optimistic model a move pays up to R / (1 - g).
 
-    Example:
-      >>> round(float(horizon(1e-4, 0.6, 1.0)), 3)
-      25.125
+    >>> round(float(horizon(1e-4, 0.6, 1.0)), 3)
+    25.125
     """
     epsilon, discount, reward_bound = _floats(epsilon, discount, reward_bound)
     # A sum of logarithms, since the product of small numbers may underflow.
@@ -63,9 +62,8 @@ def accuracy(
     ``delta = epsilon (1 - g)^2 / (6 R S N)`` for the `discount` g, the `reward_bound` R, S the
     `num_states` and N of :func:`horizon`, so that :func:`approximation_gap` is ``epsilon / 6``.
 
-    Example:
-      >>> print(f"{float(accuracy(1e-4, 0.6, 1.0, 144)):.4g}")
-      7.37e-10
+    >>> print(f"{float(accuracy(1e-4, 0.6, 1.0, 144)):.4g}")
+    7.37e-10
     """
     steps = horizon(epsilon, discount, reward_bound)
     epsilon, discount, reward_bound, num_states = _floats(
@@ -88,9 +86,8 @@ def hoeffding_visits(
     every relative frequency is within `deviation` of its probability except with probability
     `failure`.
 
-    Example:
-      >>> round(float(hoeffding_visits(0.01, 0.1, 10, 2)))
-      41470
+    >>> round(float(hoeffding_visits(0.01, 0.1, 10, 2)))
+    41470
     """
     deviation, failure, num_states, num_actions = _floats(
         deviation, failure, num_states, num_actions
@@ -154,9 +151,8 @@ def mixing_gap(
     strategy that plays actions more than `tolerance` below the best with `probability` at most p;
     g is the `discount` and R the `reward_bound`.
 
-    Example:
-      >>> round(float(mixing_gap(0.01, 0.1, 0.5, 1.0)), 6)
-      0.24
+    >>> round(float(mixing_gap(0.01, 0.1, 0.5, 1.0)), 6)
+    0.24
     """
     probability, tolerance, discount, reward_bound = _floats(
         probability, tolerance, discount, reward_bound
@@ -193,9 +189,8 @@ def approximation_gap(
     ``[0, R / (1 - g)]`` and no probability changes by more than `deviation`; S is `num_states`, N
     `num_steps`, g the `discount` and R the `reward_bound`.
 
-    Example:
-      >>> round(float(approximation_gap(1e-6, 10, 20, 0.5, 1.0)), 9)
-      0.0008
+    >>> round(float(approximation_gap(1e-6, 10, 20, 0.5, 1.0)), 9)
+    0.0008
     """
     deviation, num_states, num_steps, discount, reward_bound = _floats(
         deviation, num_states, num_steps, discount, reward_bound
@@ -211,11 +206,10 @@ def epsilon_optimal_states(optimal: Solution, value: Solution, epsilon: chex.Num
     (``minimax_value``) and the strategy's `value` (``strategy_value``): True is proved, False may
     only mean that the bounds are too wide.
 
-    Example:
-      >>> from types import SimpleNamespace
-      >>> best, own = SimpleNamespace(upper=jnp.ones(2)), SimpleNamespace(lower=jnp.array([0.5, 0.95]))
-      >>> epsilon_optimal_states(best, own, 0.1).tolist()
-      [False, True]
+    >>> from types import SimpleNamespace
+    >>> best, own = SimpleNamespace(upper=jnp.ones(2)), SimpleNamespace(lower=jnp.array([0.5, 0.95]))
+    >>> epsilon_optimal_states(best, own, 0.1).tolist()
+    [False, True]
     """
     return value.lower >= optimal.upper - epsilon
 
@@ -230,10 +224,9 @@ def near_optimal(q: chex.Array, allowed: chex.Array, tolerance: chex.Numeric) ->
     ``float[S, A]``. If Q has an error of at most e, a tolerance of ``t - 2 e`` keeps only actions
     within t of the best by the exact values, and ``t + 2 e`` keeps all of those.
 
-    Example:
-      >>> q = jnp.array([[1.0, 0.95, 0.5, 2.0]])
-      >>> near_optimal(q, jnp.array([[True, True, True, False]]), 0.1).tolist()
-      [[True, True, False, False]]
+    >>> q = jnp.array([[1.0, 0.95, 0.5, 2.0]])
+    >>> near_optimal(q, jnp.array([[True, True, True, False]]), 0.1).tolist()
+    [[True, True, False, False]]
     """
     q, allowed = jnp.asarray(q), jnp.asarray(allowed)
     best = action_max(q, allowed)[..., None]
@@ -249,10 +242,9 @@ def hat_strategy(near: chex.Array, allowed: chex.Array, exploration: chex.Numeri
     are the actions that stay in the almost-sure winning region, the strategy wins almost surely
     (lemma 6) and is near-optimal (lemma 8). Rows without allowed actions are zero.
 
-    Example:
-      >>> near, allowed = jnp.array([[True, False]]), jnp.array([[True, True]])
-      >>> [round(p, 3) for p in hat_strategy(near, allowed, 0.1)[0].tolist()]
-      [0.95, 0.05]
+    >>> near, allowed = jnp.array([[True, False]]), jnp.array([[True, True]])
+    >>> [round(p, 3) for p in hat_strategy(near, allowed, 0.1)[0].tolist()]
+    [0.95, 0.05]
     """
     p = jnp.asarray(exploration, jnp.result_type(float))
     return p * _uniform(allowed) + (1 - p) * _uniform(near)

@@ -50,9 +50,8 @@ class Polynomial:
 class Linear:
     """Linear interpolation from `first` in the first step to `last` after `num_steps`, then constant.
 
-    Example:
-      >>> [float(at(Linear(1.0, 0.0, 4), step)) for step in range(6)]
-      [1.0, 0.75, 0.5, 0.25, 0.0, 0.0]
+    >>> [float(at(Linear(1.0, 0.0, 4), step)) for step in range(6)]
+    [1.0, 0.75, 0.5, 0.25, 0.0, 0.0]
     """
 
     first: jax.Array | float

@@ -173,8 +173,7 @@ def guarantee(state: State, problem: Problem, confidence: float, **options: Any)
     """The certified satisfaction probability that the counts guarantee, however sampled; on the host.
 
     By anytime intervals at a `confidence` in (0, 1), of the `state` and `problem` of one run. It assumes
-    the graph, and nothing else that the learner assumes. Each look has the confidence, and so have all
-    looks at once. `options`, such as `tolerance`, are those of
+    the graph only, and holds with that confidence for all looks at once. `options` are those of
     :func:`~jaxltl.core.values.evaluation.data_guarantee.learn_guarantee`.
 
     Raises:

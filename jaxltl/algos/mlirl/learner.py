@@ -229,14 +229,11 @@ def make_problem(
       features: ``float[S, A, F]`` or ``float[S, Q, A, F]``.
       demonstrations: in the world; lifted here if the model is a product.
       start: center of the initial parameters; default zero weights, one per feature.
-      reward: any differentiable reward of parameters and features, such as a flax
-        network's ``apply``.
+      reward: any differentiable reward of parameters and features, default :func:`linear_reward`.
       satisfaction_over: the states of g in (2.6): ``"initial"`` (the dissertation's prose),
         ``"all"`` (its formula), or weights ``float[S]``.
-      allowed: ``bool[S, A]`` (``[S, Q, A]``), action mask of the policies, such as
-        :func:`~jaxltl.core.values.undiscounted.optimal_actions.optimal_actions`; default all.
-        Demonstrated steps outside of it
-        (:func:`~jaxltl.core.models.construct.lifting.allowed_steps`) do not count.
+      allowed: ``bool[S, A]`` (``[S, Q, A]``), action mask of the policies; default all. Demonstrated
+        steps outside of it (:func:`~jaxltl.core.models.construct.lifting.allowed_steps`) do not count.
 
     Raises:
       ValueError: features, weights, mask or reward of a wrong shape, features that are not finite,

@@ -4,10 +4,8 @@ A step collects T transitions of each of N environments with the current policy,
 generalised advantages, and makes some epochs of Adam on minibatches of the clipped surrogate
 (Schulman et al. 2017). The value after a truncation is that of the value network at the truncated
 observation; after a termination it is 0. Actions outside of an environment's mask are never taken,
-and the entropy is that over allowed actions: a network learns inside a shield.
-
-The implementation details of Huang et al. (2022) and Andrychowicz et al. (2021) are options of
-:class:`Hparams`.
+and the entropy is that over allowed actions. The implementation details of Huang et al. (2022) and
+Andrychowicz et al. (2021) are options of :class:`Hparams`.
 
 Example: a corridor left at its beginning; to go to the end and back earns most. (A step compiles
 for seconds, so only shapes are shown.)

@@ -49,31 +49,27 @@ class Hparams:
       gae_lambda: of the advantages: 1 has no bias, 0 least variance; default 0.95.
       learning_rate: of Adam; a schedule; default 2.5e-4.
       clip: bound on the change of the probability ratio in the surrogate; a schedule; default 0.2.
-      value_clip: bound on the change of values in their loss; a schedule; None: no bound;
-        default None.
+      value_clip: bound on the change of values in their loss; a schedule, or None; default None.
       value_weight: of half the squared error of values; default 0.5.
       entropy_weight: of the entropy of the actions; default 0.01.
-      max_gradient_norm: gradients are clipped to this norm; None: they are not; default 0.5.
+      max_gradient_norm: gradients are clipped to this norm, or None; default 0.5.
       target_kl: updates of a step stop when a minibatch's estimated divergence from the collecting
-        policy exceeds it; None: they do not; default None.
+        policy exceeds it, or None; default None.
       adam_epsilon: of Adam; default 1e-5.
       num_envs: N, parallel environments; static; default 8.
       num_steps: T, transitions of each of them in a step; static; default 128.
       num_epochs: passes over the collected transitions; static; default 4.
-      num_minibatches: of each pass; with a recurrent network, each has whole environments; static;
-        default 4.
-      normalize_advantage: whether advantages are standardised in each minibatch; static;
-        default True.
-      normalize_observation: whether the network reads observations (their floats) standardised by
-        their moments up to the last step, clipped to ten deviations; static; default False.
-      normalize_reward: whether rewards are divided by the standard deviation of discounted sums of
-        rewards so far, and clipped to ten; static; default False.
+      num_minibatches: of each pass; with a recurrent network of whole environments; static; default 4.
+      normalize_advantage: standardises advantages in each minibatch; static; default True.
+      normalize_observation: standardises the floats of observations by their moments up to the last
+        step, clipped to ten deviations; static; default False.
+      normalize_reward: divides rewards by the standard deviation of discounted sums of rewards so far,
+        and clips them to ten; static; default False.
       squash: map of a Gaussian action into its box: ``"clip"``, or ``"tanh"`` along axes with both
         bounds; static. Networks use units in which such axes are [-1, 1]. Default ``"clip"``.
       num_resets: initial states drawn before the T transitions of a step; static. None: T N, one for
         every possible end: fast, and takes memory. 0: N in each transition, with the same results.
-        Another number: that many, used cyclically; fastest where resets are costly and episodes
-        long. Default None.
+        Another number: that many, used cyclically. Default None.
       sharding: of the environments and of each minibatch, such as
         ``NamedSharding(mesh, PartitionSpec("environments"))``; static. Runs are equal up to the order
         of sums; collected transitions are replicated once for each step. Default None.

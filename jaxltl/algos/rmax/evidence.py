@@ -53,14 +53,13 @@ class Evidence:
 
     Attributes:
       strategy: ``float[S, A]``, of the system.
-      almost_sure: ``bool[]``, whether it wins almost surely from every state of the region.
+      almost_sure: ``bool[]``, True if it wins almost surely from every state of the region.
       optimal: the optimal worst-case value of strategies in the region.
-      worst_case: the value of this strategy against every environment.
-      played: its value against the environment of the problem.
-      epsilon_optimal: ``bool[S]``, states in which `worst_case` is certified to be within epsilon
-        of `optimal`.
-      epsilon_optimal_played: the same of `played`, the promise of theorem 6: actions that the
-        environment never takes stay unknown, so that `worst_case` can stay low.
+      worst_case, played: the value of this strategy against every environment, and against that of the
+        problem.
+      epsilon_optimal, epsilon_optimal_played: ``bool[S]``, states in which `worst_case` or `played` is
+        certified to be within epsilon of `optimal`. Theorem 6 promises the second only: actions that
+        the environment never takes stay unknown.
       reachable: ``bool[S]``, states of the region reachable from the initial ones.
       known_at: ``int32[S, A]``, of :class:`~jaxltl.algos.rmax.State`.
       data: the guarantee by the counts alone, or None.

@@ -61,13 +61,12 @@ class State:
       num_known: ``int32[]``, known pairs.
       probability, gain: ``float[S, A, K]`` and ``[S, A]``, transition probabilities and expected
         rewards of the optimistic model.
-      value: ``float[S]``, its value.
-      best: ``bool[S, A]``, its near-optimal actions.
+      value, best: ``float[S]`` and ``bool[S, A]``, its value and near-optimal actions.
       error: ``float[]``, bound on the error of `value` up to a constant.
-      last_update: ``int32[]``, moves after which the strategy was last computed.
-      num_updates: ``int32[]``, times it was computed.
-      always_almost_sure: ``bool[]``, whether every strategy so far had positive probability on
-        every allowed action, so that it wins almost surely (lemma 6).
+      last_update, num_updates: ``int32[]``, moves at the last computation of the strategy, and the
+        number of these.
+      always_almost_sure: ``bool[]``, True if every strategy so far had positive probability on every
+        allowed action, so that it wins almost surely (lemma 6).
       fault: ``int32[]``, the first pair ``s * A + a`` with a reward outside of [0, R_max], or -1.
     """
 

@@ -172,9 +172,8 @@ def objective(
 
     The loss ``float[]``, in nats, and :class:`Objective`, for `parameters`, `problem`, `hparams` and
     `initial` as in :func:`solve`; with ``hparams.mu`` minus mu times the satisfaction probability in
-    each world, as in (2.6). Differentiable in the parameters: the gradient costs one linear solve with
-    the transposed transition matrix of the policy (implicit function theorem), instead of one system
-    (3.6) for each parameter.
+    each world, as in (2.6). Differentiable in the parameters by one transposed linear solve (implicit
+    function theorem), instead of one system (3.6) for each parameter.
 
     Raises:
       ValueError: the problem does not count pairs by time up to ``hparams.horizon``, or `mu` is

@@ -22,14 +22,13 @@ def reward(
 
     By the `observation` ``float[S, O]``; differentiable in it and in the parameters.
 
-    Example:
-      >>> from jaxltl import from_dense, product
-      >>> world = from_dense([[[0, 1.0]], [[0, 1.0]]], label=[[0], [1]], propositions=["g"])
-      >>> class Late(nn.Module):  # a reward of 1 in the final automaton state
-      ...     def __call__(self, observation, memory, action):
-      ...         return 0 * observation[..., 0] + memory[..., 1] + 0 * action[..., 0]
-      >>> reward(Late(), {}, product(world, "F g"), jnp.eye(2)).shape
-      (2, 2, 1)
+    >>> from jaxltl import from_dense, product
+    >>> world = from_dense([[[0, 1.0]], [[0, 1.0]]], label=[[0], [1]], propositions=["g"])
+    >>> class Late(nn.Module):  # a reward of 1 in the final automaton state
+    ...     def __call__(self, observation, memory, action):
+    ...         return 0 * observation[..., 0] + memory[..., 1] + 0 * action[..., 0]
+    >>> reward(Late(), {}, product(world, "F g"), jnp.eye(2)).shape
+    (2, 2, 1)
     """
     return jnp.asarray(network.apply(parameters, *network_inputs(model, observation)))
 

@@ -113,17 +113,15 @@ def make_problem(
       network: the reward; default :class:`RewardNetwork`.
       weight: ``float[W]``, factors of the worlds' likelihoods; default 1.
       horizon: count pairs by time, for ``Hparams.horizon``.
-      allowed: ``bool[S, Q, A]``, or one for each world: action mask of the policies, such as
-        :func:`~jaxltl.core.values.undiscounted.optimal_actions.optimal_actions`; default all.
+      allowed: ``bool[S, Q, A]``, or one for each world: action mask of the policies; default all.
         Demonstrated steps outside of it do not count.
 
     Returns:
       :class:`Problem`, its arrays stacked over W worlds.
 
     Raises:
-      ValueError: worlds of different shapes or propositions, observations, weights, rewards or
-        masks of a wrong shape, demonstrations that do not fit their world or exceed the horizon, or
-        no counted pair.
+      ValueError: arguments of different or wrong shapes, demonstrations that do not fit their world or
+        exceed the horizon, or no counted pair.
     """
     model = stack_models(worlds)
     if allowed is not None:

@@ -12,8 +12,7 @@ advantages (Schulman et al. 2016), ``H`` is the Fisher matrix (the Hessian of th
 backtracking line search then enforces the true divergence and the estimated gains.
 
 A trajectory is an episode, cut after ``horizon`` steps. The value after a termination or after the
-horizon is 0; after a truncation it is that of the value network at the last observation. Costs are
-limited as they are sampled: nothing after a trajectory counts.
+horizon is 0; after a truncation it is that of the value network at the last observation.
 
 Example: a point in the plane; the reward is for being near 0, the cost is the action. (A step
 compiles for seconds, so only shapes are shown.)
