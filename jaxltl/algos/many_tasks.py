@@ -83,17 +83,16 @@ class SequenceNetwork(nn.Module):
     """An actor and a critic that read a :class:`~sequence_task.SequenceObservation`.
 
     With `events_seen`, each place is described by whether the current steps of the sequence reach or
-    avoid one of its events; the names of events do not matter, so that a trained network generalises to
-    other events. Otherwise it reads the observation, and an embedding of the sequence's rows.
+    avoid one of its events, so that a trained network generalises to other events. Otherwise the
+    network reads the observation, and an embedding of the sequence's rows.
 
     Attributes:
-      num_actions, shape, hidden, activation, initial_deviation: as of PPO's default network,
+      num_actions, shape, hidden, activation, initial_deviation: as of
         :class:`~jaxltl.algos.common.actor_critic.ActorCritic`; hidden layers read both parts.
       events_seen: ``observation -> float[..., E]``, the events at each place, or None; hashable.
       by_name: whether the network with `events_seen` also reads the observation and the sequence's
         rows, for a fixed world.
-      detailed: number of steps of the sequence described so; of later ones the network reads the
-        numbers of events to reach and to avoid.
+      detailed: number of steps described so; of later ones the network reads the numbers of events.
       embedding: width of the layer that embeds a step's events.
     """
 

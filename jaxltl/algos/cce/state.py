@@ -110,14 +110,12 @@ class Metrics:
     Attributes:
       num_evaluated: samples so far.
       num_feasible, num_invalid: of this step's samples.
-      enough_feasible: whether the objective chose the elites (case 2).
-      objective: mean over this step's usable samples.
-      cost: ``float[C]``, likewise.
+      enough_feasible: True if the objective chose the elites (case 2).
+      objective, cost: means over this step's usable samples; the cost is ``float[C]``.
       best_objective: of the best feasible sample so far; minus infinity without any.
       least_excess: of the sample of the least violation so far.
       spread: the largest standard deviation after the step.
-      rate: alpha_l.
-      num_restarts, status: see :class:`State`.
+      rate, num_restarts, status: alpha_l, and see :class:`State`.
     """
 
     num_evaluated: jax.Array

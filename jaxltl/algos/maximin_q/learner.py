@@ -79,18 +79,15 @@ class Hparams:
       discount: in [0, 1).
       step_size: alpha in (0, 1]; None: 1, for deterministic games; default None.
       step_power: omega in (1/2, 1]: the n-th visit of an entry has the step size
-        ``alpha / n ** omega``. Near 1 early targets are forgotten very slowly (Even-Dar and Mansour
-        2003). None: constant alpha; default None.
-      epsilon: the system is greedy with probability ``1 - epsilon``; None: never; default None.
-      environment_epsilon: the same of the environment, which is then adversarial; default None.
-      epsilon_decay: factor of both epsilons per step; default 1.0.
-      epsilon_min: lower bound of both epsilons; default 0.0.
+        ``alpha / n ** omega`` (Even-Dar and Mansour 2003). None: constant alpha; default None.
+      epsilon, environment_epsilon: the system, or an adversarial environment, is greedy with probability
+        ``1 - epsilon``; None: never; default None.
+      epsilon_decay, epsilon_min: factor per step and lower bound of both; default 1.0 and 0.0.
       restart: probability that a chain restarts at the beginning of a step; default 0.0.
       initial_value: of every entry. Untried answers of the environment count. Default 0.0.
-      per: which moves are discounted, ``"system_move"`` or ``"move"``; static;
-        default ``"system_move"``.
-      num_chains: parallel chains; static; default 1024.
-      moves_per_step: moves of each chain in a step; static. Default 64.
+      per: discounted moves, ``"system_move"`` or ``"move"``; static; default ``"system_move"``.
+      num_chains, moves_per_step: parallel chains, and moves of each in a step; static;
+        default 1024 and 64.
     """
 
     discount: Number = traced(Range(0, 1, open_above=True))
@@ -146,8 +143,7 @@ class Metrics:
 
     Attributes:
       residual: largest change of the value in the step.
-      moves: of all chains since the beginning, as a float.
-      visited: distinct entries of the table that were updated.
+      moves, visited: of all chains since the beginning, as a float; distinct updated entries.
       violations: actions outside of the mask that were taken.
       error: largest error over the measured states; NaN if the value is unknown.
       status: NONFINITE if a value is not finite, else COMPLETED, which does not certify the value;

@@ -97,9 +97,7 @@ def task_features(
                     missing, with a remark, if these exceed double precision
     ==============  ==============================================================================
 
-    All are zero where the automaton state is final. The change of the optimal satisfaction
-    probability is no feature: it is zero inside the optimal actions, and ``Hparams.mu`` weighs the
-    probability of whole runs (2.6).
+    All are zero where the automaton state is final.
 
     Args:
       model: the product.
@@ -109,8 +107,7 @@ def task_features(
       best: of :func:`~jaxltl.core.values.undiscounted.satisfaction.optimal_satisfaction`; concrete.
 
     Raises:
-      ValueError: a state or proposition does not exist, or `progress` is given for a task that is
-        not co-safe.
+      ValueError: an unknown state or proposition, or `progress` for a task that is not co-safe.
     """
     task = model.automaton
     if progress is not None and not task.is_cosafe:

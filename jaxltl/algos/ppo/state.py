@@ -142,16 +142,15 @@ class Metrics:
     Attributes:
       transitions: of environments so far.
       reward, cost: mean of a transition.
-      episodes: number of episodes that ended.
-      episode_return, episode_length: their mean undiscounted return and length; NaN without any.
+      episodes, episode_return, episode_length: number of episodes that ended, and their mean
+        undiscounted return and length; NaN without any.
       policy_loss, value_loss, entropy: mean parts of the loss over the updates.
       kl: mean estimate of the divergence from the collecting policy, ``mean(r - 1 - log r)``.
       clip_fraction: share of clipped ratios.
-      gradient_norm: mean, before clipping.
+      gradient_norm, learning_rate: mean before clipping, and rate of this step.
       explained_variance: share of the variance of the values' targets that values explained.
-      learning_rate: of this step.
-      updates: minibatches that changed the parameters.
-      nonfinite: minibatches skipped because a number was not finite.
+      updates, nonfinite: minibatches that changed the parameters, and those skipped because a number
+        was not finite.
       status: COMPLETED; NONFINITE if `nonfinite` is positive or an advantage was not finite; INVALID if
         no action was allowed somewhere (the first is taken there, and parameters stay unchanged).
     """

@@ -69,15 +69,12 @@ class Hparams:
       learning_rate: of all optimizers but ``lbfgs``; default 3e-3.
       patience: steps without a better held-out likelihood (with `mu`, plus the weighted satisfaction
         probability) after which learning stops; default 50.
-      mu: at least 0; weight of the satisfaction probability (2.6) from the initial states; None:
-        none; default None.
-      tolerance: certified error of the soft values; None: the precision of the dtype;
-        default None.
+      mu: weight of the satisfaction probability (2.6) from the initial states, or None; default None.
+      tolerance: certified error of the soft values; None: the precision of the dtype; default None.
       optimizer: ``"adam"``, ``"sgd"``, ``"rmsprop"`` or ``"lbfgs"``; static; default ``"adam"``.
       method: of :func:`~jaxltl.core.values.discounted.soft.soft_value`; static;
         default ``"value_iteration"``.
-      horizon: number of steps of a run, for a time-dependent policy, or None; static;
-        default None.
+      horizon: number of steps, for a time-dependent policy, or None; static; default None.
     """
 
     discount: Number = traced(Range(0, 1))

@@ -25,8 +25,8 @@ class Hparams:
     Attributes:
       discount: of rewards, in [0, 1]; multiplied by the environment's.
       cost_discount: of costs; 1 limits the expected sum of a trajectory's costs; default 1.0.
-      gae_lambda: of the advantages of rewards: 1 has no bias, 0 least variance; default 0.97.
-      cost_gae_lambda: of the advantages of costs; near 1 for late costs; default 0.97.
+      gae_lambda, cost_gae_lambda: of the advantages of rewards and of costs: 1 has no bias, 0 least
+        variance; default 0.97 and 0.97.
       delta: bound on the mean divergence of a step; default 0.01.
       damping: multiple of the identity added to the Fisher matrix; default 1e-3.
       penalty: TRPO only: maximise ``reward - penalty * cost``; None: the reward; default None.
@@ -37,10 +37,9 @@ class Hparams:
       num_trajectories: N, sampled in each step; static; default 200.
       hidden, value_hidden: widths of the tanh layers of the policy and of the value networks;
         ``()`` is linear; static; default ``(32, 32)``.
-      normalize: whether networks read observations standardised by their moments so far; new moments
-        do not change the policy as a function; static; default True.
-      cg_steps: of the conjugate gradient method; static; default 10.
-      search_steps: maximal number of tries of the line search; static; default 15.
+      normalize: networks read observations standardised by their moments so far; static; default True.
+      cg_steps, search_steps: of the conjugate gradient method, and maximal number of tries of the line
+        search; static; default 10 and 15.
       fisher_stride: stride of the samples that estimate the Fisher matrix; static; default 1.
       value_epochs, value_batches: passes over the samples, and minibatches of each; static;
         default 5 and 8.
@@ -97,13 +96,11 @@ class State:
 @brief(facts=partial(history, codes={"status": Status}))
 @struct.dataclass
 class Metrics:
-    """Figures of a step; scalars unless a shape is given. Means are those of the policy before the step,
-    over its finite trajectories.
+    """Figures of a step; scalars; means over finite trajectories of the policy before the step.
 
     Attributes:
       trajectories: sampled so far.
-      reward: mean undiscounted sum of a trajectory's rewards.
-      cost: mean sum of its costs, discounted by `cost_discount`.
+      reward, cost: mean sum of a trajectory's rewards, and of its costs discounted by `cost_discount`.
       cost_error: standard error of `cost`.
       length: mean number of steps.
       deviation: geometric mean of the actions' standard deviations.
@@ -113,8 +110,7 @@ class Metrics:
       scale: factor of the line search; 0 if no step was accepted.
       case: a code of :class:`Case`.
       trust_multiplier, cost_multiplier: lambda and nu, the dual variables.
-      unexplained: ``float[V]``, share of the variance of the values' targets that the networks did
-        not explain.
+      unexplained: ``float[V]``, share of the variance of the values' targets that networks miss.
       nonfinite: trajectories with a number that is not finite; no other figure includes them.
       status: COMPLETED; MAX_STEPS if no step was accepted; NONFINITE if `nonfinite` is positive or the
         step was not finite (the policy then stays unchanged).
