@@ -79,10 +79,8 @@ class Regions:
       verdict: ``int8[N]``: 1 if every point meets the threshold, -1 if none does, 0 if undecided.
 
     Example:
-      >>> halves = Regions(np.array([[0.0], [0.5]]), np.array([[0.5], [1.0]]), np.array([0.0, 0.5]),
-      ...                  np.array([0.5, 1.0]), np.array([-1, 1], np.int8))
-      >>> halves.share(1)
-      0.5
+      >>> Regions(np.zeros((1, 1)), np.ones((1, 1)), np.zeros(1), np.ones(1), np.ones(1)).share(1)
+      1.0
     """
 
     low: np.ndarray

@@ -78,11 +78,11 @@ def make_problem(
       model: of ``make_parametric``, or ``read_parametric(path).over(low, high)``.
       target: ``bool[S]``, or a label.
       bound: ``">="`` or ``"<="``: the value is to be at least or at most the threshold.
-      reward: name of the reward, for its expected total until the target; default: the
-        probability of reaching the target.
+      reward: name of the reward, for its expected total until the target; default: the probability of
+        reaching the target.
       stay: ``bool[S]``, the states allowed before the target, of probabilities only.
-      objective: ``"max"`` or ``"min"`` over the policies of a decision process: with ``"max"``,
-        ``">="`` asks for some policy and ``"<="`` for all policies.
+      objective: ``"max"`` or ``"min"`` over policies; ``">="`` with ``"max"`` asks for some policy,
+        ``"<="`` for all.
 
     Raises:
       ValueError: an unknown bound, objective, reward or label, a wrong shape, or a reward that is

@@ -31,12 +31,10 @@ class Hparams:
       exploration: in (0, 1], probability of any allowed action; default 0.1.
       restart: probability of restarting before a move in the almost-sure winning region; in the
         losing region 1; default 0.05.
-      discount: in (0, 1); among actions of the same optimistic value those that win soonest are
-        preferred; default 0.99.
+      discount: in (0, 1), prefers actions that win soonest among those of equal value; default 0.99.
       sweeps: of value iteration in a step; at least the moves to the winning region; default 40.
       tolerance: change of the last sweep at which values count as converged; default 1e-4.
-      num_runs: episodes sampled in a step; static; default 4.
-      length: moves of an episode; static; default 64.
+      num_runs, length: episodes in a step, and moves of each; static; default 4 and 64.
     """
 
     intervals: str = static(INTERVALS, default="linear")

@@ -134,13 +134,11 @@ class Hparams:
 
     Attributes:
       discount: in [0, 1).
-      mu: at least 0; weight of the satisfaction term (2.6); None: none (cases 1 and 2);
-        default None.
+      mu: weight of the satisfaction term (2.6), or None (cases 1 and 2); default None.
       l2: at least 0; precision of the Gaussian prior on the parameters; default 1e-3.
       learning_rate: of ``adam``, ``rmsprop`` and ``sgd``; default 0.1.
       start_scale: standard deviation of the noise added to ``Problem.start``; default 1.0.
-      policy: ``"boltzmann"`` (2.3) or ``"soft"`` (maximum entropy); static;
-        default ``"boltzmann"``.
+      policy: ``"boltzmann"`` (2.3) or ``"soft"`` (maximum entropy); static; default ``"boltzmann"``.
       adjoint: ``"exact"``, or ``"approximate"`` as in (2.7); static; default ``"exact"``.
       optimizer: ``"lbfgs"``, ``"adam"``, ``"rmsprop"`` or ``"sgd"``; static; default ``"lbfgs"``.
     """
