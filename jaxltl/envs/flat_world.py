@@ -85,15 +85,14 @@ def flat_world(
       discs: ``(colour, x, y, radius)``; the propositions are the sorted colours.
       extent: half a side of the square.
       time_step: distance of a step at velocity one.
-      horizon: number of steps after which an episode is truncated; None: never.
+      horizon: the time limit, or None.
       discrete: nine actions (up, right, down, left, the four diagonals, each with velocity one, and
         rest) instead of a box.
       start: the initial position; default: uniform outside of all discs.
       num_starts, seed: size and seed of the table of initial positions.
 
     Returns:
-      :class:`~jaxltl.core.environments.environment.Environment` with states :class:`FlatState`, or with
-      a horizon pairs of one and the time. Observations are ``float32[2]``.
+      :class:`~jaxltl.core.environments.environment.Environment` with states :class:`FlatState`.
 
     Raises:
       ValueError: no disc, a number that is not positive, a start outside of the square, or discs that

@@ -31,8 +31,7 @@ def gridworld(
     a self-loop. With probability `slip` a move goes to one of the two sides instead, half each.
 
     Args:
-      text: the map, see :func:`parse_map`.
-      slip: probability in [0, 1] of moving sideways.
+      text, slip: the map, see :func:`parse_map`, and the probability in [0, 1] of moving sideways.
       absorbing: propositions of absorbing cells.
       legend: the propositions of each kind of cell; default: none for ``.``, else that of its name.
       wall: the kind of cell that is a wall.

@@ -80,16 +80,14 @@ def letter_world(
       size: cells along a side.
       letters: the number of letters a, b, c, ...; or their names.
       copies: the number of cells of each letter.
-      horizon: number of steps after which an episode is truncated; None: never.
+      horizon: the time limit, or None.
       layout: the map of every episode: a text (see :func:`~jaxltl.envs.text_map.parse_map`) with
         ``.`` for empty cells, or ``int[size, size]``, numbers of letters, -1 for none.
-      start: the initial cell in a given layout; default: any empty one.
-      flat: flatten the observations.
+      start, flat: the initial cell in a given layout (default: any empty one); flat observations.
       maps: see :class:`Maps`.
 
     Returns:
-      :class:`~jaxltl.core.environments.environment.Environment` with states :class:`LetterState`, or
-      with a horizon pairs of one and the time.
+      :class:`~jaxltl.core.environments.environment.Environment` with states :class:`LetterState`.
 
     Raises:
       ValueError: letters that do not fit on the map, a malformed layout, an invalid start, or too few

@@ -296,9 +296,8 @@ class Plant(NamedTuple):
     `state` is ``float[n]``, `violation` the largest so far, and `time` the number of steps.
 
     Example:
-      >>> begun = as_environment(lqr()).reset(None)
-      >>> begun.state.tolist(), int(begun.time)
-      ([1.0, -1.0], 0)
+      >>> Plant(state=[1.0, -1.0], violation=0.0, time=0).time
+      0
     """
 
     state: jax.Array
@@ -381,7 +380,7 @@ def optimum(world: LQR) -> Optimum:
     )
     matrix, offset = _least_squares(a, b, q, r, start, world.horizon)
     bounds = np.tile(low, world.horizon), np.tile(high, world.horizon)
-    pinned = bounds[0] == bounds[1]  # what cannot vary is taken out
+    pinned = bounds[0] == bounds[1]  # constants are eliminated
     u = bounds[0].copy()
     if not pinned.all():
         free = ~pinned

@@ -116,8 +116,7 @@ class Settings(TypedDict, total=False):
       strip, weight: see :class:`Navigation`; default: (-2, -0.2) and 30.
 
     Example:
-      >>> settings = Settings(speed=0.5, radii=[1.0])
-      >>> navigation(**settings).num_observations
+      >>> navigation(**Settings(speed=0.5, radii=[1.0])).num_observations
       14
     """
 

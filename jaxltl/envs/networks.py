@@ -66,8 +66,7 @@ def make_network(
 
     Args:
       sizes: such as ``"2-10-10-1"`` or ``(2, 10, 10, 1)``: inputs, hidden layers, outputs.
-      hidden, output: the activations, ``"relu"``, ``"tanh"`` or ``"identity"``.
-      biases: add a bias to each node.
+      hidden, output, biases: the activations, see :data:`ACTIVATIONS`, and biases of all nodes.
 
     Raises:
       ValueError: fewer than two sizes, a size below 1, or an unknown activation.
@@ -108,7 +107,7 @@ def layers(network: Network, parameters: jax.Array) -> Layers:
     """The weights ``[inputs, outputs, lanes]`` and biases ``[outputs, lanes]`` of each layer.
 
     Args:
-      network: from :func:`make_network`; without biases, those of the result are None.
+      network: from :func:`make_network`; a network without biases has None instead.
       parameters: ``float[D, lanes]``, with any number of axes of lanes: layer by layer, the weights row
         by row (a row for each input) and then the biases.
 

@@ -48,8 +48,6 @@ def post_offices() -> Game:
       >>> game.num_states, game.num_actions, game.num_successors
       (36, 6, 1)
       >>> state = (2 * 2 + 1) * 2 + 1  # in the upper right, the light on, the system to move
-      >>> [a for a, can in zip(ACTIONS, game.available[state]) if can]
-      ['down', 'left']
       >>> [p for p, holds in zip(game.propositions, game.label[state]) if holds]
       ['p1']
     """
@@ -175,7 +173,7 @@ def patrol() -> Patrol:
     world = post_offices()
     joint = product(world, surveillance(), label_on="exit")
     everywhere = np.full(joint.num_states, 1 / joint.num_states)
-    whole = restrict(joint, everywhere)  # keeps what is reachable, here everything, in order
+    whole = restrict(joint, everywhere)  # reachable states, here all, in order
     initial = joint.initial.ravel()
     game = replace(whole.model, mdp=replace(whole.model.mdp, initial=initial))
     cell, light, _ = jnp.unravel_index(whole.base_state, (_CELLS, 2, 2))

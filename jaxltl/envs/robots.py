@@ -48,8 +48,6 @@ def robots(size: int) -> Game:
       >>> game.num_states, game.num_actions, game.num_successors
       (162, 5, 1)
       >>> state = (4 * 9 + 0) * 2 + 1  # environment in the middle, system in the lower left
-      >>> [a for a, can in zip(ACTIONS, game.available[state]) if can]
-      ['up', 'right', 'stay']
       >>> [p for p, holds in zip(game.propositions, game.label[state]) if holds]
       ['diagonal', 'system_turn', 'system_lower_left']
     """
@@ -96,9 +94,8 @@ def grid_game(
       system_start, environment_start: a propositional formula over the map's propositions, or a cell's
         row and column, from 0 at the top left; default: any place. Initial states are as in
         :func:`robots`.
-      slip: probability in [0, 1] of moving sideways.
+      slip, legend, wall: as for :func:`~jaxltl.envs.gridworld.gridworld`.
       system_stays, environment_stays: permit the robot to stay.
-      legend, wall: as in :func:`~jaxltl.envs.gridworld.gridworld`.
 
     Returns:
       A game with ``2 * C**2`` states and the actions :data:`ACTIONS`; deterministic without slip.

@@ -59,7 +59,7 @@ class _Numbers:
     time_step: np.float32
     thrust: np.float32  # the acceleration
     saturation: np.float32  # the action from which on it is that
-    drag: np.float32  # what a second leaves of a velocity is exp(-drag)
+    drag: np.float32  # a second scales a velocity by exp(-drag)
     turn: np.float32
     most_turn: np.float32
     gain: np.float32
@@ -88,13 +88,12 @@ def zone_world(
       colors: the propositions, each true in the zones of its colour.
       zones: the number of zones of each colour.
       radius, extent: of a zone, and half a side of the square.
-      horizon: number of steps after which an episode is truncated; None: never.
+      horizon: the time limit, or None.
       saturation: the action from which on the thrust is full; as published, .05.
       num_maps, seed: size of the table of placements, before symmetries and colours, and its seed.
 
     Returns:
-      :class:`~jaxltl.core.environments.environment.Environment` with states :class:`ZoneState`, or
-      with a horizon pairs of one and the time.
+      :class:`~jaxltl.core.environments.environment.Environment` with states :class:`ZoneState`.
 
     Raises:
       ValueError: numbers that are not positive, a repeated colour, or zones that do not fit.

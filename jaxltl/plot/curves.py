@@ -153,8 +153,7 @@ def sweep(
       metrics: figures ``[H, N, T]`` of H settings and N seeds by name, or a learner's ``Metrics``
         of a ``vmap`` over seeds within one over settings.
       settings: the names of the H settings; at most six, the number of distinct colours.
-      steps: ``[T]``, the step of each figure; default 1, 2, ...
-      show: names of figures in order; default all that are not wholly NaN.
+      steps, show: as for :func:`curves`.
 
     Returns:
       The figure, without seeds that are not finite at a step.
@@ -289,8 +288,7 @@ def paths(
     Args:
       maps: by title, coordinates x and y of M trajectories, ``[M, T]`` each.
       boxes: by name, regions ``((x, y), (x, y))``, the lower left corner first; drawn in all maps.
-      bounds: the box that is shown.
-      columns: of maps.
+      bounds, columns: the box that is shown, and the number of maps in a row.
 
 
     Raises:

@@ -15,8 +15,7 @@ Example:
   ...     {"place": np.array([[0, 0], [1, 0], [2, 0.0]])}, np.zeros((2, 2)), np.zeros((2, 2)),
   ...     zeros, zeros, np.array([[False], [False], [True]]), made, False, False, np.ones(2))
   >>> from jaxltl.plot import draw_episode, draw_episodes, play_episode
-  >>> page = play_episode(walk, episode, title="to the right")
-  >>> page.startswith("<!doctype html>") or page.startswith("<!DOCTYPE html>")
+  >>> play_episode(walk, episode, title="to the right").lower().startswith("<!doctype html>")
   True
   >>> len(draw_episode(walk, episode).axes), len(draw_episodes(walk, [episode, episode]).axes)
   (1, 2)
@@ -136,7 +135,7 @@ def scene_of(environment: Environment, episode: Episode) -> Scene:
     if not isinstance(world, LetterState | FlatState | ZoneState):
         return _free(np.asarray(world, float)[:count], shown)
     numbers: Any = environment.labels
-    while isinstance(numbers.args[0], Partial):  # what a limit or a task has put around it
+    while isinstance(numbers.args[0], Partial):  # wrappers of a limit or a task
         numbers = numbers.args[0]
     numbers = numbers.args[0]
     if isinstance(world, LetterState):

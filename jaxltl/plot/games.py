@@ -67,8 +67,7 @@ def game_values(
       policy: ``int[S]``, the system's moves, as arrows (negative for none), or ``bool[S, A]``.
       actions: the name of each action, of up, down, left, right and stay.
       environment: numbers of the environment's places to show; default all, laid out as they lie.
-      label: of the colour scale.
-      limits: values at the ends of the scale; default the data's.
+      label, limits: of the colour scale; default limits are those of the data.
       wall: the kind of cell that is not a place.
 
 
@@ -158,10 +157,9 @@ def game_moves(
       allowed: ``bool[2 * C * C, A]`` over the states of :func:`game_values`, or with M panels
         first, such as one for each memory state of a strategy.
       board, actions, wall: as for :func:`game_values`.
-      environment: the number of the environment's place.
+      environment, system: numbers of the robots' places; a ring marks the system's.
       region: ``bool[2 * C * C]``, or with M panels first: the winning region.
       available: ``bool[2 * C * C, A]``: actions that are not allowed get a hollow mark.
-      system: the number of the system's place, marked by a ring.
       titles: one per panel.
 
 

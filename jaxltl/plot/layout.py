@@ -105,7 +105,7 @@ def arrange(
     boxes: list[Box] = []
     labels: list[Label] = []
     for key in sorted(k for k in texts if k[0] == k[1]):
-        # A loop on a state that is never left says nothing, and its label would only crowd.
+        # The self-loop of a sink has no information, and its label takes space.
         if texts[key] == (("", "⊤"),):
             continue
         near = [line for k, line in wishes.items() if key[0] in k[:2]]
@@ -138,7 +138,7 @@ def graphviz_positions(count: int, initial: int, texts: Mapping[Key, Rows]) -> P
         f"node [shape=circle, fixedsize=true, width={2 * RADIUS}];",
         f"edge [fontsize={FONT_SIZE}];",
         f"{initial};",
-        *map(str, range(count)),  # the first that is named stands on the left
+        *map(str, range(count)),  # the first name is on the left
     ]
     for (source, target, _), rows in texts.items():
         # Only the size of the label counts.

@@ -174,8 +174,7 @@ def live_map(
         ``[S, A]`` as arrows as long as an action is likely; or None.
       runs: the cells of each run, a line from a dot, ``data-run``.
       marked: (state, memory, action) to be highlighted: ``g.marked``.
-      actions: A names, of up, down, left and right.
-      wall: the kind of cell that is not a place.
+      actions, wall: as for :func:`jaxltl.plot.grid`.
       pieces: number of moving pieces, ``circle.token``.
 
 

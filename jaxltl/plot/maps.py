@@ -64,8 +64,7 @@ def grid(
         probability of its action, and a row of NaN has none.
       titles: one per panel.
       label, limits: of the colour scale; limits None are those of the data.
-      actions: the name of each action, of up, down, left and right.
-      wall: the kind of cell that is not a place.
+      actions, wall: names of actions, of up, down, left and right; the kind of cell of walls.
 
 
     Raises:
@@ -244,8 +243,7 @@ def strategies(
       titles: one per panel.
       across: the maximal number of panels in a row.
       seldom: moves of a smaller probability get a small arrow.
-      actions: the name of each action, of up, down, left, right and stay.
-      wall: the kind of cell that is not a place.
+      actions, wall: as for :func:`grid`; an action may also be stay.
 
 
     Raises:

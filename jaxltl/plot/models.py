@@ -322,7 +322,7 @@ def _graph(
     for x in arrows:
         chance = "" if x.probability == 1 else f"{x.probability:.3g}".removeprefix("0")
         text = ": ".join(part for part in (x.choice, chance) if part)
-        text = text or ("⊤" if x.source == x.target else "1")  # such a loop is left out
+        text = text or ("⊤" if x.source == x.target else "1")  # layout omits "⊤"
         key = (x.source, x.target, 0)
         rows[key] = (*rows.get(key, ()), ("", text))
     if len(rows) > MOST_ARROWS:

@@ -38,8 +38,7 @@ def playback(
       states: ``int[T]``, the cells of the run, in order.
       automaton, memory: an automaton and ``int[T]``, its state at each of the steps; or neither.
       label: the text alternative; default the number of steps.
-      wait, times: seconds for each step, and the number of repetitions.
-      wall: the kind of cell that is not a place.
+      wait, times, wall: seconds for each step, the number of repetitions, and the kind of walls.
 
 
     Raises:

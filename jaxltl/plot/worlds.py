@@ -54,9 +54,8 @@ def temporal_gridworld(
       memory: the memory state to show, or several, with a panel for each.
       trajectories: of the world, drawn from a dot to a square, side by side where they overlap.
       value: ``float[S]`` or ``float[S, Q]``, as colours in a second row of panels.
-      title: one per panel.
+      title, actions: a title per panel, and names of actions, of up, down, left and right.
       label, limits: of the colour scale; default limits are those of the data.
-      actions: the name of each action, of up, down, left and right.
 
 
     Raises:

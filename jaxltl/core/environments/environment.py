@@ -148,10 +148,8 @@ class Timestep(NamedTuple):
 
     Attributes:
       world: the state after the step, also at the end of an episode.
-      reward: the reward of the step.
-      terminated: True in an absorbing state.
-      truncated: True where the simulation ends without termination.
-      cost: the cost of the step, for constrained learners.
+      reward, cost: of the step; the cost is for constrained learners.
+      terminated, truncated: True in an absorbing state, and where only the simulation ends.
       discount: the discount of later rewards, a factor on the learner's own.
 
     Example:
@@ -177,14 +175,12 @@ class Environment:
     do not recompile, and environments of one shape are stacked and vmapped.
 
     Attributes:
-      reset, step, observe, labels: see the module documentation.
-      allowed: the mask of available actions, or None if all are.
+      reset, step, observe, labels, allowed, starts, outcomes: see the module documentation; the last
+        three may be None. Arrays of `starts` and `outcomes` have a leading axis.
       actions: :class:`Finite` or :class:`Box`.
       observations: a tree of :class:`Box` with the structure of an observation.
       propositions: names of the P labels; static.
       horizon: an upper bound on the length of episodes, or None; static.
-      starts, outcomes: the distributions of `reset` and `step`, or None; the worlds and the fields of
-        the Timestep have a leading axis.
 
     Example:
       >>> coin = make_environment(
@@ -211,13 +207,10 @@ class EnvironmentOptions(TypedDict, total=False):
     """Optional parts of an environment.
 
     Attributes:
-      labels: ``world -> bool[P]``.
+      labels, allowed, starts, outcomes: see the module documentation.
       propositions: the P names.
-      allowed: ``world -> bool[A]``, the available actions of a finite action space.
       observations: a tree of :class:`Box`; default: unbounded.
       horizon: an upper bound on the length of episodes.
-      starts, outcomes: distributions of `reset` and `step`, for
-        :func:`~jaxltl.core.environments.tabulate.tabulate`.
     """
 
     labels: Callable[..., jax.Array] | None

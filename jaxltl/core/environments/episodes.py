@@ -139,16 +139,12 @@ def run_episode(
       ValueError: `num_steps` below 1.
 
     Example:
-      >>> import jaxltl as jl
-      >>> coin = jl.environments.make_environment(
-      ...     lambda key: jnp.int32(0),
-      ...     lambda world, action, key: Timestep(action, 1.0, action == 1),
-      ...     lambda world: world[None], actions=2)
-      >>> run = jax.jit(
-      ...     lambda key: run_episode(key, coin, make_agent(lambda seen, key: 1), num_steps=5))
-      >>> found = run(jax.random.key(0))
-      >>> found.reward.tolist(), bool(found.terminated)
-      ([1.0, 0.0, 0.0, 0.0, 0.0], True)
+      >>> from jaxltl import environments, gridworld
+      >>> world = environments.model_environment(gridworld("a . b", initial="a"), reward=[0, 0, 1])
+      >>> right = make_agent(lambda seen, key: 3)
+      >>> run = jax.jit(lambda key: run_episode(key, world, right, num_steps=3))
+      >>> run(jax.random.key(0)).reward.tolist()
+      [0.0, 1.0, 1.0]
     """
     num_steps = validation.integer("num_steps", num_steps, least=1, most=2**31 - 1)
     environment, agent = require_environment(environment), require_agent(agent)

@@ -35,7 +35,7 @@ def model_environment(
     Args:
       model: an MDP, a DenseMDP, a SparseMDP, which is padded, or a Game on one of them.
       reward: ``float[S]``, of the successor state, or ``float[S, A]``, of the action; default: zero.
-      observe: ``state -> observation``; default: one-hot, ``float[S]``.
+      observe: ``state -> observation``; default: one-hot.
       opponent: ``float[S, A]``, the policy of the game's environment; default: uniform.
 
     Returns:

@@ -67,7 +67,6 @@ class Monitor:
 def verdict(automaton: Automaton, word: Iterable[Letter]) -> Verdict:
     """The verdict after a finite word, on the host.
 
-    For many words, or words of a model, make a monitor once and use :func:`trace_verdicts`.
 
     Args:
       automaton: the task, with any acceptance.
@@ -109,7 +108,7 @@ def lasso_verdicts(automaton: Automaton) -> np.ndarray:
 
 
 def make_monitor(automaton: Automaton) -> Monitor:
-    """The monitor of an automaton, with any acceptance; made on the host.
+    """The monitor of an automaton, with any acceptance; computed on the host.
 
     Args:
       automaton: the task.
@@ -198,7 +197,7 @@ def trace_verdicts(
     if letters.ndim == 0:
         raise ValueError("trace_verdicts: letters is one number. Pass an array [..., T].")
     steps = letters.shape[-1]
-    if letters.size == 0:  # an empty list says nothing of its type
+    if letters.size == 0:  # an empty list has no integer type
         letters = letters.astype(jnp.int32)
     length = jnp.asarray(steps if length is None else length)
     _check_integers(letters, "trace_verdicts: letters")

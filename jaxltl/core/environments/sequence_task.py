@@ -89,8 +89,7 @@ def make_events(propositions: Ordered[str], at_most: int = 1) -> np.ndarray:
     """The labels with at most `at_most` propositions, starting with the empty one.
 
     Args:
-      propositions: the P names.
-      at_most: the most propositions that hold at once.
+      propositions, at_most: the P names, and the maximal number of true propositions.
 
     Returns:
       ``bool[E, P]``, NumPy's.
@@ -225,7 +224,7 @@ def sequence_environment(
       observations :class:`SequenceObservation`.
 
     Raises:
-      ValueError: events or a sampler that do not fit.
+      ValueError: events or a sampler of another shape.
 
     Example:
       >>> from jaxltl import environments, from_dense

@@ -95,17 +95,15 @@ class TaskTables:
     """A task over the labels of an environment, as arrays; see :func:`make_task_tables`.
 
     Attributes:
-      weight: ``int32[P]``, the contribution of each proposition to the code of a label.
-      letter: ``int32[C]``, the automaton's letter of each code.
-      delta: ``int32[Q, L]``, the successor state.
-      initial: ``int32[]``, the state before the first label.
+      weight, letter: ``int32[P]``, contributions of propositions to the code of a label, and
+        ``int32[C]``, the automaton's letter of each code.
+      delta, initial: ``int32[Q, L]``, the successors, and the state before the first label.
       verdict: ``int32[Q]``, in each state.
       repeated: ``int32[Q, L]``, the verdict of a terminal state by its automaton state and letter.
       accepting: ``bool[Q, L]``, the accepting transitions.
       reward, discount: ``float[Q, L]``, of the transitions.
       decided: ``float[3]``, the reward at each verdict, which replaces that of the transition.
-      potential: ``float[Q]``, for reward shaping; zero for none.
-      learner_discount: ``float[]``, the learner's discount, for shaping.
+      potential, learner_discount: ``float[Q]`` and ``float[]``, for reward shaping; zero for none.
       embedding: ``float[Q, ...]``, observations of the states, or None: one-hot.
       state_names: the residual formulas of the states, or empty; not part of the tree.
 
@@ -305,14 +303,13 @@ def stack_tables(tables: Sequence[TaskTables]) -> TaskTables:
 def stack_tasks(environments: Sequence[Environment]) -> Environment:
     """Task environments of one environment, padded to one shape, with a leading axis of N.
 
-    One compiled program runs all of them: ``vmap(run_episode, in_axes=(0, 0, None))(keys, stacked,
-    agent)``.
+    One compiled program runs all: ``vmap(run_episode, in_axes=(0, 0, None))(keys, stacked, agent)``.
 
     Args:
       environments: N results of :func:`task_environment`, of environments of one structure.
 
     Returns:
-      An environment whose arrays have a leading axis of N.
+      An environment with arrays of a leading axis N.
 
     Raises:
       ValueError: no environment, or environments of different structure.

@@ -1,4 +1,4 @@
-"""Time limits: environments whose episodes are truncated after a number of steps."""
+"""Time limits: truncation of episodes after a number of steps."""
 
 from __future__ import annotations
 
@@ -23,8 +23,7 @@ def with_time_limit(environment: Environment, num_steps: int) -> Environment:
     Its states are pairs ``(world, time)``; observations do not include the time.
 
     Args:
-      environment: the environment.
-      num_steps: the limit.
+      environment, num_steps: the environment and the limit.
 
     Returns:
       The environment; its horizon is the smaller of `num_steps` and the horizon before.

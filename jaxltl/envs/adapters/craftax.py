@@ -32,8 +32,8 @@ def from_craftax(
 ) -> Environment:
     """A Craftax environment, through its ``step_env``, which does not reset.
 
-    Craftax has one ``done`` for both ends of an episode. Here it is truncated at
-    ``params.max_timesteps``, and terminated if it would end without that limit. States are Craftax's.
+    Episodes are truncated at ``params.max_timesteps``, and terminated if they would end without that
+    limit. States are Craftax's.
 
     Args:
       env: as ``make_craftax_env_from_name(name, auto_reset=False)`` returns it.
