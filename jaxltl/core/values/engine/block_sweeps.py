@@ -195,7 +195,7 @@ class Chosen:
     def _solved(
         self, one_pass: Callable[[jax.Array, jax.Array], jax.Array], b: jax.Array
     ) -> jax.Array:
-        # A pass leaves what goes round for the next one, and nothing where there are no cycles.
+        # A pass leaves a residual on cycles only, for the solver below.
         first = one_pass(jnp.zeros_like(b), b)
         if not self.cyclic:
             return first

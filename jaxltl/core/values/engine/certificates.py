@@ -67,7 +67,7 @@ class Enclosure(NamedTuple):
 
     @property
     def ended(self) -> jax.Array:
-        """Whether further sweeps would not help."""
+        """True if further sweeps would not help."""
         return self.converged | self.exhausted | ~self.finite
 
 
@@ -136,7 +136,7 @@ def refuse(
 ) -> Solution:
     """The solution, without value and bounds if the policy or the model is invalid."""
     # `policy` is the argument of the solver, NaN at unavailable actions. The status is
-    # INVALID_POLICY, or INVALID for a model whose probabilities are not representable.
+    # INVALID_POLICY, or INVALID for a model with probabilities that are not representable.
     code = jnp.where(representable, Status.INVALID_POLICY, Status.INVALID)
     valid = valid & representable
 

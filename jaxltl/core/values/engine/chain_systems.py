@@ -41,7 +41,7 @@ class ChainSystem(NamedTuple):
     model: ActionModel  # a padded model or a product of one
     policy: jax.Array  # ``float[S, A]`` or ``int32[S]``
     mask: jax.Array  # ``bool[S]``, the transient states
-    # ``int32[S]``, the flat state whose row a state takes; None for its own
+    # ``int32[S]``, the flat state from which a state takes its row; None for its own
     row_of: jax.Array | None = None
 
     def solve(self, matvec: Operator, b: jax.Array) -> jax.Array:

@@ -22,7 +22,7 @@ class LinearSystem(Protocol):
         """x with ``A(x) = b`` for the operator."""
 
     def transpose_solve(self, matvec: Operator, b: jax.Array) -> jax.Array:
-        """x with ``A(x) = b`` for the transpose, whose products `matvec` gives."""
+        """x with ``A(x) = b`` for the transpose, with products by `matvec`."""
 
 
 class Krylov(NamedTuple):
@@ -71,7 +71,7 @@ def implicit(
 def _traced_when_differentiated(
     operator: Operator, fixed_point: jax.Array, system: LinearSystem
 ) -> jax.Array:
-    """The same, whose system is traced only where a derivative is taken."""
+    """The fixed point, with a linear system that is traced only where a derivative is taken."""
     # ``lax.custom_root`` traces it in any case, which is half of a solver's trace.
     closed = jax.make_jaxpr(operator)(fixed_point)
 

@@ -65,7 +65,7 @@ def iterate(
 
 def in_turn(function: Callable[..., Result], *arguments: object) -> Result:
     """``function(*arguments)``, batched sequentially under ``vmap``; not differentiable."""
-    # For work whose amount depends on the data, or that is slower in a batch. The function takes
+    # For work that depends on the data, or is slower in a batch. The function takes
     # trees of arrays and closes over no batched array.
 
     @jax.custom_batching.sequential_vmap

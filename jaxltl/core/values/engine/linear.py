@@ -1,7 +1,7 @@
 """Linear systems ``(I - c P_w) x = b`` and their transposes, inside ``jit``.
 
 Small systems are inverted by elimination, so that the number of expected steps does not matter; not
-by LAPACK, whose threads make batches of small systems wait for one another. Large systems are
+by LAPACK, which serialises batches of small systems by its threads. Large systems are
 solved by Richardson iteration and BiCGSTAB (van der Vorst 1992).
 """
 
@@ -161,7 +161,7 @@ def solver(
 
 
 def is_small(table: Any, num_states: int) -> bool:
-    """Whether systems of `num_states` are inverted; sharded ones are not."""
+    """True if systems of `num_states` are inverted; sharded ones are not."""
     spread = isinstance(table, ModelOperator | ShardedSuccessorTable) and is_sharded(table.model)
     return num_states <= DENSE_LIMIT and not spread
 

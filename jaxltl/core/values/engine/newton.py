@@ -46,7 +46,7 @@ class Backup(NamedTuple):
 
 
 class _Search(NamedTuple):
-    """Where a lane is: what P is applied to next, and what for."""
+    """State of the search of a lane: the next argument of P, and its purpose."""
 
     phase: jax.Array
     z: jax.Array
@@ -80,8 +80,8 @@ def solve(
     max_steps: jax.Array | int,
 ) -> tuple[jax.Array, ...]:
     """A value near a backup's fixed point, its image, number of steps and weights; unproven."""
-    # Sweeps ``v <- v + (1 - damping) (T v - v)`` and steps of Newton's method, whose linear systems
-    # are solved to a hundredth by BiCGSTAB, or where that fails, on small models with a monotone
+    # Sweeps ``v <- v + (1 - damping) (T v - v)`` and steps of Newton's method, with linear
+    # systems solved to a hundredth by BiCGSTAB, or where that fails, on small models with a monotone
     # backup, by elimination. A step is kept if it halves the error, and where the backup is
     # monotone and convex also if its system was solved; if not, ever more sweeps come before the
     # next.
@@ -166,7 +166,7 @@ def _look(
 
 
 def action_values(over: Any, given: Backup, ahead: Quantity) -> Quantity:
-    """``g + c x`` of a backup's numbers and what is ahead of each choice."""
+    """Action values ``g + c x``, with x the expected next value of each choice."""
     return jax.tree.map(
         lambda g, c, x: g + c * x, given.reward, over.spread(given.scale, ahead), ahead
     )

@@ -38,14 +38,12 @@ class DataGuarantee:
     Attributes:
       bound: lower bound on the satisfaction probability of the policy from the initial
         distribution (upper bound if it was minimised).
-      confidence: probability, over the data, that all statements here are true, if the assumption
-        on the graph holds.
-      optimistic: bound that no policy exceeds, with the same confidence and data.
+      confidence: probability, over the data, that all statements here are true, under `graph`.
+      optimistic: bound that no policy exceeds, with the same confidence.
       satisfaction: the policy, its automaton, and nature's worst case.
       model: the interval model.
       sets: the confidence sets of its rows.
-      gain: ``float64[R]``, first-order increase of the bound if a row's probabilities were known
-        to be its frequencies: where more samples help.
+      gain: ``float64[R]``, first-order increase of the bound if a row's frequencies were exact.
       graph: the assumption on the graph.
 
     Example:
@@ -88,34 +86,31 @@ def learn_guarantee(
 ) -> DataGuarantee:
     """A policy for a temporal-logic task, with a guarantee from counted transitions.
 
-    Confidence sets that contain all rows of the true model at once
+    Simultaneous confidence sets of all rows
     (:func:`~jaxltl.core.statistics.confidence_sets.intervals_from_counts`) are an interval model.
-    Its worst case over nature bounds the truth for every policy, so that the policy may be
-    optimised on the same data.
+    Its worst case bounds every policy, so that the policy may be optimised on the same data.
 
     Args:
-      model: its graph, labels and initial distribution are used, its probabilities are not. See
-        :func:`~jaxltl.core.models.construct.counts.model_from_counts` for a model of a log.
+      model: gives graph, labels and initial distribution, such as of
+        :func:`~jaxltl.core.models.construct.counts.model_from_counts`; its probabilities are unused.
       counts: of its transitions, matched by name; or ``int[T]``, one for each of its entries; or
-        confidence sets of its entries, such as those of selected rows, from `intervals_from_counts`.
+        confidence sets of its entries, from `intervals_from_counts`.
       task: a formula, its text, or an automaton.
       confidence: in (0, 1), of all returned statements at once.
-      graph: the assumption on the model's graph: ``"given"``, it is known; ``"seen"``,
-        ``"complete"`` or :class:`~jaxltl.core.statistics.graph_assumption.LeastProbability`, as it
-        was given to `model_from_counts`. There is no default: the guarantee holds under it only.
-      method: of counts; ``"anytime"`` (default) holds for any way of gathering data; ``"clopper-pearson"``,
+      graph: the assumption on the model's graph, required: ``"given"``, it is known; ``"seen"``,
+        ``"complete"`` or :class:`~jaxltl.core.statistics.graph_assumption.LeastProbability`, as for
+        `model_from_counts`.
+      method: of counts; ``"anytime"`` (default) holds for adaptive sampling; ``"clopper-pearson"``,
         ``"hoeffding"`` and ``"weissman"`` need numbers of samples that do not depend on outcomes.
       objective: ``"max"`` or ``"min"``.
       tolerance: width of the enclosures of the interval model's values.
 
     Returns:
-      :class:`DataGuarantee`.
+      :class:`DataGuarantee`. Concrete arrays only; not differentiable.
 
     Raises:
-      ValueError: the counts do not fit the model; an invalid confidence, label, direction or graph;
-        the model is not complete as `graph` states, or `graph.failure` leaves no confidence.
-
-    Concrete arrays only, on the host; not differentiable.
+      ValueError: counts that do not match the model; an invalid confidence, label, direction or
+        graph; a model that contradicts `graph`.
 
     Example:
       >>> from jaxltl import make_sparse
@@ -253,22 +248,19 @@ def guarantee_curve(
 ) -> np.ndarray:
     """Guaranteed bounds for random subsets of the data of given sizes.
 
-    Each subset is drawn from the next larger one without replacement: the curve is that of one
-    random order of the data.
+    The subsets are the prefixes of one random order of the data.
 
     Args:
-      model, counts, task, confidence, graph, method, objective: see :func:`learn_guarantee`; each
-        point has the confidence by itself.
-      sizes: how many transitions to take, each at most as many as there are.
+      model, counts, task, confidence, graph, method, objective: see :func:`learn_guarantee`; the
+        confidence is that of each single point.
+      sizes: numbers of transitions.
       seed: of the order.
 
     Returns:
-      ``float64[len(sizes)]``, in the order of `sizes`.
+      ``float64[len(sizes)]``, in the order of `sizes`. Concrete arrays only; not differentiable.
 
     Raises:
-      ValueError: a size is negative or larger than the data; and as there.
-
-    Concrete arrays only, on the host; not differentiable.
+      ValueError: a size is negative or larger than the data; or as :func:`learn_guarantee`.
 
     Example:
       >>> from jaxltl import make_sparse

@@ -51,29 +51,26 @@ def episode_evaluator(
     """``evaluate(parameters, key) -> (objective, costs)`` of a policy, means over episodes.
 
     Scores are fields of :class:`~jaxltl.core.values.evaluation.evaluation.EpisodeTotals` by name
-    (``"reward"``, ``"cost"``, ``"length"``, ...); with a task also the shares ``"success"``,
-    ``"violation"``, ``"undecided"`` and ``"failure"`` (``1 - success``); or functions of the totals
-    of one episode.
+    or function of the totals; with a task also the shares ``"success"``, ``"violation"``,
+    ``"undecided"`` and ``"failure"`` (``1 - success``).
 
     Args:
-      environment: plain or with a task; it travels as an argument.
-      agent: ``parameters -> Agent``, a function or a ``Partial``, such as
-        :func:`~jaxltl.envs.networks.network_agent` gives.
-      objective: to be large.
-      costs: one, or several; none gives evaluations without a cost.
+      environment: plain or with a task.
+      agent: ``parameters -> Agent``, such as of :func:`~jaxltl.envs.networks.network_agent`.
+      objective: the score to be maximised.
+      costs: a score, or several.
       num_episodes: M, of each evaluation.
-      num_steps: after which an episode is cut off; default the environment's horizon.
+      num_steps: maximal length of an episode; default the environment's horizon.
       discount: of ``"discounted_reward"`` and ``"discounted_visits"``.
 
     Returns:
       A pytree; ``evaluate(parameters, key)`` under ``jit`` and ``vmap``. One cost is a number,
-      several are ``float[C]``. Episode i has the key ``split(key, M)[i]``.
+      several are ``float[C]``. Episode i has the key ``split(key, M)[i]``. Differentiable in
+      forward mode only: an episode is a ``while_loop``.
 
     Raises:
       ValueError: an unknown score, one of a task without a task, episodes that never end, or no
         episodes.
-
-    Differentiable in forward mode only: an episode is a ``while_loop``.
 
     Example:
       >>> from jaxltl import make_environment

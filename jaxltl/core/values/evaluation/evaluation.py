@@ -1,9 +1,8 @@
 """Statistical evaluation of agents: frequencies and means over fresh episodes, with intervals.
 
-Any agent, any environment; of one with a task (:mod:`~jaxltl.core.environments.task_environment`) also
-how often the task is satisfied and violated. Episodes are independent, so each interval is one of
-a binomial test or of a mean of independent numbers, whatever the agent is made of. What is
-estimated is what happens within ``num_steps`` steps: what is undecided then is counted as that.
+With a task (:mod:`~jaxltl.core.environments.task_environment`) also the frequencies of satisfaction
+and violation. Episodes are independent, so each interval is that of a binomial test or of a mean of
+independent numbers. Estimates are for ``num_steps`` steps: other episodes count as undecided.
 """
 
 from __future__ import annotations
@@ -41,14 +40,13 @@ from jaxltl.core.values import facts
 
 @brief(codes={"verdict": Verdict})
 class EpisodeTotals(NamedTuple):
-    """Counts of one episode; with a leading axis, of many.
+    """Totals of one episode, or of many with a leading axis.
 
     Attributes:
-      reward: sum of the rewards.
-      discounted_reward: with the discount, and the environment's own.
-      cost: sum of the costs.
-      length: ``int32``, steps made.
-      terminated, truncated: how it ended; neither if it was cut off.
+      reward, cost: sums of the rewards and of the costs.
+      discounted_reward: with the discount, and that of the environment.
+      length: ``int32``, number of steps.
+      terminated, truncated: kind of end; neither if it was cut off.
       verdict: ``int32``, the task's :class:`~jaxltl.environments.Verdict` at the end; None without a task.
       visits: ``int32``, accepting readings, that of the first label included; None without.
       discounted_visits: the k-th reading, from 0, counts ``discount ** k``.
@@ -147,10 +145,10 @@ class Estimate:
     """A frequency or a mean with its confidence interval.
 
     Attributes:
-      mean: over the episodes; a share is in [0, 1], else it has the unit of what is averaged.
-      lower, upper: ends of the interval, in the same unit.
+      mean: over the episodes; a share is in [0, 1].
+      lower, upper: ends of the interval.
       error: the standard error of the mean.
-      method: what the interval rests on.
+      method: the statistical method of the interval.
 
     Example:
       >>> found = share_estimate(8, 10, 0.05)
@@ -177,14 +175,12 @@ class Evaluation:
       length: steps of an episode.
       visits, discounted_visits: accepting readings of an episode, see :class:`EpisodeTotals`; None
         without a task, or without a discount.
-      terminated, truncated, cut_off: how many episodes ended each way; at most `num_steps` steps
-        were simulated of any.
-      num_episodes: that were simulated.
+      terminated, truncated, cut_off: numbers of episodes with each end.
+      num_episodes: number of simulated episodes.
       num_steps, confidence, threshold, discount: the arguments.
-      decision: True if the chance of success is at least the threshold, False if it is below, None
-        if that is open, or no threshold was given.
-      status: CONVERGED; MAX_STEPS if a threshold was not decided; NONFINITE if a sum was not
-        finite, and then the mean is not finite either.
+      decision: True if the success probability is at least the threshold, False if it is below, None
+        if undecided or without a threshold.
+      status: CONVERGED; MAX_STEPS if a threshold was not decided; NONFINITE if a sum was not finite.
 
     Example:
       >>> from jaxltl import from_dense
@@ -271,8 +267,8 @@ class Batch:
 
     Attributes:
       size: number of episodes; memory grows with it.
-      sharding: a ``NamedSharding`` with the mesh axis over which episodes are split; of several
-        processes, each makes the same call and returns the same.
+      sharding: a ``NamedSharding`` with the mesh axis over which episodes are split; all processes
+        make the same call.
 
     Example:
       >>> Batch(size=64).sharding is None
@@ -305,30 +301,26 @@ def evaluate(
     - With a `threshold` the simulation stops after the first batch that decides it; the shares'
       intervals are then anytime-valid (Jeffreys' mixture; Ville; Robbins 1970), and the decision is
       wrong with probability at most ``1 - confidence``.
-    - Lengths and visits are bounded by `num_steps`: empirical Bernstein, anytime-valid
-      (Waudby-Smith and Ramdas 2024, theorem 2).
-    - Rewards and costs: Student's interval, which rests on the central limit theorem and on a fixed
-      number of episodes.
+    - Lengths and visits: empirical Bernstein, anytime-valid (Waudby-Smith and Ramdas 2024, thm. 2).
+    - Rewards and costs: Student's interval, by the central limit theorem for a fixed number.
 
     Args:
-      key: of everything that is drawn.
-      agent: what acts, such as ``ppo.policy(state, problem, hparams)``, or ``make_agent(function)``.
-      environment: plain, or with a task. Visits and shares are those of a task.
-      num_episodes: how many; with a threshold at most.
-      num_steps: after which an episode is cut off; default the environment's horizon.
+      key: random key.
+      agent: such as ``ppo.policy(state, problem, hparams)``, or ``make_agent(function)``.
+      environment: plain, or with a task.
+      num_episodes: number of episodes; with a threshold at most.
+      num_steps: maximal length of an episode; default the environment's horizon.
       confidence: of each interval, in (0, 1).
-      threshold: on the chance of success, in (0, 1).
+      threshold: on the success probability, in (0, 1).
       discount: in (0, 1), of `discounted_reward` and `discounted_visits`.
       batch: episodes simulated at a time, or a :class:`Batch` with a sharding.
 
     Returns:
-      :class:`Evaluation`, on the host.
+      :class:`Evaluation`, on the host; not differentiable.
 
     Raises:
-      ValueError: episodes that never end, a number out of range, a threshold without a task, or an
-        invalid agent, or actions that do not fit.
-
-    Not differentiable: what is returned is numbers of Python, from concrete arguments.
+      ValueError: episodes that never end, a number out of range, a threshold without a task, an
+        invalid agent, or invalid actions.
 
     Example:
       >>> from jaxltl import from_dense, task_environment
@@ -401,7 +393,7 @@ def _batch(
 
 
 def _decided(success: int, count: int, threshold: float, failure: float) -> bool | None:
-    """Whether the success probability is at least a threshold; None if undecided."""
+    """True if the success probability is at least a threshold; None if undecided."""
     lower, upper = anytime(np.array([success]), np.array([count]), failure)
     if lower[0] >= threshold:
         return True
@@ -462,13 +454,7 @@ def _told(
 
 
 def share_estimate(count: int, total: int, failure: float, fixed: bool = True) -> Estimate:
-    """A frequency with its interval: exact for a fixed number of trials, or anytime-valid.
-
-    Example:
-      >>> found = share_estimate(8, 10, 0.05)
-      >>> round(found.lower, 3), round(found.upper, 3), found.method
-      (0.444, 0.975, 'Clopper-Pearson')
-    """
+    """Frequency with its interval: exact for a fixed number of trials, or anytime-valid."""
     total = validation.integer("total", total, least=1, most=2**53)
     count = validation.integer("count", count, most=total)
     failure = validation.fraction("failure", failure, ends=(False, False))

@@ -44,12 +44,10 @@ class OptimalityGap(NamedTuple):
     Attributes:
       start: ``int32[N]``, their states in the table.
       weight: ``float64[N]``, their initial probabilities.
-      value, optimum: of the agent, and the best: :class:`~jaxltl.core.types.Solution` whose
-        `value`, `lower` and `upper` are ``float64[N]``.
+      value, optimum: of the agent, and optimal: :class:`~jaxltl.core.types.Solution` of ``[N]``.
       lower, upper: ``float64[N]``, bounds on the gap, optimum minus value.
-      mean: bounds on the mean gap over the beginnings.
-      mean_value, mean_optimum: bounds on theirs.
-      evidence: why the table is the environment, on which all bounds rest; see
+      mean, mean_value, mean_optimum: bounds on the means over the initial states.
+      evidence: of the equality of table and environment; see
         :class:`~jaxltl.core.environments.tabulate.Table`.
 
     Example:
@@ -85,21 +83,16 @@ def tabulate_policy(
     """Action probabilities of an agent in each tabulated state and automaton state.
 
     Args:
-      policy: a function of ``(observation, memory)``: an action, or the probabilities
-        ``float[A]``, of one world; `memory` is ``int32[]``, the state of the task's automaton. A
-        ``Partial`` with a network's parameters is compiled once.
-      environment: the one that was tabulated.
-      table: of it.
+      policy: function of ``(observation, memory)`` to an action or the probabilities ``float[A]``;
+        `memory` is ``int32[]``, the automaton state. A ``Partial`` is compiled once.
+      environment, table: the tabulated environment and its table.
       num_memory: Q.
 
     Returns:
-      ``int32[S, Q]`` or ``float[S, Q, A]``, for :func:`optimality_gap`.
+      ``int32[S, Q]`` or ``float[S, Q, A]``, for :func:`optimality_gap`; not differentiable.
 
     Raises:
-      ValueError: the table is none of :func:`~jaxltl.core.environments.tabulate.tabulate`, the number of
-        memories is none, or the policy is no function.
-
-    Not differentiable: the answer is a NumPy array.
+      ValueError: an invalid table, number of memory states, or policy.
 
     Example:
       >>> from jaxltl import make_environment, tabulate
@@ -148,27 +141,23 @@ def optimality_gap(
 
     Both are step-bounded reachability probabilities in the product of the table and the task (Baier
     and Katoen 2008, section 10.1.1): that some prefix of at most n steps has only satisfying
-    continuations, which :func:`~jaxltl.core.environments.task_environment.task_environment` counts
-    as success. Bounds include rounding. The optimum is over all policies, also time-dependent ones.
-    Without a limit of steps both are satisfaction probabilities. The last label of a terminated
-    episode repeats forever.
+    continuations. The optimum is over all policies, also time-dependent ones. Without a limit of
+    steps both are satisfaction probabilities. The last label of a terminated episode repeats
+    forever.
 
     Args:
       table: from :func:`~jaxltl.core.environments.tabulate.tabulate`.
-      task: a formula, its text, or an automaton. Memories are the states of
-        ``to_automaton(formula)``, as they are in a task's environment.
+      task: a formula, its text, or an automaton; memory states are those of its automaton.
       policy: actions ``int[S, Q]`` or their probabilities ``float[S, Q, A]``, such as
         :func:`tabulate_policy` returns. Rows that miss a sum of one by rounding are scaled.
-      num_steps: default the table's.
+      num_steps: n; default the table's.
 
     Returns:
-      :class:`OptimalityGap`.
+      :class:`OptimalityGap`. Concrete arrays only; not differentiable.
 
     Raises:
-      ValueError: a policy of another shape, or that is no distribution over the actions that are
-        allowed where a run may come to; or worlds that are cut off without a limit.
-
-    Concrete arrays only, on the host; not differentiable.
+      ValueError: a wrong shape, a reachable row of the policy that is not a distribution over
+        available actions, or a truncated table without a limit.
 
     Example:
       >>> from jaxltl import make_environment, tabulate

@@ -1,18 +1,18 @@
 """Certified values of policy against nature, or with it, by policy iteration inside ``jit``.
 
-Values carry a sign, such that one side, the leader, wants them large and must get out of what is
-open: of a probability who makes it large, of a reward until a target who makes it small. Policy
-iteration (Howard 1960; with two players, Hoffman and Karp 1966) over rows and distributions
-together, each round one linear system. It is done of the problem in which each step costs the
-leader a little more, and of that in which each earns a little more: the solutions are bounds, by
-one application of the operator with room for rounding.
+Values carry a sign, such that one player, the leader, maximises them and must leave the open
+states: the maximiser of a probability, the minimiser of a reward until a target. Policy iteration
+(Howard 1960; with two players, Hoffman and Karp 1966) over rows and distributions together, each
+round one linear system. It solves the problem in which each step costs the leader a little more,
+and that in which each earns a little more: the solutions are bounds, by one application of the
+operator with room for rounding.
 
-- Where each open state gains strictly, the leader's choices get out, whoever is against them, and
-  attain the bound.
+- Where each open state gains strictly, the leader's choices leave the open states against every
+  opponent, and attain the bound.
 - Where none gains, the bound holds for probabilities, as the value is the least solution, and for
-  rewards, as who does not reach the target pays without end. Where the leader may circle for
-  nothing, values have to be equal for this: steps between states of equal value earn nothing, and
-  values which rounding alone tells apart are made equal.
+  rewards, as a trajectory that does not reach the target has infinite cost. If the leader has free
+  cycles, this needs equal values on them: steps between states of equal value earn nothing, and
+  values that differ by rounding only are made equal.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from jaxltl.core.values.engine.linear import DENSE_LIMIT, inverse, solve_linear
 _AIM = 0.1  # of the tolerance: how much of it the extra of all steps may take
 _HASTY = 12  # rounds in which both sides move at once; then the leader waits for the other one
 _ROUNDS = 100
-_GROWTH = 8.0  # of the extra where nobody moves and yet nothing is proven
+_GROWTH = 8.0  # of the extra where no choice changes and yet no bound is proven
 _MOST_GROWTH = 1e5
 _PAIRS = 16  # entries of a row up to which each pair is compared
 _EQUAL = 2.0**12  # roundings by which equal values may differ
@@ -93,7 +93,7 @@ class Contest:
 class Bounds(NamedTuple):
     """Bounds of the nodes, and a pair of policy and nature."""
 
-    near: jax.Array  # float[N]: what the leader attains, and what it cannot exceed
+    near: jax.Array  # float[N]: bound that the leader attains; far: bound that it cannot exceed
     far: jax.Array
     attained: jax.Array  # whether they are proven
     bounded: jax.Array
@@ -114,10 +114,7 @@ def rounding(width: Any, dtype: Any) -> Any:
 
 
 def greedy_distributions(lower: jax.Array, upper: jax.Array, key: jax.Array) -> jax.Array:
-    """Greedy distributions between ends, least key first, ``float[R, W]``.
-
-    Differentiable in the ends, the order held fixed.
-    """
+    """Greedy distributions ``float[R, W]`` between the ends; differentiable, the order held fixed."""
     left, free = _left(lower, upper, key)
     left = jnp.where(left > rounding(key.shape[1], key.dtype), left, 0)
     return jnp.where(left >= free, upper, lower + jnp.maximum(left, 0))
@@ -224,7 +221,7 @@ def enclose(contest: Contest, tolerance: jax.Array, max_rounds: jax.Array) -> Bo
     low, high = contest.ahead(near.z), contest.ahead(far.z)
     p_low, p_high = contest.greedy(low), contest.greedy(high)
     lows, highs = (jnp.sum(p * d, axis=1) + contest.cost for p, d in ((p_low, low), (p_high, high)))
-    # Who leads shows what attains the one bound, and who is against it what attains the other.
+    # The leader's choices attain the one bound, those of the opponent the other.
     row = contest.best(lows if contest.policy_leads else highs)[1]
     middle = jnp.where(near.proven & far.proven, (near.z + far.z) / 2, near.base)
     return Bounds(
@@ -273,7 +270,7 @@ def _played(
         solve = system(target, share)[0]
         base = solve(jnp.sum(known, axis=1) + contest.cost[play.row] / mass)
         time = solve(steps)
-        # Never more again: else who goes round for it comes and goes with it.
+        # The extra never grows here: otherwise choices that cycle to earn it would alternate with it.
         aim = _extra(contest, base, time, tolerance)
         least = jnp.where(jnp.isfinite(aim), jnp.minimum(play.extra, aim), play.extra)
         extra = play.growth * least
@@ -281,7 +278,8 @@ def _played(
         if equal:
             z = _groups(z, contest.eps)[1]
         row, chance = _moved(contest, play, z, sign * extra * earning)
-        # Moves at once may end where nobody gets out; moves in turn do not.
+        # Simultaneous moves may end in a pair that never leaves the open states; alternating ones
+        # do not.
         lost = ~(jnp.all(jnp.isfinite(z)) & jnp.all(time >= 0))
         again = lost & play.hasty
         row, chance = (
@@ -303,7 +301,7 @@ def _played(
 
 
 def _extra(contest: Contest, base: jax.Array, time: jax.Array, tolerance: jax.Array) -> jax.Array:
-    """Extra of a step: small beside the tolerance, and more than rounding."""
+    """Extra of a step: small relative to the tolerance, and more than rounding."""
     largest = jnp.max(jnp.abs(base))
     scale: jax.Array | float = 1.0
     if contest.relative:
@@ -341,7 +339,7 @@ def _moved(
         best, row = contest.best(now)
         answers = -best > slack
         only = jnp.where(answers, row, play.row), play.probability
-        # A leader that waited moves, and the policy answers what it has found.
+        # A leader that waited moves, and the policy answers its distributions.
         moved = jnp.where(play.hasty, moved, play.row)
         chance = jnp.where(play.hasty, chance, jnp.where(better[:, None], greedy, play.probability))
     waits = ~play.hasty & jnp.any(answers)
@@ -349,7 +347,7 @@ def _moved(
 
 
 def _proves(contest: Contest, z: jax.Array, sign: float) -> jax.Array:
-    """Whether values are a bound: every node gains strictly, or none gains, rounding included."""
+    """True if values are a bound: every node gains strictly, or none gains, rounding included."""
     gain = contest.ahead(z)
     p = contest.greedy(gain)
     size = jnp.abs(gain)

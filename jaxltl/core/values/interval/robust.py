@@ -68,29 +68,26 @@ def robust_reachability(
 ) -> Solution:
     """Robust reachability probability of an interval MDP.
 
-    ``x(s) = opt_a opt_p sum_t p_t x(t)`` outside of the target, p among the distributions of row a
-    (Nilim and El Ghaoui 2005, Iyengar 2005); the least solution.
+    The least solution of ``x(s) = opt_a opt_p sum_t p_t x(t)`` outside of the target, p among the
+    distributions of row a (Nilim and El Ghaoui 2005, Iyengar 2005).
 
     Args:
-      model: the model, or a :class:`~jaxltl.core.models.game.Game` on one (or on a sparse model),
-        whose environment wants the opposite of its system.
+      model: the model, or a :class:`~jaxltl.core.models.game.Game` on one (or on a sparse model), in
+        which the environment has the opposite objective.
       target: ``bool[S]``, or the name of a label.
       policy: ``int32[S]``, rows, or ``float[R]``, their weights, to be evaluated; default:
-        optimise. Of a game, the system's, whose environment still chooses.
-      objective: ``"max"`` or ``"min"``, what the policy (the system) makes of the probability.
+        optimise. Of a game, the system's; the environment still optimises.
+      objective: ``"max"`` or ``"min"``, the direction of the policy (of the system).
       nature: ``"adversarial"`` (default), against the objective, or ``"cooperative"``.
       stay: ``bool[S]``, the states that may be passed; default all.
-      tolerance: the width of the enclosure asked for, 1e-6.
+      tolerance: width of the enclosure; default 1e-6.
 
     Returns:
-      :class:`Solution`, with `nature`.
+      :class:`Solution`, with `nature`. Concrete arrays only; :func:`robust_sensitivity` has the
+      derivatives in the ends.
 
     Raises:
-      ValueError: shapes, or a direction.
-
-    Concrete arrays only, on the host;
-    :func:`~jaxltl.core.values.interval.sensitivity.robust_sensitivity` has the derivatives in the
-    ends.
+      ValueError: a wrong shape or direction.
 
     Example:
       >>> from jaxltl import make_interval, make_sparse
@@ -123,26 +120,21 @@ def robust_total_reward(
     """Robust expected total reward of an interval MDP until a target is reached.
 
     ``x(s) = opt_a opt_p (r(s, a) + sum_t p_t x(t))`` outside of the target, infinite where the
-    target is not surely reached.
+    target is not reached almost surely.
 
     Args:
-      model: the model.
-      reward: as of :func:`~jaxltl.core.models.sparse.choice_reward`; at least 0. On transitions it is
-        taken of the successors with nature's distribution, so these must not differ within a row
-        unless the interval is a point.
-      target: ``bool[S]``, or the name of a label.
-      policy, objective, nature: as of :func:`robust_reachability`.
-      tolerance: the width of the enclosure asked for, as a share of the value, 1e-6.
+      model: the model; no games.
+      target, policy, objective, nature: as of :func:`robust_reachability`.
+      reward: as of :func:`~jaxltl.core.models.sparse.choice_reward`; at least 0. Rewards of
+        transitions must not differ within a row unless the interval is a point.
+      tolerance: width of the enclosure, relative to the value; default 1e-6.
 
     Returns:
-      :class:`Solution`, with `nature`.
+      :class:`Solution`, with `nature`. Concrete arrays only; :func:`robust_sensitivity` has the
+      derivatives in the ends.
 
     Raises:
-      ValueError: shapes, a direction, or a reward that is negative or depends on nature.
-
-    Concrete arrays only, on the host;
-    :func:`~jaxltl.core.values.interval.sensitivity.robust_sensitivity` has the derivatives in the
-    ends.
+      ValueError: a wrong shape or direction, or a reward that is negative or depends on nature.
 
     Example:
       >>> from jaxltl.core.models import interval_rows
@@ -177,20 +169,16 @@ def robust_discounted_value(
     iteration; the bounds are ``V +- |Phi V - V| / (1 - discount)``, with rounding.
 
     Args:
-      model: the model, or a game on one.
-      reward: of any sign, as of :func:`~jaxltl.core.models.sparse.choice_reward`; on transitions,
-        what nature picks earns it.
+      model, policy, objective, nature: as of :func:`robust_reachability`.
+      reward: of any sign, as of :func:`~jaxltl.core.models.sparse.choice_reward`.
       discount: in ``[0, 1)``.
-      policy, objective, nature: as of :func:`robust_reachability`.
-      tolerance: the width of the enclosure asked for; default 1e-8 of the largest possible value.
+      tolerance: width of the enclosure; default 1e-8 of the largest possible value.
 
     Returns:
-      :class:`Solution`, with `nature`.
+      :class:`Solution`, with `nature`. Concrete arrays only; not differentiable.
 
     Raises:
-      ValueError: shapes, a direction, the discount, or a reward that is not finite.
-
-    Concrete arrays only, on the host; not differentiable.
+      ValueError: a wrong shape, direction or discount, or a reward that is not finite.
 
     Example:
       >>> from jaxltl.core.models import interval_rows
@@ -213,8 +201,7 @@ def robust_expectation(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Robust expectation of the next state's value, for each choice.
 
-    ``min_p sum_t p_t value(t)``, or the maximum, over the distributions of each row: mass goes
-    first to the least (largest) values.
+    ``min_p sum_t p_t value(t)``, or the maximum, over the distributions of each row.
 
     Args:
       model: the model.
@@ -222,13 +209,12 @@ def robust_expectation(
       objective, nature: as of :func:`robust_reachability`; the default is the least expectation.
 
     Returns:
-      ``float64[R]``, and nature's distributions, ``float64[T]``.
+      ``float64[R]``, and nature's distributions, ``float64[T]``. Concrete arrays only; not
+      differentiable.
 
     Raises:
-      ValueError: a direction, the shape of the value, a model without intervals, or a successor's
-        value that is not finite.
-
-    Concrete arrays only, on the host; not differentiable.
+      ValueError: a wrong direction or shape, a model without intervals, or a value of a successor
+        that is not finite.
 
     Example:
       >>> from jaxltl.core.models import interval_rows
@@ -364,7 +350,7 @@ def sides_of(model: Any, policy: Any, objective: str, nature: str | None) -> Sid
         return host_sides(world.host, system, objective, nature)._replace(model=world)
     helpful = nature_direction(nature, objective) == "max"
     parted = _under(world, np.asarray(policy), True if system is None else system)
-    # What is left to choose is the environment's, against the policy.
+    # The remaining choices are those of the environment, against the policy.
     against = helpful if system is None else objective == "min"
     return Sides(world, parted.model, against, helpful, parted, policy)
 
@@ -390,7 +376,7 @@ def host_sides(
     maximize = objective == "max"
     if system is None:
         return Sides(None, host, maximize, helpful, None, None)
-    # Who wants what nature wants becomes nature, and the other one is the policy.
+    # The player with nature's objective becomes nature, and the other one is the policy.
     rows = np.ones(host.mdp.num_rows)
     parted = let_nature_choose(host, system if maximize == helpful else ~system, 0 * rows, rows)
     return Sides(None, parted.model, not helpful, helpful, parted, None)

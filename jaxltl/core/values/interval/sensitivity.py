@@ -27,8 +27,7 @@ class Sensitivity(NamedTuple):
 
     Example:
       >>> change = Sensitivity(lower=np.zeros(2), upper=np.array([0.0, -1.0]))
-      >>> narrower = np.array([0.0, -0.1])  # by how much the upper ends come down
-      >>> (change.upper @ narrower).item()  # what the value gains by it, to first order
+      >>> (change.upper @ np.array([0.0, -0.1])).item()  # first-order change of the value
       0.1
     """
 
@@ -48,29 +47,24 @@ def robust_sensitivity(
 ) -> Sensitivity:
     """Derivatives of a robust value in the ends of all intervals.
 
-    ``dV = sum_s y(s) (v(t) - v(t*)) d end(s, t)`` with y how often each state is visited,
-    ``y = initial + P' y`` under the policy and nature, an end that binds, and t* the successor that
-    is given the rest of the mass: the implicit function theorem, with one sparse system for all
-    ends. Policy and order of successors are held fixed; where neither is tied, this is the
-    derivative, else one of several one-sided ones.
+    ``dV = sum_s y(s) (v(t) - v(t*)) d end(s, t)`` with the expected visits ``y = initial + P' y``
+    under the policy and nature, a binding end, and t* the successor that gets the remaining mass
+    (implicit function theorem). Policy and order of successors are held fixed; with ties, this is
+    one of several one-sided derivatives.
 
     Args:
       model: the model.
-      solution: of it: the probability of reaching a target, or the reward until it is reached.
-      target: ``bool[S]``, or the name of a label.
-      objective, nature: the directions that the solution was asked for.
-      stay: ``bool[S]``, the states that may be passed, if the solution was asked so; default all.
+      solution: of :func:`robust_reachability` or :func:`robust_total_reward`.
+      target, objective, nature, stay: the arguments of that solution.
       initial: ``float[S]``, weights of the states; default the initial distribution.
 
     Returns:
-      :class:`Sensitivity`. The wider an interval that matters, the more is gained by narrowing it:
-      ``upper * (model.upper - p) + lower * (model.lower - p)`` estimates by how much.
+      :class:`Sensitivity`; ``upper * (model.upper - p) + lower * (model.lower - p)`` estimates the
+      effect of narrowing the intervals. Concrete arrays only; not differentiable.
 
     Raises:
-      ValueError: shapes, a direction, a policy of weights, a model with a radius, or an infinite
-        value from the initial states.
-
-    It is a derivative, and not differentiable itself: concrete arrays only, on the host.
+      ValueError: a wrong shape or direction, a policy of weights, a model with a radius, or an
+        infinite value from the initial states.
 
     Example:
       >>> from jaxltl import make_interval, make_sparse

@@ -28,16 +28,15 @@ def robust_next_probability(
     Args:
       model: the model.
       target: ``bool[S]``, or the name of a label.
-      objective: ``"max"`` or ``"min"``, what the policy makes of the probability.
+      objective: ``"max"`` or ``"min"``, the direction of the policy.
       nature: ``"adversarial"`` (default), against the objective, or ``"cooperative"``.
 
     Returns:
-      :class:`~jaxltl.core.types.Solution`, exactly 0 or 1 where supports say so.
+      :class:`~jaxltl.core.types.Solution`, exactly 0 or 1 where the graph decides. Concrete arrays
+      only; not differentiable.
 
     Raises:
-      ValueError: the target, or a direction.
-
-    Concrete arrays only, on the host; not differentiable.
+      ValueError: an invalid target or direction.
 
     Example:
       >>> from jaxltl.core.models import interval_rows
@@ -66,23 +65,19 @@ def robust_bounded_reachability(
     """Robust step-bounded reachability probability.
 
     ``x_0 = [s in target]``, and ``x_{k+1}(s) = 1`` on the target, ``opt_a opt_p sum_t p_t x_k(t)``
-    where one may stay, else 0; nature picks anew in each step (Givan, Leach and Dean 2000).
+    in `stay`, else 0; nature picks anew in each step (Givan, Leach and Dean 2000).
 
     Args:
-      model: the model.
-      target: ``bool[S]``, or the name of a label.
-      num_steps: how many steps there are at most.
-      stay: ``bool[S]`` or a label, what must hold before the target is reached; default anything.
-      objective, nature: as of :func:`robust_next_probability`.
+      model, target, objective, nature: as of :func:`robust_next_probability`.
+      num_steps: maximal number of steps.
+      stay: ``bool[S]`` or a label that must hold before the target is reached; default everywhere.
 
     Returns:
-      :class:`~jaxltl.core.types.Solution`; `policy` and `nature` are of the first
-      step, with all steps left.
+      :class:`~jaxltl.core.types.Solution`; `policy` and `nature` are of the first step. Concrete
+      arrays only; not differentiable.
 
     Raises:
-      ValueError: a shape, a direction, or a negative number of steps.
-
-    Concrete arrays only, on the host; not differentiable.
+      ValueError: a wrong shape or direction, or a negative number of steps.
 
     Example:
       >>> from jaxltl.core.models import interval_rows
@@ -117,18 +112,16 @@ def robust_cumulative_reward(
     in each step.
 
     Args:
-      model: the model.
+      model, objective, nature: as of :func:`robust_next_probability`.
       reward: as for :func:`~jaxltl.core.models.sparse.choice_reward`; finite, of any sign.
-      num_steps: how many steps.
-      objective, nature: as of :func:`robust_next_probability`.
+      num_steps: n.
 
     Returns:
-      :class:`~jaxltl.core.types.Solution`, as of :func:`robust_bounded_reachability`.
+      :class:`~jaxltl.core.types.Solution`, as of :func:`robust_bounded_reachability`. Concrete
+      arrays only; not differentiable.
 
     Raises:
       ValueError: the reward, a direction, or a negative number of steps.
-
-    Concrete arrays only, on the host; not differentiable.
 
     Example:
       >>> from jaxltl.core.models import interval_rows
@@ -153,18 +146,16 @@ def robust_instantaneous_reward(
     ``x_{k+1}(s) = opt_a opt_p sum_t p_t x_k(t)`` from the rewards of states ``x_0 = r``.
 
     Args:
-      model: the model.
+      model, objective, nature: as of :func:`robust_next_probability`.
       reward: as for :func:`~jaxltl.core.values.undiscounted.step_bounded.instantaneous_reward`.
-      num_step: after how many steps.
-      objective, nature: as of :func:`robust_next_probability`.
+      num_step: n.
 
     Returns:
-      :class:`~jaxltl.core.types.Solution`, as of :func:`robust_bounded_reachability`.
+      :class:`~jaxltl.core.types.Solution`, as of :func:`robust_bounded_reachability`. Concrete
+      arrays only; not differentiable.
 
     Raises:
       ValueError: the reward has no part on states, or as for :func:`robust_cumulative_reward`.
-
-    Concrete arrays only, on the host; not differentiable.
 
     Example:
       >>> from jaxltl.core.models import interval_rows

@@ -46,25 +46,22 @@ def achievable(
 ) -> Achievable:
     """Achievability: does one policy, with memory and randomisation, meet all thresholds?
 
-    Weighted sums are solved one after the other: each adds a point that its policy attains and a
-    half-space that no policy leaves (Forejt, Kwiatkowska and Parker 2012). Thresholds are met if a
-    mixture of points meets them, and not if a half-space excludes them. Near the border sums are
-    solved more accurately, down to rounding.
+    Each weighted sum adds a point that its policy attains and a half-space that no policy leaves
+    (Forejt, Kwiatkowska and Parker 2012). Thresholds are met if a mixture of points meets them, and
+    not if a half-space excludes them.
 
     Args:
       model: a SparseMDP, or any concrete model that :func:`to_sparse` takes.
       objectives: two or more, as of :class:`Objective`.
       thresholds: lower ones for ``"max"``, upper ones for ``"min"``; default the objectives'.
       tolerance: the accuracy of the first sums.
-      max_points: weighted sums at most.
+      max_points: maximal number of weighted sums.
 
     Returns:
-      :class:`Achievable`, with the front as evidence.
+      :class:`Achievable`, with the front as evidence. Concrete arrays only; not differentiable.
 
     Raises:
       ValueError: an invalid objective, or an expected reward that is infinite.
-
-    Concrete arrays only, on the host; not differentiable.
 
     Example:
       >>> from jaxltl import make_sparse
@@ -101,15 +98,13 @@ def pareto(
     Args:
       model, objectives: as for :func:`achievable`.
       tolerance: the largest distance of a value beyond the mixtures of points.
-      max_points: weighted sums at most.
+      max_points: maximal number of weighted sums.
 
     Returns:
-      :class:`Pareto`.
+      :class:`Pareto`. Concrete arrays only; not differentiable.
 
     Raises:
       ValueError: as for :func:`achievable`.
-
-    Concrete arrays only, on the host; not differentiable.
 
     Example:
       >>> from jaxltl import make_sparse
@@ -160,20 +155,17 @@ def multi_objective(
     """Multi-objective query, as ``multi(...)`` of PRISM and Storm.
 
     Args:
-      model, objectives: as for :func:`achievable`. Those with a threshold must meet it. One
-        without a threshold is optimised; if two or more have none, none may have one.
+      model, objectives, max_points: as for :func:`achievable`. One objective without a threshold is
+        optimised; if two or more have none, none may have one.
       tolerance: the width of the bounds, relative where the value exceeds one.
-      max_points: weighted sums at most.
 
     Returns:
       :class:`Achievable` if all have thresholds, :class:`ConstrainedOptimum` if one has none, and
-      :class:`Pareto` if none has one.
+      :class:`Pareto` if none has one. Concrete arrays only; not differentiable.
 
     Raises:
       ValueError: some but not all of several objectives without a threshold; or as for
         :func:`achievable`.
-
-    Concrete arrays only, on the host; not differentiable.
 
     Example:
       >>> from jaxltl import make_sparse

@@ -110,9 +110,8 @@ class ConstrainedOptimum(NamedTuple):
     Attributes:
       value, lower, upper: the value and its certified bounds; NaN if the thresholds cannot be met.
         If that is unknown, they hold provided that they can; one bound is infinite.
-      holds: whether the thresholds can be met; None if unknown.
-      share: the probabilities with which the front's policies are drawn initially, which attain the
-        bound on the safe side; None without any.
+      holds: True if the thresholds can be met; None if unknown.
+      share: initial probabilities of the front's policies that attain the safe bound, or None.
       front: the evidence.
       status: CONVERGED if the bounds are narrow, or the thresholds cannot be met.
       nearest: if `holds` is unknown, the best of the mixtures nearest to the thresholds.

@@ -1,8 +1,8 @@
 """Certified bounds on cyclic blocks: optimistic value iteration, then policy iteration.
 
-A lower bound rises from zero, and what is a little above it is an upper bound once a pass does not
+A lower bound rises from zero, and a guess a little above it is an upper bound once a pass does not
 raise it (Hartmanns and Kaminski 2020). Where that takes long, policies are evaluated by Krylov
-steps on passes (Howard 1960), of the problem in which every step costs a little more: its solution
+steps on passes (Howard 1960), for the problem in which every step costs a little more: its solution
 is a bound by one application of the operator, and its policy attains a bound that the policy's
 expected time proves. Each bound is rounded outwards.
 """
@@ -19,15 +19,15 @@ from jax import lax
 from jaxltl.core.values.engine.block_sweeps import Blocks, Chosen, images, sweep
 
 SLACK = 1e6  # smallest numbers that a guess is above nothing
-_NEAR = 0.9  # of the width asked for, how far the first guess of a bound is from the other
+_NEAR = 0.9  # distance of the first guess of a bound from the other, as a share of the tolerance
 _FINER = 0.25  # how much nearer values come before the next guess
 _PATIENCE = 20  # passes, and a quarter of those before, until a guess is given up
 _PASSES = 100  # until policy iteration is tried
 _ROUNDS = 40  # of it
-_HASTY = 15  # of them, which go on by passes; then its own improvement alone, which must end
+_HASTY = 15  # rounds continued by passes; then policy improvement alone, which must end
 _SWEEPS = 12
 _AIM = 0.1  # of the tolerance: how much of it the extra cost of the steps may take
-_KEPT = 0.75  # of the extra cost: who gains less stays, and the rest is what proves the bound
+_KEPT = 0.75  # of the extra cost: rows that gain less are kept, and the rest proves the bound
 
 
 class Problem(NamedTuple):
@@ -197,7 +197,7 @@ def _by_policies(problem: Problem, state: State, high: jax.Array) -> State:
     core, x = problem.core, state.low[problem.span]
     rows = _choices(problem, x.dtype)
     sign = rows.sign
-    # What comes in from before lies between its bounds, so each side is proven with its own.
+    # Values of earlier blocks lie between their bounds, so each side is proven with its own bound.
     middle = state.low.at[: core.first].set((state.low[: core.first] + high[: core.first]) / 2)
 
     def improve(p: _Policy) -> _Policy:
@@ -247,7 +247,7 @@ def _proven(rows: _Choices, state: State, high: jax.Array, p: _Policy) -> State:
     outer_far, outer_near = (high, state.low) if sign > 0 else (state.low, high)
     beyond = sign * far - sign * rows.best(rows.image(outer_far, far))[1]
     attained = sign * _of(p.rank, rows.image(outer_near, near)) - sign * near
-    # What is known, and places without a node, which are worth nothing.
+    # Known values, and places without a node, which have the value 0.
     fixed = (rows.keep == 0) | jnp.all(core.weight == 0, axis=(1, 2)).ravel()
     far, near = (jnp.where(fixed, rows.put, y) for y in (far, near))
     slack = problem.unit * jnp.abs(far) * 2 + problem.least
@@ -284,7 +284,7 @@ def _swept(
 
 
 def _extra(problem: Problem, value: jax.Array, time: jax.Array, keep: jax.Array) -> jax.Array:
-    """Extra cost of a step: small beside the tolerance, and more than rounding."""
+    """Extra cost of a step: small relative to the tolerance, and more than rounding."""
     time = jnp.maximum(time, 1)
     share = 1 / jnp.max(time)
     if problem.relative:

@@ -1,4 +1,4 @@
-"""Preprocessing of questions whose probabilities and rewards are given later."""
+"""Preprocessing of questions for solves with other probabilities and rewards."""
 
 from __future__ import annotations
 
@@ -31,25 +31,24 @@ from jaxltl.core.values.prepared.prepared_interval import PreparedInterval, prep
 @brief(facts=facts.prepared)
 @struct.dataclass
 class Prepared:
-    """A question about a model after preprocessing, for solves with other numbers.
+    """Preprocessed question about a model, for solves with other numbers.
 
-    Made by :func:`prepare`, read by :func:`solve_prepared`. Give it to a compiled function as an
-    argument: what a function closes over becomes part of the program.
+    Result of :func:`prepare`, argument of :func:`solve_prepared`. Pass it to compiled functions as an
+    argument; a closed-over one becomes part of the program.
 
     Attributes:
       segments: the blocks.
-      place: ``int32[S]``, where a state's value is.
+      place: ``int32[S]``, the place of a state's value.
       nodes: ``int32[M]``, the places with rows; others fill blocks.
-      own: ``int32[S]``, the place whose row a state takes, or -1.
+      own: ``int32[S]``, the place from which a state takes its row, or -1.
       row: ``int32[S]``, the row that it takes else.
-      entry_row: ``int32[T]``, the row of each transition.
-      row_state: ``int32[R]``, the state of each row.
+      entry_row, row_state: ``int32[T]`` and ``int32[R]``, row of a transition, state of a row.
       probability, reward: ``float[T]`` and ``float[R]``, as they were.
-      loops: rows that lead to where they are: entries, groups, rows, groups of these; or None.
+      loops: self-loops: entries, groups, rows, groups of these; or None.
       cycles: end components that are one node, or None.
       question: ``"probability"`` or ``"reward"``, static.
       objective: ``"max"``, ``"min"`` or ``"policy"``, static.
-      cyclic: whether some nodes are on cycles, static.
+      cyclic: True if some nodes are on cycles, static.
       levels, choices, terms, groups: see the plan, static.
 
     Example:
@@ -108,28 +107,25 @@ def prepare(
     """Prepares a question about a model for solves with other numbers inside ``jit``.
 
     Contracts chains of single successors and end components, removes states of value 0, 1 or
-    infinity, and orders the others in blocks of equal shape, in reverse topological order: one pass
-    solves an acyclic system.
+    infinity, and orders the others in blocks of equal shape, in reverse topological order.
 
     Args:
-      model: a concrete SparseMDP, or what :func:`~jaxltl.core.models.construct.convert.to_sparse` takes.
+      model: a concrete SparseMDP, or any argument of :func:`to_sparse`.
       target: ``bool[S]``.
       stay: ``bool[S]``, the states that may be passed before; default all. Not with a reward.
       reward: asks for the expected total reward until the target and not for the probability of
         reaching it; as of :func:`~jaxltl.core.models.sparse.choice_reward`, finite and at least 0.
       policy: of an IntervalMDP, rows ``int32[S]`` to be evaluated; default: optimise.
       objective: ``"max"``, ``"min"``, or ``"policy"`` for values of policies that are given later.
-      nature: of an IntervalMDP, ``"adversarial"`` (default) or ``"cooperative"``, see
-        :func:`~jaxltl.core.values.prepared.prepared_interval.prepare_interval`.
+      nature: of an IntervalMDP, ``"adversarial"`` (default) or ``"cooperative"``.
 
     Returns:
-      A pytree of arrays. Which transitions are possible and which rewards are zero is settled.
+      A pytree of arrays. The support and the rewards that are zero are fixed. Not differentiable;
+      :func:`solve_prepared` is.
 
     Raises:
       ValueError: a shape or the objective is wrong, a reward is negative or not finite, there is
         `stay` with a reward, or something is traced.
-
-    Not differentiable: it reads the graph, on the host; :func:`solve_prepared` has the derivatives.
 
     Example:
       >>> from jaxltl import make_sparse, solve_prepared

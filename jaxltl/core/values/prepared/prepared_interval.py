@@ -47,28 +47,26 @@ _LOOSE = 1e-6  # how far ends may miss a distribution, as in the models
 @brief(facts=facts.prepared)
 @struct.dataclass
 class PreparedInterval:
-    """A preprocessed question about an interval model, see :class:`Prepared`.
+    """Preprocessed question about an interval model, see :class:`Prepared`.
 
     Undecided states are the nodes 0 to N - 1; the nodes N, N + 1 and N + 2 have the values 0, 1
     and infinity.
 
     Attributes:
-      table: ``int32[R', W]``, the entries of the rows that are left, T where there is none.
-      target: ``int32[R', W]``, the nodes that they lead to.
-      owner: ``int32[R']``, the node of each row.
-      row: ``int32[R']``, which row of the model it is.
-      choice: ``int32[N, A]``, the rows of a node; the first one again where it has fewer.
-      first: ``int32[N]``, a row by which it gets out.
+      table, target: ``int32[R', W]``, entries of the remaining rows (T is padding), and their nodes.
+      owner, row: ``int32[R']``, the node of each row, and its row of the model.
+      choice: ``int32[N, A]``, the rows of a node, padded with the first one.
+      first: ``int32[N]``, a row that leaves the node.
       node: ``int32[S]``, of each state.
       policy: ``int32[S]``, rows of states that are no nodes, or of all if a policy was given.
       entry_row: ``int32[T]``, the row of each entry.
       kept: ``bool[T]``, entries to which nature keeps where values are known.
-      answers: what must stay so: entries, questions, their rows, answers.
+      answers: invariants of the preprocessing: entries, questions, their rows, answers.
       lower, upper, reward: ``float[T]``, ``float[T]``, ``float[R]``, as they were.
       question: ``"probability"`` or ``"reward"``, static.
       objective, nature_objective: ``"max"`` or ``"min"``, of the policy and of nature, static.
       num_rows: R, static.
-      has_free_cycles: whether who gets out may stay for ever, static.
+      has_free_cycles: True if the leader may cycle for ever at no cost, static.
 
     Example:
       >>> from jaxltl.core.models import interval_rows
@@ -137,7 +135,7 @@ def prepare_interval(
         host, entry = host.under_policy(policy)
     up, large = objective == "max", direction == "max"
     if policy is not None:
-        up = large  # who decides nothing wants what nature wants
+        up = large  # without choices, the policy has the objective of nature
     cost = None if reward is None else interval_reward(model, reward)
     if cost is None:
         plan = plan_reachability(host, target, stay, Query(up, large))
@@ -278,7 +276,7 @@ def _solve(
 def _checked(
     prepared: PreparedInterval, lower: Any, upper: Any, reward: Any
 ) -> tuple[jax.Array, jax.Array]:
-    """Whether numbers are finite, and whether preprocessing holds for them."""
+    """Tests that numbers are finite, and that the preprocessing holds for them."""
     finite, valid = jnp.asarray(True), jnp.asarray(True)
     if lower is not None or upper is not None:
         low = prepared.lower if lower is None else lower
@@ -368,7 +366,7 @@ def _answer(
     narrow = jnp.all((high - low <= tolerance * scale) & (low <= high))
     proven = found.attained & found.bounded
     small = residual <= tolerance * jnp.max(jnp.abs(middle), initial=1 if not is_reward else 0)
-    valid |= ~finite  # of numbers that are none, that is said
+    valid |= ~finite  # NaN and infinity have the status NONFINITE
     finite &= jnp.all(jnp.isfinite(lax.stop_gradient(middle)))
     status = status_code(proven & narrow, finite, proven, valid=valid)
     status = jnp.where(~proven & small & (status == Status.MAX_STEPS), Status.UNCERTIFIED, status)

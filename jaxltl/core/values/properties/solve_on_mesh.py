@@ -46,7 +46,7 @@ class Question:
 
     @property
     def goes_on(self) -> bool:
-        """Whether the solver narrows bounds step by step."""
+        """True if the solver narrows bounds step by step."""
         return self.prop.operator == "P"
 
     def tolerance(self, wanted: float, part: float = 1.0) -> float:
@@ -63,7 +63,7 @@ class Question:
         return as_answer(self.prop, self.states, told, wanted, f"{method} on the mesh")
 
     def is_answered(self, answer: Answer, part: float) -> bool:
-        """Whether the bounds are the narrowest of those in :data:`FINER`."""
+        """True if the answer needs no narrower bounds of those in :data:`FINER`."""
         return self.prop.relation is None or answer.status == Status.CONVERGED or part <= FINER[-1]
 
 
@@ -178,7 +178,7 @@ def _pick_memory(both: Product, places: jax.Array, quantity: jax.Array) -> jax.A
 
 
 def _shown_by(model: ShardedMDP, holds: np.ndarray) -> jax.Array:
-    """Where a state shows one of the labels that are marked."""
+    """Mask of the states with a marked label."""
     return jax.jit(lambda kind: kernels.gather(jnp.asarray(holds), kind))(model.kind)
 
 

@@ -157,18 +157,14 @@ def solve_property(
       tolerance: width of the bounds, absolute for probabilities and relative otherwise.
 
     Returns:
-      :class:`Answer`. A threshold that the bounds do not decide is tried with narrower bounds; if
-      it remains undecided, `holds` is None and the status is not CONVERGED. Of ``multi(...)``, from the
-      initial distribution:
-      :class:`~jaxltl.core.values.multi_objective.multi_objective.Achievable` if all objectives have
-      thresholds, :class:`~jaxltl.core.values.multi_objective.multi_objective.ConstrainedOptimum` if
-      one has none, :class:`~jaxltl.core.values.multi_objective.multi_objective.Pareto` if none has.
+      :class:`Answer`. If narrower bounds do not decide a threshold either, `holds` is None and the
+      status is not CONVERGED. For ``multi(...)``, the result of
+      :func:`~jaxltl.core.values.multi_objective.multi_objective.multi_objective`. Concrete arrays
+      only; not differentiable.
 
     Raises:
       ValueError: an unknown label or reward; a missing direction; a property that is not
         supported, with the reason.
-
-    Concrete arrays only, on the host; not differentiable.
 
     Example:
       >>> from jaxltl import make_sparse
@@ -176,10 +172,6 @@ def solve_property(
       ...                    initial=[1, 0, 0], label=[[0], [1], [0]], propositions=["a"])
       >>> solve_property(coin, 'P=? [ F "a" ]').value.tolist()
       [0.5]
-      >>> solve_property(coin, 'P>0.4 [ X "a" ]').holds
-      [True]
-      >>> solve_property(coin, 'multi(P>=0.4 [ F "a" ], P<=0.6 [ X "a" ])').holds
-      True
     """
     prop = parse_property(prop) if isinstance(prop, str) else prop
     if not isinstance(prop, Property):
