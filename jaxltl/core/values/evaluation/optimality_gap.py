@@ -157,7 +157,7 @@ def optimality_gap(
 
     Raises:
       ValueError: a wrong shape, a reachable row of the policy that is not a distribution over
-        available actions, or a truncated table without a limit.
+        available actions, or a table with truncated episodes without `num_steps`.
 
     Example:
       >>> from jaxltl import make_environment, tabulate
