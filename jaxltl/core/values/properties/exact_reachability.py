@@ -17,17 +17,7 @@ MAX_UNDECIDED = 32  # elimination with fractions of thousands of bits: a tenth o
 def exact_reachability(
     chain: HostMDP, target: Booleans, stay: Booleans | None = None
 ) -> tuple[Floats, Floats] | None:
-    """Bounds on reachability probabilities that differ only where the exact value is not a double.
-
-    Eliminates states in rational arithmetic; rows are normalised exactly. None if the chain is too
-    large.
-
-    >>> coin = HostMDP(np.arange(4), np.array([0, 2, 3, 4]), np.array([1, 2, 1, 2]),
-    ...                np.array([0.5, 0.5, 1, 1]))
-    >>> lower, upper = exact_reachability(coin, np.array([False, True, False]))
-    >>> lower.tolist(), upper.tolist()
-    ([0.5, 1.0, 0.0], [0.5, 1.0, 0.0])
-    """
+    """Reachability bounds by rational state elimination; None if the chain is too large."""
     if chain.num_states > MAX_STATES:
         return None
     inner = ~target if stay is None else stay & ~target
