@@ -13,16 +13,16 @@ from benchmarks import size
 
 PACKAGE = Path(jaxltl.__file__).parent
 LIMITS = {
-    "lines": 91_550,
-    "statements": 42_500,
-    "docstring lines": 19_400,
-    "functions with more than 6 parameters": 93,
-    "functions with more than 9 parameters": 8,
-    "Any in annotations": 2_040,
+    "lines": 85_900,
+    "statements": 42_350,
+    "docstring lines": 13_900,
+    "functions with more than 6 parameters": 67,
+    "functions with more than 9 parameters": 1,
+    "Any in annotations": 1_195,
     "modules of the largest folder": 20,
     "names at the top level": 80,
 }
-MODULE_LINES, BODY_LINES = 690, 68
+MODULE_LINES, BODY_LINES = 600, 68
 MEASURED = size.measure(PACKAGE)
 
 
