@@ -36,6 +36,7 @@ def many_objects(num: int) -> dict[str, dict[str, int]]:
 
 
 def make_kinds(objects: Counts, obstacles: Counts) -> Kinds:
+    """Validated cell kinds: names with colour counts."""
     kinds: dict[str, tuple[int, ...]] = {}
     for name, counts in [*objects.items(), *obstacles.items()]:
         if name in kinds:
@@ -92,6 +93,7 @@ def categories(
 
 
 def codes_of(kinds: Kinds) -> NDArray[np.int64]:
+    """Code of each kind from its colour counts."""
     return _code(np.array([row for _, row in kinds]).reshape(-1, len(COLORS)))
 
 
@@ -100,6 +102,7 @@ def _crop(colors: NDArray[Any], width: int) -> NDArray[Any]:
 
 
 def check_margin(margin: int) -> None:
+    """Raises ValueError unless a margin is at least 1."""
     if margin < 1:
         raise ValueError(f"margin={margin}; cells at the border need a ring of at least 1.")
 

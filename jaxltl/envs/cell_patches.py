@@ -38,6 +38,7 @@ def plan_map(
 
 
 def stamps_of(kinds: Kinds) -> list[NDArray[np.int64]]:
+    """One 3 x 3 patch per kind."""
     order = np.array([4, 0, 2, 6, 8, 1, 3, 5, 7])  # centre, corners, and the rest
     stamps = []
     for _, counts in kinds:

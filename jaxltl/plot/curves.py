@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -30,12 +29,8 @@ from jaxltl.plot.style import (
 )
 
 
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
-
-
 def curves(
-    metrics: Mapping[str, ArrayLike] | DataclassInstance,
+    metrics: Mapping[str, ArrayLike] | object,
     *,
     steps: ArrayLike | None = None,
     show: Sequence[str] | None = None,
@@ -67,11 +62,13 @@ def curves(
 
 
 def _shown(
-    what: str, metrics: Mapping[str, ArrayLike] | DataclassInstance, show: Sequence[str] | None
+    what: str, metrics: Mapping[str, ArrayLike] | object, show: Sequence[str] | None
 ) -> dict[str, NDArray[np.float64]]:
     """The chosen metrics by name, without those that are NaN everywhere."""
     if not isinstance(metrics, Mapping):
-        metrics = {name: getattr(metrics, name) for name in metrics.__dataclass_fields__}
+        metrics = {
+            name: getattr(metrics, name) for name in vars(type(metrics))["__dataclass_fields__"]
+        }
     every = {k: np.asarray(v, float) for k, v in metrics.items()}
     found = {k: every[k] for k in (show or every) if k in every and np.isfinite(every[k]).any()}
     if not found:
@@ -141,7 +138,7 @@ def bands(
 
 
 def sweep(
-    metrics: Mapping[str, ArrayLike] | DataclassInstance,
+    metrics: Mapping[str, ArrayLike] | object,
     settings: Sequence[str],
     *,
     steps: ArrayLike | None = None,

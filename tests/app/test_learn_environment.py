@@ -93,7 +93,7 @@ CCE = (
 )
 CPO = (
     CCE[0],
-    '[cpo]\nlimit = 0.5\ncost = "violation"\nnum_trajectories = 16\nhidden = [4]\n'
+    '[cpo]\nlimit = 0.5\ncost = "violation"\nnum_trajectories = 32\nhidden = [4]\n'
     "value_hidden = [4]\nvalue_batches = 2",
 )
 

@@ -103,6 +103,7 @@ def refuse_wrappers(root: str, env: Any, attribute: str, kinds: Any, remedy: str
 
 
 def layers(env: Any, attribute: str) -> Iterator[Any]:
+    """An environment and the environments that it wraps, outermost first."""
     while env is not None:
         yield env
         env = vars(env).get(attribute) if hasattr(env, "__dict__") else None
@@ -150,6 +151,7 @@ def _label_state(labels: Callable[..., jax.Array], world: Any) -> jax.Array:
 
 
 def observation_of(world: Any) -> Any:
+    """The observation stored in a wrapped state."""
     return world.observation
 
 

@@ -84,6 +84,7 @@ def from_gymnax(
 
 
 def space_of_actions(root: str, space: Any) -> Finite | Box:
+    """Action space from a gymnax space."""
     if hasattr(space, "n"):
         return Finite(int(space.n))
     if hasattr(space, "low") and hasattr(space, "high"):

@@ -205,6 +205,7 @@ def _edges(automaton: Automaton, q: int) -> Iterator[tuple[int, int, list[Cube]]
 
 
 def quoted(text: str) -> str:
+    """Quotes and escapes a text."""
     return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
 
 

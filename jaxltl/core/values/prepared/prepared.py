@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, TypeAlias
 import chex
 import jax
 import jax.numpy as jnp
-import numpy.typing as npt
+from numpy.typing import ArrayLike
 from jax import lax
 
 from jaxltl.core.models.ops.operators import is_deterministic
@@ -117,7 +117,7 @@ def solve_prepared(
 
 
 def _given_numbers(
-    prepared: Prepared, probability: npt.ArrayLike | None, reward: npt.ArrayLike | None
+    prepared: Prepared, probability: ArrayLike | None, reward: ArrayLike | None
 ) -> tuple[jax.Array | None, jax.Array | None]:
     """Given probabilities and rewards, with checked shapes."""
     p, r = (None if x is None else jnp.asarray(x) for x in (probability, reward))

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, overload
 import jax
 import jax.numpy as jnp
 import numpy as np
-import numpy.typing as npt
+from numpy.typing import ArrayLike
 from jax import lax
 
 from jaxltl.core.values.engine.state_quantities import reduction_for
@@ -138,7 +138,7 @@ def optimal_satisfaction(
     *,
     objective: str = "max",
     nature: str | None = None,
-    states: npt.ArrayLike | None = None,
+    states: ArrayLike | None = None,
     label_on: str | None = None,
     tolerance: float | None = None,
 ) -> Satisfaction: ...
@@ -151,7 +151,7 @@ def optimal_satisfaction(
     *,
     objective: str = "max",
     nature: str | None = None,
-    states: npt.ArrayLike | None = None,
+    states: ArrayLike | None = None,
     label_on: str | None = None,
     tolerance: Any = None,
     max_steps: jax.Array | int | None = None,
