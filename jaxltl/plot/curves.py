@@ -67,7 +67,8 @@ def _shown(
     """The chosen metrics by name, without those that are NaN everywhere."""
     if not isinstance(metrics, Mapping):
         metrics = {
-            name: getattr(metrics, name) for name in vars(type(metrics))["__dataclass_fields__"]
+            name: getattr(metrics, name)
+            for name in getattr(type(metrics), "__dataclass_fields__", {})
         }
     every = {k: np.asarray(v, float) for k, v in metrics.items()}
     found = {k: every[k] for k in (show or every) if k in every and np.isfinite(every[k]).any()}
