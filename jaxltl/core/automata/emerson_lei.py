@@ -57,6 +57,27 @@ def polarities(condition: Condition) -> tuple[int, int]:
     return 0, 0
 
 
+def residual(condition: Condition, absent: int, present: int) -> Condition:
+    """The condition if some colors never recur and others always do, without constants below."""
+    if condition[0] in ("inf", "fin"):
+        recurs, never = present >> condition[1] & 1, absent >> condition[1] & 1
+        if not recurs and not never:
+            return condition
+        return ("true" if bool(recurs) == (condition[0] == "inf") else "false",)
+    if condition[0] in ("true", "false"):
+        return condition
+    neutral, absorbing = ("true",), ("false",)
+    if condition[0] == "or":
+        neutral, absorbing = absorbing, neutral
+    parts = [residual(part, absent, present) for part in condition[1:]]
+    if absorbing in parts:
+        return absorbing
+    parts = [part for part in parts if part != neutral]
+    if len(parts) < 2:
+        return parts[0] if parts else neutral
+    return (condition[0], *parts)
+
+
 def parity_condition(num_priorities: int) -> Condition:
     """The condition that the least color seen infinitely often is even."""
     condition: Condition = ("false",)
@@ -348,3 +369,64 @@ def _unfold(
             )
     base = np.array([state for state, _ in order])
     return np.array(rows, np.int32), np.array(priorities, np.int32), base
+
+
+# ---------------------------------------------------------------------------------------------
+# The Zielonka tree
+# ---------------------------------------------------------------------------------------------
+
+
+class ZielonkaTree:
+    """The decomposition for one state on which any set of colors can recur (Zielonka 1998)."""
+
+    def __init__(self, condition: Condition, max_nodes: int) -> None:
+        inf, fin = polarities(condition)
+        self.colors = inf | fin
+        self.accepting = holds(condition, self.colors)
+        labels, self.parent, self.depth = [self.colors], [0], [0]
+        self.children: list[list[int]] = []
+        for node, label in enumerate(labels):  # grows
+            below = _largest_sets(condition, label, self.accepting == (self.depth[node] % 2 == 0))
+            self.children.append([len(labels) + i for i in range(len(below))])
+            labels += below
+            self.parent += [node] * len(below)
+            self.depth += [self.depth[node] + 1] * len(below)
+            if len(labels) > 2 * max_nodes:
+                raise ValueError(
+                    f"to_parity: more than {max_nodes} states. Use fewer letters, or raise the limit."
+                )
+        self.missing = [self.colors & ~label for label in labels]
+
+    def leaf_below(self, node: int) -> int:
+        """The first leaf below a node."""
+        while self.children[node]:
+            node = self.children[node][0]
+        return node
+
+    def step(self, leaf: int, colors: int) -> tuple[int, int]:
+        """The next leaf and the priority of a transition with some colors."""
+        node, came_from = leaf, leaf
+        while colors & self.missing[node]:
+            node, came_from = self.parent[node], node
+        priority = self.depth[node] + (not self.accepting)
+        siblings = self.children[node]
+        turn = siblings.index(came_from) + 1 if siblings else 0
+        return self.leaf_below(siblings[turn % len(siblings)] if siblings else node), priority
+
+
+def _largest_sets(condition: Condition, colors: int, accepting: bool) -> list[int]:
+    """The maximal subsets of a set of colors that have the other verdict."""
+    found: list[int] = []
+    seen: set[int] = set()
+    waiting = [colors]
+    while waiting:
+        whole = waiting.pop()
+        inf, fin = polarities(residual(condition, ~whole, 0))
+        for color in range(MAX_COLORS):
+            smaller = whole & ~(1 << color)
+            if (inf if accepting else fin) >> color & 1 and smaller not in seen:
+                seen.add(smaller)
+                (waiting if holds(condition, smaller) == accepting else found).append(smaller)
+        if len(seen) > MAX_SUBSETS:
+            raise ValueError(f"to_parity: more than {MAX_SUBSETS} sets of colors to examine.")
+    return [one for one in found if not any(one & other == one != other for other in found)]

@@ -9,27 +9,23 @@ is unique (Loeding 2001, "Efficient minimization of deterministic weak omega-aut
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core.array_types import Integers
 from jaxltl.core.automata.automaton import Automaton
-from jaxltl.core.automata.emerson_lei import parity_condition, reached_from, to_parity
+from jaxltl.core.automata.emerson_lei import parity_condition, to_parity
+from jaxltl.core.automata.merging import (
+    MERGE_WORK,
+    Table,
+    distinct_columns,
+    language_classes,
+    merged,
+)
 from jaxltl.core.sparse.graph.components import strong_components
 
-
-MAX_PAIRS = 3_000_000  # pair transitions up to which languages of states are compared
-MERGE_WORK = 20_000_000
-
-
-class Table(NamedTuple):
-    """A parity automaton as bare arrays: `delta [Q, L]`, `priority [Q, L]`, an initial state."""
-
-    delta: Integers
-    priority: Integers
-    initial: int
+ORDERS = (1, -1, 0)  # similar states first, different ones first, as they are numbered
 
 
 def simplify(automaton: Automaton) -> Automaton:
@@ -53,37 +49,49 @@ def simplify(automaton: Automaton) -> Automaton:
 
 def reduce_table(table: Table, thorough: bool = True) -> tuple[Table, str, Integers]:
     """The small table, its acceptance, and an old state of each new one; `thorough` is slow."""
-    columns, inverse = _distinct_columns(table)
-    base: Integers = np.arange(len(table.delta))
+    columns, inverse = distinct_columns(table)
     few = Table(table.delta[:, columns], table.priority[:, columns], table.initial)
+    every, work = np.arange(len(table.delta)), MERGE_WORK
+    best: tuple[Table, Integers] | None = None
+    for order in ORDERS if thorough else (None,):  # another order may merge more, if one merges any
+        small, base, work = _reduced(few, every, order, work)
+        if best is None or len(small.delta) < len(best[0].delta):
+            best = small, base
+        if work <= 0 or len(small.delta) == len(few.delta) or is_weak(small):
+            break
+    assert best is not None
+    few, base = best
+    return (
+        Table(few.delta[:, inverse], few.priority[:, inverse], few.initial),
+        _acceptance(few),
+        base,
+    )
+
+
+def _reduced(
+    few: Table, base: Integers, order: int | None, work: int
+) -> tuple[Table, Integers, int]:
+    """The table after the steps that make it smaller, merging states in an order if one is given."""
     while True:
         few, base = _composed(quotient_table(few), base)
         few, base = _composed(_fewest_priorities(few), base)
         few, base = _composed(quotient_table(few), base)
         if is_weak(few):
             few, base = _composed(_weak_minimal(few), base)
-            few = _early(few)
-            break
+            return _early(few), base, work
         size = len(few.delta)
         few, base = _composed(_move_down(few), base)
         if len(few.delta) < size:
             continue
-        if thorough:
-            few, base = _composed(_merged(few), base)
+        if order is not None:
+            table, work = merged(few, order, work)
+            few, base = _composed(quotient_table(table), base)
         if len(few.delta) == size:
-            break
-    kind = _acceptance(few)
-    return Table(few.delta[:, inverse], few.priority[:, inverse], few.initial), kind, base
+            return few, base, work
 
 
 def _composed(step: tuple[Table, Integers], base: Integers) -> tuple[Table, Integers]:
     return step[0], base[step[1]]
-
-
-def _distinct_columns(table: Table) -> tuple[Integers, Integers]:
-    both = np.concatenate([table.delta, table.priority]).T
-    _, first, inverse = np.unique(both, axis=0, return_index=True, return_inverse=True)
-    return first, inverse.ravel()
 
 
 def _acceptance(table: Table) -> str:
@@ -220,49 +228,6 @@ def _early(table: Table) -> Table:
     return table._replace(priority=priority)
 
 
-def language_classes(table: Table) -> Integers | None:
-    """The states grouped by language, int `[Q]`; None where that is too much work.
-
-    Two states differ iff some word leads to cycles of even least priority p from one and of odd
-    least priority r from the other: to a component of the pairs without priorities below these.
-    """
-    columns, _ = _distinct_columns(table)
-    delta, priority = table.delta[:, columns], table.priority[:, columns]
-    count, width = delta.shape
-    if count * count * width > MAX_PAIRS:
-        return None
-    follow = (delta[:, None] * count + delta[None]).reshape(count * count, width)
-    left = np.broadcast_to(priority[:, None], (count, count, width)).reshape(follow.shape)
-    right = np.broadcast_to(priority[None], (count, count, width)).reshape(follow.shape)
-    differ = _distinguished(follow, left, right)
-    apart = differ.reshape(count, count)
-    apart |= apart.T
-    return np.asarray(np.argmin(apart, axis=1))  # the first equivalent state
-
-
-def _distinguished(follow: Integers, left: Integers, right: Integers) -> NDArray[np.bool_]:
-    """The pairs from which some word is accepted on the left and rejected on the right."""
-    found = np.zeros(len(follow), bool)
-    number = np.arange(len(follow))
-    for p in range(0, int(left.max()) + 1, 2):
-        for r in range(1, int(right.max()) + 1, 2):
-            usable = (left >= p) & (right >= r)
-            row, column = np.nonzero(usable)
-            label = strong_components(row, follow[row, column], len(follow))
-            source, target = label[row], label[follow[row, column]]
-            stays = source == target
-            even = np.zeros(len(follow), bool)
-            odd = np.zeros(len(follow), bool)
-            even[source[stays & (left[row, column] == p)]] = True
-            odd[source[stays & (right[row, column] == r)]] = True
-            found |= (even & odd)[label[number]]
-    while True:
-        wider = found | found[follow].any(axis=1)
-        if (wider == found).all():
-            return found
-        found = wider
-
-
 def _move_down(table: Table) -> tuple[Table, Integers]:
     """Replaces states by others of their language in the lowest component that has one."""
     same = language_classes(table)
@@ -278,54 +243,3 @@ def _move_down(table: Table) -> tuple[Table, Integers]:
         target[np.setdiff1d(members, lowest)] = lowest[0]
     moved = Table(target[table.delta], table.priority, int(target[table.initial]))
     return quotient_table(moved)
-
-
-def _merged(table: Table) -> tuple[Table, Integers]:
-    """Merges states of one language, in one component, where the whole allows it, by trial."""
-    same = language_classes(table)
-    count = len(table.delta)
-    identity = np.arange(count)
-    if same is None:
-        return table, identity
-    columns, _ = _distinct_columns(table)
-    pairs = _Pairs(table.delta[:, columns], table.priority[:, columns], same)
-    budget = MERGE_WORK // max(pairs.follow.size, 1)
-    target = identity.copy()
-    start = table.initial
-    for kept in range(count):
-        for gone in np.flatnonzero(same == same[kept]).tolist():
-            if kept == gone or target[kept] != kept or target[gone] != gone:
-                continue
-            budget -= 1
-            if budget < 0:
-                break
-            trial = np.where(target == gone, kept, target)
-            if pairs.equal(start, trial):
-                target = trial
-    return quotient_table(Table(target[table.delta], table.priority, int(target[start])))
-
-
-class _Pairs:
-    """Pairs of states of one language, followed in a table and in it with states replaced."""
-
-    def __init__(self, delta: Integers, priority: Integers, same: Integers) -> None:
-        self.delta = delta
-        left, right = np.nonzero(same[:, None] == same[None])
-        self.number = np.full((len(delta), len(delta)), -1)
-        self.number[left, right] = np.arange(len(left))
-        self.follow = delta[left]
-        self.right = right
-        self.left_priority, self.right_priority = priority[left], priority[right]
-
-    def equal(self, initial: int, target: Integers) -> bool:
-        """True if the table with each state q replaced by target[q] has the same language."""
-        follow = self.number[self.follow, target[self.delta[self.right]]]
-        start = self.number[initial, target[initial]]
-        reached = reached_from(follow, start)
-        place = np.cumsum(reached) - 1
-        follow = place[follow[reached]]
-        left, right = self.left_priority[reached], self.right_priority[reached]
-        first = place[start]
-        return not (
-            _distinguished(follow, left, right)[first] or _distinguished(follow, right, left)[first]
-        )

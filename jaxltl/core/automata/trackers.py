@@ -8,41 +8,44 @@ is refuted: the formula holds iff it guesses finitely often. Pi-2 formulas are n
 
 from __future__ import annotations
 
-from typing import Any, TypeAlias
+from functools import lru_cache
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxltl.core.automata.emerson_lei import MAX_COLORS, Condition
+from jaxltl.core.automata.emerson_lei import MAX_COLORS, Condition, polarities, residual
 from jaxltl.core.logic.diagram import FALSE, TRUE
+from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.logic.normal_form import Combination, Part, is_pure, limit_parts
 from jaxltl.core.logic.progression import Progression
 from jaxltl.core.logic.simplify import GREATEST, LEAST, negated
 
+Alphabet: TypeAlias = tuple[NDArray[np.bool_], tuple[str, ...]]  # letters [L, P], propositions
+States: TypeAlias = tuple[int, ...]  # of each tracker
+
 _State: TypeAlias = tuple[int, int, int]  # the residual formula, the guess, the turn
-_PROVEN, _REFUTED, _IDLE = -1, -2, -3
+_Followed: TypeAlias = tuple[
+    Formula | None, tuple[Formula, ...]
+]  # Sigma-2, or limits one after another
+_PROVEN, _REFUTED, IDLE = -1, -2, -3
+_ASLEEP = -1  # in place of a guess
 
 
 class Tracker:
-    """The run for one formula, or for its negation: `often` if it must mark infinitely often."""
+    """The run for one Sigma-2 formula, or for some F G f, that marks each refuted guess."""
 
-    def __init__(self, part: Part) -> None:
-        limits = limit_parts(part.formula) if part.kind == "limit" else ()
-        self.often = limits[0].operator == "G" if limits else part.kind == "pi2"
+    def __init__(self, followed: _Followed, alphabet: Alphabet, max_nodes: int) -> None:
+        self.whole, limits = followed
         # Limits are tracked round-robin: all of some G F f hold iff every turn ends.
-        self.whole = None if limits else negated(part.formula) if self.often else part.formula
-        self.turns = [negated(f) if self.often else f for f in limits]
-        self.turns = [f.operands[0] for f in self.turns]
-        self.followed = self.turns if self.whole is None else [self.whole]
-
-    def bind(self, progression: Progression) -> None:
-        """Takes the diagrams once all formulas are known."""
-        self.progression = progression
-        self.guesses = [progression.diagram_of[f] for f in self.turns]
-        whole = TRUE if self.whole is None else progression.diagram_of[self.whole]
+        turns = [limit.operands[0] for limit in limits]
+        formulas = turns if self.whole is None else [self.whole]
+        self.progression = Progression(formulas, *alphabet, max_nodes)
+        self.guesses = [self.progression.diagram_of[f] for f in turns]
+        whole = TRUE if self.whole is None else self.progression.diagram_of[self.whole]
         # A co-safe formula has no safety part to guess on: it holds once nothing is left of it.
         reaches = self.whole is not None and is_pure(self.whole, GREATEST)
-        safe = progression.restricted(lambda variable: is_pure(variable, LEAST))
+        safe = self.progression.restricted(lambda variable: is_pure(variable, LEAST))
         self.restrict = (lambda _: FALSE) if reaches else safe
         self.index: dict[_State, int] = {}
         self.states: list[_State] = []
@@ -50,16 +53,25 @@ class Tracker:
         self.start = self._number((whole, self._guess(whole, 0), 0))
 
     def _guess(self, whole: int, turn: int) -> int:
-        return self.guesses[turn] if self.turns else self.restrict(whole)
+        return self.guesses[turn] if self.guesses else self.restrict(whole)
 
     def _number(self, state: _State) -> int:
         whole, _, _ = state
-        if not self.turns and whole in (TRUE, FALSE):
+        if not self.guesses and whole in (TRUE, FALSE):
             return _PROVEN if whole == TRUE else _REFUTED
         found = self.index.setdefault(state, len(self.states))
         if found == len(self.states):
             self.states.append(state)
         return found
+
+    def awake(self, state: int, needed: bool) -> int:
+        """The state with a guess if one is needed, and without one otherwise."""
+        if state < 0:
+            return state
+        whole, guess, _ = self.states[state]
+        if not needed:
+            return self._number((whole, _ASLEEP, 0))
+        return state if guess != _ASLEEP else self._number((whole, self._guess(whole, 0), 0))
 
     def row(self, state: int) -> tuple[list[int], list[bool]]:
         """For each class of letters, the next state and whether the tracker marks the step."""
@@ -74,130 +86,130 @@ class Tracker:
         whole, guess, turn = state
         states, marks = [], []
         for after in self.progression.after:
-            left, kept, following = after(whole), after(guess), turn
+            left, following = after(whole), turn
+            kept = guess if guess == _ASLEEP else after(guess)
             refuted = kept == FALSE
             if refuted:
-                following = (turn + 1) % max(len(self.turns), 1)
+                following = (turn + 1) % max(len(self.guesses), 1)
                 kept = self._guess(left, following)
             marks.append(refuted and following == 0)
             states.append(self._number((left, kept, following)))
         return states, marks
 
 
-def track(
-    parts: Combination,
-    letters: NDArray[np.bool_],
-    propositions: tuple[str, ...],
-    max_states: int,
-    max_nodes: int,
-) -> tuple[NDArray[np.int32], NDArray[np.int64], Condition, NDArray[np.intp]]:
-    """The trackers of a combination as one automaton with an Emerson-Lei condition."""
-    trackers: dict[Part, Tracker] = {}
-    for part in _leaves(parts):
-        trackers.setdefault(part, Tracker(part))
-    if len(trackers) > MAX_COLORS:
-        raise ValueError(
-            f"to_automaton: the formula falls into {len(trackers)} parts, and at most {MAX_COLORS} "
-            "can be tracked together. Split it into formulas that are tracked side by side."
+class Trackers:
+    """The trackers of a combination, one for a part and its negation, and the condition on them."""
+
+    def __init__(self, parts: Combination, alphabet: Alphabet, max_nodes: int) -> None:
+        number: dict[_Followed, int] = {}
+        self.condition = _condition(parts, number)
+        if len(number) > MAX_COLORS:
+            raise ValueError(
+                f"to_automaton: the formula falls into {len(number)} parts, and at most "
+                f"{MAX_COLORS} can be tracked together. Split it into formulas that are tracked "
+                "side by side."
+            )
+        self.trackers = [Tracker(followed, alphabet, max_nodes) for followed in number]
+        self.start = tuple(tracker.start for tracker in self.trackers)
+        classes = np.stack([t.progression.class_of for t in self.trackers])
+        # The letters that the trackers tell apart, and each letter's place among them.
+        self.letters, place = np.unique(classes, axis=1, return_inverse=True)
+        self.class_of = place.ravel()
+        self._remaining = lru_cache(maxsize=None)(self._residual)
+        self.heard = lru_cache(maxsize=None)(self._heard)
+
+    def remaining(self, states: States, condition: Condition) -> tuple[Condition, int]:
+        """A condition restricted to some states, and the trackers that it depends on."""
+        return self._remaining(condition, tuple(min(q, 0) for q in states))
+
+    def _residual(self, condition: Condition, status: States) -> tuple[Condition, int]:
+        proven, refuted = (
+            sum(1 << i for i, q in enumerate(status) if q == kind) for kind in (_PROVEN, _REFUTED)
         )
-    number = {part: i for i, part in enumerate(trackers)}
-    progression = Progression(
-        [f for t in trackers.values() for f in t.followed], letters, propositions, max_nodes
+        condition = residual(condition, proven, refuted)
+        inf, fin = polarities(condition)
+        return condition, inf | fin
+
+    def _heard(self, chosen: int) -> tuple[list[list[int]], NDArray[np.intp]]:
+        """The letters that some trackers tell apart, and each letter's place among them."""
+        letters = self.letters.copy()
+        letters[[not chosen >> i & 1 for i in range(len(letters))]] = 0
+        distinct, place = np.unique(letters, axis=1, return_inverse=True)
+        return distinct.tolist(), place.ravel()
+
+    def successors(self, states: States, chosen: int) -> list[tuple[States, int]]:
+        """For each letter that some trackers tell apart, the next states and the marks."""
+        targets, marks = [], []
+        letters, _ = self.heard(chosen)
+        for i, (tracker, state, classes) in enumerate(
+            zip(self.trackers, states, letters, strict=True)
+        ):
+            following, marked = tracker.row(state)
+            targets.append([following[k] for k in classes])
+            marks.append([marked[k] << i for k in classes])
+        every = zip(*targets, strict=True), map(sum, zip(*marks, strict=True))
+        return list(zip(*every, strict=True))
+
+
+def _followed(part: Part) -> tuple[str, _Followed]:
+    """The polarity of the marks of a part's tracker, and the formulas that it follows."""
+    limits = limit_parts(part.formula) if part.kind == "limit" else ()
+    often = limits[0].operator == "G" if limits else part.kind == "pi2"
+    sign = negated if often else lambda f: f
+    return "inf" if often else "fin", (
+        None if limits else sign(part.formula),
+        tuple(sign(limit) for limit in limits),
     )
-    every = list(trackers.values())
-    for tracker in every:
-        tracker.bind(progression)
-    run = _Product(every, _numbered(parts, number))
-    delta, colors = run.explore(max_states)
-    condition = _condition(_numbered(parts, number), every)
-    return delta, colors, condition, progression.class_of
 
 
-def _leaves(parts: Combination) -> list[Part]:
+def _condition(parts: Combination, number: dict[_Followed, int]) -> Condition:
     if isinstance(parts, Part):
-        return [parts]
-    return [leaf for part in parts[1:] for leaf in _leaves(part)]
+        polarity, followed = _followed(parts)
+        return polarity, number.setdefault(followed, len(number))
+    operator = {"&": "and", "|": "or"}[parts[0]]
+    return (operator, *(_condition(part, number) for part in parts[1:]))
 
 
-def _numbered(parts: Combination, number: dict[Part, int]) -> Any:
-    if isinstance(parts, Part):
-        return number[parts]
-    return (parts[0], *(_numbered(part, number) for part in parts[1:]))
+def too_many_states(max_states: int) -> ValueError:
+    """The error of a construction that exceeds the limit of states."""
+    return ValueError(
+        f"to_automaton: more than {max_states} states. Pass fewer letters=, split the "
+        "formula into parts that are tracked side by side, or raise max_states."
+    )
 
 
-def _condition(tree: Any, trackers: list[Tracker]) -> Condition:
-    if isinstance(tree, int):
-        return ("inf" if trackers[tree].often else "fin", tree)
-    operator = {"&": "and", "|": "or"}[tree[0]]
-    return (operator, *(_condition(part, trackers) for part in tree[1:]))
+def track_together(run: Trackers, max_states: int) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    """All trackers as one automaton with an Emerson-Lei condition: its transitions and colors."""
+    canonical: dict[States, States] = {}
+    decided: dict[Condition, States] = {}
 
-
-class _Product:
-    """Trackers side by side; those that no longer matter stand idle."""
-
-    def __init__(self, trackers: list[Tracker], tree: Any) -> None:
-        self.trackers = trackers
-        self.tree = tree
-        self.canonical: dict[tuple[int, ...], tuple[int, ...]] = {}
-        self.needed: dict[tuple[int, ...], tuple[bool | None, frozenset[int]]] = {}
-        self.decided: dict[bool, tuple[int, ...]] = {}
-
-    def _simplified(self, tree: Any, status: tuple[int, ...]) -> tuple[bool | None, frozenset[int]]:
-        """The truth of a combination if it is decided, else the trackers that it depends on."""
-        if isinstance(tree, int):
-            state = status[tree]
-            if state in (_PROVEN, _REFUTED):
-                return (state == _PROVEN) != self.trackers[tree].often, frozenset()
-            return None, frozenset([tree])
-        absorbing = tree[0] == "|"
-        open_: frozenset[int] = frozenset()
-        undecided = False
-        for part in tree[1:]:
-            truth, live = self._simplified(part, status)
-            if truth == absorbing:
-                return absorbing, frozenset()
-            undecided |= truth is None
-            open_ |= live
-        return (None if undecided else not absorbing), open_
-
-    def canonical_state(self, state: tuple[int, ...]) -> tuple[int, ...]:
+    def canonical_state(states: States) -> States:
         """The state with idle trackers set aside; decided states are one state each."""
-        if state not in self.canonical:
-            status = tuple(min(q, 0) for q in state)
-            if status not in self.needed:
-                self.needed[status] = self._simplified(self.tree, status)
-            truth, live = self.needed[status]
-            if truth is None:
-                small = tuple(q if q < 0 or i in live else _IDLE for i, q in enumerate(state))
-                # A proven part that nothing depends on is equivalent to a refuted one.
-            else:
-                small = tuple(q if q in (_PROVEN, _REFUTED) else _IDLE for q in state)
-                small = self.decided.setdefault(truth, small)
-            self.canonical[state] = small
-        return self.canonical[state]
+        if states not in canonical:
+            condition, live = run.remaining(states, run.condition)
+            small = tuple(
+                q if q in (_PROVEN, _REFUTED) or live >> i & 1 else IDLE
+                for i, q in enumerate(states)
+            )
+            canonical[states] = small if live else decided.setdefault(condition, small)
+        return canonical[states]
 
-    def explore(self, max_states: int) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-        start = self.canonical_state(tuple(t.start for t in self.trackers))
-        index = {start: 0}
-        order = [start]
-        table, marks = [], []
-        for state in order:
-            rows = [t.row(q) for t, q in zip(self.trackers, state, strict=True)]
-            successors = []
-            for target in zip(*(row[0] for row in rows), strict=True):
-                small = self.canonical_state(target)
-                if small not in index:
-                    index[small] = len(order)
-                    order.append(small)
-                successors.append(index[small])
-            table.append(successors)
-            colors = np.zeros(len(successors), np.int64)
-            for i, row in enumerate(rows):
-                colors |= np.array(row[1], np.int64) << i
-            marks.append(colors)
-            if len(order) > max_states:
-                raise ValueError(
-                    f"to_automaton: more than {max_states} states. Pass fewer letters=, split "
-                    "the formula into parts that are tracked side by side, or raise max_states."
-                )
-        return np.array(table, np.int32), np.stack(marks)
+    start = canonical_state(run.start)
+    index = {start: 0}
+    order = [start]
+    every = (1 << len(start)) - 1
+    table, marks = [], []
+    for states in order:
+        row = []
+        following = run.successors(states, every)
+        for target, _ in following:
+            small = canonical_state(target)
+            if small not in index:
+                index[small] = len(order)
+                order.append(small)
+            row.append(index[small])
+        table.append(row)
+        marks.append([colors for _, colors in following])
+        if len(order) > max_states:
+            raise too_many_states(max_states)
+    return np.array(table, np.int32), np.array(marks, np.int64)

@@ -2,8 +2,9 @@
 
 A syntactically co-safe or safety formula becomes the automaton of its progression. Any other is
 a combination of Sigma-2 and Pi-2 formulas and limits (`normal_form`), each followed by one
-tracker; their synchronous product has an Emerson-Lei condition, which becomes parity
-(`emerson_lei`), and is then reduced (`parity`).
+tracker. Two automata are made of the trackers, and the smaller is kept and reduced (`parity`):
+their synchronous product has an Emerson-Lei condition, which becomes parity (`emerson_lei`), or
+they follow their formulas only where the condition needs it (`on_demand`).
 """
 
 from __future__ import annotations
@@ -19,9 +20,11 @@ from numpy.typing import NDArray
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.emerson_lei import to_parity
 from jaxltl.core.automata.minimal import equivalence_classes, quotient
-from jaxltl.core.automata.parity import Table, is_weak, reachable, reduce_table
+from jaxltl.core.automata.merging import Table
+from jaxltl.core.automata.parity import is_weak, reachable, reduce_table
 from jaxltl.core.automata.runs import EVEN, ODD, find_lasso, live_states, universal_states
-from jaxltl.core.automata.trackers import track
+from jaxltl.core.automata.on_demand import track_on_demand
+from jaxltl.core.automata.trackers import Alphabet, Trackers, too_many_states, track_together
 from jaxltl.core.logic.diagram import FALSE, TRUE
 from jaxltl.core.logic.ltl import (
     Formula,
@@ -44,6 +47,7 @@ GOOD_ENOUGH = 3  # states up to which no other combination is tried
 WORTHWHILE = 3  # how many times as much the other combinations may track
 MAX_STEPS = 200_000  # of rewriting
 MAX_NODES = 600_000  # of diagrams
+LEEWAY = 3  # times the states of the best automaton so far that another may have
 LARGE = 200_000  # transitions of an automaton that is taken as it is
 NAMED_STATES = 300
 
@@ -177,15 +181,8 @@ def _explore(
                 states.append(successor)
         rows.append([index[successor] for successor in row])
         if len(states) > max_states:
-            raise _too_many(max_states)
+            raise too_many_states(max_states)
     return states, np.array(rows, np.int32)
-
-
-def _too_many(max_states: int) -> ValueError:
-    return ValueError(
-        f"to_automaton: more than {max_states} states. Pass fewer letters=, split the "
-        "formula into parts that are tracked side by side, or raise max_states."
-    )
 
 
 def _forced(delta: NDArray[np.int32], target: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -227,18 +224,14 @@ def _general(formula: Formula, alphabet: NDArray[np.bool_], max_states: int) -> 
             if best is not None and cost > WORTHWHILE * ways[0][1]:
                 break
             limit = max_states if work == MAX_NODES else min(max_states, work // 10)
-            if best is not None:
-                limit = min(limit, 20 * len(best[0].delta) + 100)
             try:
-                found = _tracked(parts, alphabet, formula.propositions, limit, work)
+                best = _tracked(parts, (alphabet, formula.propositions), limit, work, best)
             except ValueError:
                 if best is None and work == MAX_NODES and parts is ways[-1][0]:
                     raise
                 continue
-            if best is None or _size(found[0]) < _size(best[0]):
-                best = found
             # A weak automaton is minimal, and a large one takes too long to do again.
-            if is_weak(found[0]) or _size(best[0])[0] <= GOOD_ENOUGH:
+            if is_weak(best[0]) or _size(best[0])[0] <= GOOD_ENOUGH:
                 break
             if best[0].delta.size > LARGE:
                 break
@@ -284,20 +277,45 @@ def _size(table: Table) -> tuple[int, int]:
     return len(table.delta) - int(sink.any()), len(np.unique(table.priority))
 
 
+_Found = tuple[Table, NDArray[np.intp]]
+
+
 def _tracked(
-    parts: Combination,
-    alphabet: NDArray[np.bool_],
-    propositions: tuple[str, ...],
-    max_states: int,
-    max_nodes: int,
-) -> tuple[Table, NDArray[np.intp]]:
-    """The reduced parity automaton of trackers, over classes of letters `[L]`."""
-    delta, colors, condition, class_of = track(parts, alphabet, propositions, max_states, max_nodes)
+    parts: Combination, alphabet: Alphabet, max_states: int, max_nodes: int, best: _Found | None
+) -> _Found:
+    """The smaller of the best automaton so far and those of trackers, over classes of letters."""
+    run = Trackers(parts, alphabet, max_nodes)
+    error: ValueError | None = None
+    for construct in (_on_demand, _together):
+        limit = max_states
+        if best is not None:
+            limit = min(limit, LEEWAY * len(best[0].delta) + 100)
+        try:
+            table = reduce_table(construct(run, limit), thorough=False)[0]
+        except ValueError as caught:
+            error = caught
+            continue
+        if best is None or _size(table) < _size(best[0]):
+            best = table, run.class_of
+        if is_weak(best[0]):
+            break
+    if best is None:
+        assert error is not None
+        raise error
+    return best
+
+
+def _on_demand(run: Trackers, max_states: int) -> Table:
+    delta, priority = track_on_demand(run, max_states)
+    return Table(delta, priority, 0)
+
+
+def _together(run: Trackers, max_states: int) -> Table:
+    delta, colors = track_together(run, max_states)
     try:
-        table = to_parity(delta, colors, 0, condition, max_states)[:3]
+        return Table(*to_parity(delta, colors, 0, run.condition, max_states)[:3])
     except ValueError:
-        raise _too_many(max_states) from None
-    return reduce_table(Table(*table), thorough=False)[0], class_of
+        raise too_many_states(max_states) from None
 
 
 def _residual_names(formula: Formula, automaton: Automaton) -> tuple[str, ...]:

@@ -21,6 +21,7 @@ FALSE: Tree = ("false",)
 
 
 def unquoted(token: str) -> str:
+    """A quoted token without quotes and escapes."""
     return re.sub(r"(?s)\\(.)", r"\1", token[1:-1])
 
 
@@ -74,6 +75,7 @@ _TERMINAL = {
 
 
 def error_at(line: int | None, message: str) -> ValueError:
+    """A ValueError that names the line."""
     return ValueError(f"read_hoa: line {line}: {message}")
 
 
@@ -169,6 +171,8 @@ marks: _BEGIN INT* _FINISH
 
 @dataclass(frozen=True)
 class Edge:
+    """An edge of an automaton, as parsed."""
+
     label: Tree | None
     targets: list[Token]
     marks: list[Token]
