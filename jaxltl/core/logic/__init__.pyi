@@ -1,3 +1,4 @@
+from .comparisons import Comparison as Comparison
 from .ltl import Formula as Formula, holds_on_lasso as holds_on_lasso, parse_ltl as parse_ltl
 from .properties import (
     Property as Property,

@@ -8,7 +8,7 @@ from collections.abc import Collection, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxltl.core.logic.ltl import Formula, as_formula, subformulas, truth_on_lasso
+from jaxltl.core.logic.ltl import Formula, as_formula, proposition_text, subformulas, truth_on_lasso
 
 _BOOLEAN = frozenset(("true", "false", "ap", "!", "&", "|", "->", "<->", "xor"))
 
@@ -22,12 +22,24 @@ def require_known(needed: Collection[str], known: Sequence[str], place: str) -> 
     """Raises a ValueError that names the first proposition that is not known."""
     for name in needed:
         if name not in known:
-            guess = difflib.get_close_matches(name, known, n=1)
             raise ValueError(
                 f"{place} mentions the proposition {name!r}, which the world does not have; "
-                f"its propositions are {', '.join(known) or '(none)'}."
-                + (f" Did you mean {guess[0]!r}?" if guess else "")
+                f"its propositions are {', '.join(known) or '(none)'}.{_hint(name, known)}"
             )
+
+
+def _hint(name: str, known: Sequence[str]) -> str:
+    """A name that may be meant: one like it, or one whose first letters were read as operators."""
+    by_case = {one.lower(): one for one in reversed(known)}
+    for prefix in ("F", "G", "X"):
+        written = prefix + name
+        if (meant := by_case.get(written.lower())) is not None:
+            return (
+                f" If {written} was written, it is read as the operator {prefix} and {name}, as in "
+                f"Spot: write {proposition_text(meant)}."
+            )
+    guess = difflib.get_close_matches(name, known, n=1)
+    return f" Did you mean {guess[0]!r}?" if guess else ""
 
 
 def satisfying(

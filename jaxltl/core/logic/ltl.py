@@ -153,6 +153,10 @@ def subformulas(formula: Formula) -> tuple[Formula, ...]:
 _NAME = r"(?!(?:[URVWM]|xor|[tT][rR][uU][eE]|[fF][aA][lL][sS][eE])(?![\w.]))" \
         r"(?:[A-EH-WYZa-z_.]|[FGX](?=[0-9]))[A-Za-z0-9_.]*"  # fmt: skip
 
+# "always" before a binary operator, ")" or the end is a name, as it is to Spot.
+_BINARY_FOLLOWS = r"\s*(?:$|[)&|^=∧∨⊕→⇒↔⇔]|->|<->|<=>|\x2f\\|\\\x2f|" \
+                  r"(?:[URVWM]|xor|and|or|implies|iff|until|release|weakuntil)(?![\w.]))"  # fmt: skip
+
 # The lexer is contextual: where an operand is due `Ub` is a name, and after one it is `U b`.
 _GRAMMAR = rf"""
 ?start: implication
@@ -161,15 +165,16 @@ _GRAMMAR = rf"""
 ?exclusive: conjunction | exclusive XOR conjunction -> infix
 ?conjunction: until | until (_AND until)+ -> conjunction
 ?until: unary | unary TEMPORAL until -> infix
-?unary: PREFIX unary -> prefix | NAME -> name | QUOTED -> quoted | CONSTANT -> constant
+?unary: (PREFIX | WORD) unary -> prefix | NAME -> name | QUOTED -> quoted | CONSTANT -> constant
       | _OPEN implication _CLOSE
-IMPLICATION: "->" | "=>" | "<->" | "<=>"
-_OR: "||" | "|" | "\\/"
-XOR: "^" | /xor(?![\w.])/
-_AND: "&&" | "&" | "/\\"
-TEMPORAL: /[URVWM]/
-PREFIX: "!" | "~" | "X" | "F" | "<>" | "G" | "[]"
-CONSTANT.2: /[01]|(true|false)(?![\w.])/i
+IMPLICATION: "->" | "=>" | "<->" | "<=>" | /[→⇒↔⇔]/ | /(implies|iff)(?![\w.])/
+_OR: "||" | "|" | "\\/" | "∨" | /or(?![\w.])/
+XOR: "^" | "⊕" | /xor(?![\w.])/
+_AND: "&&" | "&" | "/\\" | "∧" | /and(?![\w.])/
+TEMPORAL: /[URVWM]/ | /(until|release|weakuntil)(?![\w.])/
+PREFIX: "!" | "~" | "X" | "F" | "<>" | "G" | "[]" | /[¬○◯◇◊⋄□◻]/
+WORD.3: /(not|next|eventually|always)(?![\w.])(?!{_BINARY_FOLLOWS})/
+CONSTANT.2: /[01⊤⊥]|(true|false)(?![\w.])/i
 NAME.1: /{_NAME}/
 QUOTED: /"(\\.|[^"\\])*"/s
 _OPEN: "("
@@ -186,6 +191,18 @@ _SPELLING = {
     "<=>": "<->",
     "1": "true",
     "0": "false",
+    **dict.fromkeys(("¬", "not"), "!"),
+    **dict.fromkeys(("○", "◯", "next"), "X"),
+    **dict.fromkeys(("◇", "◊", "⋄", "eventually"), "F"),
+    **dict.fromkeys(("□", "◻", "always"), "G"),
+    **dict.fromkeys(("→", "⇒", "implies"), "->"),
+    **dict.fromkeys(("↔", "⇔", "iff"), "<->"),
+    "⊕": "xor",
+    "⊤": "true",
+    "⊥": "false",
+    "until": "U",
+    "release": "R",
+    "weakuntil": "W",
 }
 
 
@@ -193,7 +210,9 @@ def parse_ltl(text: str) -> Formula:
     """The formula written in `text`, in the syntax of Spot.
 
     From loosest to tightest: `->` `<->` (right), `|`, `xor`, `&` (left), `U R W M` (right), then
-    the prefixes `! X F G`. Also read: `&& /\\ || \\/ ^ ~ => <=> [] <> V true false 1 0`. The
+    the prefixes `! X F G`. Also read: `&& /\\ || \\/ ^ ~ => <=> [] <> V true false 1 0`, the signs
+    `¬ ∧ ∨ ⊕ → ↔ ○ ◇ □ ⊤ ⊥` and, where an operator is due, the words `not and or implies iff next
+    eventually always until release weakuntil`. The
     precedences are those of Spot's parser, `spot/parsetl/parsetl.yy`, and the names those of its
     scanner, `scantl.ll` (Duret-Lutz et al. 2022, "From Spot 2.0 to Spot 2.10"):
 

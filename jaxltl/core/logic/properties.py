@@ -2,20 +2,29 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 from jaxltl.core.logic.bounded import Bounded, Earned, unfolded
+from jaxltl.core.logic.comparisons import RELATIONS, Comparison
 from jaxltl.core.logic.labels import is_boolean
-from jaxltl.core.logic.ltl import FALSE, TRUE, Formula, pointed
+from jaxltl.core.logic.ltl import FALSE, TRUE, Formula
+from jaxltl.core.logic.property_tokens import Token, TokenStream
 from jaxltl.core.pretty_print import brief
 
 Relation = Literal["<", "<=", ">", ">="]
 
+# Kinds of filters: of truth values (True), of numbers (False), or of either.
+FILTERS = {
+    **dict.fromkeys(("min", "max", "avg", "sum", "range"), False),
+    **dict.fromkeys(("forall", "exists", "count"), True),
+    **dict.fromkeys(("first", "print"), None),
+}
 MAX_UNFOLDED_STEPS = 100  # of a step bound inside a formula, which is unfolded into nested X
 
 
@@ -37,6 +46,8 @@ class Property:
         an :class:`~jaxltl.core.logic.bounded.Earned`, for `"LRA"` a state formula.
       parts: of `"multi"`, its objectives.
       name: the name before the colon, or None.
+      definitions: propositions of the formulas that are no labels: comparisons and nested properties.
+      aggregate, among: of a filter, its kind, such as `"min"`, and the states that it is over.
 
     Example:
       >>> asked = parse_property('Pmax>=0.9 [ F "goal" ]')
@@ -54,6 +65,9 @@ class Property:
     parts: tuple[Property, ...] = ()
     name: str | None = None
     nature: Literal["max", "min"] | None = None
+    definitions: tuple[tuple[str, Comparison | Property], ...] = ()
+    aggregate: str | None = None
+    among: Formula = TRUE
 
     @property
     def direction(self) -> Literal["max", "min"] | None:
@@ -75,6 +89,9 @@ def parse_properties(text: str) -> tuple[Property, ...]:
     or, outermost, on a reward (`F{"time"}<=5 "goal"`). Of a reward: `R{"name"}max=? [ F "goal" ]`,
     `[ C ]`, `[ C<=10 ]`, `[ I=5 ]`, `[ S ]` or `[ LRA ]`. Expected steps: `Tmin=? [ F "goal" ]`.
     Time in the long run: `LRAmax=? [ "up" ]`. Several at once: `multi(P, P, ...)`.
+    State formulas may also compare variables, `x + 1 < 2 * y`, and nest properties with thresholds,
+    `P>=0.9 [ F P>0.5 [ X "a" ] ]`. `filter(min, P=? [ F "a" ], x = 0)` is over the states of a
+    formula, by default all: one of `min max avg sum count range first forall exists print`.
     Where probabilities are intervals, the direction of the policy comes first and that of nature
     does second: `Pmaxmin=?`, `R{"time"}minmax=?`.
 
@@ -131,56 +148,8 @@ def parse_property(text: str) -> Property:
     return found[0]
 
 
-# --- tokens -----------------------------------------------------------------------------------
-
-
-class _Token(NamedTuple):
-    kind: str
-    text: str
-    start: int
-    end: int
-
-
-_TOKEN = re.compile(
-    r"""
-    (?P<space>(?:\s+|//[^\n]*)+)
-  | (?P<quoted>"(?:\\["\\]|[^"])*+")
-  | (?P<number>(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)
-  | (?P<word>[A-Za-z_][A-Za-z0-9_]*)
-  | (?P<sign><=>|=>|<=|>=|!=|&&|\|\||[-<>=&|!()\[\]{},;:?/+*])
-""",
-    re.VERBOSE,
-)
 _OPERATOR = re.compile(r"(P|R|T|LRA|S)(max|min)?(max|min)?")
 _DIRECTIONS = ("max", "min", "maxmax", "maxmin", "minmax", "minmin")
-_MAX_DIGITS = 400  # of a number and of its exponent's value, as none means more
-
-
-def _tokens(text: str) -> list[_Token]:
-    found, place = [], 0
-    while place < len(text):
-        match = _TOKEN.match(text, place)
-        if match is None:
-            hint = ". The quote is never closed" if text[place] == '"' else ""
-            raise ValueError(
-                pointed(
-                    "property",
-                    text,
-                    place,
-                    repr(text[place]),
-                    f"a property's signs and names{hint}",
-                )
-            )
-        kind = str(match.lastgroup)
-        if kind == "word" and re.fullmatch("[XFG]{2,}", match[0]):  # GF"a"
-            found += [
-                _Token("word", letter, place + i, place + i + 1)
-                for i, letter in enumerate(match[0])
-            ]
-        elif kind != "space":
-            found.append(_Token(kind, match[0], place, match.end()))
-        place = match.end()
-    return [*found, _Token("end", "", len(text.rstrip()), len(text.rstrip()))]
 
 
 # --- grammar ----------------------------------------------------------------------------------
@@ -189,37 +158,12 @@ _Path = Formula | Bounded
 _STATE = "a state formula: labels in quotes, true, false, ! & | => <=>"
 
 
-class _Parser:
+class _Parser(TokenStream):
     """Recursive-descent parser; each method reads the construct of its name."""
 
     def __init__(self, text: str) -> None:
-        self.text = text
-        self.tokens = _tokens(text)
-        self.place = 0
-
-    @property
-    def token(self) -> _Token:
-        return self.tokens[self.place]
-
-    def error(self, wanted: str, token: _Token | None = None) -> ValueError:
-        token = token or self.token
-        found = "the end" if token.kind == "end" else repr(token.text)
-        return ValueError(pointed("property", self.text, token.start, found, wanted))
-
-    def take(self) -> _Token:
-        token = self.token
-        self.place += token.kind != "end"
-        return token
-
-    def accept(self, *texts: str) -> str | None:
-        """The next token, if it is one of these signs or words."""
-        if self.token.text in texts and self.token.kind in ("sign", "word"):
-            return self.take().text
-        return None
-
-    def expect(self, sign: str, after: str = "") -> None:
-        if not self.accept(sign):
-            raise self.error(f"{sign!r}{after}")
+        super().__init__(text)
+        self.definitions: dict[str, Comparison | Property] = {}  # of the property being read
 
     # --- properties ---
 
@@ -243,9 +187,11 @@ class _Parser:
         return tuple(found)
 
     def property_(self, name: str | None = None) -> Property:
-        start = self.token
+        start, outer = self.token, self.definitions
         if self.accept("multi"):
             return self.multi(start, name)
+        if self.accept("filter"):
+            return self.filter(start, name)
         match = _OPERATOR.fullmatch(start.text) if start.kind == "word" else None
         if match is None:
             raise self.error("a property: P, Pmax, Pmin, R, Rmax, Rmin, T, LRA or multi(...)")
@@ -261,15 +207,17 @@ class _Parser:
             objective, nature = both[:3] or None, both[3:] or None
         relation, threshold = self.comparison(operator)
         self.expect("[")
+        self.definitions = {}
         path = _CONTENT[operator](self)
+        defined, self.definitions = tuple(self.definitions.items()), outer
         self.expect("]", " or an operator")
-        text = self.text[start.start : self.tokens[self.place - 1].end]
+        text = self.text[start.start : self.last.end]
         fields: dict[str, Any] = {"operator": operator, "objective": objective}
         fields |= {"relation": relation, "threshold": threshold, "reward": reward, "path": path}
-        fields["nature"] = nature
+        fields |= {"nature": nature, "definitions": defined}
         return Property(text, **fields, name=name)
 
-    def multi(self, start: _Token, name: str | None) -> Property:
+    def multi(self, start: Token, name: str | None) -> Property:
         self.expect("(")
         parts = []
         while True:
@@ -286,8 +234,33 @@ class _Parser:
             if not self.accept(","):
                 break
         self.expect(")", " or ','")
-        text = self.text[start.start : self.tokens[self.place - 1].end]
-        return Property(text, "multi", parts=tuple(parts), name=name)
+        text = self.text[start.start : self.last.end]
+        defined = tuple(one for part in parts for one in part.definitions)
+        return Property(text, "multi", parts=tuple(parts), name=name, definitions=defined)
+
+    def filter(self, start: Token, name: str | None) -> Property:
+        self.expect("(")
+        place, kind = self.token, self.take().text
+        if kind not in FILTERS:
+            raise self.error(f"the kind of the filter: {', '.join(FILTERS)}", place)
+        self.expect(",")
+        first, self.definitions = self.token, {}
+        asked, before = None, self.place
+        if first.kind == "word" and _OPERATOR.fullmatch(first.text):
+            asked = self.property_()
+        if asked is None or self.token.text not in (",", ")"):  # it begins a state formula
+            self.place = before
+            path = self.state_content()
+            asked = Property("", "P", relation=">=", threshold=Fraction(1), path=path)
+        if FILTERS[kind] not in (None, asked.relation is not None):
+            wanted = "a threshold or a state formula" if FILTERS[kind] else "a number, =?"
+            raise self.error(f"{wanted} in a filter of this kind", first)
+        among = self.state_content() if self.accept(",") else TRUE
+        self.expect(")", " or ','")
+        text = self.text[start.start : self.last.end]
+        defined, self.definitions = (*asked.definitions, *self.definitions.items()), {}
+        asked = replace(asked, text=text, name=name, definitions=defined)
+        return replace(asked, aggregate=kind, among=among)
 
     def comparison(self, operator: str) -> tuple[str | None, Fraction | None]:
         if self.accept("="):
@@ -301,40 +274,6 @@ class _Parser:
         if operator in ("P", "LRA") and not 0 <= threshold <= 1:
             raise self.error("a probability between 0 and 1", start)
         return relation, threshold
-
-    # --- numbers and names ---
-
-    def quoted(self) -> str:
-        if self.token.kind != "quoted":
-            raise self.error("a name in double quotes")
-        return re.sub(r'\\(["\\])', r"\1", self.take().text[1:-1])
-
-    def number(self, signed: bool = False) -> Fraction:
-        sign = -1 if signed and self.accept("-") else 1
-        value = self.plain_number()
-        if self.accept("/"):
-            start = self.token
-            divisor = self.plain_number()
-            if not divisor:
-                raise self.error("a divisor other than 0", start)
-            value /= divisor
-        return sign * value
-
-    def plain_number(self) -> Fraction:
-        text = self.token.text
-        if self.token.kind != "number":
-            raise self.error("a number")
-        exponent = re.split("[eE]", text)[1:] or ["0"]
-        if len(text) > _MAX_DIGITS or abs(int(exponent[0])) > _MAX_DIGITS:
-            raise self.error(f"a number of at most {_MAX_DIGITS} digits")
-        return Fraction(self.take().text)
-
-    def steps(self) -> int:
-        start = self.token
-        value = self.number()
-        if value.denominator != 1:
-            raise self.error("a whole number of steps", start)
-        return int(value)
 
     # --- paths, from loosest to tightest ---
 
@@ -399,10 +338,8 @@ class _Parser:
         token = self.token
         if self.accept("!"):
             return ~self.plain(self.atom())
-        if self.accept("("):
-            found = self.path()
-            self.expect(")", " or an operator")
-            return found
+        if token.text == "(" and token.kind == "sign":
+            return self.parentheses()
         if token.kind == "quoted":
             name = self.quoted()
             if not name:
@@ -413,13 +350,74 @@ class _Parser:
         if token.kind == "word" and token.text in "XFG":
             return self.prefixed()
         if token.kind == "word" and _OPERATOR.fullmatch(token.text):
-            raise self.error("a label in quotes or an operator; properties are not nested")
-        if token.kind == "word":
-            raise self.error(
-                f'a label in double quotes, such as "{token.text}"; variables of a '
-                "model are not read"
-            )
+            nested = self.property_()
+            if nested.relation is None:
+                raise self.error("a nested property with a threshold, such as P>=0.5", token)
+            return self.defined(nested)
+        if token.kind in ("word", "number") or token.text == "-":
+            return self.comparison_of_variables()
         raise self.error("a label in quotes, true, false, '(', '!' or one of X F G")
+
+    def defined(self, meaning: Comparison | Property) -> Formula:
+        """A proposition that stands for a comparison or a nested property."""
+        name = f"[{meaning.text}]"
+        self.definitions[name] = meaning
+        return Formula("ap", proposition=name)
+
+    def parentheses(self) -> _Path:
+        """A formula in parentheses, or a comparison that begins with one."""
+        place, known = self.place, dict(self.definitions)
+        try:
+            self.expect("(")
+            found = self.path()
+            self.expect(")", " or an operator")
+            return found
+        except ValueError:
+            after, self.place, self.definitions = self.place, place, known
+            with contextlib.suppress(ValueError):
+                return self.comparison_of_variables()
+            self.place = after
+            raise
+
+    def comparison_of_variables(self) -> Formula:
+        start = self.token
+        program = self.sum()
+        relation = self.accept(*RELATIONS)
+        if relation is None and len(program) == 1 and start.kind == "word":
+            raise self.error(
+                f'a label in double quotes, such as "{start.text}", or a comparison of variables, '
+                f"such as {start.text}=1",
+                start,
+            )
+        if relation is None:
+            raise self.error("a comparison, such as x+1<=3")
+        program = (*program, *self.sum(), relation)
+        return self.defined(Comparison(self.text[start.start : self.last.end], program))
+
+    def sum(self) -> tuple[str | Fraction, ...]:
+        found = self.term()
+        while sign := self.accept("+", "-"):
+            found = (*found, *self.term(), sign)
+        return found
+
+    def term(self) -> tuple[str | Fraction, ...]:
+        found = self.factor()
+        while sign := self.accept("*", "/"):
+            found = (*found, *self.factor(), sign)
+        return found
+
+    def factor(self) -> tuple[str | Fraction, ...]:
+        if self.accept("-"):
+            return (Fraction(0), *self.factor(), "-")
+        if self.accept("("):
+            found = self.sum()
+            self.expect(")", " or an operator")
+            return found
+        if self.token.kind == "number":
+            return (self.plain_number(),)
+        if self.token.kind != "word":
+            raise self.error("a variable or a number")
+        return (self.take().text,)
 
     # --- bounds ---
 
@@ -488,13 +486,13 @@ class _Parser:
         if path.reward is not None:
             raise self.error(
                 "a bound on a reward outermost and on state formulas only",
-                self.tokens[self.place - 1],
+                self.last,
             )
         if max(path.lower, path.upper or 0) > MAX_UNFOLDED_STEPS:
             raise self.error(
                 f"a bound of at most {MAX_UNFOLDED_STEPS} steps inside of a formula; outermost and "
                 "on state formulas it may be any",
-                self.tokens[self.place - 1],
+                self.last,
             )
         return unfolded(path)
 
@@ -535,7 +533,7 @@ class _Parser:
     def steps_content(self) -> Formula:
         return self.reach_content(self.token, "F and a state formula")
 
-    def reach_content(self, start: _Token, wanted: str) -> Formula:
+    def reach_content(self, start: Token, wanted: str) -> Formula:
         found = self.path()
         if isinstance(found, Bounded) or found.operator != "F" or not is_boolean(found.operands[0]):
             raise self.error(wanted, start)

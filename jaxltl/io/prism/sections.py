@@ -19,6 +19,8 @@ _STEP = 2**17  # lines per piece
 
 @dataclass(frozen=True)
 class Written:
+    """A section of an explicit file to be written."""
+
     kind: str  # "tra", "lab", "sta", "srew" or "trew"
     number: str  # number of the reward if there are several
     header: list[bytes]  # lines that introduce the section in a single file

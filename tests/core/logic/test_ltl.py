@@ -321,3 +321,28 @@ def test_the_text_of_a_deep_formula_takes_linear_memory(operator):
         tracemalloc.stop()
     assert text.count(operator) == depth and text.count("a") == depth * (operator != "X") + 1
     assert peak < 20e6
+
+
+@pytest.mark.parametrize(
+    "text, plain",
+    [
+        ("□(request → ◇ grant)", "G (request -> F grant)"),
+        ("always (request implies eventually grant)", "G (request -> F grant)"),
+        ("not a until (b and next c)", "!a U (b & X c)"),
+        ("¬a ∧ ○b ∨ c ⊕ ⊤ ↔ ⊥", "((!a & X b) | (c xor true)) <-> false"),
+        ("a release b or c iff a weakuntil b xor c", "(a R b | c) <-> (a W b xor c)"),
+        ("◻◇a ∧ ◊◯b ⇒ ⋄c ⇔ d", "G F a & F X b -> (F c <-> d)"),
+        ("not(a)and(b)", "!a & b"),
+        # Where no operator can be, they are names.
+        ("F next", 'F "next"'),
+        ("next U until", '"next" U "until"'),
+        ("always -> not & or", '"always" -> ("not" & "or")'),
+        ("(eventually)", '"eventually"'),
+        ("nota & always_on & android", '"nota" & "always_on" & "android"'),
+        ("and and and", '"and" & "and"'),
+    ],
+)
+def test_words_and_signs_are_operators(text, plain):
+    found = parse_ltl(text)
+    assert found == parse_ltl(plain)
+    assert parse_ltl(str(found)) == found

@@ -70,6 +70,11 @@ class Question:
 def question_on_mesh(model: ShardedMDP, prop: Property) -> Question:
     """Solver of a property of a model on a mesh of devices."""
     path = _path(prop)
+    if prop.definitions or prop.aggregate is not None:
+        raise ValueError(
+            f"{prop.text}: nested properties, variables and filters are not solved for on a mesh; "
+            "write labels, or solve on one device."
+        )
     if prop.nature is not None:
         raise ValueError(f"{prop.text}: the model has no intervals from which nature could pick.")
     objective = _objective(model, prop)

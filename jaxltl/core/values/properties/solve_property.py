@@ -5,16 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
+from jaxltl.core.values.properties.answers import (
+    Answer as Answer,
+    PropertyStrategy as PropertyStrategy,
+)
 from jaxltl.core.values.properties.exact_reachability import exact_reachability
 from jaxltl.core.values.multi_objective.multi_objective import (
     Achievable,
     ConstrainedOptimum,
     Pareto,
 )
+from jaxltl.core.values.properties.nested import filtered, with_definitions
 from jaxltl.core.values.properties.multi_objective import solve_multi_objective
 from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.logic.bounded import Bounded, Earned, unfolded
@@ -23,12 +28,9 @@ from jaxltl.core.logic.ltl import TRUE, Formula
 from jaxltl.core.logic.properties import MAX_UNFOLDED_STEPS, Property, parse_property
 from jaxltl.core.models.construct.state_formulas import states_satisfying
 from jaxltl.core.models.interval import IntervalMDP
-from jaxltl.core.models.protocols import Array
 from jaxltl.core.models.sparse import SparseMDP
-from jaxltl.core.pretty_print import brief
 from jaxltl.core.types import Solution, Status
 from jaxltl.core import validation
-from jaxltl.core.values import facts
 from jaxltl.core.values.average.average_reward import average_reward
 from jaxltl.core.values.interval.robust import width_asked
 from jaxltl.core.values.interval.step_bounded import (
@@ -42,7 +44,6 @@ from jaxltl.core.values.engine.host_solution import complement_event
 from jaxltl.core.values.undiscounted.reachability import reachability_probability
 from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction
 from jaxltl.core.values.undiscounted.sparse_satisfaction import (
-    Satisfaction,
     at_states,
     starting_states,
 )
@@ -54,62 +55,6 @@ _EXACT = 1e-10  # tolerances up to which small chains are solved in rational ari
 TINY = 1e-12  # absolute width of bounds on rewards that is always accepted
 _AVERAGE = "averages of end components"
 _OTHER = {"max": "min", "min": "max"}
-
-
-@brief
-class PropertyStrategy(NamedTuple):
-    """An optimal strategy of a property.
-
-    Attributes:
-      row: chosen rows ``int32[S]`` of the model; with a memory, ``int32[N]`` of the product.
-      by: ``"steps"`` or ``"reward"`` if the strategy also depends on the remaining steps or
-        reward, and `row` is its first choice; else empty.
-      memory: the product and its automaton, or None.
-      nature: of an interval model, nature's distributions ``float64[T]`` of the model or product.
-
-    Example:
-      >>> from jaxltl import make_sparse
-      >>> safe_or_not = make_sparse([0, 2, 3, 4], [0, 1, 3, 4, 5], [1, 1, 2, 1, 2],
-      ...                           [1, 0.5, 0.5, 1, 1], initial=[1, 0, 0], label={"a": [1]})
-      >>> solve_property(safe_or_not, 'Pmin=? [ F "a" ]').strategy.row.tolist()  # in each state
-      [1, 2, 3]
-    """
-
-    row: np.ndarray
-    by: str = ""
-    memory: Satisfaction | None = None
-    nature: Array | None = None
-
-
-@brief(facts=facts.answer)
-class Answer(NamedTuple):
-    """The result of a property.
-
-    Attributes:
-      states: ``int[I]``.
-      value, lower, upper: ``float64[I]``, with certified bounds.
-      holds: truth of a threshold in each state; None where the bounds do not decide it.
-      status: CONVERGED if all bounds are within the tolerance, or decide the threshold.
-      method: the algorithm and the proof.
-      strategy: an optimal strategy; None in chains.
-
-    Example:
-      >>> from jaxltl import make_sparse
-      >>> coin = make_sparse(None, [0, 2, 3, 4], [1, 2, 1, 2], [0.5, 0.5, 1, 1],
-      ...                    initial=[1, 0, 0], label={"a": [1]})
-      >>> found = solve_property(coin, 'P>=0.4 [ F "a" ]')
-      >>> found.states.tolist(), found.value.tolist(), found.holds, found.status.name
-      ([0], [0.5], [True], 'CONVERGED')
-    """
-
-    states: np.ndarray
-    value: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
-    holds: list[bool | None] | None
-    status: Status
-    method: str
-    strategy: PropertyStrategy | None
 
 
 class _Found(NamedTuple):
@@ -181,6 +126,15 @@ def solve_property(
             f"properties of {type(model).__name__} are not supported; give a SparseMDP "
             "(see to_sparse) or an IntervalMDP."
         )
+    if prop.definitions:
+        model = with_definitions(
+            model,
+            prop,
+            lambda world, part: cast(
+                Answer,
+                solve_property(world, part, states=range(model.num_states), tolerance=tolerance),
+            ),
+        )
     if prop.operator == "multi":
         if states is not None or isinstance(model, IntervalMDP):
             what = "from other than the initial states" if states is not None else "with intervals"
@@ -188,6 +142,8 @@ def solve_property(
                 f"{prop.text}: multi(...) is not supported {what}; ask for one objective at a time."
             )
         return solve_multi_objective(model, prop, tolerance)
+    if prop.aggregate is not None:
+        return _filter(model, prop, states, tolerance)
     if states is None:
         states = np.flatnonzero(np.asarray(model.initial) > 0)
     states = starting_states(model, states)
@@ -203,6 +159,23 @@ def solve_property(
         found = solve(tolerance * part)
         verdicts = _verdicts(prop, found)
     return _answer(prop, states, found, verdicts, tolerance)
+
+
+def _filter(
+    model: SparseMDP | IntervalMDP, prop: Property, states: object, tolerance: float
+) -> Answer:
+    """The aggregate of a property over the states of a filter."""
+    if states is not None:
+        raise ValueError(f"{prop.text}: a filter is over its own states; leave states out.")
+    among = np.flatnonzero(states_satisfying(_graph(model), prop.among, prop.text))
+    if not among.size:
+        raise ValueError(f"{prop.text}: no state satisfies {prop.among}, the states of the filter.")
+    # So that sums of bounds are as narrow as the tolerance.
+    shares = {"sum": len(among), "range": 2}
+    part = replace(prop, aggregate=None, definitions=())
+    fine = tolerance / shares.get(str(prop.aggregate), 1)
+    answer = cast(Answer, solve_property(model, part, states=among, tolerance=fine))
+    return filtered(prop, answer, tolerance)
 
 
 def as_answer(
