@@ -1,0 +1,414 @@
+"""Bounds of programs over boxes: intervals, and linear bounds forward and backward (CROWN).
+
+The box is `x = m + r e` with every `|e_j| <= 1`. Forward, each variable y gets linear bounds
+`A e + a <= y <= B e + b`, and from them and interval arithmetic an interval. Backward, from an output
+to the box, the coefficients of the output's bounds pass through each operation, with the linear
+bounds of elementwise functions over the forward intervals (Zhang et al. 2018); cancellation between
+paths is seen there.
+
+Rounding: a coefficient that is computed as a sum of n products errs by at most `(n + 1) eps` times
+the sum of their magnitudes; it multiplies a variable of bounded magnitude (1 for e), so that the
+error is added to the offset.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxltl.core.array_types import Array
+from jaxltl.core.enclosures import elementwise
+from jaxltl.core.enclosures.elementwise import Relaxation
+from jaxltl.core.enclosures.interval import (
+    Interval,
+    eps,
+    intersect,
+    module_of,
+    outward,
+    point,
+    size_of,
+    times,
+)
+from jaxltl.core.enclosures.program import Elementwise, MatrixProduct, Program, Select, narrows
+from jaxltl.core.pretty_print import brief
+
+
+@brief
+@dataclass(frozen=True)
+class LinearForm:
+    """`lower_slope e + lower <= y <= upper_slope e + upper` for every e in [-1, 1]^J.
+
+    A leading 1 in place of C holds for all boxes.
+
+    Attributes:
+      lower_slope, upper_slope: ``float[C, J, n]`` for C boxes, J input entries and n entries of y.
+      lower, upper: ``float[C, n]``, the values at the boxes' middles.
+
+    Example:
+      >>> slope, middle = np.array([[[2.0]]]), np.array([[1.0]])
+      >>> LinearForm(slope, middle, slope, middle).interval().high.round(6).tolist()
+      [[3.0]]
+    """
+
+    lower_slope: Array
+    lower: Array
+    upper_slope: Array
+    upper: Array
+
+    def interval(self) -> Interval:
+        """Bounds over the box."""
+        low_terms, high_terms = size_of(self.lower_slope).sum(1), size_of(self.upper_slope).sum(1)
+        factor = 2 * (self.lower_slope.shape[1] + 2) * eps(self.lower)
+        low, high = self.lower - low_terms, self.upper + high_terms
+        return outward(low - low_terms * factor, high + high_terms * factor, 2)
+
+    def magnitude(self) -> Array:
+        """At least the sum of the magnitudes of all terms."""
+        slopes = size_of(self.lower_slope).sum(1) + size_of(self.upper_slope).sum(1)
+        return (slopes + size_of(self.lower) + size_of(self.upper)) * (1 + 64 * eps(self.lower))
+
+
+@dataclass(frozen=True)
+class Enclosed:
+    """A program with enclosures of its variables over C boxes."""
+
+    program: Program
+    intervals: Mapping[int, Interval]  # arrays [C, n]; [1, n] for known variables
+    radius: Array  # float[C, J], of the box, with the entries of all inputs in order
+    middle: Array
+
+    @np.errstate(all="ignore")
+    def outputs(self, linear: bool) -> list[Interval]:
+        """Bounds of the outputs, with `linear` by backward bounds too: arrays [C, n]."""
+        found = []
+        for y in self.program.outputs:
+            bounds = self.intervals[y]
+            if linear and y not in self.program.known and y not in self.program.inputs:
+                bounds = intersect(bounds, backward(self, y).interval())
+            found.append(bounds)
+        return found
+
+
+@np.errstate(all="ignore")  # infinite bounds make NaN, which is no bound
+def propagate(program: Program, boxes: list[Interval], linear: bool = True) -> Enclosed:
+    """Enclosures of all variables over boxes with arrays [C, n], from the first operation on."""
+    intervals: dict[int, Interval] = {}
+    xp: Any = module_of(boxes[0].low) if boxes else np
+    for x, value in program.known.items():
+        intervals[x] = point(xp.asarray(value)[None])
+    intervals |= dict(zip(program.inputs, boxes, strict=True))
+    middle = xp.concatenate([x.middle for x in boxes], -1)
+    radius = xp.concatenate([x.radius for x in boxes], -1)
+    forms: dict[int, LinearForm] = {}
+    if linear:
+        forms |= zip(program.inputs, _input_forms(boxes, radius), strict=True)
+    last_use = _last_uses(program)
+    for position, operation in enumerate(program.operations):
+        match operation:
+            case Select():
+                found = _select(operation, [intervals[x] for x in operation.inputs])
+            case MatrixProduct():
+                found = _product(operation.matrix, intervals[operation.input])
+            case Elementwise():
+                found = elementwise.bounds(operation, [intervals[x] for x in operation.inputs])
+        y = operation.output
+        inputs = _inputs(operation)
+        real = jnp.issubdtype(found.low.dtype, jnp.floating)
+        if real and any(x in forms for x in inputs):
+            forms[y] = _forward(operation, intervals, found, forms)
+            found = intersect(found, forms[y].interval())
+        intervals[y] = found
+        for x in inputs:
+            if last_use[x] == position:
+                forms.pop(x, None)
+    return Enclosed(program, intervals, radius, middle)
+
+
+def _inputs(operation: Select | MatrixProduct | Elementwise) -> tuple[int, ...]:
+    return (operation.input,) if isinstance(operation, MatrixProduct) else operation.inputs
+
+
+def _last_uses(program: Program) -> dict[int, int]:
+    return {x: i for i, operation in enumerate(program.operations) for x in _inputs(operation)}
+
+
+def _input_forms(boxes: list[Interval], radius: Array) -> list[LinearForm]:
+    """`x = m + r e`, entry by entry."""
+    xp, forms, start = module_of(radius), [], 0
+    for box in boxes:
+        n = box.low.shape[-1]
+        unit = np.eye(radius.shape[-1], dtype=radius.dtype)[:, start : start + n]
+        slope = xp.asarray(unit)[None] * radius[:, None, start : start + n]
+        forms.append(LinearForm(slope, box.middle, slope, box.middle))
+        start += n
+    return forms
+
+
+def _select(operation: Select, inputs: list[Interval]) -> Interval:
+    if len(inputs) == 1:
+        x = inputs[0]
+        low = x.low[:, operation.index]
+        return Interval(low, low if x.low is x.high else x.high[:, operation.index])
+    return Interval(*(_joined([getattr(x, side) for x in inputs])[..., operation.index]
+                      for side in ("low", "high")))  # fmt: skip
+
+
+def _joined(arrays: list[Array]) -> Array:
+    """Concatenation along the last axis, with boxes repeated."""
+    xp = module_of(arrays[0])
+    lead = np.broadcast_shapes(*(a.shape[:-1] for a in arrays))
+    return xp.concatenate([xp.broadcast_to(a, (*lead, a.shape[-1])) for a in arrays], -1)
+
+
+def _product(matrix: Array, x: Interval) -> Interval:
+    """Products with a matrix by middle and radius (Rump 1999)."""
+    xp = module_of(x.low)
+    matrix = xp.asarray(matrix)
+    size = size_of(matrix).T
+    middle, radius = x.middle @ matrix.T, x.radius @ size
+    error = (x.magnitude @ size) * (2 * (matrix.shape[1] + 2) * eps(middle))
+    found = outward(middle - radius - error, middle + radius + error, 4)
+    finite = xp.isfinite(error)
+    low = xp.where(finite, found.low, -xp.inf)
+    # A sum of non-negative terms is not negative: its square root has a lower bound.
+    positive = (xp.min(matrix) >= 0) & (x.low >= 0).all(-1, keepdims=True)
+    low = xp.where(positive, xp.maximum(low, 0), low)
+    return Interval(low, xp.where(finite, found.high, xp.inf))
+
+
+# --- forward --------------------------------------------------------------------------------------
+
+
+def _forward(
+    operation: Select | MatrixProduct | Elementwise,
+    intervals: Mapping[int, Interval],
+    found: Interval,
+    forms: Mapping[int, LinearForm],
+) -> LinearForm:
+    """The linear bounds of an operation's output from those of its inputs."""
+    count = next(iter(forms.values())).lower_slope.shape[1]
+    dtype = found.low.dtype
+    inputs = [forms.get(x) or _constant(intervals[x], count, dtype) for x in _inputs(operation)]
+    if isinstance(operation, Select):
+        if len(inputs) == 1:
+            return _map(inputs[0], lambda a: a[..., operation.index])
+        parts = zip(
+            *([f.lower_slope, f.lower, f.upper_slope, f.upper] for f in inputs), strict=True
+        )
+        return LinearForm(*(_joined(list(p))[..., operation.index] for p in parts))
+    if isinstance(operation, MatrixProduct):
+        return _forward_product(operation.matrix, inputs[0])
+    values = [intervals[x] for x in operation.inputs]
+    return _forward_elementwise(relaxation(operation, values, found), inputs, found)
+
+
+def _map(form: LinearForm, function: Callable[[Array], Array]) -> LinearForm:
+    return LinearForm(*(function(a) for a in (
+        form.lower_slope, form.lower, form.upper_slope, form.upper)))  # fmt: skip
+
+
+def _constant(x: Interval, count: int, dtype: np.dtype) -> LinearForm:
+    """Bounds without slopes; of a Boolean variable, which has slope 0 everywhere, zeros."""
+    xp = module_of(x.low)
+    zeros = xp.zeros((x.low.shape[0], count, x.low.shape[-1]), dtype)
+    if x.low.dtype != dtype:
+        return LinearForm(zeros, zeros[:, 0], zeros, zeros[:, 0])
+    return LinearForm(zeros, x.low, zeros, x.high)
+
+
+def _forward_product(matrix: Array, x: LinearForm) -> LinearForm:
+    xp = module_of(x.lower)
+    matrix = xp.asarray(matrix)
+    up, down = xp.maximum(matrix, 0).T, xp.minimum(matrix, 0).T
+    error = (x.magnitude() @ size_of(matrix).T) * (2 * (matrix.shape[1] + 2) * eps(x.lower))
+    lower = x.lower @ up + x.upper @ down
+    upper = x.upper @ up + x.lower @ down
+    bounds = outward(lower - error, upper + error, 4)
+    return LinearForm(
+        x.lower_slope @ up + x.upper_slope @ down, bounds.low,
+        x.upper_slope @ up + x.lower_slope @ down, bounds.high,
+    )  # fmt: skip
+
+
+def _forward_elementwise(
+    bounds: Relaxation, inputs: list[LinearForm], found: Interval
+) -> LinearForm:
+    xp = module_of(found.low)
+    zero = found.low[:, None] * 0
+    lower_slope = upper_slope = xp.where(xp.isnan(zero), 0, zero)
+    lower, upper = bounds.lower, bounds.upper
+    size = size_of(lower) + size_of(upper)
+    for x, a, b in zip(inputs, bounds.lower_slope, bounds.upper_slope, strict=True):
+        a_up, a_down = xp.maximum(a, 0), xp.minimum(a, 0)
+        b_up, b_down = xp.maximum(b, 0), xp.minimum(b, 0)
+        lower_slope = lower_slope + a_up[:, None] * x.lower_slope + a_down[:, None] * x.upper_slope
+        upper_slope = upper_slope + b_up[:, None] * x.upper_slope + b_down[:, None] * x.lower_slope
+        lower = lower + times(a_up, x.lower) + times(a_down, x.upper)
+        upper = upper + times(b_up, x.upper) + times(b_down, x.lower)
+        size = size + times(xp.maximum(size_of(a), size_of(b)), x.magnitude())
+    error = size * (4 * (len(inputs) + 2) * eps(found.low))
+    offsets = outward(lower - error, upper + error, 4)
+    return LinearForm(lower_slope, offsets.low, upper_slope, offsets.high)
+
+
+def relaxation(operation: Elementwise, values: list[Interval], found: Interval) -> Relaxation:
+    """Linear bounds of an elementwise operation; exact for sums and products with known numbers."""
+    xp, zero = module_of(found.low), found.low * 0
+    zero = xp.where(xp.isnan(zero), 0, zero)
+    one = zero + 1
+    if operation.name in ("add", "sub"):
+        slopes = (one, one if operation.name == "add" else -one)
+        return Relaxation(slopes, zero, slopes, zero)
+    exact = operation.name == "convert_element_type" and (
+        jnp.issubdtype(values[0].low.dtype, jnp.floating)
+        and not narrows(found.low.dtype, values[0].low.dtype)
+    )
+    if operation.name == "neg" or exact:
+        slope = -one if operation.name == "neg" else one
+        return Relaxation((slope,), zero, (slope,), zero)
+    return elementwise.relax(operation, values, found)
+
+
+# --- backward -------------------------------------------------------------------------------------
+
+
+class _Coefficients:
+    """Coefficients of one variable's bounds by the variables still to be resolved."""
+
+    def __init__(self, known: Enclosed, target: int) -> None:
+        self.known = known
+        self.xp = xp = module_of(known.radius)
+        size = known.intervals[target].low.shape[-1]
+        unit = xp.eye(size, dtype=known.radius.dtype)[None]
+        self.slopes: dict[int, tuple[Array, Array]] = {target: (unit, unit)}  # float[C, M, n]
+        self.lower = self.upper = self.error = xp.zeros((1, size), known.radius.dtype)  # [C, M]
+        self.eps = eps(known.radius)
+
+    def add(self, x: int, lower: Array, upper: Array) -> None:
+        """Adds slopes of a variable, which may have slopes already."""
+        if x in self.known.program.known:
+            self.constant(self.known.intervals[x], lower, upper)
+            return
+        if x in self.slopes:
+            before = self.slopes[x]
+            lower, upper = lower + before[0], upper + before[1]
+            self.rounded(lower, upper, self.known.intervals[x].magnitude, 1)
+        self.slopes[x] = (lower, upper)
+
+    def rounded(self, lower: Array, upper: Array, size: Array, terms: int) -> None:
+        """Counts the errors of slopes that multiply variables of magnitudes at most `size`."""
+        total = _contract(size_of(lower) + size_of(upper), size)
+        self.error = self.error + total * (2 * (terms + 2) * self.eps)
+
+    def constant(self, value: Interval, lower: Array, upper: Array) -> None:
+        """Adds slopes times bounds to the offsets."""
+        xp = self.xp
+        low, high = value.low[:, None], value.high[:, None]
+        if value.low is value.high:
+            self.lower = self.lower + times(lower, low).sum(-1)
+            self.upper = self.upper + times(upper, low).sum(-1)
+        else:
+            self.lower = self.lower + times(lower, xp.where(lower > 0, low, high)).sum(-1)
+            self.upper = self.upper + times(upper, xp.where(upper > 0, high, low)).sum(-1)
+        self.rounded(lower, upper, value.magnitude, value.low.shape[-1])
+        self.error = self.error + (size_of(self.lower) + size_of(self.upper)) * (4 * self.eps)
+
+
+@np.errstate(all="ignore")
+def backward(known: Enclosed, target: int) -> LinearForm:
+    """Linear bounds of a variable over the boxes, by backward propagation."""
+    state, intervals = _Coefficients(known, target), known.intervals
+    xp = state.xp
+    for operation in reversed(known.program.operations):
+        if operation.output not in state.slopes:
+            continue
+        lower, upper = state.slopes.pop(operation.output)
+        match operation:
+            case Select():
+                _back_select(state, operation, lower, upper)
+            case MatrixProduct():
+                matrix = xp.asarray(operation.matrix)
+                size = intervals[operation.input].magnitude @ size_of(matrix).T
+                state.rounded(lower, upper, size, matrix.shape[0])
+                state.add(operation.input, lower @ matrix, upper @ matrix)
+            case Elementwise():
+                _back_elementwise(state, operation, lower, upper)
+    return _resolved(state, target)
+
+
+def _back_select(state: _Coefficients, operation: Select, lower: Array, upper: Array) -> None:
+    sizes = [state.known.intervals[x].low.shape[-1] for x in operation.inputs]
+    total, index = sum(sizes), operation.index
+    slopes = [_scatter(a, index, total) for a in (lower, upper)]
+    start = 0
+    for x, n in zip(operation.inputs, sizes, strict=True):
+        part = slice(start, start + n)
+        start += n
+        if not jnp.issubdtype(state.known.intervals[x].low.dtype, jnp.floating):
+            continue
+        if len(index) > total:  # entries that are repeated are summed
+            magnitude = state.known.intervals[x].magnitude
+            state.rounded(slopes[0][..., part], slopes[1][..., part], magnitude, len(index))
+        state.add(x, slopes[0][..., part], slopes[1][..., part])
+
+
+def _scatter(slope: Array, index: np.ndarray, total: int) -> Array:
+    """Sums of the slopes of equal entries."""
+    if len(index) == total and (index == np.arange(total)).all():
+        return slope
+    xp = module_of(slope)
+    zeros = xp.zeros((*slope.shape[:-1], total), slope.dtype)
+    if xp is jnp:
+        return zeros.at[..., index].add(slope)
+    order = np.argsort(index, kind="stable")
+    entries, starts = np.unique(index[order], return_index=True)
+    zeros[..., entries] = np.add.reduceat(slope[..., order], starts, axis=-1)
+    return zeros
+
+
+def _back_elementwise(
+    state: _Coefficients, operation: Elementwise, lower: Array, upper: Array
+) -> None:
+    xp, intervals = state.xp, state.known.intervals
+    values, found = [intervals[x] for x in operation.inputs], intervals[operation.output]
+    bounds = relaxation(operation, values, found)
+    state.constant(Interval(bounds.lower, bounds.upper), lower, upper)
+    up, down = xp.maximum(lower, 0), xp.minimum(lower, 0)
+    above, below = xp.maximum(upper, 0), xp.minimum(upper, 0)
+    for x, value, a, b in zip(
+        operation.inputs, values, bounds.lower_slope, bounds.upper_slope, strict=True
+    ):
+        if not jnp.issubdtype(value.low.dtype, jnp.floating):
+            continue
+        a, b = a[:, None], b[:, None]
+        new = (up * a + down * b, above * b + below * a)
+        state.rounded(*new, value.magnitude, 2)
+        state.add(x, *new)
+
+
+def _resolved(state: _Coefficients, target: int) -> LinearForm:
+    """The slopes of the inputs, as a form in e."""
+    known, xp = state.known, state.xp
+    size = known.intervals[target].low.shape[-1]
+    boxes = [known.intervals[x] for x in known.program.inputs]
+    parts = []
+    for x, box in zip(known.program.inputs, boxes, strict=True):
+        zeros = xp.zeros((1, size, box.low.shape[-1]), known.radius.dtype)
+        parts.append(state.slopes.get(x, (zeros, zeros)))
+    lower, upper = (_joined([p[side] for p in parts]) for side in (0, 1))
+    state.constant(point(known.middle), lower, upper)
+    slopes = [xp.swapaxes(a * known.radius[:, None], 1, 2) for a in (lower, upper)]
+    state.rounded(lower, upper, known.radius, 1)
+    error = state.error * (1 + 1024 * state.eps)
+    offsets = outward(state.lower - error, state.upper + error, 4)
+    return LinearForm(slopes[0], offsets.low, slopes[1], offsets.high)
+
+
+def _contract(slope: Array, size: Array) -> Array:
+    """Sums over the entries of slopes times magnitudes: [C, M, n] and [C, n] to [C, M]."""
+    xp = module_of(slope)
+    return times(slope, xp.broadcast_to(size[:, None], (size.shape[0], 1, size.shape[1]))).sum(-1)

@@ -1,0 +1,461 @@
+"""JAX functions as straight-line programs of three kinds of operations on flat vectors.
+
+Every variable is a vector; what remains of a function's primitives is selection of entries by
+constant indices (reshapes, slices, broadcasts, indexing), products with matrices (dot products with
+known arrays, sums), and elementwise functions. Calls are inlined and loops of fixed length are
+unrolled.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend import core
+from numpy.typing import DTypeLike
+
+from jaxltl.core.array_types import Array
+from jaxltl.core.enclosures.interval import module_of
+from jaxltl.core.models.protocols import PyTree
+
+MAX_OPERATIONS = 20_000  # after loops are unrolled
+MAX_MATRIX = 2**26  # entries of the matrix of one product
+_OWN = (str(Path(jax.__file__).parent), str(Path(__file__).parent))
+
+ELEMENTWISE = {
+    "add", "sub", "mul", "div", "max", "min", "neg", "abs", "sign", "floor", "ceil", "round",
+    "exp", "exp2", "expm1", "log", "log1p", "logistic", "tanh", "sqrt", "rsqrt", "cbrt",
+    "sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "asinh", "erf",
+    "square", "integer_pow", "pow", "convert_element_type", "select_n",
+    "lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not",
+}  # fmt: skip
+_RENAMED = {"add_any": "add", "copy": "reshape", "copy_p": "reshape", "stop_gradient": "reshape",
+            "squeeze": "reshape", "expand_dims": "reshape", "optimization_barrier": "reshape"}  # fmt: skip
+_SELECTIONS = {"reshape", "broadcast_in_dim", "transpose", "slice", "rev", "concatenate", "stack",
+               "split", "gather", "dynamic_slice", "tile", "dynamic_update_slice"}  # fmt: skip
+_REDUCTIONS = {"reduce_max": "max", "reduce_min": "min", "reduce_prod": "mul",
+               "reduce_and": "and", "reduce_or": "or"}  # fmt: skip
+_CALLS = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr",
+          "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr",
+          "custom_vjp_call_jaxpr": "fun_jaxpr", "remat2": "jaxpr", "checkpoint": "jaxpr"}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Select:
+    """Entries `index` of the concatenated inputs."""
+
+    inputs: tuple[int, ...]
+    output: int
+    index: np.ndarray  # int[n]
+
+
+@dataclass(frozen=True)
+class MatrixProduct:
+    """`matrix x`."""
+
+    input: int
+    output: int
+    matrix: Array  # float[n, m]
+
+
+@dataclass(frozen=True)
+class Elementwise:
+    """A function of vectors of equal length, entry by entry."""
+
+    name: str
+    params: Mapping[str, Any]
+    inputs: tuple[int, ...]
+    output: int
+    place: str  # source line, for error messages
+
+
+Operation = Select | MatrixProduct | Elementwise
+
+
+@dataclass(frozen=True)
+class Program:
+    """A straight-line program on flat vectors."""
+
+    operations: tuple[Operation, ...]
+    inputs: tuple[int, ...]
+    known: Mapping[int, Array]  # vectors that are known: literals, constants, results of integers
+    outputs: tuple[int, ...]
+    shapes: Mapping[int, jax.ShapeDtypeStruct]  # of the arrays before they were made flat
+    output_tree: jax.tree_util.PyTreeDef
+
+
+def make_program(function: Callable[..., PyTree], *args: PyTree) -> Program:
+    """The program of a JAX function at arguments of given shapes and dtypes.
+
+    Raises:
+      ValueError: the function cannot be traced, has a loop whose length depends on values, or a
+        primitive that is not supported; names it and its place in the source.
+    """
+    try:
+        closed, shapes = jax.make_jaxpr(function, return_shape=True)(*args)
+    except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
+        reason = str(error).split("\n", 1)[0]
+        raise ValueError(
+            f"the function cannot be traced: it reads the value of an argument in Python ({reason}) "
+            "Use jnp.where and jnp functions in place of `if`, float() and NumPy."
+        ) from None
+    builder = _Builder()
+    inputs = [builder.new(_spec(v)) for v in closed.jaxpr.invars]
+    outputs = builder.inline(closed.jaxpr, closed.consts, inputs)
+    return Program(
+        tuple(builder.operations),
+        tuple(inputs),
+        builder.known,
+        tuple(outputs),
+        builder.shapes,
+        jax.tree.structure(shapes),
+    )
+
+
+class _Builder:
+    """The operations so far."""
+
+    def __init__(self) -> None:
+        self.operations: list[Operation] = []
+        self.known: dict[int, Array] = {}
+        self.shapes: dict[int, jax.ShapeDtypeStruct] = {}
+        self.place = "the function"  # of the innermost call that is inlined
+
+    def new(self, aval: jax.ShapeDtypeStruct) -> int:
+        """A new variable of a shape and dtype."""
+        index = len(self.shapes)
+        self.shapes[index] = jax.ShapeDtypeStruct(aval.shape, aval.dtype)
+        return index
+
+    def constant(self, value: Array) -> int:
+        """A variable with a known value."""
+        if not isinstance(value, jax.core.Tracer):
+            value = np.asarray(value)
+        index = self.new(jax.ShapeDtypeStruct(value.shape, value.dtype))
+        self.known[index] = value.reshape(-1)
+        return index
+
+    def _place(self, equation: core.JaxprEqn) -> str:
+        """Source line of an equation: the innermost frame outside JAX and this package.
+
+        The body of a call that JAX traced before may have no such frame: then that of the call.
+        """
+        traceback: Any = equation.source_info.traceback
+        for frame in traceback.frames if traceback is not None else ():
+            if not frame.file_name.startswith(_OWN):
+                return f"{frame.file_name}:{frame.line_num}"
+        return self.place
+
+    def inline(
+        self, jaxpr: core.Jaxpr, constants: Sequence[Array], inputs: Sequence[int]
+    ) -> list[int]:
+        """Appends the operations of a jaxpr; returns its outputs."""
+        variables: dict[core.Var, int] = dict(zip(jaxpr.invars, inputs, strict=True))
+        for variable, value in zip(jaxpr.constvars, constants, strict=True):
+            variables[variable] = self.constant(value)
+
+        def read(atom: core.Var | core.Literal) -> int:
+            if isinstance(atom, core.Var):
+                return variables[atom]
+            return self.constant(np.asarray(atom.val, _spec(atom).dtype))
+
+        for equation in jaxpr.eqns:
+            outputs = self._append(equation, [read(x) for x in equation.invars])
+            variables |= dict(zip(equation.outvars, outputs, strict=True))
+        return [read(x) for x in jaxpr.outvars]
+
+    def _append(self, equation: core.JaxprEqn, inputs: list[int]) -> list[int]:
+        name = str(equation.primitive)
+        name = _RENAMED.get(name, name)
+        if name in _CALLS:
+            inner, outside = equation.params[_CALLS[name]], self.place
+            self.place = self._place(equation)
+            found = self.inline(
+                getattr(inner, "jaxpr", inner), getattr(inner, "consts", ()), inputs
+            )
+            self.place = outside
+            return found
+        if name == "scan":
+            return self._unroll(equation, inputs)
+        if len(self.operations) >= MAX_OPERATIONS:
+            raise ValueError(
+                f"{self._place(equation)}: the function has more than {MAX_OPERATIONS} operations after its "
+                "loops are unrolled; shorten the loops."
+            )
+        if self._is_exact(name, equation, inputs):
+            return self._evaluate(equation, inputs)
+        if name in _SELECTIONS:
+            return self._select(name, equation, inputs)
+        output = _spec(equation.outvars[0])
+        if name in _REDUCTIONS:
+            return [self._reduce(_REDUCTIONS[name], equation, inputs[0])]
+        if name in ("reduce_sum", "cumsum"):
+            return [self._linear(equation, inputs, 0)]
+        if name == "dot_general":
+            return [self._dot(equation, inputs)]
+        if name == "clamp":
+            low = self._elementwise("max", equation, [inputs[1], inputs[0]], output)
+            return [self._elementwise("min", equation, [low, inputs[2]], output)]
+        if name in ELEMENTWISE:
+            return [self._elementwise(name, equation, inputs, output)]
+        raise ValueError(f"{self._place(equation)}: {_refusal(name)}")
+
+    def _is_exact(self, name: str, equation: core.JaxprEqn, inputs: list[int]) -> bool:
+        """True for an operation on known numbers that is evaluated without rounding."""
+        if not all(x in self.known for x in inputs):
+            return False
+        exact = not any(jnp.issubdtype(_spec(v).dtype, jnp.floating) for v in equation.outvars)
+        widens = name == "convert_element_type" and self._converts(equation, inputs[0])
+        return exact or widens or name in _SELECTIONS or name in ("max", "min", "iota", "select_n")
+
+    def _converts(self, equation: core.JaxprEqn, x: int) -> bool:
+        """Whether the conversion of a known array loses nothing."""
+        new, value = equation.params["new_dtype"], self.known[x]
+        if not narrows(new, value.dtype):
+            return True
+        return isinstance(value, np.ndarray) and bool((value.astype(new) == value).all())
+
+    def _evaluate(self, equation: core.JaxprEqn, inputs: list[int]) -> list[int]:
+        """A primitive of known numbers."""
+        with jax.ensure_compile_time_eval():
+            arrays = [jnp.asarray(self.known[x]).reshape(self.shapes[x].shape) for x in inputs]
+            found = equation.primitive.bind(*arrays, **equation.params)
+        found = found if equation.primitive.multiple_results else [found]
+        return [self.constant(x) for x in found]
+
+    def _select(self, name: str, equation: core.JaxprEqn, inputs: list[int]) -> list[int]:
+        """Selection of entries: the primitive's own result on the entries' numbers."""
+        data = {"gather": 1, "dynamic_slice": 1, "dynamic_update_slice": 2}.get(name, len(inputs))
+        if any(x not in self.known for x in inputs[data:]):
+            raise ValueError(
+                f"{self._place(equation)}: an index depends on the argument; index by constants, or use "
+                "jnp.where."
+            )
+        sizes = [math.prod(self.shapes[x].shape) for x in inputs[:data]]
+        starts = np.cumsum([0, *sizes[:-1]])
+        numbers = [
+            np.arange(start, start + size, dtype=np.int32).reshape(self.shapes[x].shape)
+            for x, start, size in zip(inputs, starts, sizes, strict=False)
+        ]
+        indices = [self.known[x].reshape(self.shapes[x].shape) for x in inputs[data:]]
+        outputs = []
+        for i, index in enumerate(_selection(name, equation, numbers, indices)):
+            output = self.new(_spec(equation.outvars[i]))
+            selected = Select(tuple(inputs[:data]), output, np.asarray(index).reshape(-1))
+            self.operations.append(selected)
+            outputs.append(output)
+        return outputs
+
+    def _elementwise(
+        self, name: str, equation: core.JaxprEqn, inputs: list[int], output: jax.ShapeDtypeStruct
+    ) -> int:
+        inputs = [self._broadcast(x, output.shape) for x in inputs]
+        index = self.new(output)
+        self.operations.append(
+            Elementwise(name, equation.params, tuple(inputs), index, self._place(equation))
+        )
+        return index
+
+    def _broadcast(self, x: int, shape: tuple[int, ...]) -> int:
+        """An input of an elementwise function in the shape of its output."""
+        spec = self.shapes[x]
+        if spec.shape == shape:
+            return x
+        if x in self.known:
+            known = self.known[x].reshape(spec.shape)
+            return self.constant(module_of(known).broadcast_to(known, shape))
+        numbers = np.arange(math.prod(spec.shape), dtype=np.int32).reshape(spec.shape)
+        index = self.new(jax.ShapeDtypeStruct(shape, spec.dtype))
+        self.operations.append(Select((x,), index, np.broadcast_to(numbers, shape).reshape(-1)))
+        return index
+
+    def _reduce(self, name: str, equation: core.JaxprEqn, x: int) -> int:
+        """A reduction as a chain of elementwise operations."""
+        axes, shape = equation.params["axes"], self.shapes[x].shape
+        output = _spec(equation.outvars[0])
+        numbers = np.arange(math.prod(shape), dtype=np.int32).reshape(shape)
+        parts = np.moveaxis(numbers, axes, range(len(axes))).reshape(-1, math.prod(output.shape))
+        found = -1
+        for part in parts:
+            here = self.new(jax.ShapeDtypeStruct(output.shape, self.shapes[x].dtype))
+            self.operations.append(Select((x,), here, part))
+            found = here if found < 0 else self._elementwise(name, equation, [found, here], output)
+        return found
+
+    def _linear(self, equation: core.JaxprEqn, inputs: list[int], index: int) -> int:
+        """A primitive that is linear in one input and knows the others, by its matrix."""
+        shape, output = self.shapes[inputs[index]].shape, _spec(equation.outvars[0])
+        rows, columns = math.prod(output.shape), math.prod(shape)
+        if rows * columns > MAX_MATRIX:
+            raise ValueError(
+                f"{self._place(equation)}: a product with a matrix of {rows} by {columns} entries, "
+                f"{8 * rows * columns:.1e} bytes; split the array."
+            )
+        matrix = _matrix(equation, [self.known.get(x) for x in inputs], index)
+        found = self.new(output)
+        self.operations.append(MatrixProduct(inputs[index], found, matrix))
+        return found
+
+    def _dot(self, equation: core.JaxprEqn, inputs: list[int]) -> int:
+        """A dot product: with a known array a matrix; else products of entries, and their sums."""
+        for index in (0, 1):
+            if inputs[1 - index] in self.known:
+                return self._linear(equation, inputs, index)
+        left, right, _, summed = _letters(equation)
+        sizes = dict(zip(left + right, _shape(equation, 0) + _shape(equation, 1), strict=True))
+        order = "".join(dict.fromkeys(_letters(equation)[2] + summed))
+        full = jax.ShapeDtypeStruct(
+            tuple(sizes[c] for c in order), _spec(equation.outvars[0]).dtype
+        )
+        factors = []
+        for x, letters in zip(inputs, (left, right), strict=True):
+            numbers = np.arange(math.prod(self.shapes[x].shape), dtype=np.int32)
+            numbers = numbers.reshape(self.shapes[x].shape)
+            ones = [np.ones(n, np.int32) for c, n in sizes.items() if c not in letters]
+            others = "".join(c for c in sizes if c not in letters)
+            index = np.einsum(
+                f"{letters}{''.join(',' + c for c in others)}->{order}", numbers, *ones
+            )
+            factor = self.new(full)
+            self.operations.append(Select((x,), factor, index.reshape(-1)))
+            factors.append(factor)
+        products = self._elementwise("mul", equation, factors, full)
+        rows = math.prod(_spec(equation.outvars[0]).shape)
+        terms = math.prod(full.shape) // rows
+        found = self.new(_spec(equation.outvars[0]))
+        matrix = np.repeat(np.eye(rows, dtype=full.dtype), terms, axis=1)
+        self.operations.append(MatrixProduct(products, found, matrix))
+        return found
+
+    def _unroll(self, equation: core.JaxprEqn, inputs: list[int]) -> list[int]:
+        """The operations of each step of a scan, with slices of its arrays."""
+        p = equation.params
+        constants, carries = p["num_consts"], p["num_carry"]
+        fixed, carry = inputs[:constants], list(inputs[constants : constants + carries])
+        arrays, body = inputs[constants + carries :], p["jaxpr"]
+        stacked: list[list[int]] = []
+        steps = range(p["length"])
+        for t in reversed(steps) if p["reverse"] else steps:
+            here = [self._apply(lambda x, t=t: x[t], [array]) for array in arrays]
+            out = self.inline(body.jaxpr, body.consts, [*fixed, *carry, *here])
+            carry = out[:carries]
+            stacked.append(out[carries:])
+        if p["reverse"]:
+            stacked.reverse()
+        columns = [
+            self._apply(lambda *xs: jnp.stack(xs), list(c)) for c in zip(*stacked, strict=True)
+        ]
+        return [*carry, *columns]
+
+    def _apply(self, function: Callable[..., jax.Array], inputs: list[int]) -> int:
+        """Appends the operations of a function of variables."""
+        closed = jax.make_jaxpr(function)(*(self.shapes[i] for i in inputs))
+        return self.inline(closed.jaxpr, closed.consts, inputs)[0]
+
+
+def narrows(new: DTypeLike, old: DTypeLike) -> bool:
+    """Whether a conversion to a dtype of floats loses digits."""
+    new, old = jnp.dtype(new), jnp.dtype(old)
+    if not jnp.issubdtype(new, jnp.floating):
+        return False
+    if jnp.issubdtype(old, jnp.integer):
+        return jnp.iinfo(old).bits > jnp.finfo(new).nmant
+    return jnp.issubdtype(old, jnp.floating) and jnp.finfo(new).bits < jnp.finfo(old).bits
+
+
+def _selection(
+    name: str, equation: core.JaxprEqn, numbers: list[np.ndarray], indices: list[Array]
+) -> list[Array]:
+    """The numbers that the primitive selects; without compilation for the common ones."""
+    p, x = equation.params, numbers[0]
+    if name == "reshape":
+        return list(numbers)
+    if name == "transpose":
+        return [x.transpose(p["permutation"])]
+    if name == "slice":
+        strides = p["strides"] or (1,) * x.ndim
+        cut = zip(p["start_indices"], p["limit_indices"], strides, strict=True)
+        return [x[tuple(slice(*c) for c in cut)]]
+    if name == "rev":
+        return [np.flip(x, p["dimensions"])]
+    if name == "concatenate":
+        return [np.concatenate(numbers, p["dimension"])]
+    if name == "stack":
+        return [np.stack(numbers, p["axis"])]
+    if name == "broadcast_in_dim":
+        place = [1] * len(p["shape"])
+        for axis, size in zip(p["broadcast_dimensions"], x.shape, strict=True):
+            place[axis] = size
+        return [np.broadcast_to(x.reshape(place), p["shape"])]
+    with jax.ensure_compile_time_eval():
+        found = equation.primitive.bind(*map(jnp.asarray, [*numbers, *indices]), **p)
+    return list(found) if equation.primitive.multiple_results else [found]
+
+
+def _matrix(equation: core.JaxprEqn, known: list[Array | None], index: int) -> Array:
+    """Matrix of a primitive that is linear in one input: its values at unit vectors."""
+    shape, output = _shape(equation, index), _spec(equation.outvars[0])
+    units = np.eye(math.prod(shape), dtype=output.dtype).reshape(-1, *shape)
+    if str(equation.primitive) == "reduce_sum":
+        columns: Array = units.sum(tuple(a + 1 for a in equation.params["axes"]))
+    elif str(equation.primitive) == "cumsum":
+        axis = equation.params["axis"] + 1
+        reverse = equation.params["reverse"]
+        columns = np.flip(np.cumsum(np.flip(units, axis), axis), axis) if reverse else np.cumsum(
+            units, axis)  # fmt: skip
+    else:
+        left, right, out, _ = _letters(equation)
+        other = known[1 - index]
+        assert other is not None
+        other = other.reshape(_shape(equation, 1 - index)).astype(output.dtype)
+        letters = (left, right)[index]
+        columns = module_of(other).einsum(
+            f"Z{letters},{(left, right)[1 - index]}->Z{out}", units, other
+        )
+    return columns.reshape(len(units), -1).T
+
+
+def _spec(atom: core.Var | core.Literal) -> jax.ShapeDtypeStruct:
+    """Shape and dtype of a variable or literal."""
+    aval: Any = atom.aval
+    return jax.ShapeDtypeStruct(aval.shape, aval.dtype)
+
+
+def _shape(equation: core.JaxprEqn, index: int) -> tuple[int, ...]:
+    """Shape of an input."""
+    return tuple(_spec(equation.invars[index]).shape)
+
+
+def _letters(equation: core.JaxprEqn) -> tuple[str, str, str, str]:
+    """Subscripts of a dot product: left, right, output, and the contracted ones."""
+    (left_sum, right_sum), (left_batch, right_batch) = equation.params["dimension_numbers"]
+    names = iter("abcdefghijklmnopqrstuvwxyz")
+    left = [next(names) for _ in _shape(equation, 0)]
+    right = [next(names) for _ in _shape(equation, 1)]
+    for a, b in zip((*left_sum, *left_batch), (*right_sum, *right_batch), strict=True):
+        right[b] = left[a]
+    batch = [left[a] for a in left_batch]
+    summed = [left[a] for a in left_sum]
+    free = [c for c in left if c not in batch + summed] + [
+        c for c in right if c not in batch + summed
+    ]
+    return "".join(left), "".join(right), "".join(batch + free), "".join(summed)
+
+
+def _refusal(name: str) -> str:
+    """What an unsupported primitive needs."""
+    if name in ("while", "cond"):
+        return (
+            f"`{name}` depends on values that are not known. Use a loop of fixed length (lax.scan, or "
+            "lax.fori_loop with constant bounds) and jnp.where."
+        )
+    return (
+        f"the primitive `{name}` has no enclosure. Supported are arithmetic, dot products, elementary "
+        "functions, min, max, clip, where, indexing by constants, reshapes and loops of fixed length."
+    )
