@@ -69,6 +69,7 @@ from .properties.solve_property import (
     PropertyStrategy as PropertyStrategy,
     solve_property as solve_property,
 )
+from .undiscounted.mixture import Mixture as Mixture, practical_policy as practical_policy
 from .undiscounted.total_reward import hitting_time as hitting_time
 from .undiscounted.optimal_actions import (
     OptimalActions as OptimalActions,
@@ -84,6 +85,12 @@ from .undiscounted.satisfaction import (
     optimal_satisfaction as optimal_satisfaction,
     satisfaction_probability as satisfaction_probability,
 )
+from .undiscounted.satisfaction_steps import (
+    Quickest as Quickest,
+    Steps as Steps,
+    quickest_policy as quickest_policy,
+    satisfaction_steps as satisfaction_steps,
+)
 from .undiscounted.sparse_satisfaction import (
     Satisfaction as Satisfaction,
 )
@@ -95,3 +102,4 @@ from .undiscounted.step_bounded import (
     reward_bounded_reachability as reward_bounded_reachability,
 )
 from .undiscounted.total_reward import total_reward as total_reward
+from .undiscounted.steps_front import Vertex as Vertex, steps_front as steps_front

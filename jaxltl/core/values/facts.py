@@ -22,26 +22,6 @@ from jaxltl.core.types import Status
 _INNER = 92
 
 
-def evaluation(value: Any) -> Iterator[str]:
-    """Facts of an Evaluation; its ``str`` is a table."""
-    yield value.status.name
-    yield count(value.num_episodes, "episode")
-    for name in ("success", "reward", "cost", "length"):
-        found = getattr(value, name)
-        if found is not None and (name != "cost" or found.mean):
-            yield f"{name} {number(found.mean)} in [{found.lower:.6g}, {found.upper:.6g}]"
-    yield f"confidence {value.confidence:g}"
-    if value.threshold is not None:
-        known = {True: "met", False: "not met", None: "open"}[value.decision]
-        yield f"threshold {value.threshold:g} {known}"
-
-
-def estimate(value: Any) -> Iterator[str]:
-    """Of an Estimate."""
-    yield f"{number(value.mean)} in [{value.lower:.6g}, {value.upper:.6g}]"
-    yield value.method
-
-
 def guarantee(value: Any) -> Iterator[str]:
     """Of a DataGuarantee."""
     yield (

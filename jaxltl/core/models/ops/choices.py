@@ -301,6 +301,7 @@ def choices(model: Model) -> Actions | Rows:
 
 @choices.register(SparseMDP)
 def row_choices(model: SparseMDP) -> Rows:
+    """Choices of a sparse model, by rows."""
     return Rows(kernels.segment_ids(model.row_start, model.num_rows), jnp.asarray(model.row_start))
 
 

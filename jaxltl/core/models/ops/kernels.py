@@ -94,10 +94,21 @@ def folded(
     rows = gather(value, successor)
     terms = term(weight.reshape(weight.shape + (1,) * (rows.ndim - weight.ndim)), rows)
     wholes: dict[Any, Any] = {jnp.add: jnp.sum, jnp.logical_or: jnp.any, jnp.minimum: jnp.min}
-    return wholes[combine](terms, axis=axis)
+    return wholes[combine](terms, axis=axis) if combine in wholes else tree(combine, terms, axis)
+
+
+def tree(combine: Term, terms: jax.Array, axis: int) -> jax.Array:
+    """Reduction along an axis by halves."""
+    terms = jnp.moveaxis(terms, axis, 0)
+    while terms.shape[0] > 1:
+        half = terms.shape[0] // 2
+        joined = combine(terms[:half], terms[half : 2 * half])
+        terms = jnp.concatenate([joined, terms[2 * half :]])
+    return terms[0]
 
 
 def stacked(columns: Sequence[jax.Array]) -> jax.Array:
+    """Columns stacked along a last axis."""
     return jnp.stack(columns, axis=-1)
 
 
@@ -112,6 +123,7 @@ def where_positive(weight: jax.Array, value: jax.Array) -> jax.Array:
 
 
 def dtype_max(dtype: Any) -> Any:
+    """Largest value of a dtype, infinity for floats."""
     is_float = jnp.issubdtype(dtype, jnp.floating)
     return jnp.inf if is_float else jnp.iinfo(dtype).max
 

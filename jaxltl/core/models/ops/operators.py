@@ -285,9 +285,14 @@ def make_chain(successor: jax.Array, probability: jax.Array, initial: jax.Array)
     )
 
 
+@combined.register
+def _(model: DenseMDP, value: jax.Array, term: kernels.Term, combine: kernels.Term) -> jax.Array:
+    return kernels.tree(combine, term(model.successor_probability, value), -1)
+
+
 @expectation.register
 def _(model: DenseMDP, value: jax.Array) -> jax.Array:
-    return jnp.einsum("sat,t->sa", model.successor_probability, value)
+    return jnp.einsum("sat,t->sa", model.successor_probability, value, precision="highest")
 
 
 @induced_chain.register
@@ -304,7 +309,7 @@ def _(model: DenseMDP, policy: jax.Array) -> DenseMDP:
 
 @transition_matrix.register
 def _(model: DenseMDP, policy: jax.Array) -> jax.Array:
-    return jnp.einsum("sa,sat->st", policy, model.successor_probability)
+    return jnp.einsum("sa,sat->st", policy, model.successor_probability, precision="highest")
 
 
 @exists_successor.register

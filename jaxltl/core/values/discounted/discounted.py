@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -24,15 +24,21 @@ from jaxltl.core.models.compiled.compiled import compiled_form, flatten_policy, 
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.ops.array_namespace import is_traced
 from jaxltl.core.models.ops.choices import choices
+from jaxltl.core.models.mdp import MDP, DenseMDP
+from jaxltl.core.models.mesh.sharded import ShardedMDP
+from jaxltl.core.models.ops import double_word as dw
+from jaxltl.core.models.ops import kernels
 from jaxltl.core.models.ops.operators import (
     expectation,
     policy_operator,
     require_policy,
     valid_policy,
 )
-from jaxltl.core.models.ops.successor_tables import sweep_operator
+from jaxltl.core.models.ops.successor_tables import action_columns, sweep_operator
+from jaxltl.core.models.product import Product
+from jaxltl.core.models.protocols import ActionModel, SuccessorModel
 from jaxltl.core.models.sparse import SparseMDP, choice_reward
-from jaxltl.core.types import Solution, status_code
+from jaxltl.core.types import Solution, Status, status_code
 from jaxltl.core.values.engine import newton
 from jaxltl.core.values.engine.certificates import (
     Enclosure,
@@ -43,11 +49,13 @@ from jaxltl.core.values.engine.certificates import (
 )
 from jaxltl.core.values.engine.host_solution import discounted, is_sparse
 from jaxltl.core.values.engine.implicit_diff import implicit
-from jaxltl.core.values.engine.iterate import iterate
+from jaxltl.core.values.engine.iterate import in_turn, iterate
 from jaxltl.core.values.engine.linear import DENSE_LIMIT, System, solver
 
 MAX_STEPS = 100_000
 _SWEEPS = 24  # under a fixed policy, in modified policy iteration
+_STEPS = 6  # of Newton's method, in double words
+_MOST_PRODUCTS = 2000  # in the linear system of one
 _METHODS = ("auto", "policy_iteration", "modified_policy_iteration", "value_iteration")
 
 
@@ -214,7 +222,7 @@ def policy_value(
 
 @jax.jit
 def _policy_value(model, policy, reward, discount, tolerance, max_steps) -> Solution:
-    given = parameters(model, reward, discount, tolerance)
+    given, raw = parameters(model, reward, discount, tolerance), reward
     reward = expected_reward(model, reward)
     checked = valid_policy(model, policy)
     over, rows = choices(model), sweep_operator(model)
@@ -237,6 +245,7 @@ def _policy_value(model, policy, reward, discount, tolerance, max_steps) -> Solu
         return over.mean(checked.distribution, action_value(model, reward, given.discount, v))
 
     solution = solution_of(model, given, value, image, checked.distribution, n)
+    solution = _refined(model, raw, given, solution, checked.distribution)
     solution = differentiable(solution, backup, lambda: System(rows, weight, given.discount))
     return refuse(
         replace(solution, policy=checked.distribution),
@@ -337,7 +346,7 @@ def _optimal_value(
     if method == "auto":
         few = math.prod(model.state_shape) <= DENSE_LIMIT
         method = "policy_iteration" if few else "modified_policy_iteration"
-    given = parameters(model, reward, discount, tolerance)
+    given, raw = parameters(model, reward, discount, tolerance), reward
     reward, over = expected_reward(model, reward), choices(model)
     zero = jnp.zeros(model.num_states, model.dtype)
     if method == "modified_policy_iteration":
@@ -358,15 +367,106 @@ def _optimal_value(
         )
     q = reward + given.discount * expectation(model, value.reshape(model.state_shape))
     _, policy = over.argmax(q)
+    solution = solution_of(model, given, value, image, policy, n)
+    solution = _refined(model, raw, given, solution, None)
 
     def backup(v: jax.Array) -> jax.Array:
         return over.max(reward + given.discount * expectation(model, v))
 
     def system() -> System:
-        chosen = over.one_hot(policy, model.dtype)
+        chosen = over.one_hot(solution.policy, model.dtype)
         return System(sweep_operator(model), over.columns(chosen), given.discount)
 
-    return differentiable(solution_of(model, given, value, image, policy, n), backup, system)
+    return differentiable(solution, backup, system)
+
+
+def _refined(
+    model: ActionModel,
+    reward: jax.Array,
+    given: Parameters,
+    solution: Solution,
+    policy: jax.Array | None,
+) -> Solution:
+    """A solution in single precision with narrower bounds: Newton's steps in double words."""
+    # Rounding of a backup, times ``1 / (1 - discount)``, is what keeps bounds wide.
+    world = model.mdp if isinstance(model, Product) else model
+    if not isinstance(world, MDP | DenseMDP | ShardedMDP) or model.dtype.itemsize > 4:
+        return solution
+    found: Solution
+    reward = jnp.asarray(reward, model.dtype)
+    found, action = in_turn(_newton_steps, model, reward, given, solution, policy)
+    found = replace(found, policy=action if policy is None else solution.policy)
+    ended = (solution.status <= Status.PRECISION) & jnp.isfinite(found.lower).all()
+    return jax.tree.map(partial(jnp.where, ended), found, solution)
+
+
+_Progress = tuple[tuple[jax.Array, ...], jax.Array]
+
+
+def _newton_steps(
+    model: ActionModel,
+    reward: jax.Array,
+    given: Parameters,
+    solution: Solution,
+    policy: jax.Array | None,
+) -> tuple[Solution, jax.Array]:
+    rows, eps = dw.normalised_rows(model, policy), float(jnp.finfo(model.dtype).eps)
+    if reward.shape == rows.scale.shape:
+        gain = dw.double_word(jnp.where(model.available, reward, 0))
+    else:
+        weight = cast(SuccessorModel, model).successor_probability
+        earned = dw.times(weight, dw.double_word(jnp.where(weight > 0, reward, 0)))
+        gain = dw.product(rows.scale, kernels.tree(dw.plus, earned, -1))
+
+    def backup(value: jax.Array) -> tuple[jax.Array, ...]:
+        """The value, its image, the greedy actions, and the image less the value, rounded once."""
+        ahead = dw.plus(gain, dw.times(given.discount, rows.expectation(value)))
+        if policy is None:
+            image, action = dw.best(ahead, model.available)
+        else:
+            image, action = rows.mean(ahead), jnp.zeros(value.shape, jnp.int32)
+        return value, image, action, dw.minus(image, value)
+
+    def bounds(image: jax.Array, change: jax.Array) -> tuple[Enclosure, jax.Array, jax.Array]:
+        size = given.size + 2 * jnp.max(jnp.abs(dw.words(image)[0]))
+        # A bound is computed from the change with some roundings.
+        rounding = rows.unit * size + rows.underflow(size) + 16 * eps * jnp.max(jnp.abs(change))
+        # The discount was rounded to the model's dtype: the caller's number is meant.
+        rounding += eps / 2 * given.discount * size
+        ends = jnp.zeros(change.size, change.dtype), change.ravel()
+        goal = 2 * eps * size + 4 * rounding / (1 - given.discount)
+        found = enclose(*ends, given.discount, rounding, goal)
+        lower, upper = (
+            dw.outwards(dw.plus(image, dw.double_word(found.shift + x * found.half)), x)
+            for x in (-1, 1)
+        )
+        return found, lower, upper
+
+    def newton_step(carry: _Progress) -> _Progress:
+        (value, _, action, change), n = carry
+        weight = jax.nn.one_hot(action, model.num_actions, dtype=model.dtype)
+        columns = action_columns(model.num_actions, weight if policy is None else policy)
+        system = System(sweep_operator(model), columns, given.discount)
+        step = solver(system, max_steps=_MOST_PRODUCTS).solve(change)
+        new = backup(dw.plus(value, dw.double_word(step)))
+        better = jnp.max(jnp.abs(new[3])) < jnp.max(jnp.abs(change))  # false for NaN
+        at = jax.tree.map(partial(jnp.where, better), new, carry[0])
+        return at, jnp.where(better, n + 1, _STEPS)
+
+    def goes_on(carry: _Progress) -> jax.Array:
+        (_, image, _, change), n = carry
+        return (n < _STEPS) & ~bounds(image, change)[0].converged
+
+    start = backup(dw.double_word(solution.value)), jnp.int32(0)
+    (_, image, action, change), _ = lax.while_loop(goes_on, newton_step, start)
+    found, lower, upper = bounds(image, change)
+    narrow = solution.status == Status.CONVERGED
+    if given.tolerance is not None:
+        narrow = jnp.max(upper - lower) <= given.tolerance
+    value = jnp.clip(dw.words(image)[0] + found.shift, lower, upper)
+    status, residual = status_code(narrow, found.finite, True), jnp.max(jnp.abs(change))
+    parts = solution.policy, lower, upper, residual, solution.num_steps, status
+    return Solution(value, *parts), action
 
 
 def best_action(over: Any, q: Any, given: Any) -> tuple[jax.Array, Any]:

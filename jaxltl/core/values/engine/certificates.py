@@ -8,7 +8,9 @@ from typing import NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 
+from jaxltl.core.models.ops import double_word as dw
 from jaxltl.core.models.protocols import ActionModel, Model, SuccessorModel
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.types import Solution, Status
@@ -53,6 +55,9 @@ def backup_error(unit: jax.Array | float, *sizes: jax.Array) -> jax.Array:
 
 
 Operator = Callable[[jax.Array], jax.Array]
+
+
+Carry = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
 
 
 class Enclosure(NamedTuple):
@@ -106,29 +111,59 @@ def judged(
     )
 
 
+_REFINEMENTS = 8  # of an approximate solution; each multiplies its error by that of the solver
+
+
 def m_matrix_error(
-    model: ActionModel,
-    solve: Operator,
-    onward: Operator,
-    start: jax.Array,
-    one: jax.Array,
-    undecided: jax.Array,
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """A solution of ``y = one + P y`` from its approximation, its certified error and residual."""
+    rows: dw.Rows, solve: Operator, start: jax.Array, one: jax.Array, undecided: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """Bounds on the solution of ``y = one + P y`` from its approximation, its value and residual."""
     # If e >= 0 satisfies ``e - P e >= |r|`` there, where r is the residual of y and decided states
     # are absorbing, then ``|y - y*| <= e``, because ``I - P`` is an M-matrix. A second solve gives
-    # e, and a check of the inequality, rounding included, proves it.
+    # e, and a check of the inequality, rounding included, proves it. All are refined by residuals in
+    # double words.
+
+    def refined(y: jax.Array, constant: jax.Array, enough: jax.Array | float) -> Carry:
+        """y, and ``constant + P y - y`` of at most `enough`, if the solver converges."""
+
+        def step(carry: Carry) -> Carry:
+            best, least, y, n = carry
+            image = dw.plus(rows.mean(rows.expectation(y)), dw.double_word(constant))
+            left = jnp.where(undecided, dw.minus(image, y), 0)
+            better = jnp.max(jnp.abs(left)) < jnp.max(jnp.abs(least)) / 2  # false for NaN
+            best, least = (jnp.where(better, *x) for x in ((y, best), (left, least)))
+            ended = ~better | jnp.all(jnp.abs(left) <= enough)
+            correction = solve(jnp.where(ended, 0, left))
+            y = dw.plus(y, dw.double_word(jnp.where(undecided, correction, 0)))
+            return best, least, y, jnp.where(ended, _REFINEMENTS, n + 1)
+
+        never = jnp.full_like(one, jnp.inf)
+        return lax.while_loop(lambda k: k[3] < _REFINEMENTS, step, (y, never, y, jnp.int32(0)))
+
     value = jnp.where(undecided, start, one)
     # Elimination can break down where rounding closes a set that is hardly ever left.
     value = jnp.clip(jnp.where(jnp.isfinite(value), value, 0), 0, 1)
-    unit = rounding_unit(model)
-    residual = jnp.where(undecided, jnp.abs(onward(value) - value), 0)
-    claim = jnp.where(undecided, 2 * residual + 4 * unit * (value + 1e-3), 0)
+    zero = jnp.zeros_like(one)
+    unit, least = rows.unit, rows.underflow(jnp.ones_like(one))
+    given, value = value, lax.stop_gradient(value)
+    exact, residual, *_ = refined(dw.double_word(value), zero, max(unit, 1e-20) / 4)
+    size, residual = jnp.abs(dw.words(exact)[0]), jnp.abs(residual)
+    claim = 2 * residual + 4 * unit * (size + 1e-3) + 4 * least
+    claim = jnp.where(undecided, claim, 0)
     error = solve(claim)
-    enough = error - onward(error) >= residual + unit * (value + error)
-    proven = jnp.all(jnp.where(undecided, enough, True) & (error >= 0))
-    error = jnp.where(undecided, jnp.where(proven, error, 1), 0)
-    return value, error, jnp.max(residual)
+    error = dw.double_word(jnp.where(undecided & jnp.isfinite(error), error, 0))
+    error, left, *_ = refined(error, claim, claim / 4)
+    half = dw.words(error)[0]
+    enough = claim - left >= residual + unit * (size + half) + least * (1 + half)
+    proven = jnp.all(jnp.where(undecided, enough, True) & (half >= 0))
+    lower, upper = dw.outwards(dw.plus(exact, -error), -1), dw.outwards(dw.plus(exact, error), 1)
+    lower = jnp.where(proven, jnp.maximum(lower, 0), 0)
+    # XLA flushes subnormal numbers to zero.
+    upper = jnp.where(proven, jnp.clip(upper, jnp.finfo(one.dtype).tiny, 1), 1)
+    lower, upper = (jnp.where(undecided, x, one) for x in (lower, upper))
+    # The derivative is that of the approximation.
+    value = given + lax.stop_gradient(jnp.clip(dw.words(exact)[0], lower, upper) - given)
+    return value, lower, upper, jnp.max(residual)
 
 
 def refuse(

@@ -85,9 +85,17 @@ def solution_from_enclosure(
 
 def complement_event(solution: Solution) -> Solution:
     """The solution of the complementary event, with bounds rounded outwards."""
+    value, lower, upper = complement(solution.value, solution.lower, solution.upper)
+    return replace(solution, value=value, lower=lower, upper=upper)
+
+
+def complement(
+    value: jax.Array, lower: jax.Array, upper: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """A probability and its bounds, for the complementary event."""
     # Bounds that are 0 or 1 stay exact, and NumPy arrays stay NumPy arrays. Differentiable in the
     # value.
-    parts = solution.value, solution.upper, solution.lower
+    parts = value, upper, lower
     if is_traced(parts):
         parts = parts[0], *lax.stop_gradient(parts[1:])
     xp, value, far, near = namespace(*parts)
@@ -104,7 +112,7 @@ def complement_event(solution: Solution) -> Solution:
         found = to_jax(found)
     else:
         found = tuple(np.asarray(x) for x in found)
-    return replace(solution, value=found[0], lower=found[1], upper=found[2])
+    return found[0], found[1], found[2]
 
 
 @brief

@@ -32,7 +32,7 @@ _BLOCK = 32
 _REFINEMENTS = 2
 _KRYLOV_REFINEMENTS = 16
 _INNER_TOLERANCE = 1e-2  # relative residual of one system of these
-_MOST_PRODUCTS = 20_000  # with the system, in one run of BiCGSTAB
+MOST_PRODUCTS = 20_000  # with the system, in one run of BiCGSTAB
 _GOOD_RATE = 0.7  # a contraction at least this fast needs no Krylov method
 _STRETCH = 64  # steps between two looks at the true residual
 
@@ -420,7 +420,7 @@ def bicgstab(matvec: Operator, b: jax.Array, *, tolerance: float) -> tuple[jax.A
     start = start_bicgstab(jnp.zeros_like(right), right)._replace(
         shadow=shadow, rho=dot(shadow, right)
     )
-    goal, most = tolerance * norm(right), min(_MOST_PRODUCTS, 8 * right.size + 64)
+    goal, most = tolerance * norm(right), min(MOST_PRODUCTS, 8 * right.size + 64)
 
     def body(carry: tuple[Bicgstab, jax.Array]) -> tuple[Bicgstab, jax.Array]:
         k, n = carry

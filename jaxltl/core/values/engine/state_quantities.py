@@ -1,4 +1,4 @@
-"""Checked sets and rewards of states, and solutions from values with an error."""
+"""Checked sets and rewards of states, solutions from values with an error, and means of bounds."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxltl.core import validation
 from jaxltl.core.models.sparse import Rewards, SparseMDP, choice_reward, reward_structure
-from jaxltl.core.types import Solution, Status
+from jaxltl.core.types import Solution, Status, require_states
 
 TOLERANCE = 1e-6  # half the width of an enclosure up to which it counts as narrow, relative
 
@@ -25,13 +25,13 @@ def state_mask(model: SparseMDP, given: Any, name: str) -> np.ndarray:
     """A set of states as ``bool[S]``, from one in the model's shape or a label."""
     if isinstance(given, str):
         return np.asarray(model.states_with_label(given), bool)
-    given = np.asarray(given).reshape(-1)
-    if given.shape != (model.num_states,) or given.dtype != bool:
-        raise ValueError(
-            f"{name} is {given.dtype}{list(given.shape)}; give one bool for each of "
-            f"the {model.num_states} states, or a label."
-        )
-    return given
+    shape = np.shape(given)
+    fits = shape and int(np.prod(shape)) == model.num_states
+    require_states(name, given, shape if fits else (model.num_states,))
+    found = np.asarray(given).reshape(-1)
+    if found.dtype != bool:
+        raise ValueError(f"{name} is {found.dtype}[{found.size}]; give booleans, or a label.")
+    return found
 
 
 def state_reward(model: SparseMDP, reward: Any) -> np.ndarray:
@@ -122,3 +122,24 @@ def solution_from_error(
         "status": np.int32(status),
     }
     return Solution(**found)
+
+
+def safe_mean(share: np.ndarray, bound: np.ndarray, *, up: bool, highest: float = np.inf) -> float:
+    """The weighted mean of nonnegative bounds, rounded up or down."""
+    bound = np.asarray(bound, np.float64)
+    if (bound == bound[0]).all():
+        return float(bound[0])
+    slack = (share.size + 4) * float(np.finfo(np.float64).eps)
+    mean = float(share @ bound / share.sum())
+    return min(mean * (1 + slack), highest) if up else mean * (1 - slack)
+
+
+def safe_ends(model: Any, found: Any, *, highest: float = np.inf) -> tuple[float, float]:
+    """Enclosure of the mean over the initial distribution, from `lower` and `upper`."""
+    share = np.asarray(model.initial, np.float64)
+    start = np.flatnonzero(share)
+    low, high = (
+        safe_mean(share[start], x[start], up=up, highest=highest)
+        for x, up in ((found.lower, False), (found.upper, True))
+    )
+    return low, high

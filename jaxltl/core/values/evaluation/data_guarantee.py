@@ -26,7 +26,7 @@ from jaxltl.core import validation
 from jaxltl.core.values import facts
 from jaxltl.core.values.interval.robust import require_objective
 from jaxltl.core.values.interval.satisfaction import robust_satisfaction
-from jaxltl.core.values.undiscounted.mixture import safe_mean
+from jaxltl.core.values.engine.state_quantities import safe_mean
 from jaxltl.core.values.undiscounted.sparse_satisfaction import Satisfaction
 
 

@@ -7,10 +7,9 @@ independent numbers. Estimates are for ``num_steps`` steps: other episodes count
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import chex
 import jax
@@ -31,47 +30,16 @@ from jaxltl.core.environments.environment import (
 from jaxltl.core.environments.episodes import Agent, begin_episode, continue_episode, require_agent
 from jaxltl.core.environments.monitor import Verdict
 from jaxltl.core.models.mesh.lanes import on_host, require_split, vmap_split
+from jaxltl.core.policies.evaluation import (
+    ESTIMATES as ESTIMATES,
+    EpisodeTotals as EpisodeTotals,
+    Estimate as Estimate,
+    Evaluation as Evaluation,
+    evaluation_of,
+    share_estimate as share_estimate,
+)
 from jaxltl.core.pretty_print import brief
-from jaxltl.core.statistics.binomial import anytime, clopper_pearson
-from jaxltl.core.statistics.empirical_bernstein import bounded_mean
-from jaxltl.core.types import Status
-from jaxltl.core.values import facts
-
-
-@brief(codes={"verdict": Verdict})
-class EpisodeTotals(NamedTuple):
-    """Totals of one episode, or of many with a leading axis.
-
-    Attributes:
-      reward, cost: sums of the rewards and of the costs.
-      discounted_reward: with the discount, and that of the environment.
-      length: ``int32``, number of steps.
-      terminated, truncated: kind of end; neither if it was cut off.
-      verdict: ``int32``, the task's :class:`~jaxltl.environments.Verdict` at the end; None without a task.
-      visits: ``int32``, accepting readings, that of the first label included; None without.
-      discounted_visits: the k-th reading, from 0, counts ``discount ** k``.
-
-    Example:
-      >>> from jaxltl import from_dense
-      >>> from jaxltl.core.environments import make_agent, model_environment
-      >>> clock = model_environment(from_dense([[[0.0, 1.0]], [[1.0, 0.0]]]))
-      >>> agent = make_agent(lambda observation, key: jnp.int32(0))
-      >>> keys = jax.random.split(jax.random.key(0), 4)
-      >>> shapes = jax.eval_shape(jax.vmap(
-      ...     lambda key: episode_totals(key, clock, agent, num_steps=3)), keys)
-      >>> shapes.reward.shape, shapes.verdict
-      ((4,), None)
-    """
-
-    reward: jax.Array
-    discounted_reward: jax.Array
-    cost: jax.Array
-    length: jax.Array
-    terminated: jax.Array
-    truncated: jax.Array
-    verdict: jax.Array | None
-    visits: jax.Array | None
-    discounted_visits: jax.Array | None
+from jaxltl.core.statistics.binomial import anytime
 
 
 def episode_totals(
@@ -137,127 +105,6 @@ def task_world(world: Any) -> Any:
         return hasattr(x, "verdict")
 
     return next(filter(tells, jax.tree.leaves(world, is_leaf=tells)), None)
-
-
-@brief(facts=facts.estimate)
-@dataclass(frozen=True)
-class Estimate:
-    """A frequency or a mean with its confidence interval.
-
-    Attributes:
-      mean: over the episodes; a share is in [0, 1].
-      lower, upper: ends of the interval.
-      error: the standard error of the mean.
-      method: the statistical method of the interval.
-
-    Example:
-      >>> found = share_estimate(8, 10, 0.05)
-      >>> found.mean, round(found.lower, 3), round(found.upper, 3)
-      (0.8, 0.444, 0.975)
-    """
-
-    mean: float
-    lower: float
-    upper: float
-    error: float
-    method: str
-
-
-@brief(facts=facts.evaluation)
-@dataclass(frozen=True)
-class Evaluation:
-    """Result of :func:`evaluate`; printed as a table.
-
-    Attributes:
-      success, violation, undecided: shares of the episodes, by the task's verdict at their end;
-        None without a task.
-      reward, discounted_reward, cost: of an episode; the second None without a discount.
-      length: steps of an episode.
-      visits, discounted_visits: accepting readings of an episode, see :class:`EpisodeTotals`; None
-        without a task, or without a discount.
-      terminated, truncated, cut_off: numbers of episodes with each end.
-      num_episodes: number of simulated episodes.
-      num_steps, confidence, threshold, discount: the arguments.
-      decision: True if the success probability is at least the threshold, False if it is below, None
-        if undecided or without a threshold.
-      status: CONVERGED; MAX_STEPS if a threshold was not decided; NONFINITE if a sum was not finite.
-
-    Example:
-      >>> from jaxltl import from_dense
-      >>> from jaxltl.core.environments import make_agent, model_environment
-      >>> from jaxltl.core.environments.task_environment import task_environment
-      >>> coin = from_dense(
-      ...     [[[.0, .6, .4]], [[.0, 1., .0]], [[.0, .0, 1.]]], initial=[1, 0, 0],
-      ...     label=[[0, 0], [1, 0], [0, 1]], propositions=["heads", "tails"])
-      >>> task = task_environment(model_environment(coin), "!tails U heads")
-      >>> agent = make_agent(lambda observation, key: jnp.int32(0))
-      >>> found = evaluate(jax.random.key(0), agent, task, num_steps=5, threshold=0.8)
-      >>> found.success.lower < 0.6 < found.success.upper, found.decision
-      (True, False)
-      >>> found.length.mean, found.discounted_reward, found.status.name
-      (1.0, None, 'CONVERGED')
-    """
-
-    success: Estimate | None
-    violation: Estimate | None
-    undecided: Estimate | None
-    reward: Estimate
-    discounted_reward: Estimate | None
-    cost: Estimate
-    length: Estimate
-    visits: Estimate | None
-    discounted_visits: Estimate | None
-    terminated: int
-    truncated: int
-    cut_off: int
-    num_episodes: int
-    num_steps: int
-    confidence: float
-    threshold: float | None
-    discount: float | None
-    decision: bool | None
-    status: Status
-
-    def __str__(self) -> str:
-        lines = [
-            f"{self.num_episodes:,} episodes of at most {self.num_steps:,} steps; each interval "
-            f"holds with {self.confidence:g}"
-        ]
-        for name in ESTIMATES:
-            found = getattr(self, name)
-            if found is not None:
-                ends = f"[{found.lower:.6g}, {found.upper:.6g}]"
-                lines.append(
-                    f"  {name.replace('_', ' '):18}{found.mean:<10.6g}{ends:24}{found.method}"
-                )
-        lines.append(
-            f"  ended: {self.terminated:,} terminated, {self.truncated:,} truncated, "
-            f"{self.cut_off:,} cut off"
-        )
-        if self.threshold is not None:
-            said = {None: "open whether success is", True: "success is", False: "success is not"}
-            lines.append(f"  {said[self.decision]} at least {self.threshold:g}")
-        if self.status == Status.NONFINITE:
-            lines.append("  a reward or a cost is not finite")
-        return "\n".join(lines)
-
-
-ESTIMATES = (
-    "success",
-    "violation",
-    "undecided",
-    "reward",
-    "discounted_reward",
-    "cost",
-    "length",
-    "visits",
-    "discounted_visits",
-)
-_SHARES = {
-    "success": Verdict.SATISFIED,
-    "violation": Verdict.VIOLATED,
-    "undecided": Verdict.UNDECIDED,
-}
 
 
 @brief
@@ -370,7 +217,7 @@ def evaluate(
             success += int((parts[-1].verdict == Verdict.SATISFIED).sum())
             decision = _decided(success, count, threshold, failure)
     totals = jax.tree.map(lambda *x: np.concatenate(x), *parts)
-    return _told(totals, num_steps, confidence, threshold, discount, decision)
+    return evaluation_of(totals, num_steps, confidence, threshold, discount, decision)
 
 
 @partial(jax.jit, static_argnames=("num_steps", "batch"))
@@ -398,105 +245,6 @@ def _decided(success: int, count: int, threshold: float, failure: float) -> bool
     if lower[0] >= threshold:
         return True
     return False if upper[0] < threshold else None
-
-
-def _told(
-    totals: EpisodeTotals,
-    num_steps: int,
-    confidence: float,
-    threshold: float | None,
-    discount: float | None,
-    decision: bool | None,
-) -> Evaluation:
-    count, failure, fixed = len(totals.length), 1 - confidence, threshold is None
-    sums = (totals.reward, totals.discounted_reward, totals.cost)
-    fine = all(np.isfinite(x).all() for x in sums)
-    status = Status.CONVERGED if fixed or decision is not None else Status.MAX_STEPS
-    shares: dict[str, Estimate | None] = dict.fromkeys(_SHARES)
-    if totals.verdict is not None:
-        shares = {
-            name: share_estimate(int((totals.verdict == code).sum()), count, failure, fixed)
-            for name, code in _SHARES.items()
-        }
-
-    def bounded(x: Any, low: float, high: float) -> Estimate | None:
-        planned = count if fixed else None
-        return None if x is None else _bounded_estimate(x, low, high, failure, planned)
-
-    early = None
-    if discount is not None:
-        # All readings accepting, the first label's included.
-        most = (1 - discount ** (num_steps + 1)) / (1 - discount)
-        early = bounded(totals.discounted_visits, 0, most)
-    length = bounded(totals.length, 1, num_steps)
-    assert length is not None
-    return Evaluation(
-        **shares,
-        reward=_mean_estimate(totals.reward, failure),
-        discounted_reward=None
-        if discount is None
-        else _mean_estimate(totals.discounted_reward, failure),
-        cost=_mean_estimate(totals.cost, failure),
-        length=length,
-        visits=bounded(totals.visits, 0, num_steps + 1),
-        discounted_visits=early,
-        terminated=int(totals.terminated.sum()),
-        truncated=int(totals.truncated.sum()),
-        cut_off=int((~totals.terminated & ~totals.truncated).sum()),
-        num_episodes=count,
-        num_steps=num_steps,
-        confidence=confidence,
-        threshold=threshold,
-        discount=discount,
-        decision=decision,
-        status=status if fine else Status.NONFINITE,
-    )
-
-
-def share_estimate(count: int, total: int, failure: float, fixed: bool = True) -> Estimate:
-    """Frequency with its interval: exact for a fixed number of trials, or anytime-valid."""
-    total = validation.integer("total", total, least=1, most=2**53)
-    count = validation.integer("count", count, most=total)
-    failure = validation.fraction("failure", failure, ends=(False, False))
-    ends = clopper_pearson if fixed else anytime
-    (lower,), (upper,) = ends(np.array([count]), np.array([total]), failure)
-    share = count / total
-    return Estimate(
-        share,
-        float(lower),
-        float(upper),
-        math.sqrt(share * (1 - share) / total),
-        "Clopper-Pearson" if fixed else "Jeffreys' mixture, at any time",
-    )
-
-
-def _mean_estimate(x: Any, failure: float) -> Estimate:
-    from scipy.special import stdtrit  # a tenth of a second
-
-    mean, error = _mean_error(x)
-    margin = float(stdtrit(len(x) - 1, 1 - failure / 2)) * error if len(x) > 1 else math.inf
-    return Estimate(mean, mean - margin, mean + margin, error, "central limit theorem")
-
-
-def _bounded_estimate(
-    x: Any, low: float, high: float, failure: float, planned: int | None
-) -> Estimate:
-    mean, error = _mean_error(x)
-    size = high - low
-    if not size:
-        return Estimate(mean, low, high, error, "there is no other")
-    numbers = (np.asarray(x, np.float64) - low) / size
-    lower, upper = bounded_mean(numbers, failure, planned=planned)
-    method = "empirical Bernstein" + (", at any time" if planned is None else "")
-    return Estimate(mean, low + size * lower, low + size * upper, error, method)
-
-
-def _mean_error(x: Any) -> tuple[float, float]:
-    """The mean and its standard error, which is infinite for one number."""
-    x = np.asarray(x, np.float64)
-    with np.errstate(invalid="ignore", over="ignore"):
-        error = float(x.std(ddof=1)) / math.sqrt(len(x)) if len(x) > 1 else math.inf
-        return float(x.mean()), error
 
 
 # --- checks ---------------------------------------------------------------------------------------

@@ -76,7 +76,7 @@ def robust_satisfaction(
     found = _solved(host_sides(host, moves, objective, nature), host, verdicts, asked)
     row = product.base_row[found.row].astype(np.int32)
     solution = _solution(found, asked, product.start.shape, product.start, row)
-    return Satisfaction(solution, automaton, letter, product, row, found.value)
+    return Satisfaction(solution, automaton, letter, product, row, found.value, "exit")
 
 
 def _solution(

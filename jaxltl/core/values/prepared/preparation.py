@@ -21,7 +21,7 @@ from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.prepared.reachability_plan import Plan, plan_optimum, plan_policy
 from jaxltl.core.sparse.solvers.reachability import reduce_reachability, reduce_total_reward
-from jaxltl.core.types import require_shape
+from jaxltl.core.types import require_states
 from jaxltl.core.values import facts
 from jaxltl.core.values.engine.block_sweeps import Blocks
 from jaxltl.core.values.interval.robust import refuse_nature
@@ -163,11 +163,11 @@ def prepare(
         raise ValueError(f'objective={objective!r}; it must be "max", "min" or "policy".')
     sparse = to_sparse(model)
     host = sparse.host
+    require_states("target", target, model.state_shape)
     target = np.asarray(target, bool).ravel()
-    require_shape("target", target, (host.num_states,))
     if stay is not None:
+        require_states("stay", stay, model.state_shape)
         stay = np.asarray(stay, bool).ravel()
-        require_shape("stay", stay, (host.num_states,))
     cost = None if reward is None else choice_reward(sparse, reward)
     if cost is not None and not (np.isfinite(cost) & (cost >= 0)).all():
         r = int(np.flatnonzero(~(np.isfinite(cost) & (cost >= 0)))[0])

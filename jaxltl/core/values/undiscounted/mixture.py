@@ -1,4 +1,4 @@
-"""Mixtures of two policies with a certified satisfaction probability, on the host.
+"""Mixtures of two policies with certified satisfaction probability and expected steps, on the host.
 
 A mixture is ``(1 - share) policy + share other`` in each product state, again a memoryless policy.
 """
@@ -6,31 +6,53 @@ A mixture is ``(1 - share) policy + share other`` in each product state, again a
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.models.product import Product
+from jaxltl.core.models.protocols import Array
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.types import Solution
+from jaxltl.core.values.engine.validated import validated
+from jaxltl.core.values.undiscounted.optimal_actions import OptimalActions, optimal_actions
 from jaxltl.core.values.undiscounted.satisfaction import satisfaction_probability
+from jaxltl.core.values.undiscounted.satisfaction_steps import Clock, Steps
 
 WINDOW = 0.02  # maximal excess of the certified probability over the required one
-_AIM = WINDOW / 4  # excess at which the bisection ends
-_HALVINGS = 30
+_AIM = WINDOW / 4  # excess at which a search ends
+_HALVINGS = 30  # of the share where steps are bounded
+_TRIALS = 20  # mixtures of a search
+_LEAST_REST = -20.0  # logarithm of the least share of the first policy
+# Widths of enclosures: narrower ones than needed take exact fractions for policies that hardly ever
+# end.
+_COARSE, _FINEST = 1e-3, 1e-12
 
 
 @brief
 class Mixture(NamedTuple):
-    """A mixture with its certified satisfaction probability."""
+    """A mixture with its certified satisfaction probability and expected steps.
 
-    policy: np.ndarray  # ``float[S, Q, A]``
-    share: float  # of the second policy, in [0, 1]
-    attained: float  # lower bound of the probability, of the mean or the worst initial state
+    Attributes:
+      policy: ``float[S, Q, A]``.
+      share: of the second policy, in [0, 1].
+      attained: lower bound of the probability, of the mean or the worst initial state; 0 if none
+        is required.
+      steps: expected steps to satisfaction, if they are bounded.
+
+    Example:
+      >>> Mixture(np.ones((1, 1, 1)), 0.5, 0.9).share
+      0.5
+    """
+
+    policy: np.ndarray
+    share: float
+    attained: float
+    steps: Steps | None = None
 
 
-def at_starts(model: Product, value: Any, over: str) -> tuple[float, int]:
+def at_starts(model: Product, value: Array, over: str) -> tuple[float, int]:
     """The mean or minimum of a value over the initial states, and the state of the minimum."""
     weight = np.asarray(model.mdp.initial, float)
     starts = np.flatnonzero(weight > 0)
@@ -43,16 +65,25 @@ def at_starts(model: Product, value: Any, over: str) -> tuple[float, int]:
     return float(np.clip(mean, least, known.max())), place
 
 
-def from_starts(model: Product, value: Any) -> np.ndarray:
+def from_starts(model: Product, value: Array) -> np.ndarray:
     """The value ``[S]`` at the initial memory of each world state, from ``[S, Q]``."""
     memory = np.asarray(model.initial_memory)
     return np.asarray(value)[np.arange(len(memory)), memory]
 
 
-def attained(model: Product, policy: Any, over: str) -> float:
+def attained(model: Product, policy: Array, over: str, tolerance: float | None = None) -> float:
     """Lower bound of a policy's probability, for the mean or the worst initial state."""
-    found = satisfaction_probability(model, to_jax(np.asarray(policy, model.dtype)))
+    policy = to_jax(np.asarray(policy, model.dtype))
+    found = satisfaction_probability(model, policy, tolerance=tolerance)
     return at_starts(model, found.lower, over)[0]
+
+
+def attained_if_near(model: Product, policy: Array, over: str, probability: float) -> float:
+    """:func:`attained`, as close as the dtype allows if a coarse bound may not decide."""
+    coarse = attained(model, policy, over, _COARSE)
+    if coarse >= probability or coarse + _COARSE < probability:
+        return coarse
+    return attained(model, policy, over)
 
 
 def require_attainable(
@@ -75,34 +106,151 @@ def require_attainable(
 
 
 def least_mixture(
-    model: Product, policy: Any, sure: Any, probability: float, *, over: str = "mean"
+    model: Product,
+    policy: Array,
+    sure: Array,
+    probability: float,
+    *,
+    over: str = "mean",
+    steps: float = np.inf,
 ) -> Mixture:
-    """The mixture with the least share of `sure` that has a certified probability, by bisection."""
+    """The mixture with the least share of `sure` that meets certified requirements.
+
+    Requires a satisfaction probability, and a bound on the expected steps to satisfaction, if
+    `sure` has both; else the result is `sure`.
+    """
     # The share is below 1 if possible, so that no action of `policy` gets probability 0.
     policy, sure = np.asarray(policy), np.asarray(sure)
-    found = Mixture(policy, 0.0, attained(model, policy, over))
-    if found.attained >= probability:
+    if np.isinf(steps):
+        found = probable_mixture(model, policy, sure, probability, over)
+        exact = attained(model, found.policy, over)
+        return found._replace(attained=max(found.attained, exact))
+    clock, tolerance = Clock(model), None
+
+    def judged(share: float) -> Mixture:
+        mixed = (policy, sure)[int(share)] if share in (0, 1) else _mixed(policy, sure, share)
+        taken = clock.steps(mixed)
+        # The probability of a policy that takes very long is expensive.
+        needed = probability > 0 and (taken.upper <= steps or share == 1)
+        reached = attained(model, mixed, over, tolerance) if needed else 0.0
+        return Mixture(mixed, share, reached, taken)
+
+    def upper(found: Mixture) -> float:
+        return np.inf if found.steps is None else found.steps.upper
+
+    def suffices(found: Mixture) -> bool:
+        return found.attained >= probability and upper(found) <= steps
+
+    found = judged(0)
+    if suffices(found):
         return found
-    found = Mixture(sure, 1.0, attained(model, sure, over))
+    found = judged(1)
     low, high = 0.0, 1.0
     aim = probability + min(_AIM, (found.attained - probability) / 64)
+    tolerance = max((aim - probability) / 4, _FINEST)
+    longest = max(steps * (1 - _AIM), upper(found))
     for _ in range(_HALVINGS):
         middle = (low + high) / 2
-        mixed = (1 - middle) * policy + middle * sure
-        reached = attained(model, mixed, over)
-        if reached < probability:
+        tried = judged(middle)
+        if not suffices(tried):
             low = middle
             continue
-        high, found = middle, Mixture(mixed, middle, reached)
-        if reached <= aim:
+        high, found = middle, tried
+        if (probability > 0 and tried.attained <= aim) or upper(tried) >= longest:
             break
     return found
 
 
+def probable_mixture(
+    model: Product, policy: np.ndarray, sure: np.ndarray, probability: float, over: str
+) -> Mixture:
+    """The mixture with the least share of `sure` that has a certified probability.
+
+    By the secant method on logarithms of the rest of `policy` and of the loss of probability, in
+    which mixtures are nearly linear, within brackets. The bound is no closer than that takes.
+    """
+    reached = attained_if_near(model, policy, over, probability)
+    if reached >= probability:
+        return Mixture(policy, 0.0, reached)
+    found = Mixture(sure, 1.0, attained(model, sure, over))
+    top, excess = found.attained, min(_AIM, (found.attained - probability) / 64)
+    tolerance = max(excess / 4, _FINEST)
+    aim = np.log(max(top - probability - excess / 2, _FINEST))
+    # Logarithms of 1 - share and of top - probability: the bracket, and the last two mixtures.
+    low, high, rest = 0.0, _LEAST_REST, -1.0
+    before = low, np.log(max(top - reached, _FINEST))
+    for _ in range(_TRIALS):
+        share = -np.expm1(rest)
+        mixed = _mixed(policy, sure, share)
+        reached = attained(model, mixed, over, tolerance)
+        now = rest, np.log(max(top - reached, _FINEST))
+        if reached >= probability:
+            high, found = rest, Mixture(mixed, float(share), reached)
+            if reached <= probability + excess:
+                break
+        else:
+            low = rest
+        if low - high < 1e-9:
+            break
+        slope = (now[1] - before[1]) / (now[0] - before[0])
+        rest, before = now[0] + (aim - now[1]) / slope if slope > 0 else np.nan, now
+        # The step is at most to twice the logarithm, and into the bracket; else half of that.
+        end = high if found.share < 1 else max(high, 2 * low - 1)
+        if not end < rest < low:
+            rest = end if found.share == 1 else (low + high) / 2
+    return found
+
+
+def _mixed(policy: np.ndarray, sure: np.ndarray, share: float) -> np.ndarray:
+    mixed: np.ndarray = (1 - share) * policy + share * sure
+    return mixed
+
+
+@validated()
+def practical_policy(
+    model: Product,
+    policy: Array,
+    factor: float = 2.0,
+    *,
+    actions: OptimalActions | None = None,
+    probability: float = 0.0,
+    over: str = "mean",
+) -> Mixture:
+    """The policy with the least share of the quickest optimal one that is quick enough.
+
+    Its expected steps to satisfaction are at most a multiple of the quickest optimal policy's. A
+    policy inside the mask of optimal actions stays in it.
+
+    Args:
+      model: a concrete product.
+      policy: ``float[S, Q, A]``.
+      factor: the multiple, at least 1; infinite for no bound.
+      actions: of :func:`optimal_actions`; default: they are computed.
+      probability: a satisfaction probability to attain as well, at most the optimal one.
+      over: initial states of the probability, their ``"mean"`` or the ``"worst"``.
+
+    Returns:
+      :class:`Mixture`. Concrete arrays only; not differentiable.
+
+    Example:
+      >>> from jaxltl import from_dense, product
+      >>> world = from_dense([[[1.0, 0], [0, 1.0]], [[0, 1.0]] * 2], label=[[0], [1]],
+      ...                    propositions=["a"], initial=[1, 0])
+      >>> model = product(world, "F a")
+      >>> found = practical_policy(model, np.broadcast_to([0.999, 0.001], (2, 2, 2)))
+      >>> round(found.steps.value, 1), round(found.share, 1)
+      (2.0, 0.5)
+    """
+    quickest = Clock(model).quickest(optimal_actions(model) if actions is None else actions)
+    one_hot = np.eye(model.num_actions)[quickest.policy]
+    limit = np.inf if np.isinf(factor) else quickest.steps.upper * factor
+    return least_mixture(model, policy, one_hot, probability, over=over, steps=limit)
+
+
 def reaching(
     model: Product,
-    policy: Any,
-    inside: Any,
+    policy: Array,
+    inside: Array,
     best: Solution,
     probability: float,
     *,
@@ -118,24 +266,3 @@ def reaching(
         other = least_mixture(model, policy, quickest, probability, over=over)
         found = other if other.share < found.share else found
     return found
-
-
-def safe_mean(share: np.ndarray, bound: np.ndarray, *, up: bool, highest: float = np.inf) -> float:
-    """The weighted mean of nonnegative bounds, rounded up or down."""
-    bound = np.asarray(bound, np.float64)
-    if (bound == bound[0]).all():
-        return float(bound[0])
-    slack = (share.size + 4) * float(np.finfo(np.float64).eps)
-    mean = float(share @ bound / share.sum())
-    return min(mean * (1 + slack), highest) if up else mean * (1 - slack)
-
-
-def safe_ends(model: Any, found: Any, *, highest: float = np.inf) -> tuple[float, float]:
-    """Enclosure of the mean over the initial distribution, from `lower` and `upper`."""
-    share = np.asarray(model.initial, np.float64)
-    start = np.flatnonzero(share)
-    low, high = (
-        safe_mean(share[start], x[start], up=up, highest=highest)
-        for x, up in ((found.lower, False), (found.upper, True))
-    )
-    return low, high

@@ -1,8 +1,9 @@
 """Undiscounted values inside ``jit`` and over a mesh: reachability of policies and optima.
 
 Where a probability is exactly 0 or 1 is decided on the graph. In between, a policy's value is a
-linear system, certified by its residual, and an optimum is enclosed by interval iteration with end
-components collapsed.
+linear system, certified by its residual. With end components collapsed, the optimum of a small model
+is the total reward of entering the target, by policy iteration; that of a large one, or of one over
+a mesh, is enclosed by interval iteration.
 """
 
 from __future__ import annotations
@@ -21,7 +22,9 @@ from jaxltl.core.graphs.graph import TracedGraph, graph_of, take
 from jaxltl.core.graphs.reaching import Sets, max_sets, min_sets, policy_sets
 from jaxltl.core.models.mesh.sharded import is_sharded
 from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
+from jaxltl.core.models.ops.double_word import double_word, normalised_rows
 from jaxltl.core.models.ops.operators import (
+    combined,
     action_argmax,
     action_mean,
     expectation,
@@ -37,10 +40,18 @@ from jaxltl.core.values.engine.certificates import m_matrix_error, refuse, round
 from jaxltl.core.values.engine.chain_systems import ChainSystem
 from jaxltl.core.values.engine.implicit_diff import implicit
 from jaxltl.core.values.engine.iterate import in_turn, iterate
-from jaxltl.core.values.engine.linear import Inverse, System, solver
+from jaxltl.core.values.engine.linear import (
+    MOST_PRODUCTS,
+    Inverse,
+    System,
+    is_small,
+    solver,
+)
+from jaxltl.core.values.undiscounted.traced_total_reward import Problem, solve_problem
 
 _POLICY_SWEEPS = 8  # sweeps under the greedy policy for one of the optimality operator
 _FINER = 8  # factor by which a guess is narrower than the bounds, once these meet the goal
+_SWEEPS = 1_000_000  # of interval iteration
 _FAR_SWEEPS = 6  # sweeps of a guess, or of interval iteration after one that failed
 
 
@@ -68,6 +79,9 @@ def policy_reachability(
     system = lax.stop_gradient(
         System(sweep_operator(model), weight, undecided.ravel().astype(model.dtype))
     )
+    eliminable = method == "auto" and not is_sharded(model)
+    if eliminable:  # Krylov steps stagnate in chains that take very long; then elimination follows
+        max_steps = jnp.minimum(max_steps, min(MOST_PRODUCTS, 8 * model.num_states + 64))
     linear = solver(system, method, max_steps=max_steps)
 
     def image(model: ActionModel, policy: jax.Array, y: jax.Array) -> jax.Array:
@@ -75,28 +89,29 @@ def policy_reachability(
 
     constant = lax.stop_gradient((model, policy))
     onward, chain = partial(image, *constant), ChainSystem(*constant, undecided)
-    goal = _half_width(model, tolerance)
+    goal, rows = 2 * _half_width(model, tolerance), normalised_rows(*constant)
 
     def eliminated() -> tuple[jax.Array, ...]:
         solve = partial(chain.solve, lambda x: x - onward(x))
-        return m_matrix_error(model, solve, onward, solve(one), one, undecided)
+        return m_matrix_error(rows, solve, solve(one), one, undecided)
 
     start, n = linear.counted(one)
-    found = m_matrix_error(model, linear.solve, onward, start, one, undecided)
-    if method == "auto" and not isinstance(linear, Inverse) and not is_sharded(model):
-        # Krylov steps stagnate in chains that take very long.
-        found = lax.cond(jnp.max(found[1]) <= goal, lambda: found, eliminated)
-    value, error, residual = lax.stop_gradient(found)
+    found = m_matrix_error(rows, linear.solve, start, one, undecided)
+    if eliminable and not isinstance(linear, Inverse):
+        # Without a proof the width is 1, which a loose tolerance admits.
+        narrow = jnp.max(found[2] - found[1]) <= jnp.minimum(goal, 0.5)
+        found = lax.cond(narrow, lambda: found, eliminated)
+    value, lower, upper, residual = lax.stop_gradient(found)
     solution = Solution(
         value=value,
         policy=constant[1],
-        lower=jnp.maximum(value - error, 0),
-        upper=jnp.minimum(value + error, 1),
+        lower=lower,
+        upper=upper,
         residual=residual,
         num_steps=n,
         # The error of elimination is rounding, so more steps would not help.
         status=status_code(
-            jnp.max(error) <= goal, jnp.isfinite(residual), isinstance(linear, Inverse)
+            jnp.max(upper - lower) <= goal, jnp.isfinite(residual), isinstance(linear, Inverse)
         ),
     )
     solvers: dict[str, Any] = {"system": chain}
@@ -120,12 +135,13 @@ def optimal_reachability(
     model: ActionModel,
     target: jax.Array,
     tolerance: jax.Array | float | None,
-    max_steps: jax.Array | int,
+    max_steps: jax.Array | int | None,
     start: tuple[jax.Array, jax.Array] | None,
     *,
     objective: str,
 ) -> Solution:
-    """An optimum enclosed by interval iteration; the graph of a concrete model stays on the host."""
+    """An enclosed optimum; the graph of a concrete model stays on the host."""
+    # `max_steps` and `start` are options of interval iteration, which they select.
     if is_traced((model, target, tolerance, max_steps, start)):
         return _inside_jit(model, target, tolerance, max_steps, start, objective=objective)
     sets, components = _qualitative(model, target, objective=objective)
@@ -274,10 +290,56 @@ def _ended(finest: bool, carry: _Bounds, search: _Search) -> jax.Array:
 
 @partial(jax.jit, static_argnames=("objective",))
 def _optimize(model, sets: Sets, components, tolerance, max_steps, start, *, objective) -> Solution:
+    undecided = ~(sets.one | sets.zero)
+    one = sets.one.astype(model.dtype)
+    small = is_small(sweep_operator(model), one.size) and max_steps is None and start is None
+    # A user's model may lack the reduction that double words need.
+    small = small and combined.dispatch(type(model)) is not combined.dispatch(object)
+    if small:
+        run = partial(_by_policy_iteration, objective=objective)
+        asked = 2 * _half_width(model, tolerance)
+        solution, row_of = in_turn(run, model, sets, components, asked)
+    else:
+        options, row_of = (tolerance, max_steps, start), None
+        solution = _by_intervals(model, sets, components, options, objective=objective)
+    code = status_code(True, True, valid=is_representable(model))
+    solution = replace(solution, status=jnp.maximum(solution.status, code))
+    solution = jax.tree.map(lax.stop_gradient, solution)
+
+    def follow(y: jax.Array) -> jax.Array:
+        ahead = action_mean(solution.policy, expectation(model, y))
+        return jnp.where(undecided, ahead if row_of is None else ahead.ravel()[row_of], one)
+
+    # The optimum's derivative is that of the policy that attains it (Danskin).
+    system = ChainSystem(lax.stop_gradient(model), solution.policy, undecided, row_of)
+    return replace(solution, value=implicit(follow, solution.value, system=system))
+
+
+def _by_policy_iteration(
+    model: ActionModel, sets: Sets, components: EndComponents | None, asked, *, objective: str
+) -> tuple[Solution, jax.Array]:
+    """An optimum as the total reward of entering the target, and the states whose rows count."""
+    rows, one = normalised_rows(model), sets.one.astype(model.dtype)
+    leaving = model.available if components is None else model.available & ~components.inside
+    sign, gain = 1 if objective == "max" else -1, rows.expectation(double_word(one))
+    open_, finite = ~(sets.one | sets.zero), sets.one | True
+    problem = Problem(
+        rows, sign, gain, None, open_, finite, leaving, None, sets.action, components, highest=1
+    )
+    finest = max(4 * float(jnp.finfo(model.dtype).eps), 1e-12)
+    found = solve_problem(problem, jnp.minimum(asked, finest), asked)
+    value, lower, upper = (
+        jnp.where(open_, x, one) for x in (found.value, found.lower, found.upper)
+    )
+    rest = found.residual, found.num_steps, found.status
+    return Solution(value, found.policy, lower, upper, *rest), found.leaves
+
+
+def _by_intervals(model, sets: Sets, components, options: tuple, *, objective: str) -> Solution:
     """Encloses an optimum between a bound that a policy attains and one that is proven."""
     # The attained bound ("near") is the lower one of a maximum and the upper one of a minimum.
     # Sweeps under its own greedy policy move it soundly and cheaply.
-    sign = 1 if objective == "max" else -1
+    (tolerance, max_steps, start), sign = options, 1 if objective == "max" else -1
     undecided = ~(sets.one | sets.zero)
     one = sets.one.astype(model.dtype)
     goal = _half_width(model, tolerance)
@@ -296,7 +358,7 @@ def _optimize(model, sets: Sets, components, tolerance, max_steps, start, *, obj
         None,
         _Bounds(near, far, no, ~no, no),
         search,
-        max_steps=max_steps,
+        max_steps=_SWEEPS if max_steps is None else max_steps,
     )
     near, far = bounds.near, bounds.far
     still = lax.stop_gradient(search)
@@ -310,25 +372,8 @@ def _optimize(model, sets: Sets, components, tolerance, max_steps, start, *, obj
     value = (lower + upper) / 2
     residual = jnp.max(jnp.abs(still.best(sign, value)[0] - value))
     policy = jnp.where(undecided, action, sets.action)
-    solution = Solution(
-        value=value,
-        policy=policy,
-        lower=lower,
-        upper=upper,
-        residual=residual,
-        num_steps=n,
-        status=status_code(
-            bounds.half <= goal, jnp.isfinite(residual), valid=is_representable(model)
-        ),
-    )
-    solution = jax.tree.map(lax.stop_gradient, solution)
-
-    def follow(y: jax.Array) -> jax.Array:
-        return jnp.where(undecided, action_mean(policy, expectation(model, y)), one)
-
-    # The optimum's derivative is that of the policy that attains it (Danskin).
-    system = ChainSystem(still.model, policy, undecided)
-    return replace(solution, value=implicit(follow, solution.value, system=system))
+    status = status_code(bounds.half <= goal, jnp.isfinite(residual))
+    return Solution(value, policy, lower, upper, residual, n, status)
 
 
 def _collapse(components: EndComponents | None, value: jax.Array) -> jax.Array:

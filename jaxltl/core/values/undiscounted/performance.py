@@ -24,6 +24,7 @@ from jaxltl.core.graphs.graph import TracedGraph, graph_of, take
 from jaxltl.core.graphs.reaching import max_sets, min_sets, policy_sets
 from jaxltl.core.models.construct.batch import is_stacked, num_worlds
 from jaxltl.core.models.ops.array_namespace import namespace, to_jax
+from jaxltl.core.models.ops.double_word import normalised_rows
 from jaxltl.core.models.ops.operators import (
     action_mean,
     expectation,
@@ -37,7 +38,7 @@ from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.graph.qualitative import backward_reachable
 from jaxltl.core.types import Status, require_shape, status_code
 from jaxltl.core.values.engine.certificates import m_matrix_error
-from jaxltl.core.values.engine.host_solution import induced_chain
+from jaxltl.core.values.engine.host_solution import complement, induced_chain
 from jaxltl.core.values.engine.linear import inverse
 from jaxltl.core.values.undiscounted.reachability import rows_of_model
 from jaxltl.core.values.undiscounted.satisfaction import as_reachability, satisfaction_probability
@@ -137,9 +138,9 @@ def _task_performance(model: Product, policy: jax.Array, tolerance, *, method: s
     if method == "blocks" or (method == "auto" and simple and few):
         safety = model.automaton.is_safety
         target = ~model.final if safety else model.final
-        value, error = _reach(model, target, policy)
-        value = 1 - value if safety else value
-        lower, upper = jnp.maximum(value - error, 0), jnp.minimum(value + error, 1)
+        value, lower, upper = _reach(model, target, policy)
+        if safety:
+            value, lower, upper = complement(value, lower, upper)
     else:
         solution = satisfaction_probability(
             model,
@@ -200,19 +201,17 @@ def _summarize(model: Product, value, lower, upper, tolerance) -> Performance:
     )
 
 
-def _reach(model: Product, target: jax.Array, policy: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Reachability probabilities ``float[S, Q]``, and a certified bound on the error."""
+def _reach(
+    model: Product, target: jax.Array, policy: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Reachability probabilities ``float[S, Q]``, and certified bounds."""
     # ``(I - P) y = b`` on the undecided states is solved by block Jacobi over memory states,
     # exactly if the automaton's only cycles are self-loops.
     sets = policy_sets(TracedGraph(model), target, policy)
     undecided = ~(sets.one | sets.zero)
     one = sets.one.astype(model.dtype)
     solve = _block_solver(model, policy, undecided)
-
-    def onward(y: jax.Array) -> jax.Array:
-        return jnp.where(undecided, action_mean(policy, expectation(model, y)), 0)
-
-    return m_matrix_error(model, solve, onward, solve(one), one, undecided)[:2]
+    return m_matrix_error(normalised_rows(model, policy), solve, solve(one), one, undecided)[:3]
 
 
 def _block_solver(model: Product, policy: jax.Array, undecided: jax.Array):
@@ -234,7 +233,7 @@ def _block_solver(model: Product, policy: jax.Array, undecided: jax.Array):
         def sweep(carry):
             x, _, n = carry
             right = b + jnp.where(undecided, outside(x), 0)
-            new = jnp.einsum("qst,tq->sq", inverses, right)
+            new = jnp.einsum("qst,tq->sq", inverses, right, precision="highest")
             return new, jnp.any(jnp.abs(new - x) > 0), n + 1  # false for NaN
 
         def unfinished(carry):

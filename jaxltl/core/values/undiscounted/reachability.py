@@ -28,7 +28,7 @@ from jaxltl.core.sparse.solvers import reachability as solver
 from jaxltl.core.sparse.solvers.layered_reachability import PaddedProduct, layered_reachability
 from jaxltl.core.sparse.solvers.total_cost import Enclosure
 from jaxltl.core.sparse.solvers.shortest_path import fastest_rows
-from jaxltl.core.types import Solution, require_shape
+from jaxltl.core.types import Solution, require_states
 from jaxltl.core.values.engine.state_quantities import reduction_for
 from jaxltl.core.values.engine.host_solution import (
     induced_chain,
@@ -119,9 +119,9 @@ def reachability_probability(
             tolerance=tolerance,
         )
     refuse_nature(nature)
-    require_shape("target", target, model.state_shape)
+    require_states("target", target, model.state_shape)
     if stay is not None:
-        require_shape("stay", stay, model.state_shape)
+        require_states("stay", stay, model.state_shape)
     if policy is not None and not is_sparse(model):
         require_policy(model, policy)
     traced = is_sharded(model) or is_traced((model, target, stay, policy, tolerance))
@@ -135,10 +135,14 @@ def reachability_probability(
     iterative = method == "iterative" and policy is not None
     if traced or not is_table(model) or iterative or max_steps is not None or start is not None:
         padded = cast(ActionModel, model)
-        question = target, tolerance, 1_000_000 if max_steps is None else max_steps
         if policy is not None:
-            return optimum.policy_reachability(padded, policy, *question, method=method)
-        return optimum.optimal_reachability(padded, *question, start, objective=objective)
+            most = 1_000_000 if max_steps is None else max_steps
+            return optimum.policy_reachability(
+                padded, policy, target, tolerance, most, method=method
+            )
+        return optimum.optimal_reachability(
+            padded, target, tolerance, max_steps, start, objective=objective
+        )
     found = None
     if policy is None:
         found = _by_layers(model, target, tolerance, objective)
@@ -165,7 +169,9 @@ def _on_host(
     """The probabilities by the sparse engine."""
     sparse = rows_of_model(model)
     question = Question.of(target, stay, objective)
-    asked, fine = _tolerances(model, tolerance, exact=stay is None and not is_sparse(model))
+    # An optimum of a small model is as close as possible in any case, for its ties.
+    exact = stay is None and not is_sparse(model) and (tolerance is None or policy is None)
+    asked, fine = _tolerances(model, tolerance, exact=exact)
     host, depth = sparse.host, 0
     if policy is not None:
         host, _, depth = induced_chain(model, sparse, policy)

@@ -44,6 +44,7 @@ class Satisfaction(NamedTuple):
       product: the reachable product of the model and the automaton, N states.
       row: ``int32[N]``, the policy's row of the model in each of them.
       value: ``float64[N]``, the probability in each of them.
+      label_on: the label that a step of the policy reads, of the state entered or left.
 
     Example:
       >>> import jaxltl as jl
@@ -60,6 +61,7 @@ class Satisfaction(NamedTuple):
     product: SparseProduct
     row: np.ndarray
     value: np.ndarray
+    label_on: str = "entry"
 
 
 def sparse_satisfaction(
@@ -87,6 +89,7 @@ def sparse_satisfaction(
         product,
         product.base_row[row],
         np.asarray(found.value),
+        label_on,
     )
 
 

@@ -23,7 +23,7 @@ from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import ActionModel, Array, Model
 from jaxltl.core.models.sparse import Rewards, SparseMDP, choice_reward
 from jaxltl.core.sparse.solvers import reachability as optimal
-from jaxltl.core.types import Solution, require_shape
+from jaxltl.core.types import Solution, require_shape, require_states
 from jaxltl.core.values.engine.host_solution import (
     induced_chain,
     default_tolerance,
@@ -111,7 +111,7 @@ def total_reward(
             "total rewards need rewards of at least 0."
         )
     if target is not None:
-        require_shape("target", target, model.state_shape)
+        require_states("target", target, model.state_shape)
         target = np.asarray(target, bool).ravel()
     asked = default_tolerance(model) if tolerance is None else float(tolerance)
     host, depth, maximize = sparse.host, 0, objective == "max"
@@ -158,7 +158,7 @@ def hitting_time(model: Model, policy: Array, target: Array) -> NDArray[np.float
     """
     if is_traced((model, policy, target)):
         raise ValueError("hitting_time works on the host; call it outside jit and vmap.")
-    require_shape("target", target, model.state_shape)
+    require_states("target", target, model.state_shape)
     chain = induced_chain(model, to_sparse(model), policy)
     goal = np.asarray(target, bool).ravel()
     found = optimal.total_reward(
@@ -211,7 +211,7 @@ def _by_sweeps(
             "total rewards for ever are found on the host; inside jit, or over a mesh, give a "
             "target."
         )
-    require_shape("target", target, model.state_shape)
+    require_states("target", target, model.state_shape)
     padded = cast(ActionModel, model)
     reward = _on_choices(padded, world, reward)
     _require_rewards(padded, world, reward)

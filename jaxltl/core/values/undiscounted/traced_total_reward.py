@@ -3,7 +3,9 @@
 The graph decides where the value is infinite or 0. Elsewhere it is the fixed point of
 ``T x = opt_a (r(s, a) + (P x)(s, a))``, enclosed between the solutions of ``l = (1 - e) T l`` and
 ``u = (1 + e) T u`` for a small e, which is found by trial: one application of T proves
-``l <= T l`` and ``u >= T u``, because e exceeds the rounding of a backup.
+``l <= T l`` and ``u >= T u``, because e exceeds the rounding of a backup. Values and backups are in
+double words (:mod:`~jaxltl.core.models.ops.double_word`), so that e is about 1e-11 in single
+precision, and the width of the enclosure 1e-11 times the number of steps.
 
 - ``u >= T u`` and ``u >= 0`` bound a maximum, which is the least such u. For a minimum
   ``u >= T_pi u`` bounds the value of pi if pi reaches the target almost surely, by its graph.
@@ -14,12 +16,14 @@ The graph decides where the value is infinite or 0. Elsewhere it is the fixed po
 
 The equations are solved by inexact policy iteration (Newton's method): in each step the linear
 system of the greedy policy is solved to the relative residual 1e-2 (the forcing term) by BiCGSTAB,
-and by elimination for small models on one device. The system is scaled by the value, so that small
-values get as many digits as large ones.
+and by elimination for small models on one device; further steps under the same policy are those of
+iterative refinement. The system is scaled by the value, so that small values get as many digits as
+large ones. Optimal reachability probabilities are total rewards of entering the target.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple, TypeVar
@@ -32,8 +36,8 @@ from jaxltl.core.graphs.attractor import attract, avoid, surely
 from jaxltl.core.graphs.end_components import EndComponents, components_within
 from jaxltl.core.graphs.graph import TracedGraph
 from jaxltl.core.graphs.reaching import policy_sets
+from jaxltl.core.models.ops import double_word as dw
 from jaxltl.core.models.ops.operators import (
-    action_argmax,
     action_mean,
     expectation,
     is_representable,
@@ -44,7 +48,7 @@ from jaxltl.core.models.ops.successor_tables import action_columns, sweep_operat
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import ActionModel
 from jaxltl.core.types import Solution, status_code
-from jaxltl.core.values.engine.certificates import refuse, rounding_unit, underflow
+from jaxltl.core.values.engine.certificates import refuse
 from jaxltl.core.values.engine.chain_systems import ChainSystem
 from jaxltl.core.values.engine.implicit_diff import implicit
 from jaxltl.core.values.engine.iterate import in_turn
@@ -61,32 +65,42 @@ _LARGEST = 0.1  # the largest share e
 _MOST_STEPS = 1_000_000
 
 
-class _Problem(NamedTuple):
+class Problem(NamedTuple):
     """Residual problem after qualitative preprocessing."""
 
-    model: ActionModel  # the model
+    rows: dw.Rows  # of the model, and of the policy to evaluate if there is one
     sign: int  # 1 for a maximum, -1 for a minimum; static
-    reward: jax.Array  # ``float[S, A]``
-    policy: jax.Array | None  # ``float[S, A]``, the policy to evaluate, or None
+    reward: jax.Array  # ``[S, A]``, in double words
+    policy: jax.Array | None  # ``float[S, A]``, the policy as given, or None
     open: jax.Array  # ``bool[S]``, where the value is finite and not 0
     finite: jax.Array  # ``bool[S]``
     # ``bool[S, A]``, the actions to choose from; in collapsed end components those that leave
     allowed: jax.Array
-    start: jax.Array  # ``int32[S]``, actions that leave the open states almost surely
+    # ``int32[S]``, actions that leave the open states almost surely; None if all do
+    start: jax.Array | None
     decided: jax.Array  # ``int32[S]``, actions for the states that are not open
-    circles: EndComponents | None  # for a minimum, the end components of zero reward
+    circles: EndComponents | None  # the end components that are collapsed
+    highest: float = float("inf")  # static: a bound on the value; finite ones make widths absolute
+
+    @property
+    def model(self) -> ActionModel:
+        return self.rows.model
 
 
 class _Point(NamedTuple):
     """A value, its image under T, the action, and in an end component the state that takes it."""
 
-    value: jax.Array
+    value: jax.Array  # value, image: in double words
     image: jax.Array
     action: jax.Array
     leaves: jax.Array
 
 
-_Progress = tuple[_Point, jax.Array, jax.Array, jax.Array, jax.Array]
+# The inverse of the system of a policy, empty for large models; its actions; where it leaves.
+_Inverse = tuple[jax.Array, jax.Array, jax.Array]
+# The image of a point, in double words, and the relative and the absolute error of a solution.
+_Equation = tuple[Callable[[_Point], jax.Array], jax.Array, jax.Array]
+_Progress = tuple[_Point, _Inverse, jax.Array, jax.Array, jax.Array, jax.Array]
 Tree = TypeVar("Tree")
 
 
@@ -166,27 +180,28 @@ def _enclosed(
     *,
     objective: str,
 ) -> Found:
-    graph = TracedGraph(model)
+    graph, rows = TracedGraph(model), dw.normalised_rows(model, policy)
     if policy is not None:
-        problem = _of_policy(graph, reward, target, policy)
+        problem = _of_policy(graph, rows, reward, target, policy)
     else:
-        problem = (_largest if objective == "max" else _smallest)(graph, reward, target)
-    return _solution(problem, jnp.asarray(tolerance, model.dtype))
+        problem = (_largest if objective == "max" else _smallest)(graph, rows, reward, target)
+    tolerance = jnp.asarray(tolerance, model.dtype)
+    return solve_problem(problem, tolerance, tolerance)
 
 
 # --- qualitative preprocessing ----------------------------------------------------------------
 
 
 def _of_policy(
-    graph: TracedGraph, reward: jax.Array, target: jax.Array, policy: jax.Array
-) -> _Problem:
+    graph: TracedGraph, rows: dw.Rows, reward: jax.Array, target: jax.Array, policy: jax.Array
+) -> Problem:
     taken = graph.available & (policy > 0)
     finite = policy_sets(graph, target, policy).one
     first = graph.first(taken)[1]
-    return _Problem(
-        graph.model,
+    return Problem(
+        rows,
         1,
-        reward,
+        dw.double_word(reward),
         policy,
         _earning(graph, reward, target, taken) & finite,
         finite,
@@ -211,7 +226,7 @@ def _positive(reward: jax.Array) -> jax.Array:
     return lax.bitcast_convert_type(reward, kind) > 0
 
 
-def _largest(graph: TracedGraph, reward: jax.Array, target: jax.Array) -> _Problem:
+def _largest(graph: TracedGraph, rows: dw.Rows, reward: jax.Array, target: jax.Array) -> Problem:
     never = jnp.asarray(avoid(graph, target))
     doomed = attract(graph, never, among=~target)
     finite = ~doomed.region
@@ -219,12 +234,11 @@ def _largest(graph: TracedGraph, reward: jax.Array, target: jax.Array) -> _Probl
     avoids = graph.first(graph.available & graph.forall(never))[1]
     decided = jnp.where(never, avoids, jnp.where(finite, first, doomed.action))
     open_ = _earning(graph, reward, target, graph.available) & finite
-    return _Problem(
-        graph.model, 1, reward, None, open_, finite, graph.available, first, decided, None
-    )
+    gain = dw.double_word(reward)
+    return Problem(rows, 1, gain, None, open_, finite, graph.available, None, decided, None)
 
 
-def _smallest(graph: TracedGraph, reward: jax.Array, target: jax.Array) -> _Problem:
+def _smallest(graph: TracedGraph, rows: dw.Rows, reward: jax.Array, target: jax.Array) -> Problem:
     sure = surely(graph, target)
     finite = sure.region
     allowed = graph.available & graph.forall(finite) & graph.on_choices(finite & ~target)
@@ -233,10 +247,10 @@ def _smallest(graph: TracedGraph, reward: jax.Array, target: jax.Array) -> _Prob
     nothing = surely(graph, target, free)
     open_ = finite & ~nothing.region
     circles = components_within(graph, open_, free)
-    return _Problem(
-        graph.model,
+    return Problem(
+        rows,
         -1,
-        reward,
+        dw.double_word(reward),
         None,
         open_,
         finite,
@@ -257,41 +271,51 @@ def _numbers(shape: tuple[int, ...]) -> jax.Array:
     return jnp.arange(size, dtype=jnp.int32).reshape(shape)
 
 
-def _backup(problem: _Problem, value: jax.Array) -> _Point:
+def _backup(problem: Problem, value: jax.Array) -> _Point:
     """A value's image under T, 0 outside of the open states."""
-    ahead = problem.reward + expectation(problem.model, value)
+    ahead = problem.rows.expectation(value)
+    return _chosen(problem, value, dw.plus(problem.reward, ahead))
+
+
+def _chosen(problem: Problem, value: jax.Array, ahead: jax.Array) -> _Point:
+    """The image of a value from those of its choices."""
     leaves = _numbers(value.shape)
     if problem.policy is not None:
-        image, action = action_mean(problem.policy, ahead), problem.start
+        image, action = problem.rows.mean(ahead), problem.decided
     else:
-        best, action = action_argmax(problem.sign * ahead, problem.allowed)
-        image = problem.sign * best
+        image, action = dw.best(ahead if problem.sign > 0 else -ahead, problem.allowed)
     if problem.circles is not None:
         image, leaves = lax.cond(
             jnp.any(problem.circles.inside),
-            partial(_least, problem.circles.component),
+            partial(_greatest, problem.circles.component),
             lambda image: (image, leaves),
             image,
         )
-    return _Point(value, jnp.where(problem.open, image, 0), action, leaves)
+    image = jnp.where(problem.open, image, 0)
+    return _Point(value, image if problem.sign > 0 else -image, action, leaves)
 
 
-def _least(component: jax.Array, image: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The minimum over each state's end component, and the first state that attains it."""
-    label, flat, last = component.ravel(), image.ravel(), image.size - 1
-    best = jax.ops.segment_min(flat, label, num_segments=flat.size)[label]
-    mine = jnp.where(flat <= best, _numbers(flat.shape), last)
-    first = jax.ops.segment_min(mine, label, num_segments=flat.size)[label]
-    return best.reshape(image.shape), first.reshape(image.shape)
+def _greatest(component: jax.Array, image: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The maximum over each state's end component, and the first state that attains it."""
+    label, flat = component.ravel(), image.ravel()
+
+    def top(x: jax.Array) -> jax.Array:
+        return x >= jax.ops.segment_max(x, label, num_segments=flat.size)[label]
+
+    high, low = dw.words(flat)
+    first = top(high) & top(jnp.where(top(high), low, -jnp.inf))
+    mine = jnp.where(first, _numbers(flat.shape), flat.size - 1)
+    leaves = jax.ops.segment_min(mine, label, num_segments=flat.size)[label]
+    return flat[leaves].reshape(image.shape), leaves.reshape(image.shape)
 
 
-def _where_it_leaves(problem: _Problem, at: _Point, x: jax.Array) -> jax.Array:
+def _where_it_leaves(problem: Problem, at: _Point, x: jax.Array) -> jax.Array:
     if problem.circles is None:
         return x
     return lax.cond(jnp.any(problem.circles.inside), lambda x: x.ravel()[at.leaves], lambda x: x, x)
 
 
-def _onward(problem: _Problem, at: _Point) -> Callable[[jax.Array], jax.Array]:
+def _onward(problem: Problem, at: _Point) -> Callable[[jax.Array], jax.Array]:
     """``x -> P_pi x`` for the policy that attains an image, 0 outside of the open states."""
     model = problem.model
     if problem.policy is None and not isinstance(model, Product):
@@ -305,32 +329,39 @@ def _onward(problem: _Problem, at: _Point) -> Callable[[jax.Array], jax.Array]:
     return lambda x: jnp.where(problem.open, _where_it_leaves(problem, at, along(x)), 0)
 
 
-def _improved(problem: _Problem, factor: jax.Array, at: _Point) -> tuple[jax.Array, jax.Array]:
-    """A step of policy iteration for ``v = factor * T v``, and its number of applications of P."""
+def _inverse(problem: Problem, at: _Point, known: _Inverse) -> _Inverse:
+    """The inverse of the system of the policy that attains an image, unless it is known."""
+    model, weight = problem.model, problem.policy
+    table, size = sweep_operator(model), problem.open.size
+    if not is_small(table, size):
+        return known
+    if weight is None:
+        weight = jax.nn.one_hot(at.action, model.num_actions, dtype=model.dtype)
+
+    def found() -> jax.Array:
+        columns = action_columns(model.num_actions, weight)
+        system = System(table, columns, problem.open.ravel().astype(model.dtype))
+        eye = jnp.eye(size, dtype=model.dtype)
+        return inverse(eye - (eye - system.matrix())[at.leaves.ravel()])
+
+    same = jnp.all((at.action == known[1]) & (at.leaves == known[2]))
+    return lax.cond(same, lambda: known[0], found), at.action, at.leaves
+
+
+def _improved(
+    problem: Problem, change: jax.Array, at: _Point, known: _Inverse
+) -> tuple[jax.Array, jax.Array]:
+    """A step of policy iteration, and its number of applications of P."""
     # If the linear system is not solved, sweeps under its policy.
-    model, onward = problem.model, _onward(problem, at)
-    swept = factor * at.image
-    change = swept - at.value
-    positive = jnp.all(jnp.where(problem.open, at.value > 0, True))
-    scale = jnp.where(positive & problem.open, at.value, 1)
+    onward, size = _onward(problem, at), jnp.abs(dw.words(at.value)[0])
+    scale = jnp.where(problem.open & (size > 0), size, 1)
     wanted = change / scale
 
     def matvec(x: jax.Array) -> jax.Array:
-        return x - factor * onward(scale * x) / scale
+        return x - onward(scale * x) / scale
 
-    if is_small(sweep_operator(model), change.size):
-        weight = problem.policy
-        if weight is None:
-            weight = jax.nn.one_hot(at.action, model.num_actions, dtype=model.dtype)
-        system = System(
-            sweep_operator(model),
-            action_columns(model.num_actions, weight),
-            problem.open.ravel() * factor,
-        )
-        eye = jnp.eye(change.size, dtype=model.dtype)
-        moves = (eye - system.matrix())[at.leaves.ravel()]
-        x = (inverse(eye - moves) @ change.ravel()).reshape(change.shape) / scale
-        n = jnp.int32(0)
+    if known[0].size:
+        x, n = (known[0] @ change.ravel()).reshape(change.shape) / scale, jnp.int32(0)
     else:
         x, n = bicgstab(matvec, wanted, tolerance=_FORCING)
     left = norm((wanted - matvec(x)).ravel())
@@ -340,29 +371,33 @@ def _improved(problem: _Problem, factor: jax.Array, at: _Point) -> tuple[jax.Arr
         lambda: x,
         lambda: lax.fori_loop(1, _SWEEPS, lambda _, x: x + (wanted - matvec(x)), wanted),
     )
-    return at.value + scale * x, n + jnp.where(solved, 1, _SWEEPS)
+    return dw.plus(at.value, dw.double_word(scale * x)), n + jnp.where(solved, 1, _SWEEPS)
 
 
 def _solved(
-    problem: _Problem, factor: jax.Array, goal: jax.Array, at: _Point, num_steps: jax.Array
-) -> tuple[_Point, jax.Array]:
-    """An approximate solution of ``v = factor * T v`` by policy iteration."""
-    tiny = jnp.finfo(at.value.dtype).tiny
+    problem: Problem, equation: _Equation, at: _Point, known: _Inverse, num_steps: jax.Array
+) -> tuple[_Point, _Inverse, jax.Array]:
+    """An approximate solution of ``v = image(v)`` by policy iteration."""
+    image, goal, slack = equation
 
-    def error(at: _Point) -> jax.Array:
-        swept = factor * at.image
-        size = jnp.maximum(jnp.maximum(jnp.abs(swept), jnp.abs(at.value)), tiny)
-        return jnp.max(jnp.where(problem.open, jnp.abs(swept - at.value) / size, 0))
+    def changed(at: _Point) -> tuple[jax.Array, jax.Array]:
+        swept = image(at)
+        change = dw.minus(swept, at.value)
+        size = jnp.maximum(*(jnp.abs(dw.words(x)[0]) for x in (swept, at.value)))
+        left = jnp.maximum(jnp.abs(change) - slack, 0)
+        return change, jnp.max(left / jnp.maximum(size, jnp.finfo(size.dtype).tiny))
 
     def body(carry: _Progress) -> _Progress:
-        at, n, _, best, rest = carry
-        value, m = _improved(problem, factor, at)
+        at, known, n, _, best, rest = carry
+        known = _inverse(problem, at, known)
+        value, m = _improved(problem, changed(at)[0], at, known)
         new = _backup(problem, value)
-        found = error(new)
+        found = changed(new)[1]
         waits = rest + jnp.where(jnp.all(new.action == at.action), _SAME, 1)
         halved = found < best / 2  # false for NaN
         return (
             new,
+            known,
             n + m + 1,
             found,
             jnp.where(halved, found, best),
@@ -370,12 +405,13 @@ def _solved(
         )
 
     def goes_on(carry: _Progress) -> jax.Array:
-        _, n, found, _, rest = carry
+        _, _, n, found, _, rest = carry
         return ~(found <= goal) & (rest < _REST) & (n < _MOST_STEPS)
 
-    first = error(at)
-    start = (at, num_steps, first, jnp.where(jnp.isfinite(first), first, jnp.inf), jnp.int32(0))
-    return lax.while_loop(goes_on, body, start)[:2]
+    first = changed(at)[1]
+    best = jnp.where(jnp.isfinite(first), first, jnp.inf)
+    start = (at, known, num_steps, first, best, jnp.int32(0))
+    return lax.while_loop(goes_on, body, start)[:3]
 
 
 # --- the enclosure ----------------------------------------------------------------------------
@@ -385,8 +421,9 @@ class _Search(NamedTuple):
     """State of the search for bounds; pairs are lower and upper."""
 
     at: _Point  # the current point
+    known: _Inverse
     share: jax.Array  # e
-    bounds: tuple[jax.Array, jax.Array]  # the proven bounds
+    bounds: tuple[jax.Array, jax.Array]  # the proven bounds, in double words
     shares: tuple[jax.Array, jax.Array]  # the e of each proven bound, else infinity
     safe: _Point  # the point with a policy that attains the bound on the safe side
     tries: jax.Array  # tries, num_steps: numbers of trials, and of applications of P
@@ -394,26 +431,43 @@ class _Search(NamedTuple):
     ended: jax.Array  # whether other shares would not help
 
 
-def _width(problem: _Problem, bounds: tuple[jax.Array, jax.Array]) -> jax.Array:
-    """The largest relative width."""
-    lower, upper = bounds
-    each = jnp.where(jnp.isfinite(upper), (upper - lower) / upper, jnp.inf)
+def _width(problem: Problem, lower: jax.Array, upper: jax.Array) -> jax.Array:
+    """The largest width, relative unless the value has a bound."""
+    scale = upper if math.isinf(problem.highest) else 1
+    each = jnp.where(jnp.isfinite(upper), (upper - lower) / scale, jnp.inf)
     return jnp.max(jnp.where(problem.open, each, 0))
 
 
-def _tried(problem: _Problem, unit: jax.Array, tolerance: jax.Array, k: _Search) -> _Search:
+def _wide(problem: Problem, bounds: tuple[jax.Array, jax.Array]) -> jax.Array:
+    lower, upper = bounds
+    high = dw.words(upper)[0]
+    gap = jnp.where(jnp.isfinite(high), dw.minus(upper, lower), jnp.inf)
+    return _width(problem, high - gap, high)
+
+
+def _tried(problem: Problem, tolerance: jax.Array, k: _Search) -> _Search:
     """One trial: solves for one of the bounds, checks it, and updates the share."""
-    above = k.tries % 2 == 1
-    factor = 1 + jnp.where(above, k.share, -k.share)
-    at, n = _solved(problem, factor, k.share / 4, k.at, k.num_steps)
+    rows, above = problem.rows, k.tries % 2 == 1
+    sign = jnp.where(above, 1, -1).astype(k.share.dtype)
+    size = jnp.max(jnp.abs(dw.words(k.at.image)[0]))
+    # The shift exceeds the loss where words are flushed to zero.
+    shift, factor = 8 * rows.underflow(size), dw.double_word(jnp.ones_like(sign), sign * k.share)
+
+    def image(at: _Point) -> jax.Array:
+        swept = dw.plus(dw.product(factor, at.image), dw.double_word(sign * shift))
+        return jnp.where(problem.open, swept, 0)
+
+    equation = image, k.share / 4, shift / 4
+    at, known, n = _solved(problem, equation, k.at, k.known, k.num_steps)
     # Images are constant in a collapsed end component.
-    offered = jnp.where(problem.open, jnp.maximum(factor * at.image, 0), 0)
+    offered = image(at)
+    offered = jnp.where(dw.words(offered)[0] > 0, offered, 0)
     at = _backup(problem, offered)
-    # Sums of nonnegative terms have a relative error, and an absolute one by underflow.
-    least = underflow(problem.model)
-    most, fewest = at.image * (1 + unit) + least, at.image * (1 - unit) - least
-    holds = jnp.where(above, most <= offered, fewest >= offered)
-    proven = jnp.all(jnp.where(problem.open, holds & jnp.isfinite(offered), True))
+    value = dw.words(offered)[0]
+    slack = rows.unit * value + rows.underflow(jnp.max(value))
+    gain = dw.minus(at.image, offered)
+    holds = jnp.where(above, -gain >= slack, (gain >= slack) | (value == 0))
+    proven = jnp.all(jnp.where(problem.open, holds & jnp.isfinite(value), True))
 
     def kept(new: Tree, old: Tree, where: jax.Array) -> Tree:
         return jax.tree.map(lambda x, y: jnp.where(where, x, y), new, old)
@@ -424,47 +478,55 @@ def _tried(problem: _Problem, unit: jax.Array, tolerance: jax.Array, k: _Search)
     shares = kept(k.share, k.shares[0], below), kept(k.share, k.shares[1], over)
     safe = kept(at, k.safe, below if problem.sign > 0 else over)
     below_known, above_known = (x <= k.share for x in shares)
-    narrower = jnp.clip(tolerance / (2 * _width(problem, bounds)), 1e-3, 0.5)
-    floor = _ROUNDINGS * unit
-    change = jnp.where(below_known, jnp.where(above_known, narrower, 1 / 32), 16)
+    narrower = jnp.clip(tolerance / (2 * _wide(problem, bounds)), 1e-3, 0.5)
+    floor = _ROUNDINGS * rows.unit
+    # A small share without an upper bound is too small for the precision of the solution.
+    fewer = jnp.where(k.share < jnp.finfo(value.dtype).eps, 16, 1 / 32)
+    change = jnp.where(below_known, jnp.where(above_known, narrower, fewer), 16)
     share = jnp.where(above, jnp.maximum(k.share * change, floor), k.share)
-    ended = above & ((below_known & (k.share <= floor)) | (share > _LARGEST))
-    return _Search(at, share, bounds, shares, safe, k.tries + 1, n, ended)
+    ended = above & ((below_known & above_known & (k.share <= floor)) | (share > _LARGEST))
+    return _Search(at, known, share, bounds, shares, safe, k.tries + 1, n, ended)
 
 
-def _solution(problem: _Problem, tolerance: jax.Array) -> Found:
-    zero = jnp.zeros(problem.open.shape, problem.reward.dtype)
-    weight = problem.start if problem.policy is None else problem.policy
-    gain = jnp.where(problem.open, action_mean(weight, problem.reward), 0)
-    start = _Point(zero, gain, problem.start, _numbers(zero.shape))
-    unit = jnp.asarray(rounding_unit(problem.model), zero.dtype)
-    never = jnp.asarray(jnp.inf, zero.dtype)
-    k = _Search(
-        start,
-        jnp.sqrt(jnp.maximum(tolerance, 0) * _ROUNDINGS * unit),
-        (zero, jnp.where(problem.open, jnp.inf, zero)),
-        (never, never),
-        start,
-        jnp.int32(0),
-        jnp.int32(0),
-        jnp.bool_(False),
-    )
+def solve_problem(problem: Problem, tolerance: jax.Array, asked: jax.Array) -> Found:
+    """The enclosure of a problem, of width `tolerance` if possible; converged if it is `asked`."""
+    rows, model = problem.rows, problem.model
+    dtype, eps = model.dtype, float(jnp.finfo(model.dtype).eps)
+    zero = dw.double_word(jnp.zeros(problem.open.shape, dtype))
+    numbers, none = _numbers(zero.shape), jnp.int32(0)
+    start = _chosen(problem, zero, problem.reward)
+    if problem.start is not None:
+        gain = jnp.where(problem.open, action_mean(problem.start, problem.reward), 0)
+        start = _Point(zero, gain, problem.start, numbers)
+    size = zero.size if is_small(sweep_operator(model), zero.size) else 0
+    unknown = jnp.zeros((size, size), dtype), jnp.full_like(numbers, -1), numbers
+    never = jnp.asarray(jnp.inf, dtype)
+    far = jnp.where(problem.open, problem.highest, 0).astype(zero.dtype)
+    # Rounding both ends to the dtype takes a little of the width.
+    inner = jnp.maximum(tolerance - 2 * eps, tolerance / 2)
+    share = jnp.maximum(2 * _ROUNDINGS * rows.unit, 1e-6 * tolerance).astype(dtype)
+    k = _Search(start, unknown, share, (zero, far), (never, never), start, none, none, none > 0)
     k = lax.while_loop(
-        lambda k: (_width(problem, k.bounds) > tolerance) & (k.tries < 2 * _ATTEMPTS) & ~k.ended,
-        partial(_tried, problem, unit, tolerance),
+        lambda k: (_wide(problem, k.bounds) > inner) & (k.tries < 2 * _ATTEMPTS) & ~k.ended,
+        partial(_tried, problem, inner),
         k,
     )
     policy, decides = _policy(problem, k.safe)
-    lower, upper = k.bounds
+    lower, upper = dw.outwards(k.bounds[0], -1), dw.outwards(k.bounds[1], 1)
+    lower = jnp.maximum(lower, 0)
+    upper = jnp.where(problem.open, jnp.maximum(upper, jnp.finfo(dtype).tiny), upper)
+    upper = jnp.minimum(upper, problem.highest)
     if problem.sign < 0:
         # The bound holds for a policy that leaves the open states almost surely.
-        upper = jnp.where(problem.open & ~decides, jnp.inf, upper)
+        upper = jnp.where(problem.open & ~decides, problem.highest, upper)
     both = jnp.isfinite(upper)
-    value = jnp.where(both, (lower + upper) / 2, jnp.maximum(k.at.image, lower))
-    mine = _backup(problem, value)
-    residual = jnp.max(jnp.where(problem.open, jnp.abs(mine.image - value), 0))
-    narrow = _width(problem, (lower, upper)) <= tolerance
-    status = status_code(narrow, jnp.isfinite(residual), jnp.all(both) & k.ended)
+    middle = dw.words(k.bounds[0])[0] + dw.minus(k.bounds[1], k.bounds[0]) / 2
+    value = jnp.where(both, middle, jnp.maximum(dw.words(k.at.image)[0], lower))
+    value = jnp.clip(value, lower, upper)
+    residual = jnp.max(jnp.abs(dw.minus(k.safe.image, k.safe.value)))  # of the bound
+    narrow = _width(problem, lower, upper) <= asked
+    exhausted = k.ended | (_wide(problem, k.bounds) <= inner)
+    status = status_code(narrow, jnp.all(jnp.isfinite(value)), jnp.all(both) & exhausted)
     return Found(
         value,
         lower,
@@ -479,7 +541,7 @@ def _solution(problem: _Problem, tolerance: jax.Array) -> Found:
     )
 
 
-def _policy(problem: _Problem, safe: _Point) -> tuple[jax.Array, jax.Array]:
+def _policy(problem: Problem, safe: _Point) -> tuple[jax.Array, jax.Array]:
     """A point's policy in all states, and whether it leaves the open states almost surely."""
     graph = TracedGraph(problem.model)
     action, always = safe.action, jnp.bool_(True)

@@ -313,3 +313,17 @@ def test_policies_of_rows():
             operators.policy_distribution(model, np.zeros(shape))
     with pytest.raises(ValueError, match="a deterministic policy"):
         operators.policy_distribution(model, np.zeros(3, int))
+
+
+def test_products_of_dense_matrices_are_in_full_precision():
+    """GPUs multiply matrices of float32 in 10 bits by default, which no bound includes."""
+    model = jl.models.to_dense(jl.gridworld("a . b\n. . c"))
+    policy = jnp.ones((model.num_states, model.num_actions)) / model.num_actions
+    for function, argument in (
+        (jl.models.expectation, jnp.ones(model.num_states)),
+        (jl.models.pushforward, policy),
+        (operators.transition_matrix, policy),
+    ):
+        program = str(jax.make_jaxpr(function)(model, argument))
+        assert "precision=(Precision.HIGHEST, Precision.HIGHEST)" in program, function
+        assert "precision=None" not in program, function

@@ -95,7 +95,7 @@ def test_feature_expectations_by_hand(kind):
     x = rng.random(model.available.shape)
     features = rng.normal(size=(*model.available.shape, 2))
     expected = (x.ravel()[:, None] * features.reshape(-1, 2)).sum(axis=0)
-    np.testing.assert_allclose(jl.feature_expectation(x, features), expected, rtol=1e-12)
+    np.testing.assert_allclose(jl.values.feature_expectation(x, features), expected, rtol=1e-12)
 
 
 def test_bad_policies_are_named():

@@ -372,6 +372,9 @@ def test_a_table_tells_it_all():
         "discounted",
         "ended:",
     ]
+    # Columns begin at the same place, behind two spaces at least.
+    assert len({row.index(" [") for row in rows[1:-1]}) == 1
+    assert all(row[row.index("]") + 1 :].startswith("  ") for row in rows[1:-1])
     assert found.length.lower == found.length.upper == 1
     # A visit is one after the first reading.
     assert found.discounted_visits.mean == 0.5 * found.visits.mean == 0.5 * found.success.mean

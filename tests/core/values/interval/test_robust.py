@@ -448,7 +448,9 @@ def test_bad_questions():
         robust_expectation(COIN, [0, 1, 0])
     with pytest.raises(ValueError, match="not finite"):
         robust_expectation(model, [0, np.nan, 0])
-    with pytest.raises(ValueError, match="target is int64"):
+    with pytest.raises(
+        ValueError, match=r"target is \[0, 2, 0\]; give bool\[3\], one for each state\."
+    ):
         robust_reachability(model, [0, 2, 0])
     with pytest.raises(ValueError, match="objective='best'"):
         robust_reachability(model, target, objective="best")

@@ -1,0 +1,325 @@
+"""Expected number of steps to satisfaction, and the quickest optimal policy, on the host.
+
+Stochastic shortest paths (Bertsekas and Tsitsiklis 1991) to a decision, and long-run rates of
+acceptance (Puterman 1994, chapters 8 and 9). docs/optimal-actions.md has the proofs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from jaxltl.core.array_types import Booleans, Floats, Integers
+from jaxltl.core.graphs.graph import graph_of
+from jaxltl.core.graphs.reaching import max_sets
+from jaxltl.core.models.ops.array_namespace import is_traced
+from jaxltl.core.models.product import Product
+from jaxltl.core.models.protocols import Array
+from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.pretty_print import brief
+from jaxltl.core.sparse.contraction import with_stops
+from jaxltl.core.sparse.graph.qualitative import end_components
+from jaxltl.core.sparse.mdp import HostMDP
+from jaxltl.core.sparse.solvers import reachability as optimal
+from jaxltl.core.sparse.solvers.average_reward import AverageReward, average
+from jaxltl.core.sparse.solvers.shortest_path import with_exits
+from jaxltl.core.sparse.solvers.total_cost import Enclosure
+from jaxltl.core.types import Solution, Status
+from jaxltl.core.values.engine.host_solution import Chain, induced_chain, status_between
+from jaxltl.core.values.engine.state_quantities import safe_mean
+from jaxltl.core.values.undiscounted.optimal_actions import OptimalActions, optimal_actions
+from jaxltl.core.values.undiscounted.reachability import on_rows, rows_of_model
+from jaxltl.core.values.undiscounted.satisfaction import (
+    Reaching,
+    as_reachability,
+    satisfaction_probability,
+)
+from jaxltl.core.values.engine.validated import validated
+
+_EPS = float(np.finfo(np.float64).eps)
+_SOLVED = 1e-9  # relative width to which each part is solved
+_TOLERANCE = 1e-6  # relative width of a converged enclosure
+_MOST_SWEEPS = 1_000_000  # of the rates of acceptance
+_LOSS = 1e-9  # of the satisfaction probability, that counts as a rounding error
+
+
+@brief
+class Steps(NamedTuple):
+    """Expected number of steps to satisfaction, the mean over the initial states.
+
+    Of a co-safe task, the expected number of steps until the formula is decided: satisfied, or
+    lost, which means that no policy can satisfy it any more. Of a task without end (Buchi and
+    parity), the sum of two terms: the expected number of steps outside of accepting end components
+    before it is lost, and the expected number of steps between two rounds of acceptance in the
+    long run, given that the task is satisfied. A round ends where an even priority is read that is
+    less than all odd priorities of the bottom component. Of a safety task 0.
+
+    Attributes:
+      value: the number; infinite if the task stays undecided with positive probability.
+      lower, upper: certified bounds.
+      status: CONVERGED if the bounds agree in six digits, or are infinite; else PRECISION.
+
+    Example:
+      >>> from jaxltl import from_dense, product
+      >>> world = from_dense([[[0.5, 0.5]], [[0.0, 1.0]]], label=[[0], [1]], propositions=["a"],
+      ...                    initial=[1, 0])
+      >>> round(satisfaction_steps(product(world, "F a"), np.ones((2, 2, 1))).value, 6)
+      2.0
+    """
+
+    value: float
+    lower: float
+    upper: float
+    status: Status
+
+
+@brief
+class Quickest(NamedTuple):
+    """The quickest optimal policy.
+
+    Attributes:
+      policy: ``int32[S, Q]``, an optimal policy.
+      steps: its :class:`Steps`.
+      least: lower bound of the steps of every policy inside the mask of optimal actions; equal to
+        the policy's up to six digits for co-safe tasks.
+
+    Example:
+      >>> from jaxltl import from_dense, product
+      >>> world = from_dense([[[0.5, 0.5]], [[0.0, 1.0]]], label=[[0], [1]], propositions=["a"],
+      ...                    initial=[1, 0])
+      >>> round(quickest_policy(product(world, "F a")).least, 6)
+      2.0
+    """
+
+    policy: np.ndarray
+    steps: Steps
+    least: float
+
+
+@validated()
+def satisfaction_steps(model: Product, policy: Array) -> Steps:
+    """Expected number of steps of a policy until its task is satisfied, with certified bounds.
+
+    Args:
+      model: a concrete product.
+      policy: ``float[S, Q, A]`` or ``int32[S, Q]``.
+
+    Returns:
+      :class:`Steps`, which has the definition. Concrete arrays only; not differentiable.
+
+    Raises:
+      ValueError: something is traced, or the policy is invalid.
+
+    Example:
+      >>> from jaxltl import from_dense, product
+      >>> world = from_dense([[[0.75, 0.25]], [[0.0, 1.0]]], label=[[0], [1]], propositions=["a"],
+      ...                    initial=[1, 0])
+      >>> steps = satisfaction_steps(product(world, "F a"), np.ones((2, 2, 1)))
+      >>> round(steps.value, 6), steps.lower <= 4 <= steps.upper
+      (4.0, True)
+    """
+    if is_traced((model, policy)):
+        raise ValueError("satisfaction_steps works on the host; call it outside jit and vmap.")
+    return Clock(model).steps(policy)
+
+
+@validated()
+def quickest_policy(model: Product, actions: OptimalActions | None = None) -> Quickest:
+    """The optimal policy with the least expected number of steps to satisfaction.
+
+    Args:
+      model: a concrete product.
+      actions: of :func:`optimal_actions`; default: they are computed.
+
+    Returns:
+      :class:`Quickest`; the policy satisfies the task with the maximal probability. Concrete arrays
+      only; not differentiable.
+
+    Raises:
+      ValueError: something is traced.
+
+    Example:
+      >>> from jaxltl import from_dense, product
+      >>> world = from_dense([[[0.75, 0.25], [0.5, 0.5]], [[0.0, 1.0]] * 2], label=[[0], [1]],
+      ...                    propositions=["a"], initial=[1, 0])
+      >>> found = quickest_policy(product(world, "F a"))
+      >>> found.policy[0, 0].item(), round(found.steps.value, 6), round(found.least, 6)
+      (1, 2.0, 2.0)
+    """
+    if is_traced((model, actions)):
+        raise ValueError("quickest_policy works on the host; call it outside jit and vmap.")
+    return Clock(model).quickest(optimal_actions(model) if actions is None else actions)
+
+
+@dataclass(frozen=True)
+class Clock:
+    """The expected number of steps to satisfaction of a product's policies."""
+
+    model: Product
+
+    @cached_property
+    def problem(self) -> Reaching:
+        return as_reachability(self.model, "max")
+
+    @cached_property
+    def sparse(self) -> SparseMDP:
+        return rows_of_model(self.model)
+
+    @cached_property
+    def lost(self) -> Booleans:
+        """``bool[N]``: no policy satisfies the task."""
+        graph = graph_of(self.problem.model)
+        return np.asarray(max_sets(graph, np.asarray(self.problem.target)).zero).ravel()
+
+    @cached_property
+    def undecided(self) -> Booleans:
+        """``bool[N]``: the states in which steps count."""
+        return ~(self.lost | np.asarray(self.problem.target).ravel())
+
+    def steps(self, policy: Array) -> Steps:
+        """:func:`satisfaction_steps` of a policy."""
+        if self.problem.opposite:
+            return Steps(0.0, 0.0, 0.0, Status.CONVERGED)
+        chain = induced_chain(self.model, self.sparse, policy)
+        found = optimal.reward_forever(
+            chain.mdp,
+            self.undecided.astype(float),
+            maximize=False,
+            tolerance=_SOLVED,
+            depth=chain.depth,
+        )
+        value, low, high = self.mean(found)
+        if self.problem.accepting is not None:
+            part = self._between_rounds(chain)
+            value, low, high = value + part[0], low + part[1], high + part[2]
+            low, high = low * (1 - _EPS), high * (1 + _EPS)
+        bounds = np.array([low]), np.array([high])
+        return Steps(value, low, high, status_between(*bounds, _TOLERANCE, relative=True))
+
+    def quickest(self, actions: OptimalActions) -> Quickest:
+        """:func:`quickest_policy` inside a mask of optimal actions."""
+        best = np.asarray(actions.best.policy)
+        if self.problem.opposite:
+            return Quickest(best, self.steps(best), 0.0)
+        host = self.sparse.host
+        rows = on_rows(self.sparse, actions.allowed)
+        cost = np.where(rows, self.undecided[host.state], np.inf)
+        found = optimal.reward_forever(host, cost, maximize=False, tolerance=_SOLVED)
+        least = self.mean(found)[1]
+        shape = self.model.state_shape
+        taken = np.asarray(self.sparse.action)[found.row].reshape(shape)
+        if self.problem.accepting is not None:
+            rounds, inner = self._fewest_between_rounds(rows)
+            least = (least + rounds) * (1 - _EPS)
+            region = np.asarray(self.problem.accepting.region)
+            taken = np.where(region, inner.reshape(shape), best)
+        quickest = Quickest(best.astype(np.int32), self.steps(best), least)
+        if quickest.steps.upper <= least * (1 + _TOLERANCE):
+            return quickest
+        steps = self.steps(taken)
+        loss = self.probability(best)[1] - self.probability(taken)[1]
+        if steps.upper < quickest.steps.upper and loss <= _LOSS:
+            return Quickest(taken.astype(np.int32), steps, least)
+        return quickest
+
+    def probability(self, policy: Array) -> tuple[float, float, float]:
+        """Satisfaction probability from the initial distribution: value, lower and upper bound."""
+        found = satisfaction_probability(self.model, policy)
+        return self.mean(jax.tree.map(lambda x: np.asarray(x).ravel(), found), 1.0)
+
+    def mean(
+        self, found: Enclosure | AverageReward | Solution, highest: float = np.inf
+    ) -> tuple[float, float, float]:
+        """Value, lower and upper bound of the mean over the initial distribution."""
+        share = np.asarray(self.model.initial, np.float64).ravel()
+        start = np.flatnonzero(share)
+        low, high = (
+            safe_mean(share[start], np.asarray(x)[start], up=up, highest=highest)
+            for x, up in ((found.lower, False), (found.upper, True))
+        )
+        middle = float(share[start] @ np.asarray(found.value)[start] / share[start].sum())
+        return float(np.clip(middle, low, high)), low, high
+
+    # --- rounds of acceptance ---------------------------------------------------------------------
+
+    def _priorities(self, mdp: HostMDP) -> Integers:
+        """The priority that each transition reads, ``int[T]``."""
+        count = self.model.num_memory
+        source = mdp.state[mdp.row]
+        read = mdp.successor if self.model.label_on == "entry" else source
+        letter = np.asarray(self.model.letter)[read // count]
+        found: Integers = np.asarray(self.model.automaton.priority)[source % count, letter]
+        return found
+
+    def _between_rounds(self, chain: Chain) -> tuple[float, float, float]:
+        """Steps between two rounds of a policy: value, lower and upper bound."""
+        mdp, size = chain.mdp, chain.mdp.num_states
+        found = end_components(mdp)
+        member, leader = found.inside, found.component
+        read = self._priorities(mdp)
+        among, part, is_odd = member[mdp.row], leader[mdp.row], read % 2 == 1
+        odd, even = np.full((2, size), np.iinfo(np.int64).max)
+        np.minimum.at(odd, part[among & is_odd], read[among & is_odd])
+        np.minimum.at(even, part[among & ~is_odd], read[among & ~is_odd])
+        accepted = member & (even < odd)[leader]
+        hits = np.where(~is_odd & (read < odd[part]), mdp.probability, 0)
+        gain = _gain(mdp, np.add.reduceat(hits, mdp.entry_start[:-1]))
+        # Relative errors of a chain's probabilities change its stationary distribution by at most
+        # twice the number of states times as much (O'Cinneide 1993).
+        slack = 1 + 2 * (size + 2) * (chain.depth + 2) * _EPS
+        ended, goal = with_exits(mdp, among), np.arange(size + 1) == size
+
+        def at_end(worth: Floats) -> tuple[float, float, float]:
+            """The mean worth of the accepting component that is reached, 0 for others."""
+            cost = np.append(np.where(accepted, worth, 0), 0)
+            total = optimal.total_reward(
+                ended, cost, goal, maximize=False, tolerance=_SOLVED, depth=chain.depth
+            )
+            return self.mean(total)
+
+        share = at_end(np.ones(size))
+        if not share[0] > 0:
+            return np.inf, np.inf if share[2] == 0 else 0.0, np.inf
+        with np.errstate(divide="ignore"):
+            value, low, high = (
+                at_end(1 / np.maximum(rate, 0))[i]
+                for i, rate in enumerate((gain.value, gain.upper * slack, gain.lower / slack))
+            )
+        upper = high / share[1] * (1 + 2 * _EPS) if share[1] > 0 else np.inf
+        return value / share[0], low / share[2] * (1 - 2 * _EPS), upper
+
+    def _fewest_between_rounds(self, rows: Booleans) -> tuple[float, Integers]:
+        """Lower bound of the steps between rounds over policies of some rows, and a quick one."""
+        # The mean of 1 / rate is at least 1 / (mean rate), by Jensen's inequality, and the mean
+        # rate over all runs is at most the largest long-run average of even priorities.
+        host, accepting = self.sparse.host, self.problem.accepting
+        assert accepting is not None
+        region = np.asarray(accepting.region).ravel()
+        read, start = self._priorities(host), host.entry_start[:-1]
+        hits = np.where((read % 2 == 0) & region[host.state][host.row], host.probability, 0)
+        most = self.mean(_gain(*_among(host, rows, np.add.reduceat(hits, start))[:2]), 1.0)
+        reached = optimal.reachability(host, region, maximize=True, tolerance=_SOLVED)
+        share = self.mean(reached, highest=1.0)[1]
+        # Inside an accepting end component the least priority alone is sure to be accepted.
+        inner = ~region[host.state] | on_rows(self.sparse, accepting.inside)
+        least = np.asarray(accepting.least).ravel()[host.state][host.row]
+        hits = np.where((read == least) & region[host.state][host.row], host.probability, 0)
+        small, reward, row = _among(host, inner, np.add.reduceat(hits, start))
+        action = np.asarray(self.sparse.action)[row[_gain(small, reward).row]]
+        return share / most[2] * (1 - 2 * _EPS) if most[2] > 0 else np.inf, action
+
+
+def _gain(mdp: HostMDP, reward: Floats) -> AverageReward:
+    return average(mdp, reward, reward, tolerance=_SOLVED, max_steps=_MOST_SWEEPS)
+
+
+def _among(mdp: HostMDP, rows: Booleans, reward: Floats) -> tuple[HostMDP, Floats, Integers]:
+    """The model with some rows alone, their rewards, and their numbers."""
+    row, none = np.flatnonzero(rows), np.zeros(0, np.int64)
+    every = np.arange(mdp.num_states)
+    small, order = with_stops(mdp, row, every, (none, none), mdp.num_states)
+    return small, reward[row][order], row[order]
