@@ -14,7 +14,9 @@ from .adapters.pgx import from_pgx as from_pgx
 from .adapters.xminigrid import from_xminigrid as from_xminigrid
 from .flat_world import flat_world as flat_world
 from .gridworld import gridworld as gridworld
+from .gymnasium_runner import run_policy as run_policy
 from .gymnasium_tables import from_gymnasium as from_gymnasium
+from .gymnasium_task import gymnasium_task as gymnasium_task
 from .letter_world import letter_world as letter_world
 from .robots import grid_game as grid_game
 from .zone_world import zone_world as zone_world

@@ -122,6 +122,10 @@ def _initial(
     holds = place
     if formula is not None:
         holds = place & satisfying(label, propositions, formula, "initial")
+    if not place.any():
+        raise ValueError(
+            "all cells of the map are walls; give at least one other cell, such as '.'."
+        )
     if not holds.any():
         raise ValueError(f"initial={formula!r} holds in no cell of the map.")
     return holds / holds.sum()

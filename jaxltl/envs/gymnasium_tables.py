@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
-
-TERMINATED = "terminated"
+from jaxltl.envs.gymnasium_runner import TERMINATED
 
 
 def from_gymnasium(

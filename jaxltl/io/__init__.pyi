@@ -23,11 +23,21 @@ from .learned_reward import (
 )
 from .log import read_labels as read_labels, read_log as read_log
 from .model_files import read_model as read_model, write_model as write_model
+from .episodes import from_episodes as from_episodes
 from .npz import read_npz as read_npz, write_npz as write_npz
 from .drn.parametric import (
     ParametricModel as ParametricModel,
     RationalFunction as RationalFunction,
     read_parametric as read_parametric,
+)
+from .network_policy import (
+    NetworkPolicy as NetworkPolicy,
+    save_network as save_network,
+)
+from .policies import (
+    load_policy as load_policy,
+    save_policy as save_policy,
+    write_c_policy as write_c_policy,
 )
 from .pgsolver import (
     ParityGame as ParityGame,

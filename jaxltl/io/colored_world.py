@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxltl.algos.common.checkpoint import atomic_write
+from jaxltl.core.files import atomic_write
 from jaxltl.envs.cell_kinds import COLORS, OBJECTS, OBSTACLES
 from jaxltl.envs.temporal_gridworld import World, colored_world
 

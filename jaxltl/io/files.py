@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, Literal
 
-from jaxltl.algos.common.checkpoint import atomic_write
+from jaxltl.core.files import atomic_write
 from jaxltl.core import validation
 
 Compression = Literal["gzip", "xz"]
@@ -137,15 +137,6 @@ def _too_large(name: str, limit: int) -> ValueError:
     return ValueError(f"{name!r} has more than {limit} bytes, the most that are read.")
 
 
-@contextlib.contextmanager
-def errors_in(place: str) -> Iterator[None]:
-    """Prepends a place to the message of a ValueError."""
-    try:
-        yield
-    except ValueError as error:
-        raise ValueError(f"{place}{error}") from None
-
-
 def read_text(path: str | os.PathLike[str], expected: str) -> str:
     """Decoded UTF-8 contents of a file, decompressed as by :func:`read_bytes`."""
     data = read_bytes(path)
@@ -160,6 +151,7 @@ def read_text(path: str | os.PathLike[str], expected: str) -> str:
 
 
 def compression_of(data: bytes | FileBytes) -> Compression | None:
+    """Compression of a file by its first bytes, or None."""
     return next((kind for kind in _BEGINS if _begins(data, 0, kind)), None)
 
 
@@ -168,6 +160,7 @@ def _begins(data: bytes | FileBytes, place: int, kind: Compression) -> bool:
 
 
 def compression_by_name(path: str | os.PathLike[str]) -> Compression | None:
+    """Compression of a file by its suffix, or None."""
     return _SUFFIX.get(Path(path).suffix.lower())
 
 

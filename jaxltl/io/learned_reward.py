@@ -29,14 +29,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxltl.algos import todirl
-from jaxltl.algos.common.checkpoint import atomic_write, read_arrays
+from jaxltl.core.files import atomic_write, read_arrays
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.text import from_dict, to_dict
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.product import Product, product
 from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.types import Solution, worst
-from jaxltl.core.values.undiscounted.mixture import reaching, require_attainable
+from jaxltl.core.values.undiscounted.mixture import (
+    practical_policy,
+    reaching,
+    require_attainable,
+)
 from jaxltl.core.values.undiscounted.optimal_actions import optimal_actions
 
 
@@ -56,6 +60,8 @@ class LearnedReward:
       guarantee: ``"best"`` restricts plans to optimal actions for the formula; a probability mixes
         in the least sufficient share of them; ``"none"``.
       over: initial states that a probability refers to, ``"mean"`` or ``"worst"``.
+      steps_factor: bound on the expected steps to satisfaction, a multiple of the quickest optimal
+        policy's; None for no bound.
     """
 
     parameters: PyTree
@@ -69,6 +75,7 @@ class LearnedReward:
     kinds: tuple[str, ...]
     guarantee: str | float = "none"
     over: str = "mean"
+    steps_factor: float | None = None
 
     @property
     def network(self) -> todirl.RewardNetwork:
@@ -114,13 +121,19 @@ def plan_in(learned: LearnedReward, world: MDP, observation: ArrayLike) -> tuple
         return model, plan()
     sure = optimal_actions(model)
     inside = plan(allowed=sure.allowed)
-    if isinstance(asked, str):
-        return model, inside
-    require_attainable(model, sure.best, asked, learned.over, "state {}".format)
-    soft = plan()
-    mixed = reaching(model, soft.policy, inside.policy, sure.best, asked, over=learned.over)
-    policy = jnp.asarray(mixed.policy, model.dtype)
-    return model, replace(soft, policy=policy, status=worst(soft.status, inside.status))
+    factor, least, found = learned.steps_factor or np.inf, 0.0, inside
+    if not isinstance(asked, str):
+        require_attainable(model, sure.best, asked, learned.over, "state {}".format)
+        soft, least = plan(), asked
+        mixed = reaching(model, soft.policy, inside.policy, sure.best, asked, over=learned.over)
+        policy = jnp.asarray(mixed.policy, model.dtype)
+        found = replace(soft, policy=policy, status=worst(soft.status, inside.status))
+    if np.isinf(factor):
+        return model, found
+    kept = practical_policy(
+        model, found.policy, factor, actions=sure, probability=least, over=learned.over
+    )
+    return model, replace(found, policy=jnp.asarray(kept.policy, model.dtype))
 
 
 # --- files ----------------------------------------------------------------------------------
@@ -136,6 +149,7 @@ _ABOUT = (
     "kinds",
     "guarantee",
     "over",
+    "steps_factor",
 )
 
 

@@ -11,7 +11,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from jaxltl.algos.common.checkpoint import atomic_write, read_arrays
+from jaxltl.core.validation import errors_in
+from jaxltl.core.files import atomic_write, read_arrays
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.construct.padded import to_padded
 from jaxltl.core.models.game import Game, make_game
@@ -20,7 +21,7 @@ from jaxltl.core.models.mdp import MDP, DenseMDP, from_dense, make_mdp
 from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.models.sparse import Annotations, Rewards, SparseMDP, make_sparse
 from jaxltl.core.sparse.rows import offsets_from_counts
-from jaxltl.io.files import ALWAYS_ALLOWED, MAX_RATIO, errors_in, raw_bytes
+from jaxltl.io.files import ALWAYS_ALLOWED, MAX_RATIO, raw_bytes
 from jaxltl.io.text_output import exact_part
 
 Arrays = Mapping[str, Array]

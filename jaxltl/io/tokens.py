@@ -212,6 +212,7 @@ def numbered(texts: list[bytes], index_of_name: dict[bytes, int]) -> Integers:
 
 
 def decoded(text: Text, names: dict[bytes, int]) -> list[str]:
+    """Names as text; ValueError for bytes that are not UTF-8."""
     try:
         return [name.decode() for name in names]
     except UnicodeDecodeError as error:
@@ -294,4 +295,5 @@ def truncated(announced: int, count: int, items: str) -> str:
 
 
 def refuse(name: str, message: str) -> NoReturn:
+    """Raises ValueError with the name of the file."""
     raise ValueError(f"{name!r}: {message}")

@@ -103,7 +103,7 @@ def test_maps_of_words_and_of_characters():
         ("..", {"absorbing": ["z"]}, r"absorbing: 'z' .* it has \(none\)"),
         ("ab", {"initial": "z"}, "mentions the proposition 'z'"),
         ("ab", {"initial": "a & b"}, "initial='a & b' holds in no cell"),
-        ("##", {}, "initial=None holds in no cell"),
+        ("##", {}, "all cells of the map are walls"),
         ("ab", {"initial": [0.5, 0.4]}, "the initial distribution sums to 0.9"),
     ],
 )

@@ -352,7 +352,7 @@ def test_another_wall():
     [
         ("", {}, "the map is empty"),
         ("..\n...", {}, "map row 2 has 3 cells"),
-        ("##", {}, "holds in no cell of the map"),
+        ("##", {}, "all cells of the map are walls"),
         ("a?", {"legend": {"a": []}}, r"cell '\?' \(row 1, column 2\) is not in the legend"),
         ("..", {"slip": 1.5}, "slip=1.5; it must be a probability"),
         (

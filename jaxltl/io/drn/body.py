@@ -385,6 +385,7 @@ class Names(TypedDict):
 
 
 def names_of(header: Header, body: Body) -> Names:
+    """Labels, initial states and names of actions of a DRN file."""
     text = header.body
     holds = label_matrix(text, body.num_states, len(body.label_names))
     for state, column in zip(body.labelled, body.label, strict=True):

@@ -33,6 +33,8 @@ _MOST_RECORD = 2**16  # bytes of one state's valuation
 
 @dataclass(frozen=True)
 class Type:
+    """A type of values with its size in bits."""
+
     name: str
     size: int
 
@@ -60,6 +62,8 @@ class Annotation:
 
 @dataclass(frozen=True)
 class Variable:
+    """A variable of a state's record."""
+
     name: str  # name, type: as in the file
     type: Type
     offset: int  # added to the encoded value

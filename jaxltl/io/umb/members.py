@@ -72,6 +72,7 @@ def check_memory(size: int, place: str) -> None:
 
 
 def needed(contents: dict[str, Bytes], member: str, place: str) -> Bytes:
+    """Bytes of a required member; ValueError if it is missing."""
     if member not in contents:
         raise ValueError(f"{place}{member} is missing.")
     return contents[member]
@@ -121,6 +122,7 @@ def labels_of(
 
 
 def rewards_of(contents: dict[str, Bytes], index: Index, place: str) -> dict[str, Rewards]:
+    """Reward structures by name."""
     rewards, begins = {}, dict(zip(PARTS, index.begins, strict=True))
     for one in index.annotations:
         if one.group == "rewards":

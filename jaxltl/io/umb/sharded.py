@@ -14,12 +14,13 @@ import numpy as np
 from jax.sharding import Mesh
 from numpy.typing import NDArray
 
+from jaxltl.core.validation import errors_in
 from jaxltl.core.models.construct.padded import row_actions
 from jaxltl.core.models.mdp import refuse_negative
 from jaxltl.core.models.mesh.shard import ModelPart, model_from_parts, ranges_of
 from jaxltl.core.models.mesh.sharded import ShardedMDP
 from jaxltl.core.models.sparse import choice_reward, sparse_part
-from jaxltl.io.files import FileBytes, compression_of, errors_in, opened, pieces
+from jaxltl.io.files import FileBytes, compression_of, opened, pieces
 from jaxltl.io.umb.index import ACTIONS, Index, Items
 from jaxltl.io.umb.members import (
     annotations_of,

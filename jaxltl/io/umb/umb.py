@@ -14,6 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jaxltl.core.validation import errors_in
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.interval import IntervalMDP, interval_rows, refuse_ball
@@ -23,7 +24,6 @@ from jaxltl.core.models.sparse import SparseMDP, make_sparse
 from jaxltl.io.files import (
     Compression,
     compression_by_name,
-    errors_in,
     pieces,
     raw_bytes,
     write_bytes,

@@ -1,0 +1,112 @@
+"""Episodes of the packages imitation and Minari, as demonstrations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import SupportsIndex
+
+import numpy as np
+
+from jaxltl.core import validation
+from jaxltl.core.models.mdp import MDP, DenseMDP
+from jaxltl.core.models.trajectories import Trajectories, make_trajectories
+
+_NAMES = (("obs", "acts"), ("observations", "actions"))
+
+
+def from_episodes(
+    model: MDP | DenseMDP,
+    episodes: Iterable[object],
+    *,
+    state: Callable[..., SupportsIndex] | None = None,
+    action: Callable[..., SupportsIndex] | None = None,
+) -> Trajectories:
+    """Demonstrations from episodes of imitation or Minari.
+
+    Args:
+      model: the model in which they are demonstrations.
+      episodes: objects with ``obs`` and ``acts`` (``imitation.data.types.Trajectory``) or with
+        ``observations`` and ``actions`` (a Minari dataset), of one observation more than actions.
+      state, action: number of the state of an observation, and of the action of the model; default
+        the observations and actions themselves, which must be integers then.
+
+    Returns:
+      :class:`~jaxltl.core.models.trajectories.Trajectories`; last successors are checked, not kept.
+
+    Raises:
+      ValueError: naming the episode: other lengths, observations that are no integers, or a step
+        that is impossible in the model.
+
+    Example:
+      >>> from types import SimpleNamespace
+      >>> from jaxltl import from_dense
+      >>> world = from_dense([[[0, 1.0]], [[0, 1.0]]])
+      >>> episode = SimpleNamespace(obs=np.array([0, 1, 1]), acts=np.array([0, 0]))
+      >>> from_episodes(world, [episode]).state.tolist()
+      [[0, 1]]
+    """
+    pairs, whole = [], []
+    for number, episode in enumerate(episodes):
+        states, actions = _read(episode, number, state, action)
+        pairs.append(list(zip(states, actions, strict=False)))
+        if not 0 <= states[-1] < model.num_states:
+            raise ValueError(
+                f"episode {number} ends in state {states[-1]}; states are 0 to "
+                f"{model.num_states - 1}."
+            )
+        last = int(np.argmax(np.asarray(model.available)[states[-1]]))
+        whole.append([*pairs[-1], (states[-1], last)])
+    make_trajectories(model, whole)  # checks the last successors too
+    return make_trajectories(model, pairs)
+
+
+def _read(
+    episode: object,
+    number: int,
+    state: Callable[..., SupportsIndex] | None,
+    action: Callable[..., SupportsIndex] | None,
+) -> tuple[list[int], list[int]]:
+    """The states and actions of an episode."""
+    for names in _NAMES:
+        if all(hasattr(episode, name) for name in names):
+            seen, done = (getattr(episode, name) for name in names)
+            break
+    else:
+        raise ValueError(
+            f"episode {number} is {validation.shorten(episode)}; give objects with obs and acts, or "
+            "with observations and actions."
+        )
+    observed = _steps(seen)
+    acted = list(done)
+    if not acted or len(observed) != len(acted) + 1:
+        raise ValueError(
+            f"episode {number} has {len(observed)} observations and {len(acted)} actions; expected "
+            "at least one action, and one observation more than actions."
+        )
+    return (
+        [
+            _index(x, state, f"episode {number}, observation {t}", "state")
+            for t, x in enumerate(observed)
+        ],
+        [_index(x, action, f"episode {number}, action {t}", "action") for t, x in enumerate(acted)],
+    )
+
+
+def _steps(seen: Mapping[str, Sequence[object]] | Sequence[object]) -> list[object]:
+    """One observation for each step, also from a dictionary of arrays."""
+    if not isinstance(seen, Mapping):
+        return list(seen)
+    columns = [list(column) for column in seen.values()]
+    return [dict(zip(seen, row, strict=True)) for row in zip(*columns, strict=True)]
+
+
+def _index(
+    value: object, number_of: Callable[..., SupportsIndex] | None, place: str, name: str
+) -> int:
+    found = np.asarray(value if number_of is None else number_of(value))
+    if found.size != 1 or found.dtype.kind not in "iu":
+        raise ValueError(
+            f"{place} is {validation.shorten(value)}; give {name}=, a function that returns the "
+            f"number of the {name}."
+        )
+    return int(found.item())
