@@ -1,5 +1,6 @@
 """Files of learners' states: whole or not at all, bit for bit, and for the same problem only."""
 
+import errno
 import os
 import subprocess
 import sys
@@ -12,6 +13,7 @@ import pytest
 from jaxltl.algos import behavioral_cloning
 from jaxltl.algos.common import checkpoint
 from jaxltl.algos.common.chunks import Options, run_in_chunks
+from jaxltl.core.files import atomic_write
 from tests.algos.test_learner import assert_bitwise, start, toy_init, toy_step
 
 
@@ -175,3 +177,12 @@ def test_an_interrupted_write_leaves_the_old_file(tmp_path):
         file.write(b"new")
         assert path.read_bytes() == b"old", "not before it is complete"
     assert path.read_bytes() == b"new"
+
+
+def test_a_full_disk_names_the_file(tmp_path):
+    full = r"cannot write '.*large.npz': No space left.*free some"
+    with pytest.raises(ValueError, match=full), atomic_write(tmp_path / "large.npz"):
+        raise OSError(errno.ENOSPC, "No space left on device")
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(OSError, match="busy"), atomic_write(tmp_path / "large.npz"):
+        raise OSError(errno.EBUSY, "busy")

@@ -125,10 +125,13 @@ def run_in_chunks(
         if os.path.exists(checkpoint):
             now, rows = files.load(checkpoint, (now, rows), given)
     advance: Callable[..., tuple[PyTree, PyTree]]
-    if mesh is None:
-        advance = partial(run_blocks, _lane_steps(step, keep, num_lanes))
+    single = _progress_step(step, keep)
+    if not lanes:
+        advance = partial(run_blocks, single)
+    elif mesh is None:
+        advance = partial(_run_lanes, single)
     else:
-        advance = run_over_mesh(mesh, run_blocks, _lane_steps(step, keep, None))
+        advance = run_over_mesh(mesh, run_blocks, single)
     ended, made = on_host((now.done, now.count))
     while made.max() < num_steps and not ended.all():
         lengths = block_lengths(min(chunk, num_steps - int(made.max())), options.max_rows)
@@ -187,8 +190,8 @@ def trace_lanes(step: Step, state: PyTree, problem: PyTree, hparams: PyTree) -> 
 
 
 @cache  # compiled once for each step, so it must stay the same function
-def _lane_steps(step: Step, keep: str, num_lanes: int | None) -> Step:
-    """A step of :class:`Progress`, of one run or of several, with rows of counts and metrics."""
+def _progress_step(step: Step, keep: str) -> Step:
+    """A step of :class:`Progress`, with rows of counts and metrics."""
 
     def one(now: Progress, problem: PyTree, given: PyTree) -> tuple[Progress, PyTree]:
         hparams, until = given
@@ -205,17 +208,23 @@ def _lane_steps(step: Step, keep: str, num_lanes: int | None) -> Step:
         new = replace(new, count=now.count + 1)
         return new, (new.count, new.metrics)
 
-    if num_lanes is None:
-        return one
-    if num_lanes > 1:
-        return jax.vmap(one, in_axes=(0, None, (0, None)))
+    return one
 
-    def alone(now: Progress, problem: PyTree, given: PyTree) -> tuple[Progress, PyTree]:
-        # Without vmap: its loops and branches take several times as long to compile.
-        first, hparams = jax.tree.map(lambda x: x[0], (now, given[0]))
-        return jax.tree.map(lambda x: x[None], one(first, problem, (hparams, given[1])))
 
-    return alone
+@partial(jax.jit, static_argnames="step")
+def _run_lanes(
+    step: Step, now: Progress, problem: PyTree, given: PyTree, lengths: np.ndarray
+) -> tuple[Progress, PyTree]:
+    """Blocks of steps of all lanes; the rows lie along the first axis."""
+
+    def run(now: Progress, hparams: PyTree) -> tuple[Progress, PyTree]:
+        return run_blocks(step, now, problem, (hparams, given[1]), lengths)
+
+    if len(now.count) > 1:
+        return jax.vmap(run, out_axes=(0, 1))(now, given[0])
+    # Without vmap: its loops and branches take several times as long to compile.
+    last, rows = run(*jax.tree.map(lambda x: x[0], (now, given[0])))
+    return jax.tree.map(lambda x: x[None], last), jax.tree.map(lambda x: x[:, None], rows)
 
 
 def _spread(hparams: PyTree, state: PyTree) -> PyTree:

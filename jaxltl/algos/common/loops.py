@@ -18,6 +18,7 @@ from jax.tree_util import Partial
 from jaxltl.algos.common.settings import require_arrays, require_hparams
 from jaxltl.algos.common.trees import choose
 from jaxltl.core import validation
+from jaxltl.core.models.mesh.cores import over_cores
 from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.types import Status, worst
@@ -75,6 +76,16 @@ def run_blocks(
     lengths: chex.Array,
 ) -> tuple[StateT, MetricsT]:
     """Blocks of steps as one program; returns the metrics of each block's last step."""
+    return over_cores(partial(_blocks, step), state, problem, hparams, lengths)
+
+
+def _blocks(
+    step: Step[StateT, ProblemT, HparamsT, MetricsT],
+    state: StateT,
+    problem: ProblemT,
+    hparams: HparamsT,
+    lengths: jax.Array,
+) -> tuple[StateT, MetricsT]:
     empty = _zero_metrics(step, state, problem, hparams)
 
     def block(state: StateT, length: jax.Array) -> tuple[StateT, MetricsT]:
@@ -161,6 +172,18 @@ def _run_until(
     check_every: int,
     keep: str,
     idle: bool,
+) -> Learned:
+    loop = partial(_loop, step, check_every, keep, idle)
+    return over_cores(loop, state, given)
+
+
+def _loop(
+    step: Callable[..., tuple[PyTree, PyTree]],
+    check_every: int,
+    keep: str,
+    idle: bool,
+    state: PyTree,
+    given: tuple[PyTree, ...],
 ) -> Learned:
     def active(carry: tuple[Progress, PyTree], given: tuple[PyTree, ...]) -> jax.Array:
         return ~carry[0].done & (carry[0].count < given[-1])

@@ -105,6 +105,7 @@ class StateLayout(NamedTuple):
 
 
 def state_layout(num_states: int, mesh: Mesh, axis: str | None) -> StateLayout:
+    """Layout of states on the devices of a mesh axis."""
     validation.instance("mesh", mesh, Mesh, "a jax.sharding.Mesh, such as jax.make_mesh makes")
     names = axes_of(mesh, axis)
     if len(names) != 1:

@@ -278,4 +278,4 @@ def _(model: ShardedMDP, policy: jax.Array) -> Any:
 def _(model: ShardedMDP, policy: jax.Array) -> jax.Array:
     eye = jnp.eye(model.num_states, dtype=model.dtype)
     ahead = operators.expectation(model, eye)  # [N, N, A]
-    return jnp.einsum("nta,na->nt", ahead, policy)
+    return jnp.einsum("nta,na->nt", ahead, policy, precision="highest")
