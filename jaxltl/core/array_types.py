@@ -1,6 +1,6 @@
 """Types of arrays: NumPy arrays by their kind of number, and arrays of NumPy or JAX."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,8 @@ if TYPE_CHECKING:
     Array = jax.Array | NDArray[Any]
 else:  # packages without JAX import this module
     Array = np.ndarray
+
+PyTree: TypeAlias = Any  # a tree of arrays, such as the state of a simulated environment
 
 Booleans = NDArray[np.bool_]
 Integers = NDArray[np.integer[Any]]

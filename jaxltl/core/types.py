@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import enum
 from collections.abc import Iterator
 from functools import reduce
 from typing import Any, TypeVar
@@ -23,42 +22,10 @@ from jaxltl.core.pretty_print import (
     value_range,
     describe,
 )
-from jaxltl.core.validation import RANGES
+from jaxltl.core.status import Status as Status
+from jaxltl.core.validation import RANGES, shorten
 
 SolutionT = TypeVar("SolutionT", bound="Solution")
-
-
-class Status(enum.IntEnum):
-    """Status of a solver or a learner, ordered by severity; one code per lane under ``vmap``.
-
-    - ``CONVERGED``: certified; the bounds are as narrow as the tolerance.
-    - ``COMPLETED``: a learner's numbers are finite, or its stopping condition holds; no claim of
-      optimality.
-    - ``UNCERTIFIED``: the residual is below the tolerance, but no bound on the error is known.
-    - ``PRECISION``: rounding errors alone keep the bounds wider than the tolerance.
-    - ``MAX_STEPS``: stopped by `max_steps`, or without further progress.
-    - ``NONFINITE``: NaN or infinity where a number should be.
-    - ``INVALID``: an argument is invalid. Concrete invalid arguments raise ValueError, so this and
-      the next occur inside ``jit`` only.
-    - ``INVALID_POLICY``: a policy is not a distribution over available actions.
-    - ``INVALID_DISCOUNT``: a discount is out of range.
-    - ``INVALID_OPTION``: a tolerance or a number of steps is out of range.
-
-    Example:
-      >>> [status.name for status in Status if Status.MAX_STEPS < status <= Status.INVALID]
-      ['NONFINITE', 'INVALID']
-    """
-
-    CONVERGED = 0
-    COMPLETED = 1
-    UNCERTIFIED = 2
-    PRECISION = 3
-    MAX_STEPS = 4
-    NONFINITE = 5
-    INVALID = 6
-    INVALID_POLICY = 7
-    INVALID_DISCOUNT = 8
-    INVALID_OPTION = 9
 
 
 _REMEDY = {
@@ -175,6 +142,11 @@ def check(solution: SolutionT, *, certified: bool = True) -> SolutionT:
       >>> check(jl.reachability_probability(coin, coin.states_with_label("heads"))).value.tolist()
       [0.5, 1.0, 0.0]
     """
+    if not hasattr(solution, "status"):
+        raise ValueError(
+            f"check is given {describe(solution)}, which has no status; give what the "
+            "solver returned, and take the array from it: check(solution).value."
+        )
     if isinstance(solution.status, jax.core.Tracer):
         raise ValueError(
             "check(solution) reads values, so it works on the host only: "
@@ -274,3 +246,26 @@ def require_shape(name: str, array: Any, shape: tuple[int, ...]) -> None:
     """Raises a ValueError that names the argument unless `array` has `shape`."""
     if np.shape(array) != tuple(shape):
         raise ValueError(f"{name} has shape {np.shape(array)}; expected {tuple(shape)}.")
+
+
+def require_states(name: str, given: Any, shape: tuple[int, ...]) -> None:
+    """Raises ValueError unless `given` is one bool for each state; the hint is for state numbers."""
+    wanted = f"give bool[{', '.join(map(str, shape))}], one for each state"
+    if isinstance(given, str):
+        raise ValueError(f"{name}={given!r}; {wanted}, such as that label's column of model.label.")
+    listed = sorted(given) if isinstance(given, set | frozenset) else given
+    array: Any = listed if hasattr(listed, "dtype") else np.asarray(listed)
+    if listed is given and array.shape == tuple(shape):
+        if (
+            isinstance(array, jax.core.Tracer)
+            or array.dtype == bool
+            or np.isin(array, (0, 1)).all()
+        ):
+            return
+        wanted = f"{name} is {shorten(given)}; {wanted}"
+    else:
+        wanted = f"{name} has shape {array.shape}; expected {tuple(shape)}: {wanted}"
+    known = array.dtype.kind in "iu" and not isinstance(array, jax.core.Tracer)
+    if known and array.ndim == len(shape) == 1 and np.unique(array).size == array.size:
+        wanted += f"; of state numbers, np.isin(np.arange({shape[0]}), {shorten(listed)})"
+    raise ValueError(f"{wanted}.")

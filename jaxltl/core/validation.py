@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,6 +21,15 @@ ROW_SUM_TOLERANCE = 1e-6  # largest error of the sum of a distribution that is g
 
 _MAX_REPR = 60  # characters of a value in an error message
 _INEXACT = 2.0**53  # integers from here on are not all floats
+
+
+@contextlib.contextmanager
+def errors_in(place: str, remedy: str = "") -> Iterator[None]:
+    """Prepends a place to the message of a ValueError, and appends a remedy."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{place}{error}{remedy}") from None
 
 
 @dataclass(frozen=True)
@@ -47,11 +56,11 @@ class Range:
             return above & below & (value == value // 1)
 
     def __str__(self) -> str:
-        ends = [f"{'above' if self.open_below else 'at least'} {self.low:g}"]
+        ends = [f"{'above' if self.open_below else 'at least'} {self.low:.10g}"]
         if self.high == math.inf:
             ends += ["finite"] if self.open_above else []
         else:
-            ends.append(f"{'below' if self.open_above else 'at most'} {self.high:g}")
+            ends.append(f"{'below' if self.open_above else 'at most'} {self.high:.10g}")
         return ("an integer of " if self.integer else "") + " and ".join(ends)
 
 

@@ -46,3 +46,37 @@ def test_shapes_are_named():
     require_shape("target", np.zeros(3), (3,))
     with pytest.raises(ValueError, match=r"target has shape \(3,\); expected \(2, 2\)"):
         require_shape("target", np.zeros(3), (2, 2))
+
+
+@pytest.mark.parametrize(
+    "given, message",
+    [
+        ([3], r"target has shape \(1,\); expected \(4,\).*np.isin\(np.arange\(4\), \[3\]\)"),
+        ({1, 3}, r"np.isin\(np.arange\(4\), \[1, 3\]\)"),
+        ([0, 1, 2, 3], r"target is \[0, 1, 2, 3\]; give bool\[4\].*np.isin"),
+        ("goal", "target='goal'; give bool.*model.label"),
+        (np.array([0.5, 0, 0, 1]), r"target is \[0.5, 0.0, 0.0, 1.0\]; give bool\[4\]"),
+    ],
+)
+def test_sets_of_states_are_masks(given, message):
+    world = jl.gridworld("home . . goal")
+    solvers = [
+        lambda: jl.reachability_probability(world, given),
+        lambda: jl.total_reward(world, np.ones((4, 4)), given),
+        lambda: jl.values.hitting_time(world, np.zeros(4, int), given),
+        lambda: jl.prepare(jl.to_sparse(world), given),
+    ]
+    if not isinstance(given, str):  # a label
+        solvers.append(lambda: jl.values.bounded_reachability(world, given, 3))
+    for solve in solvers:
+        with pytest.raises(ValueError, match=message):
+            solve()
+    mask = np.isin(np.arange(4), [3])
+    for same in (mask, mask.astype(int), mask.tolist()):
+        assert jl.reachability_probability(world, same).value.tolist() == [1, 1, 1, 1]
+
+
+def test_check_takes_solutions():
+    for given in (jnp.ones(3), 1.0, None):
+        with pytest.raises(ValueError, match=r"has no status.*check\(solution\).value"):
+            jl.check(given)

@@ -196,6 +196,20 @@ def make_task_tables(
     )
 
 
+def _require_open(formula: str, verdict: int) -> None:
+    """Raises ValueError for a formula that is valid or unsatisfiable."""
+    if verdict != Verdict.UNDECIDED:
+        kind, words = (
+            ("valid", "every sequence of labels satisfies it")
+            if verdict == Verdict.SATISFIED
+            else ("unsatisfiable", "no sequence of labels satisfies it")
+        )
+        raise ValueError(
+            f"the formula {formula!r} is {kind}: {words}, so that every episode ends at its first "
+            "step; give another, or, to keep it, its automaton to_automaton(formula)."
+        )
+
+
 def task_environment(
     environment: Environment,
     formula: Formula | str | Automaton | TaskTables,
@@ -223,7 +237,8 @@ def task_environment(
       :class:`~jaxltl.core.environments.environment.Environment`.
 
     Raises:
-      ValueError: labels that are not ``bool[P]``, unknown propositions, a reward that does not fit the
+      ValueError: labels that are not ``bool[P]``, unknown propositions, a formula that is valid or
+        unsatisfiable (an automaton may be), a reward that does not fit the
         task, a discount out of range, or a potential or an embedding of another shape.
 
     Example:
@@ -257,6 +272,8 @@ def task_environment(
     )
     if not isinstance(formula, TaskTables):
         tables = make_task_tables(formula, inner.propositions, **options)
+        if not isinstance(formula, Automaton):
+            _require_open(str(formula), tables.verdict[tables.initial])
     elif options:
         raise ValueError(f"{', '.join(options)}: give options to make_task_tables instead.")
     else:

@@ -220,12 +220,17 @@ def _distance(delta: np.ndarray, start: np.ndarray, by_reading: np.ndarray | flo
         steps = nearer
 
 
+def is_discounted(factor: np.ndarray, decisions: np.ndarray, learner_discount: float) -> bool:
+    """True if all undecided steps are discounted, so that shaping changes no optimal policy."""
+    number = jnp.dtype(jnp.result_type(float))
+    open_ = factor[decisions == Verdict.UNDECIDED].astype(number)
+    return bool((open_ * number.type(learner_discount)).max(initial=0) < 1)
+
+
 def _require_discounted(
     factor: np.ndarray, decisions: np.ndarray, learner_discount: float, name: str
 ) -> None:
-    number = jnp.dtype(jnp.result_type(float))
-    open_ = factor[decisions == Verdict.UNDECIDED].astype(number)
-    if (open_ * number.type(learner_discount)).max(initial=0) >= 1:
+    if not is_discounted(factor, decisions, learner_discount):
         raise ValueError(
             f"shaping with the reward {name!r}: some step is not discounted, and a run that never "
             "ends would keep the potential of where it stays, which may change what is best. Give "

@@ -10,7 +10,10 @@ from .construct.counts import (
     make_counts as make_counts,
 )
 from .construct.lifting import (
+    Controller as Controller,
     FiniteMemoryPolicy as FiniteMemoryPolicy,
+    Policy as Policy,
+    Progress as Progress,
     lift_policy as lift_policy,
     lift_trajectories as lift_trajectories,
     project_policy as project_policy,

@@ -26,6 +26,7 @@ _INNER = 92  # characters of a model inside of another
 
 
 def padded(model: Any) -> Iterator[str]:
+    """Summary of a padded or dense model."""
     yield batch_text(model.available.shape[:-2])
     yield count(model.num_states, "state")
     yield count(model.num_actions, "action")
@@ -43,6 +44,7 @@ def padded(model: Any) -> Iterator[str]:
 
 
 def sparse(model: Any) -> Iterator[str]:
+    """Summary of a sparse model."""
     yield batch_text(model.row_start.shape[:-1])
     yield count(model.num_states, "state")
     yield "a chain" if model.is_chain else count(model.num_rows, "choice")
@@ -74,6 +76,7 @@ def _begins(initial: Any) -> str:
 
 
 def interval(model: Any) -> Iterator[str]:
+    """Summary of an interval model."""
     yield from sparse(model.nominal)
     low, high = readable(model.lower), readable(model.upper)
     if low is not None and high is not None and low.size:
@@ -83,12 +86,14 @@ def interval(model: Any) -> Iterator[str]:
 
 
 def parametric(model: Any) -> Iterator[str]:
+    """Summary of a parametric model."""
     ends = zip(model.parameters, np.asarray(model.low), np.asarray(model.high), strict=True)
     yield f"{names_text((f'{name} in [{low:.6g}, {high:.6g}]' for name, low, high in ends), 90)}"
     yield nested_repr(model.model, _INNER)
 
 
 def sharded(model: Any) -> Iterator[str]:
+    """Summary of a model over a mesh."""
     yield count(model.num_given, "state")
     yield count(model.num_actions, "action")
     rows = " and ".join(f"{t.successor.shape[0]:,} of {t.successor.shape[1]}" for t in model.tables)
@@ -100,6 +105,7 @@ def sharded(model: Any) -> Iterator[str]:
 
 
 def part(value: Any) -> Iterator[str]:
+    """Summary of a part of a model."""
     rows = len(value.entry_start) - 1
     yield count(rows if value.row_start is None else len(value.row_start) - 1, "state")
     yield count(rows, "choice")
@@ -108,6 +114,7 @@ def part(value: Any) -> Iterator[str]:
 
 
 def product(model: Any) -> Iterator[str]:
+    """Summary of a product."""
     yield batch_text(model.automaton.delta.shape[:-2])
     memories = count(model.num_memory, "memory", "memories")
     yield f"{count(model.num_states, 'state')} with {memories}"
@@ -119,6 +126,7 @@ def product(model: Any) -> Iterator[str]:
 
 
 def game(value: Any) -> Iterator[str]:
+    """Summary of a game."""
     read = readable(value.system)
     if read is None:
         yield f"system: {array_text(value.system)}"
@@ -127,18 +135,8 @@ def game(value: Any) -> Iterator[str]:
     yield nested_repr(value.mdp, _INNER)
 
 
-def memory_policy(value: Any) -> Iterator[str]:
-    *more, states, memories = value.next_memory.shape
-    yield batch_text(more)
-    yield count(states, "state")
-    yield count(memories, "memory", "memories")
-    stochastic = value.action.ndim > value.next_memory.ndim
-    yield (f"mixes {count(value.action.shape[-1], 'action')}" if stochastic else "deterministic")
-    yield f"action {array_text(value.action)}"
-    yield f"labels read on {value.label_on}"
-
-
 def counts(value: Any) -> Iterator[str]:
+    """Summary of counts of transitions."""
     samples = readable(value.count)
     yield count(samples.sum(), "sample") if samples is not None else ""
     yield f"of {count(len(value.count), 'transition')}"
@@ -147,6 +145,7 @@ def counts(value: Any) -> Iterator[str]:
 
 
 def trajectories(value: Any) -> Iterator[str]:
+    """Summary of trajectories."""
     *more, number_of, longest = value.state.shape
     yield batch_text(more)
     yield f"{number_of:,} of at most {count(longest, 'step')}"
@@ -156,6 +155,7 @@ def trajectories(value: Any) -> Iterator[str]:
 
 
 def table(value: Any) -> Iterator[str]:
+    """Summary of a tabulated environment."""
     yield nested_repr(value.model, _INNER)
     yield count(value.start.shape[-1], "beginning")
     for name in ("terminated", "truncated"):
@@ -166,6 +166,7 @@ def table(value: Any) -> Iterator[str]:
 
 
 def monitor(value: Any, codes: Any) -> Iterator[str]:
+    """Summary of the monitor of a formula."""
     *more, states, letters = value.delta.shape
     yield batch_text(more)
     yield count(states, "state")
@@ -174,12 +175,14 @@ def monitor(value: Any, codes: Any) -> Iterator[str]:
 
 
 def space(value: Any) -> Iterator[str]:
+    """Summary of a space of observations or actions."""
     yield f"{value.dtype}[{', '.join(str(n) for n in value.shape)}]"
     low, high = (value_range(x) for x in (value.low, value.high))
     yield f"from {low} to {high}" if max(len(low), len(high)) < 40 else ""
 
 
 def environment(value: Any) -> Iterator[str]:
+    """Summary of an environment."""
     finite = hasattr(value.actions, "num")
     yield count(value.actions.num, "action") if finite else f"actions {nested_repr(value.actions)}"
     yield f"observations {_spaces(value.observations)}"
@@ -204,6 +207,7 @@ def _spaces(tree: Any) -> str:
 
 
 def episode(value: Any) -> Iterator[str]:
+    """Summary of episodes."""
     *more, steps = value.valid.shape
     yield batch_text(more)
     yield f"at most {count(steps, 'step')}"

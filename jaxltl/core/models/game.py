@@ -175,10 +175,12 @@ def as_padded_game(model: Model) -> Game:
 
 
 def is_deterministic(model: Model) -> bool:
+    """True if each available action has one successor."""
     return not bool((support(base_model(model)).sum(-1) > 1).any())
 
 
 def swap_players(game: Game) -> Game:
+    """The game in which system and environment have changed sides."""
     xp, system = namespace(game.system)
     return replace(game, system=to_jax(xp.logical_not(system)))
 

@@ -384,11 +384,16 @@ def checked_label(
                 f"states where each holds, {{{names[0]!r}: [...]}}."
             )
         label = np.zeros((num_states, 0), bool)
-    label = validation.boolean_array("label", label)
+    by_name = 'or give the states where each holds, label={"goal": [3]}'
+    with validation.errors_in("", f" {by_name.capitalize()}."):
+        label = validation.boolean_array("label", label)
     if label.shape != (num_states, len(names)):
+        named = f"one column per proposition {names}"
+        if not names:
+            named = f"and one column per name in propositions, which is empty: give it, {by_name}"
         raise ValueError(
-            f"label has shape {label.shape}; expected ({num_states}, {len(names)}): "
-            f"one row per state, one column per proposition {names}."
+            f"label has shape {label.shape}; expected ({num_states}, {len(names) or 'P'}): "
+            f"one row per state, {named}."
         )
     return label, names
 

@@ -205,6 +205,11 @@ def product(
         model = product(world.mdp, task, label_on=label_on)
         xp, system = namespace(world.system)
         return Game(model, to_jax(xp.broadcast_to(system[:, None], model.state_shape)))
+    if isinstance(world, Product):
+        raise ValueError(
+            "world is a product with a task already; give its model and the conjunction of both "
+            'formulas: product(world.mdp, "(F a) & (G b)").'
+        )
     if isinstance(task, str | Formula):
         formula = parse_ltl(task) if isinstance(task, str) else task
         require_known(formula.propositions, world.propositions, "the task")
@@ -310,6 +315,14 @@ def _read_at(value: jax.Array, memory: jax.Array) -> jax.Array:
     for q in range(1, num_memory):
         result = jnp.where(memory == q, value[:, q : q + 1], result)
     return result
+
+
+@operators.combined.register
+def _(model: Product, value: jax.Array, term: kernels.Term, combine: kernels.Term) -> jax.Array:
+    def operator(world: MDP | DenseMDP, value: jax.Array) -> jax.Array:
+        return operators.combined(world, value, term, combine)
+
+    return _through(model, operator, value, term, combine)
 
 
 @operators.expectation.register

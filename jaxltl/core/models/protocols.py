@@ -17,8 +17,9 @@ from __future__ import annotations
 
 from typing import Any, Protocol, TypeAlias, TypeVar, runtime_checkable
 
+from jaxltl.core.array_types import PyTree as PyTree
+
 Array: TypeAlias = Any  # a NumPy array or a JAX array, which share their operators
-PyTree: TypeAlias = Any  # a tree of arrays, such as the state of a simulated environment
 
 
 class Model(Protocol):

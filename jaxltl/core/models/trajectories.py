@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from functools import partial
 
@@ -9,14 +10,24 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import struct
+from jaxltl.core import struct, validation
 
 from jaxltl.core.models import facts
 from jaxltl.core.models.mdp import MDP, DenseMDP
+from jaxltl.core.models.ops.annotated_pytree import register_annotated_pytree
 from jaxltl.core.models.ops.array_namespace import is_traced, namespace, to_jax
 from jaxltl.core.models.ops.operators import policy_distribution, sample_successor
-from jaxltl.core.models.protocols import ActionModel, Model
+from jaxltl.core.models.protocols import ActionModel, Model, PyTree
+from jaxltl.core.policies.finite_memory import FiniteMemoryPolicy
 from jaxltl.core.pretty_print import brief
+
+
+register_annotated_pytree(
+    FiniteMemoryPolicy,
+    arrays=("action", "initial_memory", "next_memory", "automaton", "letter"),
+    static=("label_on",),
+    text={"actions": (), "states": ()},
+)
 
 
 @brief(facts=facts.trajectories)
@@ -70,16 +81,15 @@ def make_trajectories(
       >>> make_trajectories(world, [[(0, 0), (1, 0)], [(1, 0)]]).length.tolist()
       [2, 1]
     """
-    if not sequences:
+    if not len(sequences):
         raise ValueError("there are no trajectories; give at least one.")
-    length = [len(pairs) for pairs in sequences]
+    checked = [_pairs(pairs, n) for n, pairs in enumerate(sequences)]
+    length = [len(pairs) for pairs in checked]
     state = np.zeros((len(sequences), max(length)), np.int32)
     action = np.zeros_like(state)
     available = np.asarray(model.available)
-    for n, pairs in enumerate(sequences):
-        if not pairs:
-            raise ValueError(f"trajectory {n} is empty; give at least one (state, action) pair.")
-        for t, (s, a) in enumerate(pairs):
+    for n, pairs in enumerate(checked):
+        for t, (s, a) in enumerate(pairs.tolist()):
             where = f"trajectory {n}, step {t}"
             if not 0 <= s < model.num_states:
                 raise ValueError(
@@ -95,6 +105,29 @@ def make_trajectories(
     _check_steps(model, *given)
     state, action, length = to_jax(given)
     return Trajectories(state, action, length, state_shape=model.state_shape)
+
+
+def _pairs(given: Sequence[tuple[int, int]], number: int) -> np.ndarray:
+    """One trajectory as ``int[T, 2]``."""
+    if not len(given):
+        raise ValueError(f"trajectory {number} is empty; give at least one (state, action) pair.")
+    with contextlib.suppress(ValueError):  # ragged
+        pairs = np.asarray(given)
+        if pairs.shape == (len(given), 2) and pairs.dtype.kind in "iu":
+            return pairs
+    for t, pair in enumerate(given):
+        found = f"trajectory {number}, step {t} is {validation.shorten(pair)}"
+        if np.shape(pair) == (3,):
+            raise ValueError(
+                f"{found}; give (state, action) alone: the next pair has the successor's state."
+            )
+        if np.shape(pair) == (2,) and np.asarray(pair).dtype.kind == "f":
+            raise ValueError(f"{found}; give integers: [(int(s), int(a)) for s, a in pairs].")
+        if np.shape(pair) != (2,) or np.asarray(pair).dtype.kind not in "iu":
+            raise ValueError(f"{found}; give a pair of integers, (state, action).")
+    raise ValueError(
+        f"trajectory {number} is {validation.shorten(given)}; give (state, action) pairs."
+    )
 
 
 def require_states(trajectories: Trajectories, model: Model) -> None:
@@ -139,7 +172,7 @@ def _check_steps(
 
 def rollout(
     model: ActionModel,
-    policy: jax.Array,
+    policy: jax.Array | FiniteMemoryPolicy,
     key: chex.PRNGKey,
     *,
     num_trajectories: int,
@@ -150,7 +183,8 @@ def rollout(
 
     Args:
       model: an MDP, a DenseMDP or a Product (states then numbered ``s * Q + q``).
-      policy: ``float[S, A]`` or ``int32[S]``; ``[S, Q, A]`` or ``[S, Q]`` in a product.
+      policy: ``float[S, A]`` or ``int32[S]``; ``[S, Q, A]`` or ``[S, Q]`` in a product; or a
+        :class:`~jaxltl.core.policies.finite_memory.FiniteMemoryPolicy` of the model.
       key: a PRNG key, consumed.
       num_trajectories, num_steps: N, and the length T of the longest; static under ``jit``.
       stop: ``bool[S]`` (or ``bool[S, Q]``): a trajectory ends with the pair that enters such a state,
@@ -169,23 +203,30 @@ def rollout(
       >>> rollout(path, policy, key, num_trajectories=2, num_steps=3).state.tolist()
       [[0, 1, 0], [0, 1, 0]]
     """
-    distribution = policy_distribution(model, policy).reshape(-1, model.num_actions)
+    if not isinstance(policy, FiniteMemoryPolicy):
+        distribution = policy_distribution(model, policy).reshape(-1, 1, model.num_actions)
+        zeros = np.zeros((len(distribution), 1), np.int32)
+        policy = FiniteMemoryPolicy(distribution, zeros[:, 0], zeros)
+    elif policy.next_memory.shape[:-1] != model.state_shape:
+        raise ValueError(
+            f"the policy is of a model of {policy.num_states} states, and this one has the shape "
+            f"{model.state_shape}; give the model that the policy was projected to."
+        )
     nowhere = np.zeros(model.state_shape, bool)
     return _rollout(
-        model, distribution, key, nowhere if stop is None else stop, num_trajectories, num_steps
+        model, policy, key, nowhere if stop is None else stop, num_trajectories, num_steps
     )
 
 
 @partial(jax.jit, static_argnums=(4, 5))
 def _rollout(
     model: Model,
-    distribution: jax.Array,
+    policy: FiniteMemoryPolicy,
     key: chex.PRNGKey,
     stop: jax.Array,
     num_trajectories: int,
     num_steps: int,
 ) -> Trajectories:
-    logits = jnp.log(distribution)
     initial = jnp.log(model.initial.ravel())
     stop = stop.ravel()
 
@@ -193,14 +234,21 @@ def _rollout(
         start_key, key = jax.random.split(key)
         start = jax.random.categorical(start_key, initial).astype(jnp.int32)
 
-        def step(state: jax.Array, t: jax.Array):
+        def step(at: PyTree, t: jax.Array):
             action_key, successor_key = jax.random.split(jax.random.fold_in(key, t))
-            action = jax.random.categorical(action_key, logits[state]).astype(jnp.int32)
-            successor = sample_successor(model, successor_key, state, action)
+            action = jnp.asarray(policy.act(action_key, at), jnp.int32)
+            successor = sample_successor(model, successor_key, at.state, action)
+            ended = stop[at.state]
             # A stopped trajectory keeps its state; its pairs are cut off below.
-            return jnp.where(stop[state], state, successor), (state, action, stop[state])
+            after = policy.update(at, jnp.where(ended, at.state, successor))
+            return jax.tree.map(lambda x, y: y.astype(x.dtype), at, after), (
+                at.state,
+                action,
+                ended,
+            )
 
-        _, (states, actions, ended) = jax.lax.scan(step, start, jnp.arange(num_steps))
+        begin = jax.tree.map(jnp.asarray, policy.start(start))
+        _, (states, actions, ended) = jax.lax.scan(step, begin, jnp.arange(num_steps))
         return states, actions, jnp.sum(~ended).astype(jnp.int32)
 
     states, actions, length = jax.vmap(one)(jax.random.split(key, num_trajectories))

@@ -92,7 +92,7 @@ def word_of(label):
 
 @pytest.mark.parametrize("ending", ["repeat", "violated", "undecided"])
 def test_world_and_automaton_step_together(ending):
-    tasks = [task_environment(walk(), f, ending=ending) for f in FORMULAS]
+    tasks = [task_environment(walk(), to_automaton(f), ending=ending) for f in FORMULAS]
     keys = jax.random.split(jax.random.key(0), 40)
     found = jax.tree.map(np.asarray, episodes(keys, stack_tasks(tasks)))
     seen = set()
@@ -209,7 +209,7 @@ def test_what_the_first_label_decides_ends_with_the_first_step():
 
 def test_a_time_limit_decides_nothing():
     for task in (
-        task_environment(with_time_limit(walk(0), 3), "F (a & !a)"),
+        task_environment(with_time_limit(walk(0), 3), to_automaton("F (a & !a)")),
         with_time_limit(task_environment(walk(0), "G F a"), 3),
     ):
         episode = run_episode(jax.random.key(0), task, random_agent(), num_steps=5)
@@ -223,7 +223,7 @@ def test_a_time_limit_decides_nothing():
 
 @pytest.mark.slow
 def test_each_of_a_stack_is_as_by_itself():
-    tasks = [task_environment(walk(), f) for f in FORMULAS]
+    tasks = [task_environment(walk(), to_automaton(f)) for f in FORMULAS]
     stacked = stack_tasks(tasks)
     keys = jax.random.split(jax.random.key(4), 5)
     found = episodes(keys, stacked)
@@ -251,7 +251,7 @@ def test_tables_are_exchanged_within_one_program():
 
     for i, formula in enumerate(FORMULAS):
         key = jax.random.key(i)
-        task = task_environment(walk(), formula, ending="violated")
+        task = task_environment(walk(), to_automaton(formula), ending="violated")
         assert memory(lane(tables, i), key) == task.reset(key).memory
     assert count == 1
 
@@ -387,3 +387,13 @@ def test_boxes_of_actions_do_as_well():
     task = task_environment(world, "F far")
     found = task.step(task.reset(jax.random.key(0)), jnp.array([2.0, 0]), jax.random.key(0))
     assert bool(found.terminated) and float(found.reward) == 1 and task.allowed is None
+
+
+@pytest.mark.parametrize(
+    "formula, kind", [("true", "valid"), ("F a | !F a", "valid"), ("G a & F !a", "unsatisfiable")]
+)
+def test_trivial_formulas_are_named(formula, kind):
+    with pytest.raises(ValueError, match=f"is {kind}: .* its automaton"):
+        task_environment(walk(), formula)
+    kept = task_environment(walk(), to_automaton(formula))
+    assert kept.reset(jax.random.key(0)).verdict != 0

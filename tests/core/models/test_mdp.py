@@ -61,7 +61,11 @@ def test_successors_without_probability_are_padding():
         ({"initial": [1.5, -0.5]}, "initial probability of state 1 is -0.5"),
         ({"initial": [np.nan, 1.0]}, "initial probability of state 0 is nan"),
         ({"initial": [0.5, 0.4]}, "the initial distribution sums to 0.9, not 1"),
-        ({"label": [[True], [False]]}, r"label has shape \(2, 1\); expected \(2, 0\)"),
+        (
+            {"label": [[True], [False]]},
+            r"label has shape \(2, 1\); expected \(2, P\).*name in propositions, which is empty",
+        ),
+        ({"label": [["a"], []]}, r'give True or False.*label=\{"goal": \[3\]\}'),
         ({"propositions": ("a", "a")}, "not distinct"),
         (
             {"label": [[True]], "propositions": ("a",)},

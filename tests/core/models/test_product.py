@@ -144,7 +144,7 @@ def test_a_projected_policy_visits_what_the_product_does(label_on):
         world = reference_world(lazy)
         follow = [
             [
-                np.asarray(runner.update(jnp.arange(lazy.num_memory), s, t))
+                np.asarray(runner.next_memory[t if label_on == "entry" else s])
                 for t in range(world.num_states)
             ]
             for s in range(world.num_states)
@@ -172,17 +172,16 @@ def test_a_projected_policy_by_sampling():
     def run(key):
         start_key, key = jax.random.split(key)
         state = jax.random.categorical(start_key, jnp.log(lazy.mdp.initial)).astype(jnp.int32)
-        memory = runner.initial_memory[state]
+        at = runner.start(state)
 
         def step(carry, key):
-            state, memory = carry
             successor = jl.models.sample_successor(
-                lazy.mdp, key, state, runner.action[state, memory]
+                lazy.mdp, key, carry.state, runner.act(None, carry)
             )
-            return (successor, runner.update(memory, state, successor)), None
+            return runner.update(carry, successor), None
 
-        (_, memory), _ = jax.lax.scan(step, (state, memory), jax.random.split(key, 200))
-        return jnp.asarray(lazy.automaton.final)[memory]
+        at, _ = jax.lax.scan(step, at, jax.random.split(key, 200))
+        return jnp.asarray(lazy.automaton.final)[at.memory]
 
     share = jax.jit(jax.vmap(run))(jax.random.split(jax.random.key(0), 4000)).mean()
     expected = float(jnp.sum(lazy.initial * best.value))
@@ -306,3 +305,19 @@ def test_programs_return_no_text_of_another_formula():
     shape = jax.eval_shape(lambda model: model, second)
     assert shape.automaton.propositions == ()
     assert jax.tree.map(np.asarray, second).automaton.propositions == ("b",)
+
+
+@pytest.mark.parametrize("kind", [lambda x: x, jl.to_sparse])
+def test_a_product_has_one_task(kind):
+    once = jl.product(kind(jl.gridworld("a . b")), "F a")
+    with pytest.raises(ValueError, match=r"world is a product.*product\(world.mdp, "):
+        jl.product(once, "G !b")
+
+
+def test_a_name_split_into_operators_is_explained():
+    world = jl.gridworld("a . Goal")
+    with pytest.raises(ValueError, match=r'If Goal was written.*operator G and oal.*write "Goal"'):
+        jl.product(world, "F Goal")
+    assert jl.product(world, 'F "Goal"').automaton.propositions == ("Goal",)
+    with pytest.raises(ValueError, match="Did you mean 'a'"):
+        jl.product(world, "F aa")

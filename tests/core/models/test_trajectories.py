@@ -124,3 +124,22 @@ def test_bad_policies_are_named():
         jl.rollout(
             corridor(), jnp.zeros(3, int), jax.random.key(0), num_trajectories=1, num_steps=1
         )
+
+
+@pytest.mark.parametrize(
+    "sequences, message",
+    [
+        (np.zeros((1, 2, 2)), r"step 0 is \[0.0, 0.0\]; give integers: \[\(int\(s\), int\(a\)\)"),
+        ([[(0, 0), (1, 0.0)]], r"step 1 is \(1, 0.0\); give integers"),
+        ([[(0, 0, 1), (1, 0, 1)]], r"step 0 is \(0, 0, 1\); give \(state, action\) alone"),
+        ([[(0, 0), (1,)]], r"trajectory 0, step 1 is \(1,\); give a pair"),
+        ([(0, 0)], "trajectory 0, step 0 is 0; give a pair"),
+        ([[("a", "b")]], "step 0 is .'a', 'b'.; give a pair"),
+    ],
+)
+def test_steps_are_pairs_of_integers(sequences, message):
+    path = jl.make_mdp([[[1]], [[1]]], [[[1.0]], [[1.0]]])
+    with pytest.raises(ValueError, match=message):
+        jl.make_trajectories(path, sequences)
+    pairs = np.array([[(0, 0), (1, 0)]])
+    assert jl.make_trajectories(path, pairs).state.tolist() == [[0, 1]]

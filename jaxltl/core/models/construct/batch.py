@@ -139,6 +139,7 @@ def _pad_successors(mdp: MDP, width: int) -> MDP:
 
 
 def is_stacked(model: Product) -> bool:
+    """True if a product has a first axis of worlds."""
     return jnp.ndim(model.letter) == 2
 
 
@@ -153,6 +154,7 @@ def _stacked(models: Sequence[Product]) -> Product:
 
 
 def num_worlds(model: Product) -> int:
+    """Number of stacked worlds."""
     return model.letter.shape[0] if is_stacked(model) else 1
 
 

@@ -2,20 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import struct
 
-from jaxltl.core.models import facts
+from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.models.game import Game
 from jaxltl.core.models.ops import operators
 from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
 from jaxltl.core.models.product import Product
-from jaxltl.core.models.protocols import ActionModel
+from jaxltl.core.models.protocols import ActionModel, Model, PyTree, base_model
+from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.models.trajectories import Trajectories, require_states
-from jaxltl.core.pretty_print import brief
+from jaxltl.core.policies.finite_memory import (
+    Controller as Controller,
+    FiniteMemoryPolicy as FiniteMemoryPolicy,
+    Policy as Policy,
+    Progress as Progress,
+)
+from jaxltl.core.sparse.product import SparseProduct
 
 
 def lift_trajectories(model: Product, trajectories: Trajectories) -> Trajectories:
@@ -140,43 +149,34 @@ def lift_policy(model: Product, policy: jax.Array) -> jax.Array:
     return jnp.repeat(policy[:, None], model.num_memory, axis=1)
 
 
-@brief(facts=facts.memory_policy)
-@struct.dataclass
-class FiniteMemoryPolicy:
-    """A policy of the base model with the automaton state as its memory.
-
-    Attributes:
-      action: ``float[S, Q, A]`` or ``int32[S, Q]``, the product policy.
-      initial_memory: ``int32[S]``, the memory of the initial state s.
-      next_memory: ``int32[S, Q]``, the memory after reading the label of s.
-      label_on: static, as in :class:`Product`.
-
-    Example:
-      >>> import jaxltl as jl
-      >>> prod = jl.product(jl.from_dense([[[0, 1.0]], [[0, 1.0]]], label={"a": [1]}), "F a")
-      >>> runs = jl.project_policy(prod, jnp.zeros((2, 2), jnp.int32))
-      >>> runs.initial_memory.tolist(), runs.next_memory.tolist()
-      ([0, 1], [[0, 1], [1, 1]])
-    """
-
-    action: jax.Array
-    initial_memory: jax.Array
-    next_memory: jax.Array
-    label_on: str = struct.field(pytree_node=False, default="entry")
-
-    def update(self, memory: jax.Array, state: jax.Array, successor: jax.Array) -> jax.Array:
-        """The memory after the step from `state` to `successor`."""
-        return self.next_memory[successor if self.label_on == "entry" else state, memory]
+@runtime_checkable
+class MemoryRows(Protocol):
+    # Such as a Satisfaction, of a layer above.
+    automaton: Automaton
+    letter: np.ndarray
+    product: SparseProduct
+    row: np.ndarray
+    label_on: str
 
 
-def project_policy(model: Product, policy: jax.Array) -> FiniteMemoryPolicy:
-    """Product policy as a finite-memory policy of the base model.
+def project_policy(
+    model: Model,
+    policy: PyTree,
+    *,
+    actions: Sequence[str] = (),
+    states: Sequence[str] = (),
+) -> FiniteMemoryPolicy:
+    """Policy of a product as a finite-memory policy of the base model, to run and to save.
 
     Args:
-      model, policy: the product, and ``float[S, Q, A]`` or ``int32[S, Q]``.
+      model: a product, a model without memory, or a game on one of these; or the model of a
+        ``Satisfaction``.
+      policy: ``float[S, Q, A]`` or ``int32[S, Q]``, or with an axis of T steps in front; for a sparse
+        world ``float[R, Q]`` or rows ``int32[S, Q]``; or the ``Satisfaction``.
+      actions, states: names of the actions and of the base model's states.
 
     Returns:
-      :class:`FiniteMemoryPolicy`.
+      :class:`~jaxltl.core.policies.finite_memory.FiniteMemoryPolicy`.
 
     Raises:
       ValueError: the policy does not have the product's shape.
@@ -184,8 +184,61 @@ def project_policy(model: Product, policy: jax.Array) -> FiniteMemoryPolicy:
     Example:
       >>> import jaxltl as jl
       >>> prod = jl.product(jl.from_dense([[[0, 1.0]], [[0, 1.0]]], label={"a": [1]}), "F a")
-      >>> project_policy(prod, jnp.zeros((2, 2), jnp.int32)).action.shape
-      (2, 2)
+      >>> found = jl.project_policy(prod, jnp.zeros((2, 2), jnp.int32))
+      >>> found.action.shape, found.initial_memory.tolist(), found.next_memory.tolist()
+      ((2, 2), [0, 1], [[0, 1], [1, 1]])
     """
-    operators.policy_distribution(model, policy)
-    return FiniteMemoryPolicy(policy, model.initial_memory, model.next_memory, model.label_on)
+    model = model.mdp if isinstance(model, Game) else model
+    world, table = base_model(model), policy
+    rows = getattr(world, "nominal", world)
+    rows = rows if isinstance(rows, SparseMDP) else None
+    named = tuple(actions) or tuple(getattr(rows, "action_names", ())), tuple(states)
+    if isinstance(policy, MemoryRows) and rows is not None:
+        memory = Product(rows, policy.automaton, policy.letter, policy.label_on)
+        count = len(policy.automaton.delta)
+        table = np.repeat(np.asarray(rows.row_start)[:-1, None], count, axis=1)
+        table[policy.product.base_state, policy.product.memory] = policy.row
+    elif isinstance(model, Product):
+        memory = model
+    else:
+        memory, zeros = None, np.zeros((model.num_states, 1), np.int32)
+    if rows is not None:
+        table = _actions_of_rows(rows, table)
+    elif memory is None:
+        operators.policy_distribution(model, table)
+    else:
+        lead = np.ndim(table) - 2 - (not operators.is_deterministic(table))
+        operators.policy_distribution(memory, table[0] if lead > 0 else table)
+    if memory is None:
+        table = jnp.expand_dims(jnp.asarray(table), 1)
+        return FiniteMemoryPolicy(table, zeros[:, 0], zeros, "entry", None, None, *named)
+    return FiniteMemoryPolicy(
+        table,
+        memory.initial_memory,
+        memory.next_memory,
+        memory.label_on,
+        memory.automaton,
+        memory.letter,
+        *named,
+    )
+
+
+def _actions_of_rows(world: SparseMDP, policy: PyTree) -> jax.Array:
+    """Actions ``[S, Q]`` or their weights ``[S, Q, A]`` from rows of a sparse world."""
+    start, own = np.asarray(world.row_start), np.asarray(policy)
+    state = np.repeat(np.arange(world.num_states), np.diff(start))
+    number = np.arange(len(state)) - start[state] if world.action is None else world.action
+    number = np.asarray(number)
+    if own.dtype.kind in "iu":
+        places = np.arange(world.num_states).reshape(-1, *[1] * (own.ndim - 1))
+        wrong = np.argwhere((own < start[places]) | (own >= start[places + 1]))
+        if own.shape[0] != world.num_states or wrong.size:
+            where = (
+                f"policy{wrong[0].tolist()} = {own[tuple(wrong[0])]}" if wrong.size else "policy"
+            )
+            raise ValueError(f"{where} is not a row of its state; give rows int32[S, Q].")
+        return jnp.asarray(number[own].astype(np.int32))
+    width = max(int(number.max(initial=0)) + 1, len(world.action_names))
+    weight = np.zeros((world.num_states, width, *own.shape[1:]), own.dtype)
+    np.add.at(weight, (state, number), own)
+    return jnp.asarray(np.moveaxis(weight, 1, -1))
