@@ -42,7 +42,7 @@ from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.interval.reachability import reachability
 from jaxltl.core.sparse.interval.robust_values import Query
 from jaxltl.core.sparse.interval.total_reward import total_reward
-from jaxltl.core.values.undiscounted.mixture import safe_ends
+from jaxltl.core.values.engine.state_quantities import safe_ends
 
 ACCEPTED, REJECTED, OPEN = 1, -1, 0
 Point = NDArray[np.float64]

@@ -274,7 +274,7 @@ def test_bad_problems_are_refused(arguments, message):
         ({"policy": "soft", "adjoint": "approximate"}, "belongs to the Boltzmann policy"),
         ({"adjoint": "none"}, "adjoint='none'; choose one of exact, approximate"),
         ({"mu": 1.0}, "make the problem in a product"),
-        ({"optimizer": "newton"}, "optimizer='newton'; choose one of lbfgs, adam, rmsprop, sgd"),
+        ({"optimizer": "newton"}, "optimizer='newton'; choose one of lbfgs, adabelief, "),
     ],
 )
 def test_bad_settings_are_refused(options, message):

@@ -77,14 +77,14 @@ class Hparams:
 
     Attributes:
       learning_rate: in shares of the box; a number or a schedule; default 0.1.
-      optimizer: ``"adam"``, ``"rmsprop"``, ``"sgd"``, or ``"sign"``, which uses the signs of the
-        gradient only; static; default ``"adam"``.
+      optimizer: the name of one of optax, such as ``"rmsprop"``, or ``"sign"``, which uses the signs
+        of the gradient only; static; default ``"adam"``.
       tolerance: of solves of decision processes, see
         :func:`~jaxltl.core.values.prepared.prepared.solve_prepared`; default None.
     """
 
     learning_rate: Schedule = traced(Range(0, open_above=True), default=0.1, schedule=True)
-    optimizer: str = static(("adam", "rmsprop", "sgd", "sign"), default="adam")
+    optimizer: str = static((*optimizers.NAMES, "sign"), default="adam")
     tolerance: Number | None = traced(Range(0, open_above=True), default=None)
 
 

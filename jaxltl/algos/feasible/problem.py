@@ -18,10 +18,10 @@ from jaxltl.core.models.protocols import Array
 from jaxltl.core.models.sparse import SparseMDP, choice_reward
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.solvers import reachability as optimal
-from jaxltl.core.types import require_shape
+from jaxltl.core.types import require_states
 from jaxltl.core.values.interval.robust import width_asked
 from jaxltl.core.values.prepared.prepared import Prepared, prepare
-from jaxltl.core.values.undiscounted.mixture import safe_ends
+from jaxltl.core.values.engine.state_quantities import safe_ends
 
 
 @brief
@@ -102,7 +102,7 @@ def make_problem(
         )
     here = model.model
     target = here.states_with_label(target) if isinstance(target, str) else np.asarray(target)
-    require_shape("target", target, (here.num_states,))
+    require_states("target", target, (here.num_states,))
     target = target.astype(bool)
     if here.is_chain:
         objective = "max"  # which allows rewards that become zero

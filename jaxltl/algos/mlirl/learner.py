@@ -140,7 +140,8 @@ class Hparams:
       start_scale: standard deviation of the noise added to ``Problem.start``; default 1.0.
       policy: ``"boltzmann"`` (2.3) or ``"soft"`` (maximum entropy); static; default ``"boltzmann"``.
       adjoint: ``"exact"``, or ``"approximate"`` as in (2.7); static; default ``"exact"``.
-      optimizer: ``"lbfgs"``, ``"adam"``, ``"rmsprop"`` or ``"sgd"``; static; default ``"lbfgs"``.
+      optimizer: ``"lbfgs"``, or the name of one of optax, such as ``"adamw"``; static; default
+        ``"lbfgs"``.
     """
 
     discount: Number = traced(Range(0, 1, open_above=True))
@@ -150,7 +151,7 @@ class Hparams:
     start_scale: Number = traced(Range(0, open_above=True), default=1.0)
     policy: str = static(("boltzmann", "soft"), default="boltzmann")
     adjoint: str = static(("exact", "approximate"), default="exact")
-    optimizer: str = static(("lbfgs", "adam", "rmsprop", "sgd"), default="lbfgs")
+    optimizer: str = static(("lbfgs", *optimizers.NAMES), default="lbfgs")
 
 
 @brief

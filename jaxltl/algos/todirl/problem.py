@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
+from jaxltl.algos.common import optimizers
 from jaxltl.algos.common.settings import COUNT, Number, static, traced
 from jaxltl.algos.todirl.networks import RewardNetwork
 from jaxltl.core import struct
@@ -71,7 +72,8 @@ class Hparams:
         probability) after which learning stops; default 50.
       mu: weight of the satisfaction probability (2.6) from the initial states, or None; default None.
       tolerance: certified error of the soft values; None: the precision of the dtype; default None.
-      optimizer: ``"adam"``, ``"sgd"``, ``"rmsprop"`` or ``"lbfgs"``; static; default ``"adam"``.
+      optimizer: ``"lbfgs"``, or the name of one of optax, such as ``"adamw"``; static; default
+        ``"adam"``.
       method: of :func:`~jaxltl.core.values.discounted.soft.soft_value`; static;
         default ``"value_iteration"``.
       horizon: number of steps, for a time-dependent policy, or None; static; default None.
@@ -83,7 +85,7 @@ class Hparams:
     patience: Number = traced(Range(1), default=50)
     mu: Number | None = traced(Range(0, open_above=True), default=None)
     tolerance: Number | None = traced(Range(0, open_above=True), default=None)
-    optimizer: str = static(("lbfgs", "adam", "rmsprop", "sgd"), default="adam")
+    optimizer: str = static(("lbfgs", *optimizers.NAMES), default="adam")
     method: str = static(("newton", "value_iteration"), default="value_iteration")
     horizon: int | None = static(COUNT, default=None)
 

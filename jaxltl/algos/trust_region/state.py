@@ -38,11 +38,11 @@ class Hparams:
       hidden, value_hidden: widths of the tanh layers of the policy and of the value networks;
         ``()`` is linear; static; default ``(32, 32)``.
       normalize: networks read observations standardised by their moments so far; static; default True.
-      cg_steps, search_steps: of the conjugate gradient method, and maximal number of tries of the line
-        search; static; default 10 and 15.
+      cg_steps: iterations of the conjugate gradient method; static; default 10.
+      search_steps: largest number of tries of the line search; static; default 15.
       fisher_stride: stride of the samples that estimate the Fisher matrix; static; default 1.
-      value_epochs, value_batches: passes over the samples, and minibatches of each; static;
-        default 5 and 8.
+      value_epochs: passes of the value networks over the samples; static; default 5.
+      value_batches: minibatches of each pass; static; default 8.
     """
 
     discount: Number = traced(Range(0, 1))

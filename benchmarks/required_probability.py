@@ -1,0 +1,206 @@
+"""Time of a required probability beside the best one: ``python -m benchmarks.required_probability``.
+
+Random maps with rivers, walls and one demonstration with detours, tasks of ordered visits and
+patrols, and probabilities from .5 to .9999: CPU seconds of ``jaxltl learn`` with
+``guarantee = "best"`` and with the probability, nothing cached, and what is attained.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxltl.core.models.product import product
+from jaxltl.core.values.undiscounted.mixture import at_starts
+from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction
+from jaxltl.envs.gridworld import ACTIONS, gridworld
+
+_FORMULAS = (
+    "F(a & X F b) & (!o U b)",
+    "F(a & X F(b & X F c)) & (!o U c)",
+    "F a & F b & G !o",
+    "G F a & G F b & G !o",
+    "G F(a & X F(b & X F c)) & G !o",
+)
+_FILE = """
+name = "map {number}"
+
+[world]
+map = '''
+{map}
+'''
+slip = {slip}
+initial = "s"
+
+[task]
+formula = "{formula}"
+guarantee = {guarantee}
+
+[demonstrations]
+file = "map{number}.json"
+
+[learner]
+method = "mlirl"
+discount = {discount}
+avoid = ["o"]
+"""
+_DETOUR = 0.15  # probability of a random step
+_ROUNDS = 2  # of a patrol
+
+
+class Case(NamedTuple):
+    """A task file but for its guarantee, its demonstration, and a probability to require."""
+
+    text: dict[str, object]
+    demonstration: dict[str, object]
+    probability: float
+
+
+def cases(count: int, seed: int = 0) -> list[Case]:
+    """Random maps; the best probability of each is above the required one."""
+    rng, found = np.random.default_rng(seed), []
+    while len(found) < count:
+        one = _case(rng, len(found))
+        if one is not None:
+            found.append(one)
+    return found
+
+
+def _map(rng: np.random.Generator) -> str:
+    """A river with a ford or two, some walls, and the places s, a, b and c."""
+    rows, columns = int(rng.integers(5, 9)), int(rng.integers(6, 13))
+    cells = np.full((rows, columns), ".")
+    river = int(rng.integers(2, columns - 2))
+    cells[:, river] = "o"
+    for _ in range(int(rng.integers(1, 3))):
+        top = int(rng.integers(0, rows - 1))
+        cells[top : top + int(rng.integers(2, 4)), river] = "."
+    for _ in range(int(rng.integers(0, 4))):
+        row, column = int(rng.integers(rows - 1)), int(rng.integers(columns - 1))
+        wall = cells[row : row + 2, column : column + 2]
+        wall[wall == "."] = "#"
+    free = np.argwhere(cells == ".")
+    for name, (row, column) in zip("sabc", rng.permutation(free)[:4], strict=True):
+        cells[row, column] = name
+    return "\n".join(map(" ".join, cells))
+
+
+def _case(rng: np.random.Generator, number: int) -> Case | None:
+    text = {
+        "number": number,
+        "map": _map(rng),
+        "slip": float(rng.choice([0.05, 0.1, 0.2])),
+        "formula": str(rng.choice(_FORMULAS)),
+        "discount": float(rng.choice([0.5, 0.9, 0.95])),
+    }
+    given = str(text["map"])
+    if "o" not in given:
+        return None
+    world = gridworld(given, slip=text["slip"], initial="s")
+    best = optimal_satisfaction(product(world, str(text["formula"])))
+    probability = float(np.round(1 - 10 ** rng.uniform(-4, np.log10(0.5)), 4))
+    if at_starts(product(world, str(text["formula"])), best.lower, "mean")[0] < probability:
+        return None
+    cells, actions = _demonstration(rng, given, str(text["formula"]))
+    if not cells:
+        return None
+    return Case(text, {"demonstrations": [{"cells": cells, "actions": actions}]}, probability)
+
+
+def _demonstration(rng: np.random.Generator, text: str, formula: str) -> tuple[list, list]:
+    """Cells and actions of the quickest policy without slip, with random steps that avoid the river."""
+    world = gridworld(text, slip=0, initial="s")
+    model = product(world, formula)
+    best = optimal_satisfaction(model)
+    onward, label = np.asarray(world.successor)[..., 0], np.asarray(world.label)
+    river = label[:, world.propositions.index("o")]
+    final = np.asarray(model.final) if model.automaton.is_cosafe else None
+    places = [world.propositions.index(x) for x in "abc" if x in formula]
+    s = int(np.argmax(np.asarray(world.initial)))
+    q, visits = int(model.initial_memory[s]), 0
+    rows, columns = np.shape([line.split() for line in text.splitlines()])
+    states, actions = [s], []
+    while len(actions) < 40 * rows:
+        a = int(np.asarray(best.policy)[s, q])
+        if rng.random() < _DETOUR:
+            a = int(rng.choice(np.flatnonzero(~river[onward[s]])))
+        actions.append(a)
+        s = int(onward[s, a])
+        q = int(model.next_memory[s, q])
+        states.append(s)
+        visits += int(label[s, places].any())
+        if final is not None and final[s, q]:
+            break
+        if final is None and visits >= _ROUNDS * len(places):
+            break
+    else:
+        return [], []
+    cells = [[s // columns + 1, s % columns + 1] for s in states]
+    return cells, [ACTIONS[a] for a in actions]
+
+
+def write(case: Case, guarantee: float | str, place: Path) -> Path:
+    """Writes a task file and its demonstration."""
+    number = case.text["number"]
+    (place / f"map{number}.json").write_text(json.dumps(case.demonstration))
+    path = place / f"map{number}-{guarantee}.toml"
+    asked = f'"{guarantee}"' if isinstance(guarantee, str) else guarantee
+    path.write_text(_FILE.format(**case.text, guarantee=asked))
+    return path
+
+
+def _run(path: Path, limit: int) -> tuple[float, dict | None]:
+    """CPU seconds of ``jaxltl learn``, and its result; None after the limit of CPU seconds."""
+    out = path.with_suffix("")
+    command = [sys.executable, "-m", "jaxltl", "learn", str(path), "--out", str(out)]
+    environment = {**os.environ, "JAX_ENABLE_COMPILATION_CACHE": "false"}
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    subprocess.run(
+        command,
+        env=environment,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        check=False,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_CPU, (limit, limit)),
+    )
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    seconds = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    result = out / "result.json"
+    return seconds, json.loads(result.read_text()) if result.exists() else None
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--count", type=int, default=50)
+    parser.add_argument("--limit", type=int, default=600, help="CPU seconds of a run")
+    given = parser.parse_args()
+    print("map states formula p | best s, p s, ratio | lower bound, neg. log-likelihood, how")
+    with tempfile.TemporaryDirectory() as name:
+        for case in cases(given.first + given.count)[given.first :]:
+            place = Path(name)
+            best, _ = _run(write(case, "best", place), given.limit)
+            seconds, result = _run(write(case, case.probability, place), given.limit)
+            line = f"{case.text['number']:3} {str(case.text['formula'])[:32]:32} {case.probability:.4f}"
+            line += f" | {best:5.1f} {seconds:6.1f} {seconds / best:5.2f} | "
+            if result is not None:
+                how, loss = result["guarantee"], result["neg_log_likelihood"]
+                states = result["num_states"] * result["num_memory"]
+                line += (
+                    f"{states:5} {result['satisfaction']['mean']['lower']:.6f} "
+                    f"{np.inf if loss is None else loss:.5f} mu {how['weight']} share {how['share']}"
+                )
+            print(line, flush=True)
+
+
+if __name__ == "__main__":
+    main()
