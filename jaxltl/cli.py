@@ -71,7 +71,9 @@ def main() -> None:
     type=click.IntRange(1),
     help="Number of seeds, which learn in parallel; the best is kept.",
 )
-@click.option("--again", is_flag=True, help="Repeat a finished run.")
+@click.option(
+    "--again", is_flag=True, help="Repeat a finished run, or overwrite the result of another task."
+)
 @click.option("--json", "as_json", is_flag=True, help="End with the result as one JSON line.")
 @over_devices
 @compiling(fast=True)
@@ -120,7 +122,7 @@ def learn(
             )
             result = None if again else run_job.finished(out, mark)
             done = group.sees(f"{out}/result.json", result is not None)
-            request = run_job.Request(out, seed, seeds, mark)
+            request = run_job.Request(out, seed, seeds, mark, again)
             result = result or run_job.run_job(
                 job, task, request, run_job.Console(begin, say, group)
             )
@@ -176,11 +178,16 @@ def check(task_file: Path) -> None:
     help="The cell of the environment's robot in moves.svg, from 1.  "
     "[default: the cell where the strategy forbids most moves]",
 )
+@click.option("--again", is_flag=True, help="Overwrite the result of another game.")
 @click.option("--json", "as_json", is_flag=True, help="End with the result as one JSON line.")
 @compiling(fast=True)
 @plain_errors
 def synthesize(
-    game_file: Path, out: Path | None, environment: tuple[int, int] | None, as_json: bool
+    game_file: Path,
+    out: Path | None,
+    environment: tuple[int, int] | None,
+    again: bool,
+    as_json: bool,
 ) -> None:
     """Solve a game: winning region, permissive strategy, and counter-strategy.
 
@@ -193,17 +200,18 @@ def synthesize(
     """
     begin = time.perf_counter()
     _begin(f"solving {game_file}")
-    from jaxltl.algos.common.checkpoint import atomic_write
     from jaxltl.app import synthesize as synthesis
     from jaxltl.app.files.game import read_game
     from jaxltl.app.reports import synthesize as report
 
     file = read_game(game_file)
-    out = run_job.make_directory(_place(out, file.name))
-    # Before the work, since the directory may not be writable.
-    with atomic_write(out / "game.toml") as copy:
-        copy.write(game_file.read_bytes())
-    with float64(), _stages(synthesis.STAGES) as progress:
+    out = _place(out, file.name)
+    with contextlib.ExitStack() as held:
+        held.enter_context(run_job.locked(out))
+        # Before the work, since the directory may not be writable.
+        run_job.claim_directory(out, "game.toml", game_file.read_bytes(), again)
+        held.enter_context(float64())
+        progress = held.enter_context(_stages(synthesis.STAGES))
         found = synthesis.synthesize(file, progress)
         place = report.place_of(found, environment)
         progress("writing")
@@ -241,7 +249,7 @@ def _stages(names: tuple[str, ...]) -> Iterator[Callable[[str], None]]:
 
 
 def _write_synthesis(found: Any, out: Path, place: int | None, begin: float) -> dict[str, Any]:
-    from jaxltl.algos.common.checkpoint import atomic_write
+    from jaxltl.core.files import atomic_write
     from jaxltl.app.reports import synthesize as report
     from jaxltl.app.reports.synthesize_page import page
 
@@ -413,7 +421,7 @@ def solve(
     questions = solving.parse_queries(properties)
     if all(one.parsed is None for one in questions):
         raise ValueError("\n".join(str(one.error) for one in questions))
-    from jaxltl.algos.common.checkpoint import atomic_write
+    from jaxltl.core.files import atomic_write
 
     # Before the work, since the directory may not be writable.
     written = contextlib.nullcontext() if strategy is None else atomic_write(strategy)
@@ -479,7 +487,7 @@ def solve(
     type=click.Choice(["anytime", "clopper-pearson", "hoeffding", "weissman"]),
 )
 @click.option("--min", "smallest", is_flag=True, help="Minimise the probability.")
-@click.option("--policy", type=click.Path(path_type=Path), help="File for the policy, as JSON.")
+@click.option("--policy", type=click.Path(path_type=Path), help="File for the policy, .npz.")
 @click.option(
     "--curve",
     type=click.Path(path_type=Path),
@@ -558,7 +566,7 @@ def reproduce(what: str, out: Path | None, seeds: int | None, as_json: bool) -> 
 
 
 def _write_pictures(pictures: list[tuple[str, bytes]], out: Path) -> None:
-    from jaxltl.algos.common.checkpoint import atomic_write
+    from jaxltl.core.files import atomic_write
 
     out.mkdir(parents=True, exist_ok=True)
     for name, picture in pictures:

@@ -10,7 +10,7 @@ PAGES = sorted(
         ROOT / "README.md",
         ROOT / "CHANGELOG.md",
         *ROOT.glob("*.md"),
-        *(p for p in ROOT.glob("docs/**/*.md") if "reference" not in p.parts),
+        *(p for p in ROOT.glob("docs/**/*.md") if "reference" not in p.relative_to(ROOT).parts),
     ]
 )
 PAGES = list(dict.fromkeys(PAGES))

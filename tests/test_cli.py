@@ -8,19 +8,25 @@ import subprocess
 import sys
 import time
 from concurrent.futures import BrokenExecutor
+from functools import partial
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
 import jaxltl
 from jaxltl import __main__ as entry
+from jaxltl.app import run_job
+from jaxltl.app.command_options import plain_errors
 from jaxltl.app.compilation import FAST_COMPILATION, cache_directory, xla_flags
 from jaxltl.app.reports.drawing import artist, draw, drawing
 from jaxltl.cli import main
 from jaxltl.core.automata.language import is_equivalent
 from jaxltl.core.automata.translate import to_automaton
+from jaxltl.core.models.mesh.cores import over_cores
 from jaxltl.io.hoa.hoa import read_hoa_stream
 from tests.app.test_task import SHOWN, TASK, write  # noqa: F401
 
@@ -60,8 +66,7 @@ def test_automata_in_order_and_from_standard_input():
 @pytest.mark.parametrize(
     ("form", "sign"), [("dot", "digraph"), ("svg", "<svg"), ("text", ">  0"), ("hoa", "HOA: v1")]
 )
-def test_forms_of_an_automaton(form, sign, monkeypatch):
-    monkeypatch.setattr("shutil.which", lambda name: None)
+def test_forms_of_an_automaton(form, sign):
     for formula in ("F a", "G F a", "F G a"):
         result = run("automaton", formula, "--to", form)
         assert result.exit_code == 0 and sign in result.output
@@ -146,6 +151,22 @@ def test_learn_prints_evidence(learned):
     assert len(last["seeds"]["mean"]) == 2
 
 
+def test_a_minimum_is_left_out_where_all_are_equal(learned):
+    from jaxltl.app.reports import learn as report
+
+    found = json.loads(learned[1].stdout.splitlines()[-1])
+
+    def texts(least):
+        for key in ("satisfaction", "best_achievable"):
+            found[key]["mean"]["value"], found[key]["minimum"]["value"] = 0.75, least
+        rows = [x.split()[:3] for x in report.table(found).splitlines()]
+        return ["policy", "minimum"] in [row[1:] for row in rows], report.page(found, [], [], "")
+
+    for least, shown in ((0.75, False), (0.75 - 1e-9, False), (0.7, True)):
+        row, page = texts(least)
+        assert row == shown and ("minimum, from row" in page) == shown
+
+
 def test_learn_says_that_it_did_not_converge(learned):
     _, result = learned
     assert not json.loads(result.stdout.splitlines()[-1])["training"]["converged"]
@@ -164,12 +185,13 @@ def test_learn_writes_its_results(learned):
         "values.svg",
         "policy.svg",
         "learning.svg",
+        "steps.svg",
     }
     written = json.loads((place / "out" / "result.json").read_text())
     assert written == json.loads(result.stdout.splitlines()[-1])
     page = (place / "out" / "report.html").read_text()
-    # What has a live part is not shown twice.
-    assert "data:image" not in page and page.count("<svg") == 2 + 3
+    # What has a live part is not shown twice; the steps have none.
+    assert page.count("data:image") == 1 and page.count("<svg") == 2 + 3
     assert "http" not in page and "prefers-color-scheme: dark" in page
 
 
@@ -194,8 +216,37 @@ def test_what_is_done_is_told_and_not_done_again(learned, monkeypatch):
         options = ["--out", out, "--seeds", 2, *more]
         assert failure("learn", task, *options) == "error: begun anew\n"
     task.write_text(task.read_text() + "\n# another\n")
-    assert failure("learn", task, "--out", out, "--seeds", 2) == "error: begun anew\n"
+    again = ["learn", task, "--out", out, "--seeds", 2, "--again"]
+    assert failure(*again) == "error: begun anew\n"
     task.write_text(task.read_text().removesuffix("\n# another\n"))
+
+
+def test_the_result_of_another_task_is_kept(learned):
+    place, _ = learned
+    other, out = place / "other.toml", place / "out"
+    other.write_text((place / "task.toml").read_text().replace("0.3", "0.25"))
+    before = (out / "result.json").read_bytes(), (out / "task.toml").read_bytes()
+    message = failure("learn", other, "--out", out)
+    assert "has the result of another file" in message and "--again" in message
+    assert before == ((out / "result.json").read_bytes(), (out / "task.toml").read_bytes())
+    assert not (out / ".lock").exists()
+
+
+def test_two_runs_do_not_share_a_directory(learned):
+    place, _ = learned
+    with run_job.locked(place / "shared"):
+        message = failure("learn", place / "task.toml", "--out", place / "shared")
+    assert "another run writes into" in message and "--out" in message
+    with run_job.locked(place / "shared"):  # free again
+        pass
+    assert list((place / "shared").iterdir()) == []
+
+
+def test_progress_in_a_pipe_is_lines(learned):
+    _, first = learned
+    assert "\r" not in first.stderr
+    stages = [line.partition(",")[0] for line in first.stderr.splitlines()]
+    assert {"compiling", "learning", "drawing"} <= set(stages)
 
 
 @pytest.mark.slow
@@ -318,6 +369,24 @@ run()
 """
     found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert (found.returncode, found.stdout, found.stderr) == (130, "", "interrupted\n")
+
+
+def test_an_interrupted_program_says_so_in_a_line(monkeypatch, capsys):
+    monkeypatch.setenv("NPROC", "2")
+
+    def stop(x):
+        raise KeyboardInterrupt
+
+    def lane(x):
+        return jax.pure_callback(stop, x, x, vmap_method="sequential")
+
+    def command():
+        jax.block_until_ready(jax.vmap(partial(over_cores, lane))(jnp.arange(2.0)))
+
+    with pytest.raises(SystemExit) as ended:
+        plain_errors(command)()
+    assert ended.value.code == 130
+    assert capsys.readouterr().err.splitlines()[-1] == "interrupted"
 
 
 def test_another_task_does_not_go_on_from_a_checkpoint(learned, monkeypatch):

@@ -73,6 +73,8 @@ class Source:
 
 @dataclass(frozen=True)
 class Outputs:
+    """Files to write besides the result, or None."""
+
     policy: Path | None = None
     curve: Path | None = None
 
@@ -97,9 +99,12 @@ def read_evidence(log: Path, source: Source, option: str = "--{} ") -> Evidence:
         if graph is not None:
             raise ValueError("a model has its graph; leave --graph and --least-probability out.")
         return _named(given, align_counts(given, read_log(log, given)), "given")
-    if not initial:
-        raise ValueError(f"name the initial state: {option.format('initial')}STATE.")
     counts = read_log(log)
+    if not initial:
+        raise ValueError(
+            f"{str(log)!r} does not name the states in which episodes begin; add "
+            f"{option.format('initial')}STATE. It has the states {_some(counts)}."
+        )
     for what, names in (("initial", initial), ("terminal", terminal)):
         unknown = [x for x in names if x not in counts.states]
         if unknown:
@@ -162,6 +167,7 @@ def certify(evidence: Evidence, query: Query) -> DataGuarantee:
 
 
 def text(evidence: Evidence, query: Query, found: DataGuarantee, seconds: float) -> str:
+    """Guarantee from a log, as text."""
     side, other = (">=", "more") if query.objective == "max" else ("<=", "less")
     lines = [
         f"P {side} {_outward(found.bound, side == '<=')} with confidence {found.confidence:g}",
@@ -201,6 +207,7 @@ def _state(evidence: Evidence, row: int) -> str:
 
 
 def entry(evidence: Evidence, query: Query, found: DataGuarantee, seconds: float) -> Record:
+    """Guarantee from a log, as a JSON object."""
     return {
         "formula": query.formula,
         "objective": query.objective,
@@ -220,6 +227,7 @@ def entry(evidence: Evidence, query: Query, found: DataGuarantee, seconds: float
 
 
 def sample_next(evidence: Evidence, found: DataGuarantee) -> list[Record]:
+    """Choices of which more samples improve the guarantee most."""
     return [
         {
             "state": _state(evidence, r),
@@ -229,41 +237,6 @@ def sample_next(evidence: Evidence, found: DataGuarantee) -> list[Record]:
         }
         for r in most_helpful(found)
     ]
-
-
-def policy_file(evidence: Evidence, query: Query, found: DataGuarantee) -> bytes:
-    """The policy as JSON: an action for each state and memory state, and the memory's update."""
-    of = found.satisfaction
-    product, automaton = of.product, of.automaton
-    rows = np.asarray(of.solution.policy)
-    letters = [
-        sorted(p for p, holds in zip(automaton.propositions, letter, strict=True) if holds)
-        for letter in automaton.letters
-    ]
-    moves = [
-        {"state": evidence.states[s], "memory": int(q), "action": evidence.actions[r]}
-        for s, q, r, still in zip(
-            product.base_state.tolist(),
-            product.memory.tolist(),
-            rows.tolist(),
-            product.still.tolist(),
-            strict=True,
-        )
-        if not still
-    ]
-    table = {
-        **entry(evidence, query, found, 0.0),
-        "initial_memory": int(automaton.initial),
-        "letters": letters,
-        "letter": {
-            name: letters[i] for name, i in zip(evidence.states, of.letter.tolist(), strict=True)
-        },
-        "update": np.asarray(automaton.delta).tolist(),
-        "update_by": "the letter of the state that is left",
-        "policy": moves,
-    }
-    del table["seconds"]
-    return (json.dumps(table, allow_nan=False) + "\n").encode()
 
 
 def curve(evidence: Evidence, query: Query) -> tuple[list[int], list[float]]:
@@ -298,15 +271,17 @@ def certify_and_write(
     say: Callable[[str], None],
 ) -> bool:
     """Runs the command, output files opened first; True if some bound did not converge."""
-    from jaxltl.algos.common.checkpoint import atomic_write
+    from jaxltl.core.files import atomic_write
+    from jaxltl.core.models.construct.lifting import project_policy
+    from jaxltl.core.policies.policy_file import save_policy
 
     check_confidence(query.confidence)
-    policy, picture = outputs.policy, outputs.curve
+    target, picture = outputs.policy, outputs.curve
     if picture is not None and picture.suffix not in PICTURES:
         raise ValueError(f"--curve {picture}: the name must end in {', '.join(PICTURES)}.")
     nothing: Any = contextlib.nullcontext()
     with (
-        nothing if policy is None else atomic_write(policy) as file,
+        nothing if target is None else atomic_write(target) as file,
         nothing if picture is None else atomic_write(picture) as drawing,
     ):
         evidence = read_evidence(log, source)
@@ -314,7 +289,9 @@ def certify_and_write(
         say(text(evidence, query, found, seconds))
         result = entry(evidence, query, found, seconds)
         if file is not None:
-            file.write(policy_file(evidence, query, found))
+            about = {**entry(evidence, query, found, 0.0), "seconds": None}
+            policy = project_policy(evidence.model, found.satisfaction, states=evidence.states)
+            save_policy(file, policy, {"result": json.dumps(about, allow_nan=False)})
         if drawing is not None:
             from jaxltl import plot
 

@@ -29,16 +29,24 @@ def plain_errors(command: Callable[..., None]) -> Callable[..., None]:
     def run(*args: Any, **options: Any) -> None:
         try:
             command(*args, **options)
-        except (ValueError, jaxltl.NotConverged) as error:
+        except (ValueError, RuntimeError) as error:
+            if "KeyboardInterrupt" in str(error):  # in a call of the host by a program of XLA
+                raise _interrupted() from None
+            if not isinstance(error, ValueError | jaxltl.NotConverged):
+                raise
             raise Failure(str(error)) from None
         except OSError as error:
             where = f"{error.filename!r}: " if error.filename else ""
             raise Failure(f"{where}{error.strerror or error}") from None
         except KeyboardInterrupt:
-            click.echo("interrupted", err=True)
-            raise SystemExit(130) from None
+            raise _interrupted() from None
 
     return run
+
+
+def _interrupted() -> SystemExit:
+    click.echo("interrupted", err=True)
+    return SystemExit(130)
 
 
 @contextlib.contextmanager

@@ -13,7 +13,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from jaxltl.app.files.schema import errors_in
+
+from jaxltl.core.validation import errors_in
 from jaxltl.app.files.task_environment import EnvironmentTask
 from jaxltl.core.environments.environment import Environment, make_environment
 from jaxltl.core.environments.time_limit import with_time_limit

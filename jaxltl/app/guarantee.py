@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 
@@ -16,19 +16,19 @@ from jaxltl.core.models.product import Product
 from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.types import Solution
 from jaxltl.core.values.undiscounted.mixture import (
-    WINDOW,
     at_starts,
     attained,
-    least_mixture,
+    attained_if_near,
+    probable_mixture,
     require_attainable,
 )
 from jaxltl.core.values.undiscounted.optimal_actions import OptimalActions, optimal_actions
 from jaxltl.core.values.undiscounted.reachability import rows_of_model
 from jaxltl.app.wording import Record
 
-_AIM = WINDOW / 4  # margin of the certified probability over the asked one
-_WEIGHTS = 10.0 ** np.arange(-1, 5.5, 0.5)  # of the satisfaction probability, in this order
-_HALVINGS = 30
+_COARSE = 1e-6  # width of the enclosure of a probability that is positive or not
+_LOSS = 1e-9  # of the best probability, that counts as a rounding error
+_KEPT = 3  # policies that are compared after mixing for the expected steps
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,14 @@ class Guarantee:
     # maximal satisfaction probability before and after the first of them
     cost: tuple[float, float] | None
     usable: bool = True  # whether each demonstration has an optimal step
+    # int[N], the number of each demonstration's steps until the formula is lost or, for "best",
+    # until a mistake has left the best probability; later ones are not used
+    used: np.ndarray | None = None
+
+    def unused(self, shown: Trajectories) -> np.ndarray:
+        """``bool[N, T]``, the steps after the formula or the best probability is lost."""
+        length = np.asarray(shown.length) if self.used is None else self.used
+        return np.asarray(shown.mask) & (np.arange(shown.state.shape[1]) >= length[:, None])
 
     @property
     def allowed(self) -> np.ndarray | None:
@@ -61,24 +69,41 @@ def ask(
     """Guarantee for a product, as the task file requests it."""
     nothing = np.zeros(np.shape(shown.state), bool)
     if asked == "none":
-        return Guarantee(asked, over, best, None, nothing, None)
+        used = _used(model, best, nothing, shown)
+        return Guarantee(asked, over, best, None, nothing, None, used=used)
     if not isinstance(asked, str):
         require_attainable(model, best, asked, over, world.place)
         if asked == 1:  # attained by optimal policies alone
             asked = "best"
     actions = optimal_actions(model, best)
     lost, cost = _losing(model, best, np.asarray(actions.allowed), shown)
-    useless = np.flatnonzero(lost.any(1) & (lost.sum(1) == np.asarray(shown.length)))
+    used = _used(model, best, lost if isinstance(asked, str) else nothing, shown)
+    lost_use = (lost & (np.arange(lost.shape[1]) < used[:, None])).sum(1)
+    useless = np.flatnonzero((used > 0) & (lost_use == used))
     if not isinstance(asked, str):
-        return Guarantee(asked, over, best, actions, nothing, None, not useless.size)
+        return Guarantee(asked, over, best, actions, nothing, None, not useless.size, used)
     if useless.size:
-        n, count = useless[0], int(lost[useless[0]].sum())
-        what = "its only step" if count == 1 else f"each of its {count} steps"
+        n, count = useless[0], int(lost_use[useless[0]])
+        first = "its first step" if shown.length[n] > 1 else "its only step"
+        what = first if count == 1 else f"each of its {count} steps"
         raise ValueError(
             f"demonstration {n + 1}: {what} lowers the best probability of satisfying the formula, "
             'so that none is left to learn from; leave it out, or write guarantee = "none".'
         )
-    return Guarantee(asked, over, best, actions, lost, cost)
+    return Guarantee(asked, over, best, actions, lost, cost, used=used)
+
+
+def _used(model: Product, best: Solution, mistake: np.ndarray, shown: Trajectories) -> np.ndarray:
+    """Steps ``int[N]`` until the formula is lost, or a mistake leads to less probability."""
+    state = np.asarray(shown.state)
+    memory, inside = memory_along(model, state), np.asarray(shown.mask)
+    value, upper = (np.asarray(x, float)[state, memory] for x in (best.value, best.upper))
+    less = mistake[:, :-1] & inside[:, 1:] & (value[:, 1:] < value[:, :-1] - _LOSS)
+    gone = inside & (upper <= 0)
+    gone[:, 1:] |= less
+    length = np.asarray(shown.length)
+    used = np.where(gone.any(1), gone.argmax(1), length)
+    return used if used.any() else length  # else there is nothing to learn from
 
 
 def _losing(
@@ -123,9 +148,10 @@ def left_out(
 ) -> list[tuple[int, int, int]]:
     """World state, memory state and action of the steps that are left out, each once."""
     state, action = np.asarray(shown.state), np.asarray(shown.action)
-    if not guarantee.forbidden.any():
+    marked = guarantee.forbidden | guarantee.unused(shown)
+    if not marked.any():
         return []
-    steps = np.stack([state, memory_along(model, state), action], -1)[guarantee.forbidden]
+    steps = np.stack([state, memory_along(model, state), action], -1)[marked]
     return [(s, q, a) for s, q, a in np.unique(steps, axis=0).tolist()]
 
 
@@ -143,6 +169,8 @@ def kept(
         found["loss"] = guarantee.actions.loss
     if attempt is not None:
         found |= {"attained": attempt.attained, "weight": attempt.weight, "share": attempt.share}
+    if unused := int(guarantee.unused(shown).sum()):
+        found["unused"] = {"steps": unused, "of": int(np.sum(shown.length))}
     if guarantee.forbidden.any():
         n, t = np.argwhere(guarantee.forbidden)[0]
         before, after = guarantee.cost or (None, None)
@@ -179,7 +207,6 @@ class Attempt:
 
 
 Learned = TypeVar("Learned")
-Train = Callable[[float, Learned], Learned]
 
 
 @dataclass(frozen=True)
@@ -189,45 +216,47 @@ class Search(Generic[Learned]):
     model: Product  # the product
     guarantee: Guarantee  # the probability
     counts: np.ndarray  # float[S, Q, A], the number of demonstrations of each pair
-    # learns with a weight mu of the satisfaction probability (2.6), starting from the previous
-    # result
-    train: Train[Learned]
     policy_of: Callable[[Learned], np.ndarray]  # the policy float[S, Q, A] of a result
+    # likely results at and below the required probability, with their weights mu (2.6)
+    constrained: Callable[[], list[tuple[Learned, float]]]
+    within_steps: Callable[[np.ndarray], np.ndarray]  # a policy mixed for the bound of its steps
 
-    def at_least(self, free: Learned, inside: Callable[[], tuple[np.ndarray, Learned]]) -> Attempt:
-        """Most likely policy found, by a search for the least sufficient weight mu.
+    def at_least(self, free: Learned, policy: np.ndarray, inside: Learned) -> Attempt:
+        """Most likely policy found: learned with the constraint, or a mixture.
 
-        Where the probability jumps with the weight, or no weight attains it, policies of both sides
-        are mixed; and the likeliest policy is mixed with the likeliest one of optimal actions or,
-        if that gives no probability near the requested one, with the quickest of these.
+        Arguments are the result without constraint, and the policy and result of optimal actions.
+        Where no reward attains the probability, a policy is mixed with the likeliest or with the
+        quickest one of optimal actions.
         """
         asked = float(self.guarantee.asked)
         first = self._attempt(self.policy_of(free), free, 0.0, 0.0)
         if first.attained >= asked:
             return first
-        below, above, found = first, None, []
-        tries = bracket(
-            self.train, first, lambda x, mu: self._attempt(self.policy_of(x), x, mu, 0.0), asked
-        )
-        for tried in tries:
-            if tried.attained < asked:
-                below = tried
-            else:
-                above = tried
-                found.append(tried)
-        if above is not None and above.attained > asked + WINDOW:
-            found.append(self._between(below, above))
-        policy, learned = inside()
-        sure = self._attempt(policy, learned, None, 1.0)
-        found += [self._between(x, sure) for x in ([first] if below is first else [first, below])]
-        if all(one.attained > asked + WINDOW for one in found):
-            # A learned policy that delays satisfaction leaves no share for other actions.
-            quick = np.asarray(self.guarantee.best.policy)[..., None] == np.arange(policy.shape[-1])
-            sure = self._attempt(quick.astype(float), learned, None, 1.0)
-            found.append(self._between(first, sure))
-        return min(found, key=lambda one: one.neg_log_likelihood)
+        below: list[Attempt] = [first]
+        found: list[Attempt] = []
+        for learned, weight in self.constrained() if self._is_weighable() else ():
+            tried = self._attempt(self.policy_of(learned), learned, weight, 0.0)
+            (found if tried.attained >= asked else below).append(tried)
+        quickest = np.asarray(self.guarantee.best.policy)[..., None] == np.arange(policy.shape[-1])
+        # A learned policy that delays satisfaction leaves no share for other actions.
+        for sure in (policy, quickest.astype(float)):
+            found += [
+                self._between(one, Attempt(sure, self.loss(sure), 1.0, None, 1.0, inside))
+                for one in below
+            ]
+        likeliest = sorted(found, key=lambda one: one.neg_log_likelihood)[:_KEPT]
+        return min(likeliest, key=lambda one: self.loss(self.within_steps(one.policy)))
 
-    def _loss(self, policy: np.ndarray) -> float:
+    def _is_weighable(self) -> bool:
+        """True if rewards matter: the uniform policy satisfies the formula sometimes.
+
+        Softmax policies have full support; else none of them satisfies it, for any reward.
+        """
+        available = np.asarray(self.model.available)
+        uniform = available / available.sum(-1, keepdims=True)
+        return attained(self.model, uniform, "mean", _COARSE) > 0
+
+    def loss(self, policy: np.ndarray) -> float:
         """Negative log-likelihood of the demonstrations."""
         seen = self.counts > 0
         with np.errstate(divide="ignore"):
@@ -236,53 +265,19 @@ class Search(Generic[Learned]):
     def _attempt(
         self, policy: np.ndarray, learned: Learned, weight: float | None, share: float
     ) -> Attempt:
-        reached = attained(self.model, policy, self.guarantee.over)
-        return Attempt(policy, self._loss(policy), reached, weight, share, learned)
+        asked, over = float(self.guarantee.asked), self.guarantee.over
+        reached = attained_if_near(self.model, policy, over, asked)
+        return Attempt(policy, self.loss(policy), reached, weight, share, learned)
 
     def _between(self, below: Attempt, above: Attempt) -> Attempt:
         """The mixture of two policies with the least share of the second."""
         asked, over = float(self.guarantee.asked), self.guarantee.over
-        found = least_mixture(self.model, below.policy, above.policy, asked, over=over)
-        if found.share == 1:
-            return above
+        found = probable_mixture(self.model, below.policy, above.policy, asked, over)
+        loss = self.loss(found.policy)
         return replace(
             above,
             policy=found.policy,
-            neg_log_likelihood=self._loss(found.policy),
+            neg_log_likelihood=loss,
             attained=found.attained,
             share=found.share,
         )
-
-
-def bracket(
-    train: Train,
-    first: Any,
-    judged: Callable[[Any, float], Any],
-    asked: float,
-    halvings: int = _HALVINGS,
-) -> Iterator[Any]:
-    """Yields attempts with increasing weights until one suffices, then by bisection.
-
-    Each starts from the result of the next smaller weight: the likelihood has several maxima, and
-    those found from too large a weight are lower.
-    """
-    low, below = 0.0, first
-    for high in map(float, _WEIGHTS):
-        last = judged(train(high, below.learned), high)
-        yield last
-        if last.attained >= asked:
-            break
-        low, below = high, last
-    else:
-        return
-    low = low or high * 1e-3
-    for _ in range(halvings):
-        if asked <= last.attained <= asked + _AIM or high / low < 1 + 1e-9:
-            return
-        middle = float(np.sqrt(low * high))
-        last = judged(train(middle, below.learned), middle)
-        yield last
-        if last.attained >= asked:
-            high = middle
-        else:
-            low, below = middle, last

@@ -10,7 +10,6 @@ import inspect
 import json
 import threading
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
@@ -18,13 +17,11 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxltl
-from jaxltl.algos.common.checkpoint import atomic_write
 from jaxltl.algos.common.chunks import Chunks, Options, run_in_chunks, trace_lanes
 from jaxltl.app.protocols import LearningTask, Training
 from jaxltl.app.reports.drawing import Picture, drawing
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.models.mesh.lanes import on_host, vmap_over_mesh
-from jaxltl.core.models.product import Product
 from jaxltl.app.wording import Record, Result
 from jaxltl.core.models.protocols import PyTree
 
@@ -110,6 +107,7 @@ def one_seed(learned: Any, i: int) -> Any:
 
 
 def postfix(figures: Mapping[str, np.ndarray]) -> dict[str, str]:
+    """Least loss and greatest gradient norm over seeds, for the progress bar."""
     return {
         "loss": f"{figures['loss'].min():.4f}",
         "gradient": f"{figures['gradient_norm'].max():.1e}",
@@ -164,21 +162,6 @@ def plain(value: Any) -> Any:
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
-def memory_arrays(model: Product, size: int | None = None) -> Record:
-    """The memory update of a policy in the first states of a product."""
-    return {
-        "initial_memory": model.initial_memory[:size],
-        "next_memory": model.next_memory[:size],
-        "label_on": model.label_on,
-    }
-
-
-def save_arrays(path: Path, arrays: Result) -> None:
-    """Writes arrays as an ``.npz``, atomically."""
-    with atomic_write(path) as file:
-        np.savez(file, allow_pickle=False, **{k: np.asarray(v) for k, v in arrays.items()})
-
-
 def automaton_picture(automaton: Automaton, live: str) -> Picture:
     """The picture of the formula's automaton."""
     return Picture(
@@ -198,4 +181,5 @@ def over_seeds(count: int) -> str:
 
 
 def short_name(text: str, width: int = 44) -> str:
+    """A name truncated to `width` characters."""
     return text if len(text) <= width else text[: width - 1] + "…"

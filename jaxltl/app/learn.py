@@ -8,10 +8,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
+from jaxltl.core.validation import errors_in
 from jaxltl.algos import mlirl
 from jaxltl.algos.common import learner
 from jaxltl.app.protocols import Training
@@ -22,9 +25,10 @@ from jaxltl.app.reports.learn_pictures import (
     task_pictures as task_pictures,
 )
 from jaxltl.app.files.demonstrations import load_demonstrations, synthetic_demonstrations
-from jaxltl.app.files.schema import errors_in
+
 from jaxltl.app.files.task_mlirl import MlirlTask, read_task as read_task
 from jaxltl.app.files.worlds import World, load_world
+from jaxltl.algos.mlirl.constrained import Point, constrained_points
 from jaxltl.app.guarantee import (
     Attempt,
     Guarantee,
@@ -33,35 +37,42 @@ from jaxltl.app.guarantee import (
     check_formula,
     kept,
 )
+from jaxltl.app.practical import StepBound, about_steps, neg_log_likelihood, step_bound
 from jaxltl.app.job import (
     about,
     compile_in_background,
     fingerprint as fingerprint,
-    memory_arrays,
     one_seed,
     plain,
     postfix as postfix,
     run_seeds,
-    save_arrays,
     settings,
     took,
 )
-from jaxltl.core.models.construct.lifting import lift_policy
+from jaxltl.core.models.construct.lifting import lift_policy, project_policy
 from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.models.product import Product, product
 from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.types import Solution, Status
 from jaxltl.core.values.discounted.soft import softmax_policy
-from jaxltl.core.values.undiscounted.mixture import at_starts, from_starts
+from jaxltl.core.values.undiscounted.mixture import at_starts, attained, from_starts
+from jaxltl.core.values.undiscounted.optimal_actions import optimal_actions
 from jaxltl.core.values.undiscounted.satisfaction import (
     optimal_satisfaction,
     satisfaction_probability,
 )
-from jaxltl.core.values.undiscounted.total_reward import hitting_time
 from jaxltl.app.wording import Record, many
 from jaxltl.core.models.protocols import PyTree
+from jaxltl.core.policies.policy_file import save_policy
 
 DOUBLE = True
+
+# Bounds of the search for a required probability, in steps so that it is deterministic: product
+# states times steps that cost about as much as compilation (benchmarks/required_probability.py),
+# and evaluations of likelihood and probability.
+_STATE_STEPS, _EVALUATIONS = 100_000, 120
+_STATIONARY = 1e-3  # relative gradient norm of the Lagrangian at which the search has converged
+_GAP = 1e-6  # of probabilities that are compared
 
 
 # --- the learners ---------------------------------------------------------------------------
@@ -85,7 +96,7 @@ class Learned:
 
 def _features(setup: Setup) -> mlirl.Features:
     """The features of the reward, in the world or in the product (chapter 2)."""
-    table, model, shown = setup.task.learner, setup.model, setup.demonstrations
+    table, model, shown = setup.task.learner, setup.model, setup.used
     avoid = table.avoid or ()
     if table.in_world:
         return mlirl.world_features(
@@ -108,7 +119,7 @@ def _problem(setup: Setup, allowed: np.ndarray | None) -> mlirl.Problem:
     return mlirl.make_problem(
         model.mdp if table.in_world else model,
         features.values,
-        setup.demonstrations,
+        setup.used,
         start=start,
         satisfaction_over=table.satisfaction_over,
         allowed=None if allowed is None else to_jax(allowed),
@@ -116,7 +127,11 @@ def _problem(setup: Setup, allowed: np.ndarray | None) -> mlirl.Problem:
 
 
 def _train(
-    setup: Setup, problem: mlirl.Problem, hparams: mlirl.Hparams, training: Training
+    setup: Setup,
+    problem: mlirl.Problem,
+    hparams: mlirl.Hparams,
+    training: Training,
+    num_steps: int | None = None,
 ) -> Learned:
     """Reward weights and policies of N seeds."""
     table, model = setup.task.learner, setup.model
@@ -126,7 +141,7 @@ def _train(
         problem,
         hparams,
         training,
-        num_steps=table.steps,
+        num_steps=num_steps or table.steps,
         keep="before",
         until=learner.gradient_vanishes(table.tolerance),
     )
@@ -161,43 +176,123 @@ def _with_guarantee(setup: Setup, training: Training) -> tuple[Learned, int, Att
     if isinstance(guarantee.asked, str):
         learned = _train(setup, problem, hparams, training)
         return learned, _least_loss(learned), None
-    # A weight of zero, not None, so that one program serves all weights.
-    hparams = dataclasses.replace(hparams, mu=0.0 if hparams.mu is None else hparams.mu)
-    learned = _train(setup, problem, hparams, training)
+    actions, again = guarantee.actions, Training(training.seed, 1)
+    inside, policy, steps = None, None, setup.task.learner.steps
+    if actions is not None and guarantee.usable:
+        inside = _train(setup, _problem(setup, np.asarray(actions.allowed)), hparams, again)
+        policy = inside.policy[0]
+        # The time without the constraint, and with it, stays in proportion to this.
+        least = int(inside.num_steps[0])
+        steps = min(steps, max(2 * least, _STATE_STEPS // setup.model.num_states))
+    learned = _train(setup, problem, hparams, training, steps)
     free = one_seed(learned, _least_loss(learned))
-    again = Training(training.seed, 1)
-
-    def train(mu: float, before: Learned, problem: mlirl.Problem = problem) -> Learned:
-        weighted = dataclasses.replace(hparams, mu=mu)
-        start = jnp.asarray(before.weights[0], problem.features.dtype)
-        # The likelihood has several maxima: from the last weights, and from the initial ones.
-        found = [
-            _train(
-                setup,
-                dataclasses.replace(problem, start=start),
-                dataclasses.replace(weighted, start_scale=0.0),
-                again,
-            ),
-            _train(setup, problem, weighted, again),
-        ]
-        return found[int(np.argmin([np.nan_to_num(one.loss[0], nan=np.inf) for one in found]))]
-
-    def inside() -> tuple[np.ndarray, Learned]:
-        actions = guarantee.actions
-        if actions is None or not guarantee.usable:
-            return np.asarray(actions.policy if actions else free.policy[0]), free
-        one = train(0.0, free, _problem(setup, np.asarray(actions.allowed)))
-        return one.policy[0], one
-
-    counts = np.asarray(problem.counts)
-    search = Search(setup.model, guarantee, counts, train, lambda one: one.policy[0])
-    found = search.at_least(free, inside)
+    search = Search(
+        setup.model,
+        guarantee,
+        np.asarray(problem.counts),
+        lambda one: one.policy[0],
+        lambda: _constrained(setup, free, hparams, training.seed),
+        lambda one: one if setup.bound is None else setup.bound.keep(setup.model, one).policy,
+    )
+    if policy is None:
+        policy = np.asarray(actions.policy if actions else free.policy[0])
+    found = search.at_least(free, policy, inside or free)
     kept = dataclasses.replace(
         found.learned,
         policy=found.policy[None],
         neg_log_likelihood=np.array([found.neg_log_likelihood]),
     )
     return kept, 0, found
+
+
+def _constrained(
+    setup: Setup, free: Learned, hparams: mlirl.Hparams, seed: int
+) -> list[tuple[Learned, float]]:
+    """The most likely results at and below the required probability, and their weights mu."""
+    guarantee, problem = setup.guarantee, setup.problem
+    required, worst = float(guarantee.asked), guarantee.over == "worst"
+    value = jnp.zeros(setup.model.state_shape, setup.model.dtype)
+
+    def evaluate(parameters: np.ndarray) -> Point:
+        nonlocal value
+        (loss, probability), (gradient, slope), new = _likelihood_and_probability(
+            jnp.asarray(parameters, value.dtype), problem, hparams, value, worst
+        )
+        point = Point(
+            parameters,
+            float(loss),
+            float(probability),
+            np.asarray(gradient),
+            np.asarray(slope),
+            new,
+        )
+        value = new if point.is_finite else value
+        return point
+
+    # The likelihood has several maxima: from the free weights, and from the initial ones.
+    key = jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), 1), 0)
+    starts = [free.weights[0], np.asarray(mlirl.init(key, problem, hparams).parameters)]
+    most = max(_STATE_STEPS // setup.model.num_states, int(free.num_steps[0]) // 2)
+    points = constrained_points(evaluate, starts, required, min(most, _EVALUATIONS))
+    enough = [point for point in points if point.probability > required]
+    # Mixed with optimal actions, each step that is not optimal keeps a share of its probability.
+    allowed = np.asarray(guarantee.actions.allowed) if guarantee.actions else False
+    lost = float(np.asarray(problem.counts)[~allowed].sum())
+    top = max(required, max((point.probability for point in points), default=0))
+
+    def mixed_loss(point: Point) -> float:
+        return point.loss + lost * np.log(max(top + _GAP - point.probability, _GAP))
+
+    chosen = [min(points, key=mixed_loss)] if points else []
+    if enough:
+        chosen = [min(enough, key=lambda point: point.loss)]
+    return [(_learned(point, free, problem, hparams), point.multiplier) for point in chosen]
+
+
+def _learned(
+    point: Point, free: Learned, problem: mlirl.Problem, hparams: mlirl.Hparams
+) -> Learned:
+    """The result at a point of the constrained problem."""
+    parameters = jnp.asarray(point.parameters, point.value.dtype)
+    policy = np.asarray(_softmax_policy(parameters, point.value, problem, hparams))
+    return dataclasses.replace(
+        free,
+        policy=policy[None],
+        weights=point.parameters[None],
+        loss=np.array([point.loss]),
+        gradient_norm=np.array([point.stationarity]),
+        converged=np.array(
+            [point.stationarity <= _STATIONARY * (1 + np.linalg.norm(point.gradient))]
+        ),
+    )
+
+
+@jax.jit
+def _likelihood_and_probability(
+    parameters: jax.Array,
+    problem: mlirl.Problem,
+    hparams: mlirl.Hparams,
+    initial: jax.Array,
+    worst: chex.Numeric,
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Loss and probability ``[2]``, their derivatives ``[2, F]``, and the value."""
+    model = problem.model
+    assert isinstance(model, Product)  # a probability is refused for rewards of the world
+
+    def terms(parameters: jax.Array) -> tuple[jax.Array, jax.Array]:
+        loss, parts = mlirl.objective(parameters, problem, hparams, initial)
+        reward = problem.reward(parameters, problem.features)
+        policy = softmax_policy(model, reward, hparams.discount, parts.value)
+        found = satisfaction_probability(model, policy).value
+        start = jnp.take_along_axis(found, model.initial_memory[:, None], axis=1)[:, 0]
+        weight = model.mdp.initial
+        least = jnp.min(jnp.where(weight > 0, start, jnp.inf))
+        probability = jnp.where(worst, least, jnp.sum(weight * start) / jnp.sum(weight))
+        return jnp.stack([loss, probability]), parts.value
+
+    each, pull, value = jax.vjp(terms, parameters, has_aux=True)
+    # One after the other, so that the linear systems are compiled once.
+    return each, lax.map(lambda x: pull(x)[0], jnp.eye(2, dtype=each.dtype)), value
 
 
 def _least_loss(learned: Learned) -> int:
@@ -254,7 +349,16 @@ class Setup:
     demonstrations: Trajectories
     dropped: int
     guarantee: Guarantee
+    bound: StepBound | None = None  # of the expected steps; None for safety formulas
     trivial: str | None = None  # remark on a formula that is always true
+
+    @property
+    def used(self) -> Trajectories:
+        """The demonstrations until the formula or, by a mistake, the best probability is lost."""
+        length = self.guarantee.used
+        if length is None or self.task.learner.in_world:  # that learner has no formula
+            return self.demonstrations
+        return dataclasses.replace(self.demonstrations, length=to_jax(length.astype(np.int32)))
 
     @functools.cached_property
     def features(self) -> mlirl.Features:
@@ -264,7 +368,10 @@ class Setup:
     @functools.cached_property
     def problem(self) -> mlirl.Problem:
         """The learning problem under the guarantee."""
-        return _problem(self, self.guarantee.allowed)
+        allowed = self.guarantee.allowed
+        if not isinstance(self.guarantee.asked, str):
+            allowed = np.asarray(self.model.available)  # an array, so that one program serves both
+        return _problem(self, allowed)
 
 
 @dataclass
@@ -274,7 +381,7 @@ class Outcome:
     chosen: int  # index of the kept seed, that of least loss
     solution: Solution  # satisfaction probability of the kept policy, with bounds
     attempt: Attempt | None  # how an asked probability was attained, if any
-    # of the learned and the quickest policy; None for formulas without end
+    # of the learned and the quickest policy, and their trade-offs; None for safety formulas
     expected_steps: Record | None
     # float[N, S], satisfaction probability of every seed from initial states
     satisfaction: np.ndarray
@@ -285,6 +392,7 @@ class Outcome:
 
 
 def prepare(task: MlirlTask, seed: int) -> Setup:
+    """The learning problem of a task file: product, demonstrations, guarantee and features."""
     world = load_world(task)
     with errors_in(f"{task.path}: [task] "):
         model = product(world.mdp, task.formula, label_on=task.label_on)
@@ -298,13 +406,16 @@ def prepare(task: MlirlTask, seed: int) -> Setup:
         shown, dropped = synthetic_demonstrations(task.path, table, model, key, best)
     with errors_in(f"{task.path}: [task] "):
         asked = ask(model, world, shown, best, task.guarantee, task.over)
-    setup = Setup(task, world, model, shown, dropped, asked, trivial)
+        actions = asked.actions or optimal_actions(model, best)
+        bound = step_bound(model, actions, asked.asked, task.over, task.steps, task.steps_factor)
+    setup = Setup(task, world, model, shown, dropped, asked, bound, trivial)
     with errors_in(f"{task.path}: [learner] "):
         _ = setup.problem  # raises its errors before learning
     return setup
 
 
 def describe(setup: Setup) -> str:
+    """Sizes of the problem in one line."""
     lengths = np.asarray(setup.demonstrations.length)
     logged = setup.world.logged
     return (
@@ -319,8 +430,18 @@ def learn(setup: Setup, training: Training) -> Outcome:
     model = setup.model
     learned, chosen, attempt = _with_guarantee(setup, training)
     training.stage("checking")
+    learned, steps = _within_steps(setup, learned, chosen)
     policy = learned.policy[chosen]
+    if attempt is not None and steps is not None and steps["share"]:
+        reached = attained(model, policy, setup.guarantee.over)
+        loss = float(learned.neg_log_likelihood[chosen])
+        attempt = dataclasses.replace(
+            attempt, policy=policy, attained=reached, neg_log_likelihood=loss
+        )
     solution = satisfaction_probability(model, policy)
+    if attempt is not None:  # the search certifies with a tolerance, and before mixing
+        lower = at_starts(model, solution.lower, setup.guarantee.over)[0]
+        attempt = dataclasses.replace(attempt, attained=lower)
     each = [
         solution if i == chosen else satisfaction_probability(model, learned.policy[i])
         for i in range(len(learned.policy))
@@ -338,7 +459,7 @@ def learn(setup: Setup, training: Training) -> Outcome:
         chosen=chosen,
         solution=solution,
         attempt=attempt,
-        expected_steps=_expected_steps(setup, policy),
+        expected_steps=steps,
         satisfaction=np.stack([from_starts(model, s.value) for s in each]),
         data=data,
         seed=training.seed,
@@ -346,6 +467,7 @@ def learn(setup: Setup, training: Training) -> Outcome:
 
 
 def summary(outcome: Outcome) -> Record:
+    """The results for ``result.json``."""
     setup, learned, i = outcome.setup, outcome.learned, outcome.chosen
     task, world, model = setup.task, setup.world, setup.model
     starts = np.flatnonzero(np.asarray(model.mdp.initial) > 0)
@@ -400,20 +522,21 @@ def summary(outcome: Outcome) -> Record:
     return plain(result)
 
 
-def _expected_steps(setup: Setup, learned: np.ndarray) -> Record | None:
-    """Expected steps until a co-safe formula is decided: learned and quickest optimal policy."""
-    model, best = setup.model, setup.guarantee.best
-    if not model.automaton.is_cosafe:
-        return None
-    ended = np.asarray(model.final) | (np.asarray(best.upper) <= 0)
-    policies = {"learned": learned, "quickest": best.policy}
-    weight = np.asarray(model.mdp.initial, float)
-    starts = weight > 0
-    with np.errstate(invalid="ignore"):
-        return {
-            name: from_starts(model, hitting_time(model, policy, ended))[starts] @ weight[starts]
-            for name, policy in policies.items()
-        }
+def _within_steps(setup: Setup, learned: Learned, chosen: int) -> tuple[Learned, Record | None]:
+    """The kept policy with its expected steps within the bound, and the report on steps."""
+    model, bound, before = setup.model, setup.bound, learned.policy[chosen]
+    if bound is None:
+        return learned, None
+    counts = np.asarray(setup.problem.counts)
+    if setup.task.learner.in_world:
+        counts = np.zeros_like(before)
+    kept = bound.keep(model, before)
+    steps = about_steps(model, bound, before, kept, counts)
+    if kept.share:
+        policy, loss = learned.policy.copy(), learned.neg_log_likelihood.copy()
+        policy[chosen], loss[chosen] = kept.policy, neg_log_likelihood(kept.policy, counts)
+        learned = dataclasses.replace(learned, policy=policy, neg_log_likelihood=loss)
+    return learned, steps
 
 
 def _evidence(solution: Solution, model: Product, world: World, starts: np.ndarray) -> Record:
@@ -439,25 +562,26 @@ def _evidence(solution: Solution, model: Product, world: World, starts: np.ndarr
 def save(out: Path, outcome: Outcome) -> None:
     """Writes the kept policy to ``policy.npz`` in a directory.
 
-    Its arrays: ``policy [S, Q, A]``; ``initial_memory [S]`` and ``next_memory [S, Q]``, the memory
-    state in the initial state s and after reading the label of s; ``label_on``; ``actions [A]``;
-    ``weights [F]`` and ``features [F]``; ``satisfaction``, ``lower`` and ``upper`` ``[S, Q]``; for
-    a log, the names ``states [S]``.
+    :func:`jaxltl.io.load_policy` reads it. Further arrays: ``weights [F]`` and ``features [F]``,
+    ``all_weights [N, F]``; ``satisfaction``, ``lower`` and ``upper`` ``[S, Q]``.
     """
     model, learned, i = outcome.setup.model, outcome.learned, outcome.chosen
     logged = outcome.setup.world.logged
-    save_arrays(
+    policy = project_policy(
+        model,
+        learned.policy[i],
+        actions=outcome.setup.world.actions,
+        states=() if logged is None else logged.states,
+    )
+    save_policy(
         out / "policy.npz",
+        policy,
         {
-            "policy": learned.policy[i],
-            **memory_arrays(model),
-            "actions": outcome.setup.world.actions,
             "weights": learned.weights[i],
             "features": learned.names,
             "all_weights": learned.weights,
             "satisfaction": outcome.solution.value,
             "lower": outcome.solution.lower,
             "upper": outcome.solution.upper,
-            **({} if logged is None else {"states": logged.states}),
         },
     )

@@ -6,7 +6,6 @@ episodes, have no selection bias.
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,14 +14,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxltl.algos.common.checkpoint import atomic_write, read_arrays
+from jaxltl.core.validation import errors_in
+from jaxltl.core.files import atomic_write
 from jaxltl.app.environment_learners import Method, make_method
 from jaxltl.app.reports.drawing import Picture, drawing
 from jaxltl.app.environment_source import load_environment
 from jaxltl.app.protocols import Training
 from jaxltl.app.reports import learn_environment as report  # noqa: F401 - part of the job
 from jaxltl.app.reports.explorer import Curves, curves
-from jaxltl.app.files.schema import errors_in, read_bytes
 from jaxltl.app.files.task_environment import EnvironmentTask, read_task as read_task
 from jaxltl.app.guarantee import check_formula
 from jaxltl.app.job import (
@@ -32,7 +31,6 @@ from jaxltl.app.job import (
     over_seeds,
     plain,
     run_seeds,
-    save_arrays,
     took,
 )
 from jaxltl.core.types import Status
@@ -40,8 +38,13 @@ from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.environments.environment import Environment, Finite, require_environment
 from jaxltl.core.environments.episodes import Agent, Episode, run_episode
-from jaxltl.core.environments.monitor import Verdict
-from jaxltl.core.environments.task_environment import task_environment
+from jaxltl.core.environments.monitor import Verdict, verdicts
+from jaxltl.core.environments.task_environment import (
+    task_environment,
+    task_tables,
+    with_task_tables,
+)
+from jaxltl.core.environments.task_reward import is_discounted, make_task_reward
 from jaxltl.core.logic.labels import require_known
 from jaxltl.core.values.evaluation.evaluation import (
     ESTIMATES,
@@ -51,6 +54,8 @@ from jaxltl.core.values.evaluation.evaluation import (
     evaluate,
 )
 from jaxltl.app.wording import Record, many
+from jaxltl.core.policies.policy_file import read_policy_file
+from jaxltl.io.network_policy import save_network
 from jaxltl.core.models.protocols import PyTree
 
 DOUBLE = False  # environments are written for single precision
@@ -59,6 +64,8 @@ _DRAWN = 4  # trajectories
 
 @dataclass(frozen=True)
 class Setup:
+    """A task, ready for learning."""
+
     task: EnvironmentTask  # the file
     automaton: Automaton  # of the formula
     environment: Environment  # the world with the task
@@ -69,6 +76,8 @@ class Setup:
 
 @dataclass
 class Outcome:
+    """Learned policies of all seeds and their evaluations."""
+
     setup: Setup  # the task
     states: PyTree  # of the learner, with a first axis of N seeds
     history: Mapping[str, np.ndarray]  # metrics [T, N] and step [T]
@@ -80,6 +89,7 @@ class Outcome:
 
 
 def prepare(task: EnvironmentTask, seed: int, world: Environment | None = None) -> Setup:
+    """The environment with its task and the learner; ValueError for a task that does not fit."""
     del seed
     world = load_environment(task, world)
     with errors_in(f"{task.path}: [task] formula: "):
@@ -94,9 +104,8 @@ def prepare(task: EnvironmentTask, seed: int, world: Environment | None = None) 
         )
     with errors_in(f"{task.path}: [task] formula: "):
         require_known(automaton.propositions, world.propositions, f"{task.formula!r}")
-    reward = {key: value for key, value in task.task.given().items() if key != "formula"}
     with errors_in(f"{task.path}: [task] "):
-        environment = task_environment(world, automaton, **reward)
+        environment = task_environment(world, automaton, **_reward(task, automaton))
     steps = task.evaluation.steps
     if steps is None and world.horizon is None:
         raise ValueError(
@@ -109,7 +118,29 @@ def prepare(task: EnvironmentTask, seed: int, world: Environment | None = None) 
     return Setup(task, automaton, environment, method, num_steps, trivial)
 
 
+def _reward(task: EnvironmentTask, automaton: Automaton) -> Record:
+    """The options of the reward, shaped by default where that changes no optimal policy."""
+    given = {key: value for key, value in task.task.given().items() if key != "formula"}
+    shaping = given.pop("shaping", "auto")
+    own = (
+        getattr(task.settings, "discount", 1.0) or 1.0
+    )  # the learner's; shaping takes it into account
+    if shaping == "auto":
+        shaping = "none"
+        options = {key: value for key, value in given.items() if key != "ending"}
+        plain = make_task_reward(automaton, verdicts(automaton), **options)
+        # Others compare rewards of whole episodes, which keep the potential where they are cut off.
+        if task.learner.method == "ppo" and is_discounted(plain.discount, verdicts(automaton), own):
+            shaping = "distance"
+            if plain.name in ("reach", "keep"):  # with shaping the default would be less than 1
+                given.setdefault("discount", 1.0)
+    if shaping == "none":
+        return given
+    return {**given, "shaping": shaping, "learner_discount": own}
+
+
 def describe(setup: Setup) -> str:
+    """Sizes of the environment, of learning and of the evaluation, as text."""
     task, made = setup.task, setup.environment
     actions = made.actions
     seen = sum(x.size for x in jax.tree.leaves(_shapes(setup)))
@@ -140,6 +171,7 @@ def _num_episodes(task: EnvironmentTask) -> int:
 
 
 def postfix(figures: Mapping[str, np.ndarray]) -> dict[str, str]:
+    """Medians of two metrics over seeds, for the progress bar."""
     names = ("episode_return", "objective", "reward", "cost")
     known = [n for n in names if n in figures and np.isfinite(figures[n]).any()]
     return {n: f"{np.nanmedian(figures[n]):.3g}" for n in known[:2]}
@@ -201,12 +233,20 @@ def _evaluated(key: jax.Array, agent: Agent, setup: Setup, *, threshold: bool) -
     return evaluate(
         key,
         agent,
-        setup.environment,
+        _unshaped(setup.environment),
         num_episodes=_num_episodes(setup.task),
         num_steps=setup.num_steps,
         confidence=asked.confidence,
         discount=asked.discount,
         threshold=asked.threshold if threshold else None,
+    )
+
+
+def _unshaped(environment: Environment) -> Environment:
+    """The environment with the reward of the formula alone."""
+    tables = task_tables(environment)
+    return with_task_tables(
+        environment, replace(tables, potential=np.zeros_like(np.asarray(tables.potential)))
     )
 
 
@@ -225,6 +265,7 @@ def _merit(setup: Setup, found: Evaluation) -> tuple[float, float, float]:
 
 
 def summary(outcome: Outcome) -> Record:
+    """The result as a JSON object."""
     setup, history = outcome.setup, outcome.history
     task, made, kept = setup.task, setup.environment, outcome.evaluations[outcome.chosen]
     last = {name: history[name][-1, outcome.chosen] for name in _drawn(outcome)}
@@ -297,10 +338,12 @@ def _drawn(outcome: Outcome) -> list[str]:
 
 
 def task_pictures(setup: Setup) -> list[Picture]:
+    """Picture of the formula's automaton."""
     return [automaton_picture(setup.automaton, "")]
 
 
 def pictures(outcome: Outcome) -> list[Picture]:
+    """Pictures of learning curves and episodes."""
     history, names = outcome.history, _drawn(outcome)
     found = [
         Picture(
@@ -316,6 +359,7 @@ def pictures(outcome: Outcome) -> list[Picture]:
 
 
 def live(outcome: Outcome) -> list[Curves]:
+    """Interactive learning curves."""
     caption = "Metrics of each step of the learner" + over_seeds(len(outcome.evaluations))
     return [curves("learning", "Learning", caption, outcome.history, _drawn(outcome))]
 
@@ -355,9 +399,12 @@ def save(out: Path, outcome: Outcome) -> None:
 
     one = jax.tree.map(lambda x: x[outcome.chosen], outcome.states)
     task = outcome.setup.task
-    save_arrays(
+    save_network(
         out / "policy.npz",
-        {
+        _acting(outcome.setup, one),
+        outcome.setup.environment,
+        automaton=outcome.setup.automaton,
+        more={
             **dict(_parts(outcome.setup.method, one)),
             "task": task.text,
             "task_file": str(task.path.absolute()),
@@ -378,13 +425,15 @@ def _parts(method: Method, state: PyTree) -> list[tuple[str, PyTree]]:
     return [(jax.tree_util.keystr(path, simple=True, separator="."), x) for path, x in leaves]
 
 
-def load_policy(
+def load_agent(
     policy_file: str | Path,
     *,
     environment: Environment | None = None,
     task_file: str | Path | None = None,
 ) -> tuple[Environment, Agent]:
-    """Policy that ``jaxltl learn`` wrote, and its environment with the formula.
+    """Agent that ``jaxltl learn`` wrote for an environment, and the environment with the formula.
+
+    :func:`jaxltl.io.load_policy` reads the same file without the environment.
 
     The file has the text of its task file, but no code: the function that makes the environment is
     imported, from a package or from the directory of the task file or of the policy. Load only
@@ -394,11 +443,10 @@ def load_policy(
       ValueError: a missing file, or one that is no policy of this task; an invalid task, or
         missing functions.
 
-    Example: ``environment, agent = load_policy("out/policy.npz")``.
+    Example: ``environment, agent = load_agent("out/policy.npz")``.
     """
     policy_file = Path(policy_file)
-    with errors_in(f"{policy_file}: "):
-        arrays = read_arrays(io.BytesIO(read_bytes(policy_file, "the policy")))
+    arrays = read_policy_file(policy_file)
     task = read_task(task_file) if task_file else _kept_task(policy_file, arrays)
     setup = prepare(task, 0, None if environment is None else require_environment(environment))
     method = setup.method

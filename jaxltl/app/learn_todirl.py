@@ -18,9 +18,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxltl.core.validation import errors_in
 from jaxltl.algos import todirl
 from jaxltl.algos.common import learner
-from jaxltl.app.todirl.guarantee import check_attainable, hold, is_weighable, likeliest
+from jaxltl.app.todirl.guarantee import (
+    check_attainable,
+    hold,
+    is_weighable,
+    likeliest,
+    step_bounds,
+    within_steps,
+)
 from jaxltl.app.todirl.summary import summary as summary
 from jaxltl.app.todirl.results import (
     LENGTH,
@@ -46,16 +54,14 @@ from jaxltl.app.files.scenes import (
     load_demonstrations,
     load_scenes,
 )
-from jaxltl.app.files.schema import errors_in
+
 from jaxltl.app.files.task_todirl import TodirlTask, read_task as read_task
 from jaxltl.app.guarantee import check_formula
 from jaxltl.app.job import (
     fingerprint as fingerprint,
-    memory_arrays,
     one_seed,
     postfix as postfix,
     run_seeds,
-    save_arrays,
     settings,
 )
 from jaxltl.core.automata.automaton import Automaton
@@ -65,11 +71,12 @@ from jaxltl.core.models.construct.batch import (
     restrict_stacked_actions,
     stack_products,
 )
-from jaxltl.core.models.construct.lifting import allowed_steps
+from jaxltl.core.models.construct.lifting import allowed_steps, project_policy
 from jaxltl.core.models.construct.restrict import with_allowed
 from jaxltl.core.models.ops.operators import action_mean, expectation
 from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.models.product import Product, product
+from jaxltl.core.policies.policy_file import save_policy
 from jaxltl.core.types import Solution, status_code
 from jaxltl.core.values.discounted.soft import soft_value
 from jaxltl.core.values.undiscounted.optimal_actions import optimal_actions
@@ -93,6 +100,7 @@ _EXPERT_DISCOUNT = 0.99  # largest default
 
 
 def prepare(task: TodirlTask, seed: int) -> Setup:
+    """Worlds, automata and demonstrations of a task; ValueError for one that does not fit."""
     judge, memory = load_automata(task)
     shown = task.demonstrations
     require_cosafe(task.path, shown, judge)
@@ -147,6 +155,8 @@ def prepare(task: TodirlTask, seed: int) -> Setup:
     setup = replace(setup, sure=[optimal_actions(lane) for lane in lanes])
     if setup.is_probability:
         check_attainable(setup)
+    setup = replace(setup, bounds=step_bounds(setup))
+    if setup.is_probability:
         return setup
     return _narrowed(setup)
 
@@ -206,6 +216,7 @@ def _observations(scenes: list[Scene], model: Product) -> jax.Array:
 
 
 def describe(setup: Setup) -> str:
+    """Numbers of worlds, memory states and demonstrations, as text."""
     pairs = sum(int(np.sum(shown.length)) for shown in setup.demonstrations)
     number = sum(len(shown.length) for shown in setup.demonstrations)
     tests = len(setup.worlds.scenes) - setup.num_training
@@ -314,7 +325,7 @@ def _judge(
 ) -> Judged:
     worlds = setup.worlds
     performances, policies, codes = [], [], []
-    held = None
+    held, held_steps = None, dict[str, np.ndarray]()
     for i in range(len(learned.held_out)):
         parameters = part_of(learned.parameters, i)
         if setup.is_probability:
@@ -325,6 +336,13 @@ def _judge(
             policy = jnp.asarray(held.policy)
         else:
             policy, status = _plan(network, parameters, worlds.model, worlds.observation, hparams)
+        if setup.bounds is not None:
+            steps = within_steps(setup, setup.bounds, np.asarray(policy))
+            policy = jnp.asarray(np.stack([one.policy for one in steps]))
+            if i == chosen:
+                times = [one.steps[:3] for one in steps if one.steps is not None]
+                shares = [one.share for one in steps]
+                held_steps = {"steps": np.array(times), "quick_share": np.array(shares)}
         lifted = policy if setup.memory is setup.judge else lift_memory_policy(policy, setup.judge)
         performances.append(_probability(worlds.judged, lifted, hparams.horizon))
         policies.append(policy if i == chosen else None)
@@ -335,6 +353,7 @@ def _judge(
     blind = jnp.broadcast_to(blind, (*expert.shape[:-1], blind.shape[-1]))
     horizon = hparams.horizon
     return Judged(
+        **held_steps,
         policy=np.asarray(policies[chosen]),
         status=np.asarray(codes[chosen]),
         performance={
@@ -444,10 +463,8 @@ def _within(model: Product, policy: jax.Array) -> Performance:
 def save(out: Path, outcome: Outcome) -> None:
     """Writes ``network.npz`` and, for each training world, ``policy_1.npz`` and so on.
 
-    :func:`jaxltl.io.learned_reward.load_reward` reads the network. The arrays of a policy:
-    ``policy [S, Q, A]`` (with a horizon ``[T, S, Q, A]``); ``initial_memory [S]`` and
-    ``next_memory [S, Q]``, the memory state in the initial state s and after reading the label of
-    s; ``label_on``; ``actions [A]``; and the satisfaction probabilities ``satisfaction [S]``.
+    :func:`jaxltl.io.load_reward` reads the network, and :func:`jaxltl.io.load_policy` a policy, whose
+    file also has the satisfaction probabilities ``satisfaction [S]``.
     """
     for pattern in ("policy_*.npz", "training_*.svg", "test_*.svg"):
         for stale in out.glob(pattern):
@@ -455,15 +472,15 @@ def save(out: Path, outcome: Outcome) -> None:
     save_reward(out / "network.npz", learned_reward(outcome))
     worlds = outcome.setup.training
     for w, scene in enumerate(worlds.scenes):
-        model, size = part_of(worlds.model, w), scene.mdp.num_states
-        save_arrays(
+        size = scene.mdp.num_states
+        model = replace(part_of(worlds.model, w), mdp=scene.mdp)
+        model = replace(model, letter=model.letter[:size])
+        policy = outcome.training.policy[w][..., :size, :, :]
+        value = outcome.training.performance["learned"].value[w, :size]
+        save_policy(
             out / f"policy_{w + 1}.npz",
-            {
-                "policy": outcome.training.policy[w][..., :size, :, :],
-                **memory_arrays(model, size),
-                "actions": ACTIONS,
-                "satisfaction": outcome.training.performance["learned"].value[w, :size],
-            },
+            project_policy(model, policy, actions=ACTIONS),
+            {"satisfaction": value},
         )
 
 
@@ -483,4 +500,5 @@ def learned_reward(outcome: Outcome) -> LearnedReward:
         kinds=tuple(kinds),
         guarantee=outcome.setup.asked,
         over=task.over,
+        steps_factor=task.steps_factor,
     )

@@ -22,7 +22,8 @@ from jaxltl.app.files.task_mlirl import WorldTable
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.product import Product, product
 from jaxltl.core.types import Status
-from jaxltl.core.values.undiscounted.mixture import from_starts, safe_mean
+from jaxltl.core.values.engine.state_quantities import safe_mean
+from jaxltl.core.values.undiscounted.mixture import from_starts
 from jaxltl.core.values.undiscounted.satisfaction import satisfaction_probability
 from jaxltl.app.wording import Record
 

@@ -6,10 +6,14 @@ Heavy modules are imported inside functions, so that the command's first line co
 from __future__ import annotations
 
 import contextlib
+import io
 import json
+import os
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,6 +28,8 @@ if TYPE_CHECKING:
     from jaxltl.app.processes import ProcessGroup
     from jaxltl.app.reports.drawing import Artist, Drawing, Picture
 
+_LINE_SECONDS = 10.0  # between lines of progress in a pipe
+
 Drawn = Callable[[], bytes]  # waits for a picture
 
 
@@ -35,6 +41,7 @@ class Request:
     seed: int  # seed, num_seeds: the first seed, and the number of seeds
     num_seeds: int
     mark: str  # the job's fingerprint, which the checkpoint must have
+    again: bool = False  # whether the result of another task is overwritten
 
     @property
     def checkpoint(self) -> Path:
@@ -79,26 +86,87 @@ def finished(out: Path, mark: str) -> Result | None:
 
 
 def make_directory(out: Path) -> Path:
-    try:
+    """The directory of the results, created if it does not exist."""
+    with _writable(out):
         out.mkdir(parents=True, exist_ok=True)
+    return out
+
+
+@contextlib.contextmanager
+def _writable(out: Path) -> Iterator[None]:
+    try:
+        yield
     except OSError as error:
         raise ValueError(
             f"cannot write into {str(out)!r}: {error.strerror}; choose another with --out."
         ) from None
-    return out
+
+
+def claim_directory(out: Path, name: str, content: bytes, again: bool) -> None:
+    """Makes a directory of results with a copy of the file that they are of.
+
+    Raises:
+      ValueError: it cannot be written to, or it has a result of another file and `again` is False.
+    """
+    from jaxltl.core.files import atomic_write
+
+    copy = make_directory(out) / name
+    done = (out / "result.json").exists()
+    if done and not again and not (copy.exists() and copy.read_bytes() == content):
+        raise ValueError(
+            f"{str(out)!r} has the result of another file, or of this one before it was changed; "
+            "choose another directory with --out, or overwrite it with --again."
+        )
+    with atomic_write(copy) as file:
+        file.write(content)
+
+
+@contextlib.contextmanager
+def locked(out: Path) -> Iterator[None]:
+    """Keeps a directory for one process at a time, also if a process is killed.
+
+    Raises:
+      ValueError: another process writes into it.
+    """
+    try:
+        import fcntl
+    except ImportError:  # not a POSIX system
+        yield
+        return
+    path = make_directory(out) / ".lock"
+    with ExitStack() as held:
+        with _writable(out):
+            file = held.enter_context(path.open("w"))
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            mine = path.stat().st_ino == os.fstat(file.fileno()).st_ino
+        except (BlockingIOError, FileNotFoundError):  # locked, or removed by the process before
+            mine = False
+        if not mine:
+            raise ValueError(
+                f"another run writes into {str(out)!r}; wait for its end, or choose another "
+                "directory with --out."
+            )
+        try:
+            yield
+        finally:
+            path.unlink(missing_ok=True)
 
 
 def run_job(job: Job[T, S, O], task: T, request: Request, console: Console) -> Result | None:
     """Runs a job, and returns the contents of ``result.json``; None in all processes but the first."""
     try:
-        return _run(job, task, request, console)
+        with ExitStack() as held:
+            return _run(job, task, request, console, held)
     except KeyboardInterrupt:
         kept = "; the same command goes on from the last checkpoint"
         console.say(f"interrupted{kept if request.checkpoint.exists() else ''}")
         raise SystemExit(130) from None
 
 
-def _run(job: Job[T, S, O], task: T, request: Request, console: Console) -> Result | None:
+def _run(
+    job: Job[T, S, O], task: T, request: Request, console: Console, held: ExitStack
+) -> Result | None:
     from jaxltl.algos.common import checkpoint as files
 
     start = time.perf_counter()
@@ -107,7 +175,7 @@ def _run(job: Job[T, S, O], task: T, request: Request, console: Console) -> Resu
     console.say(job.describe(setup))
     if group.mesh is not None:
         console.say(spread(request.num_seeds, group.num_devices))
-    group.together(lambda: _claim(request.out, task, group))
+    group.together(lambda: _claim(request, task, group, held))
     if group.sees(str(checkpoint), checkpoint.exists()):
         console.say(f"going on from {checkpoint}")
     group.sees(str(request.out), (request.out / "task.toml").exists())
@@ -138,14 +206,11 @@ def _run(job: Job[T, S, O], task: T, request: Request, console: Console) -> Resu
         return _write(job, outcome, request, pictures, begin)
 
 
-def _claim(out: Path, task: LearningTask, group: ProcessGroup) -> None:
-    """Makes the directory of results; before the work, since it may not be writable."""
-    from jaxltl.algos.common.checkpoint import atomic_write
-
+def _claim(request: Request, task: LearningTask, group: ProcessGroup, held: ExitStack) -> None:
+    """Takes the directory of results; before the work, since it may not be writable."""
     if group.is_first:
-        make_directory(out)
-        with atomic_write(out / "task.toml") as file:
-            file.write(task.path.read_bytes())
+        held.enter_context(locked(request.out))
+        claim_directory(request.out, "task.toml", task.path.read_bytes(), request.again)
 
 
 def spread(num_seeds: int, num_devices: int) -> str:
@@ -175,11 +240,28 @@ def _begun(begin: Artist, picture: Picture) -> Drawn:
 
 @contextlib.contextmanager
 def _progress_bar(total: int, *, shown: bool) -> Iterator[tqdm[Any]]:
-    """A progress bar that refreshes its clock each second, also while the work blocks."""
+    """A progress bar that refreshes its clock each second, also while the work blocks.
+
+    Where standard error is no terminal, each stage has a line, and another one each ten seconds.
+    """
     from tqdm import tqdm
 
-    done = threading.Event()
-    with tqdm(total=total, unit="step", leave=False, desc="compiling", disable=not shown) as bar:
+    class Lines(tqdm):
+        stage, since = "", 0.0
+
+        def display(self, msg: str | None = None, pos: int | None = None) -> None:
+            now, stage = time.monotonic(), self.desc.removesuffix(": ")
+            if msg != "" and (stage != self.stage or now - self.since >= _LINE_SECONDS):
+                self.stage, self.since = stage, now
+                steps = f", {self.n} of {self.total} steps" if self.n else ""
+                figures = f", {self.postfix}" if self.postfix else ""
+                print(f"{stage}{steps}{figures}", file=sys.stderr, flush=True)
+
+    terminal, done = sys.stderr.isatty(), threading.Event()
+    file = None if terminal else io.StringIO()
+    with (tqdm if terminal else Lines)(
+        total=total, unit="step", desc="compiling", disable=not shown, leave=False, file=file
+    ) as bar:
 
         def tick() -> None:
             while not done.wait(1):
@@ -201,7 +283,7 @@ def _write(
     pictures: list[tuple[Picture, Drawn]],
     begin: Artist,
 ) -> Result:
-    from jaxltl.algos.common.checkpoint import atomic_write
+    from jaxltl.core.files import atomic_write
 
     out = request.out
     live = [(x, {k: begin(d) for k, d in x.drawings.items()}) for x in job.live(outcome)]

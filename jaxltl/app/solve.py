@@ -146,6 +146,7 @@ def model_entry(model: SparseMDP | IntervalMDP, seconds: float) -> Record:
 
 
 def result_entry(result: Result) -> Record:
+    """Answer to a property, as a JSON object."""
     found = result.answer
     entry: Record = {
         "property": result.query.text,
@@ -210,6 +211,7 @@ def _number(x: Any) -> Any:
 
 
 def text(result: Result) -> str:
+    """Answer to a property, as text."""
     lines = [result.query.text]
     parsed, found = result.query.parsed, result.answer
     if parsed is not None and parsed.name is not None:

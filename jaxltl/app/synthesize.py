@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 import numpy as np
 
+from jaxltl.core.validation import errors_in
 from jaxltl.app.files.game import GameFile, World, automaton_of, load_game, load_objective
-from jaxltl.app.files.schema import errors_in
+
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.environments.monitor import Verdict, make_monitor
 from jaxltl.core.games.objective import GR1, Parity
@@ -60,6 +61,8 @@ class Play:
 
 @dataclass(frozen=True)
 class Synthesis:
+    """A solved game with its strategies and their independent checks."""
+
     file: GameFile  # file, world, nodes: the game
     world: World
     nodes: Nodes

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+import jaxltl as jl
 from jaxltl.cli import main
 from jaxltl.core.models.construct.counts import model_from_counts
 from jaxltl.core.values.evaluation.data_guarantee import learn_guarantee
@@ -61,7 +62,7 @@ def told(printed):
 
 
 def test_what_is_guaranteed_is_printed_and_written(log):
-    out = log.parent / "policy.json"
+    out = log.parent / "policy.npz"
     found = certified_as_seen(log, "--json", "--policy", out)
     assert found.exit_code == 0, found.output
     model, counts = model_from_counts(
@@ -78,11 +79,14 @@ def test_what_is_guaranteed_is_printed_and_written(log):
     printed, limit = told(found.stdout)
     assert expected.bound - 1e-5 < printed <= expected.bound
     assert expected.optimistic <= limit < expected.optimistic + 1e-5
-    table = json.loads(out.read_text())
-    assert table["assumption"] == expected.assumption
-    moves = {(x["state"], x["memory"]): x["action"] for x in table["policy"]}
-    assert moves["hall", table["initial_memory"]] == "left"
-    assert table["letter"]["kitchen"] == ["safe"]
+    with np.load(out) as file:
+        assert json.loads(str(file["result"]))["assumption"] == expected.assumption
+    robot = jl.io.load_policy(out).controller()
+    robot.start("hall")
+    assert robot.policy.actions[robot.act()] == "left"
+    policy = robot.policy
+    letter = policy.automaton.letters[policy.letter[policy.states.index("kitchen")]]
+    assert policy.label_on == "exit" and letter.tolist() == [True]
 
 
 def test_the_other_direction_and_methods(log):
@@ -135,6 +139,8 @@ def test_mistakes(log, more, message):
 
 
 def test_mistakes_in_files(log):
+    missing = run(log, "F safe", "--confidence", 0.9).stderr
+    assert "add --initial STATE. It has the states hall, " in missing
     place = log.parent / "labels.csv"
     place.write_text("state,label\nkitchen,safe\nattic,safe\n")
     assert "line 3" in certified_as_seen(log).stderr
@@ -142,7 +148,6 @@ def test_mistakes_in_files(log):
     assert "safe" in certified_as_seen(log).stderr
     log.write_text("state,action\nhall,left\n")
     assert "next" in certified_as_seen(log).stderr
-    assert "--initial STATE" in run(log, "F safe", "--confidence", 0.9).stderr
 
 
 def test_nothing_is_assumed_of_the_graph_unless_it_is_said(log):

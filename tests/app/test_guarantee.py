@@ -141,7 +141,9 @@ initial = "!r & !y"
 
 [task]
 formula = "{formula}"
+steps_factor = "none"
 guarantee = {asked}
+steps_factor = "none"
 
 [demonstrations]
 file = "shown.json"
@@ -290,7 +292,8 @@ CORRIDOR = (". . r\nb . y", "r . r\nb . y\nr r r")  # here nothing is sure
 
 
 def asking(guarantee):
-    return "[task]", f"[task]\nguarantee = {guarantee}"
+    """Without a bound on the steps, which adds a share of its own."""
+    return "[task]", f'[task]\nsteps_factor = "none"\nguarantee = {guarantee}'
 
 
 def prepared(path):
@@ -337,9 +340,8 @@ def test_a_demonstration_that_only_loses_is_named(write):  # noqa: F811
     with pytest.raises(ValueError, match="demonstration 2: its only step lowers the best prob"):
         prepared(write(shown=shown))
     useless = {"cells": [[1, 2], [1, 3]], "actions": ["right", "up"]}
-    setup = prepared(write(shown={"demonstrations": [useless]}))
-    # Once the task is lost, nothing more can be: the first step alone is left out.
-    assert setup.guarantee.forbidden.tolist() == [[True, False]]
+    with pytest.raises(ValueError, match="demonstration 1: its first step lowers the best prob"):
+        prepared(write(shown={"demonstrations": [useless]}))
     assert prepared(write(asking('"none"'), shown=shown)).guarantee.actions is None
     assert not prepared(write(asking(0.9), shown=shown)).guarantee.usable
 
@@ -439,3 +441,19 @@ def test_a_weight_is_not_both_given_and_sought(write):  # noqa: F811
     path = write(asking(0.5), ("discount = 0.9", "discount = 0.9\nmu = 1"))
     with pytest.raises(ValueError, match=r"leave mu out of \[learner\]"):
         job.read_task(path)
+
+
+@pytest.mark.parametrize("asked", ['"best"', '"none"', "0.5"])
+def test_steps_after_the_formula_is_lost_are_not_used(write, asked):  # noqa: F811
+    """Into r with the second step, and on: only the steps until then count."""
+    shown = {
+        "demonstrations": [
+            {"cells": [[2, 1], [1, 1], [1, 2], [1, 3], [2, 3]], "actions": ["up"] + ["right"] * 2}
+        ]
+    }
+    shown["demonstrations"][0]["actions"] += ["down", "left"]
+    setup = prepared(write(asking(asked), shown=shown))
+    assert setup.guarantee.used.tolist() == [3]
+    assert setup.guarantee.unused(setup.demonstrations).tolist() == [[False] * 3 + [True] * 2]
+    counted = 2 if asked == '"best"' else 3  # the mistake itself is left out by the optimal actions
+    assert np.asarray(setup.problem.counts).sum() == counted

@@ -16,7 +16,7 @@ from tests.app.test_task import write  # noqa: F401
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("optimizer", ["lbfgs", "adam"])
+@pytest.mark.parametrize("optimizer", ["lbfgs", "adam", "lion"])
 def test_the_policy_is_that_of_the_weights(write, optimizer):  # noqa: F811
     """Whether or not the last evaluation was at them, before the first step too."""
     setup = learn.prepare(read_task(write()), 0)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jaxltl as jl
 from jaxltl.app import learn_todirl
 from jaxltl.app.files.scenes import cell_observations, load_automata, load_scenes
 from jaxltl.app.files.task import method_of
@@ -429,6 +430,8 @@ def test_text_maps_files_horizon_and_another_memory(tmp_path):
     with np.load(tmp_path / "out" / "policy_2.npz") as file:
         assert file["policy"].shape == (9, 6, 3, 4)
         np.testing.assert_allclose(file["policy"].sum(axis=-1), 1)
+    policy = jl.io.load_policy(tmp_path / "out" / "policy_2.npz")
+    assert policy.has_horizon and policy.num_states == 6 and len(policy.actions) == 4
     assert {"memory.svg", "training_3.svg", "test_2.svg"} <= {
         path.name for path in (tmp_path / "out").iterdir()
     }

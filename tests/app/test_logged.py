@@ -6,6 +6,7 @@ import json
 import numpy as np
 import pytest
 
+import jaxltl as jl
 from jaxltl.app.files.demonstrations import load_demonstrations
 from jaxltl.app.files.task_mlirl import read_task
 from jaxltl.app.files.worlds import load_world
@@ -229,6 +230,9 @@ def test_what_is_learned_is_told_with_its_guarantee(write, tmp_path):
         assert "by the log's frequencies" in text and "By the transition graph:" not in text
     with np.load(out / "policy.npz") as arrays:
         assert arrays["states"].tolist() == ["dock", "goal", "pit"]
+    robot = jl.io.load_policy(out / "policy.npz").controller()
+    robot.start("dock")
+    assert robot.policy.actions[robot.act()] in ("ramp", "ledge")
     before = read_task(path).digest
     (tmp_path / "log.csv").write_text(LOG.replace("900", "901"))
     assert read_task(path).digest != before

@@ -114,11 +114,11 @@ def test_the_digest_covers_named_files(write):
         ),
         (
             ("discount = 0.9", "discount = 0.9\nlearning_rate = 0.1"),
-            r'learning_rate belongs to optimizer = "adam" or "sgd"; "lbfgs", the default, searches',
+            r'learning_rate belongs to another optimizer, such as "adam"; "lbfgs", the default, searches',
         ),
         (
             ("discount = 0.9", 'discount = 0.9\noptimizer = "lbfgs"\nlearning_rate = 0.1'),
-            r"learning_rate belongs to optimizer",
+            r"learning_rate belongs to another optimizer",
         ),
         (("[task]", "[task]\nguarantee = nan"), r"a probability in \(0, 1\]"),
         (("discount = 0.9", 'discount = 0.9\nin = "world"'), r"lacks goal"),
@@ -129,7 +129,7 @@ def test_the_digest_covers_named_files(write):
         (('formula = "!r U y"', ""), r"\[task\] lacks formula"),
         (("[task]", "[tsk]"), r"has no key 'tsk'; did you mean 'task'\?"),
         (('file = "shown.json"', ""), r"either file"),
-        (("[task]", '[task]\nguarantee = "all"'), r'"best", "none" or a probability in \(0, 1\]'),
+        (("[task]", '[task]\nguarantee = "all"'), r'"best", "none", a probability in \(0, 1\]'),
         (("[task]", "[task]\nguarantee = 0"), r"a probability in \(0, 1\]"),
         (
             ("[task]", '[task]\nover = "worst"'),

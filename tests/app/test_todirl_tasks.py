@@ -17,6 +17,7 @@ from jaxltl.core.models.construct.batch import stack_products
 from jaxltl.core.models.mdp import from_dense
 from jaxltl.core.values.undiscounted.mixture import WINDOW, at_starts
 from jaxltl.core.values.undiscounted.performance import infeasible_starts
+from jaxltl.core.values.undiscounted.satisfaction_steps import quickest_policy, satisfaction_steps
 from jaxltl.io.learned_reward import load_reward, plan_in, save_reward
 from tests.algos.test_guaranteed import evaluate
 from tests.support import replaced
@@ -115,6 +116,27 @@ def test_a_task_without_end_is_learned_and_done_in_worlds_never_seen(write, tmp_
         _, sure = evaluate(model, solution.policy)
         starts = np.flatnonzero(np.asarray(scene.mdp.initial) > 0)
         assert sure[starts, np.asarray(model.initial_memory)[starts]].all()
+
+
+def test_steps_are_within_a_multiple_of_the_least_in_every_world(write, tmp_path):
+    few = ("steps = 40", "steps = 2"), ("[task]", "[task]\nsteps_factor = 1.1")
+    setup = prepared(write(*few, ("\n[test]", '\n[test]\nleave_out = ["map 2"]')))
+    outcome = job.learn(setup, Training(0, 1))
+    assert (outcome.training.quick_share > 0).all()
+    summary = job.summary(outcome)
+    worlds = [x for kind in ("training", "test") for x in summary[kind]["expected_steps"]["worlds"]]
+    policies = [*outcome.training.policy, *outcome.test.policy]
+    for w, (world, policy) in enumerate(zip(worlds, policies, strict=True)):
+        found = satisfaction_steps(part_of(setup.worlds.model, w), policy)
+        assert world["quickest"] is not None or w == 2
+        if w < 2:
+            assert found.value == pytest.approx(world["steps"][0])
+            assert found.upper <= 1.1 * world["quickest"] * (1 + 1e-6)
+    save_reward(tmp_path / "network.npz", job.learned_reward(outcome))
+    scene = setup.worlds.scenes[1]
+    model, solution = plan_in(load_reward(tmp_path / "network.npz"), scene.mdp, scene.observation)
+    quickest = quickest_policy(model).steps.upper
+    assert satisfaction_steps(model, solution.policy).upper <= 1.1 * quickest
 
 
 @pytest.mark.few(1)

@@ -10,7 +10,8 @@ from typing import Any, TypeGuard
 import jax
 import numpy as np
 
-from jaxltl.app.files.schema import errors_in, off_map, read_bytes
+from jaxltl.core.validation import errors_in
+from jaxltl.app.files.schema import off_map, read_bytes
 from jaxltl.app.files.task import SyntheticTable
 from jaxltl.app.files.task_mlirl import MlirlTask
 from jaxltl.app.files.worlds import World

@@ -13,6 +13,7 @@ from typing import Annotated as Key
 
 import numpy as np
 
+from jaxltl.core.validation import errors_in
 from jaxltl.app.files import schema
 from jaxltl.app.files.models import read_padded
 from jaxltl.app.files.schema import (
@@ -23,7 +24,6 @@ from jaxltl.app.files.schema import (
     Table,
     Text,
     Unit,
-    errors_in,
     off_map,
     read_map,
     Meta,
@@ -53,16 +53,16 @@ Formulas = Annotated[
 class GameTable(Table):
     """``[game]``: two robots on a map, or a model file."""
 
-    map: Key[Map | None, "Rows of a text map, or the file that has them."] = None
+    map: Key[Map | None, "Rows of a text map, or the file that has them; default none."] = None
     legend: Key[Legend | None, "Propositions of each kind of cell; default the kind itself."] = None
-    wall: Key[Text | None, "Kind of cell that cannot be entered; default #."] = None
-    slip: Key[Unit | None, "Probability that a move fails."] = None
-    system_start: Key[Start | None, "Initial cells of the system's robot."] = None
-    environment_start: Key[Start | None, "Initial cells of the environment's robot."] = None
-    system_stays: Key[bool | None, "Whether the system's robot may stay."] = None
-    environment_stays: Key[bool | None, "Whether the environment's robot may stay."] = None
-    model: Key[Text | None, "Model file of a game."] = None
-    initial: Key[Text | None, "Formula of a model's initial states."] = None
+    wall: Key[Text | None, "Kind of cell that cannot be entered; default #.", '"x"'] = None
+    slip: Key[Unit | None, "Probability of slipping to either side; default 0."] = None
+    system_start: Key[Start | None, "Initial cells of the system; default all.", "[1, 4]"] = None
+    environment_start: Key[Start | None, "Initial cells of the other; default all.", '"b"'] = None
+    system_stays: Key[bool | None, "True if the system may stay; default true.", "false"] = None
+    environment_stays: Key[bool | None, "True if the other may stay; default false."] = None
+    model: Key[Text | None, "Model file of a game; default none.", '"game.pg"'] = None
+    initial: Key[Text | None, "Formula of initial states; default the model's.", '"start"'] = None
 
     def __attrs_post_init__(self) -> None:
         self.require_one(("map", "model"), "a map or a model (a file)")
@@ -77,11 +77,11 @@ class GameTable(Table):
 class TaskTable(Table):
     """``[task]``: the objective of the system."""
 
-    formula: Key[Text | None, "Formula of linear temporal logic."] = None
-    assumptions: Key[Formulas | None, "Assumed to hold infinitely often (GR(1))."] = None
-    guarantees: Key[Formulas | None, "To hold infinitely often (GR(1))."] = None
-    safe: Key[Text | None, "To hold always."] = None
-    parity: Key[Literal["model"] | None, "Parity condition of the model's file."] = None
+    formula: Key[Text | None, "Temporal-logic formula; default none.", '"G !collision"'] = None
+    assumptions: Key[Formulas | None, "Assumed infinitely often (GR(1)); default none."] = None
+    guarantees: Key[Formulas | None, "Required infinitely often (GR(1)); default none."] = None
+    safe: Key[Text | None, "Formula that must hold always; default none.", '"!collision"'] = None
+    parity: Key[Literal["model"] | None, "Condition of a parity game's file; default none."] = None
     chance: Key[
         Literal["random", "adversarial"], "Random moves: by probability, or by the environment."
     ] = "random"
@@ -118,11 +118,13 @@ class StrategyTable(Table):
     method: Key[
         Literal["auto", "stay", "rank", "counter", "parity"], "Method of permissive strategies."
     ] = "auto"
-    bound: Key[Count | None, "Bound of the counters of that method."] = None
+    bound: Key[Count | None, "Bound of counter (required) and parity; default none.", "6"] = None
 
 
 @table
 class GameFileSchema(File):
+    """Tables of a game file."""
+
     KIND: ClassVar[str] = "the game file"
     game: Key[GameTable, "The game."]
     task: Key[TaskTable, "The objective of the system."]
@@ -131,6 +133,8 @@ class GameFileSchema(File):
 
 @dataclass(frozen=True)
 class GameFile:
+    """A checked game file."""
+
     path: Path  # the file; `name` is its stem, unless the file gives one
     name: str
     game: GameTable  # game, task, strategy: the tables
@@ -176,6 +180,7 @@ class World:
 
 
 def read_game(path: str | Path) -> GameFile:
+    """Checked contents of a game file; ValueError names the key and the fix."""
     path = Path(path)
     data, _ = schema.read_toml(path, GameFileSchema.KIND)
     file = schema.convert(path, GameFileSchema, data)

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxltl.app.files.schema import errors_in, read_bytes
+from jaxltl.core.validation import errors_in
+from jaxltl.app.files.schema import read_bytes
 from jaxltl.core.games.objective import Parity
 from jaxltl.core.models.construct.padded import row_actions, to_padded
 from jaxltl.core.models.game import Game

@@ -9,8 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxltl.core.validation import errors_in
 from jaxltl.app.files.demonstrations import read_demonstrations
-from jaxltl.app.files.schema import errors_in, read_map
+from jaxltl.app.files.schema import read_map
 from jaxltl.app.files.task_todirl import TodirlTask, WorldTable, map_file
 from jaxltl.app.files.worlds import World, grid_options
 from jaxltl.app.wording import where

@@ -1,7 +1,8 @@
 """Schemas of TOML files, and errors that name the file, table, key, value and fix.
 
 A table is a :class:`Table`: each key has a type with a title that states the requirement on
-values, one line of help and a default. ``None`` stands for a key that a file leaves out.
+values, one line of help and a default. ``None`` stands for a key that a file leaves out; then the
+help ends in "; default" and what holds without the key. A second text is an example, in TOML.
 """
 
 from __future__ import annotations
@@ -32,15 +33,18 @@ from typing import Annotated as Key
 
 import attrs
 
+from jaxltl.core.validation import errors_in
+
 _Table = TypeVar("_Table", bound="Table")
 LARGEST_INT = 2**31 - 1  # int32 of compiled loops
 
 
 class Meta(NamedTuple):
-    """Requirement on a value beyond its type: in words, and as a predicate."""
+    """Requirement on a value beyond its type: in words, as a predicate, and an example in TOML."""
 
     title: str
     holds: Callable[[Any], bool] = lambda value: True
+    example: str = ""  # default the one in the title, after "such as"
 
 
 def _in(low: float, high: float = math.inf) -> Callable[[Any], bool]:
@@ -48,13 +52,13 @@ def _in(low: float, high: float = math.inf) -> Callable[[Any], bool]:
 
 
 Count = Annotated[
-    int, Meta(f"a whole number of at least 1 and at most {LARGEST_INT}", _in(1, LARGEST_INT))
+    int, Meta(f"a whole number of at least 1 and at most {LARGEST_INT}", _in(1, LARGEST_INT), "100")
 ]
-WholeNumber = Annotated[int, Meta("a whole number of at least 0", _in(0, LARGEST_INT))]
-Number = Annotated[float, Meta("a finite number")]
-NonNegative = Annotated[float, Meta("a finite number of at least 0", _in(0))]
-Unit = Annotated[float, Meta("a finite number in [0, 1]", _in(0, 1))]
-Discount = Annotated[float, Meta("a finite number in [0, 1)", lambda v: 0 <= v < 1)]
+WholeNumber = Annotated[int, Meta("a whole number of at least 0", _in(0, LARGEST_INT), "5")]
+Number = Annotated[float, Meta("a finite number", example="1.5")]
+NonNegative = Annotated[float, Meta("a finite number of at least 0", _in(0), "0.01")]
+Unit = Annotated[float, Meta("a finite number in [0, 1]", _in(0, 1), "0.1")]
+Discount = Annotated[float, Meta("a finite number in [0, 1)", lambda v: 0 <= v < 1, "0.95")]
 Confidence = Annotated[float, Meta("a number between 0 and 1, such as 0.95", lambda v: 0 < v < 1)]
 LeastProbability = Annotated[float, Meta("a number above 0 and at most 1", lambda v: 0 < v <= 1)]
 Text = Annotated[str, Meta("a text", lambda v: bool(v.strip()))]
@@ -67,13 +71,14 @@ Name = Annotated[
     ),
 ]
 Propositions = Annotated[list[str], Meta('a list of propositions, such as ["r"]')]
-StateNames = Annotated[list[str], Meta("a list of names of states", bool)]
+StateNames = Annotated[list[str], Meta("a list of names of states", bool, '["pit"]')]
 Widths = Annotated[list[Count], Meta("a list of the widths of the hidden layers, such as [64, 64]")]
 Map = Annotated[
     Text | dict[str, str],
     Meta(
         'the rows as a text, or { file = "map.txt" }',
         lambda v: isinstance(v, str) or v.keys() == {"file"},
+        '{ file = "map.txt" }',
     ),
 ]
 Legend = Annotated[
@@ -129,15 +134,9 @@ class File(Table):
     """The tables of a file; a field that is a :class:`Table` is a table, others are keys."""
 
     KIND: ClassVar[str] = "the file"  # begins the error if it cannot be read
-    name: Key[Name | None, "Name of the results' folder; default the file's own name."] = None
-
-
-@contextlib.contextmanager
-def errors_in(place: str) -> Iterator[None]:
-    try:
-        yield
-    except ValueError as error:
-        raise ValueError(f"{place}{error}") from None
+    name: Key[
+        Name | None, "Name of the results' folder; default the file's own name.", '"two goals"'
+    ] = None
 
 
 # --- reading --------------------------------------------------------------------------------
@@ -278,12 +277,13 @@ def requirement(kind: Any) -> str:
 
 
 class KeyHelp(NamedTuple):
-    """Entry of a key in the reference: name, requirement on values, default, help."""
+    """Entry of a key in the reference: name, requirement on values, default, help, an example."""
 
     name: str
     requirement: str
     default: Any
     help: str
+    example: str
 
 
 def keys_of(schema: type[Table]) -> list[KeyHelp]:
@@ -296,15 +296,27 @@ def keys_of(schema: type[Table]) -> list[KeyHelp]:
       >>> keys_of(Training)[0].default, keys_of(Training)[0].help
       (500, 'Largest number of steps.')
     """
-    return [
-        KeyHelp(
-            key_name(field),
-            requirement(field.type),
-            _default(field.default),
-            next((x for x in getattr(field.type, "__metadata__", ()) if isinstance(x, str)), ""),
-        )
-        for field in _fields(schema)
-    ]
+    entries = []
+    for field in _fields(schema):
+        kind, default = field.type, _default(field.default)
+        texts = [x for x in getattr(kind, "__metadata__", ()) if isinstance(x, str)] or [""]
+        about, example = [*texts, _example(kind, default)][:2]
+        entries.append(KeyHelp(key_name(field), requirement(kind), default, about, example))
+    return entries
+
+
+def _example(kind: Any, default: Any) -> str:
+    """Example of a type: of its requirement, or an option that is not the default."""
+    for part in _parts(kind):
+        for meta in getattr(part, "__metadata__", ()):
+            if isinstance(meta, Meta) and (meta.example or "such as " in meta.title):
+                return meta.example or meta.title.partition("such as ")[2].partition(", with")[0]
+        if get_origin(part) is Literal:
+            options = get_args(part)
+            return f'"{next((x for x in options if x != default), options[0])}"'
+        if part is bool:
+            return "true"
+    return ""
 
 
 def _default(default: Any) -> Any:

@@ -24,10 +24,50 @@ from jaxltl.app.files.schema import (
 )
 from jaxltl.app.wording import Record
 
+_STEPS_FACTOR = 2.0  # multiple of the least expected steps that leaves room for the demonstrations
+
 Probability = Annotated[float, Meta("a probability in (0, 1]", lambda v: 0 < v <= 1)]
+
+
+def _is_guarantee(value: str | float | dict[str, float]) -> bool:
+    if not isinstance(value, dict):
+        return True
+    return (
+        value.keys() == {"probability", "steps"}
+        and 0 < value["probability"] <= 1
+        and value["steps"] > 0
+    )
+
+
 GuaranteeKey = Annotated[
-    Literal["best", "none"] | Probability,
-    Meta('"best", "none" or a probability in (0, 1]'),
+    Literal["best", "none"] | Probability | dict[str, float],
+    Meta(
+        '"best", "none", a probability in (0, 1], or a probability and a number of steps, '
+        "{ probability = 0.9, steps = 60 }",
+        _is_guarantee,
+    ),
+]
+StepsFactor = Annotated[
+    Literal["none"] | float,
+    Meta('a number of at least 1, or "none"', lambda v: v == "none" or v >= 1, "1.5"),
+]
+
+
+def _is_optimizer(name: str) -> bool:
+    if name in ("lbfgs", "adam", "sgd"):
+        return True
+    from jaxltl.algos.common.optimizers import NAMES  # optax takes a second to import
+
+    return name in NAMES
+
+
+Optimizer = Annotated[
+    str,
+    Meta(
+        '"lbfgs", or the name of an optimizer of optax that needs a learning rate alone, '
+        'such as "adamw"',
+        _is_optimizer,
+    ),
 ]
 
 
@@ -36,27 +76,36 @@ class GridTable(Table):
     """Keys of ``[world]`` about text maps."""
 
     legend: Key[Legend | None, "Propositions of each kind of cell; default the kind itself."] = None
-    wall: Key[Text | None, "Kind of cell that cannot be entered; default #."] = None
+    wall: Key[Text | None, "Kind of cell that cannot be entered; default #.", '"x"'] = None
     slip: Key[Unit | None, "Probability of slipping to either side; default 0."] = None
-    absorbing: Key[Propositions | None, "No move leaves a cell where one of them holds."] = None
+    absorbing: Key[Propositions | None, "Propositions of absorbing cells; default none."] = None
 
 
 @table
 class TaskTable(Table):
     """``[task]``: the formula, and the guarantee."""
 
-    formula: Key[Text, "Formula of linear temporal logic."]
+    formula: Key[Text, "Formula of linear temporal logic.", '"!r U (g & F y)"']
     label_on: Key[
         Literal["entry", "exit"] | None,
-        "Label read by a step: of the state entered, or of the state left.",
+        "Label read by a step: of the state entered (default with mlirl) or left (with todirl); "
+        "default by the method.",
     ] = None
     guarantee: Key[
         GuaranteeKey | None,
-        "Satisfaction probability to certify: the best one, a given one, or none.",
+        "Satisfaction probability to certify; default best, and none if the learner does not see "
+        "the formula.",
+        "0.9",
+    ] = None
+    steps_factor: Key[
+        StepsFactor | None,
+        "Bound on the expected steps to satisfaction, as a multiple of the quickest optimal "
+        "policy's; default 2, and none where guarantee has steps or is none.",
     ] = None
     over: Key[
         Literal["mean", "worst"] | None,
-        "Initial states of a given probability: their mean (default), or the worst.",
+        "Initial states of a given probability: their mean, or the worst; default mean.",
+        '"worst"',
     ] = None
 
 
@@ -64,12 +113,12 @@ class TaskTable(Table):
 class SyntheticTable(Table):
     """Keys of ``[demonstrations]`` about simulated demonstrations."""
 
-    synthetic: Key[Count | None, "Number of simulated demonstrations."] = None
+    synthetic: Key[Count | None, "Number of simulated demonstrations; default none."] = None
     discount: Key[
         Discount | None,
         "Discount of a simulated demonstrator's reward; default the quickest optimal policy.",
     ] = None
-    length: Key[Count | None, "Longest simulated demonstration."] = None
+    length: Key[Count | None, "Longest simulated demonstration; default 200."] = None
 
 
 @table
@@ -86,6 +135,8 @@ class OptimizerTable(Table):
 
 @table
 class TaskFile(File):
+    """Tables common to task files of learning from demonstrations."""
+
     KIND: ClassVar[str] = "the task file"
     task: Key[TaskTable, "The formula, and the guarantee."]
 
@@ -100,14 +151,19 @@ class Task:
     label_on: str  # which label a step of the product reads, "entry" or "exit"
     guarantee: str | float  # "best", "none" or a probability to certify
     over: str  # initial states of a probability to certify, "mean" or "worst"
+    steps: float | None  # bound on the expected steps to satisfaction, or
+    steps_factor: float | None  # as a multiple of the quickest optimal policy's
     digest: str  # SHA-256 of the file and of every file that it names
 
 
 def common_fields(
     path: Path, file: TaskFile, hidden: str | None, digest: str, label_on: str
 ) -> Record:
+    """Fields of :class:`Task`, checked; `hidden` is a key that hides the formula from the learner."""
     task = file.task
-    guarantee = task.guarantee or ("none" if hidden else "best")
+    asked = task.guarantee or ("none" if hidden else "best")
+    guarantee = asked["probability"] if isinstance(asked, dict) else asked
+    steps = asked["steps"] if isinstance(asked, dict) else None
     where = f"{path}: [task]"
     if hidden and guarantee != "none":
         raise ValueError(
@@ -116,6 +172,12 @@ def common_fields(
         )
     if task.over is not None and isinstance(guarantee, str):
         raise ValueError(f"{where} over belongs to a guarantee that is a probability.")
+    factor = task.steps_factor
+    if factor not in (None, "none") and (steps is not None or guarantee == "none"):
+        other = 'none, with guarantee = "none"' if steps is None else "steps in guarantee"
+        raise ValueError(
+            f"{where} steps_factor = {factor:g} bounds the steps, but there is {other}."
+        )
     return {
         "path": path,
         "name": file.name or path.stem,
@@ -123,6 +185,8 @@ def common_fields(
         "label_on": task.label_on or label_on,
         "guarantee": guarantee,
         "over": task.over or "mean",
+        "steps": steps,
+        "steps_factor": None if factor == "none" or steps else float(factor or _STEPS_FACTOR),
         "digest": digest,
     }
 

@@ -7,7 +7,6 @@ for its hyperparameters, and ``[evaluation]``; ``examples/flat_world.toml`` show
 from __future__ import annotations
 
 import dataclasses
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -35,7 +34,7 @@ from jaxltl.app.wording import Record
 
 Schedule = Annotated[
     NonNegative | tuple[NonNegative, NonNegative],
-    Meta("a number of at least 0, or [first, last], linear over all steps"),
+    Meta("a number of at least 0, or [first, last], linear over all steps", example="[0.5, 0.1]"),
 ]
 Labels = Annotated[list[str], Meta('a list of names, such as ["goal"]')]
 Score = Literal[
@@ -56,11 +55,15 @@ Score = Literal[
 class WorldTable(Table):
     """``[world]``: the environment."""
 
-    environment: Key[Text, "Name of an environment, or of the function that makes one."]
-    arguments: Key[Record, "Arguments of that function."] = attrs.field(factory=dict)
-    labels: Key[Text | None, "Function of the labels of an observation."] = None
-    propositions: Key[Labels | None, "Names of the labels."] = None
-    horizon: Key[Count | None, "Steps after which an episode is truncated."] = None
+    environment: Key[Text, "Environment, or function that makes one.", '"brax:ant"']
+    arguments: Key[Record, "Arguments of the function.", "{ horizon = 120 }"] = attrs.field(
+        factory=dict
+    )
+    labels: Key[
+        Text | None, "Function of labels; default the environment's.", '"cart.py:labels"'
+    ] = None
+    propositions: Key[Labels | None, "Names of the labels; default the environment's."] = None
+    horizon: Key[Count | None, "Longest episode in steps; default the environment's."] = None
 
     def __attrs_post_init__(self) -> None:
         if (self.labels is None) != (self.propositions is None):
@@ -79,16 +82,28 @@ class WorldTable(Table):
 class TaskTable(Table):
     """``[task]``: the formula and its reward; see ``jaxltl.task_environment``."""
 
-    formula: Key[Text, "Formula of linear temporal logic."]
+    formula: Key[Text, "Formula of linear temporal logic.", '"G !out & F goal"']
     reward: Key[
         Literal["auto", "reach", "keep", "eventual", "two-discount", "parity"] | None,
-        "Reward of the formula.",
+        "Reward of the formula; default auto.",
+        '"reach"',
     ] = None
-    discount: Key[Unit | None, "Discount of the reward."] = None
-    ratio: Key[Unit | None, "Ratio of the rewards of successive priorities."] = None
-    shaping: Key[Literal["distance"] | None, "Potential-based shaping of the reward."] = None
+    discount: Key[
+        Unit | None,
+        "Discount of steps; default 1 for reach and keep without shaping, else 0.99.",
+        "0.98",
+    ] = None
+    ratio: Key[Unit | None, "Ratio of successive rewards; default 1 minus the discount."] = None
+    shaping: Key[
+        Literal["auto", "distance", "none"] | None,
+        "Potential-based shaping of the reward, auto for distance with ppo where all steps are "
+        "discounted, so that it changes no optimal policy; default auto.",
+        '"distance"',
+    ] = None
     ending: Key[
-        Literal["repeat", "violated", "undecided"] | None, "Verdict where the world ends."
+        Literal["repeat", "violated", "undecided"] | None,
+        "Verdict where the world ends; default repeat, of its last label.",
+        '"violated"',
     ] = None
 
 
@@ -101,13 +116,11 @@ class LearnerTable(Table):
 
 
 def hparams_table(hparams: type[Any], *omit: str) -> Any:
-    """A base class with the declared hyperparameters of a learner; default the learner's."""
-    texts = re.findall(r"^ {6}(\w+): ([^;.]+)", hparams.__doc__ or "", re.MULTILINE)
+    """A base class with the declared hyperparameters of a learner, documented and defaulted there."""
     fields = {}
     for field in dataclasses.fields(hparams):
         if "valid" in field.metadata and field.name not in omit:
-            kind: Any = Key[_type_of(field) | None, dict(texts).get(field.name, "")]
-            fields[field.name] = attrs.field(default=None, type=kind)
+            fields[field.name] = attrs.field(default=None, type=_type_of(field) | None)
     return attrs.make_class(
         "HparamsTable", fields, bases=(Table,), frozen=True, kw_only=True, slots=False
     )
@@ -115,30 +128,35 @@ def hparams_table(hparams: type[Any], *omit: str) -> Any:
 
 def _type_of(field: dataclasses.Field[Any]) -> Any:
     """The type of a hyperparameter in a file, from its declared valid values."""
-    valid = field.metadata["valid"]
+    valid, first = field.metadata["valid"], field.default
     values = valid.values
     if values is bool:
         return bool
     if isinstance(values, tuple):
         return Literal[values]
     if values.integer:
-        whole = Annotated[int, Meta(str(values), values.contains)]
+        whole = Annotated[
+            int, Meta(str(values), values.contains, "16" if first is None else str(first))
+        ]
         return Widths if "tuple" in str(field.type) else whole
-    number = Annotated[float, Meta(f"a number, {values}", values.contains)]
+    example = "0.05" if first is None else str(first)
+    number = Annotated[float, Meta(f"a number, {values}", values.contains, example)]
     if not valid.may_be_schedule:
         return number
     title = f"a number, {values}; or [first, last], linear over all steps"
-    return Annotated[number | tuple[number, number], Meta(title)]
+    return Annotated[number | tuple[number, number], Meta(title, example=f"[{example}, 0]")]
 
 
 @table
 class PpoTable(hparams_table(ppo.Hparams)):  # type: ignore[misc]
     """``[ppo]``: hyperparameters, and the networks."""
 
-    discount: Key[Unit, "Discount of rewards."] = 1.0
-    hidden: Key[Widths | None, "Widths of the networks' hidden layers."] = None
-    activation: Key[Literal["tanh", "relu", "gelu", "silu"] | None, "Activation."] = None
-    initial_deviation: Key[NonNegative | None, "Initial deviation of Gaussian actions."] = None
+    discount: Key[Unit, "Discount of rewards.", "0.99"] = 1.0
+    hidden: Key[Widths | None, "Widths of the networks' hidden layers; default [64, 64]."] = None
+    activation: Key[Literal["tanh", "relu", "gelu", "silu"] | None, "Activation; default tanh."] = (
+        None
+    )
+    initial_deviation: Key[NonNegative | None, "Deviation of Gaussian actions; default 1."] = None
 
 
 @table
@@ -154,8 +172,8 @@ class CceTable(hparams_table(cce.Hparams, "sample_share", "num_samples")):  # ty
     activation: Key[Literal["tanh", "relu"], "Activation of the network."] = "tanh"
     deviation: Key[NonNegative, "Initial deviation of the network's parameters."] = 1.0
     objective: Key[Score, "Score that is maximised."] = "reward"
-    cost: Key[Score | None, "Score that is constrained."] = None
-    limit: Key[Number | None, "Upper bound of the cost."] = None
+    cost: Key[Score | None, "Score that limit bounds; default none.", '"failure"'] = None
+    limit: Key[Number | None, "Upper bound of the cost; default none.", "0.1"] = None
     episodes: Key[Count, "Episodes by which a sample is scored."] = 10
 
     def __attrs_post_init__(self) -> None:
@@ -171,8 +189,8 @@ class CceTable(hparams_table(cce.Hparams, "sample_share", "num_samples")):  # ty
 class CpoTable(hparams_table(trust_region.Hparams, "method", "penalty")):  # type: ignore[misc]
     """``[cpo]``: hyperparameters, and the cost."""
 
-    discount: Key[Unit, "Discount of rewards."] = 1.0
-    limit: Key[Number | None, "Upper bound of the expected cost of an episode; required."] = None
+    discount: Key[Unit, "Discount of rewards.", "0.99"] = 1.0
+    limit: Key[Number | None, "Upper bound of the expected cost; default required.", "0.1"] = None
     cost: Key[
         Literal["world", "violation"], "Cost: the world's, or 1 where the formula is violated."
     ] = "world"
@@ -186,17 +204,21 @@ class EvaluationTable(Table):
     """``[evaluation]``: fresh episodes."""
 
     episodes: Key[Count, "Number of episodes."] = 1000
-    steps: Key[Count | None, "Steps after which an episode is cut off."] = None
+    steps: Key[Count | None, "Steps after which an episode is cut off; default the horizon."] = None
     confidence: Key[Confidence, "Confidence of each interval."] = 0.95
-    threshold: Key[Confidence | None, "Success probability to test for."] = None
-    discount: Key[Confidence | None, "Discount of the estimated discounted sums."] = None
+    threshold: Key[Confidence | None, "Success probability to test for; default none."] = None
+    discount: Key[Confidence | None, "Discount of the discounted scores; default none."] = None
     policy: Key[
-        Literal["drawn", "likeliest"] | None, "Actions: drawn (default), or the likeliest ones."
+        Literal["drawn", "likeliest"] | None,
+        "Actions: drawn, or the likeliest ones; default drawn.",
+        '"likeliest"',
     ] = None
 
 
 @table
 class EnvironmentFile(File):
+    """Tables of a task file of a simulated world."""
+
     KIND: ClassVar[str] = "the task file"
     world: Key[WorldTable, "The environment."]
     task: Key[TaskTable, "The formula and its reward."]
@@ -209,6 +231,8 @@ class EnvironmentFile(File):
 
 @dataclass(frozen=True)
 class EnvironmentTask:
+    """A checked task file of a simulated world."""
+
     path: Path  # the file; `name` is its stem, unless the file gives one
     name: str
     world: WorldTable  # world, task, learner, evaluation: the tables
@@ -226,6 +250,7 @@ class EnvironmentTask:
 
 
 def read_task(path: str | Path, raw: bytes | None = None) -> EnvironmentTask:
+    """Checked contents of a task file; ValueError names the key and the fix."""
     path = Path(path)
     data, found = schema.read_toml(path, EnvironmentFile.KIND, raw)
     file = schema.convert(path, EnvironmentFile, data)

@@ -29,6 +29,7 @@ from jaxltl.app.files.schema import (
 )
 from jaxltl.app.files.task import (
     GridTable,
+    Optimizer,
     OptimizerTable,
     SyntheticTable,
     Task,
@@ -44,28 +45,34 @@ Progress = Annotated[
     list[str | int],
     Meta("a list of propositions (in the world) or of automaton states (in the product)"),
 ]
-Start = Annotated[list[Number], Meta("a list of finite numbers, one per feature")]
+Start = Annotated[list[Number], Meta("a list of finite numbers, one per feature", example="[0.5]")]
 
 
 @table
 class WorldTable(GridTable):
     """``[world]``: a map, a model file, or a log of transitions."""
 
-    map: Key[Map | None, "Rows of a text map, or the file that has them."] = None
-    model: Key[Text | None, "Model file."] = None
-    transitions: Key[Text | None, "Log of transitions, from which the model is estimated."] = None
+    map: Key[Map | None, "Rows of a text map, or the file that has them; default none."] = None
+    model: Key[Text | None, "Model file; default none.", '"model.umb"'] = None
+    transitions: Key[Text | None, "Log of transitions; default none.", '"log.csv"'] = None
     initial: Key[
-        Initial | None, "Formula of the initial states; of a log, the names of these states."
+        Initial | None,
+        "Formula of the initial states, or their names in a log; default all, or the model's.",
+        '"s"',
     ] = None
-    confidence: Key[Confidence | None, "Of the guarantee that a log gives."] = None
-    labels: Key[Text | None, "Table of the states' labels, for a log."] = None
-    terminal: Key[StateNames | None, "States of a log where episodes end."] = None
+    confidence: Key[Confidence | None, "Confidence of a log, which requires it; default none."] = (
+        None
+    )
+    labels: Key[Text | None, "Table of a log's labels; default none.", '"labels.csv"'] = None
+    terminal: Key[StateNames | None, "States of a log where episodes end; default none."] = None
     graph: Key[
         Literal["seen", "complete"] | None,
-        "Assumption on the possible transitions of a log: those in the log, or all.",
+        "Possible transitions of a log: those in the log, or all; default none.",
     ] = None
     least_probability: Key[
-        LeastProbability | None, "Assume that no possible transition of a log is less likely."
+        LeastProbability | None,
+        "Assumed lower bound of a log's probabilities; default none.",
+        "0.01",
     ] = None
     method: Key[
         Literal["anytime", "clopper-pearson", "hoeffding", "weissman"] | None,
@@ -102,7 +109,7 @@ class WorldTable(GridTable):
 class DemonstrationsTable(SyntheticTable):
     """``[demonstrations]``: a file, or simulated ones."""
 
-    file: Key[Text | None, "JSON file of demonstrations."] = None
+    file: Key[Text | None, "JSON file of demonstrations; default none.", '"shown.json"'] = None
 
     def __attrs_post_init__(self) -> None:
         self.require_one(("file", "synthetic"), 'file = "..." or synthetic = N')
@@ -115,27 +122,31 @@ class LearnerTable(OptimizerTable):
     """``[learner]``: hyperparameters; see ``jaxltl.algos.mlirl.Hparams`` for other defaults."""
 
     # Files of todirl are read by task_todirl.
-    method: Key[Annotated[Literal["mlirl"], Meta('"mlirl" or "todirl"')], "Learning algorithm."]
+    method: Key[
+        Annotated[Literal["mlirl"], Meta('"mlirl" or "todirl"')], "Learning algorithm.", '"mlirl"'
+    ]
     in_: Key[
         Literal["product", "world"], "State space of the reward: the product, or the world alone."
     ] = "product"
     discount: Key[Discount, "Discount of the learned reward."]
     mu: Key[NonNegative | None, "Weight of the satisfaction probability, equation (2.6)."] = None
-    steps: Key[Count, "At most so many steps of the optimizer."] = 500
+    steps: Key[Count, "Largest number of steps of the optimizer."] = 500
     policy: Key[Literal["boltzmann", "soft"] | None, "Policy of a reward."] = None
     adjoint: Key[Literal["exact", "approximate"] | None, "Gradient of the policy."] = None
-    optimizer: Key[Literal["lbfgs", "adam", "sgd"], "Optimizer of the likelihood."] = "lbfgs"
+    optimizer: Key[Optimizer, "Optimizer of the likelihood."] = "lbfgs"
     tolerance: Key[NonNegative, "Gradient norm at which learning has converged."] = 1e-6
     start: Key[Start | None, "Initial weights; default zeros."] = None
     start_scale: Key[NonNegative | None, "Standard deviation of the initial weights."] = None
     satisfaction_over: Key[
         Literal["initial", "all"], "States over which mu weighs the satisfaction probability."
     ] = "initial"
-    avoid: Key[Propositions | None, "Propositions that add the feature avoid."] = None
-    goal: Key[Propositions | None, 'Propositions of goal cells, for in = "world".'] = None
-    progress: Key[Progress | None, "Propositions or automaton states of the feature progress."] = (
-        None
-    )
+    avoid: Key[Propositions | None, "Propositions that add the feature avoid; default none."] = None
+    goal: Key[Propositions | None, 'Goal cells, for in = "world"; default none.', '["y"]'] = None
+    progress: Key[
+        Progress | None,
+        "Propositions or automaton states of the feature progress; default mlirl.progress_states.",
+        "[1, 2]",
+    ] = None
 
     def __attrs_post_init__(self) -> None:
         if self.in_world and self.goal is None:
@@ -149,7 +160,7 @@ class LearnerTable(OptimizerTable):
             self.refuse(("goal",), 'in = "world"')
         if self.learning_rate is not None and self.optimizer == "lbfgs":
             raise ValueError(
-                'learning_rate belongs to optimizer = "adam" or "sgd"; "lbfgs", the default, '
+                'learning_rate belongs to another optimizer, such as "adam"; "lbfgs", the default, '
                 "searches for its own."
             )
         kind = str if self.in_world else int
@@ -177,6 +188,8 @@ class LearnerTable(OptimizerTable):
 
 @table
 class MlirlFile(TaskFile):
+    """Tables of a task file of ``mlirl``."""
+
     world: Key[WorldTable, "Where demonstrations were made."]
     demonstrations: Key[DemonstrationsTable, "What was demonstrated."]
     learner: Key[LearnerTable, "The learner and its hyperparameters."]
@@ -184,12 +197,15 @@ class MlirlFile(TaskFile):
 
 @dataclass(frozen=True, kw_only=True)
 class MlirlTask(Task):
+    """A checked task file of ``mlirl``."""
+
     world: WorldTable
     demonstrations: DemonstrationsTable
     learner: LearnerTable
 
 
 def read_task(path: str | Path) -> MlirlTask:
+    """Checked contents of a task file; ValueError names the key and the fix."""
     path = Path(path)
     data, raw = schema.read_toml(path, MlirlFile.KIND)
     file = schema.convert(path, MlirlFile, data)

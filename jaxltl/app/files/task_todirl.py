@@ -30,6 +30,7 @@ from jaxltl.app.files.schema import (
 )
 from jaxltl.app.files.task import (
     GridTable,
+    Optimizer,
     OptimizerTable,
     SyntheticTable,
     Task,
@@ -49,8 +50,9 @@ Maps = Annotated[
         bool,
     ),
 ]
-Files = Annotated[list[str], Meta("a list of files, one per world", bool)]
-Shape = Annotated[tuple[Count, Count], Meta("[rows, columns]")]
+Files = Annotated[list[str], Meta("a list of files, one per world", bool, '["shown.json"]')]
+Shape = Annotated[tuple[Count, Count], Meta("[rows, columns]", example="[10, 12]")]
+Names = Annotated[list[str], Meta("a list of names", example='["seed 3"]')]
 REWARDS = ("progress", "failure", "step", "won", "lost")
 
 
@@ -58,11 +60,11 @@ REWARDS = ("progress", "failure", "step", "won", "lost")
 class WorldTable(GridTable):
     """``[world]``: the training worlds."""
 
-    maps: Key[Maps, "Training worlds."]
-    objects: Key[ColorCounts | None, "Kinds of goal cells of coloured worlds."] = None
-    obstacles: Key[ColorCounts | None, "Kinds of obstacles of coloured worlds."] = None
-    margin: Key[Count | None, "Cells around a coloured world that are seen, not entered."] = None
-    initial: Key[Text | None, "Formula of the initial states, on maps with a legend."] = None
+    maps: Key[Maps, "Maps of the training worlds."]
+    objects: Key[ColorCounts | None, "Kinds of goal cells, by colours; default o1, o2, o3."] = None
+    obstacles: Key[ColorCounts | None, "Kinds of obstacles, by colours; default ob."] = None
+    margin: Key[Count | None, "Rings of cells that are seen, not entered; default 1.", "2"] = None
+    initial: Key[Text | None, "Formula of initial cells; default all cells.", '"s"'] = None
     transitions: Key[
         None,
         "Belongs to mlirl.",
@@ -83,12 +85,12 @@ class WorldTable(GridTable):
 class DemonstrationsTable(SyntheticTable):
     """``[demonstrations]``: files, or simulated ones."""
 
-    files: Key[Files | None, "JSON files of demonstrations, one per training world."] = None
-    progress: Key[Number | None, "Expert's reward of progress of the automaton."] = None
-    failure: Key[Number | None, "Expert's reward of violating the formula."] = None
-    step: Key[Number | None, "Expert's reward of each step."] = None
-    won: Key[Number | None, "Expert's reward in satisfied states."] = None
-    lost: Key[Number | None, "Expert's reward in violated states."] = None
+    files: Key[Files | None, "Files of demonstrations, one per world; default none."] = None
+    progress: Key[Number | None, "Expert's reward of progress of the automaton; default 10."] = None
+    failure: Key[Number | None, "Expert's reward of violating the formula; default -10."] = None
+    step: Key[Number | None, "Expert's reward of each step; default -1."] = None
+    won: Key[Number | None, "Expert's reward in satisfied states; default 3."] = None
+    lost: Key[Number | None, "Expert's reward in violated states; default -3."] = None
 
     def __attrs_post_init__(self) -> None:
         self.require_one(("files", "synthetic"), "files = [...] or synthetic = N")
@@ -111,20 +113,18 @@ class LearnerTable(OptimizerTable):
     """``[learner]``: hyperparameters; see ``jaxltl.algos.todirl.Hparams`` for other defaults."""
 
     method: Key[Literal["todirl"], "Learning algorithm."]
-    discount: Key[Unit, "Discount of the learned reward; 1 needs a horizon."]
-    memory: Key[Text | None, "Formula of the learner's automaton; default the task's."] = None
+    discount: Key[Unit, "Discount of the learned reward; 1 needs a horizon.", "0.95"]
+    memory: Key[Text | None, "Formula of the memory; default the task's.", '"F o1"'] = None
     radius: Key[WholeNumber, "Cells that are observed around the own one."] = 1
     hidden: Key[Widths, "Widths of the reward network's hidden layers."] = attrs.field(
         factory=lambda: [80, 80]
     )
-    steps: Key[Count, "At most so many steps of the optimizer."] = 300
+    steps: Key[Count, "Largest number of steps of the optimizer."] = 300
     patience: Key[
         Count | None, "Steps without a better held-out likelihood after which learning ends."
     ] = None
-    held_out: Key[Discount, "Share of the demonstrations that is held out."] = 0.2
-    optimizer: Key[
-        Literal["adam", "sgd", "rmsprop", "lbfgs"] | None, "Optimizer of the likelihood."
-    ] = None
+    held_out: Key[Discount, "Share of the demonstrations that is held out.", "0.1"] = 0.2
+    optimizer: Key[Optimizer | None, "Optimizer of the likelihood."] = None
     horizon: Key[Count | None, "Steps of an episode; default unbounded."] = None
 
     def __attrs_post_init__(self) -> None:
@@ -147,17 +147,13 @@ class LearnerTable(OptimizerTable):
 class TestTable(Table):
     """``[test]``: worlds for the evaluation, which have no part in learning."""
 
-    maps: Key[Maps | None, "Test worlds."] = None
-    generate: Key[Count | None, "Number of random test worlds."] = None
-    obstacles: Key[WholeNumber | None, "Obstacles of a random world; default as in training."] = (
-        None
-    )
-    min_distance: Key[Count | None, "Least distance of objects in a random world; default 3."] = (
-        None
-    )
+    maps: Key[Maps | None, "Test worlds; default none."] = None
+    generate: Key[Count | None, "Number of random test worlds; default none."] = None
+    obstacles: Key[WholeNumber | None, "Random obstacles; default as in training."] = None
+    min_distance: Key[Count | None, "Least distance of random objects; default 3.", "4"] = None
     shape: Key[Shape | None, "Rows and columns of a random world; default as in training."] = None
     seed: Key[WholeNumber | None, "First seed of the random worlds; default 0."] = None
-    leave_out: Key[list[str], "Names of test worlds that do not count in means."] = attrs.field(
+    leave_out: Key[Names, "Names of test worlds that do not count in means."] = attrs.field(
         factory=list
     )
 
@@ -170,6 +166,8 @@ class TestTable(Table):
 
 @table
 class TodirlFile(TaskFile):
+    """Tables of a task file of ``todirl``."""
+
     world: Key[WorldTable, "The training worlds."]
     demonstrations: Key[DemonstrationsTable, "What was demonstrated."]
     learner: Key[LearnerTable, "The learner and its hyperparameters."]
@@ -178,6 +176,8 @@ class TodirlFile(TaskFile):
 
 @dataclass(frozen=True, kw_only=True)
 class TodirlTask(Task):
+    """A checked task file of ``todirl``."""
+
     world: WorldTable
     demonstrations: DemonstrationsTable
     learner: LearnerTable
@@ -200,6 +200,7 @@ class TodirlTask(Task):
 
 
 def read_task(path: str | Path) -> TodirlTask:
+    """Checked contents of a task file; ValueError names the key and the fix."""
     path = Path(path)
     data, raw = schema.read_toml(path, TodirlFile.KIND)
     file = schema.convert(path, TodirlFile, data)

@@ -10,7 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxltl.app.files.schema import errors_in, read_map
+from jaxltl.core.validation import errors_in
+from jaxltl.app.files.schema import read_map
 from jaxltl.app.files.task import GridTable
 from jaxltl.app.files.task_mlirl import MlirlTask
 from jaxltl.core.logic.labels import satisfying

@@ -55,6 +55,7 @@ def certified(entry: Result) -> str:
 
 
 def number(value: float | None) -> str:
+    """A number in four digits, or "unknown"."""
     if value is None:
         return "unknown"
     return f"{value:.1e}" if value != 0 and abs(value) < 1e-3 else f"{value:.4g}"

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from markupsafe import Markup
 
+from jaxltl.app.reports import steps
 from jaxltl.app.reports.drawing import Picture
 from jaxltl.app.reports.figures import (
     Remark,
@@ -33,6 +34,7 @@ def page(
     pictures: Sequence[tuple[Picture, bytes]],
     task_text: str,
 ) -> str:
+    """The report in HTML."""
     return render_page(
         "mlirl.html",
         result,
@@ -43,10 +45,12 @@ def page(
         tiles=_tiles(result),
         evidence=[(f"{policy}, {kind}", *rest) for policy, kind, *rest in _evidence(result)],
         weights=_weights(result),
+        steps=steps,
     )
 
 
 def table(result: Result) -> str:
+    """The result as text."""
     shown, training, seeds = result["demonstrations"], result["training"], result["seeds"]
     dropped = f", {shown['dropped']} unfinished dropped" if shown["dropped"] else ""
     kind = "synthetic demonstration" if shown["synthetic"] else "demonstration"
@@ -64,6 +68,7 @@ def table(result: Result) -> str:
             for title, kind, value, bounds, where, _ in _evidence(result)
         ),
         *([f"  {_guaranteed(result['data'])}"] if "data" in result else []),
+        *steps.lines(result["expected_steps"]),
         "",
         f"negative log-likelihood  {number(result['neg_log_likelihood'])}",
         "weights",
@@ -103,7 +108,18 @@ def _evidence(result: Result) -> list[tuple[str, ...]]:
         )
         for title, key in (("learned policy", "satisfaction"), ("optimum", "best_achievable"))
         for kind in ("mean", "minimum")
+        if kind == "mean" or not _all_equal(result[key])
     ]
+
+
+def _all_equal(evidence: Result) -> bool:
+    """True if all initial states have the same probability, to four places."""
+    mean, least = evidence["mean"], evidence["minimum"]
+    return probability(mean["value"]) == probability(least["value"])
+
+
+def _minimum(least: Result) -> tuple[str, str]:
+    return probability(least["value"]), f"minimum, from {place(least)}"
 
 
 def _tiles(result: Result) -> list[tuple[str, str]]:
@@ -115,7 +131,7 @@ def _tiles(result: Result) -> list[tuple[str, str]]:
             probability(learned["mean"]["value"]),
             f"mean probability{by} over {many(learned['num_starts'], 'initial state')}",
         ),
-        (probability(learned["minimum"]["value"]), f"minimum, from {place(learned['minimum'])}"),
+        *([] if _all_equal(learned) else [_minimum(learned["minimum"])]),
         (probability(best["mean"]["value"]), f"maximal mean probability{by}"),
         (
             number(result["neg_log_likelihood"]),
@@ -162,6 +178,7 @@ def meaning(name: str, weight: float | None) -> str:
 
 
 def remarks(result: Result) -> list[Remark]:
+    """Remarks on the result, with their kinds."""
     data = result.get("data")
     first = [] if data is None else _log_remarks(data)
     return [*first, *(("warning", text) for text in warnings(result)), *_guarantees(result)]
@@ -230,6 +247,15 @@ def _guarantees(result: Result) -> list[Remark]:
         found.append(_if_true(remark) if logged else remark)
     if (lost := guarantee.get("left_out")) is not None:
         found.append(("note", _left_out(lost)))
+    if (unused := guarantee.get("unused")) is not None:
+        found.append(
+            (
+                "note",
+                f"{unused['steps']} of {unused['of']} demonstrated steps come after the formula was "
+                "lost, or after a mistake left the best probability, and were not used.",
+            )
+        )
+    found += steps.mixing(result["expected_steps"])
     return found + [("note", result[key]) for key in ("remark", "trivial") if result.get(key)]
 
 
@@ -284,11 +310,12 @@ def _attained(guarantee: Result) -> str:
             return f"{text}a share of {1 - share:.2g} of the likeliest policy is left in {other}."
         return f"{text}a share of {share:.3g} of {other} is mixed into the likeliest policy."
     if weight:
-        return f"{text}the least weight of the satisfaction probability is mu = {weight:.3g}."
+        return f"{text}the weight of the satisfaction probability is mu = {weight:.3g}."
     return f"{text}the likeliest policy attains it without a weight."
 
 
 def warnings(result: Result) -> list[str]:
+    """Warnings about the result, with remedies."""
     found = []
     learned, best = (result[k]["mean"]["value"] for k in ("satisfaction", "best_achievable"))
     if learned < (1 - _SHORTFALL) * best:
@@ -296,11 +323,11 @@ def warnings(result: Result) -> list[str]:
             f"The policy satisfies the formula with probability {probability(learned)} where "
             f"{probability(best)} is possible. " + _remedy(result)
         )
-    steps = result["expected_steps"] or {"quickest": None}
-    if steps["quickest"] and (steps["learned"] or math.inf) > _SLOW * steps["quickest"]:
-        mean = number(steps["learned"]) if steps["learned"] else "an unbounded number of"
+    time = result["expected_steps"] or {"quickest": None}
+    if time["quickest"] and (time["learned"] or math.inf) > _SLOW * time["quickest"]:
+        mean = number(time["learned"]) if time["learned"] else "an unbounded number of"
         found.append(
-            f"The policy takes {mean} steps on average where {number(steps['quickest'])} suffice: "
+            f"The policy takes {mean} steps on average where {number(time['quickest'])} suffice: "
             "it repeats rewarded demonstrated actions. Lower the discount in [learner]; with 0 "
             "each action is rewarded on its own."
         )

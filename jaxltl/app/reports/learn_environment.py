@@ -19,6 +19,7 @@ def page(
     pictures: Sequence[tuple[Picture, bytes]],
     task_text: str,
 ) -> str:
+    """The report in HTML."""
     visits = [] if _is_finite(result) else ["visits"]
     return render_page(
         "environment.html",
@@ -37,6 +38,7 @@ def page(
 
 
 def table(result: Result) -> str:
+    """The result as text."""
     lines = [f"{result['task']}: {_sentence(result)}", "", _evaluation(result)]
     lines += [
         f"  {name:18} {value:>10}  {interval:24} {method}"
@@ -130,6 +132,7 @@ def _seeds(result: Result) -> list[tuple[str, ...]]:
 
 
 def remarks(result: Result) -> list[Remark]:
+    """Remarks on the result, with their kinds."""
     found, training = result["evaluation"], result["training"]
     remarks: list[Remark] = [("note", result["trivial"])] if result["trivial"] else []
     if found["threshold"] is not None:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxltl.app.reports import steps
 from jaxltl.app.reports.drawing import Picture, drawing
 from jaxltl.app.reports.explorer import (
     START,
@@ -20,7 +21,7 @@ from jaxltl.app.reports.explorer import (
     learned_runs,
 )
 from jaxltl.app.guarantee import left_out
-from jaxltl.app.job import automaton_picture, over_seeds, short_name
+from jaxltl.app.job import automaton_picture, over_seeds, plain, short_name
 from jaxltl.core.environments.monitor import Verdict, verdicts
 from jaxltl.core.models.construct.restrict import restrict
 from jaxltl.core.models.product import Product
@@ -31,6 +32,7 @@ LIVE = "policy"  # name of the interactive part
 
 
 def task_pictures(setup: Any) -> list[Picture]:
+    """Picture of the formula's automaton."""
     return [automaton_picture(setup.model.automaton, LIVE)]
 
 
@@ -38,9 +40,11 @@ _FIGURES = ("loss", "neg_log_likelihood", "satisfaction", "gradient_norm")
 
 
 def pictures(outcome: Any) -> list[Picture]:
+    """Pictures of the policy on the map, of learning curves and of the automaton."""
     cells, history = outcome.setup.world.cells, outcome.learned.history
     return [
         *([] if cells is None else _maps(outcome, cells)),
+        *steps.pictures(plain(outcome.expected_steps)),
         Picture(
             "learning.svg",
             "Learning",
@@ -57,6 +61,7 @@ def pictures(outcome: Any) -> list[Picture]:
 
 
 def live(outcome: Any) -> list[Explorer | TooLarge | Curves]:
+    """Interactive policy on the map, and learning curves."""
     setup, model = outcome.setup, outcome.setup.model
     policy = np.asarray(outcome.learned.policy[outcome.chosen])
     caption = _CURVES + over_seeds(len(outcome.learned.loss))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+from jaxltl.app.reports import steps
 from jaxltl.app.reports.drawing import Picture
 from jaxltl.app.reports.figures import (
     Remark,
@@ -35,6 +36,7 @@ def page(
     pictures: Sequence[tuple[Picture, bytes]],
     task_text: str,
 ) -> str:
+    """The report in HTML."""
     titles = (("test", "Test worlds"), ("training", "Training worlds"))
     return render_page(
         "todirl.html",
@@ -47,6 +49,7 @@ def page(
         tiles=_tiles(result),
         within=_within(result),
         evidence=_evidence(result),
+        steps=steps,
         expert=_EXPERT[result["expert"]],
         world_tables=[
             (title, result[key], sorted(result[key]["worlds"], key=_mean_value))
@@ -62,6 +65,7 @@ def _mean_value(world: Result) -> float:
 
 
 def table(result: Result) -> str:
+    """The result as text."""
     learning, seeds = result["learning"], result["seeds"]
     lines = [
         f"{result['task']}: {_sentence(result)}",
@@ -80,6 +84,12 @@ def table(result: Result) -> str:
                 f"    {title:30} {probability(one['mean']['value']):>8}   certified "
                 f"{certified(one['mean']):15} {worst if about['num_counted'] > 1 else ''}".rstrip()
             )
+        if time := about.get("expected_steps"):
+            lines += [
+                f"    expected steps, {name} {value}, certified {bounds}"
+                for name, value, bounds in steps.rows(time)
+            ]
+            lines[-1] += f" (the largest multiple, in {time['worst_world']})"
         worst_start = probability(about["learned"]["worst_start"])
         lines.append(f"    {'from the worst initial state':30} {worst_start:>8}")
     lines += ["", f"learning  {_how_it_ended(result)}"]
@@ -184,6 +194,7 @@ def _evidence(result: Result) -> list[tuple[str, ...]]:
 
 
 def remarks(result: Result) -> list[Remark]:
+    """Remarks on the result, with their kinds."""
     guarantee = result["guarantee"]
     found: list[Remark] = [("warning", text) for text in warnings(result)]
     if guarantee["asked"] == "best":
@@ -239,6 +250,7 @@ def _attained(result: Result) -> str:
 
 
 def warnings(result: Result) -> list[str]:
+    """Warnings about the result, with remedies."""
     found = [text for kind, about in _groups(result) for text in _world_warnings(kind, about)]
     learning = result["learning"]
     if learning["solver"] != "CONVERGED":

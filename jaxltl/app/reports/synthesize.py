@@ -11,10 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxltl.app.files.game import World, task_text
-from jaxltl.app.job import plain, save_arrays, took
+from jaxltl.app.job import plain, took
 from jaxltl.app.synthesize import Play, Synthesis
 from jaxltl.core.games.objective import GR1
 from jaxltl.core.models.game import Game, is_deterministic
+from jaxltl.core.policies.policy_file import write_policy_file
 from jaxltl.app.wording import Record, Result
 
 # --- results --------------------------------------------------------------------------------
@@ -135,6 +136,7 @@ def table(result: Result, found: Synthesis) -> str:
 
 
 def verdict(result: Result) -> str:
+    """Verdict of the independent check, as text."""
     if is_confirmed(result):
         what = "both players' strategies" + (
             " and the permissive strategy" if result["strategy"] else ""
@@ -221,7 +223,7 @@ def save(out: Path, found: Synthesis) -> None:
         arrays = _arrays(found, found.restricted.model, base) | region
         arrays["mask"] = found.restricted.model.available
         arrays["memory"] = found.restricted.memory
-        save_arrays(out / "strategy.npz", arrays)
+        write_policy_file(out / "strategy.npz", "strategy", arrays)
     if found.play is not None:
         game = nodes.game
         lost = jnp.where(found.winning.region, 0, game.initial)
@@ -230,7 +232,7 @@ def save(out: Path, found: Synthesis) -> None:
         arrays |= {"counter_action": found.winning.counter_action, "available": game.available}
         if isinstance(found.winning.objective, GR1):
             arrays["assumptions"] = found.winning.objective.assumptions
-        save_arrays(out / "counter_strategy.npz", arrays)
+        write_policy_file(out / "counter_strategy.npz", "counter-strategy", arrays)
 
 
 def _arrays(found: Synthesis, game: Game, node: np.ndarray) -> Record:

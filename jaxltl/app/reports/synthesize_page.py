@@ -35,6 +35,7 @@ def page(
     pictures: Iterable[tuple[str, bytes]],
     file_text: str,
 ) -> str:
+    """The report in HTML."""
     part = play_explorer(found)
     drawn = {key: draw(each).decode() for key, each in part.drawings.items()}
     shown = [
@@ -73,6 +74,7 @@ def _tiles(result: Result) -> list[tuple[str, str]]:
 
 
 def remarks(result: Result) -> list[Remark]:
+    """Remarks on the result, with their kinds."""
     kinds = {"realizable": "good", "partly realizable": "note", "unrealizable": "warning"}
     return [
         (kinds[result["outcome"]], f"The task is {result['outcome']}."),

@@ -42,6 +42,7 @@ _FIGURES = ("per_pair", "held_out", "gradient_norm")
 
 
 def task_pictures(setup: Setup) -> list[Picture]:
+    """Pictures of the automata of the formula and of the memory."""
     same = setup.memory is setup.judge
     found = [automaton_picture(setup.judge, "training-1" if same else "")]
     if not same:
@@ -58,6 +59,7 @@ def task_pictures(setup: Setup) -> list[Picture]:
 
 
 def pictures(outcome: Outcome) -> list[Picture]:
+    """Pictures of learning curves and of policies in worlds."""
     history = outcome.learned.history
     found = [
         Picture(
@@ -74,6 +76,7 @@ def pictures(outcome: Outcome) -> list[Picture]:
 
 
 def live(outcome: Outcome) -> list[Explorer | TooLarge | Curves]:
+    """Interactive policies in worlds, and learning curves."""
     found: list[Explorer | TooLarge | Curves] = [
         _look_into(outcome, one) for one in _drawn_worlds(outcome)
     ]

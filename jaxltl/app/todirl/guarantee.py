@@ -8,7 +8,7 @@ kept.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,9 +17,19 @@ import numpy as np
 from jaxltl.app.todirl.results import Learned, Setup, part_of
 from jaxltl.app.wording import place as name_of
 from jaxltl.app.files.scenes import Scene
-from jaxltl.app.guarantee import bracket
-from jaxltl.core.values.undiscounted.mixture import attained, reaching, require_attainable
+from jaxltl.app.practical import StepBound, step_bound
+from jaxltl.core.validation import errors_in
+from jaxltl.core.values.undiscounted.mixture import (
+    WINDOW,
+    Mixture,
+    attained,
+    reaching,
+    require_attainable,
+)
+from jaxltl.core.values.undiscounted.satisfaction_steps import Clock
 
+_AIM = WINDOW / 4  # margin of the certified probability over the asked one
+_WEIGHTS = 10.0 ** np.arange(-1, 5.5, 0.5)  # of the satisfaction probability, in this order
 _HALVINGS = 5  # few bisections of the weight, since the mixture closes the gap
 
 
@@ -70,8 +80,34 @@ def hold(setup: Setup, policy: Any, inside: Any) -> Held:
                 over=setup.task.over,
             )
         )
-    policies, shares, reached = zip(*found, strict=True)
-    return Held(np.stack(policies), np.array(shares), np.array(reached))
+    return Held(
+        np.stack([one.policy for one in found]),
+        np.array([one.share for one in found]),
+        np.array([one.attained for one in found]),
+    )
+
+
+def step_bounds(setup: Setup) -> list[StepBound] | None:
+    """The bounds on the expected steps in all worlds; None for safety formulas."""
+    task, found = setup.task, []
+    for w, (scene, sure) in enumerate(zip(setup.worlds.scenes, setup.sure or (), strict=True)):
+        with errors_in(f"{task.path}: [task] in the world {scene.name}: "):
+            model = part_of(setup.worlds.model, w)
+            bound = step_bound(model, sure, setup.asked, task.over, task.steps, task.steps_factor)
+        if bound is None:
+            return None
+        found.append(bound)
+    return found
+
+
+def within_steps(setup: Setup, bounds: list[StepBound], policy: np.ndarray) -> list[Mixture]:
+    """The policies ``[W, S, Q, A]`` of all worlds with their expected steps within the bounds."""
+    found = []
+    for w, bound in enumerate(bounds):
+        model = part_of(setup.worlds.model, w)
+        kept = bound.keep(model, policy[w])
+        found.append(kept._replace(steps=kept.steps or Clock(model).steps(kept.policy)))
+    return found
 
 
 @dataclass(frozen=True)
@@ -119,6 +155,39 @@ def likeliest(
     first = judged(free, 0.0)
     found = [first]
     if first.attained < float(setup.asked) and train is not None:
-        found += bracket(train, first, judged, float(setup.asked), _HALVINGS)
+        found += _bracket(train, first, judged, float(setup.asked))
     best = min(found, key=lambda one: np.nan_to_num(one.neg_log_likelihood, nan=np.inf))
     return best.learned, best.weight
+
+
+def _bracket(
+    train: Callable[[float, Learned], Learned],
+    first: _Tried,
+    judged: Callable[[Learned, float], _Tried],
+    asked: float,
+) -> Iterator[_Tried]:
+    """Yields attempts with increasing weights until one suffices, then by bisection.
+
+    Each starts from the result of the next smaller weight: the likelihood has several maxima, and
+    those found from too large a weight are lower.
+    """
+    low, below = 0.0, first
+    for high in map(float, _WEIGHTS):
+        last = judged(train(high, below.learned), high)
+        yield last
+        if last.attained >= asked:
+            break
+        low, below = high, last
+    else:
+        return
+    low = low or high * 1e-3
+    for _ in range(_HALVINGS):
+        if asked <= last.attained <= asked + _AIM or high / low < 1 + 1e-9:
+            return
+        middle = float(np.sqrt(low * high))
+        last = judged(train(middle, below.learned), middle)
+        yield last
+        if last.attained >= asked:
+            high = middle
+        else:
+            low, below = middle, last

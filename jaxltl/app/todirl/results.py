@@ -11,6 +11,7 @@ import jax
 import numpy as np
 
 from jaxltl.app.files.scenes import Scene
+from jaxltl.app.practical import StepBound
 from jaxltl.app.files.task_todirl import TodirlTask
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.models.product import Product
@@ -52,6 +53,8 @@ def part_of(tree: TreeT, chosen: int | slice | EllipsisType) -> TreeT:
 
 @dataclass(frozen=True)
 class Setup:
+    """A task, ready for learning."""
+
     task: TodirlTask  # the file
     judge: Automaton  # judge, memory: the automata of the formula and of the learner's memory
     memory: Automaton
@@ -64,6 +67,8 @@ class Setup:
     asked: str | float  # the guarantee; a probability of 1 is "best"
     # optimal actions in each world; None without a guarantee
     sure: list[OptimalActions] | None = None
+    # bounds on the expected steps in each world; None without a guarantee and for safety formulas
+    bounds: list[StepBound] | None = None
     left_out: int = 0  # number of demonstrated steps that are not optimal
     trivial: str | None = None  # remark on a formula that is always true
 
@@ -113,16 +118,21 @@ class Judged:
     # share, attained: float[W], share of optimal actions and certified probability, if one is asked
     share: np.ndarray | None = None
     attained: np.ndarray | None = None
+    # float[W, 3], expected steps with bounds, and float[W], the share of the quickest policy
+    steps: np.ndarray | None = None
+    quick_share: np.ndarray | None = None
 
     def part(self, chosen: slice) -> Judged:
         """The part for some of the worlds."""
         each = part_of(self.performance, chosen)
-        held = part_of((self.share, self.attained), chosen)
+        held = part_of((self.share, self.attained, self.steps, self.quick_share), chosen)
         return Judged(self.policy[chosen], self.status[chosen], each, self.seeds[:, chosen], *held)
 
 
 @dataclass
 class Outcome:
+    """Learned rewards of all seeds and their evaluations."""
+
     setup: Setup  # setup, learned: the task, and the results of learning
     learned: Learned
     chosen: int  # index of the kept seed, by held-out likelihood or loss

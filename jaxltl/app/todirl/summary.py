@@ -9,14 +9,17 @@ import numpy as np
 from jaxltl.app.files.scenes import Scene
 from jaxltl.app.job import about, plain, took
 from jaxltl.app.todirl.results import Judged, Learned, Outcome, Worlds, counted_worlds, part_of
+from jaxltl.app.practical import StepBound
 from jaxltl.core.types import Status
 from jaxltl.core.values.undiscounted.performance import infeasible_starts, summarize
 from jaxltl.app.wording import Record
 
 
 def summary(outcome: Outcome) -> Record:
+    """The result as a JSON object."""
     setup, learned, i = outcome.setup, outcome.learned, outcome.chosen
     task, history, count = setup.task, learned.history, setup.num_training
+    bounds, leave_out = setup.bounds or [], task.left_out
     infeasible = np.array(
         [
             np.asarray(infeasible_starts(part_of(setup.worlds.judged, w))).sum()
@@ -46,10 +49,12 @@ def summary(outcome: Outcome) -> Record:
             "synthetic": task.demonstrations.synthetic is not None,
             "dropped": setup.dropped,
         },
-        "training": _about_worlds(setup.training, outcome.training, infeasible[:count], ()),
+        "training": _about_worlds(
+            setup.training, outcome.training, infeasible[:count], (), bounds[:count]
+        ),
         "test": outcome.test
         and setup.test
-        and _about_worlds(setup.test, outcome.test, infeasible[count:], task.left_out),
+        and _about_worlds(setup.test, outcome.test, infeasible[count:], leave_out, bounds[count:]),
         "learning": {
             **_about_learning(learned, i),
             "hyperparameters": task.learner.hyperparameters(),
@@ -96,7 +101,11 @@ def _about_learning(learned: Learned, i: int) -> Record:
 
 
 def _about_worlds(
-    worlds: Worlds, judged: Judged, infeasible: np.ndarray, leave_out: Sequence[str]
+    worlds: Worlds,
+    judged: Judged,
+    infeasible: np.ndarray,
+    leave_out: Sequence[str],
+    bounds: Sequence[StepBound],
 ) -> Record:
     found: Record = {"num_worlds": len(worlds.scenes)}
     for who, performance in judged.performance.items():
@@ -110,6 +119,23 @@ def _about_worlds(
         }
         found["infeasible"], found["left_out"] = list(mean.infeasible), list(mean.left_out)
         found["num_counted"] = mean.num_worlds
+    if judged.steps is not None:
+        least = np.array([b.quickest.steps.upper for b in bounds])
+        possible = np.isfinite(least) & (least > 0)
+        w = int(np.argmax(np.where(possible, judged.steps[:, 2], 0) / np.where(possible, least, 1)))
+        found["expected_steps"] = {
+            "factor": bounds[w].factor,
+            "mixed": int((judged.quick_share > 0).sum()) if judged.quick_share is not None else 0,
+            "worst_world": worlds.names[w],
+            "learned": judged.steps[w, 0],
+            "learned_bounds": judged.steps[w, 1:],
+            "quickest": bounds[w].quickest.steps.value,
+            "quickest_bounds": bounds[w].quickest.steps[1:3],
+            "worlds": [
+                {"name": name, "steps": steps, "quickest": bound.quickest.steps.value}
+                for name, steps, bound in zip(worlds.names, judged.steps, bounds, strict=True)
+            ],
+        }
     found["solver"] = Status(int(judged.status.max())).name
     found["worlds"] = [
         _about_world(scene, judged, w, int(infeasible[w])) for w, scene in enumerate(worlds.scenes)

@@ -196,12 +196,26 @@
     choose(key);
   }
 
+  // Marks the sides of a frame to which it scrolls.
+  function sides(frame) {
+    const rest = frame.scrollWidth - frame.clientWidth - frame.scrollLeft;
+    frame.classList.toggle("before", frame.scrollLeft > 1);
+    frame.classList.toggle("after", rest > 1);
+  }
+
   // Scrollable frames are focusable while they scroll.
   function reach() {
-    for (const frame of document.querySelectorAll(".scroll:not(.board)")) {
+    for (const frame of document.querySelectorAll(".scroll")) {
+      sides(frame);
+      if (frame.classList.contains("board")) continue;
       if (frame.scrollWidth > frame.clientWidth) frame.tabIndex = 0;
       else frame.removeAttribute("tabindex");
     }
+  }
+  for (const frame of document.querySelectorAll(".scroll")) {
+    frame.addEventListener("scroll", () => sides(frame), { passive: true });
+    frame.insertAdjacentHTML("afterend",
+      '<p class="sideways" aria-hidden="true">← scrolls sideways →</p>');
   }
   addEventListener("resize", reach);
   for (const fold of document.querySelectorAll("details")) fold.addEventListener("toggle", reach);

@@ -1,0 +1,136 @@
+"""Expected steps in reports: certified numbers, their trade-offs, and a picture of these."""
+
+from __future__ import annotations
+
+import math
+
+from jaxltl.app.reports.drawing import Picture, drawing
+from jaxltl.app.reports.figures import Remark, number, probability
+from jaxltl.app.wording import Result
+
+_PRINTED = 5  # vertices of the front in the terminal
+_DRAWN = 20  # largest multiple of the quickest policy's steps in the picture
+_NARROW = 1e-4  # relative width of bounds that are printed as an error
+
+
+def heading(steps: Result) -> str:
+    """Title of the numbers of steps."""
+    if steps["limit"] is None:
+        bound = ", not bounded"
+    elif steps["factor"] is None:
+        bound = f", at most {number(steps['limit'])}"
+    else:
+        bound = f", at most {steps['factor']:g} times those of the quickest optimal policy"
+    cosafe = steps["until"] == "the formula is decided"
+    until = steps["until"] if cosafe else "acceptance, and between two rounds of it"
+    return f"expected steps until {until}{bound}"
+
+
+def rows(steps: Result) -> list[tuple[str, str, str]]:
+    """Policy, expected steps and certificate."""
+    return [
+        (title, _steps(steps[key]), _certified(steps[key], *steps[f"{key}_bounds"]))
+        for title, key in (("learned policy", "learned"), ("quickest optimum", "quickest"))
+    ]
+
+
+def front_rows(steps: Result) -> list[tuple[str, str, str]]:
+    """Maximal probability, its expected steps, and their certificate."""
+    return [
+        (
+            probability(one["probability"]["value"]),
+            _steps(one["steps"]["value"]),
+            _certified(*(one["steps"][k] for k in ("value", "lower", "upper"))),
+        )
+        for one in steps.get("front", ())
+    ]
+
+
+def lines(steps: Result | None) -> list[str]:
+    """The numbers for the terminal."""
+    if steps is None:
+        return []
+    found = [
+        "",
+        heading(steps),
+        *(f"  {title:25} {value:>9}   certified {bounds}" for title, value, bounds in rows(steps)),
+    ]
+    others = [f"{p} in {n}" for p, n, _ in front_rows(steps)[1:]]
+    if others:
+        more = ", ..." if len(others) > _PRINTED else ""
+        found.append(f"  for less probability      {', '.join(others[:_PRINTED])}{more}")
+    return found
+
+
+def mixing(steps: Result | None) -> list[Remark]:
+    """Remark on the share of the quickest optimal policy."""
+    if steps is None or not steps["share"]:
+        return []
+    before = steps["likelihood"][0]
+    after = next(x for x in steps["likelihood"] if x["share"] == steps["share"])
+    fix = (
+        "steps_factor in [task] sets the multiple."
+        if steps["factor"]
+        else "guarantee in [task] sets the number of steps."
+    )
+    return [
+        (
+            "note",
+            f"The policy of the learned reward takes {_steps(before['steps']['value'])} steps on "
+            f"average, so a share of {steps['share']:.3g} of a quick policy with the guarantee is "
+            f"mixed in; the negative log-likelihood changes from "
+            f"{number(before['neg_log_likelihood'])} to {number(after['neg_log_likelihood'])}. "
+            f"{fix}",
+        )
+    ]
+
+
+def pictures(steps: Result | None) -> list[Picture]:
+    """The front of probability and steps, and the likelihood against steps."""
+    if steps is None:
+        return []
+    panels = {}
+    front = steps.get("front", ())
+    if len(front) > 1:
+        value, low, high = (
+            [x["probability"][k] for x in front] for k in ("value", "lower", "upper")
+        )
+        half = [(b - a) / 2 for a, b in zip(low, high, strict=True)]
+        panels["maximal satisfaction probability"] = {
+            "all policies": ([x["steps"]["value"] for x in front], value, half)
+        }
+    largest = _DRAWN * max(steps["quickest"] or 0, 1)
+    curve = [
+        (x["steps"]["value"], x["neg_log_likelihood"])
+        for x in steps["likelihood"]
+        if x["neg_log_likelihood"] is not None and (x["steps"]["value"] or math.inf) <= largest
+    ]
+    if len(curve) > 1:
+        spent, loss = zip(*sorted(curve), strict=True)
+        panels["negative log-likelihood"] = {
+            "shares of the quick policy": (list(spent), list(loss), [0.0] * len(curve))
+        }
+    if not panels:
+        return []
+    return [
+        Picture(
+            "steps.svg",
+            "Probability, steps and likelihood",
+            drawing("bands", {"": panels}, label="expected steps"),
+            "Probabilities and steps on and below the first line are attained by some policy. The "
+            "second line is the likelihood of the demonstrations when a share of the quick policy "
+            "is mixed into the learned one.",
+        )
+    ]
+
+
+def _steps(value: float | None) -> str:
+    return "unbounded" if value is None else number(value)
+
+
+def _certified(value: float | None, lower: float | None, upper: float | None) -> str:
+    if value is None or lower is None or upper is None:
+        return "no bounds" if lower is None else f"at least {number(lower)}"
+    if upper - lower <= _NARROW * max(value, 1):
+        return f"within {max(upper - value, value - lower):.1e}"
+    return f"in [{number(lower)}, {number(upper)}]"
