@@ -48,7 +48,7 @@ def fill_cells(axes: Axes, world: Board, colors: Sequence[str], lines: str = PAP
     for (row, column), color in zip(world.places, colors, strict=True):
         axes.add_patch(Rectangle((column, row), 1, 1, facecolor=color, lw=0))
         kind = world.cells[row, column]
-        if kind not in (".", world.wall) and max(world.cells.shape) <= 16:
+        if kind not in (".", world.wall):
             axes.text(
                 column + 0.07,
                 row + 0.07,

@@ -38,7 +38,8 @@ def curves(
     """The learning curves of a run, one panel per figure: the median and range over seeds.
 
     Args:
-      metrics: figures ``[T]`` or ``[N, T]`` by name, or a learner's ``Metrics``.
+      metrics: figures ``[T]`` or ``[..., T]`` by name, or a learner's ``Metrics``; all leading axes
+        are seeds.
       steps: ``[T]``, the step of each figure; default 1, 2, ...
       show: names in order; default all that are not wholly NaN.
 
@@ -51,7 +52,12 @@ def curves(
       >>> len(curves(of_two_seeds).axes)
       2
     """
-    series = {k: np.atleast_2d(v) for k, v in _shown("curves", metrics, show).items()}
+    shown = _shown("curves", metrics, show)
+    series = {k: np.atleast_2d(v).reshape(-1, np.shape(v)[-1]) for k, v in shown.items() if v.ndim}
+    if not series:
+        raise ValueError(
+            f"curves: {', '.join(shown)} are single numbers; give a run's history, [T] or [N, T]."
+        )
     chosen = list(series)
     figure = Figure(figsize=(3.1 * len(chosen) + 0.2, 2.5), layout="constrained", facecolor=PAPER)
     for i, (name, axes) in enumerate(

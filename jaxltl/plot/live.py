@@ -18,7 +18,7 @@ from jaxltl.core.automata.automaton import Automaton
 from jaxltl.plot import layout
 from jaxltl.plot.automata import edge_texts, on_the_host
 from jaxltl.plot.board import STEPS
-from jaxltl.plot.maps import kind_colors
+from jaxltl.plot.maps import kind_colors, kind_marks
 from jaxltl.plot.style import SCALE
 from jaxltl.plot.worlds import TINTS
 
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 CELL = 40
 _MARGIN = 22
+_NAMED = 24  # cells a side, beyond which cells have marks and a legend
 _INCH = 96.0
 
 
@@ -196,13 +197,16 @@ def live_map(
         parts.append(f'<g class="layer" data-memory="{key}"{hidden}>')
         parts += _layer(ground, values, policy, actions)
         parts.append("</g>")
+    # Numbers and marks grow with the map, so that they can be read where it is scaled down.
+    zoom = max(1.0, max(ground.shape) / 16)
+    large = max(ground.shape) > _NAMED
+    texts = {name: name for name in ground.names if name}
+    marks = kind_marks(texts) if large else texts
+    font = 10.5 * zoom if large else 10.5
     for state, text in enumerate(ground.names):
-        if text and max(ground.shape) <= 24:
+        if text:
             row, column = divmod(state, columns)
-            parts.append(
-                f'<text class="name" x="{column * CELL + 3}" y="{row * CELL + 11}">'
-                f"{html.escape(text)}</text>"
-            )
+            parts.append(_name(marks[text], column * CELL + 3, row * CELL + font / 2 + 5.75, font))
     for state, memory, action in marked:
         row, column = divmod(int(state), columns)
         parts.append(
@@ -217,8 +221,6 @@ def live_map(
     ]
     stride = -(-max(ground.shape) // 16)
     beyond = max([0, *(-row for row, _, _ in ground.ring)]) * CELL
-    # Numbers grow with the map, so that they can be read where it is scaled down.
-    zoom = max(1.0, max(ground.shape) / 16)
     margin = _MARGIN * zoom
     for axis, count in enumerate((columns, rows)):
         for i in range(0, count, stride):
@@ -226,7 +228,15 @@ def live_map(
             x, y = (along, off) if axis == 0 else (off, along)
             parts.append(f'<text class="number" x="{x:g}" y="{y:g}">{i + 1}</text>')
     low, more = -beyond - margin, 2 * beyond + margin + 2
-    box = (low, low, columns * CELL + more, rows * CELL + more)
+    keys = [f"{mark}: {text}" for text, mark in marks.items() if mark != text]
+    x, y = 0.0, rows * CELL + beyond + 1.5 * font
+    for key in keys:
+        if x and x + 0.62 * font * len(key) > columns * CELL:
+            x, y = 0.0, y + 1.5 * font
+        parts.append(_name(key, x, y, font))
+        x += 0.62 * font * (len(key) + 3)
+    below = y + font - rows * CELL - beyond if keys else 0
+    box = (low, low, columns * CELL + more, rows * CELL + more + below)
     return _svg(
         f"{name}-map",
         "map",
@@ -235,6 +245,11 @@ def live_map(
         f"A map of {rows} rows and {columns} columns; a table follows",
         zoom,
     )
+
+
+def _name(text: str, x: float, y: float, font: float) -> str:
+    style = "" if font == 10.5 else f' style="font-size:{font:.3g}px"'
+    return f'<text class="name" x="{x:g}" y="{y:g}"{style}>{html.escape(text)}</text>'
 
 
 def _cell(row: int, column: int, kind: str, color: str, more: str = "") -> str:

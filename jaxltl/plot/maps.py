@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -39,6 +39,9 @@ from jaxltl.plot.style import (
     settle,
     value_limits,
 )
+
+TINY = 16  # cells a side, beyond which they have no room for names and numbers
+_HATCH = "#9aa5b1"
 
 # Colours of cells that are named after one.
 _NAMED = {"r": "#f0b9b1", "y": "#f7e08e", "g": "#bfe3c4", "b": "#bcd3f2"}
@@ -85,7 +88,8 @@ def grid(
     rows, columns = kinds.shape
     across = 2 if count == 4 else min(count, 3)
     down = -(-count // across)
-    size = float(np.clip(5.2 / max(rows, columns), 0.16, 0.52))
+    longest = max(rows, columns)
+    size = float(np.clip(5.2 / longest, max(0.16, min(0.24, 9 / longest)), 0.52))
     figure = Figure(
         figsize=(
             across * (columns * size + 0.35) + (0.75 if panels is not None else 0.1),
@@ -107,6 +111,9 @@ def grid(
         keep_out_of_layout(axes)
     if panels is not None:
         scale_bar(figure, image, all_axes.tolist(), label)
+    colors = kind_colors(kinds, wall)
+    marks = _cell_texts(kinds, colors)
+    note(figure, [(colors[k], f"{m}: {k}", "s") for k, m in marks.items() if len(k) > len(m)])
     if any(titles):
         settle(figure)
     return figure
@@ -150,44 +157,26 @@ def _cells(
 ) -> AxesImage:
     rows, columns = kinds.shape
     special = kind_colors(kinds, wall)
+    marks = _cell_texts(kinds, special)
     shown: NDArray[np.float64] = np.full(kinds.shape, np.nan)
     if values is not None:
         shown = values.reshape(kinds.shape)
     image = shade_cells(axes, shown, limits)
-    tiny = max(rows, columns) > 16
+    tiny = max(rows, columns) > TINY
     for (r, c), kind in np.ndenumerate(kinds):
         blank = np.isnan(shown[r, c]) or kind == wall
         if kind == wall:
             axes.add_patch(Rectangle((c, r), 1, 1, facecolor=WALL, lw=0))
-        elif kind in special:
-            color = special[str(kind)]
-            if blank:
-                axes.add_patch(Rectangle((c, r), 1, 1, facecolor=color, lw=0))
-            if not tiny and blank:
-                axes.text(
-                    c + 0.5,
-                    r + 0.5,
-                    short_name(kind),
-                    ha="center",
-                    va="center",
-                    fontsize=9,
-                    color=INK,
-                    parse_math=False,
-                )
-            elif not tiny:
-                axes.text(
-                    c + 0.06,
-                    r + 0.06,
-                    short_name(kind),
-                    ha="left",
-                    va="top",
-                    fontsize=6.5,
-                    color=INK,
-                    weight="bold",
-                    parse_math=False,
-                    zorder=5,
-                    bbox={"facecolor": color, "edgecolor": "none", "pad": 0.9},
-                )
+            continue
+        color = special.get(str(kind), PAPER)
+        if blank and (values is not None or color != PAPER):
+            # Hatched, since a plain colour could be taken for one of the scale.
+            hatch = None if values is None else "/////"
+            axes.add_patch(
+                Rectangle((c, r), 1, 1, facecolor=color, edgecolor=_HATCH, hatch=hatch, lw=0)
+            )
+        if kind in special:
+            _name_cell(axes, (c, r), marks[str(kind)], color, blank=bool(blank), tiny=tiny)
         if numbers and not blank and not tiny:
             axes.text(
                 c + 0.5,
@@ -202,6 +191,49 @@ def _cells(
     axes.set(xlim=(0, columns), ylim=(rows, 0), aspect="equal")
     number_cells(axes, rows, columns)
     return image
+
+
+def _name_cell(
+    axes: Axes, corner: tuple[int, int], text: str, color: str, *, blank: bool, tiny: bool
+) -> None:
+    """Writes the name of a cell: into the middle of a blank one, else into its corner."""
+    where: tuple[str, str] = ("center", "center") if blank else ("left", "top")
+    axes.text(
+        corner[0] + (0.5 if blank else 0.06),
+        corner[1] + (0.5 if blank else 0.06),
+        text,
+        ha=where[0],
+        va=where[1],
+        fontsize=9 if blank and not tiny else 6.5,
+        color=INK,
+        weight="normal" if blank else "bold",
+        parse_math=False,
+        zorder=5,
+        bbox={"facecolor": color, "edgecolor": "none", "pad": 0.4 if tiny else 0.9},
+    )
+
+
+def _cell_texts(kinds: NDArray[np.str_], special: Iterable[str]) -> dict[str, str]:
+    """The text in the cells of each kind: its name, or a mark where cells are small."""
+    if max(kinds.shape) > TINY:
+        return kind_marks(special)
+    return {kind: short_name(kind) for kind in special}
+
+
+def kind_marks(kinds: Iterable[str]) -> dict[str, str]:
+    """Distinct marks of at most two characters: names that are as short, else one of their letters.
+
+    Example:
+      >>> kind_marks(["g", "goal", "lava"])
+      {'g': 'g', 'goal': 'o', 'lava': 'l'}
+    """
+    names = sorted(kinds)
+    marks = {kind: kind for kind in names if len(kind) <= 2}
+    for kind in names:
+        letters = [x for x in (*kind, *kind.upper(), *map(str, range(100))) if x.isalnum()]
+        taken = set(marks.values())
+        marks.setdefault(kind, next((x for x in letters if x not in taken), "?"))
+    return {kind: marks[kind] for kind in names}
 
 
 def kind_colors(kinds: NDArray[np.str_], wall: str) -> dict[str, str]:

@@ -23,6 +23,7 @@ from jaxltl.plot.board import (
     rule_cells,
     shade_cells,
 )
+from jaxltl.plot.maps import TINY, kind_marks
 from jaxltl.plot.style import ACCENT, INK, PAPER, SERIES, head, note, scale_bar, value_limits
 
 if TYPE_CHECKING:
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 
 # Pale versions of cell_kinds.COLORS, for contrast with drawings on top.
 TINTS = ("#e79a8c", "#f5db80", "#fdfcf8", "#c3add8", "#4a4f58")
+_RARE = 3  # cells of a kind whose name is written next to each
 _IS_LIGHT = np.array([1.0, 1.0, 1.0, 1.0, 0.0])
 
 
@@ -106,8 +108,9 @@ def temporal_gridworld(
             _name_kinds(axes, world)
             keep_out_of_layout(axes)
         scale_bar(figure, image, every[1], label, shrink=0.7)
-    if lines:
-        note(figure, [(ACCENT, "first cell", "o"), (ACCENT, "last cell", "s")])
+    ends = [(ACCENT, "first cell", "o"), (ACCENT, "last cell", "s")] if lines else []
+    marks = {name: mark for name, mark in _marks(world).items() if name != mark}
+    note(figure, [*ends, *((SERIES[1], f"{mark}: {name}", "s") for name, mark in marks.items())])
     return figure
 
 
@@ -159,7 +162,7 @@ def _color_cells(axes: Axes, world: World) -> NDArray[np.float64]:
 def _name_kinds(axes: Axes, world: World) -> None:
     """Frames objects and obstacles, and writes their names if they fit."""
     kinds = np.asarray(world.mdp.label)
-    tiny = max(world.shape) > 16
+    marks, tiny = _marks(world), max(world.shape) > TINY
     for state, number in np.argwhere(kinds):
         row, column = divmod(int(state), world.shape[1])
         name = world.mdp.propositions[number]
@@ -175,22 +178,28 @@ def _name_kinds(axes: Axes, world: World) -> None:
                 zorder=5,
             )
         )
-        # In small cells, names of rare kinds are written next to them.
-        if not tiny or kinds[:, number].sum() <= 3:
-            x, y = (column + 1.2, row + 0.04) if tiny else (column + 0.04, row + 0.04)
-            axes.text(
-                x,
-                y,
-                name,
-                ha="left",
-                va="top",
-                fontsize=6.5,
-                color=PAPER,
-                weight="bold",
-                parse_math=False,
-                zorder=7,
-                bbox={"facecolor": SERIES[1], "edgecolor": "none", "pad": 0.9},
-            )
+        # In small cells, names of rare kinds are written next to them, marks of others inside.
+        axes.text(
+            column + (1.2 if tiny and name not in marks else 0.04),
+            row + 0.04,
+            marks.get(name, name),
+            ha="left",
+            va="top",
+            fontsize=5 if name in marks else 6.5,
+            color=PAPER,
+            weight="bold",
+            parse_math=False,
+            zorder=7,
+            bbox={"facecolor": SERIES[1], "edgecolor": "none", "pad": 0.3 if marks else 0.9},
+        )
+
+
+def _marks(world: World) -> dict[str, str]:
+    """Marks of the kinds that are too frequent in small cells for their names."""
+    if max(world.shape) <= TINY:
+        return {}
+    often = np.asarray(world.mdp.label).sum(0) > _RARE
+    return kind_marks(np.array(world.mdp.propositions)[often].tolist())
 
 
 def _walks(trajectories: Trajectories | None, world: World) -> list[NDArray[np.float64]]:

@@ -85,11 +85,14 @@ def test_a_coloured_world_has_its_ring_and_names():
     assert low < -CELL and width + low >= 6 * CELL and height + low >= 5 * CELL
 
 
-def test_a_large_map_names_less_and_counts_in_strides():
-    cells = np.full((40, 40), ".")
-    cells[3, 3] = "b"
+def test_a_large_map_has_marks_with_a_legend_and_counts_in_strides():
+    cells = np.full((40, 40), ".", dtype="<U5")
+    cells[3, 3], cells[9, 30], cells[12, 1] = "b", "goal", "gold"
     text = live_map(cells, "m", {"0": (None, None)})
-    assert not parts(text, "text", "name")
+    names = [x.text for x in parts(text, "text", "name")]
+    assert names == ["b", "g", "o", "g: goal", "o: gold"]
+    box = [float(x) for x in ElementTree.fromstring(text).get("viewBox").split()]
+    assert all(float(x.get("y")) < box[1] + box[3] for x in parts(text, "text", "name"))
     assert [x.text for x in parts(text, "text", "number")][:3] == ["1", "4", "7"]
 
 

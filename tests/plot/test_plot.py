@@ -188,10 +188,9 @@ def test_graphviz_may_place_the_states(monkeypatch, tmp_path):
         plot.automaton(table, layout="neato")
 
 
-def test_notebooks_show_a_picture_unless_it_would_crowd(monkeypatch):
+def test_notebooks_show_a_picture_unless_it_would_crowd():
     import jaxltl.plot.notebook  # noqa: F401  as the package's first public name has it
 
-    monkeypatch.setattr("shutil.which", lambda name: None)
     picture = to_automaton("G F a")._repr_svg_()
     assert picture is not None
     assert ElementTree.fromstring(picture).tag == "{http://www.w3.org/2000/svg}svg"
@@ -273,6 +272,15 @@ def test_curves_with_and_without_spread():
     assert len(alone.axes[0].collections) == 0
     with pytest.raises(ValueError, match="nothing to show among unknown"):
         plot.curves({"unknown": [np.nan]})
+
+
+def test_curves_of_stacked_seeds():
+    loss = np.arange(30.0).reshape(2, 3, 5)  # of a vmap within a vmap
+    (stacked,) = plot.curves({"loss": loss, "weight": np.ones(2)}, show=["loss"]).axes
+    (flat,) = plot.curves({"loss": loss.reshape(6, 5)}).axes
+    np.testing.assert_array_equal(stacked.lines[0].get_ydata(), flat.lines[0].get_ydata())
+    with pytest.raises(ValueError, match="loss are single numbers; give a run's history"):
+        plot.curves({"loss": 3.0})
 
 
 def arrows(axes, base=0.2):
@@ -611,11 +619,43 @@ def test_a_coloured_world_is_drawn_with_all_that_is_in_it():
     ElementTree.fromstring(plot.to_bytes(figure))
 
 
-def test_a_large_coloured_world_names_only_what_is_rare():
+def test_a_large_coloured_world_marks_what_is_frequent():
     world = random_world(0, "F o1", shape=(20, 30), num_obstacles=12)
     figure = plot.temporal_gridworld(world)
-    assert sorted(text.get_text() for text in figure.axes[0].texts) == ["o1", "o2", "o3"]
+    texts = Counter(text.get_text() for text in figure.axes[0].texts)
+    assert texts == {"o1": 1, "o2": 1, "o3": 1, "ob": 12}
     assert not figure.legends
+
+
+def test_a_large_grid_has_letters_and_a_legend():
+    cells = np.full((30, 30), ".", dtype="<U5")
+    cells[0, 0], cells[3, 4], cells[5, 5], cells[29, 29], cells[7, 7] = (
+        "a",
+        "goal",
+        "gold",
+        "ab",
+        "#",
+    )
+    shown = np.where(cells == ".", 0.5, np.where(cells == "gold", np.nan, 1.0)).ravel()
+    for values in (None, shown):
+        figure = plot.grid(cells, values)
+        texts = Counter(text.get_text() for text in figure.axes[0].texts)
+        assert texts == {"a": 1, "ab": 1, "g": 1, "o": 1}
+        assert [t.get_text() for t in figure.legends[0].texts] == ["g: goal", "o: gold"]
+        assert all(text.get_fontsize() >= 6.5 for text in figure.axes[0].texts)
+    short = plot.grid(np.where(cells == "goal", "b", np.where(cells == "gold", "b", cells)))
+    assert not short.legends
+    board = plot.strategies(cells, np.full((900, 4), 0.25))
+    assert {"goal", "gold", "a", "ab"} <= {text.get_text() for text in board.axes[0].texts}
+
+
+def test_cells_without_a_value_are_hatched():
+    def hatched(figure):
+        return {x.get_xy() for x in figure.axes[0].patches if x.get_hatch()}
+
+    values = [0.2, np.nan, 0.5, 0.5, np.nan, np.nan]  # the fifth cell is a wall
+    assert hatched(plot.grid(MAP, values)) == {(1, 0), (2, 1)}
+    assert hatched(plot.grid(MAP)) == set()
 
 
 @pytest.mark.parametrize(
