@@ -8,6 +8,7 @@ import importlib
 import importlib.util
 import io
 import re
+import shutil
 import warnings
 
 import pytest
@@ -30,6 +31,15 @@ def pytest_collection_modifyitems(items):
             for root in {name.partition(".")[0] for name in _asked_for(item)}:
                 if importlib.util.find_spec(root) is None:
                     item.add_marker(pytest.mark.skip(reason=f"{root} is not installed"))
+
+
+@pytest.fixture(autouse=True, scope="session")
+def without_graphviz():
+    """Pictures are those of a machine without Graphviz; tests of it name a program of their own."""
+    which = shutil.which
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(shutil, "which", lambda x, *a, **k: None if x == "dot" else which(x, *a, **k))
+        yield
 
 
 @pytest.hookimpl(wrapper=True)

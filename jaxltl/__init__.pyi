@@ -7,6 +7,7 @@ from . import io as io
 from . import plot as plot
 from .core import (
     automata as automata,
+    enclosures as enclosures,
     environments as environments,
     games as games,
     graphs as graphs,
@@ -17,6 +18,7 @@ from .core import (
 )
 from .core.automata.automaton import Automaton as Automaton
 from .core.automata.translate import to_automaton as to_automaton
+from .core.enclosures.enclose import enclose as enclose
 from .core.environments.environment import (
     Environment as Environment,
     make_environment as make_environment,
@@ -32,7 +34,6 @@ from .core.models.construct.batch import stack_products as stack_products
 from .core.models.construct.convert import to_padded as to_padded, to_sparse as to_sparse
 from .core.models.construct.counts import make_counts as make_counts
 from .core.models.construct.lifting import (
-    FiniteMemoryPolicy as FiniteMemoryPolicy,
     lift_policy as lift_policy,
     project_policy as project_policy,
 )
@@ -54,6 +55,7 @@ from .core.models.parametric.parametric import (
 from .core.models.product import Product as Product, product as product
 from .core.models.sparse import SparseMDP as SparseMDP, make_sparse as make_sparse
 from .core.models.trajectories import make_trajectories as make_trajectories, rollout as rollout
+from .core.policies.finite_memory import FiniteMemoryPolicy as FiniteMemoryPolicy
 from .core.types import (
     NotConverged as NotConverged,
     Solution as Solution,
@@ -66,10 +68,7 @@ from .core.values.discounted.discounted import (
     policy_value as policy_value,
 )
 from .core.values.discounted.minimax import minimax_value as minimax_value
-from .core.values.discounted.occupancy import (
-    feature_expectation as feature_expectation,
-    occupancy_measure as occupancy_measure,
-)
+from .core.values.discounted.occupancy import occupancy_measure as occupancy_measure
 from .core.values.discounted.soft import soft_value as soft_value
 from .core.values.evaluation.data_guarantee import learn_guarantee as learn_guarantee
 from .core.values.evaluation.evaluation import evaluate as evaluate
@@ -89,7 +88,6 @@ from .core.values.undiscounted.satisfaction import (
     optimal_satisfaction as optimal_satisfaction,
     satisfaction_probability as satisfaction_probability,
 )
-from .core.values.undiscounted.step_bounded import bounded_reachability as bounded_reachability
 from .core.values.undiscounted.total_reward import total_reward as total_reward
 from .envs.gridworld import gridworld as gridworld
 from .io.log import read_log as read_log

@@ -4,7 +4,7 @@ The library sets none of this; single precision is tested by ``jax.enable_x64(Fa
 
 Compiling is what tests spend their time on, for programs that run once. So the compiler hardly
 optimises, and what one worker or run has compiled is read by the next. What the environment says
-stands: ``XLA_FLAGS= pytest`` tests the programs as users get them.
+stands: ``XLA_FLAGS= pytest`` tests the programs as users get them, ``JAX_PLATFORMS=cuda`` on a GPU.
 """
 
 import atexit
@@ -38,7 +38,8 @@ def _cache() -> Path | None:
     features = processor.read_text().split("\n\n")[0] if processor.exists() else ""
     lines = sorted(x for x in features.splitlines() if x.startswith(("flags", "Features", "model")))
     key = hashlib.sha256("\n".join([platform.machine(), *lines]).encode()).hexdigest()[:12]
-    place = Path(tempfile.gettempdir()) / f"jaxltl-tests-{getpass.getuser()}"
+    user = getattr(os, "getuid", getpass.getuser)()  # containers have users without a name
+    place = Path(tempfile.gettempdir()) / f"jaxltl-tests-{user}"
     place.mkdir(mode=0o700, exist_ok=True)
     if hasattr(os, "getuid") and place.stat().st_uid != os.getuid():
         return None
@@ -46,6 +47,7 @@ def _cache() -> Path | None:
 
 
 # Before JAX reads them; workers and subprocesses inherit them.
+os.environ.setdefault("JAX_PLATFORMS", "cpu")  # also where there is an accelerator
 if "XLA_FLAGS" not in os.environ:
     os.environ["XLA_FLAGS"] = xla_flags(_HASTE)
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ and (place := _cache()):

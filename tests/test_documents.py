@@ -88,7 +88,6 @@ def is_slow(name: str, block: Block) -> bool:
 @pytest.mark.filterwarnings("ignore:Brax System:UserWarning")
 def test_the_snippets_run(page, part, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("shutil.which", lambda name: None)  # pictures by our own hand
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     names: dict[str, Any] = {"__name__": "page"}
     needs = [x for b in part for x in b.marks.get("needs", "").split()]
@@ -217,7 +216,7 @@ def test_every_block_is_run_or_says_why_not(page):
         assert set(block.marks) <= {*MARKS, ""} or block.language not in RUN, where
         if "not run" in block.marks or "minutes" in block.marks:
             assert block.marks.get("not run", block.marks.get("minutes")), f"{where}: why?"
-        known = (*RUN, "", "text", "toml", "json", "{toctree}", "csv", "html", "bash")
+        known = (*RUN, "", "text", "toml", "json", "{toctree}", "csv", "html", "bash", "c")
         assert block.language in known, f"{where}: {block.language!r}"
         if block.language == "":
             assert seen == block.section, f"{where}: the output of what? ```text is no output"

@@ -16,7 +16,19 @@ HOOK = PROJECT["tool"]["hatch"]["metadata"]["hooks"]["fancy-pypi-readme"]
 def test_the_version_is_one():
     cited = re.search(r"^version: (\S+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)
     latest = re.search(r"^## (\S+)$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
-    assert cited[1] == latest[1] == jaxltl.__version__
+    page = re.search(r"version = \{(\S+)\}", (ROOT / "docs/cite.md").read_text())
+    assert cited[1] == latest[1] == page[1] == jaxltl.__version__
+
+
+def test_the_page_on_installing_has_every_extra():
+    rows = re.findall(r"^\| `(\w+)` \|", (ROOT / "docs/install.md").read_text(), re.MULTILINE)
+    assert sorted(rows) == sorted(PROJECT["project"]["optional-dependencies"])
+
+
+def test_citations_agree():
+    page, cited = ((ROOT / x).read_text() for x in ("docs/cite.md", "CITATION.cff"))
+    for text in ("Reinforcement Learning With High-Level Task Specifications", "2019", "Wen"):
+        assert text in page and text in cited
 
 
 def test_types_are_promised_and_there():

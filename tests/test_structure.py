@@ -24,13 +24,22 @@ MODULES = {
 }
 # The layers, lowest first: a module imports from its own folder and from those before it.
 LAYERS = (
-    ("core.array_types", "core.pretty_print", "core.struct", "core.validation"),
+    (
+        "core.array_types",
+        "core.files",
+        "core.pretty_print",
+        "core.status",
+        "core.struct",
+        "core.validation",
+    ),
     "core.types",
     "core.logic",
     "core.statistics",
     "core.sparse",
     "core.automata",
+    "core.policies",
     "core.models",
+    "core.enclosures",
     "core.environments",
     "core.graphs",
     ("core.values", "core.games"),
@@ -43,12 +52,15 @@ LAYERS = (
     "cli",
 )
 NO_JAX = (  # core.array_types names JAX's arrays for type checkers alone
+    "core.files",
     "core.pretty_print",
+    "core.status",
     "core.validation",
     "core.logic",
     "core.statistics",
     "core.sparse",
     "core.automata",
+    "core.policies",
 )
 
 

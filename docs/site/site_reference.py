@@ -14,6 +14,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import site_files
 from docutils import nodes
 from sphinx import addnodes
 from sphinx.util import logging
@@ -124,6 +125,7 @@ TOPICS = {
     "statistics": "Statistics",
     "models": "Models",
     "environments": "Environments and monitors",
+    "enclosures": "Enclosures",
     "graphs": "Graphs",
     "values": "Values and probabilities",
     "games": "Games",
@@ -150,13 +152,15 @@ def topics() -> dict[str, tuple[str, list[tuple[str, Any]]]]:
 
 def pages() -> dict[str, str]:
     """Files of the reference: the name of each, and its text."""
-    texts, lists = {}, []
+    texts, lists = site_files.pages(), []
+    about_files = "Every key with its valid values, default, meaning and an example."
+    lists.append(("Files of the command line", list(texts), about_files))
     for title, (about, entries) in topics().items():
         for name, value in entries:
             _note(value, name)
             _checked(name, value)
         texts[_slug(title)] = _page(title, about, entries)
-    lists.append(("By topic", list(texts)))
+    lists.append(("By topic", [_slug(title) for title in topics()]))
     for package, (title, about) in PACKAGES.items():
         below = []
         for module in _modules(package):
