@@ -164,14 +164,9 @@ def _run(path: Path, limit: int) -> tuple[float, dict | None]:
     command = [sys.executable, "-m", "jaxltl", "learn", str(path), "--out", str(out)]
     environment = {**os.environ, "JAX_ENABLE_COMPILATION_CACHE": "false"}
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    subprocess.run(
-        command,
-        env=environment,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        check=False,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_CPU, (limit, limit)),
-    )
+    quiet = subprocess.DEVNULL
+    with subprocess.Popen(command, env=environment, stdout=quiet, stderr=quiet) as process:
+        resource.prlimit(process.pid, resource.RLIMIT_CPU, (limit, limit))
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     seconds = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     result = out / "result.json"

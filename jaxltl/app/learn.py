@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -55,8 +54,9 @@ from jaxltl.core.models.product import Product, product
 from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.types import Solution, Status
 from jaxltl.core.values.discounted.soft import softmax_policy
-from jaxltl.core.values.undiscounted.mixture import at_starts, attained, from_starts
+from jaxltl.core.values.undiscounted.mixture import at_starts, certified, from_starts
 from jaxltl.core.values.undiscounted.optimal_actions import optimal_actions
+from jaxltl.core.values.undiscounted.policy_gradient import FullSupport
 from jaxltl.core.values.undiscounted.satisfaction import (
     optimal_satisfaction,
     satisfaction_probability,
@@ -210,22 +210,18 @@ def _constrained(
 ) -> list[tuple[Learned, float]]:
     """The most likely results at and below the required probability, and their weights mu."""
     guarantee, problem = setup.guarantee, setup.problem
-    required, worst = float(guarantee.asked), guarantee.over == "worst"
+    required, soft = float(guarantee.asked), FullSupport(setup.model, guarantee.over)
     value = jnp.zeros(setup.model.state_shape, setup.model.dtype)
 
     def evaluate(parameters: np.ndarray) -> Point:
         nonlocal value
-        (loss, probability), (gradient, slope), new = _likelihood_and_probability(
-            jnp.asarray(parameters, value.dtype), problem, hparams, value, worst
+        (loss, policy), pull, new = _likelihood_and_policy(
+            jnp.asarray(parameters, value.dtype), problem, hparams, value
         )
-        point = Point(
-            parameters,
-            float(loss),
-            float(probability),
-            np.asarray(gradient),
-            np.asarray(slope),
-            new,
-        )
+        # Without a certificate: only the policies that are found get one.
+        probability, slope = soft.probability(np.asarray(policy))
+        each = np.asarray(_derivatives(pull, jnp.asarray(slope, value.dtype)))
+        point = Point(parameters, float(loss), probability, each[0], each[1], new)
         value = new if point.is_finite else value
         return point
 
@@ -268,31 +264,26 @@ def _learned(
 
 
 @jax.jit
-def _likelihood_and_probability(
-    parameters: jax.Array,
-    problem: mlirl.Problem,
-    hparams: mlirl.Hparams,
-    initial: jax.Array,
-    worst: chex.Numeric,
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Loss and probability ``[2]``, their derivatives ``[2, F]``, and the value."""
-    model = problem.model
-    assert isinstance(model, Product)  # a probability is refused for rewards of the world
+def _likelihood_and_policy(
+    parameters: jax.Array, problem: mlirl.Problem, hparams: mlirl.Hparams, initial: jax.Array
+) -> tuple[tuple[jax.Array, jax.Array], Callable, jax.Array]:
+    """Loss and policy, the transpose of their derivative, and the value."""
 
-    def terms(parameters: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def terms(parameters: jax.Array) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
         loss, parts = mlirl.objective(parameters, problem, hparams, initial)
         reward = problem.reward(parameters, problem.features)
-        policy = softmax_policy(model, reward, hparams.discount, parts.value)
-        found = satisfaction_probability(model, policy).value
-        start = jnp.take_along_axis(found, model.initial_memory[:, None], axis=1)[:, 0]
-        weight = model.mdp.initial
-        least = jnp.min(jnp.where(weight > 0, start, jnp.inf))
-        probability = jnp.where(worst, least, jnp.sum(weight * start) / jnp.sum(weight))
-        return jnp.stack([loss, probability]), parts.value
+        policy = softmax_policy(problem.model, reward, hparams.discount, parts.value)
+        return (loss, policy), parts.value
 
-    each, pull, value = jax.vjp(terms, parameters, has_aux=True)
+    return jax.vjp(terms, parameters, has_aux=True)
+
+
+@jax.jit
+def _derivatives(pull: Callable, slope: jax.Array) -> jax.Array:
+    """Derivatives ``[2, F]`` of the loss, and of a function of the policy from its derivative."""
+    each = jnp.eye(2, dtype=slope.dtype)[:, 0], jnp.stack([jnp.zeros_like(slope), slope])
     # One after the other, so that the linear systems are compiled once.
-    return each, lax.map(lambda x: pull(x)[0], jnp.eye(2, dtype=each.dtype)), value
+    return lax.map(lambda x: pull(x)[0], each)
 
 
 def _least_loss(learned: Learned) -> int:
@@ -432,16 +423,17 @@ def learn(setup: Setup, training: Training) -> Outcome:
     training.stage("checking")
     learned, steps = _within_steps(setup, learned, chosen)
     policy = learned.policy[chosen]
-    if attempt is not None and steps is not None and steps["share"]:
-        reached = attained(model, policy, setup.guarantee.over)
-        loss = float(learned.neg_log_likelihood[chosen])
+    if attempt is None:
+        solution = satisfaction_probability(model, policy)
+    else:  # the search certifies with a tolerance, and before mixing
+        over = setup.guarantee.over
+        solution = certified(model, policy, over, float(setup.guarantee.asked))
         attempt = dataclasses.replace(
-            attempt, policy=policy, attained=reached, neg_log_likelihood=loss
+            attempt,
+            policy=policy,
+            attained=at_starts(model, solution.lower, over)[0],
+            neg_log_likelihood=float(learned.neg_log_likelihood[chosen]),
         )
-    solution = satisfaction_probability(model, policy)
-    if attempt is not None:  # the search certifies with a tolerance, and before mixing
-        lower = at_starts(model, solution.lower, setup.guarantee.over)[0]
-        attempt = dataclasses.replace(attempt, attained=lower)
     each = [
         solution if i == chosen else satisfaction_probability(model, learned.policy[i])
         for i in range(len(learned.policy))

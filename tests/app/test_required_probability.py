@@ -25,8 +25,8 @@ def check_case(case, place, monkeypatch):
         patch.setattr(job, "_train", counted(job._train, runs))
         patch.setattr(
             job,
-            "_likelihood_and_probability",
-            counted(job._likelihood_and_probability, evaluations),
+            "_likelihood_and_policy",
+            counted(job._likelihood_and_policy, evaluations),
         )
         setup = job.prepare(job.read_task(write(case, case.probability, place)), 0)
         outcome = job.learn(setup, Training(0, 1))

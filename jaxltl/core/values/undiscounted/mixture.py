@@ -27,7 +27,7 @@ _TRIALS = 20  # mixtures of a search
 _LEAST_REST = -20.0  # logarithm of the least share of the first policy
 # Widths of enclosures: narrower ones than needed take exact fractions for policies that hardly ever
 # end.
-_COARSE, _FINEST = 1e-3, 1e-12
+_COARSE, _FINE, _FINEST = 1e-3, 1e-9, 1e-12
 
 
 @brief
@@ -79,11 +79,21 @@ def attained(model: Product, policy: Array, over: str, tolerance: float | None =
 
 
 def attained_if_near(model: Product, policy: Array, over: str, probability: float) -> float:
-    """:func:`attained`, as close as the dtype allows if a coarse bound may not decide."""
-    coarse = attained(model, policy, over, _COARSE)
-    if coarse >= probability or coarse + _COARSE < probability:
-        return coarse
+    """:func:`attained`, as close as a comparison with a required probability needs."""
+    for tolerance in (_COARSE, _FINE):
+        reached = attained(model, policy, over, tolerance)
+        if reached >= probability or reached + tolerance < probability:
+            return reached
     return attained(model, policy, over)
+
+
+def certified(model: Product, policy: Array, over: str, probability: float) -> Solution:
+    """A policy's satisfaction probability, enclosed as closely as a required one needs."""
+    policy = to_jax(np.asarray(policy, model.dtype))
+    found = satisfaction_probability(model, policy, tolerance=_FINE)
+    if at_starts(model, found.lower, over)[0] >= probability:
+        return found
+    return satisfaction_probability(model, policy)
 
 
 def require_attainable(
@@ -123,17 +133,19 @@ def least_mixture(
     policy, sure = np.asarray(policy), np.asarray(sure)
     if np.isinf(steps):
         found = probable_mixture(model, policy, sure, probability, over)
-        exact = attained(model, found.policy, over)
-        return found._replace(attained=max(found.attained, exact))
+        close = attained(model, found.policy, over, _FINE)
+        return found._replace(attained=max(found.attained, close))
     clock, tolerance = Clock(model), None
 
     def judged(share: float) -> Mixture:
         mixed = (policy, sure)[int(share)] if share in (0, 1) else _mixed(policy, sure, share)
         taken = clock.steps(mixed)
         # The probability of a policy that takes very long is expensive.
-        needed = probability > 0 and (taken.upper <= steps or share == 1)
-        reached = attained(model, mixed, over, tolerance) if needed else 0.0
-        return Mixture(mixed, share, reached, taken)
+        if not (probability > 0 and (taken.upper <= steps or share == 1)):
+            return Mixture(mixed, share, 0.0, taken)
+        if tolerance is None:
+            return Mixture(mixed, share, attained_if_near(model, mixed, over, probability), taken)
+        return Mixture(mixed, share, attained(model, mixed, over, tolerance), taken)
 
     def upper(found: Mixture) -> float:
         return np.inf if found.steps is None else found.steps.upper

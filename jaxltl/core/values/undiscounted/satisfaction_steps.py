@@ -44,6 +44,7 @@ _EPS = float(np.finfo(np.float64).eps)
 _SOLVED = 1e-9  # relative width to which each part is solved
 _TOLERANCE = 1e-6  # relative width of a converged enclosure
 _MOST_SWEEPS = 1_000_000  # of the rates of acceptance
+_CLOSE = 1e-10  # width of probabilities; the default width may need exact fractions
 _LOSS = 1e-9  # of the satisfaction probability, that counts as a rounding error
 
 
@@ -228,7 +229,7 @@ class Clock:
 
     def probability(self, policy: Array) -> tuple[float, float, float]:
         """Satisfaction probability from the initial distribution: value, lower and upper bound."""
-        found = satisfaction_probability(self.model, policy)
+        found = satisfaction_probability(self.model, policy, tolerance=_CLOSE)
         return self.mean(jax.tree.map(lambda x: np.asarray(x).ravel(), found), 1.0)
 
     def mean(

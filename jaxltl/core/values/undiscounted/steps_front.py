@@ -19,6 +19,7 @@ from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.solvers import reachability as optimal
 from jaxltl.core.values.engine.host_solution import induced_chain
 from jaxltl.core.values.engine.validated import validated
+from jaxltl.core.values.undiscounted.policy_gradient import transient_factors
 from jaxltl.core.values.undiscounted.reachability import on_actions
 from jaxltl.core.values.undiscounted.satisfaction_steps import Clock, Quickest, quickest_policy
 
@@ -188,15 +189,10 @@ class _Front:
 
     def occupancy(self, policy: Array) -> np.ndarray:
         """Expected visits of undecided states with each action, ``float[S, Q, A]``."""
-        from scipy import sparse
-        from scipy.sparse.linalg import spsolve
-
         clock = self.clock
-        inner = np.flatnonzero(clock.undecided)
+        inner, visits = clock.undecided, np.zeros(clock.undecided.size)
         chain = induced_chain(clock.model, clock.sparse, policy)
-        step = chain.mdp.matrix[inner][:, inner]
         start = np.asarray(clock.model.initial, float).ravel()[inner]
-        visits = np.zeros(clock.undecided.size)
-        visits[inner] = spsolve((sparse.eye_array(inner.size) - step.T).tocsc(), start)
+        visits[inner] = transient_factors(chain.mdp, inner).solve(start, "T")
         rows = np.maximum(visits, 0)[clock.sparse.host.state] * chain.weight
         return on_actions(clock.sparse, rows, clock.model)
