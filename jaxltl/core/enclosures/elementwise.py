@@ -181,14 +181,17 @@ class Relaxation:
     upper: Array
 
 
-def relax(operation: Elementwise, inputs: list[Interval], output: Interval) -> Relaxation:
+def relax(
+    operation: Elementwise, inputs: list[Interval], output: Interval, parallel: bool = False
+) -> Relaxation:
     """Linear bounds over the inputs' boxes (CROWN, Zhang et al. 2018).
 
-    `output` encloses the values; its bounds are used where no linear ones are known.
+    `output` encloses the values; its bounds are used where no linear ones are known. With
+    `parallel`, the slopes of both bounds are equal, as they are for all but extrema.
     """
     name = operation.name
     if name in ("max", "min"):
-        return _relax_extreme(name, *inputs)
+        return _relax_extreme(name, inputs[0], inputs[1], parallel)
     if name in ("mul", "square") and (
         name == "square" or operation.inputs[0] == operation.inputs[1]
     ):
@@ -265,11 +268,11 @@ def _at(operation: Elementwise, points: list[Array]) -> Interval:
     return bounds(operation, [Interval(x, x + 0) for x in points])
 
 
-def _relax_extreme(name: str, x: Interval, y: Interval) -> Relaxation:
+def _relax_extreme(name: str, x: Interval, y: Interval, parallel: bool) -> Relaxation:
     """Maximum as `y + relu(x - y)`, minimum as `y - relu(y - x)`.
 
     For `z` in [l, u] with l < 0 < u, relu(z) is at most `u (z - l) / (u - l)` and at least `a z`
-    for any a in [0, 1]; a is 1 where u > -l, and 0 elsewhere.
+    for any a in [0, 1]; a is 1 where u > -l, and 0 elsewhere; if `parallel`, the slope above.
     """
     xp = module_of(x.low)
     z = arithmetic.subtract(x, y) if name == "max" else arithmetic.subtract(y, x)
@@ -277,7 +280,9 @@ def _relax_extreme(name: str, x: Interval, y: Interval) -> Relaxation:
     crossing = (z.low < 0) & (z.high > 0) & finite
     passed = xp.where(z.low >= 0, 1.0, 0.0).astype(z.low.dtype)
     above = xp.where(crossing, z.high / xp.where(crossing, z.high - z.low, 1), passed)
-    below = xp.where(crossing, (z.high > -z.low).astype(passed.dtype), passed)
+    below = above
+    if not parallel:
+        below = xp.where(crossing, (z.high > -z.low).astype(passed.dtype), passed)
     low, high = (xp.where(crossing, side, 0) for side in (z.low, z.high))
     # The slope and 1 - slope, which y multiplies, are rounded: the offset fits both ends.
     offset = xp.maximum(-above * low, high - above * high)

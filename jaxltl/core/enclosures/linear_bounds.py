@@ -1,7 +1,7 @@
 """Bounds of programs over boxes: intervals, and linear bounds forward and backward (CROWN).
 
-The box is `x = m + r e` with every `|e_j| <= 1`. Forward, each variable y gets linear bounds
-`A e + a <= y <= B e + b`, and from them and interval arithmetic an interval. Backward, from an output
+The box is `x = m + r e` with every `|e_j| <= 1`. Forward, each variable y gets an affine
+form `A e + a`, a bound of its error, and from them and interval arithmetic an interval. Backward, from an output
 to the box, the coefficients of the output's bounds pass through each operation, with the linear
 bounds of elementwise functions over the forward intervals (Zhang et al. 2018); cancellation between
 paths is seen there.
@@ -13,7 +13,7 @@ error is added to the offset.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -32,6 +32,7 @@ from jaxltl.core.enclosures.interval import (
     point,
     size_of,
     times,
+    tiny,
 )
 from jaxltl.core.enclosures.program import Elementwise, MatrixProduct, Program, Select, narrows
 from jaxltl.core.pretty_print import brief
@@ -66,11 +67,6 @@ class LinearForm:
         low, high = self.lower - low_terms, self.upper + high_terms
         return outward(low - low_terms * factor, high + high_terms * factor, 2)
 
-    def magnitude(self) -> Array:
-        """At least the sum of the magnitudes of all terms."""
-        slopes = size_of(self.lower_slope).sum(1) + size_of(self.upper_slope).sum(1)
-        return (slopes + size_of(self.lower) + size_of(self.upper)) * (1 + 64 * eps(self.lower))
-
 
 @dataclass(frozen=True)
 class Enclosed:
@@ -80,6 +76,7 @@ class Enclosed:
     intervals: Mapping[int, Interval]  # arrays [C, n]; [1, n] for known variables
     radius: Array  # float[C, J], of the box, with the entries of all inputs in order
     middle: Array
+    forms: Mapping[int, AffineForm]  # of outputs, if linear bounds were asked for
 
     @np.errstate(all="ignore")
     def outputs(self, linear: bool) -> list[Interval]:
@@ -103,29 +100,44 @@ def propagate(program: Program, boxes: list[Interval], linear: bool = True) -> E
     intervals |= dict(zip(program.inputs, boxes, strict=True))
     middle = xp.concatenate([x.middle for x in boxes], -1)
     radius = xp.concatenate([x.radius for x in boxes], -1)
-    forms: dict[int, LinearForm] = {}
+    forms: dict[int, AffineForm] = {}
     if linear:
         forms |= zip(program.inputs, _input_forms(boxes, radius), strict=True)
     last_use = _last_uses(program)
     for position, operation in enumerate(program.operations):
-        match operation:
-            case Select():
-                found = _select(operation, [intervals[x] for x in operation.inputs])
-            case MatrixProduct():
-                found = _product(operation.matrix, intervals[operation.input])
-            case Elementwise():
-                found = elementwise.bounds(operation, [intervals[x] for x in operation.inputs])
         y = operation.output
         inputs = _inputs(operation)
-        real = jnp.issubdtype(found.low.dtype, jnp.floating)
-        if real and any(x in forms for x in inputs):
-            forms[y] = _forward(operation, intervals, found, forms)
-            found = intersect(found, forms[y].interval())
-        intervals[y] = found
+        if isinstance(operation, MatrixProduct) and _is_bounded(forms.get(operation.input)):
+            # Interval arithmetic is rarely narrower here, and costs as much as the form.
+            forms[y] = _forward_product(operation.matrix, forms[operation.input])
+            intervals[y] = forms[y].interval()
+        else:
+            found = _bounds(operation, intervals)
+            if jnp.issubdtype(found.low.dtype, jnp.floating) and any(x in forms for x in inputs):
+                forms[y] = _forward(operation, intervals, found, forms)
+                found = intersect(found, forms[y].interval())
+            intervals[y] = found
         for x in inputs:
-            if last_use[x] == position:
+            if last_use[x] == position and x not in program.outputs:
                 forms.pop(x, None)
-    return Enclosed(program, intervals, radius, middle)
+    return Enclosed(program, intervals, radius, middle, forms)
+
+
+def _is_bounded(form: AffineForm | None) -> bool:
+    """True for a form of NumPy arrays without infinite bounds."""
+    return form is not None and module_of(form.error) is np and bool(np.isfinite(form.error).all())
+
+
+def _bounds(
+    operation: Select | MatrixProduct | Elementwise, intervals: Mapping[int, Interval]
+) -> Interval:
+    """The interval of an operation's output from those of its inputs."""
+    if isinstance(operation, MatrixProduct):
+        return _product(operation.matrix, intervals[operation.input])
+    inputs = [intervals[x] for x in operation.inputs]
+    if isinstance(operation, Select):
+        return _select(operation, inputs)
+    return elementwise.bounds(operation, inputs)
 
 
 def _inputs(operation: Select | MatrixProduct | Elementwise) -> tuple[int, ...]:
@@ -136,14 +148,14 @@ def _last_uses(program: Program) -> dict[int, int]:
     return {x: i for i, operation in enumerate(program.operations) for x in _inputs(operation)}
 
 
-def _input_forms(boxes: list[Interval], radius: Array) -> list[LinearForm]:
+def _input_forms(boxes: list[Interval], radius: Array) -> list[AffineForm]:
     """`x = m + r e`, entry by entry."""
     xp, forms, start = module_of(radius), [], 0
     for box in boxes:
         n = box.low.shape[-1]
-        unit = np.eye(radius.shape[-1], dtype=radius.dtype)[:, start : start + n]
+        unit = np.eye(start + n, dtype=radius.dtype)[:, start:]
         slope = xp.asarray(unit)[None] * radius[:, None, start : start + n]
-        forms.append(LinearForm(slope, box.middle, slope, box.middle))
+        forms.append(AffineForm(slope, box.middle, box.middle * 0))
         start += n
     return forms
 
@@ -183,80 +195,131 @@ def _product(matrix: Array, x: Interval) -> Interval:
 # --- forward --------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class AffineForm:
+    """`|y - slope e - middle| <= error` for every e in [-1, 1]^J: one slope for both bounds.
+
+    The slopes are those of the first J' entries of the box; later entries have slope 0. A leading 1
+    in place of C holds for all boxes.
+    """
+
+    slope: Array  # float[C, J', n]
+    middle: Array  # float[C, n]
+    error: Array  # float[C, n], infinite where no bound is known
+
+    def interval(self) -> Interval:
+        """Bounds over the box."""
+        terms = self.slope_size() + self.error
+        terms = terms * (1 + 2 * (self.slope.shape[1] + 2) * eps(self.middle))
+        return outward(self.middle - terms, self.middle + terms, 2)
+
+    def slope_size(self) -> Array:
+        """Sum of the slopes' magnitudes."""
+        return size_of(self.slope).sum(1)
+
+
+def _padded(slope: Array, count: int) -> Array:
+    """Slopes with zeros up to `count` entries."""
+    xp, missing = module_of(slope), count - slope.shape[1]
+    if not missing:
+        return slope
+    zeros = xp.zeros((slope.shape[0], missing, slope.shape[2]), slope.dtype)
+    return xp.concatenate([slope, zeros], 1)
+
+
 def _forward(
     operation: Select | MatrixProduct | Elementwise,
     intervals: Mapping[int, Interval],
     found: Interval,
-    forms: Mapping[int, LinearForm],
-) -> LinearForm:
-    """The linear bounds of an operation's output from those of its inputs."""
-    count = next(iter(forms.values())).lower_slope.shape[1]
-    dtype = found.low.dtype
-    inputs = [forms.get(x) or _constant(intervals[x], count, dtype) for x in _inputs(operation)]
+    forms: Mapping[int, AffineForm],
+) -> AffineForm:
+    """The affine form of an operation's output from those of its inputs."""
+    inputs = [forms.get(x) or _constant(intervals[x], found.low.dtype) for x in _inputs(operation)]
     if isinstance(operation, Select):
+        index = operation.index
         if len(inputs) == 1:
-            return _map(inputs[0], lambda a: a[..., operation.index])
-        parts = zip(
-            *([f.lower_slope, f.lower, f.upper_slope, f.upper] for f in inputs), strict=True
-        )
-        return LinearForm(*(_joined(list(p))[..., operation.index] for p in parts))
+            x = inputs[0]
+            return AffineForm(x.slope[..., index], x.middle[:, index], x.error[:, index])
+        count = max(x.slope.shape[1] for x in inputs)
+        parts = ([_padded(x.slope, count) for x in inputs], [x.middle for x in inputs],
+                 [x.error for x in inputs])  # fmt: skip
+        return AffineForm(*(_joined(part)[..., index] for part in parts))
     if isinstance(operation, MatrixProduct):
         return _forward_product(operation.matrix, inputs[0])
     values = [intervals[x] for x in operation.inputs]
-    return _forward_elementwise(relaxation(operation, values, found), inputs, found)
+    if operation.name in ("add", "sub"):
+        return _forward_sum(inputs[0], inputs[1], 1 if operation.name == "add" else -1)
+    return _forward_elementwise(relaxation(operation, values, found, parallel=True), inputs)
 
 
-def _map(form: LinearForm, function: Callable[[Array], Array]) -> LinearForm:
-    return LinearForm(*(function(a) for a in (
-        form.lower_slope, form.lower, form.upper_slope, form.upper)))  # fmt: skip
-
-
-def _constant(x: Interval, count: int, dtype: np.dtype) -> LinearForm:
-    """Bounds without slopes; of a Boolean variable, which has slope 0 everywhere, zeros."""
+def _constant(x: Interval, dtype: np.dtype) -> AffineForm:
+    """A form without slopes; of a Boolean variable, which has slope 0 everywhere, zeros."""
     xp = module_of(x.low)
-    zeros = xp.zeros((x.low.shape[0], count, x.low.shape[-1]), dtype)
+    slope = xp.zeros((x.low.shape[0], 0, x.low.shape[-1]), dtype)
     if x.low.dtype != dtype:
-        return LinearForm(zeros, zeros[:, 0], zeros, zeros[:, 0])
-    return LinearForm(zeros, x.low, zeros, x.high)
+        zeros = xp.zeros(x.low.shape, dtype)
+        return AffineForm(slope, zeros, zeros)
+    if x.low is x.high:
+        return AffineForm(slope, x.low, x.low * 0)
+    finite = xp.isfinite(x.low) & xp.isfinite(x.high)
+    return AffineForm(slope, xp.where(finite, x.middle, 0), xp.where(finite, x.radius, xp.inf))
 
 
-def _forward_product(matrix: Array, x: LinearForm) -> LinearForm:
-    xp = module_of(x.lower)
-    matrix = xp.asarray(matrix)
-    up, down = xp.maximum(matrix, 0).T, xp.minimum(matrix, 0).T
-    error = (x.magnitude() @ size_of(matrix).T) * (2 * (matrix.shape[1] + 2) * eps(x.lower))
-    lower = x.lower @ up + x.upper @ down
-    upper = x.upper @ up + x.lower @ down
-    bounds = outward(lower - error, upper + error, 4)
-    return LinearForm(
-        x.lower_slope @ up + x.upper_slope @ down, bounds.low,
-        x.upper_slope @ up + x.lower_slope @ down, bounds.high,
-    )  # fmt: skip
+def _forward_product(matrix: Array, x: AffineForm) -> AffineForm:
+    matrix = module_of(x.middle).asarray(matrix)
+    rounding = 2 * (matrix.shape[1] + 2) * eps(x.middle)
+    error = x.error * (1 + rounding) + (x.slope_size() + size_of(x.middle)) * rounding
+    error = error @ size_of(matrix).T + tiny(x.middle) * matrix.shape[1]
+    return AffineForm(x.slope @ matrix.T, x.middle @ matrix.T, error)
 
 
-def _forward_elementwise(
-    bounds: Relaxation, inputs: list[LinearForm], found: Interval
-) -> LinearForm:
-    xp = module_of(found.low)
-    zero = found.low[:, None] * 0
-    lower_slope = upper_slope = xp.where(xp.isnan(zero), 0, zero)
-    lower, upper = bounds.lower, bounds.upper
-    size = size_of(lower) + size_of(upper)
-    for x, a, b in zip(inputs, bounds.lower_slope, bounds.upper_slope, strict=True):
-        a_up, a_down = xp.maximum(a, 0), xp.minimum(a, 0)
-        b_up, b_down = xp.maximum(b, 0), xp.minimum(b, 0)
-        lower_slope = lower_slope + a_up[:, None] * x.lower_slope + a_down[:, None] * x.upper_slope
-        upper_slope = upper_slope + b_up[:, None] * x.upper_slope + b_down[:, None] * x.lower_slope
-        lower = lower + times(a_up, x.lower) + times(a_down, x.upper)
-        upper = upper + times(b_up, x.upper) + times(b_down, x.lower)
-        size = size + times(xp.maximum(size_of(a), size_of(b)), x.magnitude())
-    error = size * (4 * (len(inputs) + 2) * eps(found.low))
-    offsets = outward(lower - error, upper + error, 4)
-    return LinearForm(lower_slope, offsets.low, upper_slope, offsets.high)
+def _forward_sum(x: AffineForm, y: AffineForm, sign: int) -> AffineForm:
+    """`x + sign y`."""
+    xp = module_of(x.middle)
+    add = xp.add if sign > 0 else xp.subtract
+    count = max(x.slope.shape[1], y.slope.shape[1])
+    slope = x.slope
+    if y.slope.shape[1]:
+        slope = add(_padded(x.slope, count), _padded(y.slope, count))
+    error = x.error + y.error
+    middle = add(x.middle, y.middle)
+    size = size_of(slope).sum(1) + size_of(middle)
+    rounding = 4 * eps(middle)
+    return AffineForm(slope, middle, error * (1 + rounding) + size * rounding + tiny(middle))
 
 
-def relaxation(operation: Elementwise, values: list[Interval], found: Interval) -> Relaxation:
-    """Linear bounds of an elementwise operation; exact for sums and products with known numbers."""
+def _forward_elementwise(bounds: Relaxation, inputs: list[AffineForm]) -> AffineForm:
+    xp = module_of(bounds.lower)
+    finite = xp.isfinite(bounds.lower) & xp.isfinite(bounds.upper)
+    low, high = (xp.where(finite, side, 0) for side in (bounds.lower, bounds.upper))
+    middle, error = (low + high) / 2, xp.where(finite, (high - low) / 2, xp.inf)
+    size = size_of(low) + size_of(high)
+    slopes: list[Array] = []
+    for x, a in zip(inputs, bounds.lower_slope, strict=True):
+        magnitude = size_of(a)
+        middle = middle + a * x.middle
+        error = error + times(magnitude, x.error)
+        if x.slope.shape[1]:
+            size = size + magnitude * (x.slope_size() + size_of(x.middle))
+            slopes.append(a[:, None] * x.slope)
+        else:
+            size = size + magnitude * size_of(x.middle)
+    count = max(a.shape[1] for a in slopes)
+    slope = _padded(slopes[0], count)
+    for other in slopes[1:]:
+        slope = slope + _padded(other, count)
+    rounding = 4 * (len(inputs) + 2) * eps(middle)
+    error = error * (1 + rounding) + size * rounding + tiny(middle)
+    return AffineForm(slope, middle, error)
+
+
+def relaxation(
+    operation: Elementwise, values: list[Interval], found: Interval, parallel: bool = False
+) -> Relaxation:
+    """Linear bounds of an elementwise operation; exact for sums and products with known numbers.
+
+    With `parallel`, the slopes of both bounds are equal.
+    """
     xp, zero = module_of(found.low), found.low * 0
     zero = xp.where(xp.isnan(zero), 0, zero)
     one = zero + 1
@@ -270,7 +333,7 @@ def relaxation(operation: Elementwise, values: list[Interval], found: Interval) 
     if operation.name == "neg" or exact:
         slope = -one if operation.name == "neg" else one
         return Relaxation((slope,), zero, (slope,), zero)
-    return elementwise.relax(operation, values, found)
+    return elementwise.relax(operation, values, found, parallel)
 
 
 # --- backward -------------------------------------------------------------------------------------
