@@ -7,6 +7,7 @@ from . import io as io
 from . import plot as plot
 from .core import (
     automata as automata,
+    continuous as continuous,
     enclosures as enclosures,
     environments as environments,
     games as games,
@@ -47,7 +48,6 @@ from .core.models.mdp import (
     make_mdp as make_mdp,
 )
 from .core.models.mesh.lanes import vmap_over_mesh as vmap_over_mesh
-from .core.models.mesh.shard import shard as shard
 from .core.models.parametric.parametric import (
     ParametricMDP as ParametricMDP,
     make_parametric as make_parametric,

@@ -43,6 +43,7 @@ LAYERS = (
     "core.environments",
     "core.graphs",
     ("core.values", "core.games"),
+    "core.continuous",
     "algos",
     "envs",
     "io",

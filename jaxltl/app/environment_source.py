@@ -86,6 +86,7 @@ def _made(
             horizon=found.horizon,
             starts=found.starts,
             outcomes=found.outcomes,
+            ending=found.ending,
         )
 
 

@@ -1,4 +1,5 @@
 from . import automata as automata
+from . import continuous as continuous
 from . import enclosures as enclosures
 from . import environments as environments
 from . import games as games

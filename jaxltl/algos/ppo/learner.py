@@ -117,7 +117,7 @@ def make_problem(
       ValueError: a network that returns other shapes or keeps more than parameters; a memory that
         does not fit; a box of integers; not an environment.
     """
-    require_environment(environment)
+    environment = require_environment(environment)
     actions = environment.actions
     if isinstance(actions, Box) and not jnp.issubdtype(jnp.dtype(actions.dtype), jnp.floating):
         raise ValueError(

@@ -62,7 +62,8 @@ def make_problem(
       >>> float(make_problem(world, horizon=5, limit=1.0).limit)
       1.0
     """
-    actions = require_environment(environment).actions
+    environment = require_environment(environment)
+    actions = environment.actions
     if not isinstance(actions, Box) or not jnp.issubdtype(jnp.dtype(actions.dtype), jnp.floating):
         raise ValueError(
             f"the environment's actions are {actions}; trust-region search draws from a Gaussian: "

@@ -37,6 +37,9 @@ from jaxltl.core.pretty_print import brief
 from jaxltl.core.types import require_shape
 
 
+ENDINGS = ("repeat", "violated", "undecided")
+
+
 @brief
 @struct.dataclass
 class Finite:
@@ -181,6 +184,7 @@ class Environment:
       observations: a tree of :class:`Box` with the structure of an observation.
       propositions: names of the P labels; static.
       horizon: an upper bound on the length of episodes, or None; static.
+      ending: the default of the option `ending` of tasks, the verdict of terminal states; static.
 
     Example:
       >>> coin = make_environment(
@@ -201,6 +205,7 @@ class Environment:
     horizon: int | None = struct.field(pytree_node=False, default=None)
     starts: Callable[..., Any] | None = None
     outcomes: Callable[..., Any] | None = None
+    ending: str = struct.field(pytree_node=False, default="repeat")
 
 
 class EnvironmentOptions(TypedDict, total=False):
@@ -211,6 +216,8 @@ class EnvironmentOptions(TypedDict, total=False):
       propositions: the P names.
       observations: a tree of :class:`Box`; default: unbounded.
       horizon: an upper bound on the length of episodes.
+      ending: ``"repeat"`` (default), ``"violated"`` or ``"undecided"``, the default of the option of
+        tasks (:class:`~jaxltl.core.environments.task_environment.TaskOptions`).
     """
 
     labels: Callable[..., jax.Array] | None
@@ -220,6 +227,7 @@ class EnvironmentOptions(TypedDict, total=False):
     horizon: int | None
     starts: Callable[..., PyTree] | None
     outcomes: Callable[..., PyTree] | None
+    ending: str
 
 
 def make_environment(
@@ -285,6 +293,7 @@ def make_environment(
         observations=observations,
         propositions=names,
         horizon=horizon,
+        ending=validation.choice("ending", options.get("ending", "repeat"), ENDINGS),
     )
     seen = _check_functions(made)
     if observations is None:
@@ -306,7 +315,8 @@ def as_partial(function: Callable[..., Any], name: str = "function") -> Partial:
 
 
 def require_environment(environment: Any) -> Environment:
-    """Raises ValueError for anything but an :class:`Environment`."""
+    """An :class:`Environment`, or that of an object with the property `environment`; else ValueError."""
+    environment = getattr(environment, "environment", environment)
     found: Environment = validation.instance(
         "environment", environment, Environment, "one of make_environment"
     )

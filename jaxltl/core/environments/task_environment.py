@@ -27,6 +27,7 @@ from jaxltl.core import validation
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.environments.environment import (
+    ENDINGS,
     Environment,
     Timestep,
     make_box,
@@ -41,8 +42,6 @@ from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.models.ops.annotated_pytree import register_annotated_pytree
 from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.pretty_print import brief
-
-ENDINGS = ("repeat", "violated", "undecided")
 
 _Tree = TypeVar("_Tree")
 
@@ -143,7 +142,7 @@ class TaskOptions(RewardOptions, total=False):
     Attributes:
       ending: the verdict of a terminal state of the environment while the task is undecided:
         ``"repeat"`` (default): that of the last label repeated for ever, as in an absorbing state;
-        ``"violated"``; or ``"undecided"``.
+        ``"violated"``; or ``"undecided"``. An environment with another `ending` sets the default.
       embedding: ``float[Q, ...]``, observations of the automaton states; default: one-hot.
     """
 
@@ -271,6 +270,7 @@ def task_environment(
         **others,
     )
     if not isinstance(formula, TaskTables):
+        options = {"ending": environment.ending, **options}
         tables = make_task_tables(formula, inner.propositions, **options)
         if not isinstance(formula, Automaton):
             _require_open(str(formula), tables.verdict[tables.initial])

@@ -92,7 +92,7 @@ def shield_environment(
       >>> safe.allowed(safe.reset(jax.random.key(0))).tolist()
       [True, False]
     """
-    require_environment(environment)
+    environment = require_environment(environment)
     if not isinstance(environment.actions, Finite):
         raise ValueError("a shield is for finitely many actions; this world's are of a box.")
     place = Partial(_itself) if state_of is None else as_partial(state_of, "state_of")
@@ -135,6 +135,7 @@ def shield_environment(
         horizon=made.horizon,
         starts=made.starts,
         outcomes=made.outcomes,
+        ending=made.ending,
     )
 
 

@@ -92,7 +92,8 @@ def episode_evaluator(
         if isinstance(costs, str) or callable(costs)
         else tuple(validation.sequence("costs", costs))
     )
-    task = task_world(jax.eval_shape(require_environment(environment).reset, jax.random.key(0)))
+    environment = require_environment(environment)
+    task = task_world(jax.eval_shape(environment.reset, jax.random.key(0)))
     names = SUMS if task is None else SUMS + OF_TASKS
     for score in (objective, *several):
         if not callable(score) and not (isinstance(score, str) and score in names):

@@ -181,7 +181,8 @@ def evaluate(
       >>> print(str(found).rpartition("\\n")[2].strip())
       success is not at least 0.8
     """
-    num_steps = checked_steps(require_environment(environment), num_steps)
+    environment = require_environment(environment)
+    num_steps = checked_steps(environment, num_steps)
     most = 2**31 - 1
     num_episodes = validation.integer("num_episodes", num_episodes, least=1, most=most)
     batch = batch if isinstance(batch, Batch) else Batch(batch)

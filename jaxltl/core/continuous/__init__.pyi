@@ -1,0 +1,20 @@
+from .dynamics import (
+    Dynamics as Dynamics,
+    make_dynamics as make_dynamics,
+    to_environment as to_environment,
+)
+from .noise import (
+    Distribution as Distribution,
+    from_cdf as from_cdf,
+    gaussian as gaussian,
+    triangular as triangular,
+    truncated_gaussian as truncated_gaussian,
+    uniform as uniform,
+)
+from .regions import (
+    Region as Region,
+    box as box,
+    half_space as half_space,
+    union as union,
+    where_positive as where_positive,
+)

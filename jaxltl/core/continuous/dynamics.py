@@ -1,0 +1,443 @@
+"""Stochastic dynamics in continuous spaces: ``x' = step(x, u, w)`` in a box, with labelled regions.
+
+The same object is the model of proofs (:mod:`jaxltl.core.continuous`) and, by
+:func:`to_environment`, an environment of every learner.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, TypedDict, Unpack
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.tree_util import Partial
+from numpy.typing import ArrayLike, NDArray
+
+from jaxltl.core import validation
+from jaxltl.core.continuous.noise import Distribution
+from jaxltl.core.continuous.regions import Region, as_region, box, extended
+from jaxltl.core.environments.environment import (
+    Box,
+    Environment,
+    Finite,
+    Timestep,
+    make_box,
+    make_environment,
+    traced,
+)
+from jaxltl.core.pretty_print import brief, count, propositions_text
+
+Floats = NDArray[np.float64]
+Bounds = tuple[Floats, Floats]
+Step = Callable[[jax.Array, jax.Array, jax.Array], jax.Array]
+
+OUTSIDE = ("violates", "clip")
+
+
+def _facts(dynamics: Dynamics) -> list[str]:
+    actions = count(dynamics.num_actions, "action coordinate")
+    if isinstance(dynamics.actions, np.ndarray):
+        actions = count(len(dynamics.actions), "action")
+    return [
+        count(dynamics.num_states, "state coordinate"),
+        actions,
+        count(dynamics.num_noise, "noise coordinate"),
+        propositions_text(dynamics.propositions),
+        f"outside={dynamics.outside!r}",
+    ]
+
+
+@brief(facts=_facts)
+@dataclass(frozen=True, eq=False)
+class Dynamics:
+    """Stochastic dynamics in a box; :func:`make_dynamics` builds checked ones.
+
+    Attributes:
+      step: ``(float[n], float[m], float[k]) -> float[n]``, the successor of a state.
+      domain: ``(low, high)``, ``float64[n]`` each; a closed box.
+      noise: distributions of the first coordinates of the third argument.
+      disturbance: ``(low, high)`` of its other coordinates, chosen by an adversary, or None.
+      actions: ``(low, high)``, ``float64[m]`` each; ``float64[A, m]``, a grid; or None for m = 0.
+      labels: regions by proposition; box edges at the domain's edges are at infinity.
+      outside: ``"violates"``, ``"clip"``, or the proposition that holds forever outside.
+      initial: boxes of the initial states, inside the domain.
+
+    Example:
+      >>> from jaxltl.core.continuous.noise import gaussian
+      >>> walk = make_dynamics(
+      ...     lambda x, u, w: x + u + w, domain=([-2.0], [2.0]), noise=gaussian(0.1),
+      ...     actions=([-0.5], [0.5]), labels={"goal": ([1.0], [2.0])})
+      >>> walk.num_states, walk.num_actions, walk.num_noise, walk.propositions
+      (1, 1, 1, ('goal',))
+    """
+
+    step: Step
+    domain: Bounds
+    noise: tuple[Distribution, ...]
+    disturbance: Bounds | None
+    actions: Bounds | Floats | None
+    labels: Mapping[str, Region]
+    outside: str
+    initial: Region
+
+    @property
+    def num_states(self) -> int:
+        """n, the number of state coordinates."""
+        return len(self.domain[0])
+
+    @property
+    def num_actions(self) -> int:
+        """m, the number of action coordinates."""
+        if isinstance(self.actions, np.ndarray):
+            return int(self.actions.shape[1])
+        return 0 if self.actions is None else len(self.actions[0])
+
+    @property
+    def num_noise(self) -> int:
+        """k, the number of coordinates of noise and disturbance together."""
+        return len(self.noise) + (0 if self.disturbance is None else len(self.disturbance[0]))
+
+    @property
+    def propositions(self) -> tuple[str, ...]:
+        """Names of the labels; with that of the outside, last, if no region has it."""
+        own = self.outside not in (*OUTSIDE, *self.labels)
+        return (*self.labels, self.outside) if own else tuple(self.labels)
+
+    @cached_property
+    def environment(self) -> Environment:
+        """The result of :func:`to_environment`, by which every learner accepts the dynamics."""
+        return to_environment(self)
+
+    def inside(self, state: jax.Array) -> jax.Array:
+        """``bool[]``: the state ``float[n]`` lies in the domain; no derivative."""
+        low, high = (jnp.asarray(x, state.dtype) for x in self.domain)
+        return ((low <= state) & (state <= high)).all(-1)
+
+    def label(self, state: jax.Array) -> jax.Array:
+        """``bool[P]``: the propositions that hold in a state ``float[n]``; no derivative."""
+        inside = self.inside(state)
+        held = [
+            (self.labels[name].contains(state) & inside if name in self.labels else False)
+            | (~inside if name == self.outside else False)
+            for name in self.propositions
+        ]
+        return jnp.stack(held) if held else jnp.zeros(0, bool)
+
+    def sample_noise(self, key: chex.PRNGKey, disturbance: ArrayLike | None = None) -> jax.Array:
+        """``float[k]``: a sample of the noise, with a given or a uniform disturbance; differentiable
+        in the disturbance."""
+        keys = jax.random.split(key, len(self.noise) + 1)
+        drawn = [one.sample(each) for one, each in zip(self.noise, keys[1:], strict=True)]
+        random = jnp.stack(drawn) if drawn else jnp.zeros(0)
+        if self.disturbance is None:
+            return random
+        low, high = (jnp.asarray(x, random.dtype) for x in self.disturbance)
+        chosen = (
+            jax.random.uniform(keys[0], low.shape, random.dtype, low, high)
+            if disturbance is None
+            else jnp.clip(jnp.asarray(disturbance, random.dtype), low, high)
+        )
+        return jnp.concatenate([random, chosen])
+
+    def next_state(
+        self,
+        key: chex.PRNGKey,
+        state: jax.Array,
+        action: jax.Array,
+        disturbance: ArrayLike | None = None,
+    ) -> jax.Array:
+        """``float[n]``: a sampled successor; clipped to the domain if `outside` is ``"clip"``.
+
+        Args:
+          key: random key.
+          state, action: ``float[n]`` and ``float[m]``.
+          disturbance: that of the adversary, ``float[...]``; default: uniform.
+
+        Returns:
+          The successor; differentiable in state, action and disturbance.
+        """
+        noise = self.sample_noise(key, disturbance).astype(state.dtype)
+        found = jnp.asarray(self.step(state, action, noise), state.dtype)
+        if self.outside != "clip":
+            return found
+        return jnp.clip(found, *(jnp.asarray(x, state.dtype) for x in self.domain))
+
+    def sample_initial(self, key: chex.PRNGKey) -> jax.Array:
+        """``float[n]``: an initial state, uniform in a box that is chosen by its volume."""
+        low, high = self.initial.low, self.initial.high
+        which, place = jax.random.split(key)
+        volume = np.log(high - low).sum(axis=1)
+        i = jax.random.categorical(which, jnp.asarray(volume, float))
+        first, last = jnp.asarray(low, float)[i], jnp.asarray(high, float)[i]
+        return first + (last - first) * jax.random.uniform(place, first.shape, first.dtype)
+
+
+class DynamicsOptions(TypedDict, total=False):
+    """Optional parts of dynamics.
+
+    Attributes:
+      noise: a :class:`~jaxltl.core.continuous.noise.Distribution`, or one for each random coordinate.
+      disturbance: ``(low, high)`` of a bounded disturbance, chosen by an adversary.
+      actions: ``(low, high)``, a tuple, for a box of actions; an array ``float[A, m]`` for a grid.
+      outside: ``"violates"`` (default): leaving the domain violates every task; ``"clip"``:
+        successors are clipped; or the name of a label that holds forever outside.
+      initial: a :class:`~jaxltl.core.continuous.regions.Region` of boxes, or ``(low, high)``; default:
+        the domain.
+    """
+
+    noise: Distribution | Sequence[Distribution]
+    disturbance: tuple[ArrayLike, ArrayLike] | None
+    actions: ArrayLike | tuple[ArrayLike, ArrayLike] | None
+    outside: str
+    initial: Region | tuple[ArrayLike, ArrayLike] | None
+
+
+def make_dynamics(
+    step: Step,
+    *,
+    domain: tuple[ArrayLike, ArrayLike],
+    labels: Mapping[str, Region | tuple[ArrayLike, ArrayLike]],
+    **options: Unpack[DynamicsOptions],
+) -> Dynamics:
+    """Checked stochastic dynamics ``x' = step(x, u, w)`` in a box.
+
+    Args:
+      step: JAX function ``(state float[n], action float[m], noise float[k]) -> float[n]``; noise
+        holds the random coordinates, then those of the disturbance.
+      domain: ``(low, high)``, finite.
+      labels: by proposition, a :class:`~jaxltl.core.continuous.regions.Region` or ``(low, high)``. A
+        box edge at or beyond the domain's edge includes the domain's closed boundary.
+      options: see :class:`DynamicsOptions`.
+
+    Returns:
+      :class:`Dynamics`.
+
+    Raises:
+      ValueError: a step that cannot be traced, has a result of another shape, or is NaN in the
+        domain; bounds that cross or of other shapes; a label without states in the domain.
+
+    Example:
+      >>> from jaxltl import task_environment
+      >>> lake = make_dynamics(
+      ...     lambda x, u, w: x + 0.1 * u, domain=([0.0], [1.0]), actions=[[-1.0], [1.0]],
+      ...     labels={"shore": ([0.9], [1.0])}, initial=([0.0], [0.5]))
+      >>> task_environment(lake, "F shore").actions.num
+      2
+    """
+    validation.keywords("make_dynamics", options, DynamicsOptions)
+    validation.function("step", step)
+    low, high = _bounds("domain", domain)
+    outside = validation.instance("outside", options.get("outside", "violates"), str, "a name")
+    if not isinstance(labels, Mapping):
+        raise ValueError(f"labels is {validation.shorten(labels)}; give a dictionary of regions.")
+    regions = {}
+    for name in validation.distinct_names("labels", labels):
+        if name in OUTSIDE:
+            raise ValueError(f"labels: {name!r} is an option of outside; choose another name.")
+        region = extended(as_region(f"label {name!r}", labels[name], len(low)), low, high)
+        with validation.errors_in(f"label {name!r}: "):
+            _check_functions(region, len(low))
+            if not region.membership(low[None], np.nextafter(high, np.inf)[None])[1][0]:
+                raise ValueError("no state of the domain belongs to it; give a set that meets it.")
+        regions[name] = region
+    given = options.get("noise", ())
+    noise = [given] if isinstance(given, Distribution) else validation.sequence("noise", given)
+    for i, one in enumerate(noise):
+        validation.instance(f"noise[{i}]", one, Distribution, "gaussian(scale) or another one")
+    disturbance, actions = options.get("disturbance"), options.get("actions")
+    made = Dynamics(
+        step,
+        (low, high),
+        tuple(noise),
+        None if disturbance is None else _bounds("disturbance", disturbance),
+        _actions(actions),
+        regions,
+        outside,
+        _initial(options.get("initial"), low, high),
+    )
+    _check_step(made)
+    return made
+
+
+def to_environment(dynamics: Dynamics) -> Environment:
+    """The dynamics as an environment.
+
+    Its states and observations are ``float[n]``. Actions are those of the box, or indices of the grid;
+    disturbances are uniform. An episode terminates when the state leaves the domain: with
+    ``outside="violates"`` the task is violated, with a label it repeats forever.
+
+    Args:
+      dynamics: dynamics; learners call this themselves.
+
+    Returns:
+      :class:`~jaxltl.core.environments.environment.Environment`, without rewards.
+
+    Raises:
+      ValueError: anything but :class:`Dynamics`.
+
+    Example:
+      >>> still = make_dynamics(lambda x, u, w: x, domain=([0.0], [1.0]), labels={})
+      >>> to_environment(still).actions
+      Finite(num=1)
+    """
+    validation.instance("dynamics", dynamics, Dynamics, "those of make_dynamics")
+    dtype = jnp.result_type(float)
+    choices: Bounds | Floats | None = None
+    actions: Finite | Box = Finite(1)
+    if isinstance(dynamics.actions, np.ndarray):
+        choices, actions = dynamics.actions.astype(dtype), Finite(len(dynamics.actions))
+    elif dynamics.actions is not None:
+        actions = make_box(*dynamics.actions, dtype=dtype)
+        choices = (actions.low, actions.high)
+    low, high = dynamics.domain
+    if dynamics.outside != "clip":
+        low, high = np.full_like(low, -np.inf), np.full_like(high, np.inf)
+    return make_environment(
+        dynamics.sample_initial,
+        Partial(_environment_step, Partial(dynamics.next_state), Partial(dynamics.inside), choices),
+        _observed,
+        actions=actions,
+        labels=dynamics.label,
+        propositions=dynamics.propositions,
+        observations=make_box(low, high, dtype=dtype),
+        ending="violated" if dynamics.outside == "violates" else "repeat",
+    )
+
+
+def _environment_step(
+    next_state: Callable[..., jax.Array],
+    inside: Callable[..., jax.Array],
+    choices: Any,
+    state: jax.Array,
+    action: jax.Array,
+    key: chex.PRNGKey,
+) -> Timestep:
+    """A step; `choices` are the rows of a grid of actions, the bounds of a box, or None."""
+    if choices is None:
+        action = jnp.zeros(0, state.dtype)
+    elif isinstance(choices, tuple):
+        action = jnp.clip(action, *choices)
+    else:
+        action = jnp.asarray(choices)[action]
+    found = next_state(key, state, action)
+    return Timestep(found, jnp.zeros((), state.dtype), ~inside(found))
+
+
+def _observed(state: jax.Array) -> jax.Array:
+    return state
+
+
+# --- checks ---------------------------------------------------------------------------------------
+
+
+def _bounds(name: str, given: tuple[ArrayLike, ArrayLike]) -> Bounds:
+    """A pair of finite vectors, the first at most the second."""
+    pair = given if isinstance(given, tuple | list) else ()
+    if len(pair) != 2:
+        raise ValueError(f"{name} is {validation.shorten(given)}; give (low, high).")
+    low, high = (validation.float_array(name, x) for x in pair)
+    if low.ndim != 1 or low.shape != high.shape or not len(low):
+        raise ValueError(
+            f"{name}: low and high have shapes {list(low.shape)} and {list(high.shape)}; give two "
+            "vectors of one length."
+        )
+    if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
+        place = int(np.argmax(~(np.isfinite(low) & np.isfinite(high) & (low < high))))
+        raise ValueError(
+            f"{name}: low={low[place]:g} and high={high[place]:g} in coordinate {place}; give finite "
+            "bounds with low < high."
+        )
+    return low, high
+
+
+def _actions(given: Any) -> Bounds | Floats | None:
+    """The box, the grid, or None."""
+    if given is None:
+        return None
+    if isinstance(given, tuple):
+        return _bounds("actions", given)
+    grid = validation.float_array("actions", given)
+    if grid.ndim != 2 or not grid.size or not np.isfinite(grid).all():
+        raise ValueError(
+            f"actions is an array of shape {list(grid.shape)}; give finite numbers [A, m], an action "
+            "a row, or a tuple (low, high) for a box."
+        )
+    return grid
+
+
+def _initial(given: Any, low: Floats, high: Floats) -> Region:
+    """The boxes of initial states, intersected with the domain."""
+    if given is None:
+        return box(low, high)
+    region = as_region("initial", given, len(low))
+    if len(region.offset) or region.functions:
+        raise ValueError("initial: give boxes alone, of which initial states are sampled.")
+    first, last = np.maximum(region.low, low), np.minimum(region.high, high)
+    if not (first < last).all():
+        i = int(np.argmax(~(first < last).all(axis=1)))
+        raise ValueError(
+            f"initial: box {i}, {region.low[i].tolist()} to {region.high[i].tolist()}, lies outside "
+            "the domain; give boxes that meet it."
+        )
+    return box(first, last)
+
+
+def _check_step(made: Dynamics) -> None:
+    """Traces the step in both precisions that JAX has, and evaluates it at random states."""
+    n, m, k = made.num_states, made.num_actions, made.num_noise
+    shapes = f"state float[{n}], action float[{m}], noise float[{k}]"
+    for dtype in sorted({jnp.dtype(np.float32), jnp.result_type(float)}, key=str):
+        given = [jax.ShapeDtypeStruct((size,), dtype) for size in (n, m, k)]
+        try:
+            found = traced("step", made.step, *given)
+        except ValueError as error:
+            raise ValueError(_line(f"{error} Its arguments are {shapes}.")) from error
+        except Exception as error:
+            message = f"step fails with {shapes}: {error}"
+            raise ValueError(_line(f"{message}; accept arrays of these shapes.")) from error
+        if getattr(found, "shape", None) != (n,) or not jnp.issubdtype(found.dtype, jnp.floating):
+            array = hasattr(found, "dtype")
+            kind = f"{found.dtype}{list(found.shape)}" if array else type(found).__name__
+            raise ValueError(f"step returns {kind}; return float[{n}], a state.")
+    _check_finite(made)
+
+
+def _check_functions(region: Region, num_states: int) -> None:
+    """Raises ValueError for a function of a region without a scalar value."""
+    state = jax.ShapeDtypeStruct((num_states,), jnp.result_type(float))
+    for function in region.functions:
+        shape = getattr(traced("its function", function, state), "shape", None)
+        if shape != ():
+            raise ValueError(f"its function returns shape {shape}; return a number.")
+
+
+def _line(text: str) -> str:
+    """A message in one line."""
+    return " ".join(text.split())
+
+
+def _check_finite(made: Dynamics, num_samples: int = 64) -> None:
+    """Raises ValueError if a successor of a random state of the domain is not a number."""
+    low, high = made.domain
+    draw = np.random.default_rng(0)
+    state = draw.uniform(low, high, (num_samples, len(low)))
+    action = np.zeros((num_samples, 0))
+    if isinstance(made.actions, tuple):
+        action = draw.uniform(*made.actions, (num_samples, made.num_actions))
+    elif made.actions is not None:
+        action = made.actions[draw.integers(len(made.actions), size=num_samples)]
+    keys = jax.random.split(jax.random.key(0), num_samples)
+    dtype = jnp.result_type(float)
+    given = jnp.asarray(state, dtype), jnp.asarray(action, dtype)
+    found = np.asarray(jax.vmap(made.next_state)(keys, *given))
+    if np.isnan(found).any():
+        i = int(np.argmax(np.isnan(found).any(axis=1)))
+        raise ValueError(
+            f"step returns {found[i].tolist()} in state {state[i].round(6).tolist()} with action "
+            f"{action[i].tolist()}; define it in the whole domain."
+        )
