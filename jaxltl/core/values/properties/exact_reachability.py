@@ -1,26 +1,87 @@
-"""Reachability probabilities of small Markov chains in rational arithmetic."""
+"""Reachability probabilities of small Markov chains and MDPs in rational arithmetic."""
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Callable
 from fractions import Fraction
 
 import numpy as np
 
-from jaxltl.core.array_types import Booleans, Floats
+from jaxltl.core.array_types import Booleans, Floats, Integers
+from jaxltl.core.sparse.graph.qualitative import positive_under_all_policies
 from jaxltl.core.sparse.mdp import HostMDP
 
 MAX_STATES = 1000
 MAX_UNDECIDED = 32  # elimination with fractions of thousands of bits: a tenth of a second
+MAX_TERMS = 20_000  # products of fractions in all steps: a tenth of a second
+
+Bounds = tuple[Floats, Floats]
 
 
 def exact_reachability(
-    chain: HostMDP, target: Booleans, stay: Booleans | None = None
-) -> tuple[Floats, Floats] | None:
-    """Reachability bounds by rational state elimination; None if the chain is too large."""
+    mdp: HostMDP,
+    target: Booleans,
+    stay: Booleans | None = None,
+    policy: Integers | None = None,
+    objective: str = "max",
+) -> Bounds | None:
+    """Reachability bounds of a chain, or of an MDP by a policy `int[S]` of rows that is optimal.
+
+    The value of a policy is optimal if it solves the optimality equation: it is at least the least
+    solution, the maximum; the minimum is the only solution that is 0 where a policy avoids the
+    target (Baier and Katoen 2008, section 10.6.1). None if the policy is not, or the model large.
+    """
+    inner = ~target if stay is None else stay & ~target
+    value = _eliminated(mdp if policy is None else mdp.chain(policy), target, inner)
+    if value is None or policy is None:
+        return None if value is None else _bounds(value)
+    if mdp.successor.size > MAX_TERMS:
+        return None
+    best = _backup(mdp, value, objective)
+    optimal = all(value[s] == best[s] for s in np.flatnonzero(inner))
+    if objective == "min":
+        avoided = ~positive_under_all_policies(mdp, target, among=inner | target)
+        optimal &= not any(value[s] for s in np.flatnonzero(avoided))
+    return _bounds(value) if optimal else None
+
+
+def exact_steps(
+    mdp: HostMDP, target: Booleans, stay: Booleans, num_steps: int, objective: str
+) -> Bounds | None:
+    """Step-bounded reachability bounds; None if the model or the number of steps is large."""
+    if num_steps * mdp.successor.size > MAX_TERMS:
+        return None
+    value = [Fraction(int(t)) for t in target]
+    for _ in range(num_steps):
+        image = _backup(mdp, value, objective)
+        value = [
+            Fraction(1) if t else x if s else Fraction(0)
+            for t, s, x in zip(target, stay, image, strict=True)
+        ]
+    return _bounds(value)
+
+
+def exact_next(mdp: HostMDP, target: Booleans, objective: str) -> Bounds | None:
+    """Bounds of the probability that the next state is in a set; None if the model is large."""
+    if mdp.successor.size > MAX_TERMS:
+        return None
+    return _bounds(_backup(mdp, [Fraction(int(t)) for t in target], objective))
+
+
+def _backup(mdp: HostMDP, value: list[Fraction], objective: str) -> list[Fraction]:
+    """Optimal expectation of the next state's value, for each state."""
+    best: Callable[..., Fraction] = max if objective == "max" else min
+    rows = (_row(mdp, r) for r in range(mdp.num_rows))
+    image = [sum((p * value[t] for t, p in row.items()), Fraction(0)) for row in rows]
+    return [best(image[a:b]) for a, b in itertools.pairwise(mdp.row_start.tolist())]
+
+
+def _eliminated(chain: HostMDP, target: Booleans, inner: Booleans) -> list[Fraction] | None:
+    """Reachability probabilities by state elimination; None if the chain is too large."""
     if chain.num_states > MAX_STATES:
         return None
-    inner = ~target if stay is None else stay & ~target
     source = chain.state[chain.row]
     reaches = target.copy()
     while (more := inner[source] & reaches[chain.successor] & ~reaches[source]).any():
@@ -41,16 +102,19 @@ def exact_reachability(
     value = {s: Fraction(int(target[s])) for s in range(chain.num_states)}
     for s in reversed(order):
         value[s] = sum((p * value[t] for t, p in rows[s].items()), Fraction(0))
-    exact = [value[s] for s in range(chain.num_states)]
-    return np.array([_rounded(x, -1) for x in exact]), np.array([_rounded(x, 1) for x in exact])
+    return [value[s] for s in range(chain.num_states)]
 
 
-def _row(chain: HostMDP, state: int) -> dict[int, Fraction]:
+def _bounds(value: list[Fraction]) -> Bounds:
+    return np.array([_rounded(x, -1) for x in value]), np.array([_rounded(x, 1) for x in value])
+
+
+def _row(mdp: HostMDP, number: int) -> dict[int, Fraction]:
     """The normalised distribution of successors."""
     row: dict[int, Fraction] = {}
-    for e in range(*chain.entry_start[state : state + 2].tolist()):
-        t = int(chain.successor[e])
-        row[t] = row.get(t, Fraction(0)) + Fraction(float(chain.probability[e]))
+    for e in range(*mdp.entry_start[number : number + 2].tolist()):
+        t = int(mdp.successor[e])
+        row[t] = row.get(t, Fraction(0)) + Fraction(float(mdp.probability[e]))
     total = sum(row.values())
     return {t: p / total for t, p in row.items()}
 

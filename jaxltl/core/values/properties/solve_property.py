@@ -13,7 +13,12 @@ from jaxltl.core.values.properties.answers import (
     Answer as Answer,
     PropertyStrategy as PropertyStrategy,
 )
-from jaxltl.core.values.properties.exact_reachability import exact_reachability
+from jaxltl.core.values.properties.exact_reachability import (
+    Bounds,
+    exact_next,
+    exact_reachability,
+    exact_steps,
+)
 from jaxltl.core.values.multi_objective.multi_objective import (
     Achievable,
     ConstrainedOptimum,
@@ -400,7 +405,7 @@ class _Probability(NamedTuple):
         match path.operator:
             case "X":
                 target = self.where(right)
-                return lambda tolerance: self.next(target, aim)
+                return lambda tolerance: self.next(target, aim, tolerance)
             case "F":
                 return self.until(TRUE, right, aim)
             case "U":
@@ -456,27 +461,36 @@ class _Probability(NamedTuple):
             )
             if tolerance > _EXACT or not isinstance(self.model, SparseMDP):
                 return found
-            bounds = (
-                exact_reachability(self.model.host, target, stay) if self.model.is_chain else None
-            )
-            if bounds is None:
-                return found
-            lower, upper = (x[self.states] for x in bounds)
-            return found._replace(
-                solution=replace(found.solution, value=lower, lower=lower, upper=upper),
-                method="rational arithmetic",
-            )
+            policy = None
+            if not self.model.is_chain:
+                assert found.strategy is not None
+                policy = found.strategy.row
+            host = self.model.host
+            return self.exact(found, exact_reachability(host, target, stay, policy, aim.policy))
 
         return solve
 
-    def next(self, target: np.ndarray, aim: _Aim) -> _Found:
+    def exact(self, found: _Found, bounds: Bounds | None) -> _Found:
+        """The solution with bounds by rational arithmetic, where there are any."""
+        if bounds is None:
+            return found
+        lower, upper = (x[self.states] for x in bounds)
+        return found._replace(
+            solution=replace(found.solution, value=lower, lower=lower, upper=upper),
+            method="rational arithmetic",
+        )
+
+    def next(self, target: np.ndarray, aim: _Aim, tolerance: float) -> _Found:
         if isinstance(self.model, IntervalMDP):
             return _plain(
                 self.states, robust_next_probability(self.model, target, **aim.directions)
             )
-        return _plain(
+        found = _plain(
             self.states, bounded.next_probability(self.model, target, objective=aim.policy)
         )
+        if tolerance > _EXACT:
+            return found
+        return self.exact(found, exact_next(self.model.host, target, aim.policy))
 
     def automaton(self, path: Formula, aim: _Aim) -> Callable[[float], _Found]:
         def found(tolerance: float) -> _Found:
@@ -514,11 +528,17 @@ class _Probability(NamedTuple):
                 robust_bounded_reachability(model, target, steps, stay=stay, **aim.directions),
                 by="steps",
             )
-        return lambda tolerance: _plain(
-            self.states,
-            bounded.bounded_reachability(model, target, steps, stay=stay, objective=aim.policy),
-            by="steps",
-        )
+
+        def solve(tolerance: float) -> _Found:
+            found = bounded.bounded_reachability(
+                model, target, steps, stay=stay, objective=aim.policy
+            )
+            plain = _plain(self.states, found, by="steps")
+            if tolerance > _EXACT:
+                return plain
+            return self.exact(plain, exact_steps(model.host, target, stay, steps, aim.policy))
+
+        return solve
 
     def within_reward(self, path: Bounded, aim: _Aim) -> Callable[[float], _Found]:
         assert path.limit is not None

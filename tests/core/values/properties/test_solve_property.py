@@ -9,7 +9,11 @@ import jaxltl as jl
 from jaxltl.core.models.sparse import Rewards, make_sparse
 from jaxltl.core.types import Status
 from jaxltl.core.values.properties import solve_property as module
-from jaxltl.core.values.properties.exact_reachability import exact_reachability
+from jaxltl.core.values.properties.exact_reachability import (
+    exact_next,
+    exact_reachability,
+    exact_steps,
+)
 from jaxltl.core.values.properties.solve_property import meets, solve_property
 from tests.core.values.undiscounted.test_sparse_satisfaction import random_sparse
 from tests.storm_oracle import storm_model, storm_values
@@ -283,6 +287,70 @@ def test_thresholds_that_are_met_with_equality_are_decided_in_small_chains():
     )
     third = jl.solve_property(retry, 'P>=1/3 [ F "a" ]')
     assert third.holds == [None] and third.lower < 1 / 3 + 1e-15 and third.status != 0
+
+
+@pytest.mark.parametrize(
+    ("path", "least", "most"),
+    [
+        ('F "a"', 0.25, 0.5),
+        ('(!"b") U "a"', 0.25, 0.5),
+        ('X "a"', 0.125, 0.25),
+        ('F<=3 "a"', 0.21875, 0.4375),
+        ('(!"b") U<=3 "a"', 0.21875, 0.4375),
+        ('G !"a"', 0.5, 0.75),
+        ('G<=2 !"a"', 0.625, 0.8125),
+    ],
+)
+def test_thresholds_of_small_mdps_are_decided(path, least, most):
+    retry = jl.make_sparse(  # two ways to try again with probability 1/2
+        [0, 2, 3, 4],
+        [0, 3, 6, 7, 8],
+        [0, 1, 2, 0, 1, 2, 1, 2],
+        [0.5, 0.125, 0.375, 0.5, 0.25, 0.25, 1, 1],
+        initial=[1, 0, 0],
+        label={"a": [1], "b": [2]},
+    )
+    thresholds = ((">=", least, True), (">", least, False), ("<=", most, True), ("<", most, False))
+    for relation, threshold, holds in thresholds:
+        found = jl.solve_property(retry, f"P{relation}{threshold} [ {path} ]")
+        assert found.holds == [holds] and found.status == jl.Status.CONVERGED, relation
+        assert found.lower == found.upper == threshold
+
+
+def test_a_policy_that_is_not_optimal_decides_nothing():
+    """State 0 may wait for ever, so that 1 solves the equation of the minimum, which is 0."""
+    wait = jl.make_sparse([0, 2, 3], [0, 1, 2, 3], [0, 1, 1], [1.0] * 3)
+    target, (stay, go) = np.array([False, True]), (np.array([0, 2]), np.array([1, 2]))
+    assert exact_reachability(wait.host, target, None, stay, "max") is None
+    assert exact_reachability(wait.host, target, None, go, "min") is None
+    for policy, objective, value in ((go, "max", 1), (stay, "min", 0)):
+        lower, upper = exact_reachability(wait.host, target, None, policy, objective)
+        assert lower[0] == upper[0] == value
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_exact_bounds_of_random_mdps_agree_with_the_solvers(seed):
+    rng = np.random.default_rng(seed)
+    count = rng.integers(1, 4, 8)
+    rows = [rng.choice(8, rng.integers(1, 4), replace=False) for _ in range(count.sum())]
+    chance = np.concatenate([rng.dirichlet(np.ones(len(row))) for row in rows])
+    entry = np.concatenate([[0], np.cumsum([len(row) for row in rows])])
+    model = jl.make_sparse(
+        np.concatenate([[0], count.cumsum()]), entry, np.concatenate(rows), chance
+    )
+    target, stay = rng.random(8) < 0.3, rng.random(8) < 0.8
+    for objective in ("max", "min"):
+        until = jl.reachability_probability(model, target, stay=stay, objective=objective)
+        steps = jl.values.bounded_reachability(model, target, 4, stay=stay, objective=objective)
+        once = jl.values.next_probability(model, target, objective=objective)
+        for solution, bounds in (
+            (until, exact_reachability(model.host, target, stay, until.policy, objective)),
+            (steps, exact_steps(model.host, target, stay, 4, objective)),
+            (once, exact_next(model.host, target, objective)),
+        ):
+            assert bounds is not None
+            assert (solution.lower <= bounds[1]).all() and (bounds[0] <= solution.upper).all()
+            assert (np.nextafter(bounds[0], 2) >= bounds[1]).all()
 
 
 @pytest.mark.parametrize("seed", range(20))
