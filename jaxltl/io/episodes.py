@@ -11,6 +11,7 @@ from jaxltl.core import validation
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.trajectories import Trajectories, make_trajectories
 
+TERMINATED = "terminated"
 _NAMES = (("obs", "acts"), ("observations", "actions"))
 
 
@@ -32,6 +33,8 @@ def from_episodes(
 
     Returns:
       :class:`~jaxltl.core.models.trajectories.Trajectories`; last successors are checked, not kept.
+      That of a terminated episode may be an absorbing copy, as in
+      :func:`~jaxltl.envs.from_gymnasium`.
 
     Raises:
       ValueError: naming the episode: other lengths, observations that are no integers, or a step
@@ -45,7 +48,7 @@ def from_episodes(
       >>> from_episodes(world, [episode]).state.tolist()
       [[0, 1]]
     """
-    pairs, whole = [], []
+    pairs, ends = [], []
     for number, episode in enumerate(episodes):
         states, actions = _read(episode, number, state, action)
         pairs.append(list(zip(states, actions, strict=False)))
@@ -54,10 +57,15 @@ def from_episodes(
                 f"episode {number} ends in state {states[-1]}; states are 0 to "
                 f"{model.num_states - 1}."
             )
-        last = int(np.argmax(np.asarray(model.available)[states[-1]]))
-        whole.append([*pairs[-1], (states[-1], last)])
+        ended = getattr(episode, "terminal", getattr(episode, "terminations", False))
+        ends.append((states[-1], bool(np.any(ended))))
+    trajectories = make_trajectories(model, pairs)
+    whole = []
+    for steps, (final, ended) in zip(pairs, ends, strict=True):
+        final = _copy(model, *steps[-1], final) if ended else final
+        whole.append([*steps, (final, int(np.argmax(np.asarray(model.available)[final])))])
     make_trajectories(model, whole)  # checks the last successors too
-    return make_trajectories(model, pairs)
+    return trajectories
 
 
 def _read(
@@ -92,12 +100,27 @@ def _read(
     )
 
 
+def _copy(model: MDP | DenseMDP, state: int, action: int, final: int) -> int:
+    """The successor with the labels of the final state and "terminated"; else the final state."""
+    if TERMINATED not in model.propositions or not isinstance(model, MDP):
+        return final
+    label = np.asarray(model.label)
+    expected = label[final] | (np.array(model.propositions) == TERMINATED)
+    likely = np.asarray(model.probability)[state, action] > 0
+    for successor in np.asarray(model.successor)[state, action][likely].tolist():
+        if (label[successor] == expected).all():
+            return int(successor)
+    return final
+
+
 def _steps(seen: Mapping[str, Sequence[object]] | Sequence[object]) -> list[object]:
-    """One observation for each step, also from a dictionary of arrays."""
-    if not isinstance(seen, Mapping):
+    """One observation for each step, also from a dictionary or a tuple of arrays."""
+    seen = seen.unwrap() if hasattr(seen, "unwrap") else seen  # imitation's DictObs
+    if not isinstance(seen, Mapping | tuple):
         return list(seen)
-    columns = [list(column) for column in seen.values()]
-    return [dict(zip(seen, row, strict=True)) for row in zip(*columns, strict=True)]
+    columns = seen.values() if isinstance(seen, Mapping) else seen
+    rows = zip(*map(_steps, columns), strict=True)
+    return [dict(zip(seen, row, strict=True)) if isinstance(seen, Mapping) else row for row in rows]
 
 
 def _index(
