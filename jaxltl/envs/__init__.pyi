@@ -1,3 +1,4 @@
+from . import continuous_worlds as continuous_worlds
 from . import lqr as lqr
 from . import navigation as navigation
 from . import navigation_steps as navigation_steps

@@ -117,7 +117,8 @@ class Region:
         for function in self.functions:
             for start in range(0, len(low), _CHUNK):
                 part = slice(start, start + _CHUNK)
-                (bounds,) = over_boxes(function, low[part], high[part]).outputs(True)
+                with jax.enable_x64(True):  # constants of the function in double precision
+                    (bounds,) = over_boxes(function, low[part], high[part]).outputs(True)
                 certain[part] |= np.asarray(bounds.low)[:, 0] > 0
                 possible[part] |= ~(np.asarray(bounds.high)[:, 0] <= 0)
         return certain, possible | certain

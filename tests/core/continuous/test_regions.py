@@ -79,6 +79,12 @@ def test_half_spaces_round_outward_and_along_an_axis_are_boxes():
     assert region.contains(np.array([[9.0, -0.5], [9.0, -0.6]])).tolist() == [True, False]
 
 
+def test_constants_of_functions_are_in_double_precision():
+    region = where_positive(lambda x: x[0] - 0.7)  # .7 in single precision is less than .7
+    certain, possible = region.membership([[0.69999999], [0.70000001]], [[0.699999999], [0.8]])
+    assert certain.tolist() == [False, True] and possible.tolist() == [False, True]
+
+
 def test_edges_at_the_domain_move_to_infinity():
     region = regions.extended(
         box([-2.0, 0.0], [0.5, 1.0]), np.array([-1, -1.0]), np.array([1, 1.0])
