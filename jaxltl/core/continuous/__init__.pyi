@@ -1,8 +1,10 @@
+from .certificate import Certificate as Certificate, certify_policy as certify_policy
 from .dynamics import (
     Dynamics as Dynamics,
     make_dynamics as make_dynamics,
     to_environment as to_environment,
 )
+from .grid import Grid as Grid, make_grid as make_grid
 from .noise import (
     Distribution as Distribution,
     from_cdf as from_cdf,
@@ -17,4 +19,9 @@ from .regions import (
     half_space as half_space,
     union as union,
     where_positive as where_positive,
+)
+from .synthesis import (
+    CellPolicy as CellPolicy,
+    simulate_cells as simulate_cells,
+    synthesize_policy as synthesize_policy,
 )

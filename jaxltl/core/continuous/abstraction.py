@@ -1,0 +1,403 @@
+"""Bounds of satisfaction probabilities on a grid: sets first, then value iteration, then finer cells."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from jaxltl.core.array_types import Booleans, Floats, Integers
+from jaxltl.core.continuous.dynamics import Dynamics
+from jaxltl.core.continuous.grid import Grid
+from jaxltl.core.continuous.images import Images, NoiseBox, Step, image_boxes
+from jaxltl.core.continuous.interval_iteration import (
+    IterationLimits,
+    IterationResult,
+    iterate,
+    reachable,
+)
+from jaxltl.core.continuous.noise import Distribution
+from jaxltl.core.continuous.task_product import TaskProduct, task_product
+from jaxltl.core.continuous.transition_bounds import TransitionBounds, transition_bounds
+from jaxltl.core.continuous.winning_cells import Successors, contained, winning_cells
+from jaxltl.core.logic.ltl import Formula
+from jaxltl.core.pretty_print import brief
+
+TAIL = 1e-15  # probability of unbounded noise outside its box, for which nothing is assumed
+UNPROVEN, ITERATED, ALMOST_SURE, SURE = range(4)  # how the lower bound of a state was found
+
+
+@brief
+@dataclass(frozen=True)
+class Control:
+    """The choices in a cell: none for a policy, or a grid of actions.
+
+    Attributes:
+      step: the next state of state, row of `actions` and noise.
+      actions: ``float[A, m]``; one row of any numbers for the step of a policy.
+    """
+
+    step: Step
+    actions: Floats
+
+
+@brief
+@dataclass(frozen=True, eq=False)
+class Bounds:
+    """Bounds of the satisfaction probability of product states, after refinement.
+
+    Attributes:
+      grid, task: the cells and the memory.
+      lower, upper: ``float[Q, C]``.
+      how: ``int8[Q, C]``, how the lower bound was found.
+      action: ``int[Q, C]``, which attains the lower bound.
+      initial: ``bool[C]``, cells that meet the initial states.
+      seconds: wall time by stage.
+      images: of the rows of the last grid.
+    """
+
+    grid: Grid
+    task: TaskProduct
+    lower: Floats
+    upper: Floats
+    how: Integers
+    action: Integers
+    initial: Booleans
+    seconds: dict[str, float] = field(default_factory=dict)
+    images: Images | None = None
+
+    def initial_bounds(self) -> tuple[Floats, Floats]:
+        """Lower and upper bounds ``float[C]`` of beginning in each cell.
+
+        An adversary chooses among uncertain labels: least lower and greatest upper bound.
+        """
+        upper: Floats = 1 - self.task.initial(1 - self.upper)
+        return self.task.initial(self.lower), upper
+
+
+@dataclass(frozen=True)
+class Limits:
+    """When refinement stops.
+
+    Attributes:
+      tolerance: the width of the bounds of initial states.
+      threshold: stop when all initial states are proven above, or one below; or None.
+      max_cells: of the finest grid.
+      iteration: limits of value iteration.
+      upper: False to compute lower bounds alone.
+    """
+
+    tolerance: float = 1e-3
+    threshold: float | None = None
+    max_cells: int = 2**20
+    iteration: IterationLimits = field(default_factory=IterationLimits)
+    upper: bool = True
+
+
+Report = Callable[[str], None]
+
+
+def noise_box(dynamics: Dynamics) -> NoiseBox:
+    """A box of the noise and the disturbance; unbounded noise is cut where `TAIL` is left."""
+    low, high, lost = [], [], 0.0
+    for noise in dynamics.noise:
+        a, b, tail = _finite_support(noise)
+        low.append(a)
+        high.append(b)
+        lost += tail
+    random = [True] * len(low)
+    symmetric = [noise.symmetric for noise in dynamics.noise]
+    if dynamics.disturbance is not None:
+        low.extend(dynamics.disturbance[0])
+        high.extend(dynamics.disturbance[1])
+    missing = len(low) - len(random)
+    return NoiseBox(
+        np.array(low),
+        np.array(high),
+        np.array(random + [False] * missing, bool),
+        np.array(symmetric + [False] * missing, bool),
+        lost,
+    )
+
+
+def _finite_support(noise: Distribution) -> tuple[float, float, float]:
+    """Ends of an interval, and the probability outside of it."""
+    low, high = noise.support
+    lost, ends = 0.0, [low, high]
+    for side, sign in ((0, -1.0), (1, 1.0)):
+        if np.isfinite(ends[side]):
+            continue
+        reach = noise.scale
+        while True:
+            end = noise.mean + sign * reach
+            far = (end, np.inf) if sign > 0 else (-np.inf, end)
+            tail = float(noise.probability_bounds(*far, 0.0, 0.0)[1])
+            if tail <= TAIL or reach > 1e6 * noise.scale:
+                break
+            reach *= 1.1
+        ends[side], lost = end, lost + tail
+    return ends[0], ends[1], lost
+
+
+def bound_satisfaction(
+    dynamics: Dynamics,
+    control: Control,
+    formula: str | Formula,
+    grid: Grid,
+    limits: Limits,
+    report: Report = lambda text: None,
+) -> Bounds:
+    """Bounds of the satisfaction probability of every cell, refined for the initial states.
+
+    Args:
+      dynamics: the world.
+      control: the closed loop, or the step with a grid of actions, among which the lower bound's
+        policy maximises.
+      formula: LTL over the labels.
+      grid: the first cells.
+      limits: when to stop.
+      report: called with a line of progress.
+    """
+    seconds: dict[str, float] = {}
+    bounds = _first(dynamics, formula, grid)
+    while True:
+        bounds = _improve(dynamics, control, bounds, limits, report, seconds)
+        lower, upper = (x[bounds.initial] for x in bounds.initial_bounds())
+        report(
+            f"{bounds.grid.num_cells:,} cells: initial states satisfy with probability at least "
+            f"{lower.min():.6g}, at most {upper.min():.6g}"
+        )
+        cells = bounds.grid.num_cells * 2**bounds.grid.num_axes
+        if _finished(lower, upper, limits) or cells > limits.max_cells:
+            return replace(bounds, seconds=seconds)
+        bounds = _refined(dynamics, formula, bounds)
+
+
+def _finished(lower: Floats, upper: Floats, limits: Limits) -> bool:
+    if limits.threshold is not None:
+        return bool((lower >= limits.threshold).all() or (upper < limits.threshold).any())
+    return bool((upper - lower).max() <= limits.tolerance)
+
+
+def _product(
+    dynamics: Dynamics, formula: str | Formula, grid: Grid
+) -> tuple[TaskProduct, Booleans]:
+    low, high = grid.boxes()
+    names = dynamics.propositions
+    certain, possible = np.zeros((2, grid.num_cells, len(names)), bool)
+    for i, name in enumerate(names):
+        if name in dynamics.labels:
+            certain[:, i], possible[:, i] = dynamics.labels[name].membership(low, high)
+    outside = None if dynamics.outside in ("violates", "clip") else dynamics.outside
+    task = task_product(formula, names, certain, possible, outside)
+    return task, dynamics.initial.membership(low, high)[1]
+
+
+def _first(dynamics: Dynamics, formula: str | Formula, grid: Grid) -> Bounds:
+    """Bounds 0 and 1."""
+    task, initial = _product(dynamics, formula, grid)
+    shape = (task.num_memory, grid.num_cells)
+    decided = np.broadcast_to(task.decided[:, None], shape)
+    return Bounds(
+        grid,
+        task,
+        (decided == 1).astype(np.float64),
+        (decided != 0).astype(np.float64),
+        np.where(decided == 1, SURE, UNPROVEN).astype(np.int8),
+        np.zeros(shape, np.int32),
+        initial,
+    )
+
+
+def _refined(dynamics: Dynamics, formula: str | Formula, bounds: Bounds) -> Bounds:
+    """The same bounds on cells of half the size along each axis."""
+    grid = bounds.grid.refine((2,) * bounds.grid.num_axes)
+    task, initial = _product(dynamics, formula, grid)
+    parent = np.stack(np.unravel_index(np.arange(grid.num_cells), grid.shape)) // 2
+    cell = np.ravel_multi_index(tuple(parent), bounds.grid.shape)
+    if not _same_memory(task, bounds.task):  # fewer labels are uncertain: other memory states occur
+        fresh = _first(dynamics, formula, grid)
+        return replace(fresh, seconds=bounds.seconds)
+    return Bounds(
+        grid,
+        task,
+        bounds.lower[:, cell],
+        bounds.upper[:, cell],
+        bounds.how[:, cell],
+        bounds.action[:, cell],
+        initial,
+    )
+
+
+def _same_memory(x: TaskProduct, y: TaskProduct) -> bool:
+    same = x.states == y.states and x.automaton.delta.shape == y.automaton.delta.shape
+    return same and bool((x.automaton.delta == y.automaton.delta).all())
+
+
+def _improve(
+    dynamics: Dynamics,
+    control: Control,
+    bounds: Bounds,
+    limits: Limits,
+    report: Report,
+    seconds: dict[str, float],
+) -> Bounds:
+    """Better bounds on the same grid: lower ones, then upper ones as those of the negation."""
+    clock = _Clock(seconds)
+    box = noise_box(dynamics)
+    open_cells = _open(bounds.lower, bounds.upper, bounds.task)
+    cells = np.flatnonzero(open_cells.any(0))
+    if not len(cells):
+        return bounds
+    report(f"{bounds.grid.num_cells:,} cells: images of {len(cells):,} cells")
+    images = image_boxes(control.step, bounds.grid, cells, control.actions, box)
+    rows = _successors(dynamics, bounds.grid, images, control, box)
+    clock.stage("images")
+    problem = _Problem(dynamics, bounds.grid, images, rows, box, limits, bounds.initial)
+    before = _Lower(bounds.lower, bounds.how, bounds.action)
+    lower = problem.lower_bounds(bounds.task, before, bounds.upper, True, clock)
+    upper = bounds.upper
+    needed = bounds.task.initial(lower.value)[bounds.initial]
+    goal = 1 - limits.tolerance if limits.threshold is None else limits.threshold
+    if limits.upper and (needed < goal).any():
+        start = _Lower(1 - upper, np.zeros_like(lower.how), lower.action)
+        negated = bounds.task.complement()
+        found = problem.lower_bounds(negated, start, 1 - lower.value, False, clock)
+        upper = np.minimum(upper, 1 - found.value)
+    # Each bound is sound; where rounding makes them cross, the probability is between both.
+    return replace(
+        bounds, lower=lower.value, upper=np.maximum(upper, lower.value), how=lower.how,
+        action=lower.action, images=images,
+    )  # fmt: skip
+
+
+def _open(lower: Floats, upper: Floats, task: TaskProduct) -> Booleans:
+    """Product states without tight bounds."""
+    return (lower < 1) & (upper > 0) & (lower < upper) & (task.decided < 0)[:, None]
+
+
+def _successors(
+    dynamics: Dynamics, grid: Grid, images: Images, control: Control, box: NoiseBox
+) -> Successors:
+    """The cells that each row may meet."""
+    j = np.array(images.noise_of)
+    least = np.append(box.low, 0.0)[j]
+    most = np.append(box.high, 0.0)[j]
+    low, high = images.low + images.gain * least, images.high + images.gain * most
+    unbounded = np.array([i >= 0 and not np.isfinite(dynamics.noise[i].support).all() for i in j])
+    random = unbounded & (images.gain > 0)
+    low, high = np.where(random, -np.inf, low), np.where(random, np.inf, high)
+    if box.lost:
+        low, high = np.full_like(low, -np.inf), np.full_like(high, np.inf)
+    if dynamics.outside == "clip":
+        low, high = np.clip(low, *dynamics.domain), np.clip(high, *dynamics.domain)
+    start, stop, outside = grid.ranges(low, high)
+    return Successors(images.cells, len(control.actions), start, stop, outside, None, grid.shape)
+
+
+class _Clock:
+    """Wall time by stage."""
+
+    def __init__(self, seconds: dict[str, float]) -> None:
+        self.seconds, self.last = seconds, time.perf_counter()
+
+    def stage(self, name: str) -> None:
+        """Ends a stage."""
+        now = time.perf_counter()
+        self.seconds[name] = self.seconds.get(name, 0.0) + now - self.last
+        self.last = now
+
+
+@dataclass(frozen=True)
+class _Lower:
+    value: Floats
+    how: Integers
+    action: Integers
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """One grid with its rows."""
+
+    dynamics: Dynamics
+    grid: Grid
+    images: Images
+    rows: Successors
+    box: NoiseBox
+    limits: Limits
+    initial: Booleans
+
+    def lower_bounds(
+        self, task: TaskProduct, before: _Lower, upper: Floats, maximize: bool, clock: _Clock
+    ) -> _Lower:
+        """Better lower bounds of a task, by sets and by value iteration."""
+        value, how, action = before.value.copy(), before.how.copy(), before.action.copy()
+
+        def prove(rows: Successors, kind: int) -> None:
+            won = winning_cells(task, rows, value >= 1, maximize)
+            new = won.states & (value < 1)
+            value[new], how[new], action[new] = 1.0, kind, won.action[new]
+
+        if not self.rows.outside.all() or task.outside.any():
+            prove(self.rows, SURE)
+        clock.stage("sets")
+        active = self._active(task, value, upper)
+        if not len(active) or not any(j >= 0 for j in self.images.noise_of):
+            return _Lower(value, how, action)
+        rows, bounds = self._part(active)
+        prove(replace(rows, certain=bounds.certain()), ALMOST_SURE)
+        clock.stage("sets")
+        active = self._active(task, value, upper)
+        if len(active):
+            rows, bounds = self._part(active)
+            start = IterationResult(value, action, 1.0, 0)
+            found = iterate(task, bounds, rows, start, self.limits.iteration, maximize)
+            better = found.value > value
+            how[better] = ITERATED
+            value, action = found.value, found.action
+        clock.stage("value iteration")
+        return _Lower(value, how, action)
+
+    def _active(self, task: TaskProduct, value: Floats, upper: Floats) -> Integers:
+        """Rows' positions of cells that matter for initial states and are not decided."""
+        finished = (value >= 1) | (upper <= 0)
+        met = reachable(task, self.rows, self.initial, finished)
+        needed = met & ~finished & (task.decided < 0)[:, None]
+        return np.flatnonzero(np.logical_or.reduce(needed, axis=0)[self.rows.cells])
+
+    def _part(self, active: Integers) -> tuple[Successors, TransitionBounds]:
+        """The rows of some cells, with their transition probabilities."""
+        num = self.rows.num_actions
+        index = (active[:, None] * num + np.arange(num)).reshape(-1)
+        im = self.images
+        part = Images(im.cells[active], im.low[index], im.high[index], im.gain[index], im.noise_of)
+        rows = replace(
+            self.rows,
+            cells=im.cells[active],
+            start=self.rows.start[index],
+            stop=self.rows.stop[index],
+            outside=self.rows.outside[index],
+        )
+        clipped = self.dynamics.outside == "clip"
+        return rows, transition_bounds(part, self.grid, self.dynamics.noise, self.box, clipped)
+
+
+def safe_actions(dynamics: Dynamics, control: Control, bounds: Bounds) -> Booleans:
+    """Actions ``bool[Q, C, A]`` all of whose successors have lower bound 1.
+
+    In states that are satisfied surely or with probability 1, at least the policy's action is one.
+    """
+    won = bounds.lower >= 1
+    found = np.zeros((*won.shape, len(control.actions)), bool)
+    cells = np.flatnonzero((won & (bounds.task.decided < 0)[:, None]).any(0))
+    if len(cells):
+        box = noise_box(dynamics)
+        images = image_boxes(control.step, bounds.grid, cells, control.actions, box)
+        rows = _successors(dynamics, bounds.grid, images, control, box)
+        for q in np.flatnonzero(bounds.task.decided < 0):
+            inside = contained(bounds.task, rows, won, int(q)).reshape(len(cells), -1)
+            found[q, cells] = inside & won[q, cells, None]
+    found[bounds.task.decided == 1] = True
+    return found

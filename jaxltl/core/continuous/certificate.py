@@ -1,0 +1,255 @@
+"""Certificates of policies in continuous worlds: bounds of satisfaction probabilities by cell."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TypedDict, Unpack
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike
+
+from jaxltl.core import validation
+from jaxltl.core.array_types import Booleans, Floats, Integers
+from jaxltl.core.continuous.abstraction import (
+    ALMOST_SURE,
+    ITERATED,
+    SURE,
+    Bounds,
+    Control,
+    Limits,
+    bound_satisfaction,
+)
+from jaxltl.core.continuous.dynamics import Dynamics
+from jaxltl.core.continuous.grid import Grid, make_grid
+from jaxltl.core.continuous.interval_iteration import IterationLimits
+from jaxltl.core.environments.environment import traced
+from jaxltl.core.logic.ltl import Formula
+from jaxltl.core.pretty_print import brief
+from jaxltl.core.status import Status
+
+HOW = {SURE: "surely", ALMOST_SURE: "almost surely", ITERATED: "by value iteration"}
+FIRST_CELLS = 20_000  # of the default grid; finer grids follow
+_BYTES = 400  # of memory for a cell and memory state, about
+
+
+def _facts(certificate: Certificate) -> Iterator[str]:
+    lower, upper = certificate.initial_bounds
+    yield f"{certificate.formula}"
+    yield f"initial states: {lower:.7g} to {upper:.7g}"
+    yield f"{certificate.grid.num_cells:,} cells"
+    yield certificate.status.name
+
+
+@brief(facts=_facts)
+@dataclass(frozen=True, eq=False)
+class Certificate:
+    """Bounds of the probability that a formula holds from each cell, under one policy.
+
+    Attributes:
+      grid: cells of the domain.
+      lower, upper: ``float64[C]``, bounds for all states of a cell as the initial state.
+      how: ``int8[C]``: 3 where the formula holds surely (for every noise in its bounds), 2 with
+        probability 1, 1 by value iteration, 0 without a proof; see :meth:`summary`.
+      initial: ``bool[C]``, cells that meet the initial states.
+      status: ``CONVERGED`` if the bounds of all initial states are as narrow as the tolerance, or
+        decide the threshold; ``MAX_STEPS`` otherwise.
+      seconds: wall time by stage.
+      formula: text of the formula.
+
+    Example:
+      >>> from jaxltl.core.continuous import make_dynamics
+      >>> world = make_dynamics(
+      ...     lambda x, u, w: x / 2, domain=([-1.0], [1.0]), labels={"middle": ([-0.1], [0.1])})
+      >>> proof = certify_policy(world, lambda x: jnp.zeros(0), "F G middle", cells=[40])
+      >>> [float(x) for x in proof.at([0.7])], int(proof.how.min())
+      ([1.0, 1.0], 3)
+    """
+
+    grid: Grid
+    lower: Floats
+    upper: Floats
+    how: Integers
+    initial: Booleans
+    status: Status
+    seconds: dict[str, float]
+    formula: str
+
+    @property
+    def initial_bounds(self) -> tuple[float, float]:
+        """Least lower and least upper bound over the cells of initial states.
+
+        The satisfaction probability is at least the first from every initial state, and at most the
+        second from some initial cell.
+        """
+        return float(self.lower[self.initial].min()), float(self.upper[self.initial].min())
+
+    def at(self, state: ArrayLike) -> tuple[Floats, Floats]:
+        """Lower and upper bounds for initial states ``float[..., n]``; 0 and 1 outside the domain."""
+        cell = self.grid.locate(np.asarray(state, np.float64))
+        inside = cell >= 0
+        return np.where(inside, self.lower[cell], 0.0), np.where(inside, self.upper[cell], 1.0)
+
+    def summary(self) -> str:
+        """The result in one paragraph: bounds, how they were proven, and the time by stage."""
+        lower, upper = self.initial_bounds
+        count = int(self.initial.sum())
+        shares = [
+            f"{int((self.how[self.initial] == key).sum())} {text}" for key, text in HOW.items()
+        ]
+        stages = ", ".join(f"{name} {x:.2g} s" for name, x in self.seconds.items())
+        return (
+            f"{self.formula}: satisfied with probability at least {lower:.7g} from every initial state "
+            f"(least upper bound {upper:.7g}). Of {count:,} initial cells: {', '.join(shares)}. "
+            f"Time: {stages}."
+        )
+
+
+class ProofOptions(TypedDict, total=False):
+    """Options of proofs.
+
+    Attributes:
+      cells: number of cells of the first grid along each axis; default: about 20,000 in all.
+      tolerance: width of the bounds of initial states at which refinement stops; default 1e-3.
+      threshold: stop as soon as the lower bounds of all initial states reach it, or the upper bound of
+        one of them is below; default None.
+      max_cells: of the finest grid; default 2^20.
+      max_sweeps: of value iteration on one grid; default 1,000.
+      upper: False to skip upper bounds.
+      report: function that is called with lines of progress.
+    """
+
+    cells: Sequence[int]
+    tolerance: float
+    threshold: float | None
+    max_cells: int
+    max_sweeps: int
+    upper: bool
+    report: Callable[[str], None]
+
+
+Policy = Callable[[jax.Array], jax.Array]
+
+
+def certify_policy(
+    dynamics: Dynamics,
+    policy: Policy,
+    formula: str | Formula,
+    **options: Unpack[ProofOptions],
+) -> Certificate:
+    """Certified bounds of the probability that a policy satisfies a formula, for each cell.
+
+    The successors of each cell are enclosed (:func:`jaxltl.enclose`), noise included. Sets of cells
+    from which the formula holds for every noise, then with probability 1, are nested fixed points in
+    the product with the formula's automaton; bounds elsewhere are reachability probabilities of these
+    sets in an interval Markov chain whose probabilities are products of factors of each coordinate.
+    Upper bounds are those of the negated formula. Cells are halved until the bounds of the initial
+    states are narrow.
+
+    Args:
+      dynamics: the world, of :func:`make_dynamics`.
+      policy: JAX function ``float[n] -> float[m]``: deterministic, and of the state alone.
+      formula: any LTL formula over the labels.
+      options: see :class:`ProofOptions`.
+
+    Returns:
+      :class:`Certificate`. Bounds hold for real numbers: rounding of this computation is included,
+      that of the controller's own arithmetic is not.
+
+    Raises:
+      ValueError: a policy or a step with a primitive that has no enclosure, actions of another shape,
+        a proposition that is no label, or a grid beyond `max_cells`.
+
+    Example:
+      >>> from jaxltl.core.continuous import make_dynamics, triangular
+      >>> world = make_dynamics(
+      ...     lambda x, u, w: x + u + 0.02 * w, domain=([-1.0], [1.0]), noise=triangular(-1.0, 1.0),
+      ...     actions=([-0.5], [0.5]), labels={"goal": ([-0.1], [0.1])}, initial=([0.5], [0.6]))
+      >>> proof = certify_policy(world, lambda x: -0.2 * x, "F goal", cells=[100])
+      >>> proof.initial_bounds, proof.status.name
+      ((1.0, 1.0), 'CONVERGED')
+    """
+    validation.keywords("certify_policy", options, ProofOptions)
+    validation.instance("dynamics", dynamics, Dynamics, "those of make_dynamics")
+    step = closed_loop(dynamics, policy)
+    grid = first_grid(dynamics, options.get("cells"), options.get("max_cells", 2**20))
+    limits = proof_limits(options)
+    control = Control(step, np.zeros((1, 1)))
+    report = options.get("report", _silent)
+    bounds = bound_satisfaction(dynamics, control, formula, grid, limits, report)
+    return make_certificate(bounds, str(formula), limits)
+
+
+def closed_loop(dynamics: Dynamics, policy: Policy) -> Callable[..., jax.Array]:
+    """The step of a world under a policy; checks the shape of actions."""
+    validation.function("policy", policy)
+    n, m = dynamics.num_states, dynamics.num_actions
+    found = traced("policy", policy, jax.ShapeDtypeStruct((n,), jnp.float32))
+    if tuple(getattr(found, "shape", ("?",))) != (m,):
+        raise ValueError(
+            f"policy returns an array of shape {list(getattr(found, 'shape', ()))} for a state of {n} "
+            f"coordinates; return float[{m}], an action."
+        )
+    low, high = dynamics.actions if isinstance(dynamics.actions, tuple) else (-np.inf, np.inf)
+
+    def step(state: jax.Array, _: jax.Array, noise: jax.Array) -> jax.Array:
+        action = policy(state)
+        if isinstance(dynamics.actions, tuple):
+            action = jnp.clip(
+                action, jnp.asarray(low, action.dtype), jnp.asarray(high, action.dtype)
+            )
+        return dynamics.step(state, action, noise)
+
+    return step
+
+
+def first_grid(dynamics: Dynamics, cells: Sequence[int] | None, max_cells: int) -> Grid:
+    """The first grid, whose edges include those of the labels and of the initial boxes."""
+    n = dynamics.num_states
+    low, high = dynamics.domain
+    if cells is None:
+        side = max(int(FIRST_CELLS ** (1 / n)), 2)
+        cells = (side,) * n
+    regions = [*dynamics.labels.values(), dynamics.initial]
+    breakpoints = [np.unique(np.concatenate([r.breakpoints(i) for r in regions])) for i in range(n)]
+    shape = tuple(int(k) for k in np.atleast_1d(cells))
+    count = int(np.prod([float(k) for k in shape]))
+    if count > max_cells:
+        raise ValueError(
+            f"cells={shape} are {count:,} cells, which take about {count * _BYTES / 2**30:.3g} GiB for "
+            f"each memory state; give fewer, or raise max_cells={max_cells:,}."
+        )
+    return make_grid(low, high, shape, breakpoints)
+
+
+def proof_limits(options: ProofOptions) -> Limits:
+    """The limits that options ask for."""
+    threshold = options.get("threshold")
+    if threshold is not None:
+        threshold = validation.finite_number("threshold", threshold)
+    return Limits(
+        tolerance=validation.finite_number("tolerance", options.get("tolerance", 1e-3)),
+        threshold=threshold,
+        max_cells=options.get("max_cells", 2**20),
+        iteration=IterationLimits(max_sweeps=options.get("max_sweeps", 1000)),
+        upper=options.get("upper", True),
+    )
+
+
+def make_certificate(bounds: Bounds, formula: str, limits: Limits) -> Certificate:
+    """The certificate of bounds by memory state."""
+    lower, upper = bounds.initial_bounds()
+    how = bounds.task.initial(bounds.how.astype(np.float64)).astype(np.int8)
+    inside = bounds.initial
+    decided = bool((upper - lower)[inside].max() <= limits.tolerance)
+    if limits.threshold is not None:
+        reached = (lower[inside] >= limits.threshold).all()
+        decided = decided or bool(reached or (upper[inside] < limits.threshold).any())
+    status = Status.CONVERGED if decided else Status.MAX_STEPS
+    return Certificate(bounds.grid, lower, upper, how, inside, status, bounds.seconds, formula)
+
+
+def _silent(_: str) -> None:
+    """No progress."""

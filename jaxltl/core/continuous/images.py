@@ -1,0 +1,268 @@
+"""Boxes of the successors of cells, from linear bounds over blocks of cells.
+
+The next state of state x under noise w is enclosed, over a block of cells, by an affine form in x and
+w with an error. Where the error is small against the variation over one cell, the form serves all
+cells of the block; elsewhere the block is cut. One coordinate of the noise stays random for each
+coordinate of the state; the rest of the noise is treated as chosen by an adversary.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import jax
+import numpy as np
+import scipy.optimize
+
+from jaxltl.core.array_types import Booleans, Floats, Integers
+from jaxltl.core.continuous.grid import Grid
+from jaxltl.core.enclosures.interval import Interval
+from jaxltl.core.enclosures.linear_bounds import AffineForm, propagate
+from jaxltl.core.enclosures.program import Program, make_program
+from jaxltl.core.models.protocols import PyTree
+from jaxltl.core.pretty_print import brief
+
+LARGEST_BLOCK = 16  # cells along an axis; each level of blocks is a quarter as long
+# A block's form is used if its error is below these shares of the half-width of a cell's image and
+# of the noise: less trades more evaluations for narrower images.
+CELL_SHARE, NOISE_SHARE = 0.15, 0.02
+_CHUNK = 1024  # boxes of one evaluation, which then fits into the caches
+_ROUNDING = 1e-13  # relative error of a few operations in float64, with a margin of 100
+_EQUAL_GAINS = 1e-6  # gains of the noise that differ by less are one
+
+
+@brief
+@dataclass(frozen=True)
+class Images:
+    """Boxes of successors, for rows that are pairs of cells and actions, the cell first.
+
+    Coordinate i of the next state is in `[low_i, high_i] + gain_i w_i` with the noise `w_i` that
+    `noise_of` assigns to it.
+
+    Attributes:
+      cells: ``int[M]``, the cells of the rows.
+      low, high: ``float[M * A, n]``.
+      gain: ``float[M * A, n]``, not negative; 0 without noise.
+      noise_of: for each coordinate the index of its noise, or -1.
+    """
+
+    cells: Integers
+    low: Floats
+    high: Floats
+    gain: Floats
+    noise_of: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class NoiseBox:
+    """Bounds of the noise: `low <= w <= high`, and the coordinates that are random and symmetric.
+
+    The noise is outside with probability at most `lost`.
+    """
+
+    low: Floats
+    high: Floats
+    random: Booleans
+    symmetric: Booleans
+    lost: float = 0.0
+
+
+Step = Callable[[PyTree, PyTree, PyTree], PyTree]
+
+
+def image_boxes(
+    step: Step, grid: Grid, cells: Integers, actions: Floats, noise: NoiseBox
+) -> Images:
+    """Boxes of successors of cells under each action of ``float[A, m]``.
+
+    Raises:
+      ValueError: if `step` cannot be traced or enclosed, with the place.
+    """
+    cells = np.asarray(cells)
+    program = _program(step, grid.num_axes, actions.shape[1], len(noise.low))
+    num_actions, n = len(actions), grid.num_axes
+    low = np.empty((len(cells), num_actions, n))
+    high, gain = np.empty_like(low), np.empty_like(low)
+    todo = np.ones(len(cells), bool)
+    noise_of: tuple[int, ...] | None = None
+    index = np.stack(np.unravel_index(cells, grid.shape), -1)
+    for size in _block_sizes(grid.shape):
+        block_shape = tuple(-(-k // b) for k, b in zip(grid.shape, size, strict=True))
+        number = np.ravel_multi_index(tuple((index[todo] // np.array(size)).T), block_shape)
+        blocks, of_block = np.unique(number, return_inverse=True)
+        start = np.stack(np.unravel_index(blocks, block_shape), -1) * np.array(size)
+        form = _forms(program, grid, start, size, actions, noise)
+        if noise_of is None:
+            noise_of = _assigned(form.gains, noise)
+        rows = np.flatnonzero(todo)
+        here = _cell_images(form, grid, cells[rows], of_block, noise, noise_of)
+        accepted = here.accepted | (max(size) == 1)
+        low[rows[accepted]] = here.low[accepted]
+        high[rows[accepted]] = here.high[accepted]
+        gain[rows[accepted]] = here.gain[accepted]
+        todo[rows[accepted]] = False
+        if not todo.any():
+            break
+    shape = (len(cells) * num_actions, n)
+    return Images(
+        cells, low.reshape(shape), high.reshape(shape), gain.reshape(shape), noise_of or (-1,) * n
+    )
+
+
+def _program(step: Step, n: int, m: int, k: int) -> Program:
+    """The step function as a program on state, action and noise in float64."""
+    with jax.enable_x64(True):
+        specs = [jax.ShapeDtypeStruct((size,), np.float64) for size in (n, m, k)]
+        return make_program(lambda x, u, w: step(x, u, w), *specs)
+
+
+def _block_sizes(shape: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
+    size = LARGEST_BLOCK
+    while size >= 1:
+        yield tuple(min(size, k) for k in shape)
+        size //= 4
+
+
+@dataclass(frozen=True)
+class _Forms:
+    """Affine forms of blocks (N) and actions (A): `middle + slope e + gains (w - w_mid) +- error`."""
+
+    middle: Floats  # [N, A, n]
+    slope: Floats  # [N, A, n, n], of the block's e in [-1, 1]^n: state coordinate, then output
+    gains: Floats  # [N, A, k, n]
+    error: Floats  # [N, A, n]
+    low: Floats  # [N, A, n], of the whole block and all noise
+    high: Floats
+    centre: Floats  # [N, n], of the blocks
+    radius: Floats
+
+
+def _forms(
+    program: Program,
+    grid: Grid,
+    start: Integers,
+    size: tuple[int, ...],
+    actions: Floats,
+    noise: NoiseBox,
+) -> _Forms:
+    """Forms over blocks, evaluated in chunks on two threads or more."""
+    n, k, num_actions = grid.num_axes, len(noise.low), len(actions)
+    stop = np.minimum(start + np.array(size), np.array(grid.shape))
+    first = np.stack([e[i] for e, i in zip(grid.edges, start.T, strict=True)], -1)
+    last = np.stack([e[i] for e, i in zip(grid.edges, stop.T, strict=True)], -1)
+    total = len(start) * num_actions
+
+    def evaluate(begin: int) -> tuple[Floats, ...]:
+        row = np.arange(begin, min(begin + _CHUNK, total))
+        block, action = row // num_actions, actions[row % num_actions]
+        wide = np.broadcast_to(noise.low, (len(row), k)), np.broadcast_to(noise.high, (len(row), k))
+        boxes = [Interval(first[block], last[block]), Interval(action, action), Interval(*wide)]
+        known = propagate(program, boxes)
+        (y,) = program.outputs
+        bounds, form = known.intervals[y], known.forms.get(y)
+        if form is None:  # the output does not depend on the inputs
+            form = AffineForm(np.zeros((1, 0, n)), bounds.middle, bounds.radius)
+        found = (bounds.low, bounds.high, form.middle, form.slope, form.error)
+        return tuple(np.broadcast_to(x, (len(row), *x.shape[1:])) for x in found)
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        parts = list(pool.map(evaluate, range(0, total, _CHUNK)))
+    low, high, middle, some, error = (np.concatenate(x) for x in zip(*parts, strict=True))
+    m = actions.shape[1]
+    slope = np.zeros((total, n + m + k, n))
+    slope[:, : some.shape[1]] = some
+    grouped = (len(start), num_actions)
+    return _Forms(
+        middle.reshape(*grouped, n),
+        slope[:, :n].reshape(*grouped, n, n),
+        slope[:, n + m :].reshape(*grouped, k, n),
+        error.reshape(*grouped, n),
+        low.reshape(*grouped, n),
+        high.reshape(*grouped, n),
+        (first + last) / 2,
+        (last - first) / 2,
+    )
+
+
+def _assigned(gains: Floats, noise: NoiseBox) -> tuple[int, ...]:
+    """The random noise of each coordinate: at most one coordinate each, with the largest gains.
+
+    Independent noises make the coordinates independent given the state; all other noise is
+    treated as chosen by an adversary, which is sound.
+    """
+    found = [-1] * gains.shape[-1]
+    size = np.abs(np.nan_to_num(gains)).mean((0, 1))  # [k, n], of one radius of the noise
+    for j, i in zip(*scipy.optimize.linear_sum_assignment(-size), strict=True):
+        if noise.random[j] and size[j, i] > 0:
+            found[i] = int(j)
+    return tuple(found)
+
+
+@dataclass(frozen=True)
+class _CellImages:
+    low: Floats  # [M, A, n]
+    high: Floats
+    gain: Floats
+    accepted: Booleans  # [M]
+
+
+def _cell_images(
+    form: _Forms,
+    grid: Grid,
+    cells: Integers,
+    of_block: Integers,
+    noise: NoiseBox,
+    noise_of: tuple[int, ...],
+) -> _CellImages:
+    """Images of cells by the forms of their blocks."""
+    low, high = grid.boxes(cells)
+    radius = np.where(form.radius > 0, form.radius, 1)[of_block]
+    offset = ((low + high) / 2 - form.centre[of_block]) / radius
+    share = (high - low) / 2 / radius * (1 + _ROUNDING)
+    slope = form.slope[of_block]
+    size = np.abs(slope)
+    middle = form.middle[of_block] + np.einsum("ca,cuai->cui", offset, slope)
+    spread = np.einsum("ca,cuai->cui", share, size)
+    error = form.error[of_block]
+    fuzzy = np.abs(form.middle[of_block]) + size.sum(-2) + np.abs(form.gains[of_block]).sum(-2)
+    reach, gain = _random_part(form.gains, noise, noise_of)
+    own, reach = gain[of_block], reach[of_block]
+    ends = [(noise.low[j], noise.high[j]) if j >= 0 else (0.0, 0.0) for j in noise_of]
+    least, most = np.array(ends).T
+    error = error + fuzzy * _ROUNDING
+    small = error <= CELL_SHARE * spread + NOISE_SHARE * own * (most - least) / 2
+    half = (spread + error + reach) * (1 + _ROUNDING)
+    middle = middle - own * (least + most) / 2  # forms are centred at the middle of the noise
+    found_low, found_high = middle - half, middle + half
+    unknown = ~np.isfinite(found_low + found_high)  # then the interval with all of the noise
+    found_low = np.where(unknown, form.low[of_block] - own * most, found_low)
+    found_high = np.where(unknown, form.high[of_block] - own * least, found_high)
+    return _CellImages(found_low, found_high, own, (small & ~unknown).all((1, 2)))
+
+
+def _random_part(
+    gains: Floats, noise: NoiseBox, noise_of: tuple[int, ...]
+) -> tuple[Floats, Floats]:
+    """Half-width of the noise that an adversary chooses, and the gain of the random one."""
+    radius = (noise.high - noise.low) / 2
+    reach = np.abs(gains).sum(2)
+    gain = np.zeros(reach.shape)
+    for i, j in enumerate(noise_of):
+        if j < 0:
+            continue
+        slope = gains[:, :, j, i]
+        own = slope / radius[j]
+        usual = float(np.median(own))
+        near = np.abs(own - usual) <= _EQUAL_GAINS * abs(usual)
+        own = np.where(near, usual, own)
+        if noise.symmetric[j]:
+            own = np.abs(own)
+            slope = np.abs(slope)
+        own = np.where(np.isfinite(own) & (own > 0), own, 0.0)
+        gain[:, :, i] = own
+        reach[:, :, i] += np.abs(slope - own * radius[j]) - np.abs(slope)
+        reach[:, :, i] = np.maximum(reach[:, :, i], 0) + np.abs(slope) * _ROUNDING
+    return reach, gain

@@ -1,0 +1,229 @@
+"""Synthesis in continuous worlds: policies on cells with certified satisfaction probabilities."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Unpack
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike
+
+from jaxltl.core import validation
+from jaxltl.core.array_types import Array, Booleans, Floats, Integers
+from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.continuous.abstraction import Control, bound_satisfaction, safe_actions
+from jaxltl.core.continuous.certificate import (
+    Certificate,
+    ProofOptions,
+    first_grid,
+    make_certificate,
+    proof_limits,
+)
+from jaxltl.core.continuous.dynamics import Dynamics, make_dynamics  # noqa: F401 - of the examples
+from jaxltl.core.continuous.task_product import TaskProduct
+from jaxltl.core.logic.ltl import Formula
+from jaxltl.core.pretty_print import brief
+
+_PAIRS = 2**24  # of cells and actions on one grid: about 1 GiB
+
+
+@brief
+@dataclass(frozen=True, eq=False)
+class CellPolicy:
+    """A policy that looks up the action of a cell and a memory state; with its certificate.
+
+    Attributes:
+      certificate: bounds under this policy; its upper bounds are those of all policies.
+      actions: ``float[A, m]``.
+      action: ``int[Q, C]``, of each memory state and cell.
+      allowed: ``bool[Q, C, A]``, actions after which the formula still holds surely or with
+        probability 1 from every successor: a permissive strategy. All False where there is none.
+      dynamics: the world.
+      automaton: of the formula.
+      automaton_state: ``int[Q]``, of each memory state.
+      memory: ``int[Q', L]``, memory state after reading letter l in automaton state q'.
+
+    Example:
+      >>> world = make_dynamics(
+      ...     lambda x, u, w: x + u, domain=([-1.0], [1.0]), actions=[[-0.2], [0.2]],
+      ...     labels={"left": ([-1.0], [-0.5])}, initial=([0.0], [0.5]))
+      >>> policy = synthesize_policy(world, "F left", cells=[40])
+      >>> at = jnp.array([0.3])
+      >>> float(policy.act(policy.start(at), at)[0]) < 0, policy.certificate.initial_bounds
+      (True, (1.0, 1.0))
+    """
+
+    certificate: Certificate
+    actions: Floats
+    action: Integers
+    allowed: Booleans
+    dynamics: Dynamics
+    automaton: Automaton
+    automaton_state: Integers
+    memory: Integers
+
+    def start(self, state: Array) -> Array:
+        """Memory state ``int[]`` in an initial state ``float[n]``; JAX or NumPy."""
+        return self._read(jnp.asarray(self.automaton.initial), state)
+
+    def update(self, memory: Array, state: Array) -> Array:
+        """Memory state after entering a state."""
+        return self._read(jnp.asarray(self.automaton_state)[memory], state)
+
+    def act(self, memory: Array, state: Array) -> Array:
+        """Action ``float[m]`` in a state of the domain."""
+        cell = self.cell(state)
+        return jnp.asarray(self.actions, state.dtype)[jnp.asarray(self.action)[memory, cell]]
+
+    def allowed_actions(self, memory: Array, state: Array) -> Array:
+        """``bool[A]``: the permissive strategy in a state."""
+        return jnp.asarray(self.allowed)[memory, self.cell(state)]
+
+    def nearest_allowed(self, memory: Array, state: Array, action: Array) -> Array:
+        """The allowed action ``float[m]`` that is nearest to an action; that of :meth:`act` if none."""
+        allowed = self.allowed_actions(memory, state)
+        actions = jnp.asarray(self.actions, state.dtype)
+        distance = jnp.where(allowed, ((actions - action) ** 2).sum(-1), jnp.inf)
+        return jnp.where(allowed.any(), actions[jnp.argmin(distance)], self.act(memory, state))
+
+    def cell(self, state: Array) -> Array:
+        """The cell ``int[]`` of a state; the nearest one outside the domain."""
+        index = []
+        for axis, edges in enumerate(self.certificate.grid.edges):
+            # Edges rounded to the state's dtype: states within rounding of an edge may be in either
+            # of its cells.
+            inner = jnp.asarray(edges[1:-1], state.dtype)
+            index.append(jnp.searchsorted(inner, state[axis], side="right"))
+        return jnp.ravel_multi_index(tuple(index), self.certificate.grid.shape, mode="clip")
+
+    def _read(self, automaton_state: Array, state: Array) -> Array:
+        """The memory state after reading the label of a state."""
+        names = list(self.dynamics.propositions)
+        columns = np.array([names.index(p) for p in self.automaton.propositions], int)
+        label = self.dynamics.label(jnp.asarray(state))[columns]
+        letter = jnp.argmax((jnp.asarray(self.automaton.letters) == label).all(-1))
+        return jnp.asarray(self.memory)[automaton_state, letter]
+
+
+def synthesize_policy(
+    dynamics: Dynamics,
+    formula: str | Formula,
+    actions: ArrayLike | None = None,
+    **options: Unpack[ProofOptions],
+) -> CellPolicy:
+    """A policy on cells with certified bounds of its satisfaction probability.
+
+    Lower bounds are least satisfaction probabilities under the policy, over all states of the cells and
+    all disturbances; upper bounds are those of every policy over the grid of actions. Winning sets and
+    interval iteration are those of :func:`certify_policy`, with a maximum over actions.
+
+    Args:
+      dynamics: the world, of :func:`make_dynamics`.
+      formula: any LTL formula over the labels.
+      actions: ``float[A, m]``; default: the grid of the dynamics.
+      options: see :class:`ProofOptions`.
+
+    Returns:
+      :class:`CellPolicy`.
+
+    Raises:
+      ValueError: as :func:`certify_policy`; no grid of actions; more pairs of cells and actions than
+        fit, with the bytes.
+
+    Example:
+      >>> from jaxltl.core.continuous import gaussian, make_dynamics
+      >>> world = make_dynamics(
+      ...     lambda x, u, w: x + u + w, domain=([-2.0], [2.0]), noise=gaussian(0.1),
+      ...     actions=[[-0.3], [0.0], [0.3]], labels={"goal": ([1.0], [1.5])}, initial=([-0.5], [0.5]))
+      >>> found = synthesize_policy(world, "F goal", cells=[80], upper=False)
+      >>> found.certificate.initial_bounds[0] > 0.999
+      True
+    """
+    validation.keywords("synthesize_policy", options, ProofOptions)
+    validation.instance("dynamics", dynamics, Dynamics, "those of make_dynamics")
+    grid_of_actions = _actions(dynamics, actions)
+    max_cells = min(options.get("max_cells", 2**20), max(_PAIRS // len(grid_of_actions), 1))
+    grid = first_grid(dynamics, options.get("cells"), max_cells)
+    limits = replace(proof_limits(options), max_cells=max_cells)
+    control = Control(dynamics.step, grid_of_actions)
+    report: Callable[[str], None] = options.get("report", lambda _: None)
+    bounds = bound_satisfaction(dynamics, control, formula, grid, limits, report)
+    certificate = make_certificate(bounds, str(formula), limits)
+    allowed = safe_actions(dynamics, control, bounds)
+    return CellPolicy(
+        certificate, grid_of_actions, bounds.action, allowed, dynamics,
+        bounds.task.automaton, np.array([q for q, _ in bounds.task.states]),
+        _memory_table(bounds.task),
+    )  # fmt: skip
+
+
+def _memory_table(task: TaskProduct) -> Integers:
+    """``int[Q', L]``: memory states by automaton state and letter; 0 where none is reachable."""
+    number = {pair: i for i, pair in enumerate(task.states)}
+    delta, priority = task.automaton.delta, task.automaton.priority
+    table = np.zeros(delta.shape, np.int32)
+    for q, letter in np.ndindex(*delta.shape):
+        to = int(delta[q, letter])
+        # Decided states have one memory state, whatever priority led there.
+        same = next((i for (state, _), i in number.items() if state == to), 0)
+        table[q, letter] = number.get((to, int(priority[q, letter])), same)
+    return table
+
+
+def _actions(dynamics: Dynamics, actions: ArrayLike | None) -> Floats:
+    """The grid of actions."""
+    given = dynamics.actions if actions is None else actions
+    if given is None:
+        return np.zeros((1, 0))
+    if isinstance(given, tuple):
+        raise ValueError(
+            "the dynamics have a box of actions; give actions=, an array float[A, m] of those that the "
+            "policy may choose."
+        )
+    found = validation.float_array("actions", given)
+    if found.ndim != 2 or found.shape[1] != dynamics.num_actions or not len(found):
+        raise ValueError(
+            f"actions has shape {list(found.shape)}; give float[A, {dynamics.num_actions}]."
+        )
+    return found
+
+
+def simulate_cells(
+    policy: CellPolicy, key: jax.Array, state: Array, num_steps: int
+) -> tuple[Array, Array, Array]:
+    """A simulated run under a policy on cells.
+
+    Args:
+      policy: of :func:`synthesize_policy`.
+      key: random key.
+      state: ``float[n]``, the initial state.
+      num_steps: T, static.
+
+    Returns:
+      ``(states float[T, n], memory int[T], actions float[T, m])``.
+
+    Example:
+      >>> world = make_dynamics(
+      ...     lambda x, u, w: x + u, domain=([-1.0], [1.0]), actions=[[-0.2], [0.2]],
+      ...     labels={"left": ([-1.0], [-0.5])}, initial=([0.0], [0.5]))
+      >>> policy = synthesize_policy(world, "F left", cells=[40])
+      >>> states, _, _ = simulate_cells(policy, jax.random.key(0), jnp.array([0.1]), 4)
+      >>> bool(jnp.allclose(states[:, 0], jnp.array([0.1, -0.1, -0.3, -0.5]), atol=1e-6))
+      True
+    """
+
+    def step(
+        carry: tuple[jax.Array, Array], key: jax.Array
+    ) -> tuple[tuple[jax.Array, Array], tuple[jax.Array, Array, Array]]:
+        state, memory = carry
+        action = jnp.asarray(policy.act(memory, state))
+        after = policy.dynamics.next_state(key, state, action)
+        return (after, policy.update(memory, after)), (state, memory, action)
+
+    state = jnp.asarray(state)
+    _, found = jax.lax.scan(step, (state, policy.start(state)), jax.random.split(key, num_steps))
+    states, memory, actions = found
+    return states, memory, actions

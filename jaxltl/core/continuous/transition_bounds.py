@@ -1,0 +1,280 @@
+"""Interval transition probabilities between cells as factors of each coordinate.
+
+Given the state, the coordinates of the next state are independent; each has an interval probability
+for each interval of the grid. The least expectation over all such products is at least that over the
+joint intervals, and is computed coordinate by coordinate (orthogonally decoupled abstractions,
+Mathiesen et al. 2024, arXiv 2411.11803): no array has a row and a column for each cell.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from jaxltl.core.array_types import Booleans, Floats, Integers
+from jaxltl.core.continuous.grid import Grid
+from jaxltl.core.continuous.images import Images, NoiseBox
+from jaxltl.core.pretty_print import brief
+
+_CHUNK = 2**18  # probabilities handled at once by a thread
+_UNIT = float(np.finfo(np.float64).eps)
+
+
+class Noise(Protocol):
+    """A distribution of one coordinate of the noise."""
+
+    def probability_bounds(
+        self, a: Floats, b: Floats, low: Floats, high: Floats, scale: Floats
+    ) -> tuple[Floats, Floats]:
+        """Bounds of `P(a <= m + scale w < b)` over all shifts m in [low, high]."""
+
+
+@brief
+@dataclass(frozen=True)
+class Factors:
+    """Interval probabilities of one coordinate, for U different images.
+
+    Attributes:
+      start: ``int[U]``, first interval of the window.
+      low, gap: ``float[U, K]``, lower probabilities in the window, and upper minus lower ones.
+      outside: ``float[U, 2]``, lower probability and gap of leaving the grid.
+      rest: ``float[U]``, at least the probability of intervals that are not in the window.
+    """
+
+    start: Integers
+    low: Floats
+    gap: Floats
+    outside: Floats
+    rest: Floats
+
+
+@dataclass(frozen=True)
+class _Stage:
+    """Contraction of one coordinate: groups of rows that share all factors contracted so far."""
+
+    axis: int
+    factor: Integers  # int[G]
+    parent: Integers  # int[G], group of the stage before
+    parent_start: Integers  # int[G, axes], where the parent's array begins along each axis left
+    start: Integers  # int[G, axes - 1]
+    width: tuple[int, ...]
+
+
+@brief
+@dataclass(frozen=True)
+class TransitionBounds:
+    """Interval transition probabilities of rows, as factors.
+
+    Attributes:
+      factors: for each coordinate of the state.
+      ids: for each coordinate, ``int[R]``, the factors of each row.
+      stages: order of the contraction.
+      lost: probability of noise for which nothing is known.
+    """
+
+    factors: tuple[Factors, ...]
+    ids: tuple[Integers, ...]
+    stages: tuple[_Stage, ...]
+    lost: float
+
+    def least(self, value: Floats, outside: float) -> Floats:
+        """Least expectation ``float[R]`` of ``value[*shape]`` over all transition probabilities.
+
+        Values are in [0, 1]; that of leaving the grid is `outside`, 0 or 1. Rounded down.
+        """
+        source = value[None]
+        for stage in self.stages:
+            source = _contract(stage, self.factors[stage.axis], source, outside)
+        return np.maximum(source - self.lost, 0)
+
+    def certain(self) -> tuple[Integers, Integers]:
+        """Boxes of cells ``int[R, n]`` that have positive lower probabilities; start and stop."""
+        start, stop = [], []
+        for factors, index in zip(self.factors, self.ids, strict=True):
+            positive: Booleans = factors.low > self.lost
+            first = factors.start + np.argmax(positive, -1)
+            last = factors.start + positive.shape[-1] - np.argmax(positive[:, ::-1], -1)
+            start.append(first[index])
+            stop.append(np.where(positive.any(-1), last, first)[index])
+        return np.stack(start, -1), np.stack(stop, -1)
+
+
+def transition_bounds(
+    images: Images, grid: Grid, noise: Sequence[Noise], box: NoiseBox, clipped: bool
+) -> TransitionBounds:
+    """Interval transition probabilities of all rows of images.
+
+    Args:
+      images: boxes of successors.
+      grid: the cells.
+      noise: distributions of the random coordinates.
+      box: bounds of the noise that the images hold for.
+      clipped: True if successors are clipped to the grid.
+    """
+    factors, ids = [], []
+    for axis, j in enumerate(images.noise_of):
+        columns = np.stack([x[:, axis] for x in (images.low, images.high, images.gain)], -1)
+        rows, inverse = np.unique(columns, axis=0, return_inverse=True)
+        ids.append(inverse.reshape(-1))
+        low, high, gain = rows.T
+        ends = (low, high)
+        if j >= 0:
+            ends = low + gain * box.low[j], high + gain * box.high[j]
+        factors.append(
+            _factors(rows, ends, grid.edges[axis], noise[j] if j >= 0 else None, clipped)
+        )
+    stages = _stages(factors, ids, grid.shape)
+    return TransitionBounds(tuple(factors), tuple(ids), stages, box.lost)
+
+
+def _factors(
+    rows: Floats, ends: tuple[Floats, Floats], edges: Floats, noise: Noise | None, clipped: bool
+) -> Factors:
+    """Probabilities of intervals for images ``[U, 3]`` of low, high and gain."""
+    count = len(edges) - 1
+    start = np.clip(np.searchsorted(edges, ends[0], "right") - 1, 0, count - 1)
+    stop = np.clip(np.searchsorted(edges, ends[1], "right"), start + 1, count)
+    width = int((stop - start).max())
+    start = np.minimum(start, count - width)
+    index = start[:, None] + np.arange(width)
+    bottom, top = edges[0], np.nextafter(edges[-1], np.inf)  # the last cell includes its upper edge
+    if clipped:
+        bottom, top = -np.inf, np.inf
+
+    def side(at: Integers) -> Floats:
+        return np.where(at == 0, bottom, np.where(at == count, top, edges[at]))
+
+    def bounds(a: Floats, b: Floats) -> tuple[Floats, Floats]:
+        return _bounds(noise, a, b, *(x[:, None] for x in rows.T))
+
+    lower, upper = bounds(side(index), side(index + 1))
+    first, last = side(start)[:, None], side(start + width)[:, None]
+    ends_of_grid = np.full_like(first, bottom), np.full_like(first, top)
+    below, above = bounds(ends_of_grid[0], first)[1], bounds(last, ends_of_grid[1])[1]
+    rest = np.where(first > bottom, below, 0) + np.where(last < top, above, 0)
+    outside = np.zeros((len(rows), 2))
+    if not clipped:
+        least, most = bounds(*ends_of_grid)
+        outside = np.concatenate([1 - most - _UNIT, most - least + 4 * _UNIT], -1)
+        outside = np.where(np.concatenate([most, least], -1) == 1, 0, np.maximum(outside, 0))
+    gap = np.where(upper > lower, upper - lower + _UNIT, 0)
+    return Factors(start, lower, gap, outside, rest[:, 0])
+
+
+def _bounds(
+    noise: Noise | None, a: Floats, b: Floats, low: Floats, high: Floats, gain: Floats
+) -> tuple[Floats, Floats]:
+    """Bounds of the probability of [a, b); without noise, 0 or 1 where the image decides it."""
+    a, b = np.broadcast_arrays(a, b)
+    certain = ((low >= a) & (high < b)).astype(np.float64)
+    possible = ((high >= a) & (low < b)).astype(np.float64)
+    if noise is None or not (gain > 0).any():
+        return certain, possible
+    lower, upper = noise.probability_bounds(a, b, low, high, np.where(gain > 0, gain, 1.0))
+    random = gain > 0
+    return np.where(random, lower, certain), np.where(random, upper, possible)
+
+
+# --- contraction ----------------------------------------------------------------------------------
+
+
+def _stages(
+    factors: Sequence[Factors], ids: Sequence[Integers], shape: tuple[int, ...]
+) -> tuple[_Stage, ...]:
+    """Groups of rows that share factors, from the last axis to the first."""
+    num_rows = len(ids[0])
+    stages = []
+    group = np.zeros(num_rows, np.int64)  # of each row, in the stage before
+    before, span = np.zeros((1, len(shape)), np.int64), shape
+    starts = np.stack([f.start[i] for f, i in zip(factors, ids, strict=True)], -1)
+    widths = np.array([f.low.shape[1] for f in factors])
+    for axis in reversed(range(len(shape))):
+        if axis == 0:  # the last stage has one group for each row
+            new, inverse = np.arange(num_rows), np.arange(num_rows)
+        else:
+            pair = group * (int(ids[axis].max()) + 1) + ids[axis]
+            _, new, inverse = np.unique(pair, return_index=True, return_inverse=True)
+            inverse = inverse.reshape(-1)
+        first = np.full((len(new), axis), np.iinfo(np.int64).max)
+        last = np.zeros((len(new), axis), np.int64)
+        np.minimum.at(first, inverse, starts[:, :axis])
+        np.maximum.at(last, inverse, starts[:, :axis] + widths[:axis])
+        width = tuple(int(w) for w in (last - first).max(0)) if axis else ()
+        # Padded ranges stay inside those of the stage before, which include the needed ones.
+        limit = (
+            before[group[new]][:, :axis]
+            + np.array(span[:axis], np.int64)
+            - np.array(width, np.int64)
+        )
+        first = np.minimum(first, limit)
+        stages.append(_Stage(axis, ids[axis][new], group[new], before[group[new]], first, width))
+        group, before, span = inverse, first, width
+    return tuple(stages)
+
+
+def _contract(stage: _Stage, factors: Factors, source: Floats, outside: float) -> Floats:
+    """One stage: the least expectation along an axis, for each group and each cell of the others."""
+    size = max(int(np.prod(stage.width)), 1)
+    window = factors.low.shape[1]
+    chunk = max(_CHUNK // (size * window), 1)
+    found = np.empty((len(stage.factor), *stage.width))
+    strides = np.array([s // source.itemsize for s in source.strides])
+    flat = source.reshape(-1)
+
+    def compute(begin: int) -> None:
+        part = slice(begin, begin + chunk)
+        factor = stage.factor[part]
+        shift = stage.start[part] - stage.parent_start[part][:, : stage.axis]
+        place = stage.parent[part] * strides[0] + (shift * strides[1:-1]).sum(-1)
+        first = factors.start[factor] - stage.parent_start[part][:, stage.axis]
+        index = (place + first * strides[-1]).reshape(-1, *(1,) * (len(stage.width) + 1))
+        for axis, count in enumerate(stage.width):
+            steps = np.arange(count) * strides[1 + axis]
+            index = index + steps.reshape(-1, *(1,) * (len(stage.width) - axis))
+        index = index + np.arange(window) * strides[-1]
+        found[part] = _least(flat[index], factors, factor, outside)
+
+    begins = range(0, len(stage.factor), chunk)
+    _parallel(compute, begins)
+    return found
+
+
+def _parallel(function: Callable[[int], None], items: Sequence[int]) -> None:
+    if len(items) < 3:
+        for item in items:
+            function(item)
+        return
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        list(pool.map(function, items))
+
+
+def _least(value: Floats, factors: Factors, factor: Integers, outside: float) -> Floats:
+    """Least expectation along the last axis: the mass that is free goes to the least values first.
+
+    ``sum low v + min sum x v`` over ``0 <= x <= gap`` with ``sum x = 1 - sum low``. Intervals that
+    are not in the window count as 0. The sums of K products and of the masses err by at most
+    ``(K + 4) eps``, since values and masses are at most 1.
+    """
+    middle = (1,) * (value.ndim - 2)
+    low, gap = factors.low[factor], factors.gap[factor]
+    out_low, out_gap = factors.outside[factor].T
+    free = np.maximum(1 - low.sum(-1) - out_low, 0)
+    free = np.maximum(free - factors.rest[factor] - (out_gap if outside == 0 else 0), 0)
+    shape = (len(factor), *middle, value.shape[-1])
+    low, gap = low.reshape(shape), gap.reshape(shape)
+    order = np.argsort(value, -1)
+    sorted_value = np.take_along_axis(value, order, -1)
+    sorted_gap = np.take_along_axis(np.broadcast_to(gap, value.shape), order, -1)
+    filled = np.cumsum(sorted_gap, -1)
+    free = free.reshape(-1, *middle, 1)
+    taken = np.clip(free - (filled - sorted_gap), 0, sorted_gap)
+    total: Floats = (low * value).sum(-1) + (taken * sorted_value).sum(-1)
+    if outside:
+        rest = np.maximum(free[..., 0] - filled[..., -1], 0)
+        total = total + out_low.reshape(-1, *middle) + rest
+    return np.clip(total - (value.shape[-1] + 8) * _UNIT, 0, 1)

@@ -1,0 +1,137 @@
+"""Cells from which a task is satisfied surely or with probability 1, by nested fixed points.
+
+With bounded noise, a cell's successors lie in a box of cells; all of them must be in the set (noise as
+an adversary). With random noise, some cells have positive probability for every state of the cell:
+they are met almost surely if they can be met again and again. Parity conditions with priorities
+0..d are solved by `nu X_0 mu X_1 nu X_2 ...` over predecessors (Emerson and Jutla 1991); at odd
+priorities the predecessor takes the next set with positive probability while staying in the outer
+one, which is the fixed point of games with strongly fair edges (Banerjee, Majumdar, Mallik, Schmuck
+and Soudjani 2023, Theorem 3).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from jaxltl.core.array_types import Booleans, Integers
+from jaxltl.core.continuous.grid import count_in, cumulative, volume
+from jaxltl.core.continuous.task_product import TaskProduct
+from jaxltl.core.pretty_print import brief
+
+
+@brief
+@dataclass(frozen=True)
+class Successors:
+    """Boxes of cells that rows may and must meet; rows are pairs of cells and actions.
+
+    Attributes:
+      cells: ``int[M]``, the cells of the rows.
+      num_actions: A.
+      start, stop: ``int[M A, n]``, the cells that are possible.
+      outside: ``bool[M A]``, True if the domain may be left.
+      certain_start, certain_stop: ``int[M A, n]``, cells of positive probability; None: noise is an
+        adversary.
+      shape: of the grid.
+    """
+
+    cells: Integers
+    num_actions: int
+    start: Integers
+    stop: Integers
+    outside: Booleans
+    certain: tuple[Integers, Integers] | None
+    shape: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Winning:
+    """Winning product states and actions.
+
+    Attributes:
+      states: ``bool[Q, C]``.
+      action: ``int[Q, C]``, of a winning strategy; 0 elsewhere.
+    """
+
+    states: Booleans
+    action: Integers
+
+
+def winning_cells(
+    task: TaskProduct, rows: Successors, known: Booleans, maximize: bool = True
+) -> Winning:
+    """Product states from which the parity condition holds, against every successor in the boxes.
+
+    Args:
+      task: the product.
+      rows: successors of the cells that may become winning; others are winning if known.
+      known: ``bool[Q, C]``, states that are known to be winning.
+      maximize: True if the controller wants the task, False if it is an adversary too.
+    """
+    solver = _Solver(task, rows, known | (task.decided == 1)[:, None], maximize)
+    top = int(task.priority.max())
+    states = solver.solve(0, max(top, 1), [])
+    return Winning(states, solver.action)
+
+
+class _Solver:
+    """State of the nested fixed point: the sets, and the actions by which states entered them."""
+
+    def __init__(
+        self, task: TaskProduct, rows: Successors, known: Booleans, maximize: bool
+    ) -> None:
+        self.task, self.rows, self.known, self.maximize = task, rows, known, maximize
+        self.action = np.zeros(known.shape, np.int32)
+        self.open: list[int] = np.flatnonzero(task.decided < 0).tolist()
+
+    def solve(self, priority: int, top: int, outer: list[Booleans]) -> Booleans:
+        """The fixed point of the variables from `priority` on, for values of the outer ones."""
+        greatest = priority % 2 == 0
+        current = self.known | np.ones_like(self.known) if greatest else self.known.copy()
+        current[self.task.decided == 0] = False
+        while True:
+            sets = [*outer, current]
+            new = self.solve(priority + 1, top, sets) if priority < top else self.step(sets)
+            if (new == current).all():
+                return new
+            current = new
+
+    def step(self, sets: list[Booleans]) -> Booleans:
+        """One application of the predecessors of all priorities."""
+        found = self.known.copy()
+        for q in self.open:
+            priority = int(self.task.priority[q])
+            inner = sets[priority]
+            good = self.all_inside(inner, q)
+            if priority % 2 and self.rows.certain is not None:
+                good |= self.all_inside(sets[priority - 1], q) & self.some_inside(inner, q)
+            grid = good.reshape(-1, self.rows.num_actions)
+            won = grid.any(1) if self.maximize else grid.all(1)
+            cells = self.rows.cells
+            before = inner[q, cells]
+            new = won & ~found[q, cells]
+            changed = new & (~before if priority % 2 else np.ones_like(before))
+            self.action[q, cells[changed]] = grid[changed].argmax(1)
+            found[q, cells[new]] = True
+        return found
+
+    def all_inside(self, states: Booleans, q: int) -> Booleans:
+        """Rows whose successors are all in a set."""
+        return contained(self.task, self.rows, states, q)
+
+    def some_inside(self, states: Booleans, q: int) -> Booleans:
+        """Rows with positive probability of a set."""
+        assert self.rows.certain is not None
+        table = cumulative(self.task.entered(states, q).reshape(self.rows.shape))
+        return count_in(table, *self.rows.certain) > 0
+
+
+def contained(task: TaskProduct, rows: Successors, states: Booleans, memory: int) -> Booleans:
+    """Rows ``bool[R]`` whose possible successors, entered from a memory state, are all in a set."""
+    table = cumulative(task.entered(states, memory).reshape(rows.shape))
+    cells = volume(rows.start, rows.stop)
+    inside = count_in(table, rows.start, rows.stop) == cells
+    if not task.outside[memory]:
+        inside &= ~rows.outside
+    return inside & ((cells > 0) | rows.outside)
