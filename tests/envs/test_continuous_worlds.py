@@ -102,4 +102,4 @@ def trained(name, seed, num_steps):
 def test_ppo_learns_reach_avoid_in_the_linear_world():
     agent, task = trained("easy", 0, 60)
     found = jl.evaluate(jax.random.key(1), agent, task, num_steps=100, num_episodes=2000)
-    assert found["success"].lower > 0.97
+    assert found.success.lower > 0.97
