@@ -192,7 +192,9 @@ def _product(
             certain[:, i], possible[:, i] = dynamics.labels[name].membership(low, high)
     outside = None if dynamics.outside in ("violates", "clip") else dynamics.outside
     task = task_product(formula, names, certain, possible, outside)
-    return task, dynamics.initial.membership(low, high)[1]
+    # The initial boxes are closed: a cell that only touches the upper edge of one is initial too.
+    closed = replace(dynamics.initial, high=np.nextafter(dynamics.initial.high, np.inf))
+    return task, closed.membership(low, high)[1]
 
 
 def _first(dynamics: Dynamics, formula: str | Formula, grid: Grid) -> Bounds:
@@ -351,7 +353,8 @@ class _Problem:
         clock.stage("sets")
         active = self._active(task, value, upper)
         if len(active):
-            rows, bounds = self._part(active)
+            if len(active) < len(rows.cells):
+                rows, bounds = self._part(active)
             start = IterationResult(value, action, 1.0, 0)
             found = iterate(task, bounds, rows, start, self.limits.iteration, maximize)
             better = found.value > value
@@ -369,6 +372,10 @@ class _Problem:
 
     def _part(self, active: Integers) -> tuple[Successors, TransitionBounds]:
         """The rows of some cells, with their transition probabilities."""
+        clipped = self.dynamics.outside == "clip"
+        if len(active) == len(self.rows.cells):
+            noise = self.dynamics.noise
+            return self.rows, transition_bounds(self.images, self.grid, noise, self.box, clipped)
         num = self.rows.num_actions
         index = (active[:, None] * num + np.arange(num)).reshape(-1)
         im = self.images
@@ -380,7 +387,6 @@ class _Problem:
             stop=self.rows.stop[index],
             outside=self.rows.outside[index],
         )
-        clipped = self.dynamics.outside == "clip"
         return rows, transition_bounds(part, self.grid, self.dynamics.noise, self.box, clipped)
 
 

@@ -75,7 +75,7 @@ class Grid:
             start.append(np.where(a > e[-1], len(e) - 1, first))
             end = np.where(b >= e[-1], len(e) - 1, np.searchsorted(e, b, "right"))
             stop.append(np.where(a > e[-1], start[-1], np.maximum(end, 0)))
-        return np.stack(start, -1), np.stack(stop, -1), outside
+        return np.stack(start, -1).astype(np.int32), np.stack(stop, -1).astype(np.int32), outside
 
     def refine(self, factor: Sequence[int]) -> Grid:
         """The grid with each cell cut into ``factor[i]`` equal parts along axis i."""
@@ -143,7 +143,7 @@ def count_in(table: Integers, start: Integers, stop: Integers) -> Integers:
     total = np.zeros(len(start), np.int64)
     n = start.shape[1]
     strides = np.array([s // table.itemsize for s in table.strides])
-    flat, first, last = table.reshape(-1), start * strides, stop * strides
+    flat, first, last = table.reshape(-1), start * strides, stop * strides  # int64
     for corner in itertools.product((0, 1), repeat=n):
         index = sum(last[:, i] if c else first[:, i] for i, c in enumerate(corner))
         sign = 1 if (n - sum(corner)) % 2 == 0 else -1

@@ -98,12 +98,14 @@ def image_boxes(
         if noise_of is None:
             noise_of = _assigned(form.gains, noise)
         rows = np.flatnonzero(todo)
-        here = _cell_images(form, grid, cells[rows], of_block, noise, noise_of)
-        accepted = here.accepted | (max(size) == 1)
-        low[rows[accepted]] = here.low[accepted]
-        high[rows[accepted]] = here.high[accepted]
-        gain[rows[accepted]] = here.gain[accepted]
-        todo[rows[accepted]] = False
+        many = max(_CHUNK * 64 // num_actions, 1)  # cells at once, which bounds the memory
+        for begin in range(0, len(rows), many):
+            here, block = rows[begin : begin + many], of_block.reshape(-1)[begin : begin + many]
+            image = _cell_images(form, grid, cells[here], block, noise, noise_of)
+            accepted = image.accepted | (max(size) == 1)
+            for array, new in ((low, image.low), (high, image.high), (gain, image.gain)):
+                array[here[accepted]] = new[accepted]
+            todo[here[accepted]] = False
         if not todo.any():
             break
     shape = (len(cells) * num_actions, n)

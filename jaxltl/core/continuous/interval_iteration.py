@@ -13,6 +13,8 @@ from jaxltl.core.continuous.transition_bounds import TransitionBounds
 from jaxltl.core.continuous.winning_cells import Successors
 from jaxltl.core.pretty_print import brief
 
+_EVALUATION_SWEEPS = 200  # of a policy between two sweeps over all actions
+
 
 @brief
 @dataclass(frozen=True)
@@ -59,23 +61,55 @@ def iterate(
       maximize: True if the controller maximises, False if it minimises.
     """
     value, action = start.value.copy(), start.action.copy()
-    open_memory = np.flatnonzero(task.decided < 0)
-    cells, shape = rows.cells, rows.shape
     change, sweep = np.inf, 0
     while sweep < limits.max_sweeps and change > limits.tolerance:
         sweep, change = sweep + 1, 0.0
-        for q in reversed(open_memory):
-            entered = task.entered(value, q).reshape(shape)
-            found = bounds.least(entered, float(task.outside[q])).reshape(-1, rows.num_actions)
+        for q in reversed(np.flatnonzero(task.decided < 0)):
+            found = _expected(task, bounds, value, q, rows.shape).reshape(-1, rows.num_actions)
             best = found.argmax(1) if maximize else found.argmin(1)
             new = np.take_along_axis(found, best[:, None], 1)[:, 0]
-            before = value[q, cells]
-            better = new > before
-            gain = (new - before)[better]
-            action[q, cells[better]] = best[better]
-            value[q, cells[better]] = new[better]
-            change = max(change, float(gain.max(initial=0)))
+            better = new > value[q, rows.cells]
+            action[q, rows.cells[better]] = best[better]
+            change = max(change, _raise(value, q, rows.cells, new))
+        if maximize and rows.num_actions > 1:
+            _evaluate(task, bounds, rows, value, action, max(change / 10, limits.tolerance))
     return IterationResult(value, action, change, sweep)
+
+
+def _expected(
+    task: TaskProduct, bounds: TransitionBounds, value: Floats, memory: int, shape: tuple[int, ...]
+) -> Floats:
+    """Least expected values ``[R]`` of the rows from a memory state."""
+    entered = task.entered(value, memory).reshape(shape)
+    return bounds.least(entered, float(task.outside[memory]))
+
+
+def _raise(value: Floats, memory: int, cells: Integers, new: Floats) -> float:
+    """Raises values to new ones; returns the largest change."""
+    before = value[memory, cells]
+    value[memory, cells] = np.maximum(before, new)
+    return float((new - before).max(initial=0))
+
+
+def _evaluate(
+    task: TaskProduct,
+    bounds: TransitionBounds,
+    rows: Successors,
+    value: Floats,
+    action: Integers,
+    tolerance: float,
+) -> None:
+    """Sweeps with the chosen actions alone, which cost a fraction of those over all actions."""
+    open_memory = np.flatnonzero(task.decided < 0)
+    first = np.arange(len(rows.cells)) * rows.num_actions
+    parts = {q: bounds.part(first + action[q, rows.cells]) for q in open_memory}
+    for _ in range(_EVALUATION_SWEEPS):
+        change = 0.0
+        for q in reversed(open_memory):
+            found = _expected(task, parts[q], value, q, rows.shape)
+            change = max(change, _raise(value, q, rows.cells, found))
+        if change <= tolerance:
+            return
 
 
 def reachable(

@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -21,7 +21,7 @@ from jaxltl.core.continuous.grid import Grid
 from jaxltl.core.continuous.images import Images, NoiseBox
 from jaxltl.core.pretty_print import brief
 
-_CHUNK = 2**18  # probabilities handled at once by a thread
+_CHUNK = 2**16  # probabilities handled at once by a thread
 _UNIT = float(np.finfo(np.float64).eps)
 
 
@@ -74,12 +74,14 @@ class TransitionBounds:
       factors: for each coordinate of the state.
       ids: for each coordinate, ``int[R]``, the factors of each row.
       stages: order of the contraction.
+      shape: of the grid.
       lost: probability of noise for which nothing is known.
     """
 
     factors: tuple[Factors, ...]
     ids: tuple[Integers, ...]
     stages: tuple[_Stage, ...]
+    shape: tuple[int, ...]
     lost: float
 
     def least(self, value: Floats, outside: float) -> Floats:
@@ -92,6 +94,11 @@ class TransitionBounds:
             source = _contract(stage, self.factors[stage.axis], source, outside)
         return np.maximum(source - self.lost, 0)
 
+    def part(self, rows: Integers) -> TransitionBounds:
+        """The transition probabilities of some rows."""
+        ids = tuple(x[rows] for x in self.ids)
+        return replace(self, ids=ids, stages=_stages(self.factors, ids, self.shape))
+
     def certain(self) -> tuple[Integers, Integers]:
         """Boxes of cells ``int[R, n]`` that have positive lower probabilities; start and stop."""
         start, stop = [], []
@@ -101,7 +108,7 @@ class TransitionBounds:
             last = factors.start + positive.shape[-1] - np.argmax(positive[:, ::-1], -1)
             start.append(first[index])
             stop.append(np.where(positive.any(-1), last, first)[index])
-        return np.stack(start, -1), np.stack(stop, -1)
+        return np.stack(start, -1).astype(np.int32), np.stack(stop, -1).astype(np.int32)
 
 
 def transition_bounds(
@@ -120,7 +127,7 @@ def transition_bounds(
     for axis, j in enumerate(images.noise_of):
         columns = np.stack([x[:, axis] for x in (images.low, images.high, images.gain)], -1)
         rows, inverse = np.unique(columns, axis=0, return_inverse=True)
-        ids.append(inverse.reshape(-1))
+        ids.append(inverse.reshape(-1).astype(np.int32))
         low, high, gain = rows.T
         ends = (low, high)
         if j >= 0:
@@ -129,7 +136,7 @@ def transition_bounds(
             _factors(rows, ends, grid.edges[axis], noise[j] if j >= 0 else None, clipped)
         )
     stages = _stages(factors, ids, grid.shape)
-    return TransitionBounds(tuple(factors), tuple(ids), stages, box.lost)
+    return TransitionBounds(tuple(factors), tuple(ids), stages, grid.shape, box.lost)
 
 
 def _factors(
@@ -190,7 +197,7 @@ def _stages(
     num_rows = len(ids[0])
     stages = []
     group = np.zeros(num_rows, np.int64)  # of each row, in the stage before
-    before, span = np.zeros((1, len(shape)), np.int64), shape
+    before, span = np.zeros((1, len(shape)), np.int32), shape
     starts = np.stack([f.start[i] for f, i in zip(factors, ids, strict=True)], -1)
     widths = np.array([f.low.shape[1] for f in factors])
     for axis in reversed(range(len(shape))):
@@ -200,8 +207,8 @@ def _stages(
             pair = group * (int(ids[axis].max()) + 1) + ids[axis]
             _, new, inverse = np.unique(pair, return_index=True, return_inverse=True)
             inverse = inverse.reshape(-1)
-        first = np.full((len(new), axis), np.iinfo(np.int64).max)
-        last = np.zeros((len(new), axis), np.int64)
+        first = np.full((len(new), axis), np.iinfo(np.int32).max, np.int32)
+        last = np.zeros((len(new), axis), np.int32)
         np.minimum.at(first, inverse, starts[:, :axis])
         np.maximum.at(last, inverse, starts[:, :axis] + widths[:axis])
         width = tuple(int(w) for w in (last - first).max(0)) if axis else ()
@@ -212,7 +219,8 @@ def _stages(
             - np.array(width, np.int64)
         )
         first = np.minimum(first, limit)
-        stages.append(_Stage(axis, ids[axis][new], group[new], before[group[new]], first, width))
+        parent = group[new].astype(np.int32)
+        stages.append(_Stage(axis, ids[axis][new], parent, before[parent], first, width))
         group, before, span = inverse, first, width
     return tuple(stages)
 
