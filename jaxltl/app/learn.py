@@ -12,10 +12,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.tree_util import Partial
 
 from jaxltl.core.validation import errors_in
 from jaxltl.algos import mlirl
-from jaxltl.algos.common import learner
 from jaxltl.app.protocols import Training
 from jaxltl.app.reports import learn as report  # noqa: F401 - part of the job
 from jaxltl.app.reports.learn_pictures import (
@@ -143,7 +143,7 @@ def _train(
         training,
         num_steps=num_steps or table.steps,
         keep="before",
-        until=learner.gradient_vanishes(table.tolerance),
+        until=Partial(_ends, table.tolerance),
     )
     wait()
     states = jax.device_get(dataclasses.replace(found.state, key=None))
@@ -164,9 +164,19 @@ def _train(
         status=status,
         num_steps=np.asarray(states.step),
         # Values of softmax policies have no certificate without contraction.
-        converged=found.done & (status <= Status.UNCERTIFIED),
+        converged=(gradient_norm <= table.tolerance) & (status <= Status.UNCERTIFIED),
         history=history,
     )
+
+
+def _ends(
+    tolerance: float, before: mlirl.State, after: mlirl.State, metrics: mlirl.Metrics
+) -> jax.Array:
+    """True if the gradient vanishes, or a step changes nothing, so that no later one does."""
+    # Where the loss is steep, rounding hides its decrease before the gradient is that small.
+    parts = ((state.parameters, state.optimizer) for state in (before, after))
+    same = jax.tree.map(lambda x, y: jnp.all((x == y) | (x != x)), *parts)  # NaN equals NaN
+    return (metrics.gradient_norm <= tolerance) | jnp.all(jnp.stack(jax.tree.leaves(same)))
 
 
 def _with_guarantee(setup: Setup, training: Training) -> tuple[Learned, int, Attempt | None]:
