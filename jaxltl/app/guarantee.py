@@ -69,7 +69,7 @@ def ask(
     """Guarantee for a product, as the task file requests it."""
     nothing = np.zeros(np.shape(shown.state), bool)
     if asked == "none":
-        used = _used(model, best, nothing, shown)
+        used = used_steps(model, best, nothing, shown)
         return Guarantee(asked, over, best, None, nothing, None, used=used)
     if not isinstance(asked, str):
         require_attainable(model, best, asked, over, world.place)
@@ -77,7 +77,7 @@ def ask(
             asked = "best"
     actions = optimal_actions(model, best)
     lost, cost = _losing(model, best, np.asarray(actions.allowed), shown)
-    used = _used(model, best, lost if isinstance(asked, str) else nothing, shown)
+    used = used_steps(model, best, lost if isinstance(asked, str) else nothing, shown)
     lost_use = (lost & (np.arange(lost.shape[1]) < used[:, None])).sum(1)
     useless = np.flatnonzero((used > 0) & (lost_use == used))
     if not isinstance(asked, str):
@@ -93,7 +93,9 @@ def ask(
     return Guarantee(asked, over, best, actions, lost, cost, used=used)
 
 
-def _used(model: Product, best: Solution, mistake: np.ndarray, shown: Trajectories) -> np.ndarray:
+def used_steps(
+    model: Product, best: Solution, mistake: np.ndarray, shown: Trajectories
+) -> np.ndarray:
     """Steps ``int[N]`` until the formula is lost, or a mistake leads to less probability."""
     state = np.asarray(shown.state)
     memory, inside = memory_along(model, state), np.asarray(shown.mask)
@@ -106,15 +108,22 @@ def _used(model: Product, best: Solution, mistake: np.ndarray, shown: Trajectori
     return used if used.any() else length  # else there is nothing to learn from
 
 
+def mistakes(model: Product, allowed: np.ndarray, shown: Trajectories) -> np.ndarray:
+    """The demonstrated steps ``bool[N, T]`` that a mask ``bool[S, Q, A]`` does not allow."""
+    state, action = np.asarray(shown.state), np.asarray(shown.action)
+    found: np.ndarray = np.asarray(shown.mask) & ~allowed[state, memory_along(model, state), action]
+    return found
+
+
 def _losing(
     model: Product, best: Solution, allowed: np.ndarray, shown: Trajectories
 ) -> tuple[np.ndarray, tuple[float, float] | None]:
     """The steps that are not allowed, and the maximal probability before and after the first."""
-    state, action, inside = (np.asarray(x) for x in (shown.state, shown.action, shown.mask))
-    memory = memory_along(model, state)
-    lost = inside & ~allowed[state, memory, action]
+    lost = mistakes(model, allowed, shown)
     if not lost.any():
         return lost, None
+    state, action = np.asarray(shown.state), np.asarray(shown.action)
+    memory = memory_along(model, state)
     first = tuple(np.argwhere(lost)[0])
     s, q, a = state[first], memory[first], action[first]
     value = np.asarray(best.value, float)

@@ -56,7 +56,7 @@ from jaxltl.app.files.scenes import (
 )
 
 from jaxltl.app.files.task_todirl import TodirlTask, read_task as read_task
-from jaxltl.app.guarantee import check_formula
+from jaxltl.app.guarantee import check_formula, mistakes, used_steps
 from jaxltl.app.job import (
     fingerprint as fingerprint,
     one_seed,
@@ -73,9 +73,11 @@ from jaxltl.core.models.construct.batch import (
 )
 from jaxltl.core.models.construct.lifting import allowed_steps, project_policy
 from jaxltl.core.models.construct.restrict import with_allowed
+from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.models.ops.operators import action_mean, expectation
 from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.models.product import Product, product
+from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.policies.policy_file import save_policy
 from jaxltl.core.types import Solution, status_code
 from jaxltl.core.values.discounted.soft import soft_value
@@ -150,15 +152,30 @@ def prepare(task: TodirlTask, seed: int) -> Setup:
         trivial=trivial,
     )
     if setup.asked == "none":
-        return setup
+        return _until_mistakes(setup)
     lanes = [part_of(worlds.model, w) for w in range(len(worlds.scenes))]
     setup = replace(setup, sure=[optimal_actions(lane) for lane in lanes])
     if setup.is_probability:
         check_attainable(setup)
-    setup = replace(setup, bounds=step_bounds(setup))
+    setup = _until_mistakes(replace(setup, bounds=step_bounds(setup)))
     if setup.is_probability:
         return setup
     return _narrowed(setup)
+
+
+def _until_mistakes(setup: Setup) -> Setup:
+    """Demonstrations until the formula is lost or, for "best", a mistake has left the best probability."""
+    shown, unused = list[Trajectories](), 0
+    for w, each in enumerate(setup.demonstrations):
+        mdp = setup.worlds.scenes[w].mdp
+        model = product(mdp, setup.judge, label_on=setup.task.label_on)
+        mistake = np.zeros(each.state.shape, bool)
+        if setup.asked == "best" and setup.sure is not None:
+            mistake = mistakes(model, np.asarray(setup.sure[w].allowed)[: mdp.num_states], each)
+        used = used_steps(model, optimal_satisfaction(model), mistake, each)
+        unused += int(np.sum(each.length)) - int(used.sum())
+        shown.append(replace(each, length=to_jax(used.astype(np.int32))))
+    return replace(setup, demonstrations=shown, unused=unused)
 
 
 def _narrowed(setup: Setup) -> Setup:

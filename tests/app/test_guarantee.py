@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import jaxltl as jl
+from benchmarks.mistakes import losses
 from jaxltl.app import learn as job
 from jaxltl.app.protocols import Training
 from jaxltl.app.reports.learn import _nearly_best, remarks
@@ -457,3 +458,9 @@ def test_steps_after_the_formula_is_lost_are_not_used(write, asked):  # noqa: F8
     assert setup.guarantee.unused(setup.demonstrations).tolist() == [[False] * 3 + [True] * 2]
     counted = 2 if asked == '"best"' else 3  # the mistake itself is left out by the optimal actions
     assert np.asarray(setup.problem.counts).sum() == counted
+
+
+@pytest.mark.slow
+def test_steps_after_a_mistake_would_spoil_the_likelihood(tmp_path):
+    (_, few, cut), (_, every, whole) = losses(tmp_path)
+    assert few == 132 and every == 177 and cut < 0.1 and whole > 10

@@ -11,6 +11,7 @@ import jaxltl as jl
 from jaxltl.app import learn_todirl as job
 from jaxltl.app.files.task_todirl import read_task
 from jaxltl.app.protocols import Training
+from jaxltl.app.reports import steps
 from jaxltl.app.reports.learn_todirl import remarks
 from jaxltl.app.todirl.results import part_of
 from jaxltl.core.models.construct.batch import stack_products
@@ -374,3 +375,19 @@ def test_what_no_policy_has_in_a_world_is_refused_with_what_is_possible(write, t
     with pytest.raises(ValueError, match=r"in the training world map 1: guarantee = 0.999: the be"):
         prepared(write(narrow, ("guarantee = 0.85", "guarantee = 0.999"), text=RISKY))
     assert prepared(write(("guarantee = 0.85", "guarantee = 1.0"), text=RISKY)).asked == "best"
+
+
+@pytest.mark.parametrize("asked", ['"best"', '"none"', "0.6"])
+def test_steps_after_the_formula_is_lost_are_not_used(write, tmp_path, asked):
+    """Around the first r and into the second, and on: only the steps until then count."""
+    shown = {
+        "cells": [[4, 1], [3, 1], [3, 2], [3, 3], [4, 3], [4, 4]],
+        "actions": ["up", "right", "right", "down", "right", "right"],
+    }
+    (tmp_path / "shown.json").write_text(json.dumps({"demonstrations": [shown]}))
+    changes = ("guarantee = 0.85", f"guarantee = {asked}"), ("slip = 0.1", "slip = 0.0")
+    setup = prepared(write(*changes, text=RISKY))
+    (used,) = setup.demonstrations
+    assert used.length.tolist() == [4] and setup.unused == 2
+    (remark,) = steps.unused({"unused": {"steps": setup.unused, "of": 6}})
+    assert remark[1].startswith("2 of 6 demonstrated steps come after the formula was lost")

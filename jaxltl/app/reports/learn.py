@@ -247,14 +247,7 @@ def _guarantees(result: Result) -> list[Remark]:
         found.append(_if_true(remark) if logged else remark)
     if (lost := guarantee.get("left_out")) is not None:
         found.append(("note", _left_out(lost)))
-    if (unused := guarantee.get("unused")) is not None:
-        found.append(
-            (
-                "note",
-                f"{unused['steps']} of {unused['of']} demonstrated steps come after the formula was "
-                "lost, or after a mistake left the best probability, and were not used.",
-            )
-        )
+    found += steps.unused(guarantee)
     found += steps.mixing(result["expected_steps"])
     return found + [("note", result[key]) for key in ("remark", "trivial") if result.get(key)]
 

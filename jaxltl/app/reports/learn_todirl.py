@@ -212,7 +212,7 @@ def remarks(result: Result) -> list[Remark]:
     if lost := guarantee["left_out"]:
         text = f"{lost} demonstrated steps lower the satisfaction probability and were left out."
         found.append(("note", text))
-    return found
+    return found + steps.unused(guarantee)
 
 
 def _attained(result: Result) -> str:

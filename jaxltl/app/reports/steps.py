@@ -85,6 +85,17 @@ def mixing(steps: Result | None) -> list[Remark]:
     ]
 
 
+def unused(guarantee: Result) -> list[Remark]:
+    """Remark on the demonstrated steps after a mistake."""
+    if not (steps := guarantee.get("unused")):
+        return []
+    text = (
+        f"{steps['steps']} of {steps['of']} demonstrated steps come after the formula was lost, or "
+        "after a mistake left the best probability, and were not used."
+    )
+    return [("note", text)]
+
+
 def pictures(steps: Result | None) -> list[Picture]:
     """The front of probability and steps, and the likelihood against steps."""
     if steps is None:

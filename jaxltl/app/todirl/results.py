@@ -70,6 +70,7 @@ class Setup:
     # bounds on the expected steps in each world; None without a guarantee and for safety formulas
     bounds: list[StepBound] | None = None
     left_out: int = 0  # number of demonstrated steps that are not optimal
+    unused: int = 0  # number of those after the formula or the best probability is lost
     trivial: str | None = None  # remark on a formula that is always true
 
     @property

@@ -26,6 +26,7 @@ def summary(outcome: Outcome) -> Record:
             for w in range(len(setup.worlds.scenes))
         ]
     )
+    pairs = [int(np.sum(shown.length)) for shown in setup.demonstrations]
     result = {
         **about(task),
         "memory": task.memory,
@@ -36,6 +37,7 @@ def summary(outcome: Outcome) -> Record:
             "asked": setup.asked,
             "over": task.over,
             "left_out": setup.left_out,
+            "unused": setup.unused and {"steps": setup.unused, "of": setup.unused + sum(pairs)},
             "loss": setup.loss,
             "weight": learned.weight,
         },
@@ -45,7 +47,7 @@ def summary(outcome: Outcome) -> Record:
         "num_memory": setup.worlds.model.num_memory,
         "demonstrations": {
             "number": [len(shown.length) for shown in setup.demonstrations],
-            "pairs": [int(np.sum(shown.length)) for shown in setup.demonstrations],
+            "pairs": pairs,
             "synthetic": task.demonstrations.synthetic is not None,
             "dropped": setup.dropped,
         },
