@@ -14,9 +14,9 @@ from benchmarks import size
 
 PACKAGE = Path(jaxltl.__file__).parent
 LIMITS = {
-    "lines": 96_000,
-    "statements": 47_650,
-    "docstring lines": 15_750,
+    "lines": 96_450,
+    "statements": 47_900,
+    "docstring lines": 15_860,
     "functions with more than 6 parameters": 67,
     "functions with more than 9 parameters": 1,
     "Any in annotations": 1_195,

@@ -1,10 +1,12 @@
 from .certificate import Certificate as Certificate, certify_policy as certify_policy
+from .counterexample import counterexample as counterexample
 from .dynamics import (
     Dynamics as Dynamics,
     make_dynamics as make_dynamics,
     to_environment as to_environment,
 )
 from .grid import Grid as Grid, make_grid as make_grid
+from .learned_policy import state_policy as state_policy
 from .noise import (
     Distribution as Distribution,
     from_cdf as from_cdf,

@@ -25,6 +25,7 @@ from jaxltl.core.continuous.abstraction import (
 from jaxltl.core.continuous.dynamics import Dynamics
 from jaxltl.core.continuous.grid import Grid, make_grid
 from jaxltl.core.continuous.interval_iteration import IterationLimits
+from jaxltl.core.continuous.learned_policy import Policy, StatePolicy, learned_policy
 from jaxltl.core.environments.environment import traced
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.pretty_print import brief
@@ -130,9 +131,6 @@ class ProofOptions(TypedDict, total=False):
     report: Callable[[str], None]
 
 
-Policy = Callable[[jax.Array], jax.Array]
-
-
 def certify_policy(
     dynamics: Dynamics,
     policy: Policy,
@@ -150,7 +148,9 @@ def certify_policy(
 
     Args:
       dynamics: the world, of :func:`make_dynamics`.
-      policy: JAX function ``float[n] -> float[m]``: deterministic, and of the state alone.
+      policy: deterministic, and of the state alone: a JAX function ``float[n] -> float[m]``, or what
+        :func:`state_policy` accepts: a flax module with its parameters, or the agent of a learner in
+        these dynamics or in the task environment of this formula.
       formula: any LTL formula over the labels.
       options: see :class:`ProofOptions`.
 
@@ -173,7 +173,7 @@ def certify_policy(
     """
     validation.keywords("certify_policy", options, ProofOptions)
     validation.instance("dynamics", dynamics, Dynamics, "those of make_dynamics")
-    step = closed_loop(dynamics, policy)
+    step = closed_loop(dynamics, learned_policy(policy, dynamics, formula))
     grid = first_grid(dynamics, options.get("cells"), options.get("max_cells", 2**20))
     limits = proof_limits(options)
     control = Control(step, np.zeros((1, 1)))
@@ -182,9 +182,8 @@ def certify_policy(
     return make_certificate(bounds, str(formula), limits)
 
 
-def closed_loop(dynamics: Dynamics, policy: Policy) -> Callable[..., jax.Array]:
+def closed_loop(dynamics: Dynamics, policy: StatePolicy) -> Callable[..., jax.Array]:
     """The step of a world under a policy; checks the shape of actions."""
-    validation.function("policy", policy)
     n, m = dynamics.num_states, dynamics.num_actions
     found = traced("policy", policy, jax.ShapeDtypeStruct((n,), jnp.float32))
     if tuple(getattr(found, "shape", ("?",))) != (m,):

@@ -239,7 +239,8 @@ def _cell_images(
     half = (spread + error + reach) * (1 + _ROUNDING)
     middle = middle - own * (least + most) / 2  # forms are centred at the middle of the noise
     found_low, found_high = middle - half, middle + half
-    unknown = ~np.isfinite(found_low + found_high)  # then the interval with all of the noise
+    # Then the interval with all of the noise.
+    unknown = ~(np.isfinite(found_low) & np.isfinite(found_high))
     found_low = np.where(unknown, form.low[of_block] - own * most, found_low)
     found_high = np.where(unknown, form.high[of_block] - own * least, found_high)
     return _CellImages(found_low, found_high, own, (small & ~unknown).all((1, 2)))
