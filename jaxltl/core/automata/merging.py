@@ -17,7 +17,12 @@ MAX_CANDIDATES = 200_000  # pairs of states that may be merged
 MAX_ROUNDS = 12  # of comparisons with one state of each class
 MERGE_WORK = 1_200_000  # pair transitions of the products that prove or refute merges: about .6 s
 WINDOW = 1000  # merges that a counterexample is tried on
-TURNS = 8  # of a cycle before its priorities are read, and while they are
+KNOWN = 20_000  # pairs of a merge and a counterexample to others that are tried first
+UNREAD = 1 << 30  # above all priorities
+TURNS = 4  # of a cycle before its priorities are read, and while they are
+
+
+Word = tuple[Integers, Integers]  # the letters of a prefix and of a cycle
 
 
 class Table(NamedTuple):
@@ -93,15 +98,24 @@ def _product(one: Table, two: Table, frontier: Integers) -> tuple[Integers, _Edg
     return number, _joint_edges(follow, one.priority[left], two.priority[right]), size
 
 
-def merged(table: Table, order: int, work: int) -> tuple[Table, int]:
-    """The table with states of one language merged, one after another, where the whole allows it."""
+def merged(table: Table, order: int, work: int, words: list[Word]) -> tuple[Table, int]:
+    """The table with states of one language merged, one after another, where the whole allows it.
+
+    The `words` that refute merges of a table with the same language are tried first, and new ones
+    are appended.
+    """
     same = language_classes(table)
     if same is None or (np.bincount(same) ** 2).sum() > MAX_CANDIDATES:
         return table, work
-    columns, _ = distinct_columns(table)
+    columns, place_of = distinct_columns(table)
     few = Table(table.delta[:, columns], table.priority[:, columns], int(table.initial))
     target = np.arange(len(same))
     kept, gone = _candidates(few, same, order)
+    if words and len(kept):
+        fine, count = np.ones(len(kept), bool), KNOWN // min(len(kept), WINDOW)
+        known = [(place_of[prefix], place_of[cycle]) for prefix, cycle in words[-count:]]
+        fine[:WINDOW] = _agreeing(few, kept[:WINDOW], gone[:WINDOW], known)
+        kept, gone = kept[fine], gone[fine]
     together = 1  # merges that are tried at once
     while len(kept) and work > 0:
         trial = target.copy()
@@ -123,8 +137,9 @@ def merged(table: Table, order: int, work: int) -> tuple[Table, int]:
         else:
             fine = np.ones(len(kept), bool)
             word = _lasso(edges, *loop)
-            fine[:WINDOW] = _agreeing(few, kept[:WINDOW], gone[:WINDOW], word)
+            fine[:WINDOW] = _agreeing(few, kept[:WINDOW], gone[:WINDOW], [word])
             fine[0] = False
+            words.append((columns[word[0]], columns[word[1]]))
         kept, gone = kept[fine], gone[fine]
     return Table(target[table.delta], table.priority, int(target[table.initial])), work
 
@@ -191,8 +206,14 @@ def _different_loops(every: _Edges, count: int) -> Iterator[tuple[_Edges, list[N
     waiting = [every]
     while waiting:
         edges = waiting.pop()
+        if (edges.left == edges.right).all():
+            continue
         component = strong_components(edges.source, edges.target, count)
         edges = edges.chosen(component[edges.source] == component[edges.target])
+        # Where both read the same priorities, all cycles agree.
+        unequal = np.zeros(count, bool)
+        unequal[component[edges.source[edges.left != edges.right]]] = True
+        edges = edges.chosen(unequal[component[edges.source]])
         if not len(edges.source):
             continue
         of = component[edges.source]
@@ -210,9 +231,7 @@ def _different_loops(every: _Edges, count: int) -> Iterator[tuple[_Edges, list[N
         waiting.append(edges.chosen(~bad[of] & unlike[of] & ~lowest[1]))
 
 
-def _lasso(
-    every: _Edges, inside: _Edges, marks: list[NDArray[np.bool_]]
-) -> tuple[list[int], list[int]]:
+def _lasso(every: _Edges, inside: _Edges, marks: list[NDArray[np.bool_]]) -> Word:
     """The letters of a cycle inside a component through each of two marks, and those to it."""
     one, two = (int(np.argmax(mark)) for mark in marks)
     start = int(inside.source[one])
@@ -223,7 +242,7 @@ def _lasso(
     if two != one:
         cycle += [*_walk(inside, end, int(inside.source[two])), int(inside.letter[two])]
         end = int(inside.target[two])
-    return prefix, cycle + _walk(inside, end, start)
+    return np.array(prefix, int), np.array(cycle + _walk(inside, end, start))
 
 
 def _walk(edges: _Edges, start: int, goal: int) -> list[int]:
@@ -242,17 +261,20 @@ def _walk(edges: _Edges, start: int, goal: int) -> list[int]:
     return letters[::-1]
 
 
-def _agreeing(
-    table: Table, kept: Integers, gone: Integers, word: tuple[list[int], list[int]]
-) -> NDArray[np.bool_]:
-    """The merges, each alone, with which a word seems to have the verdict that it has without."""
-    prefix, cycle = word
+def _agreeing(table: Table, kept: Integers, gone: Integers, words: list[Word]) -> NDArray[np.bool_]:
+    """The merges, each alone, with which words seem to have the verdicts that they have without."""
+    reads = max(len(prefix) + len(cycle) * 2 * TURNS for prefix, cycle in words)
+    letters = np.array([np.append(p, np.resize(c, reads - len(p))) for p, c in words])
+    begin = np.array([len(p) + len(c) * TURNS for p, c in words])
     kept, gone = np.append(table.initial, kept), np.append(table.initial, gone)  # first: none
-    state = np.where(gone == table.initial, kept, table.initial)
-    least = np.full(len(kept), table.priority.max() + 1)
-    for step, letter in enumerate([*prefix, *cycle * (2 * TURNS)]):
-        if step >= len(prefix) + len(cycle) * TURNS:
-            np.minimum(least, table.priority[state, letter], out=least)
-        state = table.delta[state, letter]
-        state = np.where(state == gone, kept, state)
-    return np.asarray((least % 2 == least[0] % 2)[1:])
+    state = np.where(gone == table.initial, kept, table.initial)[None].repeat(len(words), axis=0)
+    least = np.full(state.shape, UNREAD)
+    delta, priority, width = table.delta.ravel(), table.priority.ravel(), table.delta.shape[1]
+    for step, letter in enumerate(letters.T[:, :, None]):
+        place = state * width + letter
+        if step >= begin.min():
+            late = np.where(begin <= step, 0, UNREAD)[:, None]
+            np.minimum(least, priority[place] + late, out=least)
+        state = delta[place]
+        np.copyto(state, kept, where=state == gone)
+    return np.asarray((least % 2 == least[:, :1] % 2)[:, 1:].all(axis=0))

@@ -19,13 +19,14 @@ from jaxltl.core.automata.emerson_lei import parity_condition, to_parity
 from jaxltl.core.automata.merging import (
     MERGE_WORK,
     Table,
+    Word,
     distinct_columns,
     language_classes,
     merged,
 )
 from jaxltl.core.sparse.graph.components import strong_components
 
-ORDERS = (1, -1, 0)  # similar states first, different ones first, as they are numbered
+ORDERS = (1, -1)  # similar states first, different ones first
 
 
 def simplify(automaton: Automaton) -> Automaton:
@@ -52,9 +53,10 @@ def reduce_table(table: Table, thorough: bool = True) -> tuple[Table, str, Integ
     columns, inverse = distinct_columns(table)
     few = Table(table.delta[:, columns], table.priority[:, columns], table.initial)
     every, work = np.arange(len(table.delta)), MERGE_WORK
+    words: list[Word] = []
     best: tuple[Table, Integers] | None = None
     for order in ORDERS if thorough else (None,):  # another order may merge more, if one merges any
-        small, base, work = _reduced(few, every, order, work)
+        small, base, work = _reduced(few, every, order, work, words)
         if best is None or len(small.delta) < len(best[0].delta):
             best = small, base
         if work <= 0 or len(small.delta) == len(few.delta) or is_weak(small):
@@ -69,7 +71,7 @@ def reduce_table(table: Table, thorough: bool = True) -> tuple[Table, str, Integ
 
 
 def _reduced(
-    few: Table, base: Integers, order: int | None, work: int
+    few: Table, base: Integers, order: int | None, work: int, words: list[Word]
 ) -> tuple[Table, Integers, int]:
     """The table after the steps that make it smaller, merging states in an order if one is given."""
     while True:
@@ -84,7 +86,7 @@ def _reduced(
         if len(few.delta) < size:
             continue
         if order is not None:
-            table, work = merged(few, order, work)
+            table, work = merged(few, order, work, words)
             few, base = _composed(quotient_table(table), base)
         if len(few.delta) == size:
             return few, base, work

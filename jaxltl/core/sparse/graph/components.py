@@ -72,9 +72,9 @@ def _is_quick(size: int) -> bool:
 
 def _tarjan(source: Integers, target: Integers, num_nodes: int) -> Integers:
     """Tarjan's algorithm (1972), with a stack of iterators instead of recursion."""
-    after: list[list[int]] = [[] for _ in range(num_nodes)]
-    for a, b in zip(source.tolist(), target.tolist(), strict=True):
-        after[a].append(b)
+    targets = target[np.argsort(source, kind="stable")].tolist()
+    ends = np.bincount(source, minlength=num_nodes).cumsum().tolist()
+    after = [targets[a:b] for a, b in zip([0, *ends], ends, strict=False)]
     label, number = [-1] * num_nodes, [-1] * num_nodes
     low = [0] * num_nodes
     visited = components = 0
