@@ -11,6 +11,7 @@ from jaxltl.app import synthesize as synthesis
 from jaxltl.app.files.game import load_game, read_game
 from jaxltl.app.reports import synthesize as report
 from jaxltl.app.reports.synthesize_page import play_explorer
+from jaxltl.io.policies import load_policy
 from tests.support import replaced
 from tests.test_cli import failure, run
 
@@ -145,6 +146,31 @@ def test_the_written_strategy_plays_alone(won):
         met.add(node)
     # All that is met later: 4 diagonal pairs where the environment moves, 8 others where not.
     assert len(met) == 12
+
+
+def test_the_written_strategies_are_policies(won, lost):
+    """Both players' files, loaded and played in the world alone."""
+    rng = np.random.default_rng(2)
+    for (_, _, out), name, mover in ((won, "strategy", 1), (lost, "counter_strategy", 0)):
+        world = load_game(read_game(out / "game.toml")).game
+        collides = np.asarray(world.label)[:, world.propositions.index("collision")]
+        robot = load_policy(out / f"{name}.npz").controller()
+        assert robot.policy.num_states == world.num_states and robot.policy.actions[0] == "up"
+        state = int(np.argmax(np.asarray(world.initial)))
+        robot.start(state)
+        for _ in range(200):
+            moves = np.flatnonzero(np.asarray(world.available)[state])
+            own = bool(np.asarray(world.system)[state]) == bool(mover)
+            action = robot.act() if own else int(rng.choice(moves))
+            assert action in moves
+            state = int(world.mdp.successor[state, action, 0])
+            robot.update(state)
+            if collides[state]:
+                break
+        assert collides[state] == (name != "strategy")
+    assert robot.policy.automaton is None and robot.policy.next_memory.shape[1] == 1
+    with np.load(won[2] / "strategy.npz") as file:
+        assert str(file["kind"]) == "table" and "automaton" in file
 
 
 def test_the_environments_place_in_the_picture(won, tmp_path):

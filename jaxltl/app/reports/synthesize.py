@@ -14,8 +14,12 @@ from jaxltl.app.files.game import World, task_text
 from jaxltl.app.job import plain, took
 from jaxltl.app.synthesize import Play, Synthesis
 from jaxltl.core.games.objective import GR1
+from jaxltl.core.games.permissive import Permissive
+from jaxltl.core.games.strategy_policy import explored, policy_of_nodes
+from jaxltl.core.games.winning import Winning
 from jaxltl.core.models.game import Game, is_deterministic
-from jaxltl.core.policies.policy_file import write_policy_file
+from jaxltl.core.models.product import product
+from jaxltl.core.policies.policy_file import save_policy, write_policy_file
 from jaxltl.app.wording import Record, Result
 
 # --- results --------------------------------------------------------------------------------
@@ -204,8 +208,9 @@ def _missed(play: Play, found: Synthesis) -> str:
 
 
 def save(out: Path, found: Synthesis) -> None:
-    """Writes the strategies into a directory, atomically.
+    """Writes the strategies into a directory, atomically, as policies that `load_policy` reads.
 
+    Beside the arrays of a policy of the world they have those of the solved game:
     ``strategy.npz``, if the system wins from some initial state, is its permissive strategy as
     the restricted game of N states: ``successor``, ``probability``, ``initial``, ``system``,
     ``label``, ``propositions`` and ``actions`` as in a game file's model; the allowed moves
@@ -216,23 +221,45 @@ def save(out: Path, found: Synthesis) -> None:
     GR(1) ``[N, M]`` with ``assumptions [M, N]``, which advance its memory; and its game of N
     nodes, as above.
     """
-    region = {"region": found.wins}
-    nodes = found.nodes
+    nodes, winning = found.nodes, found.winning
     if found.strategy is not None and found.restricted is not None:
         base = np.asarray(found.strategy.base_state[found.restricted.base_state])
-        arrays = _arrays(found, found.restricted.model, base) | region
+        arrays = _arrays(found, found.restricted.model, base)
         arrays["mask"] = found.restricted.model.available
         arrays["memory"] = found.restricted.memory
-        write_policy_file(out / "strategy.npz", "strategy", arrays)
+        _write(out / "strategy.npz", "strategy", found, found.strategy, arrays)
     if found.play is not None:
         game = nodes.game
-        lost = jnp.where(found.winning.region, 0, game.initial)
+        lost = jnp.where(winning.region, 0, game.initial)
         game = replace(game, mdp=game.mdp.replace(initial=lost / lost.sum()))
-        arrays = _arrays(found, game, np.arange(game.num_states)) | region
-        arrays |= {"counter_action": found.winning.counter_action, "available": game.available}
-        if isinstance(found.winning.objective, GR1):
-            arrays["assumptions"] = found.winning.objective.assumptions
-        write_policy_file(out / "counter_strategy.npz", "counter-strategy", arrays)
+        arrays = _arrays(found, game, np.arange(game.num_states))
+        arrays |= {"counter_action": winning.counter_action, "available": game.available}
+        if isinstance(winning.objective, GR1):
+            arrays["assumptions"] = winning.objective.assumptions
+        _write(out / "counter_strategy.npz", "counter-strategy", found, winning, arrays)
+
+
+def _write(
+    path: Path, kind: str, found: Synthesis, strategy: Permissive | Winning, arrays: Record
+) -> None:
+    """Writes a strategy as a finite-memory policy, or as its game alone where it is none."""
+    nodes, world = found.nodes, found.world
+    player = "system" if isinstance(strategy, Permissive) else "environment"
+    part = explored(strategy, player)
+    memory, task = part.memory, None
+    if nodes.automaton is not None:
+        memory = nodes.automaton_state[part.state] + memory * len(nodes.automaton.delta)
+        task = product(world.game.mdp, nodes.automaton, label_on="exit")
+    skipped, state = nodes.by_chance[part.state], nodes.world_state[part.state]
+    part = part._replace(state=state, memory=memory)
+    try:
+        policy = policy_of_nodes(
+            part, world.game.num_states, skipped=skipped, task=task, actions=world.actions
+        )
+    except ValueError:  # an adversary's random moves
+        write_policy_file(path, kind, arrays)
+        return
+    save_policy(path, policy, {k: v for k, v in arrays.items() if k != "actions"})
 
 
 def _arrays(found: Synthesis, game: Game, node: np.ndarray) -> Record:
@@ -246,6 +273,7 @@ def _arrays(found: Synthesis, game: Game, node: np.ndarray) -> Record:
         "actions": np.array(found.world.actions),
         "world_state": found.nodes.world_state[node],
         "automaton_state": found.nodes.automaton_state[node],
+        "region": found.wins,
     }
 
 

@@ -20,6 +20,7 @@ from .shielded_environment import (
     ShieldedWorld as ShieldedWorld,
     shield_environment as shield_environment,
 )
+from .strategy_policy import strategy_policy as strategy_policy
 from .verify import Verification as Verification, verify as verify
 from .winning import (
     Winning as Winning,

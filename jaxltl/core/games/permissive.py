@@ -10,6 +10,7 @@ import jax
 import numpy as np
 from jaxltl.core import struct
 
+from jaxltl.core.array_types import Booleans
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.games import facts
 from jaxltl.core.games.generalized_reactivity import NEVER, gr1_layers, solve_gr1
@@ -424,8 +425,7 @@ def _by_layers(arena: _Arena, region, stay) -> Permissive:
             latest = -graph.least(-np.where(region, rounds[i], NEVER))
             mask |= stay & first[:, None] & (latest <= covered[:, None])
         masks.append(mask | (stay & ~game.system[:, None]))
-    delta = np.array([[j, (j + 1) % num_goals] for j in range(num_goals)])
-    joint = _beside_goals(game, objective, delta)
+    joint = pursuing(game, objective.guarantees)
     both = np.broadcast_to(region[:, None], joint.state_shape)
     return _on(
         joint,
@@ -438,12 +438,11 @@ def _by_layers(arena: _Arena, region, stay) -> Permissive:
     )
 
 
-def _beside_goals(game: Game, objective: GR1, delta: np.ndarray) -> Game:
-    """Product of the game with the index of the pursued guarantee."""
-    num_goals = len(delta)
-    # A letter is the set of guarantees that hold; few of them occur.
-    rows, letter = np.unique(np.asarray(objective.guarantees).T, axis=0, return_inverse=True)
-    step = np.array([[delta[j, int(row[j])] for row in rows] for j in range(num_goals)])
+def pursuing(game: Game, sets: Booleans) -> Game:
+    """Product of the game with the index of the one of the sets `[J, S]` that is pursued."""
+    # A letter is the collection of sets that a state is in; few of them occur.
+    rows, letter = np.unique(np.asarray(sets).T, axis=0, return_inverse=True)
+    step = (np.arange(len(sets))[:, None] + rows.T) % len(sets)
     return _beside(game, step, 0, letter.ravel(), "exit")
 
 
