@@ -93,9 +93,10 @@ def make_task_reward(
     factor of d and f = 0 after the end (Ng, Harada & Russell 1999, "Policy invariance under reward
     transformations"). The sum telescopes to ``-f(q_0)`` for every policy if all discounts are below 1;
     otherwise an infinite run keeps the potential of its last state, and shaping is refused.
-    ``"distance"`` is the potential ``1 - n(q) / max n``, with n the least number of transitions to a
+    ``"distance"`` is the potential ``1 - n(q) / max n``, with n the length of a shortest path to a
     satisfied verdict (``"reach"``) or an accepting transition, and ``n(q) / max n`` to a violated
-    verdict for ``"keep"``.
+    verdict for ``"keep"``. A transition is as long as the number of propositions that hold in its
+    letter, at least 1.
 
     `decisions` are the verdicts ``int32[Q]`` of the automaton states.
     """
@@ -188,11 +189,14 @@ def _potential(
         if shaping != "distance":
             raise ValueError(f"shaping={shaping!r}; give None, 'distance' or an array.")
         delta = np.asarray(automaton.delta)
+        # Else a letter in which all holds would be the nearest way through all stages.
+        cost = np.maximum(np.asarray(automaton.letters).sum(axis=1), 1)
         if name in ("reach", "keep"):
             goal = Verdict.SATISFIED if name == "reach" else Verdict.VIOLATED
-            steps = _distance(delta, np.where(decisions == goal, 0, np.inf), np.inf)
+            steps = _distance(delta, cost, np.where(decisions == goal, 0, np.inf), np.inf)
         else:
-            steps = _distance(delta, np.full(len(delta), np.inf), np.where(accepting, 1, np.inf))
+            never = np.full(len(delta), np.inf)
+            steps = _distance(delta, cost, never, np.where(accepting, cost, np.inf))
         known = np.isfinite(steps)
         most = max(steps[known].max(initial=0), 1)
         share: np.ndarray = np.where(known, steps, most) / most
@@ -210,11 +214,13 @@ def _potential(
     return table.astype(float)
 
 
-def _distance(delta: np.ndarray, start: np.ndarray, by_reading: np.ndarray | float) -> np.ndarray:
-    """Shortest distances ``n = min(start, min over letters of by_reading and 1 + n')``."""
+def _distance(
+    delta: np.ndarray, cost: np.ndarray, start: np.ndarray, by_reading: np.ndarray | float
+) -> np.ndarray:
+    """Shortest distances ``n = min(start, min over letters of by_reading and cost + n')``."""
     steps = start
     while True:
-        nearer = np.minimum(steps, np.minimum(by_reading, 1 + steps[delta]).min(axis=1))
+        nearer = np.minimum(steps, np.minimum(by_reading, cost + steps[delta]).min(axis=1))
         if (nearer == steps).all():
             return steps
         steps = nearer

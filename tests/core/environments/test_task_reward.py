@@ -301,7 +301,10 @@ def test_distances_in_the_automaton():
             automaton, verdicts(automaton), shaping="distance", **options
         ).potential
 
-    assert potential("F (a & F b)").tolist() == [0, 0, 1]  # a and b may come at once
+    # A letter with both a and b is as long as one with a and one with b.
+    assert potential("F (a & F b)").tolist() == [0, 0.5, 1]
+    assert potential("F (a & F (b & F c))").tolist() == pytest.approx([0, 1 / 3, 2 / 3, 1])
+    assert potential("!c U (a & (!c U b))").tolist() == [0, 0.5, 1, 0]
     assert potential("F (a & X b)").tolist() == [0, 0.5, 1]
     assert potential("G (a -> X !b)").tolist() == [1, 0.5, 0]
     assert potential("G F (a & X b)", reward="two-discount").tolist() == [0, 0.5]
