@@ -204,7 +204,12 @@ def _stages(
         if axis == 0:  # the last stage has one group for each row
             new, inverse = np.arange(num_rows), np.arange(num_rows)
         else:
+            # Rows far apart with equal factors are two groups: padded ranges stay short.
             pair = group * (int(ids[axis].max()) + 1) + ids[axis]
+            for other in range(axis):
+                near = starts[:, other] // (2 * widths[other])
+                _, pair = np.unique(pair, return_inverse=True)
+                pair = pair.reshape(-1) * (int(near.max()) + 1) + near
             _, new, inverse = np.unique(pair, return_index=True, return_inverse=True)
             inverse = inverse.reshape(-1)
         first = np.full((len(new), axis), np.iinfo(np.int32).max, np.int32)

@@ -165,7 +165,7 @@ class _Builder:
                 return variables[atom]
             return self.constant(np.asarray(atom.val, _spec(atom).dtype))
 
-        for equation in jaxpr.eqns:
+        for equation in _needed(jaxpr):
             outputs = self._append(equation, [read(x) for x in equation.invars])
             variables |= dict(zip(equation.outvars, outputs, strict=True))
         return [read(x) for x in jaxpr.outvars]
@@ -357,6 +357,17 @@ class _Builder:
         """Appends the operations of a function of variables."""
         closed = jax.make_jaxpr(function)(*(self.shapes[i] for i in inputs))
         return self.inline(closed.jaxpr, closed.consts, inputs)[0]
+
+
+def _needed(jaxpr: core.Jaxpr) -> list[core.JaxprEqn]:
+    """The equations that the outputs depend on; others, as of unused random keys, are left out."""
+    needed = {v for v in jaxpr.outvars if isinstance(v, core.Var)}
+    found = []
+    for equation in reversed(jaxpr.eqns):
+        if not needed.isdisjoint(equation.outvars):
+            found.append(equation)
+            needed |= {v for v in equation.invars if isinstance(v, core.Var)}
+    return found[::-1]
 
 
 def narrows(new: DTypeLike, old: DTypeLike) -> bool:
