@@ -111,14 +111,19 @@ def about_steps(
         _traded(clock, (1 - x) * before + x * bound.anchor, x, counts) for x in shares
     ]
     if model.automaton.is_cosafe:
-        found["front"] = [
-            {
-                name: dict(zip(("value", "lower", "upper"), numbers, strict=True))
-                for name, numbers in (("probability", one.probability), ("steps", one.steps))
-            }
-            for one in steps_front(model, bound.quickest)
-        ]
+        found["front"] = front(model, bound.quickest)
     return found
+
+
+def front(model: Product, quickest: Quickest | None = None) -> list[Record]:
+    """The front of probability and steps of a co-safe task."""
+    return [
+        {
+            name: dict(zip(("value", "lower", "upper"), numbers, strict=True))
+            for name, numbers in (("probability", one.probability), ("steps", one.steps))
+        }
+        for one in steps_front(model, quickest)
+    ]
 
 
 def _traded(clock: Clock, policy: np.ndarray, share: float, counts: np.ndarray) -> Record:

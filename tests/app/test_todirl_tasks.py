@@ -391,3 +391,19 @@ def test_steps_after_the_formula_is_lost_are_not_used(write, tmp_path, asked):
     assert used.length.tolist() == [4] and setup.unused == 2
     (remark,) = steps.unused({"unused": {"steps": setup.unused, "of": 6}})
     assert remark[1].startswith("2 of 6 demonstrated steps come after the formula was lost")
+
+
+@pytest.mark.slow
+def test_the_report_has_the_front_of_probability_and_steps(write):
+    changes = (
+        ('files = ["shown.json"]', "synthetic = 3\nlength = 3000"),  # optimal policies take long
+        ("guarantee = 0.85", 'guarantee = "best"'),
+    )
+    setup = prepared(write(*changes, ("steps = 60", "steps = 1"), text=RISKY))
+    outcome = job.learn(setup, Training(0, 1))
+    time = job.summary(outcome)["training"]["expected_steps"]
+    front = time["front"]
+    assert front[0]["steps"]["value"] == pytest.approx(time["quickest"]) and len(front) > 1
+    (line,) = steps.trade_off(time)
+    assert f"{front[1]['probability']['value']:.4f} in " in line
+    assert "steps.svg" in {picture.name for picture in job.pictures(outcome)}

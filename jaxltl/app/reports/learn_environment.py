@@ -116,7 +116,11 @@ def _tiles(result: Result) -> list[tuple[str, str]]:
     if not _is_finite(result):
         entry = found["visits"]
         tiles.append((number(entry["mean"]), f"accepting visits, in {_interval('visits', entry)}"))
-    return [*tiles, (number(found["length"]["mean"]), "steps of an episode")]
+    length = found["length"]
+    text = (
+        f"steps until the formula is decided or the episode ends, in {_interval('length', length)}"
+    )
+    return [*tiles, (number(length["mean"]), text)]
 
 
 def _seeds(result: Result) -> list[tuple[str, ...]]:

@@ -90,6 +90,7 @@ def table(result: Result) -> str:
                 for name, value, bounds in steps.rows(time)
             ]
             lines[-1] += f" (the largest multiple, in {time['worst_world']})"
+            lines += [f"  {line}" for line in steps.trade_off(time)]
         worst_start = probability(about["learned"]["worst_start"])
         lines.append(f"    {'from the worst initial state':30} {worst_start:>8}")
     lines += ["", f"learning  {_how_it_ended(result)}"]

@@ -55,11 +55,14 @@ def lines(steps: Result | None) -> list[str]:
         heading(steps),
         *(f"  {title:25} {value:>9}   certified {bounds}" for title, value, bounds in rows(steps)),
     ]
+    return found + trade_off(steps)
+
+
+def trade_off(steps: Result) -> list[str]:
+    """A line on the steps of smaller probabilities."""
     others = [f"{p} in {n}" for p, n, _ in front_rows(steps)[1:]]
-    if others:
-        more = ", ..." if len(others) > _PRINTED else ""
-        found.append(f"  for less probability      {', '.join(others[:_PRINTED])}{more}")
-    return found
+    more = ", ..." if len(others) > _PRINTED else ""
+    return [f"  for less probability      {', '.join(others[:_PRINTED])}{more}"] if others else []
 
 
 def mixing(steps: Result | None) -> list[Remark]:
@@ -123,14 +126,18 @@ def pictures(steps: Result | None) -> list[Picture]:
         }
     if not panels:
         return []
+    text = "Probabilities and steps on and below the first line are attained by some policy."
+    if steps["likelihood"]:
+        text += (
+            " The second line is the likelihood of the demonstrations when a share of the quick "
+            "policy is mixed into the learned one."
+        )
     return [
         Picture(
             "steps.svg",
             "Probability, steps and likelihood",
             drawing("bands", {"": panels}, label="expected steps"),
-            "Probabilities and steps on and below the first line are attained by some policy. The "
-            "second line is the likelihood of the demonstrations when a share of the quick policy "
-            "is mixed into the learned one.",
+            text,
         )
     ]
 

@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxltl.app.todirl.results import Judged, Outcome, Setup, Worlds, counted_worlds, part_of
+from jaxltl.app.todirl.summary import summary
+from jaxltl.app.reports import steps
 from jaxltl.app.reports.drawing import Picture, drawing
 from jaxltl.app.reports.explorer import (
     LONGEST_RUN,
@@ -70,6 +72,8 @@ def pictures(outcome: Outcome) -> list[Picture]:
             "learning",
         )
     ]
+    if time := summary(outcome)["training"].get("expected_steps"):
+        found += steps.pictures({**time, "likelihood": []})
     for one in _drawn_worlds(outcome):
         found += _draw(outcome, one)
     return found

@@ -8,8 +8,17 @@ import numpy as np
 
 from jaxltl.app.files.scenes import Scene
 from jaxltl.app.job import about, plain, took
-from jaxltl.app.todirl.results import Judged, Learned, Outcome, Worlds, counted_worlds, part_of
-from jaxltl.app.practical import StepBound
+from jaxltl.app.todirl.results import (
+    Judged,
+    Learned,
+    Outcome,
+    Setup,
+    Worlds,
+    counted_worlds,
+    part_of,
+)
+from jaxltl.app.practical import StepBound, front
+from jaxltl.core.models.product import product
 from jaxltl.core.types import Status
 from jaxltl.core.values.undiscounted.performance import infeasible_starts, summarize
 from jaxltl.app.wording import Record
@@ -83,7 +92,15 @@ def summary(outcome: Outcome) -> Record:
         },
         **took(outcome.seconds),
     }
+    _add_front(setup, result["training"].get("expected_steps"))
     return plain(result)
+
+
+def _add_front(setup: Setup, time: Record | None) -> None:
+    """Adds the front of probability and steps in the world of the largest multiple."""
+    if time and setup.judge.is_cosafe:
+        scene = setup.worlds.scenes[setup.worlds.names.index(time["worst_world"])]
+        time["front"] = front(product(scene.mdp, setup.judge, label_on=setup.task.label_on))
 
 
 def _about_learning(learned: Learned, i: int) -> Record:
