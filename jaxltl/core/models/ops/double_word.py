@@ -35,6 +35,13 @@ def two_sum(a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array]:
     return total, (a - (total - rest)) + (b - rest)
 
 
+def _fast_sum(a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """:func:`two_sum` of floats where b is not larger than a, or a is 0 (Dekker 1971)."""
+    info = jnp.finfo(a.dtype)
+    total = lax.reduce_precision(a + b, info.nexp, info.nmant)
+    return total, b - (total - a)
+
+
 def double_word(high: jax.Array, low: jax.Array | float = 0) -> jax.Array:
     """``high + low`` as a normalised double word."""
     return lax.complex(*two_sum(high, jnp.broadcast_to(low, high.shape).astype(high.dtype)))
@@ -45,14 +52,15 @@ def words(x: jax.Array) -> tuple[jax.Array, jax.Array]:
     return lax.real(x), lax.imag(x)
 
 
+@jax.jit
 def plus(x: jax.Array, y: jax.Array) -> jax.Array:
     """Sum with a relative error of at most ``4 u^2`` for the unit roundoff u."""
     # AccurateDWPlusDW of Joldes, Muller and Popescu (2017, theorem 3.1): 3 u^2 / (1 - 4 u).
     (a, c), (b, d) = words(x), words(y)
     high, rest = two_sum(a, b)
     low, more = two_sum(c, d)
-    high, rest = two_sum(high, rest + low)
-    return lax.complex(*two_sum(high, more + rest))
+    high, rest = _fast_sum(high, rest + low)
+    return lax.complex(*_fast_sum(high, more + rest))
 
 
 def minus(x: jax.Array, y: jax.Array) -> jax.Array:
@@ -60,6 +68,7 @@ def minus(x: jax.Array, y: jax.Array) -> jax.Array:
     return lax.real(plus(x, -y))
 
 
+@jax.jit
 def times(w: jax.Array, x: jax.Array) -> jax.Array:
     """Product of a float and a double word, with a relative error of at most ``64 u^2``."""
     # With 12 of 24 bits in either half, products of halves are exact, and the three of them that
@@ -67,24 +76,27 @@ def times(w: jax.Array, x: jax.Array) -> jax.Array:
     # with at most four roundings.
     high, low = words(x)
     (a, b), (c, d) = _halves(w), _halves(high)
-    total, rest = two_sum(a * c, a * d)
-    total, more = two_sum(total, b * c)
-    return lax.complex(*two_sum(total, (rest + more) + (b * d + w * low)))
+    total, rest = _fast_sum(a * c, a * d)
+    total, more = _fast_sum(total, b * c)
+    return lax.complex(*_fast_sum(total, (rest + more) + (b * d + w * low)))
 
 
+@jax.jit
 def product(x: jax.Array, y: jax.Array) -> jax.Array:
     """Product of two double words, with a relative error of at most ``80 u^2``."""
     high, low = words(x)
     total, rest = words(times(high, y))
-    return lax.complex(*two_sum(total, rest + low * lax.real(y)))
+    return lax.complex(*_fast_sum(total, rest + low * lax.real(y)))
 
 
+@jax.jit
 def reciprocal(x: jax.Array) -> jax.Array:
     """``1 / x`` with a relative error of at most ``128 u^2``, 0 where x is 0."""
     # One step of Newton's method squares the relative error u of the first guess.
     high = lax.real(x)
     guess = jnp.where(high == 0, 0, 1 / jnp.where(high == 0, 1, high))
-    left = minus(double_word(jnp.ones_like(high)), times(guess, x))
+    near, rest = words(times(guess, x))
+    left = (1 - near) - rest  # the first difference is exact (Sterbenz 1974)
     return double_word(guess, jnp.where(high == 0, 0, guess * left))
 
 
@@ -99,8 +111,10 @@ def _halves(x: jax.Array) -> tuple[jax.Array, jax.Array]:
 def outwards(x: jax.Array, end: int) -> jax.Array:
     """The nearest float that is not below a double word, for `end` 1, or not above it, for -1."""
     high, low = words(x)
-    beyond = jnp.nextafter(high, jnp.asarray(end * jnp.inf, high.dtype))
-    return jnp.where(end * low > 0, beyond, high)
+    # Floats of one sign are ordered like their bits; the low word of 0 is 0.
+    kind = jnp.int64 if high.dtype.itemsize == 8 else jnp.int32
+    bits = lax.bitcast_convert_type(high, kind) + jnp.where(high < 0, -end, end).astype(kind)
+    return jnp.where(end * low > 0, lax.bitcast_convert_type(bits, high.dtype), high)
 
 
 def best(quantity: jax.Array, available: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -149,8 +163,12 @@ class Rows(NamedTuple):
 def normalised_rows(model: ActionModel, policy: jax.Array | None = None) -> Rows:
     """The rows of a model, and of a policy ``float[S, A]``, each divided by its sum."""
     one = double_word(jnp.ones(model.state_shape, model.dtype))
-    scale = reciprocal(combined(model, one, times, plus))
-    if policy is not None:
+    total = combined(model, one, times, plus)
+    if policy is None:
+        scale = reciprocal(total)
+    else:
         weight = double_word(policy)
-        policy = product(weight, reciprocal(kernels.tree(plus, weight, -1))[..., None])
+        whole = kernels.tree(plus, weight, -1)[..., None]
+        scale = reciprocal(jnp.concatenate([total, whole], -1))
+        scale, policy = scale[..., :-1], product(weight, scale[..., -1:])
     return lax.stop_gradient(Rows(model, scale, policy))

@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
 from jaxltl.core.models.ops.underflow import is_positive
@@ -98,13 +99,8 @@ def folded(
 
 
 def tree(combine: Term, terms: jax.Array, axis: int) -> jax.Array:
-    """Reduction along an axis by halves."""
-    terms = jnp.moveaxis(terms, axis, 0)
-    while terms.shape[0] > 1:
-        half = terms.shape[0] // 2
-        joined = combine(terms[:half], terms[half : 2 * half])
-        terms = jnp.concatenate([joined, terms[2 * half :]])
-    return terms[0]
+    """Reduction along an axis by an operation with the neutral element 0."""
+    return lax.reduce(terms, np.zeros((), terms.dtype), combine, (axis % terms.ndim,))
 
 
 def stacked(columns: Sequence[jax.Array]) -> jax.Array:

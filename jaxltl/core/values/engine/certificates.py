@@ -58,6 +58,7 @@ Operator = Callable[[jax.Array], jax.Array]
 
 
 Carry = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
+Pair = tuple[jax.Array, jax.Array]  # a double word, and a residual
 
 
 class Enclosure(NamedTuple):
@@ -82,11 +83,12 @@ def enclose(
     discount: jax.Array,
     rounding: jax.Array,
     tolerance: jax.Array | None,
+    low: jax.Array | float = 0,
 ) -> Enclosure:
     """MacQueen's (1966) bounds on the fixed point of a monotone T with ``T(v + c) = T(v) + g c``."""
-    # ``T v + g / (1 - g) * [min, max](T v - v)`` for the discount g.
+    # ``T v + g / (1 - g) * [min, max](T v - v)`` for the discount g, and its low word.
     change = image - value
-    gap = jnp.where(discount < 1, 1 - discount, jnp.nan)
+    gap = jnp.where(discount < 1, (1 - discount) - low, jnp.nan)
     rounding = rounding / gap
     down = discount / gap * jnp.min(change, axis=0) - rounding
     up = discount / gap * jnp.max(change, axis=0) + rounding
@@ -111,7 +113,7 @@ def judged(
     )
 
 
-_REFINEMENTS = 8  # of an approximate solution; each multiplies its error by that of the solver
+_REFINEMENTS = 9  # of an approximate solution; each multiplies its error by that of the solver
 
 
 def m_matrix_error(
@@ -123,7 +125,7 @@ def m_matrix_error(
     # e, and a check of the inequality, rounding included, proves it. All are refined by residuals in
     # double words.
 
-    def refined(y: jax.Array, constant: jax.Array, enough: jax.Array | float) -> Carry:
+    def refined(y: jax.Array, constant: jax.Array, enough: jax.Array) -> Pair:
         """y, and ``constant + P y - y`` of at most `enough`, if the solver converges."""
 
         def step(carry: Carry) -> Carry:
@@ -134,11 +136,13 @@ def m_matrix_error(
             best, least = (jnp.where(better, *x) for x in ((y, best), (left, least)))
             ended = ~better | jnp.all(jnp.abs(left) <= enough)
             correction = solve(jnp.where(ended, 0, left))
-            y = dw.plus(y, dw.double_word(jnp.where(undecided, correction, 0)))
+            correction = jnp.where(undecided & jnp.isfinite(correction), correction, 0)
+            y = dw.plus(y, dw.double_word(correction))
             return best, least, y, jnp.where(ended, _REFINEMENTS, n + 1)
 
         never = jnp.full_like(one, jnp.inf)
-        return lax.while_loop(lambda k: k[3] < _REFINEMENTS, step, (y, never, y, jnp.int32(0)))
+        start = y, never, y, jnp.int32(0)
+        return lax.while_loop(lambda k: k[3] < _REFINEMENTS, step, start)[:2]
 
     value = jnp.where(undecided, start, one)
     # Elimination can break down where rounding closes a set that is hardly ever left.
@@ -146,14 +150,24 @@ def m_matrix_error(
     zero = jnp.zeros_like(one)
     unit, least = rows.unit, rows.underflow(jnp.ones_like(one))
     given, value = value, lax.stop_gradient(value)
-    exact, residual, *_ = refined(dw.double_word(value), zero, max(unit, 1e-20) / 4)
-    size, residual = jnp.abs(dw.words(exact)[0]), jnp.abs(residual)
-    claim = 2 * residual + 4 * unit * (size + 1e-3) + 4 * least
-    claim = jnp.where(undecided, claim, 0)
-    error = solve(claim)
-    error = dw.double_word(jnp.where(undecided & jnp.isfinite(error), error, 0))
-    error, left, *_ = refined(error, claim, claim / 4)
-    half = dw.words(error)[0]
+
+    def claimed(exact: jax.Array, residual: jax.Array) -> jax.Array:
+        size = jnp.abs(dw.words(exact)[0])
+        claim = 2 * jnp.abs(residual) + 4 * unit * (size + 1e-3) + 4 * least
+        return jnp.where(undecided, claim, 0)
+
+    def refine(last: jax.Array, pairs: tuple[Pair, Pair]) -> tuple[Pair, Pair]:
+        """The value and its residual, then its error and the residual of that."""
+        claim = claimed(*pairs[1])
+        y = jnp.where(last, 0, dw.double_word(value))
+        enough = jnp.where(last, claim, max(unit, 1e-20)) / 4
+        return pairs[1], refined(y, jnp.where(last, claim, 0), enough)
+
+    # One loop, so that the program has each operation once.
+    none = dw.double_word(zero), zero
+    (exact, residual), (error, left) = lax.fori_loop(0, 2, refine, (none, none))
+    claim, residual = claimed(exact, residual), jnp.abs(residual)
+    size, half = jnp.abs(dw.words(exact)[0]), dw.words(error)[0]
     enough = claim - left >= residual + unit * (size + half) + least * (1 + half)
     proven = jnp.all(jnp.where(undecided, enough, True) & (half >= 0))
     lower, upper = dw.outwards(dw.plus(exact, -error), -1), dw.outwards(dw.plus(exact, error), 1)

@@ -100,7 +100,7 @@ class _Point(NamedTuple):
 _Inverse = tuple[jax.Array, jax.Array, jax.Array]
 # The image of a point, in double words, and the relative and the absolute error of a solution.
 _Equation = tuple[Callable[[_Point], jax.Array], jax.Array, jax.Array]
-_Progress = tuple[_Point, _Inverse, jax.Array, jax.Array, jax.Array, jax.Array]
+_Progress = tuple[_Point, _Inverse, jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]
 Tree = TypeVar("Tree")
 
 
@@ -375,43 +375,41 @@ def _improved(
 
 
 def _solved(
-    problem: Problem, equation: _Equation, at: _Point, known: _Inverse, num_steps: jax.Array
+    problem: Problem, equation: _Equation, start: _Point, known: _Inverse, num_steps: jax.Array
 ) -> tuple[_Point, _Inverse, jax.Array]:
-    """An approximate solution of ``v = image(v)`` by policy iteration."""
+    """An approximate solution of ``v = image(v)`` by policy iteration, and its backup."""
+    # One backup in the program serves the steps and the solution, which is an image.
     image, goal, slack = equation
 
-    def changed(at: _Point) -> tuple[jax.Array, jax.Array]:
+    def body(carry: _Progress) -> _Progress:
+        at, known, n, best, rest, wait, _ = carry
+        begun = n >= 0
         swept = image(at)
         change = dw.minus(swept, at.value)
         size = jnp.maximum(*(jnp.abs(dw.words(x)[0]) for x in (swept, at.value)))
-        left = jnp.maximum(jnp.abs(change) - slack, 0)
-        return change, jnp.max(left / jnp.maximum(size, jnp.finfo(size.dtype).tiny))
+        excess = jnp.maximum(jnp.abs(change) - slack, 0)
+        found = jnp.max(excess / jnp.maximum(size, jnp.finfo(size.dtype).tiny))
+        halved = begun & (found < best / 2)  # false for NaN
+        best, rest = jnp.where(halved, found, best), jnp.where(halved, 0, rest + wait)
+        goes_on = ~(found <= goal) & (rest < _REST) & (n < _MOST_STEPS)
 
-    def body(carry: _Progress) -> _Progress:
-        at, known, n, _, best, rest = carry
-        known = _inverse(problem, at, known)
-        value, m = _improved(problem, changed(at)[0], at, known)
+        def improved() -> tuple[jax.Array, _Inverse, jax.Array]:
+            own = _inverse(problem, at, known)
+            value, m = _improved(problem, change, at, own)
+            return value, own, n + m + 1
+
+        def offered() -> tuple[jax.Array, _Inverse, jax.Array]:
+            # Images are constant in a collapsed end component.
+            return jnp.where(dw.words(swept)[0] > 0, swept, 0), known, jnp.maximum(n, 0)
+
+        value, known, after = lax.cond(begun & goes_on, improved, offered)
         new = _backup(problem, value)
-        found = changed(new)[1]
-        waits = rest + jnp.where(jnp.all(new.action == at.action), _SAME, 1)
-        halved = found < best / 2  # false for NaN
-        return (
-            new,
-            known,
-            n + m + 1,
-            found,
-            jnp.where(halved, found, best),
-            jnp.where(halved, 0, waits).astype(jnp.int32),
-        )
+        wait = jnp.where(jnp.all(new.action == at.action), _SAME, 1).astype(jnp.int32)
+        return new, known, after, best, rest, wait, begun & ~goes_on
 
-    def goes_on(carry: _Progress) -> jax.Array:
-        _, _, n, found, _, rest = carry
-        return ~(found <= goal) & (rest < _REST) & (n < _MOST_STEPS)
-
-    first = changed(at)[1]
-    best = jnp.where(jnp.isfinite(first), first, jnp.inf)
-    start = (at, known, num_steps, first, best, jnp.int32(0))
-    return lax.while_loop(goes_on, body, start)[:3]
+    none, never = jnp.int32(0), jnp.asarray(jnp.inf, goal.dtype)
+    first = (start, known, num_steps, never, none, none, none > 0)
+    return lax.while_loop(lambda carry: ~carry[-1], body, first)[:3]
 
 
 # --- the enclosure ----------------------------------------------------------------------------
@@ -425,29 +423,28 @@ class _Search(NamedTuple):
     share: jax.Array  # e
     bounds: tuple[jax.Array, jax.Array]  # the proven bounds, in double words
     shares: tuple[jax.Array, jax.Array]  # the e of each proven bound, else infinity
+    gap: jax.Array  # their distance, infinite without an upper one
     safe: _Point  # the point with a policy that attains the bound on the safe side
-    tries: jax.Array  # tries, num_steps: numbers of trials, and of applications of P
-    num_steps: jax.Array
+    residual: jax.Array  # of that point
+    tries: jax.Array  # number of trials
+    num_steps: jax.Array  # number of applications of P; -1 before the first backup
     ended: jax.Array  # whether other shares would not help
 
 
-def _width(problem: Problem, lower: jax.Array, upper: jax.Array) -> jax.Array:
+def _width(problem: Problem, gap: jax.Array, upper: jax.Array) -> jax.Array:
     """The largest width, relative unless the value has a bound."""
     scale = upper if math.isinf(problem.highest) else 1
-    each = jnp.where(jnp.isfinite(upper), (upper - lower) / scale, jnp.inf)
+    each = jnp.where(jnp.isfinite(upper), gap / scale, jnp.inf)
     return jnp.max(jnp.where(problem.open, each, 0))
 
 
-def _wide(problem: Problem, bounds: tuple[jax.Array, jax.Array]) -> jax.Array:
-    lower, upper = bounds
-    high = dw.words(upper)[0]
-    gap = jnp.where(jnp.isfinite(high), dw.minus(upper, lower), jnp.inf)
-    return _width(problem, high - gap, high)
+def _wide(problem: Problem, k: _Search) -> jax.Array:
+    return _width(problem, k.gap, dw.words(k.bounds[1])[0])
 
 
 def _tried(problem: Problem, tolerance: jax.Array, k: _Search) -> _Search:
     """One trial: solves for one of the bounds, checks it, and updates the share."""
-    rows, above = problem.rows, k.tries % 2 == 1
+    rows, above = problem.rows, (k.tries & 1) == 1
     sign = jnp.where(above, 1, -1).astype(k.share.dtype)
     size = jnp.max(jnp.abs(dw.words(k.at.image)[0]))
     # The shift exceeds the loss where words are flushed to zero.
@@ -459,11 +456,7 @@ def _tried(problem: Problem, tolerance: jax.Array, k: _Search) -> _Search:
 
     equation = image, k.share / 4, shift / 4
     at, known, n = _solved(problem, equation, k.at, k.known, k.num_steps)
-    # Images are constant in a collapsed end component.
-    offered = image(at)
-    offered = jnp.where(dw.words(offered)[0] > 0, offered, 0)
-    at = _backup(problem, offered)
-    value = dw.words(offered)[0]
+    offered, value = at.value, dw.words(at.value)[0]
     slack = rows.unit * value + rows.underflow(jnp.max(value))
     gain = dw.minus(at.image, offered)
     holds = jnp.where(above, -gain >= slack, (gain >= slack) | (value == 0))
@@ -476,16 +469,20 @@ def _tried(problem: Problem, tolerance: jax.Array, k: _Search) -> _Search:
     over = proven & above & (k.share <= k.shares[1])
     bounds = kept(offered, k.bounds[0], below), kept(offered, k.bounds[1], over)
     shares = kept(k.share, k.shares[0], below), kept(k.share, k.shares[1], over)
-    safe = kept(at, k.safe, below if problem.sign > 0 else over)
+    safer = (below if problem.sign > 0 else over) | (k.num_steps < 0)
+    safe, residual = kept((at, jnp.max(jnp.abs(gain))), (k.safe, k.residual), safer)
+    high = dw.words(bounds[1])[0]
+    gap = jnp.where(jnp.isfinite(high), dw.minus(bounds[1], bounds[0]), jnp.inf)
     below_known, above_known = (x <= k.share for x in shares)
-    narrower = jnp.clip(tolerance / (2 * _wide(problem, bounds)), 1e-3, 0.5)
+    narrower = jnp.clip(tolerance / (2 * _width(problem, gap, high)), 1e-3, 0.5)
     floor = _ROUNDINGS * rows.unit
     # A small share without an upper bound is too small for the precision of the solution.
     fewer = jnp.where(k.share < jnp.finfo(value.dtype).eps, 16, 1 / 32)
     change = jnp.where(below_known, jnp.where(above_known, narrower, fewer), 16)
     share = jnp.where(above, jnp.maximum(k.share * change, floor), k.share)
     ended = above & ((below_known & above_known & (k.share <= floor)) | (share > _LARGEST))
-    return _Search(at, known, share, bounds, shares, safe, k.tries + 1, n, ended)
+    steps = k.tries + 1, n, ended
+    return _Search(at, known, share, bounds, shares, gap, safe, residual, *steps)
 
 
 def solve_problem(problem: Problem, tolerance: jax.Array, asked: jax.Array) -> Found:
@@ -494,20 +491,35 @@ def solve_problem(problem: Problem, tolerance: jax.Array, asked: jax.Array) -> F
     dtype, eps = model.dtype, float(jnp.finfo(model.dtype).eps)
     zero = dw.double_word(jnp.zeros(problem.open.shape, dtype))
     numbers, none = _numbers(zero.shape), jnp.int32(0)
-    start = _chosen(problem, zero, problem.reward)
+    # Where every policy leaves the open states, the first one is greedy for zero.
+    start, num_steps = _Point(zero, zero, problem.decided, numbers), none - 1
     if problem.start is not None:
         gain = jnp.where(problem.open, action_mean(problem.start, problem.reward), 0)
-        start = _Point(zero, gain, problem.start, numbers)
+        start, num_steps = _Point(zero, gain, problem.start, numbers), none
     size = zero.size if is_small(sweep_operator(model), zero.size) else 0
     unknown = jnp.zeros((size, size), dtype), jnp.full_like(numbers, -1), numbers
     never = jnp.asarray(jnp.inf, dtype)
-    far = jnp.where(problem.open, problem.highest, 0).astype(zero.dtype)
+    far = jnp.where(problem.open, problem.highest, 0).astype(dtype)
     # Rounding both ends to the dtype takes a little of the width.
     inner = jnp.maximum(tolerance - 2 * eps, tolerance / 2)
     share = jnp.maximum(2 * _ROUNDINGS * rows.unit, 1e-6 * tolerance).astype(dtype)
-    k = _Search(start, unknown, share, (zero, far), (never, never), start, none, none, none > 0)
+    bounds = zero, far.astype(zero.dtype)
+    residual = jnp.max(jnp.abs(dw.words(start.image)[0]))
+    k = _Search(
+        start,
+        unknown,
+        share,
+        bounds,
+        (never, never),
+        far,
+        start,
+        residual,
+        none,
+        num_steps,
+        none > 0,
+    )
     k = lax.while_loop(
-        lambda k: (_wide(problem, k.bounds) > inner) & (k.tries < 2 * _ATTEMPTS) & ~k.ended,
+        lambda k: (_wide(problem, k) > inner) & (k.tries < 2 * _ATTEMPTS) & ~k.ended,
         partial(_tried, problem, inner),
         k,
     )
@@ -520,12 +532,11 @@ def solve_problem(problem: Problem, tolerance: jax.Array, asked: jax.Array) -> F
         # The bound holds for a policy that leaves the open states almost surely.
         upper = jnp.where(problem.open & ~decides, problem.highest, upper)
     both = jnp.isfinite(upper)
-    middle = dw.words(k.bounds[0])[0] + dw.minus(k.bounds[1], k.bounds[0]) / 2
+    middle = dw.words(k.bounds[0])[0] + k.gap / 2
     value = jnp.where(both, middle, jnp.maximum(dw.words(k.at.image)[0], lower))
     value = jnp.clip(value, lower, upper)
-    residual = jnp.max(jnp.abs(dw.minus(k.safe.image, k.safe.value)))  # of the bound
-    narrow = _width(problem, lower, upper) <= asked
-    exhausted = k.ended | (_wide(problem, k.bounds) <= inner)
+    narrow = _width(problem, upper - lower, upper) <= asked
+    exhausted = k.ended | (_wide(problem, k) <= inner)
     status = status_code(narrow, jnp.all(jnp.isfinite(value)), jnp.all(both) & exhausted)
     return Found(
         value,
@@ -535,8 +546,8 @@ def solve_problem(problem: Problem, tolerance: jax.Array, asked: jax.Array) -> F
         k.safe.leaves,
         problem.open,
         problem.finite,
-        residual,
-        k.num_steps,
+        k.residual,
+        jnp.maximum(k.num_steps, 0),
         status,
     )
 
