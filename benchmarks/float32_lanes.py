@@ -18,7 +18,7 @@ import numpy as np
 import jaxltl as jl
 
 FORMULAS = ("F a", "!b U a", "F (a & F b)", "G F a & G F b")
-SIZE, DISCOUNT = 200, 127 / 128  # a discount that float32 represents
+SIZE, DISCOUNT = 200, 0.999
 
 
 def random_world(rng, num_states, sticky=0.998):
@@ -62,9 +62,9 @@ def uniform(model):
     return jnp.full(shape, 1 / model.num_actions, model.dtype)
 
 
-def earned(model):
+def earned(model, scale=1.0):
     shape = (*model.state_shape, model.num_actions)
-    reward = np.random.default_rng(1).random(shape).astype(np.float32)
+    reward = (scale * np.random.default_rng(1).random(shape)).astype(np.float32)
     return jnp.asarray(reward, model.dtype)
 
 
@@ -87,10 +87,10 @@ QUESTIONS = {
         m, jnp.ones(m.state_shape), last_two(m), policy=uniform(m), tolerance=width
     ),
     "value of a policy": lambda m, width: jl.policy_value(
-        m, uniform(m), earned(m), DISCOUNT, tolerance=width and width * 1000
+        m, uniform(m), earned(m, 1 - DISCOUNT), DISCOUNT, tolerance=width
     ),
     "optimal value": lambda m, width: jl.optimal_value(
-        m, earned(m), DISCOUNT, tolerance=width and width * 1000
+        m, earned(m, 1 - DISCOUNT), DISCOUNT, tolerance=width
     ),
 }
 

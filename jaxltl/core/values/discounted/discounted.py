@@ -16,6 +16,7 @@ from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from jaxltl.core.values.engine.validated import validated
@@ -87,6 +88,9 @@ def reward_size(model: Any, reward: Any) -> jax.Array:
     return jnp.max(expected_reward(model, jax.tree.map(jnp.abs, reward)))
 
 
+Words = tuple[jax.typing.ArrayLike, jax.typing.ArrayLike, jax.typing.ArrayLike]
+
+
 class Parameters(NamedTuple):
     """Numbers of a discounted problem, for :mod:`jaxltl.core.values.engine.newton`."""
 
@@ -95,6 +99,8 @@ class Parameters(NamedTuple):
     unit: jax.Array  # relative rounding of a backup
     tolerance: jax.Array | None  # width of the enclosure, or None
     policy: Any = None  # a policy's weights, in columns, or None
+    low: jax.Array | float = 0  # the discount's low word
+    error: jax.Array | float = 0  # of the double word
 
 
 def judge(value: jax.Array, image: jax.Array, given: Parameters) -> tuple[jax.Array, jax.Array]:
@@ -109,14 +115,27 @@ def _enclosed(value: jax.Array, image: jax.Array, given: Parameters) -> Enclosur
 
 
 def parameters(model: Any, reward: Any, discount: Any, tolerance: Any) -> Parameters:
-    """Parameters of a problem."""
+    """Parameters of a problem; the discount is a number or of :func:`discount_words`."""
+    high, *rest = discount if isinstance(discount, tuple) else (discount,)
     goal = None if tolerance is None else jnp.asarray(tolerance, model.dtype)
     return Parameters(
-        jnp.asarray(discount, model.dtype),
+        jnp.asarray(high, model.dtype),
         reward_size(model, reward),
         jnp.asarray(rounding_unit(model), model.dtype),
         goal,
+        None,
+        *rest,
     )
+
+
+def discount_words(discount: jax.Array | float, dtype: jnp.dtype) -> Words:
+    """A discount as a high and a low word, and the error of their sum."""
+    number = jnp.asarray(discount) if is_traced(discount) else np.float64(discount)
+    high = number.astype(dtype)
+    low = lax.stop_gradient(number - high.astype(number.dtype)).astype(dtype)
+    # A number of Python that is the argument of a jitted function was rounded to its dtype there.
+    rounded = getattr(number, "weak_type", False) and number.dtype.itemsize < 8
+    return high, low, np.asarray(float(jnp.finfo(dtype).eps) / 2 if rounded else 0, dtype)
 
 
 def gains(model: Any, reward: jax.Array) -> Any:
@@ -216,7 +235,10 @@ def policy_value(
     policy = flatten_policy(model, policy)
     require_policy(form, policy)
     return reshape_solution(
-        model, _policy_value(form, policy, reward, discount, tolerance, max_steps)
+        model,
+        _policy_value(
+            form, policy, reward, discount_words(discount, form.dtype), tolerance, max_steps
+        ),
     )
 
 
@@ -323,7 +345,7 @@ def optimal_value(
         _optimal_value(
             form,
             reward,
-            discount,
+            discount_words(discount, form.dtype),
             method=method,
             tolerance=tolerance,
             max_steps=MAX_STEPS if max_steps is None else max_steps,
@@ -336,7 +358,7 @@ def optimal_value(
 def _optimal_value(
     model: Any,
     reward: jax.Array,
-    discount: jax.Array | float,
+    discount: Words,
     *,
     method: str,
     tolerance: jax.Array | float | None,
@@ -411,6 +433,7 @@ def _newton_steps(
     policy: jax.Array | None,
 ) -> tuple[Solution, jax.Array]:
     rows, eps = dw.normalised_rows(model, policy), float(jnp.finfo(model.dtype).eps)
+    factor = dw.double_word(given.discount, given.low)
     if reward.shape == rows.scale.shape:
         gain = dw.double_word(jnp.where(model.available, reward, 0))
     else:
@@ -420,46 +443,47 @@ def _newton_steps(
 
     def backup(value: jax.Array) -> tuple[jax.Array, ...]:
         """The value, its image, the greedy actions, and the image less the value, rounded once."""
-        ahead = dw.plus(gain, dw.times(given.discount, rows.expectation(value)))
+        ahead = dw.plus(gain, dw.product(factor, rows.expectation(value)))
         if policy is None:
             image, action = dw.best(ahead, model.available)
         else:
             image, action = rows.mean(ahead), jnp.zeros(value.shape, jnp.int32)
         return value, image, action, dw.minus(image, value)
 
-    def bounds(image: jax.Array, change: jax.Array) -> tuple[Enclosure, jax.Array, jax.Array]:
+    def bounds(image: jax.Array, change: jax.Array) -> Enclosure:
         size = given.size + 2 * jnp.max(jnp.abs(dw.words(image)[0]))
         # A bound is computed from the change with some roundings.
         rounding = rows.unit * size + rows.underflow(size) + 16 * eps * jnp.max(jnp.abs(change))
-        # The discount was rounded to the model's dtype: the caller's number is meant.
-        rounding += eps / 2 * given.discount * size
+        rounding += given.error * given.discount * size
         ends = jnp.zeros(change.size, change.dtype), change.ravel()
         goal = 2 * eps * size + 4 * rounding / (1 - given.discount)
-        found = enclose(*ends, given.discount, rounding, goal)
-        lower, upper = (
-            dw.outwards(dw.plus(image, dw.double_word(found.shift + x * found.half)), x)
-            for x in (-1, 1)
-        )
-        return found, lower, upper
+        return enclose(*ends, given.discount, rounding, goal, given.low)
 
     def newton_step(carry: _Progress) -> _Progress:
         (value, _, action, change), n = carry
         weight = jax.nn.one_hot(action, model.num_actions, dtype=model.dtype)
         columns = action_columns(model.num_actions, weight if policy is None else policy)
         system = System(sweep_operator(model), columns, given.discount)
-        step = solver(system, max_steps=_MOST_PRODUCTS).solve(change)
+        linear = solver(system, max_steps=_MOST_PRODUCTS)
+        step = lax.cond(n < 0, jnp.zeros_like, linear.solve, change)
         new = backup(dw.plus(value, dw.double_word(step)))
-        better = jnp.max(jnp.abs(new[3])) < jnp.max(jnp.abs(change))  # false for NaN
+        better = (n < 0) | (jnp.max(jnp.abs(new[3])) < jnp.max(jnp.abs(change)))  # false for NaN
         at = jax.tree.map(partial(jnp.where, better), new, carry[0])
         return at, jnp.where(better, n + 1, _STEPS)
 
     def goes_on(carry: _Progress) -> jax.Array:
         (_, image, _, change), n = carry
-        return (n < _STEPS) & ~bounds(image, change)[0].converged
+        return (n < 0) | (n < _STEPS) & ~bounds(image, change).converged
 
-    start = backup(dw.double_word(solution.value)), jnp.int32(0)
+    # The first step is zero, so that the program has one backup.
+    value, none = dw.double_word(solution.value), jnp.zeros_like(solution.value)
+    start: _Progress = (value, value, none.astype(jnp.int32), none), jnp.int32(-1)
     (_, image, action, change), _ = lax.while_loop(goes_on, newton_step, start)
-    found, lower, upper = bounds(image, change)
+    found = bounds(image, change)
+    lower, upper = (
+        dw.outwards(dw.plus(image, dw.double_word(found.shift + x * found.half)), x)
+        for x in (-1, 1)
+    )
     narrow = solution.status == Status.CONVERGED
     if given.tolerance is not None:
         narrow = jnp.max(upper - lower) <= given.tolerance

@@ -503,13 +503,12 @@ def solve_problem(problem: Problem, tolerance: jax.Array, asked: jax.Array) -> F
     # Rounding both ends to the dtype takes a little of the width.
     inner = jnp.maximum(tolerance - 2 * eps, tolerance / 2)
     share = jnp.maximum(2 * _ROUNDINGS * rows.unit, 1e-6 * tolerance).astype(dtype)
-    bounds = zero, far.astype(zero.dtype)
     residual = jnp.max(jnp.abs(dw.words(start.image)[0]))
     k = _Search(
         start,
         unknown,
         share,
-        bounds,
+        (zero, far.astype(zero.dtype)),
         (never, never),
         far,
         start,
