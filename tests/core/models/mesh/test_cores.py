@@ -9,8 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
+from jax.interpreters import mlir
 from jax.sharding import PartitionSpec
+from jaxlib import xla_client
 
+from jaxltl.core.models.mesh import cores
 from jaxltl.core.models.mesh.cores import over_cores
 from tests.support import counted_traces, lane
 
@@ -140,3 +143,29 @@ def test_an_error_in_a_part_is_an_error():
 
     with pytest.raises(Exception, match="no such number"):
         jax.block_until_ready(jax.jit(jax.vmap(partial(over_cores, function)))(jnp.arange(2.0)))
+
+
+@pytest.mark.parametrize("internal", ["make_cpu_client", "emit_python_callback"])
+@pytest.mark.parametrize("missing", [True, False])
+def test_without_internals_of_jax_it_is_the_vmap(internal, missing, monkeypatch):
+    def refuse(*_, **__):
+        raise RuntimeError("changed")
+
+    def name(x):
+        return x + threading.current_thread().name.startswith("ThreadPool")
+
+    def function(x):  # a function of its own, so that nothing is cached
+        return jax.pure_callback(name, x, x, vmap_method="sequential")
+
+    owner = mlir if internal == "emit_python_callback" else xla_client
+    if missing:
+        monkeypatch.delattr(owner, internal)
+    else:
+        monkeypatch.setattr(owner, internal, refuse)
+    cores._device.cache_clear()
+    try:
+        found = jax.jit(jax.vmap(partial(over_cores, function)))(jnp.arange(3))
+        assert found.tolist() == [0, 1, 2]
+    finally:
+        monkeypatch.undo()
+        cores._device.cache_clear()
