@@ -264,7 +264,8 @@ def _improve(
     needed = bounds.task.initial(lower.value)[bounds.initial]
     goal = 1 - limits.tolerance if limits.threshold is None else limits.threshold
     if limits.upper and (needed < goal).any():
-        start = _Lower(1 - upper, np.zeros_like(lower.how), lower.action)
+        how = np.where(upper <= 0, SURE, UNPROVEN).astype(np.int8)
+        start = _Lower(1 - upper, how, lower.action)
         negated = bounds.task.complement()
         found = problem.lower_bounds(negated, start, 1 - lower.value, False, clock)
         upper = np.minimum(upper, 1 - found.value)
@@ -338,7 +339,8 @@ class _Problem:
         value, how, action = before.value.copy(), before.how.copy(), before.action.copy()
 
         def prove(rows: Successors, kind: int) -> None:
-            won = winning_cells(task, rows, value >= 1, maximize)
+            known = (value >= 1) & (how >= kind)  # "surely" rests on sure states alone
+            won = winning_cells(task, rows, known, maximize)
             new = won.states & (value < 1)
             value[new], how[new], action[new] = 1.0, kind, won.action[new]
 
@@ -379,7 +381,8 @@ class _Problem:
         num = self.rows.num_actions
         index = (active[:, None] * num + np.arange(num)).reshape(-1)
         im = self.images
-        part = Images(im.cells[active], im.low[index], im.high[index], im.gain[index], im.noise_of)
+        arrays = {x: getattr(im, x)[index] for x in ("low", "high", "gain", "varying")}
+        part = replace(im, cells=im.cells[active], **arrays)
         rows = replace(
             self.rows,
             cells=im.cells[active],

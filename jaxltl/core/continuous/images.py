@@ -19,6 +19,7 @@ import scipy.optimize
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.continuous.grid import Grid
+from jaxltl.core.continuous.noise_gains import conditioning_order, gain_bounds, gain_program
 from jaxltl.core.enclosures.interval import Interval
 from jaxltl.core.enclosures.linear_bounds import AffineForm, propagate
 from jaxltl.core.enclosures.program import Program, make_program
@@ -31,6 +32,7 @@ LARGEST_BLOCK = 16  # cells along an axis; each level of blocks is a quarter as 
 CELL_SHARE, NOISE_SHARE = 0.15, 0.02
 _CHUNK = 1024  # boxes of one evaluation, which then fits into the caches
 _ROUNDING = 1e-13  # relative error of a few operations in float64, with a margin of 100
+_CONSTANT = 1e-14  # relative width of the bounds of a constant gain
 _EQUAL_GAINS = 1e-6  # gains of the noise that differ by less are one
 
 
@@ -47,6 +49,9 @@ class Images:
       low, high: ``float[M * A, n]``.
       gain: ``float[M * A, n]``, not negative; 0 without noise.
       noise_of: for each coordinate the index of its noise, or -1.
+      varying: ``float[M * A, n]``, the part of the box that may depend on `w_i` itself; None: 0.
+      order: the coordinates in an order in which each box depends on noises of earlier ones alone;
+        () for any order.
     """
 
     cells: Integers
@@ -54,6 +59,8 @@ class Images:
     high: Floats
     gain: Floats
     noise_of: tuple[int, ...]
+    varying: Floats | None = None
+    order: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -82,43 +89,44 @@ def image_boxes(
       ValueError: if `step` cannot be traced or enclosed, with the place.
     """
     cells = np.asarray(cells)
-    program = _program(step, grid.num_axes, actions.shape[1], len(noise.low))
+    programs = _programs(step, grid.num_axes, actions.shape[1], len(noise.low))
     num_actions, n = len(actions), grid.num_axes
     low = np.empty((len(cells), num_actions, n))
-    high, gain = np.empty_like(low), np.empty_like(low)
+    high, gain, varying = np.empty_like(low), np.empty_like(low), np.empty_like(low)
     todo = np.ones(len(cells), bool)
-    noise_of: tuple[int, ...] | None = None
+    order, noise_of = tuple(range(n)), (-1,) * n
     index = np.stack(np.unravel_index(cells, grid.shape), -1)
     for size in _block_sizes(grid.shape):
         block_shape = tuple(-(-k // b) for k, b in zip(grid.shape, size, strict=True))
         number = np.ravel_multi_index(tuple((index[todo] // np.array(size)).T), block_shape)
         blocks, of_block = np.unique(number, return_inverse=True)
         start = np.stack(np.unravel_index(blocks, block_shape), -1) * np.array(size)
-        form = _forms(program, grid, start, size, actions, noise)
-        if noise_of is None:
-            noise_of = _assigned(form.gains, noise)
+        form = _forms(programs, grid, start, size, actions, noise)
+        if todo.all():  # on the largest blocks, whose bounds hold for all cells
+            order, noise_of = _assigned(form, noise)
         rows = np.flatnonzero(todo)
         many = max(_CHUNK * 64 // num_actions, 1)  # cells at once, which bounds the memory
         for begin in range(0, len(rows), many):
             here, block = rows[begin : begin + many], of_block.reshape(-1)[begin : begin + many]
             image = _cell_images(form, grid, cells[here], block, noise, noise_of)
             accepted = image.accepted | (max(size) == 1)
-            for array, new in ((low, image.low), (high, image.high), (gain, image.gain)):
+            for array, new in ((low, image.low), (high, image.high), (gain, image.gain),
+                               (varying, image.varying)):  # fmt: skip
                 array[here[accepted]] = new[accepted]
             todo[here[accepted]] = False
         if not todo.any():
             break
     shape = (len(cells) * num_actions, n)
-    return Images(
-        cells, low.reshape(shape), high.reshape(shape), gain.reshape(shape), noise_of or (-1,) * n
-    )
+    low, high, gain, varying = (x.reshape(shape) for x in (low, high, gain, varying))
+    return Images(cells, low, high, gain, noise_of, varying, order)
 
 
-def _program(step: Step, n: int, m: int, k: int) -> Program:
-    """The step function as a program on state, action and noise in float64."""
+def _programs(step: Step, n: int, m: int, k: int) -> tuple[Program, Program | None]:
+    """The step function and its gains as programs on state, action and noise in float64."""
     with jax.enable_x64(True):
         specs = [jax.ShapeDtypeStruct((size,), np.float64) for size in (n, m, k)]
-        return make_program(lambda x, u, w: step(x, u, w), *specs)
+        program = make_program(lambda x, u, w: step(x, u, w), *specs)
+        return program, gain_program(program, step, specs) if k else None
 
 
 def _block_sizes(shape: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
@@ -135,6 +143,8 @@ class _Forms:
     middle: Floats  # [N, A, n]
     slope: Floats  # [N, A, n, n], of the block's e in [-1, 1]^n: state coordinate, then output
     gains: Floats  # [N, A, k, n]
+    gain_low: Floats  # [N, A, k, n], bounds of the derivatives in the noise
+    gain_high: Floats
     error: Floats  # [N, A, n]
     low: Floats  # [N, A, n], of the whole block and all noise
     high: Floats
@@ -143,7 +153,7 @@ class _Forms:
 
 
 def _forms(
-    program: Program,
+    programs: tuple[Program, Program | None],
     grid: Grid,
     start: Integers,
     size: tuple[int, ...],
@@ -162,17 +172,18 @@ def _forms(
         block, action = row // num_actions, actions[row % num_actions]
         wide = np.broadcast_to(noise.low, (len(row), k)), np.broadcast_to(noise.high, (len(row), k))
         boxes = [Interval(first[block], last[block]), Interval(action, action), Interval(*wide)]
-        known = propagate(program, boxes)
-        (y,) = program.outputs
+        known = propagate(programs[0], boxes)
+        (y,) = programs[0].outputs
         bounds, form = known.intervals[y], known.forms.get(y)
         if form is None:  # the output does not depend on the inputs
             form = AffineForm(np.zeros((1, 0, n)), bounds.middle, bounds.radius)
-        found = (bounds.low, bounds.high, form.middle, form.slope, form.error)
+        gains = gain_bounds(programs[1], boxes, n)
+        found = (bounds.low, bounds.high, form.middle, form.slope, form.error, *gains)
         return tuple(np.broadcast_to(x, (len(row), *x.shape[1:])) for x in found)
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         parts = list(pool.map(evaluate, range(0, total, _CHUNK)))
-    low, high, middle, some, error = (np.concatenate(x) for x in zip(*parts, strict=True))
+    low, high, middle, some, error, *gains = (np.concatenate(x) for x in zip(*parts, strict=True))
     m = actions.shape[1]
     slope = np.zeros((total, n + m + k, n))
     slope[:, : some.shape[1]] = some
@@ -181,6 +192,8 @@ def _forms(
         middle.reshape(*grouped, n),
         slope[:, :n].reshape(*grouped, n, n),
         slope[:, n + m :].reshape(*grouped, k, n),
+        gains[0].reshape(*grouped, k, n),
+        gains[1].reshape(*grouped, k, n),
         error.reshape(*grouped, n),
         low.reshape(*grouped, n),
         high.reshape(*grouped, n),
@@ -189,18 +202,20 @@ def _forms(
     )
 
 
-def _assigned(gains: Floats, noise: NoiseBox) -> tuple[int, ...]:
-    """The random noise of each coordinate: at most one coordinate each, with the largest gains.
+def _assigned(form: _Forms, noise: NoiseBox) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """The order of the coordinates and the random noise of each: at most one coordinate each.
 
-    Independent noises make the coordinates independent given the state; all other noise is
-    treated as chosen by an adversary, which is sound.
+    The largest gains are random. All other noise is treated as chosen by an adversary who knows the
+    noises of earlier coordinates.
     """
-    found = [-1] * gains.shape[-1]
-    size = np.abs(np.nan_to_num(gains)).mean((0, 1))  # [k, n], of one radius of the noise
+    found = [-1] * form.gains.shape[-1]
+    size = np.abs(np.nan_to_num(form.gains)).mean((0, 1))  # [k, n], of one radius of the noise
     for j, i in zip(*scipy.optimize.linear_sum_assignment(-size), strict=True):
         if noise.random[j] and size[j, i] > 0:
             found[i] = int(j)
-    return tuple(found)
+    depends = ((form.gain_low != 0) | (form.gain_high != 0)).any((0, 1))
+    own = np.array([size[j, i] if j >= 0 else 0.0 for i, j in enumerate(found)])
+    return conditioning_order(found, depends, own / np.maximum(size.sum(0), 1e-300))
 
 
 @dataclass(frozen=True)
@@ -208,6 +223,7 @@ class _CellImages:
     low: Floats  # [M, A, n]
     high: Floats
     gain: Floats
+    varying: Floats
     accepted: Booleans  # [M]
 
 
@@ -230,12 +246,12 @@ def _cell_images(
     spread = np.einsum("ca,cuai->cui", share, size)
     error = form.error[of_block]
     fuzzy = np.abs(form.middle[of_block]) + size.sum(-2) + np.abs(form.gains[of_block]).sum(-2)
-    reach, gain = _random_part(form.gains, noise, noise_of)
-    own, reach = gain[of_block], reach[of_block]
+    own, reach, varying = (x[of_block] for x in _random_part(form, noise, noise_of))
     ends = [(noise.low[j], noise.high[j]) if j >= 0 else (0.0, 0.0) for j in noise_of]
     least, most = np.array(ends).T
     error = error + fuzzy * _ROUNDING
-    small = error <= CELL_SHARE * spread + NOISE_SHARE * own * (most - least) / 2
+    allowed = CELL_SHARE * spread + NOISE_SHARE * own * (most - least) / 2
+    small = (error <= allowed) & (varying <= allowed)
     half = (spread + error + reach) * (1 + _ROUNDING)
     middle = middle - own * (least + most) / 2  # forms are centred at the middle of the noise
     found_low, found_high = middle - half, middle + half
@@ -243,29 +259,38 @@ def _cell_images(
     unknown = ~(np.isfinite(found_low) & np.isfinite(found_high))
     found_low = np.where(unknown, form.low[of_block] - own * most, found_low)
     found_high = np.where(unknown, form.high[of_block] - own * least, found_high)
-    return _CellImages(found_low, found_high, own, (small & ~unknown).all((1, 2)))
+    found_low = np.where(np.isnan(found_low), -np.inf, found_low)
+    found_high = np.where(np.isnan(found_high), np.inf, found_high)
+    return _CellImages(found_low, found_high, own, varying, (small & ~unknown).all((1, 2)))
 
 
 def _random_part(
-    gains: Floats, noise: NoiseBox, noise_of: tuple[int, ...]
-) -> tuple[Floats, Floats]:
-    """Half-width of the noise that an adversary chooses, and the gain of the random one."""
+    form: _Forms, noise: NoiseBox, noise_of: tuple[int, ...]
+) -> tuple[Floats, Floats, Floats]:
+    """Gain of the random noise, half-width of all other noise, and variation with the random one."""
     radius = (noise.high - noise.low) / 2
-    reach = np.abs(gains).sum(2)
-    gain = np.zeros(reach.shape)
+    reach = np.abs(form.gains).sum(2)
+    gain, varying = np.zeros(reach.shape), np.zeros(reach.shape)
     for i, j in enumerate(noise_of):
         if j < 0:
             continue
-        slope = gains[:, :, j, i]
-        own = slope / radius[j]
-        usual = float(np.median(own))
-        near = np.abs(own - usual) <= _EQUAL_GAINS * abs(usual)
-        own = np.where(near, usual, own)
-        if noise.symmetric[j]:
-            own = np.abs(own)
+        slope = form.gains[:, :, j, i]
+        least, most = form.gain_low[:, :, j, i], form.gain_high[:, :, j, i]
+        if noise.symmetric[j]:  # the noise and its reflection have one distribution
+            flip = slope < 0
             slope = np.abs(slope)
-        own = np.where(np.isfinite(own) & (own > 0), own, 0.0)
+            least, most = np.where(flip, -most, least), np.where(flip, -least, most)
+        known = np.isfinite(least) & np.isfinite(most)
+        least, most = np.where(known, least, 0.0), np.where(known, most, 0.0)
+        own = least / 2 + most / 2
+        usual = float(np.median(own))
+        own = np.where(np.abs(own - usual) <= _EQUAL_GAINS * abs(usual), usual, own)
+        own = np.where(own > 0, own, 0.0)
+        apart = np.maximum(most - own, own - least) * radius[j]
+        # Bounds of a constant derivative differ by their rounding.
+        constant = apart <= _CONSTANT * own * radius[j]
+        varying[:, :, i] = np.where((own > 0) & ~constant, apart * (1 + _ROUNDING), 0.0)
         gain[:, :, i] = own
         reach[:, :, i] += np.abs(slope - own * radius[j]) - np.abs(slope)
         reach[:, :, i] = np.maximum(reach[:, :, i], 0) + np.abs(slope) * _ROUNDING
-    return reach, gain
+    return gain, reach, varying

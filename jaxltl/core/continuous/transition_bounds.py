@@ -1,9 +1,9 @@
 """Interval transition probabilities between cells as factors of each coordinate.
 
-Given the state, the coordinates of the next state are independent; each has an interval probability
-for each interval of the grid. The least expectation over all such products is at least that over the
-joint intervals, and is computed coordinate by coordinate (orthogonally decoupled abstractions,
-Mathiesen et al. 2024, arXiv 2411.11803): no array has a row and a column for each cell.
+Each coordinate of the next state has an interval probability for each interval of the grid, given the
+state and the coordinates before it in an order (see :mod:`.noise_gains`). The least expectation over
+all such products is at least that over the joint intervals, and is computed coordinate by coordinate
+(orthogonally decoupled abstractions, Mathiesen et al. 2024, arXiv 2411.11803): no array has a row and a column for each cell.
 """
 
 from __future__ import annotations
@@ -71,10 +71,11 @@ class TransitionBounds:
     """Interval transition probabilities of rows, as factors.
 
     Attributes:
-      factors: for each coordinate of the state.
+      factors: for each coordinate of the state, in their order.
       ids: for each coordinate, ``int[R]``, the factors of each row.
       stages: order of the contraction.
-      shape: of the grid.
+      shape: of the grid, with its axes in that order.
+      order: of the coordinates.
       lost: probability of noise for which nothing is known.
     """
 
@@ -82,6 +83,7 @@ class TransitionBounds:
     ids: tuple[Integers, ...]
     stages: tuple[_Stage, ...]
     shape: tuple[int, ...]
+    order: tuple[int, ...]
     lost: float
 
     def least(self, value: Floats, outside: float) -> Floats:
@@ -89,7 +91,7 @@ class TransitionBounds:
 
         Values are in [0, 1]; that of leaving the grid is `outside`, 0 or 1. Rounded down.
         """
-        source = value[None]
+        source = np.ascontiguousarray(np.transpose(value, self.order))[None]
         for stage in self.stages:
             source = _contract(stage, self.factors[stage.axis], source, outside)
         return np.maximum(source - self.lost, 0)
@@ -103,12 +105,16 @@ class TransitionBounds:
         """Boxes of cells ``int[R, n]`` that have positive lower probabilities; start and stop."""
         start, stop = [], []
         for factors, index in zip(self.factors, self.ids, strict=True):
-            positive: Booleans = factors.low > self.lost
+            # The product of the coordinates' probabilities must exceed what is lost.
+            positive: Booleans = factors.low > 1.01 * self.lost ** (1 / len(self.order))
             first = factors.start + np.argmax(positive, -1)
             last = factors.start + positive.shape[-1] - np.argmax(positive[:, ::-1], -1)
             start.append(first[index])
             stop.append(np.where(positive.any(-1), last, first)[index])
-        return np.stack(start, -1).astype(np.int32), np.stack(stop, -1).astype(np.int32)
+        axes = np.argsort(self.order)
+        return np.stack(start, -1)[:, axes].astype(np.int32), np.stack(stop, -1)[:, axes].astype(
+            np.int32
+        )
 
 
 def transition_bounds(
@@ -124,25 +130,31 @@ def transition_bounds(
       clipped: True if successors are clipped to the grid.
     """
     factors, ids = [], []
-    for axis, j in enumerate(images.noise_of):
-        columns = np.stack([x[:, axis] for x in (images.low, images.high, images.gain)], -1)
+    order = images.order or tuple(range(grid.num_axes))
+    varying = np.zeros_like(images.gain) if images.varying is None else images.varying
+    for axis in order:
+        j = images.noise_of[axis]
+        columns = np.stack(
+            [x[:, axis] for x in (images.low, images.high, images.gain, varying)], -1
+        )
         rows, inverse = np.unique(columns, axis=0, return_inverse=True)
         ids.append(inverse.reshape(-1).astype(np.int32))
-        low, high, gain = rows.T
+        low, high, gain, _ = rows.T
         ends = (low, high)
         if j >= 0:
             ends = low + gain * box.low[j], high + gain * box.high[j]
         factors.append(
             _factors(rows, ends, grid.edges[axis], noise[j] if j >= 0 else None, clipped)
         )
-    stages = _stages(factors, ids, grid.shape)
-    return TransitionBounds(tuple(factors), tuple(ids), stages, grid.shape, box.lost)
+    shape = tuple(grid.shape[axis] for axis in order)
+    stages = _stages(factors, ids, shape)
+    return TransitionBounds(tuple(factors), tuple(ids), stages, shape, order, box.lost)
 
 
 def _factors(
     rows: Floats, ends: tuple[Floats, Floats], edges: Floats, noise: Noise | None, clipped: bool
 ) -> Factors:
-    """Probabilities of intervals for images ``[U, 3]`` of low, high and gain."""
+    """Probabilities of intervals for images ``[U, 4]`` of low, high, gain and variation."""
     count = len(edges) - 1
     start = np.clip(np.searchsorted(edges, ends[0], "right") - 1, 0, count - 1)
     stop = np.clip(np.searchsorted(edges, ends[1], "right"), start + 1, count)
@@ -174,7 +186,13 @@ def _factors(
 
 
 def _bounds(
-    noise: Noise | None, a: Floats, b: Floats, low: Floats, high: Floats, gain: Floats
+    noise: Noise | None,
+    a: Floats,
+    b: Floats,
+    low: Floats,
+    high: Floats,
+    gain: Floats,
+    varying: Floats,
 ) -> tuple[Floats, Floats]:
     """Bounds of the probability of [a, b); without noise, 0 or 1 where the image decides it."""
     a, b = np.broadcast_arrays(a, b)
@@ -182,7 +200,13 @@ def _bounds(
     possible = ((high >= a) & (low < b)).astype(np.float64)
     if noise is None or not (gain > 0).any():
         return certain, possible
-    lower, upper = noise.probability_bounds(a, b, low, high, np.where(gain > 0, gain, 1.0))
+    scale = np.where(gain > 0, gain, 1.0)
+    lower, upper = noise.probability_bounds(a, b, low, high, scale)
+    if varying.any():  # the shift may depend on the noise: narrower and wider intervals
+        first, last = a + varying, b - varying
+        lower = noise.probability_bounds(first, np.maximum(first, last), low, high, scale)[0]
+        lower = np.where(first < last, lower, 0.0)
+        upper = noise.probability_bounds(a - varying, b + varying, low, high, scale)[1]
     random = gain > 0
     return np.where(random, lower, certain), np.where(random, upper, possible)
 

@@ -91,8 +91,10 @@ class _Solver:
         current = self.known | np.ones_like(self.known) if greatest else self.known.copy()
         current[self.task.decided == 0] = False
         while True:
-            sets = [*outer, current]
+            sets, before = [*outer, current], self.action.copy()
             new = self.solve(priority + 1, top, sets) if priority < top else self.step(sets)
+            if not greatest:  # states that entered earlier keep the actions by which they did
+                self.action = np.where(current, before, self.action)
             if (new == current).all():
                 return new
             current = new
@@ -109,10 +111,8 @@ class _Solver:
             grid = good.reshape(-1, self.rows.num_actions)
             won = grid.any(1) if self.maximize else grid.all(1)
             cells = self.rows.cells
-            before = inner[q, cells]
             new = won & ~found[q, cells]
-            changed = new & (~before if priority % 2 else np.ones_like(before))
-            self.action[q, cells[changed]] = grid[changed].argmax(1)
+            self.action[q, cells[new]] = grid[new].argmax(1)
             found[q, cells[new]] = True
         return found
 

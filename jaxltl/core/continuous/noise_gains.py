@@ -1,0 +1,106 @@
+"""Gains of the noise in a step function, and the order in which coordinates are independent.
+
+Coordinate i of the next state is `m_i + g_i w_i`. Its interval probabilities hold for every value of
+`m_i` that does not depend on `w_i`; products of them over the coordinates hold if each `m_i` depends
+on noises of earlier coordinates alone, given which the next one is bounded. Bounds of the derivatives
+in the noise decide both: by the mean value theorem `m_i` varies with a noise at most as much as the
+derivative differs from the gain that was taken out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxltl.core.array_types import Booleans, Floats
+from jaxltl.core.enclosures.interval import Interval
+from jaxltl.core.enclosures.linear_bounds import propagate
+from jaxltl.core.enclosures.program import Elementwise, MatrixProduct, Program, make_program
+
+_UNDERFLOW = 1e-200  # of products with 0 that are rounded outward
+# Functions that may jump: their derivatives do not bound their variation.
+_JUMPS = {"sign", "floor", "ceil", "round", "lt", "le", "gt", "ge", "eq", "ne", "atan2", "pow"}
+
+
+def gain_program(
+    program: Program, step: object, specs: Sequence[jax.ShapeDtypeStruct]
+) -> Program | None:
+    """Derivatives ``[k, n]`` of a step in the noise, flat; None where they bound no variation.
+
+    Args:
+      program: of the step, with the noise as its last input.
+      step: JAX function of state, action and noise.
+      specs: of the three arguments.
+    """
+    assert callable(step)
+    if jumps(program):
+        return None
+
+    def gains(x: jax.Array, u: jax.Array, w: jax.Array) -> jax.Array:
+        units = jnp.eye(specs[2].shape[0], dtype=w.dtype)
+        return jnp.stack([jax.jvp(lambda v: step(x, u, v), (w,), (unit,))[1] for unit in units])
+
+    try:
+        return make_program(gains, *specs)
+    except ValueError:  # a derivative without an enclosure
+        return None
+
+
+def jumps(program: Program) -> bool:
+    """True if a function that may jump is applied to variables that depend on the last input."""
+    noisy = {program.inputs[-1]}
+    for operation in program.operations:
+        inputs = (operation.input,) if isinstance(operation, MatrixProduct) else operation.inputs
+        if not noisy.intersection(inputs):
+            continue
+        noisy.add(operation.output)
+        if isinstance(operation, Elementwise):
+            real = jnp.issubdtype(program.shapes[operation.output].dtype, jnp.floating)
+            if operation.name in _JUMPS or not real:
+                return True
+    return False
+
+
+def gain_bounds(
+    program: Program | None, boxes: list[Interval], num_states: int
+) -> tuple[Floats, Floats]:
+    """Bounds ``[C, k, n]`` of the derivatives over boxes; infinite where none is known."""
+    shape = (len(boxes[0].low), boxes[-1].low.shape[-1], num_states)
+    if program is None:
+        return np.full(shape, -np.inf), np.full(shape, np.inf)
+    found = propagate(program, boxes, linear=False).intervals[program.outputs[0]]
+    sides = (np.broadcast_to(x.reshape(-1, *shape[1:]), shape) for x in (found.low, found.high))
+    low, high = sides
+    known = np.isfinite(low) & np.isfinite(high)
+    zero = np.maximum(np.abs(low), np.abs(high)) < _UNDERFLOW
+    low, high = np.where(zero, 0.0, low), np.where(zero, 0.0, high)
+    return np.where(known, low, -np.inf), np.where(known, high, np.inf)
+
+
+def conditioning_order(
+    noise_of: Sequence[int], depends: Booleans, share: Floats
+) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """An order of the coordinates, and the noises that remain assigned to them.
+
+    Args:
+      noise_of: for each coordinate the index of its noise, or -1.
+      depends: ``bool[k, n]``, noises on which coordinates may depend.
+      share: ``float[n]``: in a cycle of dependences the coordinate with the least share loses its
+        noise, which is then treated as chosen by an adversary.
+    """
+    assigned, order = list(noise_of), list[int]()
+    remaining = list(range(len(assigned)))
+    while remaining:
+        free = [
+            i for i in remaining
+            if not any(depends[assigned[j], i] for j in remaining if j != i and assigned[j] >= 0)
+        ]  # fmt: skip
+        if free:
+            order.append(free[0])
+            remaining.remove(free[0])
+        else:
+            assigned[min((i for i in remaining if assigned[i] >= 0), key=lambda i: share[i])] = -1
+    return tuple(order), tuple(assigned)

@@ -1,0 +1,266 @@
+"""Certificates against simulated runs of random worlds, networks and formulas."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+
+from jaxltl.core.continuous import (
+    box,
+    certify_policy,
+    gaussian,
+    make_dynamics,
+    truncated_gaussian,
+    uniform,
+)
+from jaxltl.core.continuous.task_product import task_product
+from jaxltl.core.continuous.winning_cells import Successors, winning_cells
+from jaxltl.core.logic.ltl import parse_ltl
+
+LEVEL = 1e-6
+
+
+def no_action(x):
+    return jnp.zeros(0, x.dtype)
+
+
+def interval(hits, runs, level=LEVEL):
+    """Clopper-Pearson interval."""
+    low = scipy.stats.beta.ppf(level / 2, hits, runs - hits + 1) if hits else 0.0
+    high = scipy.stats.beta.isf(level / 2, hits + 1, runs - hits) if hits < runs else 1.0
+    return low, high
+
+
+# --- runs -----------------------------------------------------------------------------------------
+
+
+def labels_of_runs(world, policy, starts, num_steps, seed=0, disturbance=None):
+    """Labels ``bool[T + 1, N, P]`` and domain membership ``bool[T + 1, N]``."""
+    bounds = world.actions if isinstance(world.actions, tuple) else None
+
+    def step(carry, key):
+        x, alive = carry
+        u = jax.vmap(policy)(x)
+        u = u if bounds is None else jnp.clip(u, *map(jnp.asarray, bounds))
+        keys = jax.random.split(key, len(x))
+        after = jax.vmap(lambda k, x, u: world.next_state(k, x, u, disturbance))(keys, x, u)
+        after = jnp.where(alive[:, None], after, x)  # the last state outside is kept
+        return (after, alive & jax.vmap(world.inside)(after)), (jax.vmap(world.label)(x), alive)
+
+    keys = jax.random.split(jax.random.key(seed), num_steps + 1)
+    alive = jnp.ones(len(starts), bool)
+    _, found = jax.jit(lambda x: jax.lax.scan(step, (x, alive), keys))(jnp.asarray(starts))
+    return tuple(np.asarray(x) for x in found)
+
+
+def verdicts(formula, world, labels, alive):
+    """Runs that surely satisfy and surely violate a formula, after their finite number of steps."""
+    names = list(world.propositions)
+    formula = parse_ltl(formula)
+    used = sorted(formula.propositions)
+    columns = [names.index(p) for p in used]
+    every = np.array([[i >> j & 1 for j in range(len(used))] for i in range(2 ** len(used))], bool)
+    task = task_product(formula, used, every, every, None)
+    automaton = task.automaton
+    sink = {q: int(d) for (q, _), d in zip(task.states, task.decided, strict=True) if d >= 0}
+    decided = np.array([sink.get(q, -1) for q in range(len(automaton.delta))])
+    order = [used.index(p) for p in automaton.propositions]
+    weights = 2 ** np.arange(len(order))
+    number = {int(row @ weights): i for i, row in enumerate(np.asarray(automaton.letters, int))}
+    table = np.array([number.get(i, -1) for i in range(2 ** len(order))])
+    q = np.full(labels.shape[1], int(automaton.initial))
+    lost = np.zeros(labels.shape[1], bool)
+    for label, inside in zip(labels, alive, strict=True):
+        letter = table[label[:, columns][:, order].astype(int) @ weights]
+        assert (letter >= 0).all()
+        if world.outside == "violates":
+            lost |= ~inside & (decided[q] != 1)
+        q = np.where(lost, q, automaton.delta[q, letter])
+    return (decided[q] == 1) & ~lost, (decided[q] == 0) | lost
+
+
+def check(proof, formula, world, policy, start, runs, num_steps, **options):
+    """Raises AssertionError if simulated frequencies from a state contradict its bounds."""
+    starts = np.tile(np.asarray(start, np.float32), (runs, 1))
+    good, bad = verdicts(
+        formula, world, *labels_of_runs(world, policy, starts, num_steps, **options)
+    )
+    lower, upper = proof.at(np.asarray(starts[0], np.float64))
+    least, most = interval(good.sum(), runs)[0], 1 - interval(bad.sum(), runs)[0]
+    assert least <= upper and lower <= most, (formula, start, (lower, upper), (least, most))
+    return float(upper - lower)
+
+
+# --- couplings of coordinates ---------------------------------------------------------------------
+
+DIFFER = box([[-1, 0], [0, -1]], [[0, 1], [1, 0]])
+COUPLED = {
+    "the first one has both": lambda x, u, w: jnp.stack([0.3 * w[0] + 0.3 * w[1], 0.3 * w[0]]),
+    "the second one has both": lambda x, u, w: jnp.stack([0.3 * w[0], 0.3 * w[0] - 0.3 * w[1]]),
+    "both have both": lambda x, u, w: jnp.stack([0.3 * w[0] + 0.1 * w[1], 0.1 * w[0] + 0.3 * w[1]]),
+    "one noise": lambda x, u, w: 0.5 * jnp.stack([w[0], -w[0]]),
+}
+
+
+@pytest.mark.parametrize("formula", ["X d", "X !d"])
+@pytest.mark.parametrize("name", COUPLED)
+def test_coordinates_with_common_noise(name, formula):
+    step = COUPLED[name]
+    world = make_dynamics(
+        lambda x, u, w: step(x, u, w) + 0 * x,
+        domain=([-1, -1], [1, 1]),
+        noise=[uniform(-1, 1)] * 2,
+        labels={"d": DIFFER},
+        initial=([-0.1, -0.1], [0.1, 0.1]),
+    )
+    proof = certify_policy(world, no_action, formula, cells=[20, 20], max_cells=400)
+    check(proof, formula, world, no_action, [0.03, 0.05], 20_000, 1)
+
+
+def test_a_triangular_coupling_keeps_probabilities():
+    """The coordinate with both noises is bounded given the other one, in either order of axes."""
+    for swap in (False, True):
+        step = lambda x, u, w: (0.3 * w + 0.02 * jnp.stack([w[1], 0 * w[0]]))[:: -1 if swap else 1]  # noqa: B023, E731
+        world = make_dynamics(
+            step,
+            domain=([-1, -1], [1, 1]),
+            noise=[uniform(-1, 1)] * 2,
+            labels={"d": DIFFER},
+            initial=([-0.1, -0.1], [0.1, 0.1]),
+        )
+        proof = certify_policy(world, no_action, "X d", cells=[20, 20], max_cells=400)
+        lower, upper = proof.initial_bounds
+        assert 0.4 < lower <= 0.5 <= upper < 0.6
+        check(proof, "X d", world, no_action, [0.03, 0.05], 20_000, 1)
+
+
+GAINS = {
+    "proportional": lambda x, w: (1 + x) * 0.3 * w,
+    "a tangent": lambda x, w: 0.4 * jnp.tanh(2 * w),
+    "clipped": lambda x, w: jnp.clip(w, -0.3, 0.15),
+    "a jump": lambda x, w: jnp.where(w > 0.2, 0.5, -0.1) + 0.01 * w,
+    "a sign": lambda x, w: 0.15 * jnp.sign(w) + 0.1 * w,
+    "a square": lambda x, w: w * w - 0.1,
+    "negative": lambda x, w: 0.1 - 0.25 * w,
+}
+
+
+@pytest.mark.parametrize("noise", [uniform(-1, 1), truncated_gaussian(0.5, -1.0, 0.8, 0.1)])
+@pytest.mark.parametrize("name", GAINS)
+def test_noise_that_is_not_additive(name, noise):
+    gain = GAINS[name]
+    world = make_dynamics(
+        lambda x, u, w: gain(x, w) + 0.1 * x,
+        domain=([-1.0], [1.0]),
+        noise=noise,
+        labels={"d": ([-0.2], [0.2])},
+        initial=([-0.9], [0.9]),
+    )
+    for formula in ("X d", "X !d"):
+        proof = certify_policy(world, no_action, formula, cells=[10], max_cells=40)
+        for start in (-0.35, 0.05, 0.75):
+            check(proof, formula, world, no_action, [start], 10_000, 1)
+
+
+def test_reflected_noise_with_a_mean():
+    world = make_dynamics(
+        lambda x, u, w: 0.5 * x - w,
+        domain=([-2.0], [2.0]),
+        noise=gaussian(0.3, mean=0.4),
+        labels={"d": ([-0.6], [-0.1])},
+        initial=([-0.9], [0.9]),
+    )
+    proof = certify_policy(world, no_action, "X d", cells=[80])
+    for start in (-0.5, 0.0, 0.5):
+        middle = 0.5 * start - 0.4
+        value = np.diff(scipy.stats.norm.cdf([-0.6, -0.1], middle, 0.3))[0]
+        lower, upper = proof.at([start + 0.01])
+        assert lower - 0.02 <= value <= upper + 0.02 and upper - lower < 0.05
+
+
+# --- winning strategies ---------------------------------------------------------------------------
+
+
+def random_game(draw, formula, num_cells=12, num_actions=2):
+    """A product and boxes of successors on a line of cells."""
+    certain = draw.random((num_cells, 2)) < 0.4
+    possible = certain | (draw.random((num_cells, 2)) < 0.1)
+    task = task_product(formula, ["a", "b"], certain, possible, None)
+    first = draw.integers(0, num_cells, (num_cells * num_actions, 1))
+    stop = np.minimum(first + draw.integers(1, 4, first.shape), num_cells)
+    inner = draw.integers(first, stop)
+    outside = draw.random(len(first)) < 0.05
+    cells = np.arange(num_cells)
+    certain_box = inner, inner + 1
+    return task, Successors(cells, num_actions, first, stop, outside, certain_box, (num_cells,))
+
+
+def wins(task, rows, action):
+    """States ``bool[Q, C]`` from which a strategy wins surely: no reachable odd cycle or exit."""
+    num_memory, num_cells = action.shape
+    edges, bad = {}, set()
+    for q in range(num_memory):
+        for c in range(num_cells):
+            row = c * rows.num_actions + action[q, c]
+            to = range(int(rows.start[row, 0]), int(rows.stop[row, 0]))
+            edges[q, c] = [
+                (r, d) for d in to for r in np.flatnonzero(task.moves[q, task.label_class[d]])
+            ]
+            if rows.outside[row] and not task.outside[q]:
+                bad.add((q, c))
+    edges |= {s: [s] for s in edges if task.decided[s[0]] >= 0}
+    bad = {s for s in bad if task.decided[s[0]] < 0} | {s for s in edges if task.decided[s[0]] == 0}
+    for p in sorted({int(x) for x in task.priority if x % 2}):
+        allowed = {s for s in edges if task.priority[s[0]] >= p and task.decided[s[0]] < 0}
+        for s in allowed:
+            if task.priority[s[0]] == p and s in closure(edges, edges[s], allowed):
+                bad.add(s)
+    found = np.zeros(action.shape, bool)
+    for q, c in edges:
+        found[q, c] = not (closure(edges, [(q, c)], set(edges)) & bad)
+    return found
+
+
+def closure(edges, begin, allowed):
+    """States that are reachable through allowed ones."""
+    todo = [s for s in begin if s in allowed]
+    found = set(todo)
+    while todo:
+        new = [t for t in edges[todo.pop()] if t in allowed and t not in found]
+        found |= set(new)
+        todo += new
+    return found
+
+
+GAMES = ["F G a", "G F a & G F b", "F G a | G F b", "F G a & G F b",
+         "(F G a | G F b) & (F G b | G F a)"]  # fmt: skip
+
+
+@pytest.mark.parametrize("formula", GAMES)
+def test_winning_strategies_win(formula):
+    """Against every path of the graph of a strategy, enumerated by reachability."""
+    draw, won = np.random.default_rng(len(formula)), 0
+    for _ in range(12):
+        task, rows = random_game(draw, formula)
+        rows, none = replace(rows, certain=None), np.zeros((task.num_memory, 12), bool)
+        found = winning_cells(task, rows, none)
+        lost = winning_cells(task.complement(), rows, none, False)
+        assert not (found.states & lost.states).any()
+        assert not (found.states & ~wins(task, rows, found.action)).any()
+        won += (found.states & (task.decided < 0)[:, None]).sum()
+    assert won > 20
+
+
+@pytest.mark.parametrize("formula", GAMES)
+def test_winning_states_of_a_fixed_policy_are_exact(formula):
+    """Without choices, a state wins if and only if no losing path begins there."""
+    draw = np.random.default_rng(len(formula))
+    for _ in range(12):
+        task, rows = random_game(draw, formula, num_actions=1)
+        rows, none = replace(rows, certain=None), np.zeros((task.num_memory, 12), bool)
+        found = winning_cells(task, rows, none)
+        exact = wins(task, rows, none.astype(int))
+        assert (found.states == exact)[task.decided < 0].all()
