@@ -282,7 +282,11 @@ def _random_part(
             least, most = np.where(flip, -most, least), np.where(flip, -least, most)
         known = np.isfinite(least) & np.isfinite(most)
         least, most = np.where(known, least, 0.0), np.where(known, most, 0.0)
-        own = least / 2 + most / 2
+        # The form's slope errs by its error; the derivative's bounds may be wider, as of a clip.
+        own, wide = least / 2 + most / 2, 2 * form.error[:, :, i] / radius[j]
+        by_form = known & np.isfinite(slope + wide) & (wide < most / 2 - least / 2)
+        own = np.where(by_form, slope / radius[j], own)
+        least, most = (np.where(by_form, own + d * wide, x) for d, x in ((-1, least), (1, most)))
         usual = float(np.median(own))
         own = np.where(np.abs(own - usual) <= _EQUAL_GAINS * abs(usual), usual, own)
         own = np.where(own > 0, own, 0.0)

@@ -10,6 +10,7 @@ derivative differs from the gain that was taken out.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -44,9 +45,21 @@ def gain_program(
         return jnp.stack([jax.jvp(lambda v: step(x, u, v), (w,), (unit,))[1] for unit in units])
 
     try:
-        return make_program(gains, *specs)
+        return _needed(make_program(gains, *specs))
     except ValueError:  # a derivative without an enclosure
         return None
+
+
+def _needed(program: Program) -> Program:
+    """The program without operations on which no output depends."""
+    used, kept = set(program.outputs), []
+    for operation in reversed(program.operations):
+        if operation.output in used:
+            kept.append(operation)
+            used.update(
+                (operation.input,) if isinstance(operation, MatrixProduct) else operation.inputs
+            )
+    return replace(program, operations=tuple(reversed(kept)))
 
 
 def jumps(program: Program) -> bool:
@@ -71,7 +84,7 @@ def gain_bounds(
     shape = (len(boxes[0].low), boxes[-1].low.shape[-1], num_states)
     if program is None:
         return np.full(shape, -np.inf), np.full(shape, np.inf)
-    found = propagate(program, boxes, linear=False).intervals[program.outputs[0]]
+    found = propagate(program, boxes).intervals[program.outputs[0]]
     sides = (np.broadcast_to(x.reshape(-1, *shape[1:]), shape) for x in (found.low, found.high))
     low, high = sides
     known = np.isfinite(low) & np.isfinite(high)
