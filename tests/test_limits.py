@@ -14,9 +14,9 @@ from benchmarks import size
 
 PACKAGE = Path(jaxltl.__file__).parent
 LIMITS = {
-    "lines": 96_473,
-    "statements": 47_928,
-    "docstring lines": 15_860,
+    "lines": 97_200,
+    "statements": 48_350,
+    "docstring lines": 15_920,
     "functions with more than 6 parameters": 67,
     "functions with more than 9 parameters": 1,
     "Any in annotations": 1_195,

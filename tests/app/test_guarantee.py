@@ -144,7 +144,6 @@ initial = "!r & !y"
 formula = "{formula}"
 steps_factor = "none"
 guarantee = {asked}
-steps_factor = "none"
 
 [demonstrations]
 file = "shown.json"

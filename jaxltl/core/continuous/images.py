@@ -117,8 +117,8 @@ def image_boxes(
         if not todo.any():
             break
     shape = (len(cells) * num_actions, n)
-    low, high, gain, varying = (x.reshape(shape) for x in (low, high, gain, varying))
-    return Images(cells, low, high, gain, noise_of, varying, order)
+    flat = [x.reshape(shape) for x in (low, high, gain, varying)]
+    return Images(cells, flat[0], flat[1], flat[2], noise_of, flat[3], order)
 
 
 def _programs(step: Step, n: int, m: int, k: int) -> tuple[Program, Program | None]:

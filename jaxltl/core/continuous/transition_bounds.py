@@ -170,7 +170,7 @@ def _factors(
         return np.where(at == 0, bottom, np.where(at == count, top, edges[at]))
 
     def bounds(a: Floats, b: Floats) -> tuple[Floats, Floats]:
-        return _bounds(noise, a, b, *(x[:, None] for x in rows.T))
+        return _bounds(noise, (a, b), rows)
 
     lower, upper = bounds(side(index), side(index + 1))
     first, last = side(start)[:, None], side(start + width)[:, None]
@@ -187,16 +187,11 @@ def _factors(
 
 
 def _bounds(
-    noise: Noise | None,
-    a: Floats,
-    b: Floats,
-    low: Floats,
-    high: Floats,
-    gain: Floats,
-    varying: Floats,
+    noise: Noise | None, ends: tuple[Floats, Floats], rows: Floats
 ) -> tuple[Floats, Floats]:
     """Bounds of the probability of [a, b); without noise, 0 or 1 where the image decides it."""
-    a, b = np.broadcast_arrays(a, b)
+    a, b = np.broadcast_arrays(*ends)
+    low, high, gain, varying = (x[:, None] for x in rows.T)
     certain = ((low >= a) & (high < b)).astype(np.float64)
     possible = ((high >= a) & (low < b)).astype(np.float64)
     if noise is None or not (gain > 0).any():
