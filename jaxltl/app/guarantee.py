@@ -180,11 +180,12 @@ def kept(
         found |= {"attained": attempt.attained, "weight": attempt.weight, "share": attempt.share}
     if unused := int(guarantee.unused(shown).sum()):
         found["unused"] = {"steps": unused, "of": int(np.sum(shown.length))}
-    if guarantee.forbidden.any():
-        n, t = np.argwhere(guarantee.forbidden)[0]
+    left = guarantee.forbidden & ~guarantee.unused(shown)
+    if left.any():
+        n, t = np.argwhere(left)[0]
         before, after = guarantee.cost or (None, None)
         found["left_out"] = {
-            "steps": int(guarantee.forbidden.sum()),
+            "steps": int(left.sum()),
             "of": int(np.sum(shown.length)),
             "demonstration": int(n) + 1,
             "step": int(t) + 1,

@@ -309,7 +309,7 @@ def test_demonstrated_steps_that_lose_are_left_out_and_named(write):  # noqa: F8
     start = int(model.initial_memory[4])
     best, _ = evaluate(model, np.eye(4)[np.asarray(setup.guarantee.best.policy)])
     assert lost == {
-        "steps": 2,
+        "steps": 1,
         "of": 5,
         "demonstration": 2,
         "step": 2,
@@ -325,8 +325,10 @@ def test_demonstrated_steps_that_lose_are_left_out_and_named(write):  # noqa: F8
     assert counts.sum() == 3 and counts[4, start, 0] == 0
     texts = [text for kind, text in remarks(result) if kind == "note"]
     assert texts == [
-        "2 of 5 demonstrated steps lower the maximal satisfaction probability and were left out; first at "
-        f"row 2, column 2 (demonstration 2, step 2): from {lost['from']:.4f} to {lost['to']:.4f}."
+        "1 of 5 demonstrated steps lowers the maximal satisfaction probability and was left out; first at "
+        f"row 2, column 2 (demonstration 2, step 2): from {lost['from']:.4f} to {lost['to']:.4f}.",
+        "1 of 5 demonstrated steps comes after the formula was lost, or after a mistake left the best "
+        "probability, and was not used.",
     ]
     (good,) = (text for kind, text in remarks(result) if kind == "good")
     assert good.startswith("By construction no policy has a greater satisfaction probability")
@@ -411,21 +413,22 @@ def test_steps_that_lose_nothing_by_themselves_are_left_out_truly_told(write):  
 
 
 @pytest.mark.slow
-def test_where_what_was_learned_dawdles_the_quickest_policy_is_mixed_in(write):  # noqa: F811
-    """Up and down for ever is what was shown, so that any share of a loss would come to pass."""
+def test_a_demonstrated_mistake_is_weighed_or_optimal_actions_are_mixed_in(write):  # noqa: F811
+    """A weight of the task may attain the probability or not, by the last digits of the search."""
     shown = {"demonstrations": [ERRING["demonstrations"][1]]}
     outcome, result = learned(write(asking('0.9\nover = "worst"'), shown=shown))
     found = result["guarantee"]
-    assert 0.9 <= found["attained"] <= 0.9 + WINDOW and 0 < found["share"] < 1
+    assert 0.9 <= found["attained"] <= 0.9 + WINDOW
+    assert (found["weight"] is not None and found["weight"] > 0) or 0 < found["share"] < 1
     value, _ = evaluate(outcome.setup.model, kept_policy(outcome))
     assert at_starts(outcome.setup.model, value, "worst")[0] == pytest.approx(found["attained"])
     assert np.isfinite(result["neg_log_likelihood"])
     (text,) = (text for kind, text in remarks(result) if kind == "good")
     assert text.startswith("Asked for 0.9000 from the worst initial state, certified 0.9")
-    assert text.endswith("mixed into the likeliest policy.")
+    assert found["share"] == 0 or text.endswith("mixed into the likeliest policy.")
 
 
-@pytest.mark.exhaustive
+@pytest.mark.slow
 def test_where_any_loss_is_all_the_sure_policy_is_what_there_is(write):  # noqa: F811
     shown = {"demonstrations": [ERRING["demonstrations"][1]]}
     outcome, result = learned(write(asking(0.5), ("!r U y", "G F b & G !r"), shown=shown))

@@ -74,7 +74,11 @@ def constrained_points(
         def loss(x: np.ndarray, at: Callable[..., Point] = at) -> tuple[float, np.ndarray]:
             point = at(x)
             # SLSQP shortens a step to a loss this large; it cannot use an infinite one.
-            return (point.loss, point.gradient) if point.is_finite else (1e12, 0 * x)
+            return (
+                (point.loss, np.asarray(point.gradient, float))
+                if point.is_finite
+                else (1e12, 0 * x)
+            )
 
         def excess(x: np.ndarray, at: Callable[..., Point] = at) -> float:
             point = at(x)
@@ -82,10 +86,11 @@ def constrained_points(
 
         def slope(x: np.ndarray, at: Callable[..., Point] = at) -> np.ndarray:
             point = at(x)
-            return point.slope if point.is_finite else 0 * x
+            return np.asarray(point.slope, float) if point.is_finite else 0 * x
 
         constraint = {"type": "ineq", "fun": excess, "jac": slope}
         options = {"maxiter": most, "ftol": _PRECISION}
         with contextlib.suppress(_BudgetSpent):
-            minimize(loss, start, jac=True, method="SLSQP", constraints=constraint, options=options)
+            begin = np.asarray(start, float)
+            minimize(loss, begin, jac=True, method="SLSQP", constraints=constraint, options=options)
     return [point for point in points if point.is_finite]

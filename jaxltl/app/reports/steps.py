@@ -92,9 +92,10 @@ def unused(guarantee: Result) -> list[Remark]:
     """Remark on the demonstrated steps after a mistake."""
     if not (steps := guarantee.get("unused")):
         return []
+    verbs = ("comes", "was") if steps["steps"] == 1 else ("come", "were")
     text = (
-        f"{steps['steps']} of {steps['of']} demonstrated steps come after the formula was lost, or "
-        "after a mistake left the best probability, and were not used."
+        f"{steps['steps']} of {steps['of']} demonstrated steps {verbs[0]} after the formula was lost, "
+        f"or after a mistake left the best probability, and {verbs[1]} not used."
     )
     return [("note", text)]
 
