@@ -374,10 +374,8 @@ def test_what_no_policy_has_in_a_world_is_refused_with_what_is_possible(write, t
     narrow = (". . a . .", ". r a . .")
     with pytest.raises(ValueError, match=r"in the training world map 1: guarantee = 0.999: the be"):
         prepared(write(narrow, ("guarantee = 0.85", "guarantee = 0.999"), text=RISKY))
-    drawn = ('files = ["shown.json"]', "synthetic = 2\nlength = 60")
-    assert (
-        prepared(write(("guarantee = 0.85", "guarantee = 1.0"), drawn, text=RISKY)).asked == "best"
-    )
+    sure = (("guarantee = 0.85", "guarantee = 1.0"), ("slip = 0.1", "slip = 0.0"))
+    assert prepared(write(*sure, text=RISKY)).asked == "best"
 
 
 @pytest.mark.parametrize("asked", ['"best"', '"none"', "0.6"])
