@@ -1,4 +1,4 @@
-"""How the site is made of the pages in docs/, the notebooks, the docstrings and CHANGELOG.md.
+"""Configuration of the site: it is made of the pages in docs/, the notebooks, the docstrings and CHANGELOG.md.
 
     pip install ".[docs]" && sphinx-build -W --keep-going -c docs . build/site
 

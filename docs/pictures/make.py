@@ -3,7 +3,7 @@
     python docs/pictures/make.py docs/gallery.md docs/guides/mlirl.md
 
 runs the Python blocks of each page as its test does, those that are marked as alone in a namespace
-of their own, each in an empty folder, and keeps the pictures that the page refers to beside this
+of their own, each in an empty folder, and keeps the pictures that the page refers to next to this
 file. It prints the seconds and the output of each block, says which output the page does not show
 as it is, and ends with status 1 then. With `--check` nothing is written.
 """
@@ -27,7 +27,7 @@ BLOCK = re.compile(
 
 
 def run(page: pathlib.Path, keep: bool) -> bool:
-    """Whether each block prints what stands under it."""
+    """True if each block prints the output under it."""
     text, same = page.read_text(), True
     wanted = set(re.findall(r"pictures/([\w.-]+)", text))
     names: dict = {}

@@ -1,4 +1,4 @@
-"""What pages need beyond the theme: formulas as MathML, and what readers of screens are told."""
+"""Additions to the theme: formulas as MathML, and text for screen readers."""
 
 import re
 from typing import Any
@@ -47,7 +47,7 @@ def tell(app: Any, name: str, template: str, context: dict[str, Any], doctree: A
 
 
 def setup(app: Any) -> dict[str, bool]:
-    """What Sphinx calls."""
+    """Entry point of Sphinx."""
     app.add_html_math_renderer("mathml", (inline, None), (block, None))
     app.connect("doctree-read", head_tables)
     app.connect("html-page-context", tell, priority=900)

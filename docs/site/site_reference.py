@@ -70,7 +70,7 @@ def _modules(package: ModuleType) -> list[ModuleType]:
 
 
 def _own(module: ModuleType) -> list[str]:
-    """What a module defines, in its order."""
+    """Definitions of a module, in its order."""
     return [
         name
         for name, value in vars(module).items()
@@ -215,7 +215,7 @@ def write_pages(app: Any) -> None:
 
 
 def resolve(target: str, *modules: str) -> tuple[Any, bool]:
-    """What a dotted name means, by itself or in one of these modules; and whether anything."""
+    """Meaning of a dotted name, by itself or in one of these modules, and True if it has one."""
     for full in (target, *(f"{module}.{target}" for module in modules if module)):
         parts = full.split(".")
         for end in range(len(parts), 0, -1):
@@ -313,7 +313,7 @@ def find(app: Any, env: Any, node: Any, contnode: Any) -> Any:
 
 
 def setup(app: Any) -> dict[str, bool]:
-    """What Sphinx calls."""
+    """Entry point of Sphinx."""
     app.connect("builder-inited", write_pages)
     app.connect("autodoc-process-docstring", refer, priority=400)
     app.connect("autodoc-process-signature", sign)

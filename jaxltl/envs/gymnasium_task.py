@@ -32,7 +32,7 @@ def gymnasium_task(
     flattened vector and q one-hot; of a ``Dict`` the key ``"memory"``; others become
     ``"observation"`` in such a ``Dict``. `info` has ``verdict``, ``memory``, and of a step
     ``discount`` (the task's) and ``reward`` (the environment's). Learners with a constant discount
-    fit co-safe and safety tasks, whose discount is 1.
+    fit co-safe and safety tasks, with discount 1.
 
     Args:
       env: the environment.

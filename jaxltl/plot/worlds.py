@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 # Pale versions of cell_kinds.COLORS, for contrast with drawings on top.
 TINTS = ("#e79a8c", "#f5db80", "#fdfcf8", "#c3add8", "#4a4f58")
-_RARE = 3  # cells of a kind whose name is written next to each
+_RARE = 3  # cells of a kind; above it the name is not written next to each
 _IS_LIGHT = np.array([1.0, 1.0, 1.0, 1.0, 0.0])
 
 

@@ -210,7 +210,7 @@ def _missed(play: Play, found: Synthesis) -> str:
 def save(out: Path, found: Synthesis) -> None:
     """Writes the strategies into a directory, atomically, as policies that `load_policy` reads.
 
-    Beside the arrays of a policy of the world they have those of the solved game:
+    Besides the arrays of a policy of the world they have those of the solved game:
     ``strategy.npz``, if the system wins from some initial state, is its permissive strategy as
     the restricted game of N states: ``successor``, ``probability``, ``initial``, ``system``,
     ``label``, ``propositions`` and ``actions`` as in a game file's model; the allowed moves

@@ -394,7 +394,7 @@ class _Problem:
 
 
 def safe_actions(dynamics: Dynamics, control: Control, bounds: Bounds) -> Booleans:
-    """Actions ``bool[Q, C, A]`` all of whose successors have lower bound 1.
+    """Actions ``bool[Q, C, A]`` that lead only to states of lower bound 1.
 
     In states that are satisfied surely or with probability 1, at least the policy's action is one.
     """

@@ -90,7 +90,7 @@ class Grid:
 def make_grid(
     low: Floats, high: Floats, shape: Sequence[int], breakpoints: Sequence[Floats] = ()
 ) -> Grid:
-    """Grid of a box with about equal cells, whose nearest edges are moved to the breakpoints.
+    """Grid of a box with about equal cells; edges near breakpoints are moved to them.
 
     Args:
       low, high: ``float[n]``, the domain.

@@ -205,7 +205,7 @@ def _forms(
 def _assigned(form: _Forms, noise: NoiseBox) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """The order of the coordinates and the random noise of each: at most one coordinate each.
 
-    The largest gains are random. All other noise is treated as chosen by an adversary who knows the
+    The largest gains are random. All other noise is treated as chosen by an adversary that knows the
     noises of earlier coordinates.
     """
     found = [-1] * form.gains.shape[-1]

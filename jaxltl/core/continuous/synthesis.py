@@ -167,7 +167,7 @@ def _memory_table(task: TaskProduct) -> Integers:
     table = np.zeros(delta.shape, np.int32)
     for q, letter in np.ndindex(*delta.shape):
         to = int(delta[q, letter])
-        # Decided states have one memory state, whatever priority led there.
+        # Decided states have one memory state, for all priorities that lead there.
         same = next((i for (state, _), i in number.items() if state == to), 0)
         table[q, letter] = number.get((to, int(priority[q, letter])), same)
     return table

@@ -145,7 +145,7 @@ def _memory(
 
     def visit(q: int, letter: int) -> int:
         to = int(delta[q, letter])
-        # A decided state keeps one priority: what it read before does not matter.
+        # A decided state keeps one priority: the letters read before do not matter.
         decided = _decided(automaton, to)
         pair = (to, int(priority[q, letter]) if decided < 0 else 1 - decided)
         return number.setdefault(pair, len(number))

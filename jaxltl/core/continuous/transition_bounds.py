@@ -106,7 +106,7 @@ class TransitionBounds:
         """Boxes of cells ``int[R, n]`` that have positive lower probabilities; start and stop."""
         start, stop = [], []
         for factors, index in zip(self.factors, self.ids, strict=True):
-            # The product of the coordinates' probabilities must exceed what is lost.
+            # The product of the coordinates' probabilities must exceed the lost probability.
             positive: Booleans = factors.low > 1.01 * self.lost ** (1 / len(self.order))
             first = factors.start + np.argmax(positive, -1)
             last = factors.start + positive.shape[-1] - np.argmax(positive[:, ::-1], -1)

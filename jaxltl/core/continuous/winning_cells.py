@@ -117,7 +117,7 @@ class _Solver:
         return found
 
     def all_inside(self, states: Booleans, q: int) -> Booleans:
-        """Rows whose successors are all in a set."""
+        """Rows with all successors in a set."""
         return contained(self.task, self.rows, states, q)
 
     def some_inside(self, states: Booleans, q: int) -> Booleans:
@@ -128,7 +128,7 @@ class _Solver:
 
 
 def contained(task: TaskProduct, rows: Successors, states: Booleans, memory: int) -> Booleans:
-    """Rows ``bool[R]`` whose possible successors, entered from a memory state, are all in a set."""
+    """Rows ``bool[R]`` with all possible successors, entered from a memory state, in a set."""
     table = cumulative(task.entered(states, memory).reshape(rows.shape))
     cells = volume(rows.start, rows.stop)
     inside = count_in(table, rows.start, rows.stop) == cells

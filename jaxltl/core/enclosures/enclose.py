@@ -38,7 +38,7 @@ def enclose(
       Function of two pytrees ``low`` and ``high`` with the structure of the argument, either of its
       shapes or with one leading axis more for a batch of boxes. NumPy arrays are answered by NumPy,
       without compilation; JAX arrays inside ``jit``, ``vmap`` and ``grad`` by JAX, differentiable in
-      both. Infinite where no bound is known, as for a quotient whose divisor may be 0.
+      both. Infinite where no bound is known, as for a quotient by a number that may be 0.
 
     Raises:
       ValueError: on the call, if a primitive has no enclosure (named with its source line), a loop's

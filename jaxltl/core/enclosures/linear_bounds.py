@@ -76,7 +76,7 @@ class Enclosed:
     intervals: Mapping[int, Interval]  # arrays [C, n]; [1, n] for known variables
     radius: Array  # float[C, J], of the box, with the entries of all inputs in order
     middle: Array
-    forms: Mapping[int, AffineForm]  # of outputs, if linear bounds were asked for
+    forms: Mapping[int, AffineForm]  # of outputs, if linear bounds are computed
 
     @np.errstate(all="ignore")
     def outputs(self, linear: bool) -> list[Interval]:

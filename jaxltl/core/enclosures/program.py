@@ -215,7 +215,7 @@ class _Builder:
         return exact or widens or name in _SELECTIONS or name in ("max", "min", "iota", "select_n")
 
     def _converts(self, equation: core.JaxprEqn, x: int) -> bool:
-        """Whether the conversion of a known array loses nothing."""
+        """True if the conversion of a known array loses nothing."""
         new, value = equation.params["new_dtype"], self.known[x]
         if not narrows(new, value.dtype):
             return True
@@ -371,7 +371,7 @@ def _needed(jaxpr: core.Jaxpr) -> list[core.JaxprEqn]:
 
 
 def narrows(new: DTypeLike, old: DTypeLike) -> bool:
-    """Whether a conversion to a dtype of floats loses digits."""
+    """True if a conversion to a dtype of floats loses digits."""
     new, old = jnp.dtype(new), jnp.dtype(old)
     if not jnp.issubdtype(new, jnp.floating):
         return False
@@ -460,7 +460,7 @@ def _letters(equation: core.JaxprEqn) -> tuple[str, str, str, str]:
 
 
 def _refusal(name: str) -> str:
-    """What an unsupported primitive needs."""
+    """Remedy for an unsupported primitive."""
     if name in ("while", "cond"):
         return (
             f"`{name}` depends on values that are not known. Use a loop of fixed length (lax.scan, or "

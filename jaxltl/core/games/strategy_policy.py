@@ -53,7 +53,7 @@ def strategy_policy(
       where that suffices.
 
     Raises:
-      ValueError: a player who wins from no initial state, or moves whose memory depends on more
+      ValueError: a player that wins from no initial state, or moves with a memory that depends on more
         than the states that are met.
 
     Example:

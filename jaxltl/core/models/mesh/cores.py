@@ -79,7 +79,7 @@ def _is_available() -> bool:
 
 @cache
 def _device() -> PyTree:
-    """The processor, as a device whose programs run in the calling thread; None without support."""
+    """The processor, as a device that runs programs in the calling thread; None without support."""
     try:
         from jaxlib.xla_client import make_cpu_client
 
@@ -209,7 +209,7 @@ def _undata(x: jax.Array, implementation: PyTree) -> jax.Array:
 
 
 def _bits(x: PyTree) -> PyTree:
-    """An array whose numbers of 64 bits are two of 32, along a last axis."""
+    """An array with numbers of 64 bits as two of 32, along a last axis."""
     if x.dtype.itemsize < 8:
         return x
     if isinstance(x, np.ndarray):
