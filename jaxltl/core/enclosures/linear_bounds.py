@@ -256,9 +256,11 @@ def _constant(x: Interval, dtype: np.dtype) -> AffineForm:
     """A form without slopes; of a Boolean variable, which has slope 0 everywhere, zeros."""
     xp = module_of(x.low)
     slope = xp.zeros((x.low.shape[0], 0, x.low.shape[-1]), dtype)
-    if x.low.dtype != dtype:
+    if not jnp.issubdtype(x.low.dtype, jnp.floating):
         zeros = xp.zeros(x.low.shape, dtype)
         return AffineForm(slope, zeros, zeros)
+    if x.low.dtype != dtype:  # parameters in single precision over boxes in double precision
+        x = outward(x.low.astype(dtype), x.high.astype(dtype))
     if x.low is x.high:
         return AffineForm(slope, x.low, x.low * 0)
     finite = xp.isfinite(x.low) & xp.isfinite(x.high)

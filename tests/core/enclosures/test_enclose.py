@@ -194,3 +194,11 @@ def test_operations_that_no_output_needs_are_left_out():
 
     low, high = enclose(function)(np.float32(0), np.float32(1))
     assert low <= 0 and 2 <= high < 2.001
+
+
+def test_single_precision_parameters_over_double_precision_boxes():
+    one = jnp.ones(2, jnp.float32)
+    low, high = np.array([-0.71, -0.01]), np.array([-0.69, 0.01])
+    for function in (lambda x: jnp.minimum(3 + x, one), lambda x: jnp.clip(3 + x, -one, one)):
+        least, most = enclose(function)(low, high)
+        assert (least <= 1).all() and (most >= 1).all() and (most - least < 1e-6).all()
