@@ -159,11 +159,17 @@ def bound_satisfaction(
       grid: the first cells.
       limits: when to stop.
       report: called with a line of progress.
+
+    An interrupt ends refinement; the bounds of the grid before are returned.
     """
     seconds: dict[str, float] = {}
     bounds = _first(dynamics, formula, grid)
     while True:
-        bounds = _improve(dynamics, control, bounds, limits, report, seconds)
+        try:
+            bounds = _improve(dynamics, control, bounds, limits, report, seconds)
+        except KeyboardInterrupt:  # bounds of the coarser grid hold on this one
+            report("interrupted: the bounds proven so far are kept")
+            return replace(bounds, seconds=seconds)
         lower, upper = (x[bounds.initial] for x in bounds.initial_bounds())
         report(
             f"{bounds.grid.num_cells:,} cells: initial states satisfy with probability at least "

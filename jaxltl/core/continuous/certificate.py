@@ -144,7 +144,8 @@ def certify_policy(
     the product with the formula's automaton; bounds elsewhere are reachability probabilities of these
     sets in an interval Markov chain whose probabilities are products of factors of each coordinate.
     Upper bounds are those of the negated formula. Cells are halved until the bounds of the initial
-    states are narrow.
+    states are narrow, or until an interrupt (``KeyboardInterrupt``), after which the bounds of the
+    grid before are returned with the status ``MAX_STEPS``.
 
     Args:
       dynamics: the world, of :func:`make_dynamics`.

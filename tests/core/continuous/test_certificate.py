@@ -169,3 +169,22 @@ def test_bad_input(change, message):
     given = {"policy": to_b, "formula": "F b", "cells": [4, 4]} | change
     with pytest.raises(ValueError, match=message):
         certify_policy(plane(), given.pop("policy"), given.pop("formula"), **given)
+
+
+def test_an_interrupt_keeps_the_bounds_of_the_grid_before():
+    lines = []
+
+    def interrupt(line):
+        lines.append(line)
+        if line.startswith("80 cells"):
+            raise KeyboardInterrupt
+
+    def policy(x):
+        return jnp.full(1, 0.2)
+
+    options = {"cells": [40], "tolerance": 0.0}
+    whole = certify_policy(scalar(), policy, "F goal", max_cells=40, **options)
+    found = certify_policy(scalar(), policy, "F goal", report=interrupt, **options)
+    assert found.status.name == "MAX_STEPS" and "interrupted" in lines[-1]
+    x = np.linspace(-1.9, 1.9, 50)[:, None]
+    np.testing.assert_array_equal(found.at(x), whole.at(x))
