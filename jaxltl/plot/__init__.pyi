@@ -1,4 +1,5 @@
 from .automata import automaton as automaton
+from .certificates import certificate as certificate
 from .curves import (
     bands as bands,
     curves as curves,
