@@ -460,9 +460,9 @@ def solve(
 
 
 @main.command()
-@click.argument("log", metavar="LOG", type=click.Path(path_type=Path))
-@click.argument("formula")
-@click.option("--confidence", required=True, type=float, help="In (0, 1), such as 0.95.")
+@click.argument("log", metavar="LOG|POLICY", type=click.Path(path_type=Path))
+@click.argument("formula", required=False)
+@click.option("--confidence", type=float, help="In (0, 1), such as 0.95; required for a log.")
 @click.option("--initial", multiple=True, metavar="STATE", help="Initial state.")
 @click.option("--terminal", multiple=True, metavar="STATE", help="State where episodes end.")
 @click.option("--labels", type=click.Path(path_type=Path), help="Table of states and labels.")
@@ -497,7 +497,7 @@ def solve(
 @plain_errors
 def certify(
     log: Path,
-    formula: str,
+    formula: str | None,
     policy: Path | None,
     curve: Path | None,
     as_json: bool,
@@ -505,10 +505,21 @@ def certify(
 ) -> None:
     """Learn a policy from logged transitions, with a guaranteed satisfaction probability.
 
-    LOG is a table with the columns state, action and next; see docs/data.md. The exit status is 1
-    if the solver's bounds did not converge, 2 for errors of usage.
+    LOG is a table with the columns state, action and next; see docs/data.md. POLICY is a policy.npz
+    that `jaxltl learn` wrote in a continuous world of make_dynamics, for which FORMULA, by default
+    that of its task, is proven; see docs/continuous-proofs.md. The exit status is 1 if the bounds did
+    not converge, 2 for errors of usage.
     """
-    _begin(f"certifying {formula!r} from {log}")
+    _begin(f"certifying {formula or 'the task'} from {log}")
+    if log.suffix == ".npz":
+        others = (policy, curve, *(x for name, x in options.items() if name != "method"))
+        if any(x not in (None, (), False) for x in others):
+            raise ValueError("a POLICY takes no options of logs; give a formula and --json alone.")
+        _certify_policy(log, formula, as_json)
+        return
+    if formula is None or options["confidence"] is None:
+        missing = "FORMULA" if formula is None else "--confidence, such as 0.95"
+        raise ValueError(f"a LOG needs {missing}.")
     from jaxltl.app import certify as app
 
     objective: Literal["max", "min"] = "min" if options.pop("smallest") else "max"
@@ -520,6 +531,20 @@ def certify(
     if app.certify_and_write(
         log, query, app.Source(graph=graph, **options), outputs, as_json, click.echo
     ):
+        raise SystemExit(1)
+
+
+def _certify_policy(policy: Path, formula: str | None, as_json: bool) -> None:
+    """Proves a saved policy in its continuous world."""
+    from jaxltl.app.proof import certify_policy_file
+    from jaxltl.app.reports.learn_environment import proof_sentence
+    from jaxltl.core.status import Status
+
+    result, status = certify_policy_file(policy, formula, _say)
+    click.echo(f"{result['formula']}\n{proof_sentence(result)}")
+    if as_json:
+        _print_json(result)
+    if status != Status.CONVERGED:
         raise SystemExit(1)
 
 

@@ -16,8 +16,14 @@ from typing import Any
 
 from jaxltl.core.validation import errors_in
 from jaxltl.app.files.task_environment import EnvironmentTask
-from jaxltl.core.environments.environment import Environment, make_environment
+from jaxltl.core.continuous.dynamics import Dynamics
+from jaxltl.core.environments.environment import (
+    Environment,
+    make_environment,
+    require_environment,
+)
 from jaxltl.core.environments.time_limit import with_time_limit
+from jaxltl.envs.continuous_worlds import BenchmarkWorld
 
 BUILT_IN = {
     "flat_world": "jaxltl.envs.flat_world:flat_world",
@@ -35,18 +41,23 @@ PACKAGES = {
 }
 
 
-def load_environment(task: EnvironmentTask, world: Environment | None = None) -> Environment:
+def load_environment(
+    task: EnvironmentTask, world: Environment | Dynamics | None = None
+) -> Environment:
     """The environment of a task file, with its labels and its horizon."""
-    table, folder = task.world, task.path.parent
-    if world is None:
-        with errors_in(f"{task.path}: [world] labels: "):
-            labels = None if table.labels is None else _function(table.labels, folder)
-        with errors_in(f"{task.path}: [world] environment: "):
-            world = _made(
-                table.environment, table.arguments, folder, labels, table.propositions or []
-            )
+    world, table = load_world(task) if world is None else world, task.world
     with errors_in(f"{task.path}: [world] "):
+        world = require_environment(world)
         return world if table.horizon is None else with_time_limit(world, table.horizon)
+
+
+def load_world(task: EnvironmentTask) -> Environment | Dynamics:
+    """The environment or the dynamics of a task file, with its labels."""
+    table, folder = task.world, task.path.parent
+    with errors_in(f"{task.path}: [world] labels: "):
+        labels = None if table.labels is None else _function(table.labels, folder)
+    with errors_in(f"{task.path}: [world] environment: "):
+        return _made(table.environment, table.arguments, folder, labels, table.propositions or [])
 
 
 def _made(
@@ -55,7 +66,7 @@ def _made(
     folder: Path,
     labels: Callable[..., Any] | None,
     propositions: list[str],
-) -> Environment:
+) -> Environment | Dynamics:
     root, _, rest = name.partition(":")
     if root in PACKAGES and rest:
         return _of_package(root, rest, arguments, labels, propositions)
@@ -66,10 +77,16 @@ def _made(
         raise ValueError(f"{name!r} does not take [world.arguments]: {problem}.") from None
     with _user_errors(name):
         found = function(**arguments)
+    if isinstance(found, BenchmarkWorld):
+        found = found.dynamics
+    if isinstance(found, Dynamics):
+        if labels is not None:
+            raise ValueError(f"{name!r} returns dynamics with labels; leave labels out.")
+        return found
     if not isinstance(found, Environment):
         raise ValueError(
             f"{name!r} returns a {type(found).__name__}, no Environment; let it return one of "
-            "make_environment, or of an adapter such as from_gymnax."
+            "make_environment, of an adapter such as from_gymnax, or dynamics of make_dynamics."
         )
     if labels is None:
         return found

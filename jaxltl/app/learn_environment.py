@@ -6,7 +6,7 @@ episodes, have no selection bias.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,7 +18,8 @@ from jaxltl.core.validation import errors_in
 from jaxltl.core.files import atomic_write
 from jaxltl.app.environment_learners import Method, make_method
 from jaxltl.app.reports.drawing import Picture, drawing
-from jaxltl.app.environment_source import load_environment
+from jaxltl.app.environment_source import load_environment, load_world
+from jaxltl.app.proof import entry as proof_entry, picture as proof_picture, prove
 from jaxltl.app.protocols import Training
 from jaxltl.app.reports import learn_environment as report  # noqa: F401 - part of the job
 from jaxltl.app.reports.explorer import Curves, curves
@@ -36,7 +37,9 @@ from jaxltl.app.job import (
 from jaxltl.core.types import Status
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.translate import to_automaton
-from jaxltl.core.environments.environment import Environment, Finite, require_environment
+from jaxltl.core.continuous.certificate import Certificate, ProofOptions
+from jaxltl.core.continuous.dynamics import Dynamics
+from jaxltl.core.environments.environment import Environment, Finite
 from jaxltl.core.environments.episodes import Agent, Episode, run_episode
 from jaxltl.core.environments.monitor import Verdict, verdicts
 from jaxltl.core.environments.task_environment import (
@@ -61,6 +64,8 @@ from jaxltl.core.models.protocols import PyTree
 DOUBLE = False  # environments are written for single precision
 _DRAWN = 4  # trajectories
 
+Report = Callable[[str], None]
+
 
 @dataclass(frozen=True)
 class Setup:
@@ -72,6 +77,13 @@ class Setup:
     method: Method  # the learner
     num_steps: int  # limit of an episode in the evaluation
     trivial: str | None  # remark on a formula that is always true
+    dynamics: Dynamics | None = None  # of a continuous world, in which the policy is proven
+
+    @property
+    def acts(self) -> str:
+        """Actions of the evaluated policy; in dynamics by default those of the proof."""
+        default = "drawn" if self.dynamics is None else "likeliest"
+        return self.task.evaluation.policy or default
 
 
 @dataclass
@@ -85,13 +97,21 @@ class Outcome:
     evaluations: list[Evaluation]  # of every seed, from fresh episodes
     episodes: list[Episode]  # some of the kept policy, for pictures
     seed: int  # the first seed
+    proof: Certificate | str | None = None  # or the reason for which there is none
     seconds: float = 0.0  # wall time
 
 
-def prepare(task: EnvironmentTask, seed: int, world: Environment | None = None) -> Setup:
+def prepare(task: EnvironmentTask, seed: int, world: Environment | Dynamics | None = None) -> Setup:
     """The environment with its task and the learner; ValueError for a task that does not fit."""
     del seed
-    world = load_environment(task, world)
+    loaded = load_world(task) if world is None else world
+    dynamics = loaded if isinstance(loaded, Dynamics) else None
+    if dynamics is None and task.proof.given():
+        raise ValueError(
+            f"{task.path}: [proof] is for worlds of make_dynamics, and [world] environment "
+            f"{task.world.environment!r} is a simulator: leave [proof] out."
+        )
+    world = load_environment(task, loaded)
     with errors_in(f"{task.path}: [task] formula: "):
         automaton = to_automaton(task.formula)
     with errors_in(f"{task.path}: [task] "):
@@ -115,7 +135,7 @@ def prepare(task: EnvironmentTask, seed: int, world: Environment | None = None) 
     num_steps = checked_steps(environment, steps)
     with errors_in(f"{task.path}: [{task.learner.method}] "):
         method = make_method(task, environment, num_steps)
-    return Setup(task, automaton, environment, method, num_steps, trivial)
+    return Setup(task, automaton, environment, method, num_steps, trivial, dynamics)
 
 
 def _reward(task: EnvironmentTask, automaton: Automaton) -> Record:
@@ -216,7 +236,20 @@ def learn(setup: Setup, training: Training) -> Outcome:
         )
         for i in range(_DRAWN)
     ]
-    return Outcome(setup, found.state, history, chosen, each, shown, seed)
+    proof = _proven(setup, jax.tree.map(lambda x: x[chosen], found.state), training.stage)
+    return Outcome(setup, found.state, history, chosen, each, shown, seed, proof)
+
+
+def _proven(setup: Setup, state: PyTree, say: Report) -> Certificate | str | None:
+    """The proof of the kept policy, without random actions; None in a simulator."""
+    if setup.dynamics is None:
+        return None
+    options: ProofOptions = {**setup.task.proof.given(), "report": say}  # type: ignore[typeddict-item]
+    agent = setup.method.agent(state, True)
+    try:
+        return prove(setup.dynamics, agent, setup.environment, setup.task.formula, options)
+    except ValueError as reason:  # such as an operation that has no enclosure
+        return str(reason)
 
 
 def _agent(setup: Setup, states: PyTree, i: int) -> Agent:
@@ -225,7 +258,7 @@ def _agent(setup: Setup, states: PyTree, i: int) -> Agent:
 
 
 def _acting(setup: Setup, state: PyTree) -> Agent:
-    return setup.method.agent(state, setup.task.evaluation.policy == "likeliest")
+    return setup.method.agent(state, setup.acts == "likeliest")
 
 
 def _evaluated(key: jax.Array, agent: Agent, setup: Setup, *, threshold: bool) -> Evaluation:
@@ -287,7 +320,7 @@ def summary(outcome: Outcome) -> Record:
             "trivial": setup.trivial,
             "policy": {
                 "made_of": setup.method.description,
-                "acts": task.evaluation.policy or "drawn",
+                "acts": setup.acts,
             },
             "evaluation": _as_numbers(kept),
             "training": {
@@ -304,6 +337,7 @@ def summary(outcome: Outcome) -> Record:
                 "evaluations": [_as_numbers(x) for x in outcome.evaluations],
             },
             "drawn": _pictured(outcome) is not None,
+            "proof": proof_entry(outcome.proof),
             **took(outcome.seconds),
         }
     )
@@ -355,7 +389,11 @@ def pictures(outcome: Outcome) -> list[Picture]:
         )
     ]
     drawn = _pictured(outcome)
-    return found if drawn is None else [drawn, *found]
+    found = found if drawn is None else [drawn, *found]
+    dynamics, proof = outcome.setup.dynamics, outcome.proof
+    if dynamics is None or not isinstance(proof, Certificate):
+        return found
+    return [proof_picture(proof, dynamics, outcome.episodes), *found]
 
 
 def live(outcome: Outcome) -> list[Curves]:
@@ -428,7 +466,7 @@ def _parts(method: Method, state: PyTree) -> list[tuple[str, PyTree]]:
 def load_agent(
     policy_file: str | Path,
     *,
-    environment: Environment | None = None,
+    environment: Environment | Dynamics | None = None,
     task_file: str | Path | None = None,
 ) -> tuple[Environment, Agent]:
     """Agent that ``jaxltl learn`` wrote for an environment, and the environment with the formula.
@@ -445,10 +483,19 @@ def load_agent(
 
     Example: ``environment, agent = load_agent("out/policy.npz")``.
     """
-    policy_file = Path(policy_file)
+    setup, agent = load_policy(Path(policy_file), environment, task_file)
+    return setup.environment, agent
+
+
+def load_policy(
+    policy_file: Path,
+    environment: Environment | Dynamics | None = None,
+    task_file: str | Path | None = None,
+) -> tuple[Setup, Agent]:
+    """The task of a policy file, and its agent; see :func:`load_agent`."""
     arrays = read_policy_file(policy_file)
     task = read_task(task_file) if task_file else _kept_task(policy_file, arrays)
-    setup = prepare(task, 0, None if environment is None else require_environment(environment))
+    setup = prepare(task, 0, environment)
     method = setup.method
     state = jax.eval_shape(
         lambda key: method.algorithm.init(key, method.problem, method.hparams), jax.random.key(0)
@@ -465,7 +512,7 @@ def load_agent(
     kept = {name: getattr(state, name) for name in method.kept}
     leaves = [jnp.asarray(arrays[name], x.dtype) for name, x in _parts(method, state)]
     state = replace(state, **jax.tree.unflatten(jax.tree.structure(kept), leaves))
-    return setup.environment, _acting(setup, state)
+    return setup, _acting(setup, state)
 
 
 def _kept_task(policy_file: Path, arrays: Mapping[str, np.ndarray]) -> EnvironmentTask:

@@ -55,7 +55,7 @@ Score = Literal[
 class WorldTable(Table):
     """``[world]``: the environment."""
 
-    environment: Key[Text, "Environment, or function that makes one.", '"brax:ant"']
+    environment: Key[Text, "Environment, or function that makes one or dynamics.", '"brax:ant"']
     arguments: Key[Record, "Arguments of the function.", "{ horizon = 120 }"] = attrs.field(
         factory=dict
     )
@@ -216,6 +216,18 @@ class EvaluationTable(Table):
 
 
 @table
+class ProofTable(Table):
+    """``[proof]``: bounds of the learned policy's satisfaction probability, in worlds of dynamics."""
+
+    cells: Key[
+        Widths | None, "Cells along each axis at first; default about 20,000 in all.", "[200, 200]"
+    ] = None
+    tolerance: Key[Confidence | None, "Width of the bounds; default 0.001.", "0.01"] = None
+    threshold: Key[Confidence | None, "Stop where this bound is decided.", "0.999"] = None
+    max_cells: Key[Count | None, "Cells of the finest grid; default 1,048,576."] = None
+
+
+@table
 class EnvironmentFile(File):
     """Tables of a task file of a simulated world."""
 
@@ -227,6 +239,7 @@ class EnvironmentFile(File):
     cce: Key[CceTable | None, "Hyperparameters of cce."] = None
     cpo: Key[CpoTable | None, "Hyperparameters of cpo."] = None
     evaluation: Key[EvaluationTable, "Episodes of the evaluation."] = EvaluationTable()
+    proof: Key[ProofTable, "Proof of the learned policy."] = ProofTable()
 
 
 @dataclass(frozen=True)
@@ -240,6 +253,7 @@ class EnvironmentTask:
     learner: LearnerTable
     settings: PpoTable | CceTable | CpoTable  # the table of the method's name
     evaluation: EvaluationTable
+    proof: ProofTable
     given: Record  # the keys of `settings` that the file has
     digest: str  # SHA-256 of the file and of every file that it names
     text: str  # of the file when it was read
@@ -280,6 +294,7 @@ def read_task(path: str | Path, raw: bytes | None = None) -> EnvironmentTask:
         learner=file.learner,
         settings=tables[method] or _TABLES[method](),
         evaluation=file.evaluation,
+        proof=file.proof,
         given=data.get(method, {}),
         digest=digest,
         text=found.decode(),

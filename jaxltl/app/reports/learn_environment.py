@@ -31,6 +31,7 @@ def page(
         remarks=remarks(result),
         tiles=_tiles(result),
         evaluation=_evaluation(result),
+        proof=proof_sentence(result["proof"]) if result.get("proof") else "",
         estimates=_estimates(result),
         seed_header=("seed", *_PROBABILITIES, *visits),
         seed_rows=_seeds(result),
@@ -44,6 +45,8 @@ def table(result: Result) -> str:
         f"  {name:18} {value:>10}  {interval:24} {method}"
         for name, value, interval, method in _estimates(result)
     ]
+    if result.get("proof"):
+        lines += ["", proof_sentence(result["proof"])]
     seeds = result["seeds"]
     if seeds["number"] > 1:
         each = ", ".join(probability(x["success"]["mean"]) for x in seeds["evaluations"])
@@ -53,6 +56,20 @@ def table(result: Result) -> str:
             "kept, chosen by other episodes",
         ]
     return "\n".join([*lines, *remark_lines(remarks(result))])
+
+
+def proof_sentence(found: Result) -> str:
+    """The certified bounds of a proof, in two lines, or the reason for which there is none."""
+    if "reason" in found:
+        return f"no proof: {found['reason']}"
+    shares = ", ".join(f"{count:,} {text}" for text, count in found["how"].items() if count)
+    stages = ", ".join(f"{name} {x:.2g} s" for name, x in found["seconds"].items())
+    return (
+        f"proven: probability at least {found['lower']:.7g} from every initial state; the least upper "
+        f"bound is {found['upper']:.7g} ({found['status']}, deterministic policy)\n"
+        f"  {found['initial_cells']:,} of {found['cells']:,} cells are initial: "
+        f"{shares or 'no lower bound'}; {stages}"
+    )
 
 
 def _is_finite(result: Result) -> bool:
@@ -116,6 +133,10 @@ def _tiles(result: Result) -> list[tuple[str, str]]:
     if not _is_finite(result):
         entry = found["visits"]
         tiles.append((number(entry["mean"]), f"accepting visits, in {_interval('visits', entry)}"))
+    proof = result.get("proof") or {}
+    if "lower" in proof:
+        bounds = f"[{proof['lower']:.6g}, {proof['upper']:.6g}]"
+        tiles.insert(0, (bounds, "certified bounds of the worst initial state"))
     length = found["length"]
     text = (
         f"steps until the formula is decided or the episode ends, in {_interval('length', length)}"

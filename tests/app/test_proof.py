@@ -1,0 +1,47 @@
+"""`jaxltl learn` and `jaxltl certify` in continuous worlds."""
+
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from jaxltl.app import learn_environment as job
+from jaxltl.app.files.task_environment import read_task
+from jaxltl.cli import main
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "shuttle.toml"
+
+
+def run(*arguments):
+    return CliRunner().invoke(main, [str(a) for a in arguments])
+
+
+@pytest.mark.slow
+def test_a_task_file_learns_and_proves_and_certify_proves_the_saved_policy(tmp_path):
+    out = tmp_path / "out"
+    told = run("learn", EXAMPLE, "--out", out)
+    assert told.exit_code == 0, told.output
+    proof = json.loads((out / "result.json").read_text())["proof"]
+    assert proof["status"] == "CONVERGED" and proof["lower"] >= 0.999
+    assert "proven: probability at least" in told.stdout and "cells: images" in told.stderr
+    assert (out / "certificate.svg").exists()
+    assert "Certified lower bounds" in (out / "report.html").read_text()
+    again = run("certify", out / "policy.npz", "G !rock", "--json")
+    assert again.exit_code == 0, again.output
+    safety = json.loads(again.stdout.splitlines()[-1])
+    assert safety["formula"] == "G !rock" and 0 <= safety["lower"] <= safety["upper"] <= 1
+    refused = run("certify", out / "policy.npz", "--confidence", "0.9")
+    assert refused.exit_code == 2 and "takes no options of logs" in refused.stderr
+
+
+def test_the_policy_of_a_continuous_world_acts_without_randomness_by_default():
+    setup = job.prepare(read_task(EXAMPLE), 0)
+    assert setup.dynamics is not None and setup.acts == "likeliest"
+
+
+def test_a_proof_needs_dynamics(tmp_path):
+    text = EXAMPLE.with_name("flat_world.toml").read_text() + "\n[proof]\nthreshold = 0.9\n"
+    (tmp_path / "task.toml").write_text(text)
+    with pytest.raises(ValueError, match=r"\[proof\] is for worlds of make_dynamics"):
+        job.prepare(read_task(tmp_path / "task.toml"), 0)
