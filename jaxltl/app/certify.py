@@ -7,13 +7,13 @@ import json
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from decimal import ROUND_CEILING, ROUND_FLOOR, Context
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from jaxltl.core import validation
+from jaxltl.core.pretty_print import rounded_outward
 from jaxltl.core.statistics.graph_assumption import Graph, LeastProbability
 from jaxltl.core.validation import Range
 from jaxltl.core.models.construct.counts import TransitionCounts, model_from_counts, align_counts
@@ -28,7 +28,6 @@ from jaxltl.core.values.evaluation.data_guarantee import (
 from jaxltl.app.wording import Record
 
 SHOWN = 5  # choices for which more samples are recommended
-DIGITS = 5  # of printed bounds, which solvers compute to 1e-6
 POINTS = 13  # of a curve
 _HINT = (
     "each choice may lead to each of them; --least-probability P or --graph seen assume more, and "
@@ -170,9 +169,9 @@ def text(evidence: Evidence, query: Query, found: DataGuarantee, seconds: float)
     """Guarantee from a log, as text."""
     side, other = (">=", "more") if query.objective == "max" else ("<=", "less")
     lines = [
-        f"P {side} {_outward(found.bound, side == '<=')} with confidence {found.confidence:g}",
+        f"P {side} {rounded_outward(found.bound, side == '<=')} with confidence {found.confidence:g}",
         f"  of {query.formula!r}, under the policy found; no policy has {other} than "
-        f"{_outward(found.optimistic, side == '>=')}",
+        f"{rounded_outward(found.optimistic, side == '>=')}",
         f"  {int(evidence.counts.sum())} transitions of {evidence.model.num_rows} choices in "
         f"{evidence.model.num_states} states, {found.sets.num_claims} claims of {query.method}",
     ]
@@ -188,12 +187,6 @@ def text(evidence: Evidence, query: Query, found: DataGuarantee, seconds: float)
             f"({int(found.sets.num_samples[row])} so far) help most: up to {found.gain[row]:.3g}"
         )
     return "\n".join([*lines, f"  {seconds:.3f} s"])
-
-
-def _outward(bound: float, up: bool) -> str:
-    """A bound, rounded outward."""
-    context = Context(prec=DIGITS, rounding=ROUND_CEILING if up else ROUND_FLOOR)
-    return f"{float(context.create_decimal(float(bound))):.{DIGITS}g}"
 
 
 def most_helpful(found: DataGuarantee) -> list[int]:

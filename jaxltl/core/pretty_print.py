@@ -13,6 +13,7 @@ import functools
 import importlib
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from decimal import ROUND_CEILING, ROUND_FLOOR, Context
 from typing import Any, TypeVar, overload
 
 import numpy as np
@@ -256,6 +257,16 @@ def bounds_text(lower: Any, upper: Any) -> str:
     text = f"bounds at most {most:.2g} apart" if most > 0 else "bounds meet"
     none = known.size - int(np.count_nonzero(known))
     return f"{text}, none for {none:,} of {known.size:,}" if none else text
+
+
+def rounded_outward(bound: float, up: bool, digits: int = 5) -> str:
+    """A bound as text with some significant digits, rounded up or down.
+
+    >>> rounded_outward(0.9999999, False), rounded_outward(0.9999999, True)
+    ('0.99999', '1')
+    """
+    context = Context(prec=digits, rounding=ROUND_CEILING if up else ROUND_FLOOR)
+    return f"{float(context.create_decimal(float(bound))):.{digits}g}"
 
 
 def enum_counts(value: Any, codes: Iterable[enum.IntEnum]) -> str:

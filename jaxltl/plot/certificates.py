@@ -51,6 +51,9 @@ def certificate(
       runs: trajectories ``float[T, n]``, such as those of ``run_episode``, drawn as lines from a
         circle to a square.
 
+    Returns:
+      Matplotlib figure of the map and its scale.
+
     Raises:
       ValueError: axes that are no two coordinates of the state.
 
@@ -117,11 +120,15 @@ def _outline(
     """Outlines of the boxes of a region, projected on two coordinates and cut at a window."""
     for low, high in zip(region.low[:, axes], region.high[:, axes], strict=True):
         low, high = np.clip(low, *window), np.clip(high, *window)
-        style = {"lw": 1.6, "ls": "-" if name else "--", "fill": False, "ec": color}
-        panel.add_patch(Rectangle(tuple(low), *(high - low), clip_on=False, **style))
+        width, height = (float(x) for x in high - low)
+        outline = Rectangle(
+            (float(low[0]), float(low[1])), width, height,
+            lw=1.6, ls="-" if name else "--", fill=False, ec=color, clip_on=False,
+        )  # fmt: skip
+        panel.add_patch(outline)
         halo = [withStroke(linewidth=2.0, foreground=PAPER)]
         middle = (low + high) / 2
         panel.text(
-            *middle, name, color=color, fontsize=8, ha="center", va="center",
+            middle[0], middle[1], name, color=color, fontsize=8, ha="center", va="center",
             path_effects=halo, parse_math=False, zorder=6,
         )  # fmt: skip

@@ -28,7 +28,7 @@ from jaxltl.core.continuous.interval_iteration import IterationLimits
 from jaxltl.core.continuous.learned_policy import Policy, StatePolicy, learned_policy
 from jaxltl.core.environments.environment import traced
 from jaxltl.core.logic.ltl import Formula
-from jaxltl.core.pretty_print import brief
+from jaxltl.core.pretty_print import brief, rounded_outward
 from jaxltl.core.status import Status
 
 HOW = {SURE: "surely", ALMOST_SURE: "almost surely", ITERATED: "by value iteration"}
@@ -37,9 +37,9 @@ _BYTES = 400  # of memory for a cell and memory state, about
 
 
 def _facts(certificate: Certificate) -> Iterator[str]:
-    lower, upper = certificate.initial_bounds
+    lower, upper = certificate.bounds_text()
     yield f"{certificate.formula}"
-    yield f"initial states: {lower:.7g} to {upper:.7g}"
+    yield f"initial states: {lower} to {upper}"
     yield f"{certificate.grid.num_cells:,} cells"
     yield certificate.status.name
 
@@ -87,6 +87,11 @@ class Certificate:
         """
         return float(self.lower[self.initial].min()), float(self.upper[self.initial].min())
 
+    def bounds_text(self) -> tuple[str, str]:
+        """:attr:`initial_bounds` with seven digits, rounded outward."""
+        lower, upper = self.initial_bounds
+        return rounded_outward(lower, False, 7), rounded_outward(upper, True, 7)
+
     def at(self, state: ArrayLike) -> tuple[Floats, Floats]:
         """Lower and upper bounds for initial states ``float[..., n]``; 0 and 1 outside the domain."""
         cell = self.grid.locate(np.asarray(state, np.float64))
@@ -95,15 +100,15 @@ class Certificate:
 
     def summary(self) -> str:
         """The result in one paragraph: bounds, how they were proven, and the time by stage."""
-        lower, upper = self.initial_bounds
+        lower, upper = self.bounds_text()
         count = int(self.initial.sum())
         shares = [
             f"{int((self.how[self.initial] == key).sum())} {text}" for key, text in HOW.items()
         ]
         stages = ", ".join(f"{name} {x:.2g} s" for name, x in self.seconds.items())
         return (
-            f"{self.formula}: satisfied with probability at least {lower:.7g} from every initial state "
-            f"(least upper bound {upper:.7g}). Of {count:,} initial cells: {', '.join(shares)}. "
+            f"{self.formula}: satisfied with probability at least {lower} from every initial state "
+            f"(least upper bound {upper}). Of {count:,} initial cells: {', '.join(shares)}. "
             f"Time: {stages}."
         )
 
