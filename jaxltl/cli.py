@@ -535,16 +535,15 @@ def certify(
 
 
 def _certify_policy(policy: Path, formula: str | None, as_json: bool) -> None:
-    """Proves a saved policy in its continuous world."""
-    from jaxltl.app.proof import certify_policy_file
-    from jaxltl.app.reports.learn_environment import proof_sentence
-    from jaxltl.core.status import Status
+    """Proves a saved policy in its dynamics."""
+    from jaxltl.app.learn_environment import certify_policy_file
+    from jaxltl.app.reports import proof
 
-    result, status = certify_policy_file(policy, formula, _say)
-    click.echo(f"{result['formula']}\n{proof_sentence(result)}")
+    result = proof.entry(certify_policy_file(policy, formula, _say))
+    click.echo(f"{result['formula']}\n{proof.sentence(result)}")
     if as_json:
         _print_json(result)
-    if status != Status.CONVERGED:
+    if result["status"] != "CONVERGED":
         raise SystemExit(1)
 
 

@@ -49,7 +49,7 @@ COMPLETIONS = {
     task_todirl.WorldTable: ("", "legend"),
     task_todirl.DemonstrationsTable: ("files", "synthetic", "synthetic discount"),
     task_todirl.TestTable: ("maps", "generate"),
-    task_environment.WorldTable: ("", "labels propositions"),
+    task_environment.WorldTable: ("", "environment", "environment labels propositions"),
     task_environment.CceTable: ("", "cost limit"),
     game.GameTable: ("map", "model"),
     game.TaskTable: ("", "formula", "guarantees"),

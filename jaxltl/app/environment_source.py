@@ -54,10 +54,37 @@ def load_environment(
 def load_world(task: EnvironmentTask) -> Environment | Dynamics:
     """The environment or the dynamics of a task file, with its labels."""
     table, folder = task.world, task.path.parent
+    if table.dynamics is not None:
+        with errors_in(f"{task.path}: [world] dynamics: "):
+            return _made_dynamics(table.dynamics, table.arguments, folder)
     with errors_in(f"{task.path}: [world] labels: "):
         labels = None if table.labels is None else _function(table.labels, folder)
     with errors_in(f"{task.path}: [world] environment: "):
-        return _made(table.environment, table.arguments, folder, labels, table.propositions or [])
+        names = table.propositions or []
+        return _made(table.environment or "", table.arguments, folder, labels, names)
+
+
+def _made_dynamics(name: str, arguments: Mapping[str, object], folder: Path) -> Dynamics:
+    """The dynamics that a user's function returns."""
+    found = _called(name, _function(name, folder), arguments)
+    if isinstance(found, BenchmarkWorld):
+        return found.dynamics
+    if isinstance(found, Dynamics):
+        return found
+    raise ValueError(
+        f"{name!r} returns a {type(found).__name__}, no dynamics; let it return those of "
+        "make_dynamics, or write environment = for one that is only simulated."
+    )
+
+
+def _called(name: str, function: Callable[..., object], arguments: Mapping[str, object]) -> object:
+    """The result of a user's function."""
+    try:
+        inspect.signature(function).bind(**arguments)
+    except TypeError as problem:
+        raise ValueError(f"{name!r} does not take [world.arguments]: {problem}.") from None
+    with _user_errors(name):
+        return function(**arguments)
 
 
 def _made(
@@ -66,27 +93,17 @@ def _made(
     folder: Path,
     labels: Callable[..., Any] | None,
     propositions: list[str],
-) -> Environment | Dynamics:
+) -> Environment:
     root, _, rest = name.partition(":")
     if root in PACKAGES and rest:
         return _of_package(root, rest, arguments, labels, propositions)
-    function = _function(BUILT_IN.get(name, name), folder)
-    try:
-        inspect.signature(function).bind(**arguments)
-    except TypeError as problem:
-        raise ValueError(f"{name!r} does not take [world.arguments]: {problem}.") from None
-    with _user_errors(name):
-        found = function(**arguments)
-    if isinstance(found, BenchmarkWorld):
-        found = found.dynamics
+    found = _called(name, _function(BUILT_IN.get(name, name), folder), arguments)
     if isinstance(found, Dynamics):
-        if labels is not None:
-            raise ValueError(f"{name!r} returns dynamics with labels; leave labels out.")
-        return found
+        raise ValueError(f"{name!r} returns dynamics; write dynamics = {name!r} for them.")
     if not isinstance(found, Environment):
         raise ValueError(
             f"{name!r} returns a {type(found).__name__}, no Environment; let it return one of "
-            "make_environment, of an adapter such as from_gymnax, or dynamics of make_dynamics."
+            "make_environment, or of an adapter such as from_gymnax."
         )
     if labels is None:
         return found

@@ -19,9 +19,8 @@ from jaxltl.core.files import atomic_write
 from jaxltl.app.environment_learners import Method, make_method
 from jaxltl.app.reports.drawing import Picture, drawing
 from jaxltl.app.environment_source import load_environment, load_world
-from jaxltl.app.proof import entry as proof_entry, picture as proof_picture, prove
 from jaxltl.app.protocols import Training
-from jaxltl.app.reports import learn_environment as report  # noqa: F401 - part of the job
+from jaxltl.app.reports import learn_environment as report, proof as proofs  # noqa: F401 - part of the job
 from jaxltl.app.reports.explorer import Curves, curves
 from jaxltl.app.files.task_environment import EnvironmentTask, read_task as read_task
 from jaxltl.app.guarantee import check_formula
@@ -37,8 +36,9 @@ from jaxltl.app.job import (
 from jaxltl.core.types import Status
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.translate import to_automaton
-from jaxltl.core.continuous.certificate import Certificate, ProofOptions
+from jaxltl.core.continuous.certificate import Certificate, ProofOptions, certify_policy
 from jaxltl.core.continuous.dynamics import Dynamics
+from jaxltl.core.continuous.learned_policy import state_policy
 from jaxltl.core.environments.environment import Environment, Finite
 from jaxltl.core.environments.episodes import Agent, Episode, run_episode
 from jaxltl.core.environments.monitor import Verdict, verdicts
@@ -106,11 +106,6 @@ def prepare(task: EnvironmentTask, seed: int, world: Environment | Dynamics | No
     del seed
     loaded = load_world(task) if world is None else world
     dynamics = loaded if isinstance(loaded, Dynamics) else None
-    if dynamics is None and task.proof.given():
-        raise ValueError(
-            f"{task.path}: [proof] is for worlds of make_dynamics, and [world] environment "
-            f"{task.world.environment!r} is a simulator: leave [proof] out."
-        )
     world = load_environment(task, loaded)
     with errors_in(f"{task.path}: [task] formula: "):
         automaton = to_automaton(task.formula)
@@ -118,7 +113,7 @@ def prepare(task: EnvironmentTask, seed: int, world: Environment | Dynamics | No
         trivial = check_formula(automaton)
     if automaton.propositions and not world.propositions:
         raise ValueError(
-            f"{task.path}: [world] environment {task.world.environment!r} has no labels, and "
+            f"{task.path}: [world] environment {task.world.function!r} has no labels, and "
             f"the formula mentions {', '.join(automaton.propositions)}: give labels = "
             '"file.py:function" and propositions = [...].'
         )
@@ -171,7 +166,7 @@ def describe(setup: Setup) -> str:
     )
     steps = task.learner.steps
     return (
-        f"{task.world.environment}: {does}, {many(seen, 'number')} observed, "
+        f"{task.world.function}: {does}, {many(seen, 'number')} observed, "
         f"{many(len(made.propositions), 'label')}; {many(len(setup.automaton.delta), 'automaton state')} "
         f"({setup.automaton.acceptance}); {task.learner.method} with "
         f"{setup.method.description}: {many(steps, 'step')} of at most "
@@ -244,12 +239,18 @@ def _proven(setup: Setup, state: PyTree, say: Report) -> Certificate | str | Non
     """The proof of the kept policy, without random actions; None in a simulator."""
     if setup.dynamics is None:
         return None
-    options: ProofOptions = {**setup.task.proof.given(), "report": say}  # type: ignore[typeddict-item]
-    agent = setup.method.agent(state, True)
     try:
-        return prove(setup.dynamics, agent, setup.environment, setup.task.formula, options)
+        return prove(setup, setup.method.agent(state, True), setup.task.formula, say)
     except ValueError as reason:  # such as an operation that has no enclosure
         return str(reason)
+
+
+def prove(setup: Setup, agent: Agent, formula: str, say: Report) -> Certificate:
+    """The certificate of an agent that was learned in dynamics."""
+    assert setup.dynamics is not None
+    options: ProofOptions = {**setup.task.proof.given(), "report": say}  # type: ignore[typeddict-item]
+    policy = state_policy(agent, setup.environment)
+    return certify_policy(setup.dynamics, policy, formula, **options)
 
 
 def _agent(setup: Setup, states: PyTree, i: int) -> Agent:
@@ -307,7 +308,7 @@ def summary(outcome: Outcome) -> Record:
         {
             **about(task),
             "environment": {
-                "name": task.world.environment,
+                "name": task.world.function,
                 "arguments": task.world.arguments,
                 "propositions": list(made.propositions),
                 "horizon": made.horizon,
@@ -337,7 +338,7 @@ def summary(outcome: Outcome) -> Record:
                 "evaluations": [_as_numbers(x) for x in outcome.evaluations],
             },
             "drawn": _pictured(outcome) is not None,
-            "proof": proof_entry(outcome.proof),
+            "proof": None if outcome.proof is None else proofs.entry(outcome.proof),
             **took(outcome.seconds),
         }
     )
@@ -393,7 +394,7 @@ def pictures(outcome: Outcome) -> list[Picture]:
     dynamics, proof = outcome.setup.dynamics, outcome.proof
     if dynamics is None or not isinstance(proof, Certificate):
         return found
-    return [proof_picture(proof, dynamics, outcome.episodes), *found]
+    return [proofs.picture(proof, dynamics, outcome.episodes), *found]
 
 
 def live(outcome: Outcome) -> list[Curves]:
@@ -531,3 +532,14 @@ def _kept_task(policy_file: Path, arrays: Mapping[str, np.ndarray]) -> Environme
         if all((folder / name).is_file() for name in named)
     ]
     return read_task((there or [path.parent])[0] / path.name, raw)
+
+
+def certify_policy_file(policy: Path, formula: str | None, say: Report) -> Certificate:
+    """Proves a policy that ``jaxltl learn`` wrote in dynamics; by default for its task's formula."""
+    setup, agent = load_policy(policy)
+    if setup.dynamics is None:
+        raise ValueError(
+            f"{policy}: its world {setup.task.world.function!r} is a simulator; proofs need dynamics of "
+            "make_dynamics."
+        )
+    return prove(setup, agent, formula or setup.task.formula, say)

@@ -43,5 +43,41 @@ def test_the_policy_of_a_continuous_world_acts_without_randomness_by_default():
 def test_a_proof_needs_dynamics(tmp_path):
     text = EXAMPLE.with_name("flat_world.toml").read_text() + "\n[proof]\nthreshold = 0.9\n"
     (tmp_path / "task.toml").write_text(text)
-    with pytest.raises(ValueError, match=r"\[proof\] is for worlds of make_dynamics"):
+    with pytest.raises(ValueError, match=r"\[proof\] is for dynamics"):
+        read_task(tmp_path / "task.toml")
+
+
+WORLD = 'dynamics = "shuttle.py:make"'
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ((WORLD, 'environment = "shuttle.py:make"\n'), r"\[proof\] is for dynamics"),
+        ((WORLD, f'{WORLD}\nenvironment = "flat_world"'), "must have either environment ="),
+        ((WORLD, f'{WORLD}\nlabels = "a.py:b"'), "labels belongs to an environment"),
+        ((WORLD, 'dynamics = "shuttle.py:box"'), "does not take"),
+        (
+            (
+                f"{WORLD}\nhorizon = 40\n\n[world.arguments]\ngust = 0.02",
+                'dynamics = "shuttle.py:triangular"',
+            ),
+            "no dynamics; let it return",
+        ),
+        (("gust = 0.02", "wind = 1"), "unexpected keyword argument 'wind'"),
+        (("[80, 80]", "[]"), "it must be a list of numbers of cells"),
+    ],
+)
+def test_refused_task_files(tmp_path, change, message):
+    (tmp_path / "shuttle.py").write_text(EXAMPLE.with_suffix(".py").read_text())
+    (tmp_path / "task.toml").write_text(EXAMPLE.read_text().replace(*change))
+    with pytest.raises(ValueError, match=message):
+        job.prepare(read_task(tmp_path / "task.toml"), 0)
+
+
+def test_an_environment_that_is_dynamics_is_refused(tmp_path):
+    text = EXAMPLE.read_text().replace("dynamics =", "environment =").partition("[proof]")[0]
+    (tmp_path / "shuttle.py").write_text(EXAMPLE.with_suffix(".py").read_text())
+    (tmp_path / "task.toml").write_text(text)
+    with pytest.raises(ValueError, match="returns dynamics; write dynamics = "):
         job.prepare(read_task(tmp_path / "task.toml"), 0)

@@ -204,5 +204,5 @@ def is_environment_task(path: str | Path) -> bool:
     """True if a task file is of a simulated world, by its world or by its method."""
     data = read_toml(Path(path), TaskFile.KIND)[0]
     world, learner = (data.get(name) for name in ("world", "learner"))
-    simulated = isinstance(world, dict) and "environment" in world
+    simulated = isinstance(world, dict) and not world.keys().isdisjoint(("environment", "dynamics"))
     return simulated or (isinstance(learner, dict) and learner.get("method") in ENVIRONMENT_METHODS)

@@ -36,6 +36,7 @@ Schedule = Annotated[
     NonNegative | tuple[NonNegative, NonNegative],
     Meta("a number of at least 0, or [first, last], linear over all steps", example="[0.5, 0.1]"),
 ]
+Cells = Annotated[list[Count], Meta("a list of numbers of cells, such as [200, 200]", bool)]
 Labels = Annotated[list[str], Meta('a list of names, such as ["goal"]')]
 Score = Literal[
     "reward",
@@ -55,7 +56,14 @@ Score = Literal[
 class WorldTable(Table):
     """``[world]``: the environment."""
 
-    environment: Key[Text, "Environment, or function that makes one or dynamics.", '"brax:ant"']
+    environment: Key[
+        Text | None, "Environment, or function that makes one; default the dynamics.", '"brax:ant"'
+    ] = None
+    dynamics: Key[
+        Text | None,
+        "Function that makes dynamics, in which the policy is proven; default the environment.",
+        '"shuttle.py:make"',
+    ] = None
     arguments: Key[Record, "Arguments of the function.", "{ horizon = 120 }"] = attrs.field(
         factory=dict
     )
@@ -65,7 +73,19 @@ class WorldTable(Table):
     propositions: Key[Labels | None, "Names of the labels; default the environment's."] = None
     horizon: Key[Count | None, "Longest episode in steps; default the environment's."] = None
 
+    @property
+    def function(self) -> str:
+        """The environment, or the function of dynamics."""
+        return self.environment or self.dynamics or ""
+
     def __attrs_post_init__(self) -> None:
+        self.require_one(
+            ("environment", "dynamics"),
+            'environment = "NAME", or dynamics = "file.py:function" of a function that returns '
+            "dynamics of make_dynamics",
+        )
+        if self.dynamics is not None:
+            self.refuse(("labels", "propositions"), "an environment; dynamics have labels")
         if (self.labels is None) != (self.propositions is None):
             raise ValueError(
                 "labels and propositions belong together: a function and the names of what it "
@@ -74,7 +94,7 @@ class WorldTable(Table):
 
     def named_files(self) -> list[str]:
         """The Python files that the table names, each once."""
-        named = [name.rpartition(":")[0] for name in (self.environment, self.labels) if name]
+        named = [name.rpartition(":")[0] for name in (self.function, self.labels) if name]
         return [name for name in dict.fromkeys(named) if name.endswith(".py")]
 
 
@@ -220,11 +240,13 @@ class ProofTable(Table):
     """``[proof]``: bounds of the learned policy's satisfaction probability, in worlds of dynamics."""
 
     cells: Key[
-        Widths | None, "Cells along each axis at first; default about 20,000 in all.", "[200, 200]"
+        Cells | None, "Cells along each axis at first; default about 20,000 in all.", "[200, 200]"
     ] = None
     tolerance: Key[Confidence | None, "Width of the bounds; default 0.001.", "0.01"] = None
-    threshold: Key[Confidence | None, "Stop where this bound is decided.", "0.999"] = None
-    max_cells: Key[Count | None, "Cells of the finest grid; default 1,048,576."] = None
+    threshold: Key[Confidence | None, "Stop when this bound is decided; default none.", "0.999"] = (
+        None
+    )
+    max_cells: Key[Count | None, "Cells of the finest grid; default 1048576."] = None
 
 
 @table
@@ -276,6 +298,11 @@ def read_task(path: str | Path, raw: bytes | None = None) -> EnvironmentTask:
                 f'{path}: [{other}] is for method = "{other}", and [learner] says "{method}": '
                 "leave one of them out."
             )
+    if file.world.dynamics is None and file.proof.given():
+        raise ValueError(
+            f"{path}: [proof] is for dynamics, and [world] environment = "
+            f"{file.world.environment!r} is simulated: leave [proof] out."
+        )
     if method == "cpo" and (file.cpo is None or file.cpo.limit is None):
         raise ValueError(
             f"{path}: [cpo] lacks limit, the upper bound of the expected cost of an episode."

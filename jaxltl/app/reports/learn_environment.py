@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from jaxltl.app.reports import proof
 from jaxltl.app.reports.drawing import Picture
 from jaxltl.app.reports.figures import Remark, number, probability, remark_lines
 from jaxltl.app.reports.page import Part, render_page
@@ -31,7 +32,7 @@ def page(
         remarks=remarks(result),
         tiles=_tiles(result),
         evaluation=_evaluation(result),
-        proof=proof_sentence(result["proof"]) if result.get("proof") else "",
+        proof=proof.sentence(result["proof"]) if result.get("proof") else "",
         estimates=_estimates(result),
         seed_header=("seed", *_PROBABILITIES, *visits),
         seed_rows=_seeds(result),
@@ -46,7 +47,7 @@ def table(result: Result) -> str:
         for name, value, interval, method in _estimates(result)
     ]
     if result.get("proof"):
-        lines += ["", proof_sentence(result["proof"])]
+        lines += ["", proof.sentence(result["proof"])]
     seeds = result["seeds"]
     if seeds["number"] > 1:
         each = ", ".join(probability(x["success"]["mean"]) for x in seeds["evaluations"])
@@ -56,20 +57,6 @@ def table(result: Result) -> str:
             "kept, chosen by other episodes",
         ]
     return "\n".join([*lines, *remark_lines(remarks(result))])
-
-
-def proof_sentence(found: Result) -> str:
-    """The certified bounds of a proof, in two lines, or the reason for which there is none."""
-    if "reason" in found:
-        return f"no proof: {found['reason']}"
-    shares = ", ".join(f"{count:,} {text}" for text, count in found["how"].items() if count)
-    stages = ", ".join(f"{name} {x:.2g} s" for name, x in found["seconds"].items())
-    return (
-        f"proven: probability at least {found['lower']:.7g} from every initial state; the least upper "
-        f"bound is {found['upper']:.7g} ({found['status']}, deterministic policy)\n"
-        f"  {found['initial_cells']:,} of {found['cells']:,} cells are initial: "
-        f"{shares or 'no lower bound'}; {stages}"
-    )
 
 
 def _is_finite(result: Result) -> bool:
@@ -133,10 +120,7 @@ def _tiles(result: Result) -> list[tuple[str, str]]:
     if not _is_finite(result):
         entry = found["visits"]
         tiles.append((number(entry["mean"]), f"accepting visits, in {_interval('visits', entry)}"))
-    proof = result.get("proof") or {}
-    if "lower" in proof:
-        bounds = f"[{proof['lower']:.6g}, {proof['upper']:.6g}]"
-        tiles.insert(0, (bounds, "certified bounds of the worst initial state"))
+    tiles = [*proof.tiles(result.get("proof") or {}), *tiles]
     length = found["length"]
     text = (
         f"steps until the formula is decided or the episode ends, in {_interval('length', length)}"
