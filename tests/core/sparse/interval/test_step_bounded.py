@@ -157,7 +157,8 @@ def test_many_steps_are_as_few_that_changed_something():
     assert ((found.error >= 0) & (found.error <= 1)).all()
 
 
-@pytest.mark.parametrize("maximize, helpful", list(product((False, True), repeat=2)))
+@pytest.mark.few(2)
+@pytest.mark.parametrize("maximize, helpful", [(0, 0), (1, 1), (0, 1), (1, 0)])
 def test_a_huge_number_of_steps_is_answered_by_the_limit(maximize, helpful):
     # State 0 leaves with probability 2e-7 at most, to a coin between the target and a sink.
     model = interval_rows(
