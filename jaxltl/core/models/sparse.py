@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import Any, TypedDict, Unpack
+from typing import Any, TypeAlias, TypedDict, Unpack
 
 import chex
 import jax
@@ -66,6 +66,9 @@ def _taken(x: Array | None, index: Array) -> Array | None:
     if x is None:
         return None
     return gather(x, index) if is_traced((x, index)) else np.asarray(x)[index]
+
+
+Reward: TypeAlias = str | Rewards | Array | None
 
 
 @brief(facts=facts.sparse, drawn=True)

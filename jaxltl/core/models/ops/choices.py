@@ -7,15 +7,17 @@ methods.
 from __future__ import annotations
 
 from functools import singledispatch
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple, Protocol, TypeAlias
 
 import chex
 import jax
 import jax.numpy as jnp
 from jax import lax
+from numpy.typing import DTypeLike
 
 from jaxltl.core.models.ops import kernels
-from jaxltl.core.models.protocols import Model
+from jaxltl.core.models.protocols import Model, PyTree
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief
 from jaxltl.core import validation
@@ -130,7 +132,7 @@ class Actions(NamedTuple):
         """``sum_a pi(s, a) x(s, a)`` for weights, or integers that choose an action in each state."""
         return action_mean(policy, quantity)
 
-    def one_hot(self, choice: jax.Array, dtype: Any) -> jax.Array:
+    def one_hot(self, choice: jax.Array, dtype: DTypeLike) -> jax.Array:
         return jax.nn.one_hot(choice, self.shape[-1], dtype=dtype)
 
     def columns(self, quantity: jax.Array) -> list[jax.Array]:
@@ -269,7 +271,7 @@ class Rows(NamedTuple):
             return kernels.gather(quantity, policy)
         return self.sum(_beside(policy, quantity) * quantity)
 
-    def one_hot(self, choice: jax.Array, dtype: Any) -> jax.Array:
+    def one_hot(self, choice: jax.Array, dtype: DTypeLike) -> jax.Array:
         number = jnp.arange(self.shape[0], dtype=jnp.int32)
         mine = kernels.gather(jnp.asarray(choice), self.state)
         return (number == mine).astype(jax.dtypes.canonicalize_dtype(dtype))
@@ -289,6 +291,21 @@ class Rows(NamedTuple):
 
     def unpacked(self, quantity: jax.Array) -> jax.Array:
         return quantity
+
+
+Layout: TypeAlias = Columns | Rows
+Quantity: TypeAlias = PyTree  # on choices: columns ``[N, ...]``, of a sparse model ``[R, ...]``
+
+
+class SweepOperator(Protocol):
+    """Transitions of a model for compiled sweeps."""
+
+    @property
+    def choices(self) -> Layout:
+        """The layout of quantities on choices."""
+
+    def expectation(self, value: jax.Array) -> Quantity:
+        """Expected value of the next state, on choices, from ``[N, ...]``."""
 
 
 @singledispatch
@@ -313,7 +330,7 @@ class RowEntries(NamedTuple):
     successor: jax.Array  # int32[T]
     probability: jax.Array  # float[T]
 
-    def over_entries(self, operation: Any, quantity: jax.Array) -> jax.Array:
+    def over_entries(self, operation: Callable[..., jax.Array], quantity: jax.Array) -> jax.Array:
         """A reduction over the entries of each row: ``[R, ...]`` from ``[T, ...]``."""
         return kernels.segment_reduce(operation, quantity, self.row, self.choices.shape[0])
 

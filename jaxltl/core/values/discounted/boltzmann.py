@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from functools import partial, reduce
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.typing import ArrayLike
 
 from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.models.compiled.compiled import compiled_form, reshape_solution
-from jaxltl.core.models.ops.choices import choices
+from jaxltl.core.models.ops.choices import Layout, Quantity, choices
 from jaxltl.core.models.ops.successor_tables import sweep_operator
-from jaxltl.core.models.protocols import Model
+from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.types import Solution, Status, status_code
 from jaxltl.core.values.discounted.discounted import (
     action_value,
@@ -31,7 +32,7 @@ from jaxltl.core.values.engine.certificates import backup_error, most_choices, r
 from jaxltl.core.values.engine.linear import System
 
 
-def boltzmann_expansion(num_actions: Any) -> Any:
+def boltzmann_expansion(num_actions: ArrayLike) -> Array:
     """Largest row sum of the Jacobian of ``sum_a softmax(q)_a q_a`` over all q.
 
     The Boltzmann operator contracts for discounts below its inverse. The supremum is ``g / 2``,
@@ -40,11 +41,11 @@ def boltzmann_expansion(num_actions: Any) -> Any:
     >>> [round(boltzmann_expansion(n), 2) for n in (1, 2, 3, 4)]
     [1.0, 1.2, 1.33, 1.42]
     """
-    xp: Any = jnp if isinstance(num_actions, jax.Array) else np
+    xp = jnp if isinstance(num_actions, jax.Array) else np
     n = xp.asarray(num_actions, float)
     others = xp.log(xp.maximum(n - 1, 1))
 
-    def halved(_: Any, ends: Any) -> Any:
+    def halved(_: object, ends: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = ends
         middle = (low + high) / 2
         above = middle * xp.tanh((middle - others) / 2) >= 2
@@ -62,7 +63,7 @@ def boltzmann_expansion(num_actions: Any) -> Any:
 
 @validated(adjoint=("exact", "approximate"), method=("damped", "newton"))
 def boltzmann_value(
-    model: Any,
+    model: Model,
     reward: jax.Array,
     discount: jax.Array | float,
     *,
@@ -106,12 +107,7 @@ def boltzmann_value(
     return reshape_solution(
         model,
         _boltzmann_value(
-            form,
-            reward,
-            discount,
-            initial,
-            (tolerance, max_steps),
-            options=(adjoint, method),
+            form, reward, discount, initial, (tolerance, max_steps), options=(adjoint, method)
         ),
     )
 
@@ -156,10 +152,7 @@ def _boltzmann_value(
             residual=jnp.max(jnp.abs(image - value)),
             num_steps=n,
             status=status_code(
-                converged,
-                jnp.isfinite(bound),
-                bound <= given.enough,
-                certified=given.contracts,
+                converged, jnp.isfinite(bound), bound <= given.enough, certified=given.contracts
             ),
         ),
     )
@@ -191,7 +184,9 @@ class _Given(NamedTuple):
     enough: jax.Array  # the error below which there is little but rounding
 
 
-def _given(model: Any, reward: jax.Array, discount: jax.Array, tolerance: Any) -> _Given:
+def _given(
+    model: Model, reward: jax.Array, discount: jax.Array, tolerance: jax.Array | float | None
+) -> _Given:
     expansion = discount * boltzmann_expansion(most_choices(model))
     contracts = expansion < 1
     gap = jnp.where(contracts, 1 - expansion, 1)
@@ -215,7 +210,7 @@ def _judge(value: jax.Array, image: jax.Array, given: _Given) -> tuple[jax.Array
     return (error <= given.enough) | ~jnp.isfinite(error), error
 
 
-def softmax_mean(over: Any, q: Any, given: Any) -> tuple[jax.Array, Any]:
+def softmax_mean(over: Layout, q: Quantity, given: _Given) -> tuple[jax.Array, Quantity]:
     """``sum_a softmax(q)_a q_a`` of columns, and its derivative."""
     _, policy = soft_maximum(over, q, given)
     finite = jax.tree.map(lambda x: jnp.where(jnp.isneginf(x), 0, x), q)
@@ -227,7 +222,7 @@ def softmax_mean(over: Any, q: Any, given: Any) -> tuple[jax.Array, Any]:
 
 @validated()
 def boltzmann_fixed_points(
-    model: Any,
+    model: Model,
     reward: jax.Array,
     discount: jax.Array | float,
     key: chex.PRNGKey,

@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +24,7 @@ from jaxltl.core.values.interval.robust import refuse_nature, robust_discounted_
 from jaxltl.core.models.compiled.compiled import compiled_form, flatten_policy, reshape_solution
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.ops.array_namespace import is_traced
-from jaxltl.core.models.ops.choices import choices
+from jaxltl.core.models.ops.choices import Layout, Quantity, choices
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.mesh.sharded import ShardedMDP
 from jaxltl.core.models.ops import double_word as dw
@@ -37,7 +37,7 @@ from jaxltl.core.models.ops.operators import (
 )
 from jaxltl.core.models.ops.successor_tables import action_columns, sweep_operator
 from jaxltl.core.models.product import Product
-from jaxltl.core.models.protocols import ActionModel, SuccessorModel
+from jaxltl.core.models.protocols import ActionModel, Array, Model, PyTree, SuccessorModel
 from jaxltl.core.models.sparse import SparseMDP, choice_reward
 from jaxltl.core.types import Solution, Status, status_code
 from jaxltl.core.values.engine import newton
@@ -61,17 +61,19 @@ _METHODS = ("auto", "policy_iteration", "modified_policy_iteration", "value_iter
 
 
 def action_value(
-    model: Any, reward: jax.Array, discount: jax.Array | float, value: jax.Array
+    model: Model, reward: jax.Array, discount: jax.Array | float, value: jax.Array
 ) -> jax.Array:
     """``Q(s, a) = R(s, a) + discount * sum_t P(t | s, a) V(t)``; zero at unavailable actions."""
     q = reward + discount * expectation(model, value)
     return jnp.where(choices(model).available, q, 0)
 
 
-def expected_reward(model: Any, reward: jax.Array) -> jax.Array:
+def expected_reward(model: Model, reward: jax.Array) -> jax.Array:
     """A reward on pairs ``[S, A]`` or transitions ``[S, A, K]`` as its expectation ``[S, A]``."""
-    if isinstance(getattr(model, "mdp", model), SparseMDP):
-        return jnp.asarray(choice_reward(getattr(model, "mdp", model), reward), model.dtype)
+    world = getattr(model, "mdp", model)
+    if isinstance(world, SparseMDP):
+        return jnp.asarray(choice_reward(world, reward), model.dtype)
+    model = cast(SuccessorModel, model)
     actions = (*model.state_shape, model.num_actions)
     transitions = (*actions, model.num_successors)
     reward = jnp.asarray(reward, model.dtype)
@@ -83,12 +85,12 @@ def expected_reward(model: Any, reward: jax.Array) -> jax.Array:
     raise ValueError(f"reward has shape {reward.shape}; expected {actions} or {transitions}.")
 
 
-def reward_size(model: Any, reward: Any) -> jax.Array:
+def reward_size(model: Model, reward: PyTree) -> jax.Array:
     """Largest expected magnitude of a reward: rounding of rewards that cancel does not cancel."""
     return jnp.max(expected_reward(model, jax.tree.map(jnp.abs, reward)))
 
 
-Words = tuple[jax.typing.ArrayLike, jax.typing.ArrayLike, jax.typing.ArrayLike]
+Words = tuple[Array, Array, Array]
 
 
 class Parameters(NamedTuple):
@@ -98,7 +100,7 @@ class Parameters(NamedTuple):
     size: jax.Array  # the largest reward, see reward_size
     unit: jax.Array  # relative rounding of a backup
     tolerance: jax.Array | None  # width of the enclosure, or None
-    policy: Any = None  # a policy's weights, in columns, or None
+    policy: Quantity = None  # a policy's weights, in columns, or None
     low: jax.Array | float = 0  # the discount's low word
     error: jax.Array | float = 0  # of the double word
 
@@ -114,7 +116,12 @@ def _enclosed(value: jax.Array, image: jax.Array, given: Parameters) -> Enclosur
     return enclose(value, image, given.discount, rounding, given.tolerance)
 
 
-def parameters(model: Any, reward: Any, discount: Any, tolerance: Any) -> Parameters:
+def parameters(
+    model: Model,
+    reward: jax.Array,
+    discount: jax.Array | float | Words,
+    tolerance: jax.Array | float | None,
+) -> Parameters:
     """Parameters of a problem; the discount is a number or of :func:`discount_words`."""
     high, *rest = discount if isinstance(discount, tuple) else (discount,)
     goal = None if tolerance is None else jnp.asarray(tolerance, model.dtype)
@@ -138,14 +145,14 @@ def discount_words(discount: jax.Array | float, dtype: jnp.dtype) -> Words:
     return high, low, np.asarray(float(jnp.finfo(dtype).eps) / 2 if rounded else 0, dtype)
 
 
-def gains(model: Any, reward: jax.Array) -> Any:
+def gains(model: Model, reward: jax.Array) -> Quantity:
     """The reward's columns, minus infinity at unavailable actions."""
     over = choices(model)
     return over.columns(over.logits(reward))
 
 
 def solution_of(
-    model: Any,
+    model: Model,
     given: Parameters,
     value: jax.Array,
     image: jax.Array,
@@ -185,7 +192,7 @@ def differentiable(
 
 @validated()
 def policy_value(
-    model: Any,
+    model: Model,
     policy: jax.Array,
     reward: jax.Array,
     discount: jax.Array | float,
@@ -222,9 +229,8 @@ def policy_value(
     if isinstance(model, IntervalMDP):
         if max_steps is not None:
             raise ValueError("interval models are solved by policy iteration; give no max_steps.")
-        width: Any = tolerance
         return robust_discounted_value(
-            model, reward, float(discount), policy=policy, nature=nature, tolerance=width
+            model, reward, float(discount), policy=policy, nature=nature, tolerance=tolerance
         )
     refuse_nature(nature)
     concrete = not is_traced((model, policy, reward, discount, tolerance))
@@ -251,7 +257,7 @@ def _policy_value(model, policy, reward, discount, tolerance, max_steps) -> Solu
     weight = over.columns(checked.distribution)
     given = given._replace(policy=weight)
 
-    def combine(over: Any, q: Any, given: Parameters):
+    def combine(over: Layout, q: Quantity, given: Parameters):
         return over.mean(given.policy, q), given.policy
 
     value, image, n, _ = newton.solve(
@@ -279,7 +285,7 @@ def _policy_value(model, policy, reward, discount, tolerance, max_steps) -> Solu
 
 @validated(method=_METHODS)
 def optimal_value(
-    model: Any,
+    model: Model,
     reward: jax.Array,
     discount: jax.Array | float,
     *,
@@ -330,9 +336,8 @@ def optimal_value(
                 "interval models are solved by policy iteration; give no method, max_steps or "
                 "evaluation_sweeps."
             )
-        width: Any = tolerance
         return robust_discounted_value(
-            model, reward, float(discount), nature=nature, tolerance=width
+            model, reward, float(discount), nature=nature, tolerance=tolerance
         )
     refuse_nature(nature)
     concrete = not is_traced((model, reward, discount, tolerance))
@@ -356,7 +361,7 @@ def optimal_value(
 
 @partial(jax.jit, static_argnames=("method",))
 def _optimal_value(
-    model: Any,
+    model: ActionModel,
     reward: jax.Array,
     discount: Words,
     *,
@@ -493,7 +498,7 @@ def _newton_steps(
     return Solution(value, *parts), action
 
 
-def best_action(over: Any, q: Any, given: Any) -> tuple[jax.Array, Any]:
+def best_action(over: Layout, q: Quantity, given: PyTree) -> tuple[jax.Array, Quantity]:
     """The largest action value, and weight one on the first action that attains it."""
     return over.best(q)
 

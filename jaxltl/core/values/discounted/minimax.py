@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import chex
 import jax
@@ -23,7 +23,7 @@ from jaxltl.core.graphs.graph import Graph, graph_of, take
 from jaxltl.core.models.compiled.compiled import compiled_form, flatten_policy, reshape_solution
 from jaxltl.core.models.game import Game, as_game
 from jaxltl.core.models.ops.array_namespace import namespace, to_jax
-from jaxltl.core.models.ops.choices import choice_shape, choices
+from jaxltl.core.models.ops.choices import Layout, Quantity, SweepOperator, choice_shape, choices
 from jaxltl.core.models.ops.operators import (
     expectation,
     is_deterministic,
@@ -31,6 +31,7 @@ from jaxltl.core.models.ops.operators import (
     valid_policy,
 )
 from jaxltl.core.models.ops.successor_tables import sweep_operator
+from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.types import Solution, require_shape, status_code
 from jaxltl.core.values.discounted.discounted import best_action, expected_reward
@@ -52,7 +53,7 @@ _METHODS = ("policy_iteration", "value_iteration", "strategy_iteration")
 
 @validated(per=_PER, method=_METHODS)
 def minimax_value(
-    game: Any,
+    game: Model,
     reward: chex.Array,
     discount: chex.Numeric,
     *,
@@ -105,12 +106,12 @@ def minimax_value(
       ([4.0, 4.0], [1, 0])
     """
     given = as_game(game)
-    game, reward = compiled_form(given, reward)
+    form, reward = compiled_form(given, reward)
     if allowed is not None:
-        require_shape("allowed", allowed, choice_shape(game))
-    graph = graph_of(game, allowed)
+        require_shape("allowed", allowed, choice_shape(form))
+    graph = graph_of(form, allowed)
     xp = graph.xp
-    system, moves = take(graph, (game.system, graph.available))
+    system, moves = take(graph, (form.system, graph.available))
     if allowed is not None:
         moves = moves & xp.asarray(allowed, bool)
     # Chance and the environment may lead to where play gets stuck.
@@ -118,13 +119,13 @@ def minimax_value(
     moves = moves & ~graph.on_choices(lost) & ~graph.exists(lost)
     defined = _returns(graph, per, system | lost, moves, xp.zeros_like(lost))
     moves, live = to_jax((moves, ~lost))
-    problem = _Problem(game, None, moves, live, defined, reward, discount)
+    problem = _Problem(form, None, moves, live, defined, reward, discount)
     return reshape_solution(given, _solve(problem, tolerance, max_steps, per=per, method=method))
 
 
 @validated(per=_PER, method=_METHODS, environment=("adversarial",))
 def strategy_value(
-    game: Any,
+    game: Model,
     strategy: chex.Array,
     reward: chex.Array,
     discount: chex.Numeric,
@@ -167,22 +168,22 @@ def strategy_value(
       [2.0, 2.0]
     """
     asked = as_game(game)
-    game, reward = compiled_form(asked, reward)
+    form, reward = compiled_form(asked, reward)
     if isinstance(environment, str):
         environment = None
     strategy, environment = (flatten_policy(asked.mdp, x) for x in (strategy, environment))
-    given = [("strategy", strategy, game.system)]
+    given = [("strategy", strategy, form.system)]
     if environment is not None:
-        given.append(("environment", environment, ~game.system))
+        given.append(("environment", environment, ~form.system))
     for name, policy, states in given:
-        kind, shape = "stochastic", choice_shape(game)
+        kind, shape = "stochastic", choice_shape(form)
         if is_deterministic(policy):
-            kind, shape = "of integers", game.state_shape
+            kind, shape = "of integers", form.state_shape
         require_shape(f"{name} ({kind})", policy, shape)
-        require_policy(game, policy, _read(game, states))
-    checked = _joint(game, strategy, environment)
-    graph = graph_of(game, checked)
-    system, used = take(graph, (game.system, checked.used))
+        require_policy(form, policy, _read(form, states))
+    checked = _joint(form, strategy, environment)
+    graph = graph_of(form, checked)
+    system, used = take(graph, (form.system, checked.used))
     followed = graph.xp.ones_like(system)
     drawn = followed if environment is not None else system
     moves = graph.available & graph.xp.where(graph.on_choices(drawn), used, True)
@@ -192,11 +193,11 @@ def strategy_value(
     defined = _returns(graph, per, system | lost, moves, drawn)
     moves, drawn, live = to_jax((moves, drawn, ~lost))
     checked = checked._replace(used=drawn)
-    problem = _Problem(game, checked, moves, live, defined, reward, discount)
+    problem = _Problem(form, checked, moves, live, defined, reward, discount)
     return reshape_solution(asked, _solve(problem, tolerance, max_steps, per=per, method=method))
 
 
-def _read(game: Game, states: Any) -> Any:
+def _read(game: Game, states: Array) -> Array:
     """A player's states with available moves: rows of its policy that are read."""
     if isinstance(game.mdp, SparseMDP):  # every state has a choice
         return states
@@ -241,7 +242,7 @@ def _joint(game: Game, strategy: chex.Array, environment: chex.Array | None) -> 
     return _Drawn(weight, given, valid, representable, lax.stop_gradient(weight) > 0)
 
 
-def _returns(graph: Graph, per: str, goal: Any, moves: Any, drawn: Any) -> Any:
+def _returns(graph: Graph, per: str, goal: Array, moves: Array, drawn: Array) -> Array:
     """True if the environment always returns to a goal, so that values per system move exist."""
     if per == "move":
         return np.True_
@@ -262,7 +263,7 @@ class _Play(NamedTuple):
 
     system: jax.Array
     drawn: jax.Array | None  # states in which moves are drawn by `weight`
-    weight: Any  # in columns
+    weight: Quantity  # in columns
     horizon: jax.Array  # the largest value of h; infinite or NaN without a bound
     discount: jax.Array
     unit: jax.Array  # relative rounding of a backup
@@ -270,7 +271,7 @@ class _Play(NamedTuple):
     tolerance: jax.Array | None
 
 
-def _chosen(over: Any, q: Any, play: _Play) -> tuple[jax.Array, Any]:
+def _chosen(over: Layout, q: Quantity, play: _Play) -> tuple[jax.Array, Quantity]:
     """Values and weights of both players' best moves."""
     own = jax.tree.map(lambda s, x: jnp.where(s, x, -x), over.spread(play.system, q), q)
     best, weight = best_action(over, own, play)
@@ -281,12 +282,14 @@ def _chosen(over: Any, q: Any, play: _Play) -> tuple[jax.Array, Any]:
     return jnp.where(play.drawn, _mean(over, weight, q), best), weight
 
 
-def _mean(over: Any, weight: Any, q: Any) -> jax.Array:
+def _mean(over: Layout, weight: Quantity, q: Quantity) -> jax.Array:
     """The mean of columns that are infinite where moves are not allowed."""
     return over.mean(weight, jax.tree.map(lambda x: jnp.where(jnp.isinf(x), 0, x), q))
 
 
-def _gains(rows: Any, play: _Play, reward: Any, moves: Any, live: jax.Array) -> Any:
+def _gains(
+    rows: SweepOperator, play: _Play, reward: Quantity, moves: Quantity, live: jax.Array
+) -> Quantity:
     """Columns of a reward: infinitely bad for the owner at moves that are not allowed."""
     never = jnp.where(play.system, -jnp.inf, jnp.inf).astype(play.discount.dtype)
     if play.drawn is not None:
@@ -302,7 +305,12 @@ def _gains(rows: Any, play: _Play, reward: Any, moves: Any, live: jax.Array) -> 
 
 
 def _horizon(
-    rows: Any, play: _Play, problem: _Problem, moves: Any, per: str, max_steps: chex.Numeric
+    rows: SweepOperator,
+    play: _Play,
+    problem: _Problem,
+    moves: Quantity,
+    per: str,
+    max_steps: chex.Numeric,
 ) -> jax.Array:
     """A function h with ``h >= 1 + g P h`` for all moves; infinite or NaN without one.
 
@@ -448,7 +456,13 @@ def _solve(
     )
 
 
-def _approached(rows: Any, numbers: newton.Backup, zero: jax.Array, method: str, max_steps: Any):
+def _approached(
+    rows: SweepOperator,
+    numbers: newton.Backup,
+    zero: jax.Array,
+    method: str,
+    max_steps: chex.Numeric,
+):
     """Approximate fixed point, its image, the number of steps, and the weights of its choices."""
     policies = method == "policy_iteration"
     if method == "strategy_iteration":
@@ -479,18 +493,20 @@ class _Strategies(NamedTuple):
     """State of strategy iteration: z is the value of the choices `weight`."""
 
     z: jax.Array
-    weight: Any
+    weight: Quantity
     value: jax.Array
     image: jax.Array
     unchanged: jax.Array
     done: jax.Array
 
 
-def _strategy_iteration(rows: Any, numbers: newton.Backup, zero: jax.Array, max_steps: Any):
+def _strategy_iteration(
+    rows: SweepOperator, numbers: newton.Backup, zero: jax.Array, max_steps: chex.Numeric
+):
     """Solves for the value of both players' choices, then improves the environment's, or,
     where those are a best answer already, the system's (Hoffman and Karp 1966)."""
 
-    def step(rows: Any, k: _Strategies, given: newton.Backup) -> _Strategies:
+    def step(rows: SweepOperator, k: _Strategies, given: newton.Backup) -> _Strategies:
         over, play = rows.choices, given.extra
         q = newton.action_values(over, given, rows.expectation(k.z))
         image, best = _chosen(over, q, play)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +14,7 @@ from jaxltl.core.models.ops.choices import choices
 from jaxltl.core.models.ops.operators import pushforward, require_policy, valid_policy
 from jaxltl.core.models.ops.successor_tables import sweep_operator
 from jaxltl.core.models.product import Product
+from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.types import Solution, status_code
 from jaxltl.core.values.engine.certificates import backup_error, most_choices, refuse
@@ -25,7 +25,7 @@ from jaxltl.core.values.engine.linear import System, solver
 
 @validated()
 def occupancy_measure(
-    model: Any,
+    model: Model,
     policy: jax.Array,
     discount: jax.Array | float,
     *,
@@ -110,7 +110,7 @@ def _occupancy(model, policy, discount, start, tolerance) -> Solution:
     return refuse(solution, checked.given, checked.valid, checked.representable)
 
 
-def _inflow_terms(model: Any) -> Any:
+def _inflow_terms(model: Model) -> jax.Array:
     """Number of terms of each state's inflow, ``[S]`` or more."""
     if isinstance(model, Product):
         return _inflow_terms(model.mdp)[:, None] + model.num_memory

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,13 +12,12 @@ from jax import lax
 
 from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.models.compiled.compiled import compiled_form, reshape_solution
-from jaxltl.core.models.ops.choices import choices
+from jaxltl.core.models.ops.choices import Layout, Quantity, choices
 from jaxltl.core.models.ops.operators import expectation, pushforward
 from jaxltl.core.models.ops.successor_tables import PredecessorTable, sweep_operator
-from jaxltl.core.models.protocols import Model
+from jaxltl.core.models.protocols import Model, PyTree
 from jaxltl.core.types import Solution
 from jaxltl.core.values.discounted.discounted import (
-    Parameters,
     differentiable,
     expected_reward,
     gains,
@@ -37,7 +35,7 @@ _SWEEPS_BETWEEN = 4  # sweeps between two tests of the remainder
 
 @validated(method=("newton", "value_iteration"))
 def soft_value(
-    model: Any,
+    model: Model,
     reward: jax.Array,
     discount: jax.Array | float,
     *,
@@ -111,7 +109,7 @@ def _soft_value(
     return with_softmax(model, reward, given.discount, solution)
 
 
-def soft_maximum(over: Any, q: Any, given: Parameters) -> tuple[jax.Array, Any]:
+def soft_maximum(over: Layout, q: Quantity, given: PyTree) -> tuple[jax.Array, Quantity]:
     """``log sum_a exp q_a`` of columns, and its derivative, the softmax."""
     # Elementwise over columns: reductions over a short last axis take several times as long.
     top = over.max(q)
@@ -121,7 +119,7 @@ def soft_maximum(over: Any, q: Any, given: Parameters) -> tuple[jax.Array, Any]:
 
 
 def policy_logits(
-    model: Any, reward: jax.Array, discount: jax.Array | float, value: jax.Array
+    model: Model, reward: jax.Array, discount: jax.Array | float, value: jax.Array
 ) -> jax.Array:
     """Logits of the soft policy: action values, minus infinity at unavailable actions."""
     q = reward + discount * expectation(model, value)
@@ -129,14 +127,14 @@ def policy_logits(
 
 
 def with_softmax(
-    model: Any, reward: jax.Array, discount: jax.Array, solution: Solution
+    model: Model, reward: jax.Array, discount: jax.Array, solution: Solution
 ) -> Solution:
     """The solution with the softmax of its action values as its policy."""
     return replace(solution, policy=softmax_policy(model, reward, discount, solution.value))
 
 
 def softmax_policy(
-    model: Any, reward: jax.Array, discount: jax.Array | float, value: jax.Array
+    model: Model, reward: jax.Array, discount: jax.Array | float, value: jax.Array
 ) -> jax.Array:
     """Softmax of action values; every available action has a positive normal probability."""
     q, over = policy_logits(model, reward, discount, value), choices(model)
@@ -150,7 +148,7 @@ def softmax_policy(
 
 @validated()
 def soft_policy_adjoint(
-    model: Any,
+    model: Model,
     policy: jax.Array,
     discount: jax.Array | float,
     cotangent: jax.Array,

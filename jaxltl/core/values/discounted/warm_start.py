@@ -7,13 +7,14 @@ ends on the width of the bounds of the active lanes.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
 from jaxltl.core.models.game import Game
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.values.engine.iterate import fill_row
 
 _MOST_SWEEPS = 100_000
@@ -151,7 +152,7 @@ def _quantities(graph: _Graph, models: _Models, value: jax.Array) -> list[jax.Ar
     """``gain + discount * P v``, one column per action for contiguous reads."""
     num_actions, width = graph.successor.shape[1:]
 
-    def reached(*where: Any) -> jax.Array:
+    def reached(*where: int | slice) -> jax.Array:
         return value.at[graph.successor[:, *where]].get(
             mode="promise_in_bounds", wrap_negative_indices=False
         )
@@ -173,7 +174,7 @@ _iterate = jax.custom_batching.custom_vmap(_plain)
 
 
 @_iterate.def_vmap
-def _lanes_last(size: int, batched: Any, graph: _Graph, models: _Models) -> Any:
+def _lanes_last(size: int, batched: PyTree, graph: _Graph, models: _Models) -> PyTree:
     shared, own = batched
     if any(shared):
         axes = jax.tree.map(lambda b: 0 if b else None, (shared, own))

@@ -3,24 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxltl.core import struct
+from jaxltl.core.models.protocols import Array
 from jax import lax
 
 from jaxltl.core.values.engine.linear import solve_linear
+
+
+# The new values, and the ranks of the chosen rows.
+Sweep = Callable[..., tuple[jax.Array, jax.Array | None]]
 
 
 @struct.dataclass
 class Blocks:
     """A segment of a :class:`~jaxltl.core.sparse.prepared.block_schedule.Schedule` with its weights."""
 
-    target: Any  # ``int32[C, A, W, B]``, places
-    source: Any  # ``int32[C, A, W, B]``, which numbers the weights are
-    weight: Any  # ``float[C, A, W, B]``
-    name: Any  # ``int32[C, A, B]``, of the rows
+    target: Array  # ``int32[C, A, W, B]``, places
+    source: Array  # ``int32[C, A, W, B]``, which numbers the weights are
+    weight: Array  # ``float[C, A, W, B]``
+    name: Array  # ``int32[C, A, B]``, of the rows
     first: int = struct.field(pytree_node=False)  # the place of the first node, static
 
     @property

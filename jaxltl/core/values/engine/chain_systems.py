@@ -8,7 +8,7 @@ digits than the number of steps costs; those over a mesh are solved by refined B
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +29,9 @@ from jaxltl.core.values.engine.linear import (
     norm,
     solve_linear,
 )
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 Operator = Callable[[jax.Array], jax.Array]
 
@@ -94,7 +97,7 @@ def _eliminated(transposed: bool) -> Callable[..., np.ndarray]:
     return solve
 
 
-def _transitions(system: ChainSystem) -> Any:
+def _transitions(system: ChainSystem) -> csr_array | None:
     """``float64[N, N]``, the chain on transient states, SciPy's; None if rows are invalid."""
     from scipy.sparse import csr_array, diags_array
 
@@ -119,7 +122,7 @@ def _transitions(system: ChainSystem) -> Any:
     return found
 
 
-def _solution(chain: Any, b: np.ndarray, transposed: bool) -> np.ndarray:
+def _solution(chain: csr_array | None, b: np.ndarray, transposed: bool) -> np.ndarray:
     """The solution by sparse elimination, refined once; NaN where that failed."""
     failed = np.full(b.size, np.nan)
     if chain is None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple, cast
 
 import jax
 import numpy as np
@@ -20,11 +20,7 @@ from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.solvers.discounted import discounted_value
 from jaxltl.core.sparse.solvers.total_cost import Enclosure
-from jaxltl.core.types import (
-    Solution,
-    Status,
-    row_tolerance,
-)
+from jaxltl.core.types import Solution, Status, row_tolerance
 from jaxltl.core.values.engine.state_quantities import finite_reward
 
 
@@ -49,7 +45,7 @@ def solution_from_enclosure(
     if sparse is not None and not is_sparse(model):
         policy = np.asarray(sparse.action)[found.row]
     policy = policy.astype(np.int32).reshape(shape)
-    parts: dict[str, Any] = {
+    parts: dict[str, Array] = {
         "value": found.value.reshape(shape),
         "policy": policy,
         "lower": low.reshape(shape),
@@ -101,13 +97,13 @@ def complement(
     xp, value, far, near = namespace(*parts)
     one = xp.ones((), value.dtype)
 
-    def outwards(bound: Any, end: int) -> Any:
+    def outwards(bound: Array, end: int) -> Array:
         rounded = one - bound
         beyond = xp.clip(xp.nextafter(rounded, end * one), 0, 1)
         # By Sterbenz's lemma, 1 - rounded has no rounding error, so that this test is exact.
         return xp.where(one - rounded == bound, rounded, beyond)
 
-    found: Any = one - value, outwards(far, -1), outwards(near, 2)
+    found: tuple[Array, ...] = one - value, outwards(far, -1), outwards(near, 2)
     if any(isinstance(x, jax.Array) for x in parts):
         found = to_jax(found)
     else:
@@ -172,8 +168,7 @@ def with_given_policy(solution: Solution, policy: Array) -> Solution:
     if policy is None:
         return solution
     table = np.asarray(policy)
-    kind: Any = np.int32 if is_deterministic(table) else table.dtype
-    given: Any = table.astype(kind)
+    given: Array = table.astype(np.int32) if is_deterministic(table) else table.copy()
     return replace(solution, policy=given)
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import jax
 from jax import lax
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.values.engine.linear import solve_linear
 
 Operator = Callable[[jax.Array], jax.Array]
@@ -75,15 +76,15 @@ def _traced_when_differentiated(
     # ``lax.custom_root`` traces it in any case, which is half of a solver's trace.
     closed = jax.make_jaxpr(operator)(fixed_point)
 
-    def image(constants: list[Any], v: jax.Array) -> jax.Array:
+    def image(constants: list[jax.Array], v: jax.Array) -> jax.Array:
         return jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, constants))(v)[0]
 
     @jax.custom_jvp
-    def root(constants: list[Any], system: LinearSystem, v: jax.Array) -> jax.Array:
+    def root(constants: list[jax.Array], system: LinearSystem, v: jax.Array) -> jax.Array:
         return v
 
     @root.defjvp
-    def _(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
+    def _(primals: PyTree, tangents: PyTree) -> tuple[jax.Array, jax.Array]:
         constants, system, v = primals
         v = root(constants, system, v)
         _, change = jax.jvp(lambda c: image(c, v), (constants,), (tangents[0],))

@@ -9,20 +9,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
 from jaxltl.core.models.mesh.sharded import is_sharded
-from jaxltl.core.models.ops.choices import RowEntries
+from jaxltl.core.models.ops.choices import Quantity, RowEntries, SweepOperator
 from jaxltl.core.models.ops.operators import transition_matrix
 from jaxltl.core.models.ops.successor_tables import (
     ModelOperator,
     ShardedSuccessorTable,
     SuccessorTable,
 )
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.values.engine.iterate import in_turn, iterate
 
 Operator = Callable[[jax.Array], jax.Array]
@@ -41,9 +42,9 @@ class System(NamedTuple):
     """``x - scale * sum_a w(s, a) (P x)(s, a)`` over numbered states."""
 
     # the model's successors, see :func:`~jaxltl.core.models.ops.successor_tables.sweep_operator`
-    table: Any
+    table: SweepOperator
     # ``float[N]`` for each action, such as a policy's columns; of a sparse model ``float[R]``
-    weight: Any
+    weight: Quantity
     scale: jax.Array  # ``float[N]`` or a scalar, such as the discount; zero where a value is fixed
 
     @property
@@ -160,13 +161,13 @@ def solver(
     return Inverse(system, in_turn(inverse, system.matrix()))
 
 
-def is_small(table: Any, num_states: int) -> bool:
+def is_small(table: SweepOperator, num_states: int) -> bool:
     """True if systems of `num_states` are inverted; sharded ones are not."""
     spread = isinstance(table, ModelOperator | ShardedSuccessorTable) and is_sharded(table.model)
     return num_states <= DENSE_LIMIT and not spread
 
 
-def _refined(inverse_: jax.Array, matvec: Any, b: jax.Array) -> jax.Array:
+def _refined(inverse_: jax.Array, matvec: Operator, b: jax.Array) -> jax.Array:
     x = inverse_ @ b
     for _ in range(_REFINEMENTS):
         better = x + inverse_ @ (b - matvec(x))
@@ -309,7 +310,7 @@ def _krylov(matvec, table, given, b, tolerance, max_steps, *, lanes: str = "in t
     size = norm(b)
     goal = _Goal(b, tolerance * size, jnp.asarray(max_steps, jnp.int32))
 
-    def step(table: Any, k: _Search, given: Any) -> _Search:
+    def step(table: PyTree, k: _Search, given: PyTree) -> _Search:
         given, goal = given
         image = matvec(table, given, k.z)
         branches = [partial(f, goal) for f in (_richardson, _first, _second, _look)]
@@ -439,13 +440,13 @@ def krylov_refined(matvec: Operator, b: jax.Array) -> jax.Array:
     """x with ``matvec(x) = b`` as nearly as the dtype allows, by iterative refinement."""
     goal = float(jnp.finfo(b.dtype).eps) ** 0.8 * norm(b.ravel())
 
-    def body(carry: Any) -> Any:
+    def body(carry: PyTree) -> PyTree:
         x, residual, _, n = carry
         better = x + bicgstab(matvec, residual, tolerance=_INNER_TOLERANCE)[0]
         residual = b - matvec(better)
         return better, residual, norm(residual.ravel()), n + 1
 
-    def unfinished(carry: Any) -> jax.Array:
+    def unfinished(carry: PyTree) -> jax.Array:
         _, _, size, n = carry
         return (size > goal) & (n < _KRYLOV_REFINEMENTS)
 

@@ -10,12 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jaxltl.core.models.ops.choices import Layout, Quantity, SweepOperator
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.values.engine.iterate import iterate
 from jaxltl.core.values.engine.linear import (
     Bicgstab,
@@ -26,11 +28,10 @@ from jaxltl.core.values.engine.linear import (
     start_bicgstab,
 )
 
-Quantity = Any  # on choices: columns ``[N, ...]``, of a sparse model ``[R, ...]``
 # From the choices, their values, and parameters: the value and the weights of its derivative.
-Combine = Callable[[Any, Quantity, Any], tuple[jax.Array, Quantity]]
+Combine = Callable[[Layout, Quantity, PyTree], tuple[jax.Array, Quantity]]
 # From value, image and parameters: whether it is good enough, and how good it is.
-Judge = Callable[[jax.Array, jax.Array, Any], tuple[jax.Array, jax.Array]]
+Judge = Callable[[jax.Array, jax.Array, PyTree], tuple[jax.Array, jax.Array]]
 
 _INNER = 128  # applications of P in the linear solver for one step of Newton's
 _EXACT = 1e-2  # relative residual asked of it
@@ -42,7 +43,7 @@ class Backup(NamedTuple):
     reward: Quantity  # ``float[N]`` for each action, of a sparse model ``float[R]``
     scale: jax.Array  # the discount, a scalar or ``float[N]``
     damping: jax.Array  # how much of the old value a sweep keeps
-    extra: Any  # what `combine` and `judge` read besides
+    extra: PyTree  # what `combine` and `judge` read besides
 
 
 class _Search(NamedTuple):
@@ -68,7 +69,7 @@ _LOOK, _FIRST, _SECOND, _DIRECT = range(4)
 
 
 def solve(
-    table: Any,
+    table: SweepOperator,
     combine: Combine,
     judge: Judge,
     backup: Backup,
@@ -89,7 +90,7 @@ def solve(
     small = monotone and is_small(table, value.shape[0])
     over = table.choices
 
-    def step(table: Any, k: _Search, given: Backup) -> _Search:
+    def step(table: SweepOperator, k: _Search, given: Backup) -> _Search:
         over, ahead = table.choices, table.expectation(k.z)
         branches = [partial(_look, over, combine, judge, newton, monotone, given)]
         if newton:
@@ -101,13 +102,14 @@ def solve(
         return lax.switch(k.phase, branches, k, ahead)
 
     zero = jnp.zeros_like(value)
+    weight: Quantity = over.spread(zero, backup.reward)
     scalar, none, no = zero[0], jnp.int32(0), jnp.bool_(False)
     start = _Search(
         phase=jnp.int32(_LOOK),
         z=value,
         value=value,
         image=value,
-        weight=over.packed(over.spread(zero, backup.reward)),
+        weight=over.packed(weight),
         error=jnp.full_like(scalar, jnp.inf),
         done=no,
         newton=no,
@@ -165,23 +167,24 @@ def _look(
     )
 
 
-def action_values(over: Any, given: Backup, ahead: Quantity) -> Quantity:
+def action_values(over: Layout, given: Backup, ahead: Quantity) -> Quantity:
     """Action values ``g + c x``, with x the expected next value of each choice."""
     return jax.tree.map(
         lambda g, c, x: g + c * x, given.reward, over.spread(given.scale, ahead), ahead
     )
 
 
-def _applied(over: Any, given: Backup, k: _Search, ahead: Quantity) -> jax.Array:
-    return k.z - given.scale * over.mean(over.unpacked(k.weight), ahead)
+def _applied(over: Layout, given: Backup, k: _Search, ahead: Quantity) -> jax.Array:
+    weight: Quantity = over.unpacked(k.weight)
+    return k.z - given.scale * over.mean(weight, ahead)
 
 
-def _first(over: Any, given: Backup, k: _Search, ahead: Quantity) -> _Search:
+def _first(over: Layout, given: Backup, k: _Search, ahead: Quantity) -> _Search:
     krylov = k.krylov.first(_applied(over, given, k, ahead))
     return k._replace(krylov=krylov, z=krylov.r, phase=jnp.full_like(k.phase, _SECOND))
 
 
-def _second(over: Any, small: bool, given: Backup, k: _Search, ahead: Quantity) -> _Search:
+def _second(over: Layout, small: bool, given: Backup, k: _Search, ahead: Quantity) -> _Search:
     krylov = k.krylov.second(_applied(over, given, k, ahead))
     size, inner = krylov.size, k.inner + 2
     solved = size <= k.target
@@ -196,7 +199,7 @@ def _second(over: Any, small: bool, given: Backup, k: _Search, ahead: Quantity) 
     )
 
 
-def _direct(table: Any, given: Backup, k: _Search, ahead: Quantity) -> _Search:
+def _direct(table: SweepOperator, given: Backup, k: _Search, ahead: Quantity) -> _Search:
     del ahead
     matrix = System(table, table.choices.unpacked(k.weight), given.scale).matrix()
     z = k.value + inverse(matrix) @ (k.image - k.value)

@@ -3,25 +3,28 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
+from jax.typing import ArrayLike
 
 from jaxltl.core import validation
-from jaxltl.core.models.sparse import Rewards, SparseMDP, choice_reward, reward_structure
+from jaxltl.core.models.protocols import Array, Model
+from jaxltl.core.models.sparse import Reward, Rewards, SparseMDP, choice_reward, reward_structure
+from jaxltl.core.sparse.interval.strategy_iteration import RobustValues
+from jaxltl.core.sparse.solvers.total_cost import Enclosure
 from jaxltl.core.types import Solution, Status, require_states
 
 TOLERANCE = 1e-6  # half the width of an enclosure up to which it counts as narrow, relative
 
 
-def reduction_for(objective: str) -> Any:
+def reduction_for(objective: str) -> np.ufunc:
     """``np.maximum`` or ``np.minimum``; ValueError if the objective is neither "max" nor "min"."""
     if not isinstance(objective, str) or objective not in ("max", "min"):
         raise ValueError(f'objective={validation.shorten(objective)}; it must be "max" or "min".')
     return np.maximum if objective == "max" else np.minimum
 
 
-def state_mask(model: SparseMDP, given: Any, name: str) -> np.ndarray:
+def state_mask(model: SparseMDP, given: Array | str, name: str) -> np.ndarray:
     """A set of states as ``bool[S]``, from one in the model's shape or a label."""
     if isinstance(given, str):
         return np.asarray(model.states_with_label(given), bool)
@@ -34,7 +37,7 @@ def state_mask(model: SparseMDP, given: Any, name: str) -> np.ndarray:
     return found
 
 
-def state_reward(model: SparseMDP, reward: Any) -> np.ndarray:
+def state_reward(model: SparseMDP, reward: Reward) -> np.ndarray:
     """The rewards of states, ``float64[S]``; ValueError without any, or if some are not finite."""
     given = reward_structure(model, reward)
     if given.state is None:
@@ -45,7 +48,7 @@ def state_reward(model: SparseMDP, reward: Any) -> np.ndarray:
     return finite_reward(model, Rewards(state=given.state))[0][model.host.row_start[:-1]]
 
 
-def finite_reward(model: SparseMDP, reward: Any) -> tuple[np.ndarray, np.ndarray]:
+def finite_reward(model: SparseMDP, reward: Reward) -> tuple[np.ndarray, np.ndarray]:
     """Expected rewards of rows, and those of absolute values: ``float64[R]``; ValueError if not finite."""
     given = reward_structure(model, reward)
     earned = choice_reward(model, given)
@@ -93,8 +96,8 @@ def transition_reward(model: SparseMDP, given: Rewards) -> np.ndarray:
 
 def solution_from_error(
     value: np.ndarray,
-    error: Any,
-    policy: Any,
+    error: ArrayLike,
+    policy: Array,
     num_steps: int,
     *,
     highest: float = math.inf,
@@ -112,7 +115,7 @@ def solution_from_error(
     finite = bool(np.isfinite(value).all())
     narrow = bool((error <= tolerance * np.maximum(np.abs(value), least)).all())
     status = Status.CONVERGED if narrow else Status.PRECISION if finite else Status.NONFINITE
-    found: Any = {
+    found: dict[str, Array] = {
         "value": value + 0.0,
         "policy": policy,
         "lower": lower,
@@ -124,7 +127,7 @@ def solution_from_error(
     return Solution(**found)
 
 
-def safe_mean(share: np.ndarray, bound: np.ndarray, *, up: bool, highest: float = np.inf) -> float:
+def safe_mean(share: np.ndarray, bound: ArrayLike, *, up: bool, highest: float = np.inf) -> float:
     """The weighted mean of nonnegative bounds, rounded up or down."""
     bound = np.asarray(bound, np.float64)
     if (bound == bound[0]).all():
@@ -134,7 +137,9 @@ def safe_mean(share: np.ndarray, bound: np.ndarray, *, up: bool, highest: float 
     return min(mean * (1 + slack), highest) if up else mean * (1 - slack)
 
 
-def safe_ends(model: Any, found: Any, *, highest: float = np.inf) -> tuple[float, float]:
+def safe_ends(
+    model: Model, found: Solution | Enclosure | RobustValues, *, highest: float = np.inf
+) -> tuple[float, float]:
     """Enclosure of the mean over the initial distribution, from `lower` and `upper`."""
     share = np.asarray(model.initial, np.float64)
     start = np.flatnonzero(share)

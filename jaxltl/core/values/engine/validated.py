@@ -6,11 +6,13 @@ import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import wraps
-from typing import Any, ParamSpec, TypeVar
+from typing import ParamSpec, TypeVar
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.types import Solution, Status
 from jaxltl.core.validation import RANGES, choice, is_concrete, require_in_range, require_real
 
@@ -51,7 +53,7 @@ def validated(**words: tuple[str, ...]) -> Callable[[Callable[P, R]], Callable[P
     return decorate
 
 
-def traced_arguments(arguments: Mapping[str, Any]) -> dict[str, jax.Array]:
+def traced_arguments(arguments: Mapping[str, PyTree]) -> dict[str, jax.Array]:
     """Checks concrete arguments by their names; returns the scalar ones that are traced."""
     traced = {}
     for name, value in arguments.items():
@@ -64,7 +66,7 @@ def traced_arguments(arguments: Mapping[str, Any]) -> dict[str, jax.Array]:
     return traced
 
 
-def argument_status(arguments: Mapping[str, Any]) -> jax.Array:
+def argument_status(arguments: Mapping[str, ArrayLike]) -> jax.Array:
     """Status code of scalar arguments: CONVERGED, or the reason why one is out of range."""
     status = jnp.int32(Status.CONVERGED)
     for name, value in arguments.items():
@@ -74,7 +76,7 @@ def argument_status(arguments: Mapping[str, Any]) -> jax.Array:
     return status
 
 
-def invalidated(solution: Any, reason: jax.Array) -> Any:
+def invalidated(solution: PyTree, reason: jax.Array) -> PyTree:
     """A solution, without value and bounds, or an array of NaN, if `reason` is not CONVERGED."""
     valid = reason == Status.CONVERGED
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -23,6 +22,7 @@ from jaxltl.core.pretty_print import brief
 from jaxltl.core.statistics.confidence_sets import ConfidenceSets, Method, intervals_from_counts
 from jaxltl.core.types import require_shape
 from jaxltl.core import validation
+from jaxltl.core.models.protocols import RowModel
 from jaxltl.core.values import facts
 from jaxltl.core.values.interval.robust import require_objective
 from jaxltl.core.values.interval.satisfaction import robust_satisfaction
@@ -74,7 +74,7 @@ class DataGuarantee:
 
 
 def learn_guarantee(
-    model: Any,
+    model: RowModel,
     counts: TransitionCounts | ConfidenceSets | np.ndarray,
     task: Task,
     confidence: float,
@@ -235,7 +235,7 @@ def _gain(
 
 
 def guarantee_curve(
-    model: Any,
+    model: RowModel,
     counts: TransitionCounts | np.ndarray,
     task: Task,
     confidence: float,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
 
 import chex
 import jax
@@ -14,6 +13,7 @@ from jax.tree_util import Partial
 
 from jaxltl.core import validation
 from jaxltl.core.environments.environment import Environment, as_partial, require_environment
+from jaxltl.core.environments.episodes import Agent
 from jaxltl.core.environments.monitor import Verdict
 from jaxltl.core.values.evaluation.evaluation import (
     EpisodeTotals,
@@ -40,7 +40,7 @@ class _Scores:
 
 def episode_evaluator(
     environment: Environment,
-    agent: Callable[..., Any],
+    agent: Callable[..., Agent],
     *,
     objective: Score = "reward",
     costs: Score | Sequence[Score] = (),
@@ -113,11 +113,11 @@ def episode_evaluator(
 def _evaluate(
     settings: _Scores,
     environment: Environment,
-    agent: Callable[..., Any],
+    agent: Callable[..., Agent],
     discount: chex.Numeric,
     parameters: chex.Array,
     key: chex.PRNGKey,
-) -> Any:
+) -> jax.Array | tuple[jax.Array, jax.Array]:
     run = partial(
         episode_totals,
         environment=environment,
@@ -143,11 +143,11 @@ _VERDICTS = {
 }
 
 
-def _of_one(score: Score, totals: Any) -> jax.Array:
+def _of_one(score: Score, totals: EpisodeTotals) -> jax.Array:
     if callable(score):
         return jnp.asarray(score(totals))
     if score in _VERDICTS:
-        return totals.verdict == _VERDICTS[score]
+        return jnp.asarray(totals.verdict == _VERDICTS[score])
     if score == "failure":
-        return totals.verdict != Verdict.SATISFIED
+        return jnp.asarray(totals.verdict != Verdict.SATISFIED)
     return getattr(totals, score)

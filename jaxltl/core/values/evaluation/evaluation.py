@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import chex
 import jax
@@ -30,6 +29,7 @@ from jaxltl.core.environments.environment import (
 from jaxltl.core.environments.episodes import Agent, begin_episode, continue_episode, require_agent
 from jaxltl.core.environments.monitor import Verdict
 from jaxltl.core.models.mesh.lanes import on_host, require_split, vmap_split
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.policies.evaluation import (
     ESTIMATES as ESTIMATES,
     EpisodeTotals as EpisodeTotals,
@@ -56,17 +56,17 @@ def episode_totals(
     counted = hasattr(task, "accepted")
     zero, one = jnp.zeros((), number), jnp.ones((), number)
 
-    def accepting(world: Any) -> jax.Array:
+    def accepting(world: PyTree) -> jax.Array:
         return jnp.asarray(task_world(world).accepted) if counted else jnp.bool_(False)
 
     first = accepting(begin.world)
     sums = (zero, zero, zero, first.astype(jnp.int32), first.astype(number))
 
-    def going(carry: Any) -> jax.Array:
+    def going(carry: PyTree) -> jax.Array:
         now, time, *_ = carry
         return (time < num_steps) & ~(now.terminated | now.truncated)
 
-    def move(carry: Any) -> Any:
+    def move(carry: PyTree) -> PyTree:
         now, time, paid, kept, sums = carry
         now, made = continue_episode(now, environment, agent, jax.random.fold_in(path, time))
         kept, read = kept * discount, accepting(now.world)
@@ -98,10 +98,10 @@ def episode_totals(
     )
 
 
-def task_world(world: Any) -> Any:
+def task_world(world: PyTree) -> PyTree:
     """The part of an environment's state that has a verdict, also nested; None without one."""
 
-    def tells(x: Any) -> bool:
+    def tells(x: object) -> bool:
         return hasattr(x, "verdict")
 
     return next(filter(tells, jax.tree.leaves(world, is_leaf=tells)), None)
@@ -262,12 +262,12 @@ def checked_steps(environment: Environment, num_steps: int | None) -> int:
     return validation.integer("num_steps", steps, least=1, most=2**31 - 1)
 
 
-def _checked_agent(agent: Any, environment: Environment) -> tuple[Agent, Any]:
+def _checked_agent(agent: object, environment: Environment) -> tuple[Agent, PyTree]:
     """The agent as a tree of arrays, checked against the environment; and the state's shapes."""
     agent = require_agent(agent)
     agent = replace(agent, act=as_partial(agent.act, "agent.act"))
 
-    def first(key: chex.PRNGKey) -> Any:
+    def first(key: chex.PRNGKey) -> tuple[PyTree, PyTree]:
         world = environment.reset(key)
         seen, mask = environment.observe(world), allowed_in(environment, world)
         return agent.act(agent.memory, seen, mask, key)[0], world

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from jaxltl.core import validation
 from jaxltl.core.automata.automaton import Automaton
@@ -19,8 +20,10 @@ from jaxltl.core.environments.tabulate import Table
 from jaxltl.core.environments.time_limit import without_time_limit
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.models.ops.operators import is_deterministic
-from jaxltl.core.models.product import product
+from jaxltl.core.models.product import Product, product
+from jaxltl.core.models.protocols import Array, PyTree
 from jaxltl.core.pretty_print import brief
+from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.product import sparse_product
 from jaxltl.core.sparse.solvers import step_bounded as host
 from jaxltl.core.types import Solution
@@ -78,7 +81,7 @@ class OptimalityGap(NamedTuple):
 
 
 def tabulate_policy(
-    policy: Callable[..., Any], environment: Environment, table: Table, num_memory: int
+    policy: Callable[..., jax.Array], environment: Environment, table: Table, num_memory: int
 ) -> np.ndarray:
     """Action probabilities of an agent in each tabulated state and automaton state.
 
@@ -123,8 +126,8 @@ def tabulate_policy(
 
 
 @jax.jit
-def _acts(policy: Any, environment: Environment, memory: jax.Array, worlds: Any) -> jax.Array:
-    def one(world: Any) -> jax.Array:
+def _acts(policy: PyTree, environment: Environment, memory: jax.Array, worlds: PyTree) -> jax.Array:
+    def one(world: PyTree) -> jax.Array:
         return jax.vmap(partial(policy, environment.observe(world)))(memory)
 
     return jax.vmap(one)(worlds)
@@ -133,7 +136,7 @@ def _acts(policy: Any, environment: Environment, memory: jax.Array, worlds: Any)
 def optimality_gap(
     table: Table,
     task: Automaton | Formula | str,
-    policy: Any,
+    policy: ArrayLike,
     *,
     num_steps: int | None = None,
 ) -> OptimalityGap:
@@ -214,7 +217,7 @@ def optimality_gap(
     )
 
 
-def _rows_of(policy: Any) -> np.ndarray:
+def _rows_of(policy: ArrayLike) -> np.ndarray:
     try:
         found = np.asarray(policy)
     except ValueError:  # ragged
@@ -227,8 +230,8 @@ def _rows_of(policy: Any) -> np.ndarray:
 
 
 def _bounded(
-    table: Table, model: Any, task: Automaton, policy: np.ndarray, start: np.ndarray, steps: int
-) -> tuple[Any, Any]:
+    table: Table, model: Product, task: Automaton, policy: np.ndarray, start: np.ndarray, steps: int
+) -> tuple[Solution, Solution]:
     """Step-bounded probabilities of the agent and the optimum, from each initial state."""
     base, decisions, letter = table.model.host, verdicts(task), np.asarray(model.letter)
     found = sparse_product(
@@ -270,7 +273,9 @@ def _bounded(
     )
 
 
-def _unbounded(table: Table, model: Any, policy: np.ndarray, start: np.ndarray) -> tuple[Any, Any]:
+def _unbounded(
+    table: Table, model: Product, policy: np.ndarray, start: np.ndarray
+) -> tuple[Solution, Solution]:
     """Probabilities of the agent and the optimum without a step bound."""
     if np.asarray(table.truncated).any():
         raise ValueError(
@@ -295,7 +300,7 @@ def _unbounded(table: Table, model: Any, policy: np.ndarray, start: np.ndarray) 
     )
     own = product_satisfaction(model, policy=mass / total[base.host.state])
     best = product_satisfaction(model)
-    at: Any = start, np.asarray(model.initial_memory)[start]
+    at: Array = start, np.asarray(model.initial_memory)[start]
     return at_states(own, at), at_states(best, at)
 
 
@@ -313,7 +318,7 @@ def _weights(
     action: np.ndarray,
     base: np.ndarray,
     memory: np.ndarray,
-    mdp: Any,
+    mdp: HostMDP,
     fixed: np.ndarray,
 ) -> np.ndarray:
     """``float64[R']``, the agent's distribution over the rows of each pair."""

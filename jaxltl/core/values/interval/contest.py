@@ -18,14 +18,16 @@ operator with room for rounding.
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxltl.core import struct
+from jaxltl.core.models.protocols import Array
 from jax import lax
+from numpy.typing import DTypeLike
 
-from jaxltl.core.values.engine.linear import DENSE_LIMIT, inverse, solve_linear
+from jaxltl.core.values.engine.linear import DENSE_LIMIT, Operator, inverse, solve_linear
 
 _AIM = 0.1  # of the tolerance: how much of it the extra of all steps may take
 _HASTY = 12  # rounds in which both sides move at once; then the leader waits for the other one
@@ -108,7 +110,7 @@ def _all(z: jax.Array) -> jax.Array:
     return jnp.concatenate([z, jnp.asarray([0, 1], z.dtype)])
 
 
-def rounding(width: Any, dtype: Any) -> Any:
+def rounding(width: Array, dtype: DTypeLike) -> Array:
     """Bound on the rounding error of a sum of `width` masses."""
     return 4 * float(jnp.finfo(dtype).eps) * (width + 1)
 
@@ -139,7 +141,7 @@ def _left(lower: jax.Array, upper: jax.Array, key: jax.Array) -> tuple[jax.Array
     return rest - before, free
 
 
-def system(target: jax.Array, weight: jax.Array) -> tuple[Any, Any]:
+def system(target: jax.Array, weight: jax.Array) -> tuple[Operator, Operator]:
     """Solvers of ``x - P x = b`` and of its transpose."""
     size = target.shape[0]
     weight = jnp.where(target < size, weight, 0)

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+import jax
 import numpy as np
+from jax.typing import ArrayLike
 
 from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP, make_interval
 from jaxltl.core.models.ops.operators import is_deterministic, row_weights
-from jaxltl.core.models.sparse import Rewards, SparseMDP, reward_structure, choice_reward
+from jaxltl.core.models.sparse import Reward, Rewards, SparseMDP, choice_reward, reward_structure
 from jaxltl.core.sparse.interval.discounted import DiscountedModel, discounted_value
 from jaxltl.core.sparse.interval.game_encoding import EncodedChoices, let_nature_choose
 from jaxltl.core.sparse.interval.reachability import reachability
@@ -19,6 +21,7 @@ from jaxltl.core.sparse.interval.total_reward import total_reward
 from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
 from jaxltl.core.types import Solution, require_shape
 from jaxltl.core import validation
+from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.values.engine.host_solution import status_between
 from jaxltl.core.values.engine.state_quantities import state_mask
 
@@ -38,7 +41,7 @@ def nature_direction(nature: str | None, objective: str) -> str:
     return objective if nature == "cooperative" else {"max": "min", "min": "max"}[objective]
 
 
-def width_asked(tolerance: Any) -> float:
+def width_asked(tolerance: jax.Array | float | None) -> float:
     """The width of the enclosure: `tolerance`, or the default."""
     if tolerance is None:
         return TOLERANCE
@@ -57,14 +60,14 @@ def refuse_nature(nature: str | None) -> None:
 
 @validated()
 def robust_reachability(
-    model: Any,
-    target: Any,
+    model: Model,
+    target: Array | str,
     *,
-    policy: Any = None,
+    policy: Array | None = None,
     objective: str = "max",
     nature: str | None = None,
-    stay: Any = None,
-    tolerance: Any = None,
+    stay: Array | None = None,
+    tolerance: jax.Array | float | None = None,
 ) -> Solution:
     """Robust reachability probability of an interval MDP.
 
@@ -98,7 +101,7 @@ def robust_reachability(
     """
     asked = width_asked(tolerance)
     sides = sides_of(model, policy, objective, nature)
-    model = sides.model
+    model = sides.world
     target = sides.states(state_mask(model.nominal, target, "target"))
     if stay is not None:
         stay = sides.states(state_mask(model.nominal, stay, "stay")) | sides.added
@@ -108,14 +111,14 @@ def robust_reachability(
 
 @validated()
 def robust_total_reward(
-    model: Any,
-    reward: Any,
-    target: Any,
+    model: Model,
+    reward: Reward,
+    target: Array | str,
     *,
-    policy: Any = None,
+    policy: Array | None = None,
     objective: str = "max",
     nature: str | None = None,
-    tolerance: Any = None,
+    tolerance: jax.Array | float | None = None,
 ) -> Solution:
     """Robust expected total reward of an interval MDP until a target is reached.
 
@@ -145,7 +148,7 @@ def robust_total_reward(
     """
     asked = width_asked(tolerance)
     sides = sides_of(model, policy, objective, nature)
-    model = sides.model
+    model = sides.world
     target = sides.states(state_mask(model.nominal, target, "target"))
     earned = sides.rows(interval_reward(model, reward))
     found = total_reward(sides.host, earned, target, sides.query(asked))
@@ -154,14 +157,14 @@ def robust_total_reward(
 
 @validated()
 def robust_discounted_value(
-    model: Any,
-    reward: Any,
+    model: Model,
+    reward: Reward,
     discount: float,
     *,
-    policy: Any = None,
+    policy: Array | None = None,
     objective: str = "max",
     nature: str | None = None,
-    tolerance: float | None = None,
+    tolerance: jax.Array | float | None = None,
 ) -> Solution:
     """Robust discounted value of an interval MDP.
 
@@ -188,7 +191,7 @@ def robust_discounted_value(
       ([1.142857, 0.0], [0.25, 0.75, 1.0])
     """
     sides = sides_of(model, policy, objective, nature)
-    earned = sides.entries(entry_reward(sides.model, reward))
+    earned = sides.entries(entry_reward(sides.world, reward))
     largest = float(np.abs(earned).max(initial=0)) / (1 - float(discount))
     asked = 1e-8 * max(largest, 1e-300) if tolerance is None else width_asked(tolerance)
     discounts = np.where(sides.choosing, 1.0, float(discount))
@@ -197,7 +200,7 @@ def robust_discounted_value(
 
 
 def robust_expectation(
-    model: IntervalMDP, value: Any, *, objective: str = "max", nature: str | None = None
+    model: IntervalMDP, value: ArrayLike, *, objective: str = "max", nature: str | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Robust expectation of the next state's value, for each choice.
 
@@ -232,7 +235,7 @@ def robust_expectation(
     return model.host.sum_rows(p * ahead), p
 
 
-def entry_reward(model: IntervalMDP, reward: Any) -> np.ndarray:
+def entry_reward(model: IntervalMDP, reward: Reward) -> np.ndarray:
     """Finite reward of each entry, ``float64[T]``."""
     given = reward_structure(model.nominal, reward)
     host = model.nominal.host
@@ -249,7 +252,7 @@ def entry_reward(model: IntervalMDP, reward: Any) -> np.ndarray:
     return earned
 
 
-def interval_reward(model: IntervalMDP, reward: Any) -> np.ndarray:
+def interval_reward(model: IntervalMDP, reward: Reward) -> np.ndarray:
     """Non-negative reward of each choice, ``float64[R]``, if it is independent of nature."""
     earned = choice_reward(model.nominal, reward)
     bad = ~((earned >= 0) & np.isfinite(earned))
@@ -280,15 +283,15 @@ def robust_solution(
     sides: Sides, found: RobustValues, tolerance: float, *, relative: bool
 ) -> Solution:
     """The :class:`Solution` of certified values."""
-    size = sides.model.num_states
+    size = sides.world.num_states
     value, lower, upper = (x[:size] for x in (found.value, found.lower, found.upper))
     status = status_between(lower, upper, tolerance, relative=relative)
     row, chance = found.row, found.probability
     if sides.spread is not None:
         row = sides.spread.policy(row, chance)
-        chance = sides.spread.nature(chance, np.asarray(sides.model.nominal.probability))
+        chance = sides.spread.nature(chance, np.asarray(sides.world.nominal.probability))
     policy = np.asarray(row.astype(np.int32) if sides.policy is None else sides.policy)
-    parts: dict[str, Any] = {
+    parts: dict[str, Array] = {
         "value": value,
         "policy": policy,
         "nature": chance,
@@ -304,12 +307,18 @@ def robust_solution(
 class Sides(NamedTuple):
     """An uncertain MDP with the directions of policy and nature."""
 
-    model: Any  # the given model
+    model: IntervalMDP | None  # the given model
     host: UncertainMDP  # the solved one, in which a policy and nature choose
     maximize: bool  # whether the policy maximises
     helpful: bool  # whether nature maximises
     spread: EncodedChoices | None  # of the given model in the solved one
-    policy: Any
+    policy: Array | None
+
+    @property
+    def world(self) -> IntervalMDP:
+        """The given model."""
+        assert self.model is not None
+        return self.model
 
     def query(self, tolerance: float) -> Query:
         return Query(self.maximize, self.helpful, tolerance)
@@ -324,7 +333,7 @@ class Sides(NamedTuple):
     @property
     def added(self) -> np.ndarray:
         """Auxiliary states, ``bool[S']``."""
-        return np.arange(self.host.mdp.num_states) >= self.model.num_states
+        return np.arange(self.host.mdp.num_states) >= self.world.num_states
 
     def states(self, quantity: np.ndarray) -> np.ndarray:
         """A set of states ``bool[S']``, without auxiliary ones."""
@@ -343,7 +352,7 @@ class Sides(NamedTuple):
         return np.where(self.choosing, 0, quantity[self.spread.row])
 
 
-def sides_of(model: Any, policy: Any, objective: str, nature: str | None) -> Sides:
+def sides_of(model: Model, policy: Array | None, objective: str, nature: str | None) -> Sides:
     """Directions of policy and nature, games and given policies encoded."""
     world, system = world_of(model)
     if policy is None:
@@ -355,7 +364,7 @@ def sides_of(model: Any, policy: Any, objective: str, nature: str | None) -> Sid
     return Sides(world, parted.model, against, helpful, parted, policy)
 
 
-def world_of(model: Any) -> tuple[IntervalMDP, np.ndarray | None]:
+def world_of(model: Model) -> tuple[IntervalMDP, np.ndarray | None]:
     """The interval model, and in a game the states of the system."""
     world = model.mdp if isinstance(model, Game) else model
     if isinstance(world, SparseMDP) and isinstance(model, Game):
@@ -382,7 +391,7 @@ def host_sides(
     return Sides(None, parted.model, not helpful, helpful, parted, None)
 
 
-def _under(model: IntervalMDP, policy: np.ndarray, where: Any) -> EncodedChoices:
+def _under(model: IntervalMDP, policy: np.ndarray, where: Array) -> EncodedChoices:
     """The model under a policy, in all states or in those of one player."""
     host = model.host
     if is_deterministic(policy) and np.all(where):

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+import jax
 import numpy as np
+from numpy.typing import ArrayLike
 
 from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.array_types import Booleans, Floats, Integers
@@ -14,6 +16,7 @@ from jaxltl.core.automata.translate import Task
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.ops.operators import is_deterministic, require_weights
 from jaxltl.core.models.product import Product
+from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.sparse.interval.game_encoding import let_nature_choose
 from jaxltl.core.sparse.interval.l1_ball import Ball
 from jaxltl.core.sparse.interval.parity import parity_against_nature
@@ -46,13 +49,13 @@ class _Verdicts(NamedTuple):
 
 
 def robust_satisfaction(
-    model: Any,
+    model: Model,
     task: Task,
     *,
     objective: str = "max",
     nature: str | None = None,
-    states: Any = None,
-    tolerance: float | None = None,
+    states: ArrayLike | None = None,
+    tolerance: jax.Array | float | None = None,
 ) -> Satisfaction:
     """Robust satisfaction probability of a task in an interval MDP; labels are read on exit."""
     model, system = world_of(model)
@@ -80,12 +83,12 @@ def robust_satisfaction(
 
 
 def _solution(
-    found: RobustValues, tolerance: float, shape: tuple[int, ...], states: Integers, policy: Any
+    found: RobustValues, tolerance: float, shape: tuple[int, ...], states: Integers, policy: Array
 ) -> Solution:
     """The :class:`Solution` at some states of the product."""
     low, high = (x[states].reshape(shape) for x in (found.lower, found.upper))
     status = Status.CONVERGED if (high - low <= tolerance).all() else Status.PRECISION
-    parts: dict[str, Any] = {
+    parts: dict[str, Array] = {
         "value": found.value[states].reshape(shape),
         "policy": policy,
         "lower": low,
@@ -102,10 +105,10 @@ def _solution(
 def robust_product_satisfaction(
     model: Product,
     *,
-    policy: Any = None,
+    policy: Array | None = None,
     objective: str = "max",
     nature: str | None = None,
-    tolerance: Any = None,
+    tolerance: jax.Array | float | None = None,
 ) -> Solution:
     """Robust satisfaction probability from all states of a product of an interval MDP."""
     if not isinstance(model, Product) or not isinstance(model.mdp, IntervalMDP):
@@ -119,7 +122,7 @@ def robust_product_satisfaction(
             "world by with_allowed(world, rows)."
         )
     asked = width_asked(tolerance)
-    world: Any = model.mdp
+    world: IntervalMDP = model.mdp
     task, letter, shape = model.automaton, np.asarray(model.letter), model.state_shape
     delta, priority = np.asarray(task.delta), np.asarray(task.priority)
     yes, no = universal_states(task), ~live_states(task)
@@ -203,7 +206,7 @@ def _fixed(
     model: Product, product: SparseProduct, host: UncertainMDP, policy: np.ndarray, helpful: bool
 ) -> Sides:
     """The product under a finite-memory policy."""
-    world: Any = model.mdp
+    world: IntervalMDP = model.mdp
     mine = product.host.state
     memory = product.memory[mine]
     if is_deterministic(policy):

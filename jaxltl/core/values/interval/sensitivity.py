@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from jax.typing import ArrayLike
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.models.interval import IntervalMDP, refuse_ball, require_interval
@@ -14,6 +15,8 @@ from jaxltl.core.sparse.graph.qualitative import backward_reachable
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.types import Solution
 from jaxltl.core import validation
+from jaxltl.core.models.protocols import Array
+from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
 from jaxltl.core.values.interval.robust import nature_direction
 from jaxltl.core.values.engine.state_quantities import state_mask
 
@@ -38,12 +41,12 @@ class Sensitivity(NamedTuple):
 def robust_sensitivity(
     model: IntervalMDP,
     solution: Solution,
-    target: Any,
+    target: Array | str,
     *,
     objective: str = "max",
     nature: str | None = None,
-    stay: Any = None,
-    initial: Any = None,
+    stay: Array | str | None = None,
+    initial: ArrayLike | None = None,
 ) -> Sensitivity:
     """Derivatives of a robust value in the ends of all intervals.
 
@@ -136,7 +139,7 @@ def _visits(chain: HostMDP, goal: Booleans, stay: Booleans, weight: Floats) -> F
     return found
 
 
-def _against_the_rest(host: Any, ahead: Floats, maximize: bool) -> tuple[Floats, Booleans]:
+def _against_the_rest(host: UncertainMDP, ahead: Floats, maximize: bool) -> tuple[Floats, Booleans]:
     """Gain of each entry over the entry that receives the remaining mass of its row."""
     mdp = host.mdp
     start, far = mdp.entry_start[:-1], np.inf

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -14,12 +13,15 @@ from jaxltl.core.sparse.interval.robust_values import Query
 from jaxltl.core.sparse.interval.step_bounded import StepBoundedValues
 from jaxltl.core.types import Solution
 from jaxltl.core import validation
+from jaxltl.core.array_types import Floats
+from jaxltl.core.models.protocols import Array
+from jaxltl.core.models.sparse import Reward
 from jaxltl.core.values.interval.robust import entry_reward, nature_direction
 from jaxltl.core.values.engine.state_quantities import solution_from_error, state_reward, state_mask
 
 
 def robust_next_probability(
-    model: IntervalMDP, target: Any, *, objective: str = "max", nature: str | None = None
+    model: IntervalMDP, target: Array | str, *, objective: str = "max", nature: str | None = None
 ) -> Solution:
     """Robust probability that the next state is in a set.
 
@@ -55,10 +57,10 @@ def robust_next_probability(
 
 def robust_bounded_reachability(
     model: IntervalMDP,
-    target: Any,
+    target: Array | str,
     num_steps: int,
     *,
-    stay: Any = None,
+    stay: Array | str | None = None,
     objective: str = "max",
     nature: str | None = None,
 ) -> Solution:
@@ -100,7 +102,7 @@ def robust_bounded_reachability(
 
 def robust_cumulative_reward(
     model: IntervalMDP,
-    reward: Any,
+    reward: Reward,
     num_steps: int,
     *,
     objective: str = "max",
@@ -135,7 +137,7 @@ def robust_cumulative_reward(
 
 def robust_instantaneous_reward(
     model: IntervalMDP,
-    reward: Any,
+    reward: Reward,
     num_step: int,
     *,
     objective: str = "max",
@@ -170,8 +172,8 @@ def robust_instantaneous_reward(
 
 def _earned(
     model: IntervalMDP,
-    earned: Any,
-    start: Any,
+    earned: Floats,
+    start: Floats,
     num_steps: int,
     objective: str,
     nature: str | None,
@@ -190,7 +192,7 @@ def _earned(
 
 def _solution(found: StepBoundedValues, highest: float = 1) -> Solution:
     """The :class:`Solution` of step-bounded values."""
-    nature: Any = found.probability
+    nature: Array = found.probability
     solution = solution_from_error(
         found.value, found.error, found.row.astype(np.int32), found.num_steps, highest=highest
     )

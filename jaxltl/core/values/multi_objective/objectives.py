@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from jaxltl.core.array_types import Integers
 from jaxltl.core.automata.translate import Task
 from jaxltl.core.automata.runs import live_states, universal_states
 from jaxltl.core.models.protocols import Array
@@ -213,7 +214,7 @@ def _product(
 ) -> tuple[SparseProduct, np.ndarray]:
     """The product with all monitors, and the state of each in each joint one, ``int[J, n]``."""
     first = np.flatnonzero(np.asarray(model.initial) > 0)
-    letters: Any = np.zeros((model.num_states, len(trackers)), np.int64)
+    letters: Integers = np.zeros((model.num_states, len(trackers)), np.int64)
     for i, x in enumerate(trackers):
         letters[:, i] = x.letter
     shown, letter = np.unique(letters, axis=0, return_inverse=True)
@@ -228,7 +229,7 @@ def _product(
 
     begin = np.tile([x.first for x in trackers], (first.size, 1)).reshape(first.size, -1)
     begin = after(begin.astype(np.int64), letters[first])
-    known: Any = np.zeros((0, len(trackers)), np.int64)
+    known: Integers = np.zeros((0, len(trackers)), np.int64)
     frontier, steps = np.unique(begin, axis=0), []
     codes: dict[tuple[int, ...], int] = {}
     while len(frontier):

@@ -10,13 +10,14 @@ expected time proves. Each bound is rounded outwards.
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxltl.core.values.engine.block_sweeps import Blocks, Chosen, images, sweep
+from jaxltl.core.models.protocols import PyTree
+from jaxltl.core.values.engine.block_sweeps import Blocks, Chosen, Sweep, images, sweep
 
 SLACK = 1e6  # smallest numbers that a guess is above nothing
 _NEAR = 0.9  # distance of the first guess of a bound from the other, as a share of the tolerance
@@ -34,7 +35,7 @@ class Problem(NamedTuple):
     """The cyclic blocks of a system."""
 
     core: Blocks
-    given: dict[str, Any]  # options of block_sweeps.sweep
+    given: dict[str, PyTree]  # options of block_sweeps.sweep
     unit: float  # relative rounding error of a sum
     least: float  # loss of a sum to underflow
     tolerance: jax.Array  # width of the enclosure
@@ -111,8 +112,8 @@ def _above(problem: Problem, low: jax.Array, high: jax.Array, wide: jax.Array) -
 def _risen(problem: Problem, s: State) -> State:
     """One sweep of the lower bound and of the candidate upper bound."""
     span, unit = problem.span, problem.unit
-    down: Any = partial(sweep, factor=1 - unit, shift=-problem.least, **problem.given)
-    up: Any = partial(sweep, factor=1 + unit, shift=problem.least, **problem.given)
+    down: Sweep = partial(sweep, factor=1 - unit, shift=-problem.least, **problem.given)
+    up: Sweep = partial(sweep, factor=1 + unit, shift=problem.least, **problem.given)
     low = down(problem.core, s.low)[0]
     high = lax.cond(s.guessed, lambda x: up(problem.core, x)[0], lambda x: x, s.high)
     new, old = low[span], s.low[span]
@@ -179,7 +180,7 @@ class _Choices(NamedTuple):
         )
 
 
-def _choices(problem: Problem, dtype: Any) -> _Choices:
+def _choices(problem: Problem, dtype: jnp.dtype) -> _Choices:
     if "keep" in problem.given:
         span = problem.span
         return _Choices(problem, problem.given["keep"][span], problem.given["put"][span])
@@ -270,16 +271,11 @@ def _proven(rows: _Choices, state: State, high: jax.Array, p: _Policy) -> State:
 
 
 def _swept(
-    problem: Problem,
-    outer: jax.Array,
-    value: jax.Array,
-    *,
-    shift: jax.Array,
-    rank: jax.Array,
+    problem: Problem, outer: jax.Array, value: jax.Array, *, shift: jax.Array, rank: jax.Array
 ) -> jax.Array:
     """Greedy rows after some sweeps, which propagate improvements."""
-    x: Any = outer.at[problem.span].set(value)
-    going: Any = partial(sweep, problem.core, shift=shift, **problem.given)
+    x = outer.at[problem.span].set(value)
+    going: Sweep = partial(sweep, problem.core, shift=shift, **problem.given)
     return lax.fori_loop(0, _SWEEPS, lambda _, c: going(c[0], choose=True), (x, rank))[1]
 
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 
-from typing import Any
-
 import chex
 import jax
 import jax.numpy as jnp
@@ -15,7 +13,7 @@ from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.mesh.sharded import refuse_sharded
 from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
-from jaxltl.core.models.protocols import Model
+from jaxltl.core.models.protocols import Model, PyTree
 from jaxltl.core.models.sparse import Rewards, choice_reward, refuse_underflow
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.mdp import HostMDP
@@ -211,7 +209,7 @@ def _prepared(host: HostMDP, plan: Plan, cost: np.ndarray | None, objective: str
         first = blocks[-1].last
     loops = None if plan.loops is None else tuple(x.astype(np.int32) for x in plan.loops[:4])
     cycles = None if plan.cycles is None else tuple(x.astype(np.int32) for x in plan.cycles)
-    arrays: dict[str, Any] = {
+    arrays: dict[str, PyTree] = {
         "segments": tuple(blocks),
         "place": plan.place,
         "nodes": np.concatenate(nodes).astype(np.int32),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import chex
 import jax
@@ -15,13 +15,14 @@ from jax import lax
 
 from jaxltl.core.models.ops.operators import is_deterministic
 from jaxltl.core.models.ops.underflow import is_subnormal
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.types import Solution, require_shape, row_tolerance, status_code
-from jaxltl.core.values.engine.block_sweeps import Blocks, Chosen, chosen_names, meets, sweep
+from jaxltl.core.values.engine.block_sweeps import Blocks, Chosen, Sweep, chosen_names, meets, sweep
 from jaxltl.core.values.engine.implicit_diff import implicit
 from jaxltl.core.values.engine.iterate import in_turn
 from jaxltl.core.values.engine.linear import inverse
 from jaxltl.core.values.engine.validated import validated
-from jaxltl.core.values.prepared.interval_iteration import SLACK, Problem, enclose_cycles
+from jaxltl.core.values.prepared.interval_iteration import SLACK, Problem, State, enclose_cycles
 from jaxltl.core.values.prepared.preparation import Prepared, prepare
 from jaxltl.core.values.prepared.prepared_interval import (
     PreparedInterval,
@@ -296,7 +297,7 @@ def _enclosed(
     prepared = lax.stop_gradient(prepared)
     dtype, size = prepared.probability.dtype, prepared.size
     unit, least = _rounding(prepared)
-    given: dict[str, Any] = {"maximize": prepared.objective != "min"}
+    given: dict[str, PyTree] = {"maximize": prepared.objective != "min"}
     if decided is not None:
         given["keep"] = decided.keep[:size].astype(dtype)
         given["put"] = decided.put[:size].astype(dtype)
@@ -316,7 +317,7 @@ def _enclosed(
 def _solve_cyclic(
     prepared: Prepared,
     start: jax.Array,
-    given: dict[str, Any],
+    given: dict[str, PyTree],
     tolerance: jax.Array,
     max_steps: jax.Array,
 ) -> _Found:
@@ -324,12 +325,13 @@ def _solve_cyclic(
     unit, least = _rounding(prepared)
     before, core, after = prepared.segments
     size = prepared.size
-    down: Any = partial(sweep, factor=1 - unit, shift=-least, **given)
-    up: Any = partial(sweep, factor=1 + unit, shift=least, **given)
+    down: Sweep = partial(sweep, factor=1 - unit, shift=-least, **given)
+    up: Sweep = partial(sweep, factor=1 + unit, shift=least, **given)
     arrays = {k: x for k, x in given.items() if k != "maximize"}
 
-    def enclosed(core: Blocks, arrays: Any, tolerance: Any, low: Any, high: Any, most: Any) -> Any:
+    def enclosed(core: Blocks, arrays: dict[str, jax.Array], *numbers: jax.Array) -> State:
         options = {"maximize": given["maximize"], **arrays}
+        tolerance, low, high, most = numbers
         problem = Problem(core, options, unit, least, tolerance, prepared.question == "reward")
         return enclose_cycles(problem, low, high, most)
 
@@ -348,7 +350,7 @@ def _solve_cyclic(
     if "keep" not in given:
         # Greedy in a bound that a pass does not worsen: its policy attains it.
         safe = low if given["maximize"] else jnp.where(s.proven, high, low)
-        parts: list[Any] = []
+        parts: list[PyTree] = []
         for part in prepared.segments:
             safe, ranks = sweep(part, safe, choose=True, **given)
             parts.append(ranks)
@@ -459,7 +461,7 @@ def _towards_exits(prepared: Prepared, cycles: tuple[jax.Array, ...], rows: jax.
     count, many = state.shape[0], inside.shape[0]
     last = jnp.iinfo(jnp.int32).max
 
-    def further(carry: Any) -> Any:
+    def further(carry: PyTree) -> PyTree:
         there, row, _ = carry
         leads = (
             jax.ops.segment_max(
@@ -483,10 +485,7 @@ def is_direct(prepared: Prepared) -> bool:
 
 
 def evaluate_prepared(
-    prepared: Prepared,
-    *,
-    probability: chex.Array | None = None,
-    reward: chex.Array | None = None,
+    prepared: Prepared, *, probability: chex.Array | None = None, reward: chex.Array | None = None
 ) -> tuple[jax.Array, jax.Array]:
     """Uncertified values of a prepared Markov chain: one linear system ``x = r + P x``."""
     if prepared.num_rows != prepared.num_states or prepared.objective == "policy":

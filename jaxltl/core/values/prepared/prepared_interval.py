@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
 
 import chex
 import jax
@@ -26,6 +25,8 @@ from jaxltl.core.sparse.prepared.interval_plan import (
 from jaxltl.core.sparse.rows import concatenated_ranges
 from jaxltl.core.types import Solution, Status, require_shape, status_code
 from jaxltl.core import validation
+from jaxltl.core.models.protocols import Array
+from jaxltl.core.models.sparse import Reward
 from jaxltl.core.values import facts
 from jaxltl.core.values.engine.implicit_diff import implicit
 from jaxltl.core.values.engine.iterate import in_turn
@@ -76,20 +77,20 @@ class PreparedInterval:
       ('max', 'min', 1, [0, 2, 1])
     """
 
-    table: Any
-    target: Any
-    owner: Any
-    row: Any
-    choice: Any
-    first: Any
-    node: Any
-    policy: Any
-    entry_row: Any
-    kept: Any
-    answers: Any
-    lower: Any
-    upper: Any
-    reward: Any
+    table: Array
+    target: Array
+    owner: Array
+    row: Array
+    choice: Array
+    first: Array
+    node: Array
+    policy: Array
+    entry_row: Array
+    kept: Array
+    answers: Array
+    lower: Array
+    upper: Array
+    reward: Array
     question: str = struct.field(pytree_node=False)
     objective: str = struct.field(pytree_node=False)
     nature_objective: str = struct.field(pytree_node=False)
@@ -109,11 +110,11 @@ class PreparedInterval:
 
 def prepare_interval(
     model: IntervalMDP,
-    target: Any,
+    target: Array | str,
     *,
-    stay: Any = None,
-    reward: Any = None,
-    policy: Any = None,
+    stay: Array | str | None = None,
+    reward: Reward = None,
+    policy: Array | None = None,
     objective: str = "max",
     nature: str | None = None,
 ) -> PreparedInterval:
@@ -123,7 +124,7 @@ def prepare_interval(
     target = state_mask(model.nominal, target, "target")
     stay = None if stay is None else state_mask(model.nominal, stay, "stay")
     host: UncertainMDP = model.host
-    entry: Any = np.arange(model.num_transitions)
+    entry: Array = np.arange(model.num_transitions)
     if policy is not None:
         policy = np.asarray(policy)
         if not is_deterministic(policy):
@@ -150,8 +151,8 @@ def _prepared(
     host: UncertainMDP,
     entry: np.ndarray,
     plan: IntervalPlan,
-    cost: Any,
-    policy: Any,
+    cost: Array,
+    policy: Array,
     directions: tuple[str, str],
 ) -> PreparedInterval:
     """The arrays."""
@@ -257,7 +258,12 @@ def solve_prepared_interval(
 
 @jax.jit
 def _solve(
-    prepared: PreparedInterval, lower: Any, upper: Any, reward: Any, tolerance: Any, max_steps: Any
+    prepared: PreparedInterval,
+    lower: Array,
+    upper: Array,
+    reward: Array,
+    tolerance: Array,
+    max_steps: Array,
 ) -> Solution:
     finite, valid = _checked(prepared, *lax.stop_gradient((lower, upper, reward)))
     lower = prepared.lower if lower is None else lower
@@ -274,7 +280,7 @@ def _solve(
 
 
 def _checked(
-    prepared: PreparedInterval, lower: Any, upper: Any, reward: Any
+    prepared: PreparedInterval, lower: Array, upper: Array, reward: Array
 ) -> tuple[jax.Array, jax.Array]:
     """Tests that numbers are finite, and that the preprocessing holds for them."""
     finite, valid = jnp.asarray(True), jnp.asarray(True)
@@ -318,7 +324,7 @@ def _checked(
     return finite, valid
 
 
-def _contest(prepared: PreparedInterval, lower: Any, upper: Any, reward: Any) -> Contest:
+def _contest(prepared: PreparedInterval, lower: Array, upper: Array, reward: Array) -> Contest:
     """The residual problem with its intervals and rewards."""
     low, high = (jnp.append(x, 0)[prepared.table] for x in (lower, upper))
     is_reward = prepared.question == "reward"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from fractions import Fraction
-from typing import Any
 
 import numpy as np
 
@@ -13,6 +12,7 @@ from jaxltl.core.logic.labels import is_boolean
 from jaxltl.core.logic.ltl import TRUE, Formula
 from jaxltl.core.logic.properties import MAX_UNFOLDED_STEPS, Property
 from jaxltl.core.models.construct.state_formulas import states_satisfying
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.models.sparse import SparseMDP, choice_reward
 from jaxltl.core.types import Status
 from jaxltl.core.values.multi_objective.front_search import nearest_mixture
@@ -114,13 +114,13 @@ def _objective(model: SparseMDP, prop: Property, strict: bool) -> Objective:
             f"{prop.text}: inside multi(...), ask for {prop.operator}max=? or "
             f"{prop.operator}min=?, or give a threshold."
         )
-    given: dict[str, Any] = {"direction": direction, "threshold": _rounded(prop, strict)}
+    given: dict[str, PyTree] = {"direction": direction, "threshold": _rounded(prop, strict)}
     if prop.operator == "P":
         return Objective(**given, **_event(model, prop))
     return Objective(**given, **_sum(model, prop))
 
 
-def _event(model: SparseMDP, prop: Property) -> dict[str, Any]:
+def _event(model: SparseMDP, prop: Property) -> dict[str, PyTree]:
     path = prop.path
     if isinstance(path, Bounded):
         if path.reward is not None or max(path.lower, path.upper or 0) > MAX_UNFOLDED_STEPS:
@@ -144,7 +144,7 @@ def _event(model: SparseMDP, prop: Property) -> dict[str, Any]:
     return {"formula": path}
 
 
-def _sum(model: SparseMDP, prop: Property) -> dict[str, Any]:
+def _sum(model: SparseMDP, prop: Property) -> dict[str, PyTree]:
     path = prop.path
     if prop.operator == "LRA" or not (isinstance(path, Formula) or path.kind == "total"):  # type: ignore[union-attr]
         raise ValueError(

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +21,7 @@ from jaxltl.core.models.mesh.lanes import on_host
 from jaxltl.core.models.mesh.sharded import ShardedMDP
 from jaxltl.core.models.ops import kernels
 from jaxltl.core.models.product import Product, product
+from jaxltl.core.models.protocols import Array
 from jaxltl.core.types import Solution, Status
 from jaxltl.core.values.properties.solve_property import FINER, Answer, as_answer
 from jaxltl.core.values.undiscounted.reachability import reachability_probability
@@ -56,8 +56,8 @@ class Question:
     def answer(self, found: Solution, wanted: float) -> Answer:
         """The answer of a solution."""
         names = ("value", "lower", "upper")
-        small: Any = {name: self.taken(getattr(found, name)) for name in names}
-        nobody: Any = np.zeros(0, np.int32)
+        small: dict[str, Array] = {name: self.taken(getattr(found, name)) for name in names}
+        nobody: Array = np.zeros(0, np.int32)
         told = replace(found, **small, policy=nobody, status=on_host(found.status))
         method = "interval iteration" if self.goes_on else "policy iteration by a Krylov method"
         return as_answer(self.prop, self.states, told, wanted, f"{method} on the mesh")
@@ -120,7 +120,7 @@ def _path(prop: Property) -> Formula:
     )
 
 
-def _reward(model: ShardedMDP, prop: Property) -> Any:
+def _reward(model: ShardedMDP, prop: Property) -> jax.Array:
     """On choices, ``float[N, A]``; where none is named the only one."""
     if prop.operator == "T":
         return jax.jit(lambda x: jnp.ones(x.shape, model.dtype))(model.available)
@@ -167,7 +167,7 @@ def _starts(model: ShardedMDP) -> jax.Array:
     return jax.jit(lambda x: x[order], out_shardings=_everywhere(model))(found)
 
 
-def _everywhere(model: Any) -> NamedSharding:
+def _everywhere(model: ShardedMDP) -> NamedSharding:
     return NamedSharding(model.mesh, PartitionSpec())
 
 
@@ -188,7 +188,9 @@ def _shown_by(model: ShardedMDP, holds: np.ndarray) -> jax.Array:
 
 
 @partial(jax.jit, static_argnames="objective")
-def _reach_for(model: Any, target: Any, start: Any, half: Any, steps: Any, objective: str) -> Any:
+def _reach_for(
+    model: ShardedMDP, target: Array, start: Bounds, half: Array, steps: Array, objective: str
+) -> Solution:
     return reachability_probability(
         model, target, objective=objective, tolerance=half, max_steps=steps, start=start
     )
@@ -201,7 +203,9 @@ def _reach(
 
 
 @partial(jax.jit, static_argnames="objective")
-def _earn_until(model: Any, reward: Any, target: Any, share: Any, objective: str) -> Any:
+def _earn_until(
+    model: ShardedMDP, reward: jax.Array, target: jax.Array, share: jax.Array, objective: str
+) -> Solution:
     return total_reward(model, reward, target, objective=objective, tolerance=share)
 
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple, TypedDict, cast
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from jaxltl.core.values.properties.answers import (
     Answer as Answer,
@@ -33,9 +34,10 @@ from jaxltl.core.logic.ltl import TRUE, Formula
 from jaxltl.core.logic.properties import MAX_UNFOLDED_STEPS, Property, parse_property
 from jaxltl.core.models.construct.state_formulas import states_satisfying
 from jaxltl.core.models.interval import IntervalMDP
-from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.models.sparse import Reward, SparseMDP
 from jaxltl.core.types import Solution, Status
 from jaxltl.core import validation
+from jaxltl.core.models.protocols import Array
 from jaxltl.core.values.average.average_reward import average_reward
 from jaxltl.core.values.interval.robust import width_asked
 from jaxltl.core.values.interval.step_bounded import (
@@ -48,10 +50,7 @@ from jaxltl.core.values.undiscounted import step_bounded as bounded
 from jaxltl.core.values.engine.host_solution import complement_event
 from jaxltl.core.values.undiscounted.reachability import reachability_probability
 from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction
-from jaxltl.core.values.undiscounted.sparse_satisfaction import (
-    at_states,
-    starting_states,
-)
+from jaxltl.core.values.undiscounted.sparse_satisfaction import at_states, starting_states
 from jaxltl.core.values.undiscounted.total_reward import total_reward
 
 TOLERANCE = 1e-6
@@ -70,6 +69,13 @@ class _Found(NamedTuple):
     strategy: PropertyStrategy | None
 
 
+class Directions(TypedDict):
+    """Directions of the policy and of nature, as arguments of the solvers."""
+
+    objective: str
+    nature: str | None
+
+
 class _Aim(NamedTuple):
     """Directions of the policy and of nature: ``"max"`` or ``"min"``."""
 
@@ -81,7 +87,7 @@ class _Aim(NamedTuple):
         return _Aim(_OTHER[self.policy], None if self.nature is None else _OTHER[self.nature])
 
     @property
-    def directions(self) -> dict[str, Any]:
+    def directions(self) -> Directions:
         """Keyword arguments of the solvers."""
         if self.nature is None:
             return {"objective": self.policy, "nature": None}
@@ -94,7 +100,7 @@ def solve_property(
     model: SparseMDP | IntervalMDP,
     prop: Property | str,
     *,
-    states: Any = None,
+    states: ArrayLike | None = None,
     tolerance: float = TOLERANCE,
 ) -> Answer | Achievable | ConstrainedOptimum | Pareto:
     """Model checking: the value of a property, or its truth, with certified bounds.
@@ -218,7 +224,7 @@ def _status(prop: Property, found: _Found, tolerance: float) -> Status:
         return max(told, Status.NONFINITE)
     with np.errstate(invalid="ignore"):
         width = np.where(lower == upper, 0, upper - lower)
-        most: Any = tolerance
+        most: Array = tolerance
         if prop.operator in ("R", "T"):
             most = np.maximum(tolerance * np.maximum(np.abs(lower), np.abs(upper)), TINY)
         narrow = (width == 0) | ((width <= most) & np.isfinite(width))
@@ -313,9 +319,9 @@ def _solver(
         return lambda tolerance: _plain(
             states, average_reward(known, share, objective=aim.policy, tolerance=tolerance)
         )._replace(method=_AVERAGE)
-    reward: Any = np.ones(model.num_rows) if prop.operator == "T" else prop.reward
+    reward: Reward = np.ones(model.num_rows) if prop.operator == "T" else prop.reward
     if isinstance(path, Formula):
-        target: Any = states_satisfying(graph, path.operands[0], prop.text)
+        target = states_satisfying(graph, path.operands[0], prop.text)
         return lambda tolerance: _plain(
             states, total_reward(model, reward, target, tolerance=tolerance, **aim.directions)
         )
@@ -336,7 +342,7 @@ def _solver(
 def _steps_solver(
     model: SparseMDP | IntervalMDP,
     cumulative: bool,
-    reward: Any,
+    reward: Reward,
     steps: int,
     aim: _Aim,
     states: np.ndarray,
@@ -404,7 +410,7 @@ class _Probability(NamedTuple):
         left, right = path.operands[0], path.operands[-1]
         match path.operator:
             case "X":
-                target = self.where(right)
+                target: Array = self.where(right)
                 return lambda tolerance: self.next(target, aim, tolerance)
             case "F":
                 return self.until(TRUE, right, aim)
@@ -422,9 +428,9 @@ class _Probability(NamedTuple):
         return states_satisfying(_graph(self.model), condition, self.text)
 
     def at_once(self, path: Formula) -> _Found:
-        holds: Any = self.where(path).astype(np.float64)[self.states]
-        zero: Any = np.int32(0)
-        nobody: Any = np.zeros(0, np.int32)
+        holds: Array = self.where(path).astype(np.float64)[self.states]
+        zero: Array = np.int32(0)
+        nobody: Array = np.zeros(0, np.int32)
         return _Found(
             Solution(
                 value=holds,
@@ -449,8 +455,8 @@ class _Probability(NamedTuple):
         return found
 
     def until(self, left: Formula, right: Formula, aim: _Aim) -> Callable[[float], _Found]:
-        target: Any = self.where(right)
-        stay: Any = None if left == TRUE else self.where(left)
+        target: Array = self.where(right)
+        stay: Array = None if left == TRUE else self.where(left)
 
         def solve(tolerance: float) -> _Found:
             found = _plain(

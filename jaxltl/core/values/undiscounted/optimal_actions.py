@@ -8,12 +8,11 @@ rest. docs/optimal-actions.md has the proofs.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import jax
 import numpy as np
 from jaxltl.core import struct
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from jaxltl.core.graphs.end_components import components_within
 from jaxltl.core.graphs.graph import graph_of
@@ -241,9 +240,9 @@ def _judged(
     return OptimalActions(allowed, policy, solution, attained, *to_jax((loss, np.int32(status))))
 
 
-def _staying(problem: Reaching, keeps: Booleans, dtype: Any) -> tuple[jax.Array, jax.Array]:
+def _staying(problem: Reaching, keeps: Booleans, dtype: DTypeLike) -> tuple[jax.Array, jax.Array]:
     """The mask without actions that return to an accepting end component, and its uniform policy."""
-    accepting: Any = problem.accepting
+    accepting = problem.accepting
     if accepting is not None:
         graph = graph_of(problem.model)
         region, inside = np.asarray(accepting.region), np.asarray(accepting.inside)

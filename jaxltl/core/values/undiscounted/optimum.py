@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -34,19 +34,13 @@ from jaxltl.core.models.ops.operators import (
 )
 from jaxltl.core.models.ops.successor_tables import action_columns, sweep_operator
 from jaxltl.core.models.product import Product
-from jaxltl.core.models.protocols import ActionModel
+from jaxltl.core.models.protocols import ActionModel, PyTree
 from jaxltl.core.types import Solution, status_code
 from jaxltl.core.values.engine.certificates import m_matrix_error, refuse, rounding_unit, underflow
 from jaxltl.core.values.engine.chain_systems import ChainSystem
 from jaxltl.core.values.engine.implicit_diff import implicit
 from jaxltl.core.values.engine.iterate import in_turn, iterate
-from jaxltl.core.values.engine.linear import (
-    MOST_PRODUCTS,
-    Inverse,
-    System,
-    is_small,
-    solver,
-)
+from jaxltl.core.values.engine.linear import MOST_PRODUCTS, Inverse, System, is_small, solver
 from jaxltl.core.values.undiscounted.traced_total_reward import Problem, solve_problem
 
 _POLICY_SWEEPS = 8  # sweeps under the greedy policy for one of the optimality operator
@@ -114,7 +108,7 @@ def policy_reachability(
             jnp.max(upper - lower) <= goal, jnp.isfinite(residual), isinstance(linear, Inverse)
         ),
     )
-    solvers: dict[str, Any] = {"system": chain}
+    solvers: dict[str, PyTree] = {"system": chain}
     if isinstance(linear, Inverse):
         solvers = {"solve": linear.solve, "transpose_solve": linear.transpose_solve}
     differentiable = implicit(lambda y: one + image(model, policy, y), value, **solvers)
@@ -153,10 +147,10 @@ def optimal_reachability(
 
 @partial(jax.jit, static_argnames=("objective",))
 def _inside_jit(
-    model: ActionModel, target: Any, tolerance: Any, max_steps: Any, start: Any, *, objective: str
+    model: ActionModel, target: jax.Array, *options: PyTree, objective: str
 ) -> Solution:
     sets, components = in_turn(partial(_qualitative, objective=objective), model, target)
-    return _optimize(model, sets, components, tolerance, max_steps, start, objective=objective)
+    return _optimize(model, sets, components, *options, objective=objective)
 
 
 def _qualitative(
@@ -178,7 +172,7 @@ class _Search(NamedTuple):
     # Both are rounded outwards: sums of nonnegative terms err by a share `slack` of them, and by
     # `least` where products underflow.
 
-    model: Any
+    model: ActionModel
     undecided: jax.Array
     one: jax.Array
     components: EndComponents | None

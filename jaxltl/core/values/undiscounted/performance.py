@@ -11,7 +11,7 @@ import math
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -34,6 +34,7 @@ from jaxltl.core.models.ops.operators import (
     valid_policy,
 )
 from jaxltl.core.models.product import Product
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.graph.qualitative import backward_reachable
 from jaxltl.core.types import Status, require_shape, status_code
@@ -150,7 +151,7 @@ def _task_performance(model: Product, policy: jax.Array, tolerance, *, method: s
         )
         value, lower, upper = solution.value, solution.lower, solution.upper
     found = _summarize(model, value, lower, upper, tolerance)
-    unknown: Any = {
+    unknown: dict[str, PyTree] = {
         "mean": jnp.nan,
         "lower": 0,
         "upper": 1,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple, cast
 
 import jax
 import numpy as np
@@ -149,7 +149,7 @@ def reachability_probability(
     return _on_host(model, target, None, policy, objective, tolerance) if found is None else found
 
 
-def refuse_iteration(max_steps: Any, start: Any) -> None:
+def refuse_iteration(max_steps: object, start: object) -> None:
     """Raises ValueError if an option of interval iteration is given to a solver of sparse rows."""
     if max_steps is not None or start is not None:
         raise ValueError(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple, overload
+from typing import NamedTuple, overload
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +28,7 @@ from jaxltl.core.models.mesh.sharded import is_sharded
 from jaxltl.core.models.ops.array_namespace import is_traced, namespace, to_jax
 from jaxltl.core.models.ops.operators import is_deterministic, require_policy
 from jaxltl.core.models.product import Product
-from jaxltl.core.models.protocols import Model
+from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.solvers.shortest_path import fastest_rows, with_exits
@@ -153,7 +153,7 @@ def optimal_satisfaction(
     nature: str | None = None,
     states: ArrayLike | None = None,
     label_on: str | None = None,
-    tolerance: Any = None,
+    tolerance: jax.Array | float | None = None,
     max_steps: jax.Array | int | None = None,
     start: tuple[jax.Array, jax.Array] | None = None,
 ) -> Solution | Satisfaction:
@@ -236,7 +236,12 @@ def optimal_satisfaction(
 
 
 def _optimal(
-    model: Product, tolerance: Any, max_steps: Any, start: Any, *, objective: str
+    model: Product,
+    tolerance: jax.Array | float | None,
+    max_steps: jax.Array | int | None,
+    start: tuple[jax.Array, jax.Array] | None,
+    *,
+    objective: str,
 ) -> Solution:
     problem, given = as_reachability(model, objective), start
     if start is not None and problem.opposite:  # rounded outwards
@@ -261,7 +266,7 @@ def _optimal(
     return found if given is None else _within(found, given)
 
 
-def _within(found: Solution, bounds: tuple[Any, Any]) -> Solution:
+def _within(found: Solution, bounds: tuple[jax.Array, jax.Array]) -> Solution:
     """A solution with bounds no wider than given ones, despite rounding outwards."""
     lower = jnp.maximum(found.lower, bounds[0])
     upper = jnp.minimum(found.upper, bounds[1])
@@ -277,7 +282,7 @@ class Reaching(NamedTuple):
     """An optimal satisfaction problem as an optimal reachability problem."""
 
     model: Product  # the product, or that of the task's negation
-    target: Any  # ``bool[S, Q]``
+    target: Array  # ``bool[S, Q]``
     objective: str  # ``"max"`` or ``"min"``
     opposite: bool  # whether the satisfaction probability is one minus that of the target
     # for Buchi and parity, the accepting end components of the target
@@ -298,7 +303,7 @@ def as_reachability(model: Product, objective: str) -> Reaching:
     return Reaching(model, accepting.region, "max", objective == "min", accepting)
 
 
-def _visiting(problem: Reaching, found: Solution) -> Any:
+def _visiting(problem: Reaching, found: Solution) -> Array:
     """A policy that reads the least priority of accepting end components infinitely often."""
     model, accepting = problem.model, problem.accepting
     assert accepting is not None
@@ -310,10 +315,7 @@ def _visiting(problem: Reaching, found: Solution) -> Any:
     outer = ~np.asarray(accepting.region).ravel()
     row = row_of_action(sparse, accepting.action)
     rows = fastest_rows(
-        visits,
-        np.append(inside, True),
-        np.append(outer, True),
-        np.append(row, sparse.num_rows),
+        visits, np.append(inside, True), np.append(outer, True), np.append(row, sparse.num_rows)
     )
     return np.asarray(sparse.action)[rows[:-1]].reshape(model.state_shape)
 
@@ -342,12 +344,12 @@ def _shifted(automaton: Automaton) -> Automaton:
     return replace(automaton, priority=priority, acceptance="parity", state_names=())
 
 
-def _not_final(model: Product) -> Any:
+def _not_final(model: Product) -> jax.Array:
     _, final = namespace(model.final)
     return to_jax(~final)
 
 
-def _one_hot(policy: Any, num_actions: int) -> Any:
+def _one_hot(policy: Array, num_actions: int) -> Array:
     xp, table = namespace(policy)
     return table[..., None] == xp.arange(num_actions)
 

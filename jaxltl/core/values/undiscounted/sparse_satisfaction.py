@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+import jax
 import numpy as np
 
 from jaxltl.core.automata.automaton import Automaton, letter_index
@@ -71,7 +72,7 @@ def sparse_satisfaction(
     objective: str = "max",
     states: Array | None = None,
     label_on: str = "entry",
-    tolerance: float | None = None,
+    tolerance: jax.Array | float | None = None,
 ) -> Satisfaction:
     """Optimal satisfaction probability on the reachable product, up to states with a verdict."""
     reduction_for(objective)
@@ -133,13 +134,13 @@ def _best(
     product: SparseProduct,
     reader: _Reader,
     objective: str,
-    tolerance: float | None,
+    tolerance: jax.Array | float | None,
     depth: int = 0,
 ) -> tuple[Solution, np.ndarray]:
     """The optimal probability from all states of a product, and the rows that attain it."""
     automaton = reader.automaton
     opposite = automaton.is_safety or (not automaton.has_final_states and objective == "min")
-    goal: Any = (reader.rejecting if opposite else reader.accepting)[product.memory]
+    goal: np.ndarray = (reader.rejecting if opposite else reader.accepting)[product.memory]
     visiting = None
     if not automaton.has_final_states:
         entry_letter = product.entry_letter(reader.letter, reader.on_entry)
@@ -180,7 +181,7 @@ def product_satisfaction(
             "a product of a sparse model takes no mask of actions; restrict the world "
             "by with_allowed(world, rows), or write the product out by to_sparse."
         )
-    world: Any = model.mdp
+    world: SparseMDP = model.mdp
     task = model.automaton
     automaton = replace(task, delta=np.asarray(task.delta), priority=np.asarray(task.priority))
     letter, shape = np.asarray(model.letter), model.state_shape
@@ -193,7 +194,7 @@ def product_satisfaction(
         product, depth, objective = product._replace(host=chain.mdp), chain.depth, "max"
     reader = _Reader(automaton, letter, on_entry)
     found, row = _best(product, reader, objective, tolerance, depth)
-    parts: dict[str, Any] = {
+    parts: dict[str, Array] = {
         name: np.asarray(getattr(found, name)).reshape(shape)
         for name in ("value", "lower", "upper")
     }
@@ -215,7 +216,7 @@ def _chain(product: SparseProduct, model: Product, policy: Array) -> Chain:
         taken = policy.ravel()[product.host.state] == product.base_row
         weight = taken.astype(np.float64)
     else:
-        world: Any = model.mdp
+        world: SparseMDP = model.mdp
         require_shape("policy", policy, (world.num_rows, model.num_memory))
         weight = policy[product.base_row, memory]
     return induced_chain(written, written, weight)
@@ -268,7 +269,7 @@ def sparse_mdp_of_product(product: SparseProduct) -> SparseMDP:
 
 def at_states(solution: Solution, states: np.ndarray) -> Solution:
     """A solution's value and bounds at some states."""
-    taken: dict[str, Any] = {
+    taken: dict[str, Array] = {
         name: np.asarray(getattr(solution, name), np.float64)[states]
         for name in ("value", "lower", "upper")
     }

@@ -6,7 +6,6 @@ Solved in double precision; bounds include all rounding.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
@@ -277,6 +276,6 @@ def reward_bounded_reachability(
 # --- what these and other host solvers share -----------------------------------------------------
 
 
-def _problem(model: Model, objective: str, num_steps: int = 0) -> tuple[SparseMDP, Any]:
+def _problem(model: Model, objective: str, num_steps: int = 0) -> tuple[SparseMDP, np.ufunc]:
     validation.integer("num_steps", num_steps)
     return to_sparse(model), reduction_for(objective)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 
-from typing import TypeAlias, cast
+from typing import cast
 
 import chex
 import jax
@@ -21,7 +21,7 @@ from jaxltl.core.models.mesh.sharded import ShardedMDP, is_sharded
 from jaxltl.core.models.ops.array_namespace import is_traced
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import ActionModel, Array, Model
-from jaxltl.core.models.sparse import Rewards, SparseMDP, choice_reward
+from jaxltl.core.models.sparse import Reward, Rewards, SparseMDP, choice_reward
 from jaxltl.core.sparse.solvers import reachability as optimal
 from jaxltl.core.types import Solution, require_shape, require_states
 from jaxltl.core.values.engine.host_solution import (
@@ -35,7 +35,6 @@ from jaxltl.core.values.interval.robust import refuse_nature, robust_total_rewar
 from jaxltl.core.values.undiscounted.traced_total_reward import total_reward_by_sweeps
 
 _SIX_DIGITS = 1e-6
-Reward: TypeAlias = str | Rewards | Array | None
 World = MDP | DenseMDP | ShardedMDP
 
 
@@ -48,7 +47,7 @@ def total_reward(
     policy: chex.Array | None = None,
     objective: str = "max",
     nature: str | None = None,
-    tolerance: float | None = None,
+    tolerance: jax.Array | float | None = None,
 ) -> Solution:
     """Total expected reward until a target is reached, or for ever.
 
