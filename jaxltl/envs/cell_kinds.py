@@ -76,11 +76,7 @@ def find_kinds(colors: NDArray[Any], codes: NDArray[np.int64]) -> NDArray[np.int
 
 
 def categories(
-    colors: ArrayLike,
-    *,
-    objects: Counts = OBJECTS,
-    obstacles: Counts = OBSTACLES,
-    margin: int = 1,
+    colors: ArrayLike, *, objects: Counts = OBJECTS, obstacles: Counts = OBSTACLES, margin: int = 1
 ) -> NDArray[np.int32]:
     """Category ``int32[rows, columns]`` of each cell by the colours of its 3 x 3 patch.
 

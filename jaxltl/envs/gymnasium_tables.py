@@ -13,10 +13,7 @@ from jaxltl.envs.gymnasium_runner import TERMINATED
 
 
 def from_gymnasium(
-    env: Any,
-    *,
-    labels: Mapping[str, Sequence[int]] | None = None,
-    initial: ArrayLike | None = None,
+    env: Any, *, labels: Mapping[str, Sequence[int]] | None = None, initial: ArrayLike | None = None
 ) -> SparseMDP:
     """The MDP of the transition table of a Gymnasium environment.
 

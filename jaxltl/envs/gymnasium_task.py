@@ -92,11 +92,7 @@ class _Steps:
 
         this: PyTree = self  # becomes a gymnasium.Wrapper when gymnasium is imported
         gymnasium.utils.RecordConstructorArgs.__init__(
-            this,
-            _disable_deepcopy=True,
-            tables=tables,
-            labels=labels,
-            names=names,
+            this, _disable_deepcopy=True, tables=tables, labels=labels, names=names
         )
         gymnasium.Wrapper.__init__(this, env)
         spaces = self._spaces = gymnasium.spaces

@@ -403,11 +403,7 @@ def simulate(
 
 @jax.jit  # so that calls outside of jit share one compilation
 def _simulate(
-    network: Network,
-    settings: _Static,
-    world: Navigation,
-    parameters: jax.Array,
-    key: chex.PRNGKey,
+    network: Network, settings: _Static, world: Navigation, parameters: jax.Array, key: chex.PRNGKey
 ) -> Run:
     num_trajectories, absorbing = settings.value
     dtype = jnp.promote_types(parameters.dtype, jnp.float32)

@@ -30,10 +30,7 @@ from .drn.parametric import (
     RationalFunction as RationalFunction,
     read_parametric as read_parametric,
 )
-from .network_policy import (
-    NetworkPolicy as NetworkPolicy,
-    save_network as save_network,
-)
+from .network_policy import NetworkPolicy as NetworkPolicy, save_network as save_network
 from .policies import (
     load_policy as load_policy,
     save_policy as save_policy,

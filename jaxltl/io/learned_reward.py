@@ -36,11 +36,7 @@ from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.product import Product, product
 from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.types import Solution, worst
-from jaxltl.core.values.undiscounted.mixture import (
-    practical_policy,
-    reaching,
-    require_attainable,
-)
+from jaxltl.core.values.undiscounted.mixture import practical_policy, reaching, require_attainable
 from jaxltl.core.values.undiscounted.optimal_actions import optimal_actions
 
 

@@ -18,12 +18,7 @@ from jaxltl.core.environments.environment import Environment, allowed_in
 from jaxltl.core.environments.episodes import Agent
 from jaxltl.core.environments.task_environment import TaskObservation, task_tables
 from jaxltl.core.policies.finite_memory import Controller, Key, Progress
-from jaxltl.core.policies.policy_file import (
-    Arrays,
-    automaton_of,
-    automaton_text,
-    write_policy_file,
-)
+from jaxltl.core.policies.policy_file import Arrays, automaton_of, automaton_text, write_policy_file
 from jaxltl.core.pretty_print import brief
 
 _PLATFORMS = ("cpu", "cuda", "tpu")

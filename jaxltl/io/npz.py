@@ -45,13 +45,7 @@ _ENDS = {"lower": _NUMBERS, "upper": _NUMBERS}  # of interval models
 _BALL = {"center": _NUMBERS, "radius": _NUMBERS}  # of those with a ball besides
 _OF_INTERVALS = {**_ENDS, **_BALL}
 _PADDED = {"transition": _NUMBERS, "available": _TRUTH, **_SHARED, **_OF_INTERVALS}
-_SPARSE = {
-    "row_start": _WHOLE,
-    "entry_start": _WHOLE,
-    "action": _WHOLE,
-    **_SHARED,
-    **_OF_INTERVALS,
-}
+_SPARSE = {"row_start": _WHOLE, "entry_start": _WHOLE, "action": _WHOLE, **_SHARED, **_OF_INTERVALS}
 _VALUES = ("biufUS", "truth values, numbers and texts")
 _REWARD, _VARIABLE = "reward:", "variable:"
 _PARTS = ("state", "choice", "transition")

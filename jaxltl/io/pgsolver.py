@@ -165,11 +165,7 @@ class _Reader:
             ) from None
 
     def _made(
-        self,
-        vertex: Integers,
-        priority: Integers,
-        degree: Integers,
-        successor: Integers,
+        self, vertex: Integers, priority: Integers, degree: Integers, successor: Integers
     ) -> ParityGame:
         valuation = {"vertex": vertex, "priority": priority}
         if any(self.names):

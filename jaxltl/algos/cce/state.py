@@ -8,9 +8,7 @@ import jax
 from jaxltl.core import struct
 from jax.sharding import NamedSharding
 
-from jaxltl.algos.cce._elites import (
-    Sample,
-)
+from jaxltl.algos.cce._elites import Sample
 from jaxltl.algos.common.schedules import Polynomial as Polynomial, Schedule
 from jaxltl.algos.common.settings import COUNT, Number, static, traced
 from jaxltl.core.models.protocols import PyTree

@@ -8,11 +8,7 @@ from collections.abc import Iterator
 import chex
 import optax
 
-_SCALINGS = {
-    "adam": optax.scale_by_adam,
-    "rmsprop": optax.scale_by_rms,
-    "sgd": optax.identity,
-}
+_SCALINGS = {"adam": optax.scale_by_adam, "rmsprop": optax.scale_by_rms, "sgd": optax.identity}
 # With their own search, with a random key, deprecated.
 _OTHERS = ("lbfgs", "noisy_sgd", "optimistic_adam")
 

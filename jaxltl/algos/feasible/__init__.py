@@ -18,13 +18,7 @@ from jaxltl.algos.feasible.learner import (
     train,
     train_until,
 )
-from jaxltl.algos.feasible.problem import (
-    Problem,
-    certify,
-    make_problem,
-    require_problem,
-    within,
-)
+from jaxltl.algos.feasible.problem import Problem, certify, make_problem, require_problem, within
 
 __all__ = [
     "Best",

@@ -100,10 +100,7 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
     more = state.samples <= loops.MAX_STEPS - size
     new = sampled_counts(state, problem, hparams) * more
     state = replace(
-        state,
-        step=state.step + 1,
-        samples=state.samples + size * more,
-        counts=state.counts + new,
+        state, step=state.step + 1, samples=state.samples + size * more, counts=state.counts + new
     )
     if hparams.intervals == "linear":
         lower, upper = linear_intervals(state, new, hparams)

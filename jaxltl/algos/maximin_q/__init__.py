@@ -15,12 +15,7 @@ from jaxltl.algos.maximin_q.learner import (
     value,
     value_is_stable,
 )
-from jaxltl.algos.maximin_q.problem import (
-    Problem,
-    make_problem,
-    recurrent_states,
-    with_exact_value,
-)
+from jaxltl.algos.maximin_q.problem import Problem, make_problem, recurrent_states, with_exact_value
 
 __all__ = [
     "Hparams",

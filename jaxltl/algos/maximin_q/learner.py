@@ -51,11 +51,7 @@ from jax import lax
 from jax.tree_util import Partial
 
 from jaxltl.algos.common import learner, loops, splitmix
-from jaxltl.algos.common.play import (
-    draw,
-    observed_reward,
-    take,
-)
+from jaxltl.algos.common.play import draw, observed_reward, take
 from jaxltl.algos.common.settings import COUNT, Number, static, traced
 from jaxltl.algos.maximin_q._alias import draw_alias
 from jaxltl.algos.maximin_q.problem import Problem

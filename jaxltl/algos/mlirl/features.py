@@ -33,11 +33,7 @@ from jaxltl.core.models.trajectories import Trajectories
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.solvers.shortest_path import expected_steps
 from jaxltl.core.types import Solution
-from jaxltl.core.values.undiscounted.reachability import (
-    on_actions,
-    row_of_action,
-    rows_of_model,
-)
+from jaxltl.core.values.undiscounted.reachability import on_actions, row_of_action, rows_of_model
 from jaxltl.core.values.undiscounted.satisfaction import as_reachability, until_visit
 
 

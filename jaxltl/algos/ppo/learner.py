@@ -262,11 +262,7 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
     status = jnp.where((losses["nonfinite"] > 0) | ~finite, Status.NONFINITE, Status.COMPLETED)
     made = learner.saturating_add(state.transitions, hparams.num_envs * hparams.num_steps)
     new = replace(
-        after,
-        step=state.step + 1,
-        parameters=parameters,
-        optimizer=optimizer,
-        transitions=made,
+        after, step=state.step + 1, parameters=parameters, optimizer=optimizer, transitions=made
     )
     return new, Metrics(
         **figures,

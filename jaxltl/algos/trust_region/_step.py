@@ -11,11 +11,7 @@ from jax import lax
 from jax.scipy.sparse.linalg import cg
 
 from jaxltl.algos.trust_region._cpo_dual import Case, Dual, cpo_dual, cpo_weights, ratio
-from jaxltl.algos.trust_region._policy_networks import (
-    gaussian,
-    kl_divergence,
-    log_density,
-)
+from jaxltl.algos.trust_region._policy_networks import gaussian, kl_divergence, log_density
 from jaxltl.algos.trust_region._value_fit import positive
 from jaxltl.algos.trust_region.state import Hparams
 from jaxltl.core.models.protocols import PyTree

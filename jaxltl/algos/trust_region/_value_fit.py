@@ -8,9 +8,7 @@ import jax.numpy as jnp
 import optax
 
 from jaxltl.algos.common.collection import minibatch_epochs
-from jaxltl.algos.trust_region._policy_networks import (
-    values_at,
-)
+from jaxltl.algos.trust_region._policy_networks import values_at
 from jaxltl.algos.trust_region.state import Hparams, State
 from jaxltl.core.models.protocols import PyTree
 

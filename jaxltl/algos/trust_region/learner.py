@@ -92,9 +92,7 @@ from jaxltl.algos.trust_region.policies import (
 )
 from jaxltl.algos.trust_region.problem import Problem, action_size, make_problem, observed_vector
 from jaxltl.algos.trust_region.state import METHODS, Hparams, Metrics, State
-from jaxltl.core.environments.environment import (
-    require_key,
-)
+from jaxltl.core.environments.environment import require_key
 from jaxltl.core.models.protocols import PyTree
 
 __all__ = [

@@ -15,18 +15,11 @@ from jax.tree_util import Partial
 from jaxltl.algos.common import action_distributions as actions_of
 from jaxltl.algos.common.actor_critic import Output
 from jaxltl.algos.common.collection import Transition, transition
-from jaxltl.algos.trust_region._policy_networks import (
-    gaussian,
-    normalized,
-)
+from jaxltl.algos.trust_region._policy_networks import gaussian, normalized
 from jaxltl.algos.trust_region.problem import Problem, as_action, observed_vector
 from jaxltl.algos.trust_region.state import Hparams, State
 from jaxltl.core import validation
-from jaxltl.core.environments.environment import (
-    flat_observation,
-    require_key,
-    some_action,
-)
+from jaxltl.core.environments.environment import flat_observation, require_key, some_action
 from jaxltl.core.environments.episodes import Agent
 from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.pretty_print import brief

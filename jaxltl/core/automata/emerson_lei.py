@@ -310,11 +310,7 @@ def _largest(parts: list[Integers]) -> list[Integers]:
 
 
 def _unfold(
-    delta: Integers,
-    component: Integers,
-    trees: dict[int, _Tree],
-    initial: int,
-    max_states: int,
+    delta: Integers, component: Integers, trees: dict[int, _Tree], initial: int, max_states: int
 ) -> tuple[Integers, Integers, Integers]:
     """The automaton on pairs of a state and a lowest node of the tree that holds it."""
     width = delta.shape[1]

@@ -81,10 +81,7 @@ def _agreeing(
 
 
 def _reading(
-    automaton: Automaton,
-    letter: NDArray[np.int64],
-    rows: NDArray[np.bool_],
-    names: tuple[str, ...],
+    automaton: Automaton, letter: NDArray[np.int64], rows: NDArray[np.bool_], names: tuple[str, ...]
 ) -> Automaton:
     """The automaton that reads its own `letter[l]` where the new letter l occurs."""
     return replace(
@@ -180,10 +177,7 @@ def _loops(runs: Runs, parities: tuple[int, ...]) -> Iterator[_Loops]:
 
 
 def _through(
-    delta: NDArray[np.int32],
-    inside: NDArray[np.bool_],
-    marks: list[NDArray[np.bool_]],
-    entry: int,
+    delta: NDArray[np.int32], inside: NDArray[np.bool_], marks: list[NDArray[np.bool_]], entry: int
 ) -> tuple[list[int], list[int]]:
     """The letters to node `entry`, and of a loop inside through a transition of each mark."""
     everywhere = np.ones_like(inside)
@@ -242,10 +236,7 @@ def _components(delta: NDArray[np.int32], allowed: NDArray[np.bool_]) -> Integer
 
 
 def _path(
-    delta: NDArray[np.int32],
-    allowed: NDArray[np.bool_],
-    start: int,
-    goal: NDArray[np.bool_],
+    delta: NDArray[np.int32], allowed: NDArray[np.bool_], start: int, goal: NDArray[np.bool_]
 ) -> tuple[list[int], int]:
     """The letters of a shortest path to a goal, which must be reachable, and its end."""
     from scipy.sparse.csgraph import breadth_first_order

@@ -100,11 +100,7 @@ def _reset(initial: jax.Array, key: chex.PRNGKey) -> jax.Array:
 
 
 def _step(
-    model: MDP | DenseMDP,
-    reward: jax.Array,
-    state: jax.Array,
-    action: jax.Array,
-    key: chex.PRNGKey,
+    model: MDP | DenseMDP, reward: jax.Array, state: jax.Array, action: jax.Array, key: chex.PRNGKey
 ) -> Timestep:
     after = sample_successor(model, key, state, action).astype(jnp.int32)
     return Timestep(after, _earned(reward, state, action, after), terminated=jnp.bool_(False))

@@ -275,11 +275,7 @@ def generalized_buchi(game: Any, sets: Sequence[States], *, safe: States = "true
 
 
 def gr1(
-    game: Any,
-    assumptions: Sequence[States],
-    guarantees: Sequence[States],
-    *,
-    safe: States = "true",
+    game: Any, assumptions: Sequence[States], guarantees: Sequence[States], *, safe: States = "true"
 ) -> GR1:
     """GR(1) objective ``G safe & ((G F A_1 & ... & G F A_M) -> (G F G_1 & ... & G F G_J))``.
 

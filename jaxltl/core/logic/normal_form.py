@@ -127,10 +127,7 @@ class Rewriter:
             [
                 self.limit_often(replace_all(operand, greatest, strong)),
                 conjunction(
-                    [
-                        self.limit_ever(kept),
-                        self.limit_often(replace_all(operand, greatest, TRUE)),
-                    ]
+                    [self.limit_ever(kept), self.limit_often(replace_all(operand, greatest, TRUE))]
                 ),
             ]
         )

@@ -484,10 +484,7 @@ class _Parser(TokenStream):
         if isinstance(path, Formula):
             return path
         if path.reward is not None:
-            raise self.error(
-                "a bound on a reward outermost and on state formulas only",
-                self.last,
-            )
+            raise self.error("a bound on a reward outermost and on state formulas only", self.last)
         if max(path.lower, path.upper or 0) > MAX_UNFOLDED_STEPS:
             raise self.error(
                 f"a bound of at most {MAX_UNFOLDED_STEPS} steps inside of a formula; outermost and "

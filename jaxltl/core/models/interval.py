@@ -500,10 +500,7 @@ def _scaled(
 
 
 def _merged(
-    row: np.ndarray,
-    successor: np.ndarray,
-    numbers: list[np.ndarray],
-    rewards: dict[str, Rewards],
+    row: np.ndarray, successor: np.ndarray, numbers: list[np.ndarray], rewards: dict[str, Rewards]
 ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray], dict[str, Rewards]]:
     """Merges repeated successors of a row by summing their ends."""
     order = np.lexsort((successor, row))

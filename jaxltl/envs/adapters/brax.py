@@ -25,10 +25,7 @@ from jaxltl.envs.adapters.common import (
 
 
 def from_brax(
-    env: Any,
-    *,
-    labels: Callable[..., jax.Array] | None = None,
-    propositions: Sequence[str] = (),
+    env: Any, *, labels: Callable[..., jax.Array] | None = None, propositions: Sequence[str] = ()
 ) -> Environment:
     """A Brax environment without its auto-reset and batch wrappers.
 

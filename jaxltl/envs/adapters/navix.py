@@ -24,10 +24,7 @@ from jaxltl.envs.adapters.common import (
 
 
 def from_navix(
-    env: Any,
-    *,
-    labels: Callable[..., jax.Array] | None = None,
-    propositions: Sequence[str] = (),
+    env: Any, *, labels: Callable[..., jax.Array] | None = None, propositions: Sequence[str] = ()
 ) -> Environment:
     """A Navix environment.
 

@@ -227,10 +227,7 @@ def _state_lines(
 
 
 def _action_lines(
-    model: SparseMDP,
-    rows: slice,
-    actions: Callable[[int], str] | None,
-    rewards: list[_Reward],
+    model: SparseMDP, rows: slice, actions: Callable[[int], str] | None, rewards: list[_Reward]
 ) -> list[str]:
     after = _bracketed([choice for _, choice in rewards], rows, rows.stop - rows.start)
     if actions is None or model.action is None:

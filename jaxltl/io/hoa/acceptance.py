@@ -6,12 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core.array_types import Integers
-from jaxltl.io.hoa.grammar import (
-    FALSE,
-    TRUE,
-    Tree,
-    error_at,
-)
+from jaxltl.io.hoa.grammar import FALSE, TRUE, Tree, error_at
 from jaxltl.io.hoa.header import Header
 
 MAX_COLORS = 62  # acceptance sets as bits of one int64

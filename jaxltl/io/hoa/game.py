@@ -26,13 +26,7 @@ from jaxltl.io.files import read_text
 from jaxltl.io.hoa.acceptance import condition_given, decisive_sets, edge_priority
 from jaxltl.io.hoa.grammar import Edge, Item, State, error_at, parse_tokens, split_texts
 from jaxltl.io.hoa.header import Header, read_header
-from jaxltl.io.hoa.table import (
-    by_number,
-    guarded_edges,
-    label_reader,
-    marks_of,
-    nondeterminism,
-)
+from jaxltl.io.hoa.table import by_number, guarded_edges, label_reader, marks_of, nondeterminism
 from jaxltl.io.hoa.hoa import parity_text, quoted
 from jaxltl.io.pgsolver import edges_of, max_even, min_even, objective_of
 

@@ -6,13 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from jaxltl.io.hoa.grammar import (
-    KNOWN_HEADERS,
-    Item,
-    Tree,
-    error_at,
-    unquoted,
-)
+from jaxltl.io.hoa.grammar import KNOWN_HEADERS, Item, Tree, error_at, unquoted
 
 if TYPE_CHECKING:
     from lark import Token

@@ -24,11 +24,7 @@ from jaxltl.io.hoa.acceptance import (
     decisive_sets,
     edge_priority,
 )
-from jaxltl.io.hoa.grammar import (
-    error_at,
-    parse_tokens,
-    split_texts,
-)
+from jaxltl.io.hoa.grammar import error_at, parse_tokens, split_texts
 from jaxltl.io.hoa.header import MAX_PRIORITIES, Header, read_header
 from jaxltl.io.hoa.table import Table, alphabet_of, by_number, read_table
 

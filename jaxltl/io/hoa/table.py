@@ -13,12 +13,7 @@ from numpy.typing import NDArray
 from jaxltl.core.array_types import Integers
 from jaxltl.core.automata.automaton import letter_text
 from jaxltl.core.logic.ltl import Letter, as_letters
-from jaxltl.io.hoa.grammar import (
-    Edge,
-    State,
-    Tree,
-    error_at,
-)
+from jaxltl.io.hoa.grammar import Edge, State, Tree, error_at
 from jaxltl.io.hoa.header import Header, only_target, set_number
 
 LetterSet = TypeVar("LetterSet")

@@ -285,10 +285,7 @@ def _read_rows(text: Text) -> _Rows:
     del parts
     state, choice, target, probability, action, lines = columns
     if sizes and sizes[-1] != state.size:
-        raise text.error(
-            rest.line - 1,
-            truncated(sizes[-1], state.size, "transitions"),
-        )
+        raise text.error(rest.line - 1, truncated(sizes[-1], state.size, "transitions"))
     num_states = sizes[0] if sizes else int(max(state.max(), target.max())) + 1
     if num_states > 16 * state.size + 10_000:
         raise text.error(
@@ -298,10 +295,7 @@ def _read_rows(text: Text) -> _Rows:
     rows = _Rows(num_states, is_chain, state, choice, target, probability, action, lines, names)
     new = _new_rows(text, rows, form)
     if len(sizes) == 3 and sizes[1] != new.sum():
-        raise text.error(
-            rest.line - 1,
-            truncated(sizes[1], int(new.sum()), "choices"),
-        )
+        raise text.error(rest.line - 1, truncated(sizes[1], int(new.sum()), "choices"))
     return rows
 
 

@@ -21,13 +21,7 @@ from jaxltl.core.models.interval import IntervalMDP, interval_rows, refuse_ball
 from jaxltl.core.models.mdp import checked_initial
 from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import SparseMDP, make_sparse
-from jaxltl.io.files import (
-    Compression,
-    compression_by_name,
-    pieces,
-    raw_bytes,
-    write_bytes,
-)
+from jaxltl.io.files import Compression, compression_by_name, pieces, raw_bytes, write_bytes
 from jaxltl.io.umb.index import (
     ACTIONS,
     INITIAL,

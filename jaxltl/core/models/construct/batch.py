@@ -267,10 +267,7 @@ def split_trajectories(
 
 
 def demonstration_counts(
-    models: Product,
-    trajectories: Demonstrations,
-    *,
-    horizon: int | None = None,
+    models: Product, trajectories: Demonstrations, *, horizon: int | None = None
 ) -> jax.Array:
     """State-action counts ``float[W, S, Q, A]`` in each product; ``[W, T, S, Q, A]`` with a horizon T."""
     given, count = _of_each_world(trajectories), num_worlds(models)

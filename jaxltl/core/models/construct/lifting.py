@@ -160,11 +160,7 @@ class MemoryRows(Protocol):
 
 
 def project_policy(
-    model: Model,
-    policy: PyTree,
-    *,
-    actions: Sequence[str] = (),
-    states: Sequence[str] = (),
+    model: Model, policy: PyTree, *, actions: Sequence[str] = (), states: Sequence[str] = ()
 ) -> FiniteMemoryPolicy:
     """Policy of a product as a finite-memory policy of the base model, to run and to save.
 

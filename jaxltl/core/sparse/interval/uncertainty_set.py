@@ -100,14 +100,7 @@ class UncertainMDP:
                 ball = {"center": center, "gain": self.ball.gain[row], "deficit": deficit[row]}
             found.append(
                 RowTable(
-                    row,
-                    entry,
-                    used,
-                    lower,
-                    upper,
-                    self.free_mass[row],
-                    self.rounding[row],
-                    **ball,
+                    row, entry, used, lower, upper, self.free_mass[row], self.rounding[row], **ball
                 )
             )
         return found

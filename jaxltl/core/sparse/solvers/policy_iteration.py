@@ -31,10 +31,7 @@ from jaxltl.core.sparse.linear.extended_precision import (
     perturbation_bound,
     refined_optimum,
 )
-from jaxltl.core.sparse.linear.optimality_equation import (
-    OptimalityEquation,
-    propagate_improvements,
-)
+from jaxltl.core.sparse.linear.optimality_equation import OptimalityEquation, propagate_improvements
 from jaxltl.core.sparse.linear.topological_order import (
     Edges,
     Levels,

@@ -137,12 +137,7 @@ def reward_forever(
 
 
 def reduce_reachability(
-    mdp: HostMDP,
-    target: Booleans,
-    *,
-    maximize: bool,
-    stay: Booleans | None = None,
-    depth: int = 0,
+    mdp: HostMDP, target: Booleans, *, maximize: bool, stay: Booleans | None = None, depth: int = 0
 ) -> ReducedProblem:
     """Residual problem of :func:`reachability`, with the same arguments."""
     blocked = np.zeros(mdp.num_states, bool) if stay is None else ~stay & ~target
@@ -324,10 +319,7 @@ def _solve_nodes(reduced: ReducedProblem, tolerance: float) -> Enclosure:
     if problem is None:
         return Enclosure(known, known, known, reduced.known_row, 0, 0.0, "the graph")
     found = solve_shortest_path(
-        problem,
-        maximize=reduced.maximize,
-        tolerance=tolerance,
-        relative=not np.isfinite(highest),
+        problem, maximize=reduced.maximize, tolerance=tolerance, relative=not np.isfinite(highest)
     )
     infinite = np.isinf(known)
     value, lower, upper = (
