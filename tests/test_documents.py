@@ -35,6 +35,7 @@ RUN = ("python", "sh", "pycon", "console")
 # Of a page that says nothing of how it is tested: what is slow in it, by a text.
 SLOW = {"README.md": ("ppo.train(", "jaxltl learn", "mlirl.train(")}
 ALL_SLOW = (
+    "docs/continuous-proofs.md",
     "docs/data.md",
     "docs/devices.md",
     "docs/gallery.md",
