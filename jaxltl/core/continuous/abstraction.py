@@ -160,14 +160,15 @@ def bound_satisfaction(
       limits: when to stop.
       report: called with a line of progress.
 
-    An interrupt ends refinement; the bounds of the grid before are returned.
+    An interrupt ends refinement; the bounds of the last finished grid are returned.
     """
     seconds: dict[str, float] = {}
     bounds = _first(dynamics, formula, grid)
+    refined = bounds
     while True:
         try:
-            bounds = _improve(dynamics, control, bounds, limits, report, seconds)
-        except KeyboardInterrupt:  # bounds of the coarser grid hold on this one
+            bounds = _improve(dynamics, control, refined, limits, report, seconds)
+        except KeyboardInterrupt:
             report("interrupted: the bounds proven so far are kept")
             return replace(bounds, seconds=seconds)
         lower, upper = (x[bounds.initial] for x in bounds.initial_bounds())
@@ -178,7 +179,7 @@ def bound_satisfaction(
         cells = bounds.grid.num_cells * 2**bounds.grid.num_axes
         if _finished(lower, upper, limits) or cells > limits.max_cells:
             return replace(bounds, seconds=seconds)
-        bounds = _refined(dynamics, formula, bounds)
+        refined = _refined(dynamics, formula, bounds)
 
 
 def _finished(lower: Floats, upper: Floats, limits: Limits) -> bool:
