@@ -22,6 +22,7 @@ from .regions import (
     union as union,
     where_positive as where_positive,
 )
+from .shielded_dynamics import shield_dynamics as shield_dynamics
 from .synthesis import (
     CellPolicy as CellPolicy,
     simulate_cells as simulate_cells,

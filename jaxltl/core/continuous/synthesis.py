@@ -39,8 +39,9 @@ class CellPolicy:
       certificate: bounds under this policy; its upper bounds are those of all policies.
       actions: ``float[A, m]``.
       action: ``int[Q, C]``, of each memory state and cell.
-      allowed: ``bool[Q, C, A]``, actions after which the formula still holds surely or with
-        probability 1 from every successor: a permissive strategy. All False where there is none.
+      allowed: ``bool[Q, C, A]``, actions after which the policy satisfies the formula surely or with
+        probability 1 from every successor: a permissive strategy, for learners inside of it see
+        :func:`~jaxltl.core.continuous.shielded_dynamics.shield_dynamics`. All False where there is none.
       dynamics: the world.
       automaton: of the formula.
       automaton_state: ``int[Q]``, of each memory state.
