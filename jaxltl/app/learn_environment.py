@@ -36,7 +36,8 @@ from jaxltl.app.job import (
 from jaxltl.core.types import Status
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.translate import to_automaton
-from jaxltl.core.continuous.certificate import Certificate, ProofOptions, certify_policy
+from jaxltl.core.continuous.certificate import ProofOptions, certify_policy
+from jaxltl.core.continuous.counterexample import counterexample
 from jaxltl.core.continuous.dynamics import Dynamics
 from jaxltl.core.continuous.learned_policy import state_policy
 from jaxltl.core.environments.environment import Environment, Finite
@@ -97,7 +98,7 @@ class Outcome:
     evaluations: list[Evaluation]  # of every seed, from fresh episodes
     episodes: list[Episode]  # some of the kept policy, for pictures
     seed: int  # the first seed
-    proof: Certificate | str | None = None  # or the reason for which there is none
+    proof: proofs.Proof | str | None = None  # or the reason for which there is none
     seconds: float = 0.0  # wall time
 
 
@@ -235,7 +236,7 @@ def learn(setup: Setup, training: Training) -> Outcome:
     return Outcome(setup, found.state, history, chosen, each, shown, seed, proof)
 
 
-def _proven(setup: Setup, state: PyTree, say: Report) -> Certificate | str | None:
+def _proven(setup: Setup, state: PyTree, say: Report) -> proofs.Proof | str | None:
     """The proof of the kept policy, without random actions; None in a simulator."""
     if setup.dynamics is None:
         return None
@@ -245,12 +246,19 @@ def _proven(setup: Setup, state: PyTree, say: Report) -> Certificate | str | Non
         return str(reason)
 
 
-def prove(setup: Setup, agent: Agent, formula: str, say: Report) -> Certificate:
-    """The certificate of an agent that was learned in dynamics."""
+def prove(setup: Setup, agent: Agent, formula: str, say: Report) -> proofs.Proof:
+    """The certificate of an agent that was learned in dynamics, and a run if it is refuted."""
     assert setup.dynamics is not None
-    options: ProofOptions = {**setup.task.proof.given(), "report": say}  # type: ignore[typeddict-item]
+    table = setup.task.proof
+    options: ProofOptions = {**table.given(), "report": say}  # type: ignore[typeddict-item]
     policy = state_policy(agent, setup.environment)
-    return certify_policy(setup.dynamics, policy, formula, **options)
+    found = certify_policy(setup.dynamics, policy, formula, **options)
+    if found.initial_bounds[1] >= (table.threshold or 1 - (table.tolerance or 1e-3)):
+        return proofs.Proof(found)
+    say("searching a run that violates the formula")
+    key, steps = jax.random.key(0), setup.num_steps
+    run = counterexample(setup.dynamics, policy, formula, key, found, steps)
+    return proofs.Proof(found, run)
 
 
 def _agent(setup: Setup, states: PyTree, i: int) -> Agent:
@@ -392,7 +400,7 @@ def pictures(outcome: Outcome) -> list[Picture]:
     drawn = _pictured(outcome)
     found = found if drawn is None else [drawn, *found]
     dynamics, proof = outcome.setup.dynamics, outcome.proof
-    if dynamics is None or not isinstance(proof, Certificate):
+    if dynamics is None or not isinstance(proof, proofs.Proof):
         return found
     return [proofs.picture(proof, dynamics, outcome.episodes), *found]
 
@@ -534,7 +542,7 @@ def _kept_task(policy_file: Path, arrays: Mapping[str, np.ndarray]) -> Environme
     return read_task((there or [path.parent])[0] / path.name, raw)
 
 
-def certify_policy_file(policy: Path, formula: str | None, say: Report) -> Certificate:
+def certify_policy_file(policy: Path, formula: str | None, say: Report) -> proofs.Proof:
     """Proves a policy that ``jaxltl learn`` wrote in dynamics; by default for its task's formula."""
     setup, agent = load_policy(policy)
     if setup.dynamics is None:

@@ -29,7 +29,7 @@ from jaxltl.plot.style import (
     scale_bar,
 )
 
-_INITIAL = "#c2571a"
+_INITIAL = "#d99a00"
 
 
 def certificate(

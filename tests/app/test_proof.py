@@ -3,12 +3,16 @@
 import json
 from pathlib import Path
 
+import jax.numpy as jnp
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
 from jaxltl.app import learn_environment as job
 from jaxltl.app.files.task_environment import read_task
+from jaxltl.app.reports import proof
 from jaxltl.cli import main
+from jaxltl.core.environments import make_agent
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "shuttle.toml"
 
@@ -22,8 +26,8 @@ def test_a_task_file_learns_and_proves_and_certify_proves_the_saved_policy(tmp_p
     out = tmp_path / "out"
     told = run("learn", EXAMPLE, "--out", out)
     assert told.exit_code == 0, told.output
-    proof = json.loads((out / "result.json").read_text())["proof"]
-    assert proof["status"] == "CONVERGED" and proof["lower"] >= 0.999
+    found = json.loads((out / "result.json").read_text())["proof"]
+    assert found["status"] == "CONVERGED" and found["lower"] >= 0.999
     assert "proven: probability at least" in told.stdout and "cells: images" in told.stderr
     assert (out / "certificate.svg").exists()
     assert "Certified lower bounds" in (out / "report.html").read_text()
@@ -33,6 +37,31 @@ def test_a_task_file_learns_and_proves_and_certify_proves_the_saved_policy(tmp_p
     assert safety["formula"] == "G !rock" and 0 <= safety["lower"] <= safety["upper"] <= 1
     refused = run("certify", out / "policy.npz", "--confidence", "0.9")
     assert refused.exit_code == 2 and "takes no options of logs" in refused.stderr
+
+
+@pytest.mark.slow
+def test_a_refuted_policy_comes_with_a_run():
+    setup = job.prepare(read_task(EXAMPLE), 0)
+    upwards = make_agent(lambda seen, key: jnp.array([0.0, 1.0]) + 0 * seen.world)
+    lines = []
+    found = job.prove(setup, upwards, "G !rock", lines.append)
+    result = proof.entry(found)
+    assert result["upper"] < 0.999 and result["status"] == "CONVERGED"
+    run = np.array(result["counterexample"])
+    start, end = setup.dynamics.initial.contains(run[:1]), run[-1]
+    rock = setup.dynamics.labels["rock"].contains(end)
+    assert start.all() and (rock or (np.abs(end) > 1).any())
+    assert f"a run violates it after {len(run) - 1} steps: from " in proof.sentence(result)
+    drawn = proof.picture(found, setup.dynamics, [])
+    assert "a run that violates it" in drawn.caption and b"<svg" in drawn.drawing
+
+
+def test_bounds_are_printed_rounded_outward():
+    entry = {"lower": 0.99999996, "upper": 0.99999996, "status": "CONVERGED", "cells": 4}
+    entry |= {"initial_cells": 1, "how": {"surely": 1}, "seconds": {}, "counterexample": None}
+    assert "at least 0.9999999 from" in proof.sentence(entry)
+    assert "at most 1 from" in proof.sentence(entry)
+    assert proof.tiles(entry)[0][0] == "[0.9999999, 1]"
 
 
 def test_the_policy_of_a_continuous_world_acts_without_randomness_by_default():

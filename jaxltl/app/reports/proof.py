@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import jax
 import numpy as np
 
 from jaxltl.app.reports.drawing import Picture
-from jaxltl.app.wording import Record, Result
+from jaxltl.app.wording import Record, Result, many
+from jaxltl.core.array_types import Floats
 from jaxltl.core.continuous.certificate import HOW, Certificate
 from jaxltl.core.continuous.dynamics import Dynamics
 from jaxltl.core.environments.episodes import Episode
@@ -17,10 +19,19 @@ from jaxltl.core.pretty_print import rounded_outward
 _DIGITS = 7
 
 
-def entry(proof: Certificate | str) -> Record:
+@dataclass(frozen=True)
+class Proof:
+    """The certificate of a policy and, if it is refuted, a violating run ``float[T + 1, n]``."""
+
+    certificate: Certificate
+    violation: Floats | None = None
+
+
+def entry(found: Proof | str) -> Record:
     """A proof, or the reason for which there is none, as a JSON object."""
-    if isinstance(proof, str):
-        return {"reason": proof}
+    if isinstance(found, str):
+        return {"reason": found}
+    proof = found.certificate
     lower, upper = proof.initial_bounds
     how = proof.how[proof.initial]
     return {
@@ -31,23 +42,30 @@ def entry(proof: Certificate | str) -> Record:
         "cells": proof.grid.num_cells,
         "initial_cells": int(proof.initial.sum()),
         "how": {text: int((how == key).sum()) for key, text in HOW.items()},
+        "counterexample": None if found.violation is None else found.violation.tolist(),
         "seconds": {name: round(x, 3) for name, x in proof.seconds.items()},
     }
 
 
 def sentence(proof: Result) -> str:
-    """The certified bounds of an entry, in two lines, or the reason for which there is no proof."""
+    """The certified bounds of an entry, in lines, or the reason for which there is no proof."""
     if "reason" in proof:
         return f"no proof: {proof['reason']}"
     shares = ", ".join(f"{count:,} {text}" for text, count in proof["how"].items() if count)
     stages = ", ".join(f"{name} {x:.2g} s" for name, x in proof["seconds"].items())
     lower, upper = _bounds(proof)
-    return (
-        f"proven: probability at least {lower} from every initial state; the least upper bound is "
-        f"{upper} ({proof['status']}, deterministic policy)\n"
+    lines = [
+        f"proven: probability at least {lower} from every initial state, at most {upper} from some "
+        f"({proof['status']}, policy without random actions)",
         f"  {proof['initial_cells']:,} of {proof['cells']:,} cells are initial: "
-        f"{shares or 'no lower bound'}; {stages}"
-    )
+        f"{shares or 'no lower bound'}; {stages}",
+    ]
+    if run := proof["counterexample"]:
+        places = (", ".join(f"{x:.4g}" for x in run[i]) for i in (0, -1))
+        lines.append(
+            f"  a run violates it after {many(len(run) - 1, 'step')}: from {' to '.join(places)}"
+        )
+    return "\n".join(lines)
 
 
 def tiles(proof: Result) -> list[tuple[str, str]]:
@@ -65,20 +83,21 @@ def _bounds(proof: Result) -> tuple[str, str]:
     )
 
 
-def picture(proof: Certificate, dynamics: Dynamics, episodes: Sequence[Episode]) -> Picture:
-    """The map of lower bounds, with episodes."""
+def picture(proof: Proof, dynamics: Dynamics, episodes: Sequence[Episode]) -> Picture:
+    """The map of lower bounds, with episodes or with the violating run."""
     # Deferred: matplotlib.
     from jaxltl.plot.certificates import certificate
     from jaxltl.plot.style import to_bytes
 
-    runs = []
-    for one in episodes:
+    runs = [] if proof.violation is None else [proof.violation]
+    for one in episodes if proof.violation is None else ():
         states = np.asarray(jax.tree.leaves(one.world.world)[0])  # of a time limit: (state, time)
         runs.append(states[: int(np.asarray(one.valid).sum()) + 1])
     return Picture(
         "certificate.svg",
         "Certified lower bounds",
-        to_bytes(certificate(proof, dynamics, runs=runs)),
-        "Lower bounds of the satisfaction probability by initial state, for the deterministic policy, "
-        "with sampled runs. Bounds hold for real arithmetic.",
+        to_bytes(certificate(proof.certificate, dynamics, runs=runs)),
+        "Lower bounds of the satisfaction probability by initial state, for the policy without random "
+        f"actions, with {'sampled runs' if proof.violation is None else 'a run that violates it'}. "
+        "States that no initial state reaches may have the trivial bound 0.",
     )
