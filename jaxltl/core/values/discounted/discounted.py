@@ -427,7 +427,8 @@ def _refined(
     return jax.tree.map(partial(jnp.where, ended), found, solution)
 
 
-_Progress = tuple[tuple[jax.Array, ...], jax.Array]
+# The last value with its image, greedy actions and residual; those of the least residual; steps.
+_Progress = tuple[tuple[jax.Array, ...], tuple[jax.Array, ...], jax.Array]
 
 
 def _newton_steps(
@@ -465,25 +466,29 @@ def _newton_steps(
         return enclose(*ends, given.discount, rounding, goal, given.low)
 
     def newton_step(carry: _Progress) -> _Progress:
-        (value, _, action, change), n = carry
+        (value, _, action, change), kept, n = carry
         weight = jax.nn.one_hot(action, model.num_actions, dtype=model.dtype)
         columns = action_columns(model.num_actions, weight if policy is None else policy)
         system = System(sweep_operator(model), columns, given.discount)
         linear = solver(system, max_steps=_MOST_PRODUCTS)
         step = lax.cond(n < 0, jnp.zeros_like, linear.solve, change)
         new = backup(dw.plus(value, dw.double_word(step)))
-        better = (n < 0) | (jnp.max(jnp.abs(new[3])) < jnp.max(jnp.abs(change)))  # false for NaN
-        at = jax.tree.map(partial(jnp.where, better), new, carry[0])
-        return at, jnp.where(better, n + 1, _STEPS)
+        size = jnp.max(jnp.abs(new[3]))
+        better = (n < 0) | (size < jnp.max(jnp.abs(kept[3])))  # false for NaN
+        kept = jax.tree.map(partial(jnp.where, better), new, kept)
+        # A greedy policy that changes may raise the residual for some steps.
+        useful = better if policy is not None else jnp.isfinite(size)
+        return new, kept, jnp.where(useful, n + 1, _STEPS)
 
     def goes_on(carry: _Progress) -> jax.Array:
-        (_, image, _, change), n = carry
+        _, (_, image, _, change), n = carry
         return (n < 0) | (n < _STEPS) & ~bounds(image, change).converged
 
     # The first step is zero, so that the program has one backup.
     value, none = dw.double_word(solution.value), jnp.zeros_like(solution.value)
-    start: _Progress = (value, value, none.astype(jnp.int32), none), jnp.int32(-1)
-    (_, image, action, change), _ = lax.while_loop(goes_on, newton_step, start)
+    start = value, value, none.astype(jnp.int32), none
+    begin: _Progress = start, start, jnp.int32(-1)
+    _, (_, image, action, change), _ = lax.while_loop(goes_on, newton_step, begin)
     found = bounds(image, change)
     lower, upper = (
         dw.outwards(dw.plus(image, dw.double_word(found.shift + x * found.half)), x)
