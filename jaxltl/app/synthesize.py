@@ -19,6 +19,7 @@ from jaxltl.core.games.winning import Winning, adversarial_chance, objective_at,
 from jaxltl.core.graphs.attractor import attractor
 from jaxltl.core.models.construct.restrict import Restriction, restrict
 from jaxltl.core.models.game import Game
+from jaxltl.core.values.undiscounted.worst_case_steps import worst_case_steps
 
 Progress = Callable[[str], None]
 STAGES = ("reading", "solving", "checking", "strategy", "writing")
@@ -73,6 +74,9 @@ class Synthesis:
     restricted: Restriction | None  # the game under that strategy
     strategy_verdict: Verification | None  # of the independent check of that game
     play: Play | None  # one that the environment wins from an initial state, or None
+    # bounds of the expected moves of both players until acceptance from any initial state: with the
+    # system's moves drawn uniformly, as by the saved policy, and with any of the allowed ones
+    moves: tuple[float, ...] | None
 
     @property
     def wins(self) -> np.ndarray:
@@ -96,15 +100,16 @@ def synthesize(file: GameFile, progress: Progress = lambda stage: None) -> Synth
     wins = np.asarray(winning.region)
     initial = np.asarray(nodes.game.initial) > 0
     progress("strategy")
-    strategy = restricted = strategy_verdict = None
+    strategy = restricted = strategy_verdict = moves = None
     if wins[initial].any():
         strategy = _strategy(file, nodes)
         restricted = apply_strategy(strategy)
         strategy_verdict = check_strategy(nodes, strategy, restricted)
+        moves = expected_moves(nodes, strategy, restricted)
     lost = np.flatnonzero(initial & ~wins)
     play = lost_play(nodes, winning, int(lost[0]), world.actions) if lost.size else None
     return Synthesis(
-        file, world, nodes, winning, verdict, strategy, restricted, strategy_verdict, play
+        file, world, nodes, winning, verdict, strategy, restricted, strategy_verdict, play, moves
     )
 
 
@@ -157,6 +162,24 @@ def check_strategy(nodes: Nodes, strategy: Permissive, restricted: Restriction) 
             for sets in (objective.guarantees, objective.assumptions)
         ]
     return verify(Winning(game.replace(system=nobody), objective, ~nobody, *actions))
+
+
+def expected_moves(
+    nodes: Nodes, strategy: Permissive, restricted: Restriction
+) -> tuple[float, ...] | None:
+    """The bounds of ``Synthesis.moves``; None for other objectives than Buchi and reachability."""
+    game, base = restricted.model, strategy.base_state[restricted.base_state]
+    objective = objective_at(nodes.objective, base)
+    # States in which an adversary resolves a random move have moves that are none of the players'.
+    if isinstance(objective, GR1) or objective.num_priorities > 2 or nodes.by_chance.any():
+        return None
+    accepting = np.asarray((objective.priority == 0) | objective.won) & ~np.asarray(objective.lost)
+    if accepting.all():  # safety
+        return None
+    return tuple(
+        float(worst_case_steps(x, accepting, game.available).upper[game.initial > 0].max())
+        for x in (game, Game(game.mdp, jnp.zeros_like(game.system)))
+    )
 
 
 # --- a play that the environment wins -------------------------------------------------------

@@ -515,3 +515,14 @@ def test_mistakes_in_the_problem():
         rmax.init(jax.random.key(0), example(), settings(update="some"))
     with pytest.raises(ValueError, match="moves_per_step=0"):
         rmax.init(jax.random.key(0), example(), settings(moves_per_step=0))
+
+
+def test_the_evidence_has_the_expected_moves_between_accepting_states():
+    """With weight w of the bet, which wins every second time: 2 / w moves, and one more from there."""
+    world, reward = gamble()
+    problem = rmax.make_problem(world, [False, True], reward)
+    hparams = settings()
+    found = rmax.evidence(rmax.init(jax.random.key(0), problem, hparams), problem, hparams)
+    first = 2 / float(found.strategy[0, 0])
+    np.testing.assert_allclose(found.steps.value, [first, first + 1], rtol=1e-9)
+    assert found.steps.lower[0] <= first <= found.steps.upper[0]

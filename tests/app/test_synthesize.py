@@ -515,3 +515,28 @@ def test_methods_that_do_not_fit(arrays, tmp_path):
     assert "[strategy] bound=2 is too small: the system wins, but not surely within it" in message(
         "G F bad", 'method = "counter"\nbound = 2', **far
     )
+
+
+def test_the_expected_moves_until_acceptance_are_certified(arrays):
+    """One move to the label, and one that reads it."""
+    found = synthesis.synthesize(read_game(arrays("F bad")))
+    result = report.summary(found, 1.0)
+    for upper in result["expected_moves"].values():
+        assert 2 <= upper <= 2 + 1e-5
+    text = report.table(result, found)
+    assert "until acceptance at most 2 if drawn uniformly, 2 for any choice, certified" in text
+
+
+def test_expected_moves_are_those_of_the_worst_choice(arrays):
+    """Both moves lead to the label, one of them only with probability 1/4."""
+    probability = [[[0.25, 0.75], [1.0, 0]], [[1.0, 0], [0, 0]], [[1.0, 0], [0, 0]]]
+    successor = [[[2, 0], [2, 0]], [[0, 0], [0, 0]], [[2, 0], [0, 0]]]
+    found = synthesis.synthesize(
+        read_game(arrays("F bad", probability=probability, successor=successor))
+    )
+    assert found.moves == pytest.approx((1 / 0.625 + 1, 5), rel=1e-5)
+
+
+def test_safety_has_no_expected_moves(arrays):
+    found = synthesis.synthesize(read_game(arrays("G !bad")))
+    assert report.summary(found, 1.0)["expected_moves"] is None

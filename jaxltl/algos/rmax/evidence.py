@@ -26,6 +26,7 @@ from jaxltl.core.statistics.confidence_sets import Method, intervals_from_counts
 from jaxltl.core.types import Solution
 from jaxltl.core.values.discounted.minimax import minimax_value, strategy_value
 from jaxltl.core.values.interval.robust import robust_discounted_value
+from jaxltl.core.values.undiscounted.worst_case_steps import worst_case_steps
 
 
 @brief
@@ -62,6 +63,7 @@ class Evidence:
         the environment never takes stay unknown.
       reachable: ``bool[S]``, states of the region reachable from the initial ones.
       known_at: ``int32[S, A]``, of :class:`~jaxltl.algos.rmax.State`.
+      steps: worst-case expected moves until an accepting state is entered next, in the region.
       data: the guarantee by the counts alone, or None.
     """
 
@@ -74,6 +76,7 @@ class Evidence:
     epsilon_optimal_played: jax.Array
     reachable: jax.Array
     known_at: jax.Array
+    steps: Solution
     data: DataEvidence | None = None
 
 
@@ -114,6 +117,7 @@ def evidence(
         epsilon_optimal_played=near(played) & problem.region,
         reachable=jnp.zeros(game.num_states, bool).at[reached].set(True),
         known_at=state.known_at,
+        steps=worst_case_steps(game, problem.accepting, strategy),
         data=data,
     )
 

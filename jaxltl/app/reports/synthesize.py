@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxltl.app.files.game import World, task_text
 from jaxltl.app.job import plain, took
+from jaxltl.app.reports.figures import number
 from jaxltl.app.synthesize import Play, Synthesis
 from jaxltl.core.games.objective import GR1
 from jaxltl.core.games.permissive import Permissive
@@ -48,6 +49,7 @@ def summary(found: Synthesis, seconds: float) -> Record:
         },
         "verdict": found.verdict._asdict(),
         "strategy": _about_strategy(found),
+        "expected_moves": found.moves and dict(zip(("drawn", "any"), found.moves, strict=True)),
         "play": _about_play(found),
         **took(seconds),
     }
@@ -132,6 +134,12 @@ def table(result: Result, found: Synthesis) -> str:
         ]
         if strategy["num_memory"] > 1:
             lines.append(f"  memory            {strategy['num_memory']} states")
+    if moves := result["expected_moves"]:
+        drawn, worst = ("unbounded" if x is None else number(x) for x in moves.values())
+        lines += [
+            f"  expected moves    until acceptance at most {drawn} if drawn uniformly, {worst} for any "
+            "choice, certified"
+        ]
     lines += ["", verdict(result)]
     if found.play is not None:
         note = "" if found.world.places is None else " (cells as row, column)"
