@@ -1,24 +1,25 @@
 """Time of a required probability beside the best one: ``python -m benchmarks.required_probability``.
 
 Random maps with rivers, walls and one demonstration with detours, tasks of ordered visits and
-patrols, and probabilities from .5 to .9999: CPU seconds of ``jaxltl learn`` with
-``guarantee = "best"`` and with the probability, nothing cached, and what is attained.
+patrols, and probabilities from .5 to .9999: CPU seconds of the job of ``jaxltl learn`` with
+``guarantee = "best"`` and with the probability in one process, compiled anew for each, and what is
+attained.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import os
-import resource
-import subprocess
-import sys
 import tempfile
+import time
 from pathlib import Path
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
+from jaxltl.app import learn as job
+from jaxltl.app.protocols import Training
 from jaxltl.core.models.product import product
 from jaxltl.core.values.undiscounted.mixture import at_starts
 from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction
@@ -158,42 +159,35 @@ def write(case: Case, guarantee: float | str, place: Path) -> Path:
     return path
 
 
-def _run(path: Path, limit: int) -> tuple[float, dict | None]:
-    """CPU seconds of ``jaxltl learn``, and its result; None after the limit of CPU seconds."""
-    out = path.with_suffix("")
-    command = [sys.executable, "-m", "jaxltl", "learn", str(path), "--out", str(out)]
-    environment = {**os.environ, "JAX_ENABLE_COMPILATION_CACHE": "false"}
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    quiet = subprocess.DEVNULL
-    with subprocess.Popen(command, env=environment, stdout=quiet, stderr=quiet) as process:
-        resource.prlimit(process.pid, resource.RLIMIT_CPU, (limit, limit))
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    seconds = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    result = out / "result.json"
-    return seconds, json.loads(result.read_text()) if result.exists() else None
+def _run(path: Path) -> tuple[float, dict]:
+    """CPU seconds of learning with nothing compiled, and the result."""
+    jax.clear_caches()
+    before = time.process_time()
+    setup = job.prepare(job.read_task(path), 0)
+    result = job.summary(job.learn(setup, Training(0, 1)))
+    return time.process_time() - before, result
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--count", type=int, default=50)
-    parser.add_argument("--limit", type=int, default=600, help="CPU seconds of a run")
     given = parser.parse_args()
-    print("map states formula p | best s, p s, ratio | lower bound, neg. log-likelihood, how")
+    jax.config.update("jax_enable_x64", True)
+    print("map formula p | best s, p s, ratio | states, lower bound, neg. log-likelihood, how")
     with tempfile.TemporaryDirectory() as name:
         for case in cases(given.first + given.count)[given.first :]:
             place = Path(name)
-            best, _ = _run(write(case, "best", place), given.limit)
-            seconds, result = _run(write(case, case.probability, place), given.limit)
+            best, _ = _run(write(case, "best", place))
+            seconds, result = _run(write(case, case.probability, place))
+            how, loss = result["guarantee"], result["neg_log_likelihood"]
+            states = result["num_states"] * result["num_memory"]
             line = f"{case.text['number']:3} {str(case.text['formula'])[:32]:32} {case.probability:.4f}"
-            line += f" | {best:5.1f} {seconds:6.1f} {seconds / best:5.2f} | "
-            if result is not None:
-                how, loss = result["guarantee"], result["neg_log_likelihood"]
-                states = result["num_states"] * result["num_memory"]
-                line += (
-                    f"{states:5} {result['satisfaction']['mean']['lower']:.6f} "
-                    f"{np.inf if loss is None else loss:.5f} mu {how['weight']} share {how['share']}"
-                )
+            line += f" | {best:5.1f} {seconds:6.1f} {seconds / best:5.2f} | {states:5} "
+            line += (
+                f"{result['satisfaction']['mean']['lower']:.6f} "
+                f"{np.inf if loss is None else loss:.5f} mu {how['weight']} share {how['share']}"
+            )
             print(line, flush=True)
 
 
