@@ -1,0 +1,241 @@
+"""One case of :mod:`benchmarks.continuous`, in a process of its own; prints a JSON line."""
+
+from __future__ import annotations
+
+import json
+import resource
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.stats
+
+import jaxltl as jl
+from jaxltl.core.continuous.certificate import Certificate, certify_policy, first_grid
+from jaxltl.core.continuous.dynamics import Dynamics
+from jaxltl.core.continuous.regions import box
+from jaxltl.core.continuous.synthesis import CellPolicy, simulate_cells, synthesize_policy
+from jaxltl.core.environments import make_agent
+from jaxltl.envs import continuous_worlds as worlds
+
+Policy = Callable[[jax.Array], jax.Array]
+THRESHOLD = 0.999999
+# Of tasks beyond reach-avoid: halves of the target, which the noise visits, and two distant places.
+HALVES = {
+    "a": box([-0.2, -0.2], [0.2, 0.0]),
+    "b": box([-0.2, 0.0], [0.2, 0.2]),
+    "far": box([0.2, -0.7], [0.7, 0.7]),
+}
+APART = {"a": box([-0.5, -0.3], [-0.2, 0.3]), "b": box([0.2, -0.3], [0.5, 0.3])}
+
+
+@dataclass
+class Meter:
+    """CPU seconds, wall seconds and the peak of resident memory since construction."""
+
+    def __post_init__(self) -> None:
+        jnp.zeros(1).block_until_ready()
+        self.memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        self.begin = time.process_time(), time.perf_counter()
+
+    def read(self) -> dict[str, float]:
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - self.memory
+        return {
+            "cpu": time.process_time() - self.begin[0],
+            "wall": time.perf_counter() - self.begin[1],
+            "megabytes": peak / 1024,
+        }
+
+
+def network(folder: str, world: str, seed: int) -> Policy:
+    """A ReLU network of a file of policies."""
+    with np.load(Path(folder) / f"{world}.npz") as file:
+        layers = []
+        while f"seed{seed}_kernel{len(layers)}" in file:
+            i = len(layers)
+            layers.append((file[f"seed{seed}_kernel{i}"], file[f"seed{seed}_bias{i}"]))
+
+    def policy(x: jax.Array) -> jax.Array:
+        for i, (kernel, bias) in enumerate(layers):
+            x = x @ kernel + bias
+            x = jax.nn.relu(x) if i < len(layers) - 1 else x
+        return x
+
+    return policy
+
+
+def _stages(certificate: Certificate) -> str:
+    times = ", ".join(f"{name} {x:.2g} s" for name, x in certificate.seconds.items())
+    count = [int((certificate.how[certificate.initial] == i).sum()) for i in (3, 2, 1, 0)]
+    return (
+        f"{times}; cells surely {count[0]}, almost {count[1]}, iterated {count[2]}, no {count[3]}"
+    )
+
+
+def _of_certificate(certificate: Certificate) -> dict[str, Any]:
+    lower, upper = certificate.initial_bounds
+    return {
+        "cells": certificate.grid.num_cells,
+        "lower": lower,
+        "upper": upper,
+        "mean_lower": float(certificate.lower[certificate.initial].mean()),
+        "mean_upper": float(certificate.upper[certificate.initial].mean()),
+        "seconds": certificate.seconds,
+        "status": certificate.status.name,
+        "remark": _stages(certificate),
+    }
+
+
+def simulated(
+    dynamics: Dynamics, policy: Policy, formula: str, episodes: int, num_steps: int = 100
+) -> dict[str, list[float]]:
+    """Clopper-Pearson intervals of satisfied and violated episodes, at level 1 - 1e-6."""
+    task = jl.task_environment(dynamics, formula)
+    agent = make_agent(lambda seen, key: policy(seen.world))
+    found = jl.evaluate(
+        jax.random.key(0), agent, task, num_episodes=episodes, num_steps=num_steps,
+        confidence=1 - 1e-6,
+    )  # fmt: skip
+    return {
+        "satisfied": [found.success.lower, found.success.upper],
+        "violated": [found.violation.lower, found.violation.upper],
+    }
+
+
+def _with_simulation(row: dict[str, Any], intervals: dict[str, list[float]]) -> dict[str, Any]:
+    """The row with simulated intervals, which must meet the bounds of the mean initial state."""
+    good, bad = intervals["satisfied"], intervals["violated"]
+    sound = good[0] <= row["mean_upper"] + 1e-9 and 1 - bad[0] >= row["mean_lower"] - 1e-9
+    remark = f"{row['remark']}; simulated {good[0]:.6f} to {1 - bad[0]:.6f}"
+    remark += "" if sound else " CONTRADICTS THE BOUNDS"
+    return row | {"simulated": intervals, "sound": sound, "remark": remark}
+
+
+def policies(case: dict[str, Any]) -> dict[str, Any]:
+    """The certificate of a trained network."""
+    world = getattr(worlds, case["world"])()
+    meter = Meter()
+    policy = network(case["folder"], case["world"], case["seed"])
+    proof = certify_policy(
+        world.dynamics, policy, world.formula, threshold=THRESHOLD, max_cells=case["max_cells"]
+    )
+    row = _of_certificate(proof) | meter.read()
+    found = simulated(world.dynamics, policy, world.formula, case["episodes"])
+    return _with_simulation(row, found)
+
+
+def tasks(case: dict[str, Any]) -> dict[str, Any]:
+    """The certificate of a task beyond reach-avoid."""
+    base = getattr(worlds, case["world"])().dynamics
+    dynamics = replace(base, labels={**base.labels, **HALVES})
+    meter = Meter()
+    if case["policy"] == "synthesis":
+        actions = np.linspace(-1, 1, 9)[:, None]
+        found = synthesize_policy(
+            replace(dynamics, labels={**base.labels, **APART}), case["formula"], actions,
+            cells=[60, 60], max_cells=3600, upper=False,
+        )  # fmt: skip
+        return _of_certificate(found.certificate) | meter.read()
+    policy = network(case["folder"], case["world"], 1)
+    proof = certify_policy(
+        dynamics, policy, case["formula"], threshold=THRESHOLD, max_cells=case["max_cells"]
+    )
+    row = _of_certificate(proof) | meter.read()
+    episodes = max(case["episodes"] // 50, 1)
+    return _with_simulation(row, simulated(dynamics, policy, case["formula"], episodes, 300))
+
+
+# --- synthesis ------------------------------------------------------------------------------------
+
+
+def published_cells(world: worlds.BenchmarkWorld) -> list[int]:
+    """Cells along each axis of the published grid."""
+    low, high = world.dynamics.domain
+    return np.round((high - low) / np.array(world.cell_width)).astype(int).tolist()
+
+
+def synthesis(case: dict[str, Any]) -> dict[str, Any]:
+    """A policy on the published grid, with the mean bounds of all cells."""
+    world = getattr(worlds, case["world"])()
+    cells = published_cells(world)
+    formula = world.formula
+    if world.num_steps is not None:
+        formula = " & ".join("X " * k + "!outside" for k in range(world.num_steps + 1))
+    meter = Meter()
+    options: dict[str, Any] = {"cells": cells, "max_cells": _grid_size(world, cells)}
+    options["upper"] = case["upper"]
+    if world.dynamics.actions is None:
+        certificate = certify_policy(world.dynamics, _no_action, formula, **options)
+    else:
+        certificate = synthesize_policy(world.dynamics, formula, **options).certificate
+    row = _of_certificate(certificate) | meter.read()
+    # From unsafe cells the probability is 0: means, not the least bound.
+    row |= {"lower": row["mean_lower"], "upper": row["mean_upper"]}
+    return row | {"remark": f"mean bounds; {row['remark']}"}
+
+
+def _no_action(x: jax.Array) -> jax.Array:
+    return jnp.zeros(0, x.dtype)
+
+
+def _grid_size(world: worlds.BenchmarkWorld, cells: list[int]) -> int:
+    """Number of cells of the first grid, in which edges of labels may be inserted."""
+    return first_grid(world.dynamics, cells, 2**30).num_cells
+
+
+def models(case: dict[str, Any]) -> dict[str, Any]:
+    """The robot on a coarse grid: bounds of the policy on cells, and simulated runs of it."""
+    side, base = case["side"], worlds.robot().dynamics
+    actions = np.array([[v, angle] for v in (-1.0, 0.0, 1.0) for angle in (-1.0, -0.5, 0, 0.5, 1)])
+    meter = Meter()
+    options: dict[str, Any] = {"cells": [side, side], "max_cells": (side + 4) ** 2}
+    policy = synthesize_policy(base, worlds.REACH_AVOID, actions, **options)
+    row = _of_certificate(policy.certificate) | meter.read()
+    starts = jax.vmap(base.sample_initial)(jax.random.split(jax.random.key(1), case["episodes"]))
+    good = int(np.asarray(_reaches(policy, starts)).sum())
+    interval = clopper_pearson(good, len(starts))
+    lower, upper = (float(x.mean()) for x in policy.certificate.at(np.asarray(starts, float)))
+    row |= {"lower": lower, "upper": upper, "simulated": {"satisfied": interval}}
+    row["sound"] = interval[1] >= lower  # its upper bounds are those of all policies
+    row["remark"] = (
+        f"mean bounds of initial states; simulated {interval[0]:.6f} to {interval[1]:.6f}; "
+        f"{row['remark']}"
+    )
+    return row
+
+
+def _reaches(policy: CellPolicy, starts: jax.Array, num_steps: int = 300) -> jax.Array:
+    """Runs that enter the target before unsafe states or leaving the domain: ``bool[N]``."""
+    names = list(policy.dynamics.propositions)
+    columns = np.array([names.index("target"), names.index("unsafe")])
+
+    def run(key: jax.Array, start: jax.Array) -> jax.Array:
+        states, _, _ = simulate_cells(policy, key, start, num_steps)
+        label = jax.vmap(policy.dynamics.label)(states)[:, columns]
+        lost = label[:, 1] | ~jax.vmap(policy.dynamics.inside)(states)
+        first = jnp.where(label[:, 0].any(), label[:, 0].argmax(), num_steps)
+        return first < jnp.where(lost.any(), lost.argmax(), num_steps)
+
+    return jax.jit(jax.vmap(run))(jax.random.split(jax.random.key(2), len(starts)), starts)
+
+
+def clopper_pearson(hits: int, runs: int, level: float = 1e-6) -> list[float]:
+    """The exact confidence interval of a probability."""
+    low = scipy.stats.beta.ppf(level / 2, hits, runs - hits + 1) if hits else 0.0
+    high = scipy.stats.beta.isf(level / 2, hits + 1, runs - hits) if hits < runs else 1.0
+    return [float(low), float(high)]
+
+
+def main() -> None:
+    case = json.loads(sys.argv[1])
+    print(json.dumps(globals()[case["part"]](case)))
+
+
+if __name__ == "__main__":
+    main()
