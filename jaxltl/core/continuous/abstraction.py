@@ -26,6 +26,7 @@ from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.pretty_print import brief
 
 TAIL = 1e-15  # probability of unbounded noise outside its box, for which nothing is assumed
+_ROWS = 2**16  # handled at once, which bounds the memory
 UNPROVEN, ITERATED, ALMOST_SURE, SURE = range(4)  # how the lower bound of a state was found
 
 
@@ -295,15 +296,18 @@ def _successors(
     j = np.array(images.noise_of)
     least = np.append(box.low, 0.0)[j]
     most = np.append(box.high, 0.0)[j]
-    low, high = images.low + images.gain * least, images.high + images.gain * most
     unbounded = np.array([i >= 0 and not np.isfinite(dynamics.noise[i].support).all() for i in j])
-    random = unbounded & (images.gain > 0)
-    low, high = np.where(random, -np.inf, low), np.where(random, np.inf, high)
-    if box.lost:
-        low, high = np.full_like(low, -np.inf), np.full_like(high, np.inf)
-    if dynamics.outside == "clip":
-        low, high = np.clip(low, *dynamics.domain), np.clip(high, *dynamics.domain)
-    start, stop, outside = grid.ranges(low, high)
+    start = np.empty(images.low.shape, np.int32)
+    stop, outside = np.empty_like(start), np.empty(len(start), bool)
+    for begin in range(0, len(start), _ROWS):
+        part = slice(begin, begin + _ROWS)
+        gain = images.gain[part]
+        low, high = images.low[part] + gain * least, images.high[part] + gain * most
+        random = (unbounded & (gain > 0)) | (box.lost > 0)
+        low, high = np.where(random, -np.inf, low), np.where(random, np.inf, high)
+        if dynamics.outside == "clip":
+            low, high = np.clip(low, *dynamics.domain), np.clip(high, *dynamics.domain)
+        start[part], stop[part], outside[part] = grid.ranges(low, high)
     return Successors(images.cells, len(control.actions), start, stop, outside, None, grid.shape)
 
 

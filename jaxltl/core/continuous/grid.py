@@ -12,6 +12,8 @@ import numpy as np
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.pretty_print import brief
 
+_BOXES = 2**16  # counted at once, which bounds the memory
+
 
 @brief
 @dataclass(frozen=True, eq=False)
@@ -143,11 +145,14 @@ def count_in(table: Integers, start: Integers, stop: Integers) -> Integers:
     total = np.zeros(len(start), np.int64)
     n = start.shape[1]
     strides = np.array([s // table.itemsize for s in table.strides])
-    flat, first, last = table.reshape(-1), start * strides, stop * strides  # int64
-    for corner in itertools.product((0, 1), repeat=n):
-        index = sum(last[:, i] if c else first[:, i] for i, c in enumerate(corner))
-        sign = 1 if (n - sum(corner)) % 2 == 0 else -1
-        total += sign * flat[index]
+    flat = table.reshape(-1)
+    for begin in range(0, len(start), _BOXES):
+        part = slice(begin, begin + _BOXES)
+        first, last = start[part] * strides, stop[part] * strides  # int64
+        for corner in itertools.product((0, 1), repeat=n):
+            index = sum(last[:, i] if c else first[:, i] for i, c in enumerate(corner))
+            sign = 1 if (n - sum(corner)) % 2 == 0 else -1
+            total[part] += sign * flat[index]
     return total
 
 

@@ -31,6 +31,7 @@ LARGEST_BLOCK = 16  # cells along an axis; each level of blocks is a quarter as 
 # of the noise: less trades more evaluations for narrower images.
 CELL_SHARE, NOISE_SHARE = 0.15, 0.02
 _CHUNK = 1024  # boxes of one evaluation, which then fits into the caches
+_ROWS = 2**14  # pairs of cells and actions at once, which bounds the memory
 _ROUNDING = 1e-13  # relative error of a few operations in float64, with a margin of 100
 _CONSTANT = 1e-14  # relative width of the bounds of a constant gain
 _EQUAL_GAINS = 1e-6  # gains of the noise that differ by less are one
@@ -96,29 +97,48 @@ def image_boxes(
     todo = np.ones(len(cells), bool)
     order, noise_of = tuple(range(n)), (-1,) * n
     index = np.stack(np.unravel_index(cells, grid.shape), -1)
+    usual: Floats | None = None
     for size in _block_sizes(grid.shape):
-        block_shape = tuple(-(-k // b) for k, b in zip(grid.shape, size, strict=True))
-        number = np.ravel_multi_index(tuple((index[todo] // np.array(size)).T), block_shape)
-        blocks, of_block = np.unique(number, return_inverse=True)
-        start = np.stack(np.unravel_index(blocks, block_shape), -1) * np.array(size)
-        form = _forms(programs, grid, start, size, actions, noise)
-        if todo.all():  # on the largest blocks, whose bounds hold for all cells
-            order, noise_of = _assigned(form, noise)
         rows = np.flatnonzero(todo)
-        many = max(_CHUNK * 64 // num_actions, 1)  # cells at once, which bounds the memory
-        for begin in range(0, len(rows), many):
-            here, block = rows[begin : begin + many], of_block.reshape(-1)[begin : begin + many]
-            image = _cell_images(form, grid, cells[here], block, noise, noise_of)
-            accepted = image.accepted | (max(size) == 1)
-            for array, new in ((low, image.low), (high, image.high), (gain, image.gain),
-                               (varying, image.varying)):  # fmt: skip
-                array[here[accepted]] = new[accepted]
-            todo[here[accepted]] = False
+        start, of_block = _blocks(index[rows], grid.shape, size)
+        # The largest blocks are few, and decide the order of the coordinates for all cells.
+        many = max(len(start), 1) if usual is None else max(_ROWS // num_actions, 1)
+        for first in range(0, len(start), many):
+            form = _forms(programs, grid, start[first : first + many], size, actions, noise)
+            if usual is None:
+                order, noise_of = _assigned(form, noise)
+            random = _random_part(form, noise, noise_of, usual)
+            usual = random.usual
+            mine = np.flatnonzero((of_block >= first) & (of_block < first + many))
+            for part in np.array_split(mine, -(-len(mine) * num_actions // _ROWS)):
+                here = rows[part]
+                image = _cell_images(form, random, grid, cells[here], of_block[part] - first)
+                accepted = image.accepted | (max(size) == 1)
+                for array, new in ((low, image.low), (high, image.high), (gain, image.gain),
+                                   (varying, image.varying)):  # fmt: skip
+                    array[here[accepted]] = new[accepted]
+                todo[here[accepted]] = False
         if not todo.any():
             break
     shape = (len(cells) * num_actions, n)
-    flat = [x.reshape(shape) for x in (low, high, gain, varying)]
-    return Images(cells, flat[0], flat[1], flat[2], noise_of, flat[3], order)
+    gain, varying = (_compact(x.reshape(shape)) for x in (gain, varying))
+    return Images(cells, low.reshape(shape), high.reshape(shape), gain, noise_of, varying, order)
+
+
+def _blocks(
+    index: Integers, shape: tuple[int, ...], size: tuple[int, ...]
+) -> tuple[Integers, Integers]:
+    """First cells ``int[B, n]`` of the blocks that contain cells ``int[M, n]``, and the block of each."""
+    block_shape = tuple(-(-k // b) for k, b in zip(shape, size, strict=True))
+    number = np.ravel_multi_index(tuple((index // np.array(size)).T), block_shape)
+    blocks, of_block = np.unique(number, return_inverse=True)
+    start = np.stack(np.unravel_index(blocks, block_shape), -1) * np.array(size)
+    return start, of_block.reshape(-1)
+
+
+def _compact(rows: Floats) -> Floats:
+    """Equal rows as one row in memory."""
+    return np.broadcast_to(rows[0].copy(), rows.shape) if (rows == rows[:1]).all() else rows
 
 
 def _programs(step: Step, n: int, m: int, k: int) -> tuple[Program, Program | None]:
@@ -228,12 +248,7 @@ class _CellImages:
 
 
 def _cell_images(
-    form: _Forms,
-    grid: Grid,
-    cells: Integers,
-    of_block: Integers,
-    noise: NoiseBox,
-    noise_of: tuple[int, ...],
+    form: _Forms, random: _Random, grid: Grid, cells: Integers, of_block: Integers
 ) -> _CellImages:
     """Images of cells by the forms of their blocks."""
     low, high = grid.boxes(cells)
@@ -246,9 +261,8 @@ def _cell_images(
     spread = np.einsum("ca,cuai->cui", share, size)
     error = form.error[of_block]
     fuzzy = np.abs(form.middle[of_block]) + size.sum(-2) + np.abs(form.gains[of_block]).sum(-2)
-    own, reach, varying = (x[of_block] for x in _random_part(form, noise, noise_of))
-    ends = [(noise.low[j], noise.high[j]) if j >= 0 else (0.0, 0.0) for j in noise_of]
-    least, most = np.array(ends).T
+    own, reach, varying = (x[of_block] for x in (random.gain, random.reach, random.varying))
+    least, most = random.least, random.most
     error = error + fuzzy * _ROUNDING
     allowed = CELL_SHARE * spread + NOISE_SHARE * own * (most - least) / 2
     small = (error <= allowed) & (varying <= allowed)
@@ -264,10 +278,24 @@ def _cell_images(
     return _CellImages(found_low, found_high, own, varying, (small & ~unknown).all((1, 2)))
 
 
-def _random_part(
-    form: _Forms, noise: NoiseBox, noise_of: tuple[int, ...]
-) -> tuple[Floats, Floats, Floats]:
+@dataclass(frozen=True)
+class _Random:
     """Gain of the random noise, half-width of all other noise, and variation with the random one."""
+
+    gain: Floats  # [N, A, n]
+    reach: Floats
+    varying: Floats
+    least: Floats  # [n], bounds of the random noise
+    most: Floats
+    usual: Floats  # [n], gains to which nearly equal ones are set
+
+
+def _random_part(
+    form: _Forms, noise: NoiseBox, noise_of: tuple[int, ...], usual: Floats | None
+) -> _Random:
+    """The parts of the noise; the usual gains are those of the largest blocks."""
+    ends = [(noise.low[j], noise.high[j]) if j >= 0 else (0.0, 0.0) for j in noise_of]
+    typical = np.zeros(len(noise_of)) if usual is None else usual
     radius = (noise.high - noise.low) / 2
     reach = np.abs(form.gains).sum(2)
     gain, varying = np.zeros(reach.shape), np.zeros(reach.shape)
@@ -287,8 +315,10 @@ def _random_part(
         by_form = known & np.isfinite(slope + wide) & (wide < most / 2 - least / 2)
         own = np.where(by_form, slope / radius[j], own)
         least, most = (np.where(by_form, own + d * wide, x) for d, x in ((-1, least), (1, most)))
-        usual = float(np.median(own))
-        own = np.where(np.abs(own - usual) <= _EQUAL_GAINS * abs(usual), usual, own)
+        if usual is None:
+            typical[i] = np.median(own)
+        near = np.abs(own - typical[i]) <= _EQUAL_GAINS * abs(typical[i])
+        own = np.where(near, typical[i], own)
         own = np.where(own > 0, own, 0.0)
         apart = np.maximum(most - own, own - least) * radius[j]
         # Bounds of a constant derivative differ by their rounding.
@@ -297,4 +327,5 @@ def _random_part(
         gain[:, :, i] = own
         reach[:, :, i] += np.abs(slope - own * radius[j]) - np.abs(slope)
         reach[:, :, i] = np.maximum(reach[:, :, i], 0) + np.abs(slope) * _ROUNDING
-    return gain, reach, varying
+    least, most = np.array(ends).T
+    return _Random(gain, reach, varying, least, most, typical)
