@@ -14,9 +14,9 @@ from benchmarks import size
 
 PACKAGE = Path(jaxltl.__file__).parent
 LIMITS = {
-    "lines": 97_200,
-    "statements": 48_400,
-    "docstring lines": 15_950,
+    "lines": 97_300,
+    "statements": 48_450,
+    "docstring lines": 15_960,
     "functions with more than 6 parameters": 67,
     "functions with more than 9 parameters": 1,
     "Any in annotations": 878,
