@@ -1,0 +1,1 @@
+"""The PRISM language: expressions, guarded commands and programs; without JAX."""

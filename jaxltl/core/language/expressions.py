@@ -1,0 +1,343 @@
+"""Expressions of the PRISM language: syntax trees, types, and folding of constants."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import reduce
+from operator import is_ as operator_is
+from typing import Any, Literal
+
+from jaxltl.core.language.source import LanguageError
+
+Type = Literal["bool", "int", "double"]
+Value = bool | int | float
+
+MAX_DEPTH = 150  # of a tree, also after formulas are substituted: traversals are recursive
+MAX_SIZE = 200_000  # nodes, counted as if nothing were shared
+MAX_INTEGER = 2**53  # integers up to which every operation on arrays is exact
+FUNCTIONS = {  # the least and the most numbers of arguments
+    "min": (1, None),
+    "max": (1, None),
+    "floor": (1, 1),
+    "ceil": (1, 1),
+    "round": (1, 1),
+    "pow": (2, 2),
+    "mod": (2, 2),
+    "log": (2, 2),
+}
+RELATIONS = ("<", "<=", ">", ">=")
+
+
+@dataclass(frozen=True, slots=True)
+class Expression:
+    """A node of a syntax tree.
+
+    Attributes:
+      operator: ``"literal"``, ``"name"``, ``"label"``, an operator (``! neg & | => <=> = != < <= >
+        >= + - * / ?:``), or a function (``min max floor ceil round pow mod log``). ``& | +`` and
+        ``* min max`` take two operands or more.
+      operands: the operands, from left to right.
+      value: of a literal its value, of a name or a label the name.
+      place: offset in the source text, for errors; trees are compared without it.
+      depth, size: of the tree, where shared nodes count as often as they occur.
+
+    Example:
+      >>> x = Expression("name", value="x")
+      >>> str(Expression("+", (x, literal(1))))
+      '(x + 1)'
+    """
+
+    operator: str
+    operands: tuple[Expression, ...] = ()
+    value: Value | str | None = None
+    place: int = field(default=-1, compare=False, repr=False)
+    depth: int = field(init=False, compare=False, repr=False)
+    size: int = field(init=False, compare=False, repr=False)
+
+    def __post_init__(self) -> None:
+        depth, size = 0, 1
+        for operand in self.operands:
+            depth = max(depth, operand.depth)
+            size += operand.size
+        object.__setattr__(self, "depth", depth + 1)
+        object.__setattr__(self, "size", size)
+        if depth >= MAX_DEPTH or size > MAX_SIZE:
+            what = f"deeper than {MAX_DEPTH}" if depth >= MAX_DEPTH else f"larger than {MAX_SIZE}"
+            raise LanguageError(
+                self.place, f"the expression is {what} with its formulas; simplify it."
+            )
+
+    @property
+    def is_literal(self) -> bool:
+        """True for a value."""
+        return self.operator == "literal"
+
+    def __str__(self) -> str:
+        if self.operator == "literal":
+            return str(self.value).lower() if isinstance(self.value, bool) else str(self.value)
+        if self.operator in ("name", "label"):
+            return str(self.value) if self.operator == "name" else f'"{self.value}"'
+        parts = [str(x) for x in self.operands]
+        if self.operator in FUNCTIONS:
+            return f"{self.operator}({', '.join(parts)})"
+        if self.operator == "?:":
+            return f"({parts[0]} ? {parts[1]} : {parts[2]})"
+        if len(parts) == 1:
+            return ("-" if self.operator == "neg" else "!") + parts[0]
+        return f"({f' {self.operator} '.join(parts)})"
+
+
+def literal(value: Value, place: int = -1) -> Expression:
+    """A constant as an expression."""
+    return Expression("literal", (), value, place)
+
+
+TRUE, FALSE = literal(True), literal(False)
+
+
+def value_type(value: object) -> Type:
+    """The type of a value."""
+    return "bool" if isinstance(value, bool) else "int" if isinstance(value, int) else "double"
+
+
+# --- types ------------------------------------------------------------------------------------
+
+
+def type_of(expression: Expression, types: Mapping[str, Type]) -> Type:
+    """The type of an expression over typed names.
+
+    Args:
+      expression: the tree.
+      types: the type of each variable and constant.
+
+    Raises:
+      LanguageError: an unknown name, or an operand of a wrong type.
+
+    Example:
+      >>> type_of(Expression("/", (literal(4), literal(2))), {})
+      'double'
+    """
+    return _type(expression, types, {})
+
+
+def _type(e: Expression, types: Mapping[str, Type], known: dict[int, Type]) -> Type:
+    if (found := known.get(id(e))) is None:
+        parts = [_type(x, types, known) for x in e.operands]
+        found = known[id(e)] = _node_type(e, parts, types)
+    return found
+
+
+def _node_type(e: Expression, parts: list[Type], types: Mapping[str, Type]) -> Type:
+    operator = e.operator
+    if operator == "literal":
+        return value_type(e.value)
+    if operator == "label":
+        return "bool"
+    if operator == "name":
+        if str(e.value) not in types:
+            raise LanguageError(
+                e.place, f"{e.value} is not declared; it is no constant, variable or formula."
+            )
+        return types[str(e.value)]
+    if operator in ("!", "&", "|", "=>", "<=>"):
+        _require(e, parts, "bool")
+        return "bool"
+    if operator in ("=", "!="):
+        if ("bool" in parts) and parts[0] != parts[1]:
+            raise LanguageError(e.place, f"{e} compares a Boolean with a number.")
+        return "bool"
+    if operator == "?:":
+        _require(e, parts[:1], "bool")
+        if ("bool" in parts[1:]) and parts[1] != parts[2]:
+            raise LanguageError(e.place, f"{e} is a Boolean in one case and a number in the other.")
+        return "double" if "double" in parts[1:] else parts[1]
+    _require(e, parts, "number")
+    if operator in RELATIONS:
+        return "bool"
+    if operator in ("floor", "ceil", "round"):
+        return "int"
+    if operator == "mod":
+        _require(e, parts, "int")
+        return "int"
+    if operator in ("/", "log"):
+        return "double"
+    return "double" if "double" in parts else "int"
+
+
+def _require(e: Expression, parts: list[Type], kind: str) -> None:
+    for operand, actual in zip(e.operands, parts, strict=False):
+        if (actual == "bool") != (kind == "bool") or (kind == "int" and actual != "int"):
+            wanted = {"bool": "a Boolean", "int": "an integer"}.get(kind, "a number")
+            place = operand.place if operand.place >= 0 else e.place
+            what = {"bool": "a Boolean", "int": "an integer", "double": "a double"}[actual]
+            raise LanguageError(
+                place, f"{operand} is {what}; {e.operator} takes {wanted} as operand."
+            )
+
+
+# --- substitution and folding -----------------------------------------------------------------
+
+
+def substitute(
+    expression: Expression,
+    names: Mapping[str, Expression],
+    memory: dict[int, Expression] | None = None,
+    labels: Mapping[str, Expression] | None = None,
+) -> Expression:
+    """Replaces names, and labels, by expressions, and folds operators of literals.
+
+    Args:
+      expression: the tree.
+      names: the expression of each replaced name; others stay.
+      memory: results by node, shared between calls with the same names and trees that stay alive.
+      labels: the expression of each replaced label.
+
+    Raises:
+      LanguageError: an operation on literals that is undefined or too large.
+
+    Example:
+      >>> e = Expression("+", (Expression("name", value="N"), literal(1)))
+      >>> str(substitute(e, {"N": literal(2)}))
+      '3'
+    """
+    memory = {} if memory is None else memory
+    if (found := memory.get(id(expression))) is not None:
+        return found
+    if expression.operator == "name":
+        found = names.get(str(expression.value), expression)
+    elif expression.operator == "label" and labels is not None:
+        found = labels.get(str(expression.value), expression)
+    elif not expression.operands:
+        found = expression
+    else:
+        parts = tuple([substitute(x, names, memory, labels) for x in expression.operands])
+        found = _simplified(expression, parts)
+    memory[id(expression)] = found
+    return found
+
+
+def _simplified(e: Expression, parts: tuple[Expression, ...]) -> Expression:
+    """The node with new operands, folded where these decide it."""
+    operator = e.operator
+    if operator in ("&", "|"):
+        neutral = operator == "&"
+        rest = []
+        for part in parts:
+            if part.is_literal and part.value is neutral:
+                continue
+            if part.is_literal and part.value is (not neutral):
+                return literal(not neutral, e.place)
+            rest.append(part)
+        if len(rest) < 2:
+            return rest[0] if rest else literal(neutral, e.place)
+        parts = tuple(rest)
+    elif all(x.is_literal for x in parts):
+        return literal(apply(operator, [x.value for x in parts], e.place), e.place)
+    if len(parts) == len(e.operands) and all(map(operator_is, parts, e.operands)):
+        return e
+    return Expression(operator, parts, e.value, e.place)
+
+
+def names_in(expression: Expression, found: set[str] | None = None) -> set[str]:
+    """The names that occur in an expression."""
+    found = set() if found is None else found
+    stack, seen = [expression], set()
+    while stack:
+        e = stack.pop()
+        if id(e) in seen:
+            continue
+        seen.add(id(e))
+        if e.operator == "name":
+            found.add(str(e.value))
+        stack.extend(e.operands)
+    return found
+
+
+def conjuncts(expression: Expression) -> list[Expression]:
+    """The operands of nested conjunctions."""
+    if expression.operator != "&":
+        return [expression]
+    return [x for operand in expression.operands for x in conjuncts(operand)]
+
+
+# --- operators on Python's numbers ------------------------------------------------------------
+
+
+def apply(operator: str, values: list[Any], place: int = -1) -> Value:
+    """An operator on Python's numbers; LanguageError where it is undefined or too large.
+
+    >>> apply("mod", [-1, 3]), apply("/", [1, 4]), apply("round", [2.5])
+    (2, 0.25, 3)
+    """
+    try:
+        result = SCALAR[operator](*values)
+    except (TypeError, ValueError, OverflowError, ZeroDivisionError) as error:
+        shown = ", ".join(str(x) for x in values)
+        raise LanguageError(place, f"{operator} of {shown} is not defined: {error}.") from None
+    if isinstance(result, int) and not isinstance(result, bool) and abs(result) > MAX_INTEGER:
+        raise LanguageError(place, f"an integer of {operator} is larger than 2^53.")
+    return result
+
+
+def _divide(a: float, b: float) -> float:
+    if b == 0:
+        return math.nan if a == 0 or a != a else math.copysign(math.inf, a)
+    return a / b
+
+
+def _power(a: Any, b: Any) -> Any:
+    if isinstance(a, int) and isinstance(b, int):
+        if b < 0:
+            raise ValueError("the exponent of an integer is negative; write pow(1.0 * x, y)")
+        if abs(a) > 1 and b * math.log2(abs(a)) > 54:
+            raise ValueError("it is larger than 2^53")
+        return a**b
+    return math.pow(a, b)
+
+
+def _modulo(a: int, b: int) -> int:
+    if b <= 0:
+        raise ValueError("the divisor must be positive")
+    return a % b
+
+
+def _logarithm(x: float, base: float) -> float:
+    if x == 0:
+        return -math.inf
+    return math.log(x) / math.log(base)
+
+
+def _numbers(*values: Any) -> tuple[Any, ...]:
+    """Numbers of one type."""
+    return tuple(float(x) for x in values) if float in map(type, values) else values
+
+
+SCALAR: dict[str, Callable[..., Any]] = {
+    "!": lambda a: not a,
+    "neg": lambda a: -a,
+    "&": lambda *x: all(x),
+    "|": lambda *x: any(x),
+    "=>": lambda a, b: not a or b,
+    "<=>": lambda a, b: a == b,
+    "=": lambda a, b: a == b,
+    "!=": lambda a, b: a != b,
+    "<": lambda a, b: a < b,
+    "<=": lambda a, b: a <= b,
+    ">": lambda a, b: a > b,
+    ">=": lambda a, b: a >= b,
+    "+": lambda *x: reduce(lambda a, b: a + b, x),
+    "-": lambda a, b: a - b,
+    "*": lambda *x: reduce(lambda a, b: a * b, x),
+    "/": _divide,
+    "?:": lambda a, b, c: _numbers(b, c)[0 if a else 1],
+    "min": lambda *x: min(_numbers(*x)),
+    "max": lambda *x: max(_numbers(*x)),
+    "floor": math.floor,
+    "ceil": math.ceil,
+    "round": lambda a: math.floor(a + 0.5) if abs(a) < 2**52 else int(a),
+    "pow": _power,
+    "mod": _modulo,
+    "log": _logarithm,
+}

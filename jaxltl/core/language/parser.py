@@ -1,0 +1,502 @@
+"""Recursive-descent parser of the PRISM language."""
+
+from __future__ import annotations
+
+from typing import Literal, cast
+
+from jaxltl.core.language.expressions import FUNCTIONS, RELATIONS, TRUE, Expression, Type, literal
+from jaxltl.core.language.source import LanguageError, Source, TokenReader
+from jaxltl.core.language.syntax import (
+    Assignment,
+    Command,
+    Constant,
+    Declaration,
+    Kind,
+    Module,
+    Outcome,
+    Player,
+    RenamedModule,
+    RewardItem,
+    RewardStructure,
+    Syntax,
+)
+
+_MAX_NESTING = 60  # of parentheses and prefixes, at most 10 frames of Python each
+_KINDS: dict[str, Kind] = {
+    "dtmc": "dtmc",
+    "probabilistic": "dtmc",
+    "mdp": "mdp",
+    "nondeterministic": "mdp",
+    "smg": "smg",
+}
+_REFUSED = {
+    "ctmc": "continuous-time Markov chains",
+    "stochastic": "continuous-time Markov chains",
+    "ma": "Markov automata",
+    "pta": "probabilistic timed automata",
+    "pomdp": "partially observable models",
+    "popta": "partially observable models",
+    "csg": "concurrent games",
+    "tptg": "timed games",
+    "tsg": "timed games",
+    "system": "system ... endsystem blocks (modules are composed in parallel over all actions)",
+    "observables": "observables of partially observable models",
+    "observable": "observables of partially observable models",
+    "invariant": "invariants of timed automata",
+}
+_RESERVED = frozenset(_KINDS) | {
+    *("bool", "clock", "const", "double", "endinit", "endinvariant", "endmodule", "endrewards"),
+    *("endplayer", "endsystem", "false", "formula", "global", "init", "int", "label", "max", "min"),
+    *("module", "player", "prob", "rate", "rewards", "true", "ctmc", "stochastic", "func"),
+    *("pta", "pomdp", "popta", "csg", "invariant", "observables", "observable", "system"),
+}
+# Binary operators by precedence, the tightest last; operators of one level associate to the left.
+_LEVELS: dict[str, int] = {
+    "=>": 1,
+    "<=>": 2,
+    "|": 3,
+    "&": 4,
+    "=": 6,
+    "!=": 6,
+    **dict.fromkeys(RELATIONS, 7),
+    "+": 8,
+    "-": 8,
+    "*": 9,
+    "/": 9,
+    "^": 10,
+}
+_NOT = 5
+SIMPLE = 6  # the level of comparisons, in which no Boolean operator stands outside of parentheses
+_FLAT = ("&", "|", "+", "*")
+
+
+class ExpressionParser(TokenReader):
+    """Expressions, by precedence climbing."""
+
+    def __init__(self, text: str, start: int = 0) -> None:
+        super().__init__(text, start)
+        self.nesting = 0
+
+    def expression(self, level: int = 0) -> Expression:
+        """An expression with operators of a level and tighter ones; level 0 has ``? :`` too."""
+        self.nesting += 1
+        if self.nesting > _MAX_NESTING:
+            raise LanguageError(self.place, f"parentheses are nested deeper than {_MAX_NESTING}.")
+        found = self._climb(level)
+        if level == 0 and self.texts[self.at] == "?":
+            self.at += 1
+            then = self.expression()
+            self.expect(":", " of a conditional expression")
+            found = Expression("?:", (found, then, self.expression()), place=found.place)
+        self.nesting -= 1
+        return found
+
+    def _climb(self, level: int) -> Expression:
+        left = self._prefix(level)
+        while True:
+            operator = self.texts[self.at]
+            precedence = _LEVELS.get(operator, -1)
+            if precedence < max(level, 1) or self.kinds[self.at] != "sign":
+                return left
+            self.at += 1
+            right = self._climb(precedence + 1)
+            if operator in _FLAT and left.operator == operator and not left.value:
+                operands = (*left.operands, right)
+                left = self._chain(operator, operands, left.place)
+            else:
+                name = "pow" if operator == "^" else operator
+                left = Expression(name, (left, right), place=left.place)
+
+    def _chain(self, operator: str, operands: tuple[Expression, ...], place: int) -> Expression:
+        """A chain of one operator as one node, so that long chains are not deep."""
+        while self.texts[self.at] == operator and self.kinds[self.at] == "sign":
+            self.at += 1
+            operands = (*operands, self._climb(_LEVELS[operator] + 1))
+        return Expression(operator, operands, place=place)
+
+    def _prefix(self, level: int) -> Expression:
+        place = self.place
+        if self.kinds[self.at] == "sign" and self.texts[self.at] in ("!", "-"):
+            self.nesting += 1
+            if self.nesting > _MAX_NESTING:
+                raise LanguageError(place, f"operators are nested deeper than {_MAX_NESTING}.")
+            negated = self.texts[self.at] == "!"
+            self.at += 1
+            # After a tighter operator, as in a = !b, the negation takes one operand alone.
+            operand = self._climb(SIMPLE) if negated and level <= _NOT else self._prefix(11)
+            self.nesting -= 1
+            return Expression("!" if negated else "neg", (operand,), place=place)
+        return self._atom()
+
+    def _atom(self) -> Expression:
+        kind, text, place = self.kinds[self.at], self.texts[self.at], self.place
+        if kind == "integer":
+            self.at += 1
+            if len(text) > 15:
+                raise LanguageError(place, f"the integer {text[:20]}... is larger than 2^53.")
+            return literal(int(text), place)
+        if kind == "real":
+            self.at += 1
+            value = float(text) if len(text) < 400 else float("inf")
+            if value == float("inf"):
+                raise LanguageError(place, "the number is too large for double precision.")
+            return literal(value, place)
+        if kind == "word":
+            return self._word(text, place)
+        if kind == "quoted":
+            return Expression("label", value=self.quoted("a label"), place=place)
+        if not self.accept("("):
+            self.fail("an expression")
+        found = self.expression()
+        self.expect(")", " or an operator")
+        return found
+
+    def _word(self, text: str, place: int) -> Expression:
+        self.at += 1
+        if text in ("true", "false"):
+            return literal(text == "true", place)
+        called = self.texts[self.at] == "("
+        if text == "func" and called:
+            self.at += 1
+            name = self.word("the name of a function")
+            self.expect(",", " after the name of a function")
+        elif text in FUNCTIONS and called:
+            self.at += 1
+            name = text
+        elif text in _RESERVED:
+            self.at -= 1
+            self.fail("an expression")
+        else:
+            if called:
+                self.at -= 1
+                self.fail(f"a variable, a constant, or one of {', '.join(FUNCTIONS)}")
+            return Expression("name", value=text, place=place)
+        if name not in FUNCTIONS:
+            raise LanguageError(place, f"{name} is no function; there are {', '.join(FUNCTIONS)}.")
+        return self._call(name, place)
+
+    def _call(self, name: str, place: int) -> Expression:
+        operands = [self.expression()]
+        while self.accept(","):
+            operands.append(self.expression())
+        self.expect(")", " or ','")
+        least, most = FUNCTIONS[name]
+        if len(operands) < least or (most is not None and len(operands) > most):
+            raise LanguageError(
+                place, f"{name} takes {most} argument{'s' * (most != 1)}, not {len(operands)}."
+            )
+        return Expression(name, tuple(operands), place=place)
+
+
+def parse_expression(text: str) -> Expression:
+    """The expression that a text writes.
+
+    Args:
+      text: an expression over constants, variables, formulas and labels in quotes.
+
+    Raises:
+      ValueError: with line and column.
+
+    Example:
+      >>> str(parse_expression("!x = 1 | a => b"))
+      '((!(x = 1) | a) => b)'
+    """
+    try:
+        parser = ExpressionParser(text)
+        found = parser.expression()
+        if parser.kinds[parser.at] != "end":
+            parser.fail("an operator or the end")
+        return found
+    except LanguageError as error:
+        raise Source(text, "expression").located(error) from None
+
+
+def parse_program(text: str, name: str = "model") -> Syntax:
+    """The syntax tree of a program in the PRISM language.
+
+    Args:
+      text: the program.
+      name: of the file, for errors.
+
+    Raises:
+      ValueError: with file, line and column: a syntax error, or a feature that is not supported
+        (continuous time, clocks, partial observability, concurrent games, ``system`` blocks,
+        unbounded integers).
+
+    Example:
+      >>> parse_program("mdp module m x : [0..1]; [a] x=0 -> (x'=1); endmodule").kind
+      'mdp'
+    """
+    source = Source(text, name)
+    try:
+        return _ProgramParser(source).program()
+    except LanguageError as error:
+        raise source.located(error) from None
+
+
+class _ProgramParser(ExpressionParser):
+    """Items of a program; each method reads the construct of its name."""
+
+    def __init__(self, source: Source) -> None:
+        super().__init__(source.text)
+        self.source = source
+        self.kind: Kind | None = None
+        self.constants: list[Constant] = []
+        self.formulas: list[tuple[str, Expression]] = []
+        self.variables: list[Declaration] = []
+        self.modules: list[Module | RenamedModule] = []
+        self.labels: list[tuple[str, Expression]] = []
+        self.rewards: list[RewardStructure] = []
+        self.initial: Expression | None = None
+        self.players: list[Player] = []
+
+    def program(self) -> Syntax:
+        readers = {
+            "const": self.constant,
+            "rate": self.constant,
+            "prob": self.constant,
+            "formula": self.formula,
+            "label": self.label,
+            "global": self.global_variable,
+            "module": self.module,
+            "rewards": self.reward_structure,
+            "init": self.initial_block,
+            "player": self.player,
+        }
+        while self.kinds[self.at] != "end":
+            text = self.texts[self.at]
+            if self.kinds[self.at] == "word" and text in _KINDS:
+                self.model_type(text)
+            elif self.kinds[self.at] == "word" and text in readers:
+                readers[text]()
+            elif self.kinds[self.at] == "word" and text in _REFUSED:
+                raise LanguageError(self.place, f"{text}: {_REFUSED[text]} are not supported.")
+            else:
+                self.fail(
+                    "the type of the model (dtmc, mdp, smg), const, formula, label, global, "
+                    "module, rewards, init or player"
+                )
+        if not self.modules:
+            raise LanguageError(self.place, "the model has no module; it needs at least one.")
+        return Syntax(
+            self.source,
+            self.kind or "mdp",  # PRISM's default
+            tuple(self.constants),
+            tuple(self.formulas),
+            tuple(self.variables),
+            tuple(self.modules),
+            tuple(self.labels),
+            tuple(self.rewards),
+            self.initial,
+            tuple(self.players),
+        )
+
+    def model_type(self, text: str) -> None:
+        if self.kind is not None:
+            raise LanguageError(self.place, "the type of the model is given twice.")
+        self.kind = _KINDS[text]
+        self.at += 1
+
+    def name(self, what: str) -> tuple[str, int]:
+        """A name that is no keyword, and its place."""
+        place = self.place
+        found = self.word(what)
+        if found in _RESERVED:
+            self.at -= 1
+            self.fail(f"{what}; {found} is a keyword")
+        return found, place
+
+    def constant(self) -> None:
+        type_: Type = "int"
+        if not self.accept("const"):
+            self.at += 1
+            type_ = "double"
+            self.accept("double")
+        elif self.texts[self.at] in ("int", "double", "bool"):
+            type_ = cast(Literal["int", "double", "bool"], self.texts[self.at])
+            self.at += 1
+        elif self.accept("rate") or self.accept("prob"):
+            type_ = "double"
+        name, place = self.name("the name of a constant")
+        expression = self.expression() if self.accept("=") else None
+        self.expect(";", " at the end of a constant")
+        self.constants.append(Constant(name, type_, expression, place))
+
+    def formula(self) -> None:
+        self.at += 1
+        name, _ = self.name("the name of a formula")
+        self.expect("=")
+        self.formulas.append((name, self.expression()))
+        self.expect(";", " at the end of a formula")
+
+    def label(self) -> None:
+        self.at += 1
+        place = self.place
+        name = self.quoted("the name of a label in double quotes")
+        if name in ("init", "deadlock") or not name:
+            raise LanguageError(place, f'the label "{name}" is built in; choose another name.')
+        self.expect("=")
+        self.labels.append((name, self.expression()))
+        self.expect(";", " at the end of a label")
+
+    def global_variable(self) -> None:
+        self.at += 1
+        self.variables.append(self.declaration())
+
+    def declaration(self) -> Declaration:
+        name, place = self.name("the name of a variable")
+        self.expect(":", " and the range of a variable")
+        low = high = None
+        kind = self.place
+        if self.accept("["):
+            low = self.expression()
+            self.expect("..", " between the ends of a range")
+            high = self.expression()
+            self.expect("]")
+        elif self.accept("int"):
+            raise LanguageError(
+                kind,
+                f"the integer {name} is unbounded, which is not supported; give a range [0..9].",
+            )
+        elif self.accept("clock"):
+            raise LanguageError(kind, f"{name} is a clock: timed automata are not supported.")
+        elif not self.accept("bool"):
+            self.fail("a range, such as [0..3], or bool")
+        initial = self.expression() if self.accept("init") else None
+        self.expect(";", " at the end of a variable")
+        return Declaration(name, low, high, initial, place)
+
+    def module(self) -> None:
+        self.at += 1
+        name, place = self.name("the name of a module")
+        if self.accept("="):
+            base, _ = self.name("the name of the module to copy")
+            self.modules.append(RenamedModule(name, base, tuple(self.renaming()), place))
+            return
+        declarations: list[Declaration] = []
+        commands: list[Command] = []
+        while not self.accept("endmodule"):
+            if self.texts[self.at] == "invariant":
+                raise LanguageError(
+                    self.place, f"invariant: {_REFUSED['invariant']} are not supported."
+                )
+            if self.texts[self.at] == "[":
+                commands.append(self.command())
+            elif self.kinds[self.at] == "word" and not commands:
+                declarations.append(self.declaration())
+            elif commands:
+                self.fail("a command, which begins with '[', or endmodule")
+            else:
+                self.fail("a variable, a command or endmodule")
+        self.modules.append(Module(name, tuple(declarations), tuple(commands), place))
+
+    def renaming(self) -> list[tuple[str, str]]:
+        self.expect("[")
+        found: list[tuple[str, str]] = []
+        while True:
+            place = self.place
+            old = self.word("a name to be replaced")
+            self.expect("=")
+            new, _ = self.name("a new name")
+            if old in dict(found):
+                raise LanguageError(place, f"{old} is renamed twice.")
+            found.append((old, new))
+            if not self.accept(","):
+                break
+        self.expect("]", " or ','")
+        self.expect("endmodule")
+        return found
+
+    def command(self) -> Command:
+        place = self.place
+        self.at += 1
+        action = "" if self.texts[self.at] == "]" else self.name("the name of an action")[0]
+        self.expect("]", " after the action")
+        guard = self.expression()
+        self.expect("->", " after the guard")
+        outcomes = [self.outcome()]
+        while self.accept("+"):
+            outcomes.append(self.outcome())
+        self.expect(";", " or '+' after an update")
+        if len(outcomes) > 1:
+            for each in outcomes:
+                if each.probability is TRUE:
+                    raise LanguageError(place, "an update of several has no probability.")
+        fixed = tuple(
+            Outcome(literal(1), None, o.assignments) if o.probability is TRUE else o
+            for o in outcomes
+        )
+        return Command(action, guard, fixed, place)
+
+    def outcome(self) -> Outcome:
+        """An update; without a probability, the constant TRUE stands for it."""
+        text, upper = self.texts[self.at], None
+        after = self.texts[self.at + 1 : self.at + 3]
+        if (text == "true" and after[:1] in ([";"], ["&"])) or (text == "(" and after[1:] == ["'"]):
+            return Outcome(TRUE, None, self.update())
+        if self.accept("["):
+            lower = self.expression()
+            self.expect(",", " between the ends of an interval of probabilities")
+            upper = self.expression()
+            self.expect("]")
+        else:
+            lower = self.expression()
+        self.expect(":", " after a probability")
+        return Outcome(lower, upper, self.update())
+
+    def update(self) -> tuple[Assignment, ...]:
+        found: list[Assignment] = []
+        while True:
+            if not self.accept("true"):
+                self.expect("(", " before an assignment, such as (x'=1), or true")
+                name, place = self.name("a variable")
+                self.expect("'", " after the variable that is assigned")
+                self.expect("=")
+                found.append(Assignment(name, self.expression(), place))
+                self.expect(")", " or an operator")
+            if not self.accept("&"):
+                return tuple(found)
+
+    def reward_structure(self) -> None:
+        place = self.place
+        self.at += 1
+        name = self.quoted("a name") if self.kinds[self.at] == "quoted" else ""
+        items: list[RewardItem] = []
+        while not self.accept("endrewards"):
+            action: str | None = None
+            if self.accept("["):
+                action = "" if self.texts[self.at] == "]" else self.name("an action")[0]
+                self.expect("]", " after the action")
+            guard = self.expression()
+            if self.texts[self.at] == "->":
+                raise LanguageError(self.place, "rewards of single successors are not supported.")
+            self.expect(":", " between a guard and a reward")
+            value = self.expression()
+            self.expect(";", " after a reward")
+            items.append(RewardItem(action, guard, value))
+        self.rewards.append(RewardStructure(name, tuple(items), place))
+
+    def initial_block(self) -> None:
+        if self.initial is not None:
+            raise LanguageError(self.place, "there are two init blocks.")
+        self.at += 1
+        self.initial = self.expression()
+        self.expect("endinit")
+
+    def player(self) -> None:
+        self.at += 1
+        place = self.place
+        quoted = self.kinds[self.at] == "quoted"
+        name = self.quoted("a name") if quoted else self.name("the name of a player")[0]
+        modules: list[str] = []
+        actions: list[str] = []
+        while True:
+            if self.accept("["):
+                actions.append(self.name("an action")[0])
+                self.expect("]")
+            else:
+                modules.append(self.name("a module or an action in brackets")[0])
+            if not self.accept(","):
+                break
+        self.expect("endplayer", " or ','")
+        self.players.append(Player(name, tuple(modules), tuple(actions), place))

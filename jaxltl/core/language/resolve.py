@@ -1,0 +1,512 @@
+"""Resolution of programs: formulas, renaming, constants, and types."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+from jaxltl.core.language.expressions import (
+    MAX_INTEGER,
+    Expression,
+    Type,
+    Value,
+    literal,
+    names_in,
+    substitute,
+    type_of,
+    value_type,
+)
+from jaxltl.core.language.parser import ExpressionParser, parse_program
+from jaxltl.core.language.source import LanguageError
+from jaxltl.core.language.syntax import (
+    Assignment,
+    Command,
+    Constant,
+    Declaration,
+    Module,
+    Outcome,
+    Program,
+    RenamedModule,
+    RewardItem,
+    RewardStructure,
+    Syntax,
+    Variable,
+)
+
+Change = Callable[[Expression], Expression]
+Named = TypeVar("Named", Constant, Module)
+
+
+def read_program(
+    text: str, constants: Mapping[str, object] | None = None, name: str = "model"
+) -> Program:
+    """Parses and resolves a program in the PRISM language.
+
+    Args:
+      text: the program.
+      constants: values of constants, as numbers, Booleans or texts such as ``"1/3"``. Those that
+        the program defines cannot be given.
+      name: of the file, for errors.
+
+    Returns:
+      :class:`~jaxltl.core.language.syntax.Program`. Constants of type double without a value become
+      its `parameters` if only probabilities and rewards depend on them.
+
+    Raises:
+      ValueError: with file, line and column: errors of syntax, names and types, unsupported
+        features, and constants without a value.
+
+    Example:
+      >>> p = read_program("dtmc const int N; module m x : [0..N]; [] true -> (x'=0); endmodule",
+      ...                  {"N": "2 * 3"})
+      >>> p.constants, p.variables[0].high
+      ({'N': 6}, 6)
+    """
+    return resolve(parse_program(text, name), constants)
+
+
+def resolve(syntax: Syntax, constants: Mapping[str, object] | None = None) -> Program:
+    """The program of a syntax tree; arguments, result and errors as of :func:`read_program`."""
+    given = {key: _given(key, value) for key, value in (constants or {}).items()}
+    try:
+        return _Resolver(syntax, given).program()
+    except LanguageError as error:
+        raise syntax.source.located(error) from None
+
+
+def _given(name: str, value: object) -> Value:
+    """A value that is given for a constant."""
+    if isinstance(value, str):
+        try:
+            parser = ExpressionParser(value)
+            found = substitute(parser.expression(), {})
+            if parser.kinds[parser.at] != "end":
+                parser.fail("an operator or the end")
+        except LanguageError as error:
+            raise ValueError(f"constant {name} = {value!r}: {error.message}") from None
+        if not found.is_literal:
+            raise ValueError(f"constant {name} = {value!r}; give a number, true or false.")
+        value = found.value
+    if isinstance(value, bool):
+        return value
+    if hasattr(value, "item"):
+        value = value.item()
+    if not isinstance(value, int | float) or not math.isfinite(value) or abs(value) > MAX_INTEGER:
+        raise ValueError(f"constant {name} is {value!r}; give a finite number, true or false.")
+    return value
+
+
+@dataclass(frozen=True)
+class _Changed:
+    """Applies a function to the expressions of a tree."""
+
+    change: Change
+
+    def declaration(self, d: Declaration) -> Declaration:
+        ends = (None if e is None else self.change(e) for e in (d.low, d.high, d.initial))
+        low, high, initial = ends
+        return replace(d, low=low, high=high, initial=initial)
+
+    def command(self, c: Command) -> Command:
+        return Command(
+            c.action, self.change(c.guard), tuple(map(self.outcome, c.outcomes)), c.place
+        )
+
+    def outcome(self, o: Outcome) -> Outcome:
+        upper = None if o.upper is None else self.change(o.upper)
+        assignments = [
+            Assignment(a.variable, self.change(a.expression), a.place) for a in o.assignments
+        ]
+        return Outcome(self.change(o.probability), upper, tuple(assignments))
+
+    def module(self, m: Module) -> Module:
+        return Module(
+            m.name,
+            tuple(map(self.declaration, m.declarations)),
+            tuple(map(self.command, m.commands)),
+            m.place,
+        )
+
+    def rewards(self, r: RewardStructure) -> RewardStructure:
+        items = [RewardItem(i.action, self.change(i.guard), self.change(i.value)) for i in r.items]
+        return replace(r, items=tuple(items))
+
+
+class _Resolver:
+    """Stages of the resolution; each method is one stage."""
+
+    def __init__(self, syntax: Syntax, given: Mapping[str, Value]) -> None:
+        self.syntax, self.given = syntax, given
+
+    def program(self) -> Program:
+        syntax = self.syntax
+        formulas = self.expanded_formulas()
+        expand = _substitution(formulas)
+        modules = self.renamed(
+            tuple(
+                _Changed(expand).module(m) if isinstance(m, Module) else m for m in syntax.modules
+            )
+        )
+        self.check_names(modules)
+        constants = self.constant_values(expand)
+        known = {name: literal(value) for name, value in constants.items()}
+        fold = _substitution(known)
+        both: Change = lambda e: fold(expand(e))  # noqa: E731
+        modules = [_Changed(fold).module(m) for m in modules]
+        owned: list[tuple[Declaration, int | None]] = []
+        owned += [(_Changed(both).declaration(d), None) for d in syntax.variables]
+        owned += [(d, i) for i, m in enumerate(modules) for d in m.declarations]
+        variables = tuple(self.variable(d, i) for d, i in owned)
+        parameters = tuple(
+            c.name for c in syntax.constants if c.name not in constants and c.type == "double"
+        )
+        used = _used_names(modules, [_Changed(both).rewards(r) for r in syntax.rewards])
+        program = Program(
+            syntax.source,
+            syntax.kind,
+            constants,
+            tuple(p for p in parameters if p in used),
+            {name: fold(e) for name, e in formulas.items()},
+            variables,
+            tuple(replace(m, declarations=()) for m in modules),
+            self.labels(both),
+            tuple(_Changed(both).rewards(r) for r in syntax.rewards),
+            None if syntax.initial is None else both(syntax.initial),
+            syntax.players,
+        )
+        _Checker(program, self.undefined(constants)).check()
+        return program
+
+    def undefined(self, constants: Mapping[str, Value]) -> dict[str, int]:
+        return {c.name: c.place for c in self.syntax.constants if c.name not in constants}
+
+    def expanded_formulas(self) -> dict[str, Expression]:
+        raw = self.syntax.formulas
+        table: dict[str, Expression] = {}
+        for name, e in raw:
+            if name in table:
+                raise LanguageError(e.place, f"the formula {name} is defined twice.")
+            table[name] = e
+        done: dict[str, Expression] = {}
+        for name in _in_order({n: (names_in(e), e.place) for n, e in table.items()}, "formula"):
+            done[name] = substitute(table[name], done)
+        return {name: done[name] for name in table}
+
+    def renamed(self, modules: tuple[Module | RenamedModule, ...]) -> list[Module]:
+        found: dict[str, Module] = {}
+        for m in modules:
+            if m.name in found:
+                raise LanguageError(m.place, f"there are two modules {m.name}.")
+            if isinstance(m, RenamedModule):
+                if m.base not in found:
+                    raise LanguageError(
+                        m.place,
+                        f"there is no module {m.base} before {m.name} that could be copied.",
+                    )
+                m = _renamed(found[m.base], m)
+            found[m.name] = m
+        return list(found.values())
+
+    def check_names(self, modules: Sequence[Module]) -> None:
+        """Raises LanguageError if two constants, formulas or variables have one name."""
+        formulas = [(name, e.place) for name, e in self.syntax.formulas]
+        constants = [(c.name, c.place) for c in self.syntax.constants]
+        variables = [(v.name, v.place) for v in self.syntax.variables]
+        variables += [
+            (d.name, m.place if d.place < 0 else d.place) for m in modules for d in m.declarations
+        ]
+        seen: set[str] = set()
+        for name, place in (*formulas, *constants, *variables):
+            if name in seen:
+                raise LanguageError(place, f"the name {name} is declared twice.")
+            seen.add(name)
+        unknown = sorted(set(self.given) - {c.name for c in self.syntax.constants})
+        if unknown:
+            listed = ", ".join(c.name for c in self.syntax.constants) or "none"
+            raise ValueError(
+                f"{self.syntax.source.name!r} has no constant {unknown[0]}; it has {listed}."
+            )
+
+    def constant_values(self, expand: Change) -> dict[str, Value]:
+        """The value of each constant that is defined or given."""
+        table = {c.name: c for c in self.syntax.constants}
+        texts = {c.name: expand(c.expression) for c in table.values() if c.expression is not None}
+        order = _in_order({n: (names_in(e), table[n].place) for n, e in texts.items()}, "constant")
+        found: dict[str, Value] = {}
+        for name, value in self.given.items():
+            if name in texts:
+                raise LanguageError(table[name].place, f"the constant {name} has a value already.")
+            found[name] = _typed(table[name], value)
+        known = {name: literal(value) for name, value in found.items()}
+        types: dict[str, Type] = {c.name: c.type for c in table.values()}
+        for name in order:
+            type_of(texts[name], types)
+            e = substitute(texts[name], known)
+            if e.is_literal:
+                found[name] = _typed(table[name], e.value)
+                known[name] = literal(found[name])
+            elif missing := sorted(names_in(e) & set(table)):
+                raise LanguageError(table[name].place, _no_value(missing[0]))
+        return found
+
+    def variable(self, d: Declaration, module: int | None) -> Variable:
+        if d.low is None or d.high is None:
+            value = self.number(d.initial, d, "bool") if d.initial is not None else False
+            return Variable(d.name, "bool", 0, 1, int(value), module, d.place)
+        low, high = (int(self.number(e, d, "int")) for e in (d.low, d.high))
+        if low > high:
+            raise LanguageError(d.place, f"the range [{low}..{high}] of {d.name} is empty.")
+        initial = low if d.initial is None else int(self.number(d.initial, d, "int"))
+        if not low <= initial <= high:
+            raise LanguageError(
+                d.place, f"{d.name} begins with {initial}, outside of its range [{low}..{high}]."
+            )
+        return Variable(d.name, "int", low, high, initial, module, d.place)
+
+    def number(self, e: Expression, d: Declaration, expected: Type) -> Value:
+        if not e.is_literal:
+            missing = sorted(names_in(e))
+            table = {c.name for c in self.syntax.constants}
+            if missing and missing[0] in table:
+                raise LanguageError(e.place, _no_value(missing[0]))
+            raise LanguageError(e.place, f"{e} is no constant; ranges and initial values must be.")
+        assert e.value is not None and not isinstance(e.value, str)
+        if value_type(e.value) != expected:
+            kind = "a Boolean" if expected == "bool" else "an integer"
+            raise LanguageError(d.place, f"{e} is given for {d.name}; expected {kind}.")
+        return e.value
+
+    def labels(self, change: Change) -> dict[str, Expression]:
+        found: dict[str, Expression] = {}
+        for name, e in self.syntax.labels:
+            if name in found:
+                raise LanguageError(e.place, f'the label "{name}" is defined twice.')
+            found[name] = substitute(change(e), {}, labels=found)
+        return found
+
+
+def _no_value(name: str) -> str:
+    return (
+        f"the constant {name} has no value; give constants={{{name!r}: ...}}, or --const {name}=... "
+        "on the command line."
+    )
+
+
+def _typed(constant: Constant, value: object) -> Value:
+    """A value of a constant's type."""
+    assert isinstance(value, int | float)
+    actual = value_type(value)
+    if constant.type == "double" and actual == "int":
+        return float(value)
+    given = constant.expression is None
+    if given and constant.type == "int" and isinstance(value, float) and value.is_integer():
+        return int(value)
+    if actual != constant.type:
+        raise LanguageError(
+            constant.place,
+            f"the constant {constant.name} is {value}, and its type {constant.type}.",
+        )
+    return value
+
+
+def _substitution(names: Mapping[str, Expression]) -> Change:
+    """Substitution that shares results between expressions."""
+    memory: dict[int, Expression] = {}
+    alive: list[Expression] = []  # nodes keep their ids in use
+
+    def change(e: Expression) -> Expression:
+        alive.append(e)
+        return substitute(e, names, memory)
+
+    return change
+
+
+def _in_order(needs: Mapping[str, tuple[set[str], int]], what: str) -> list[str]:
+    """Names so that each comes after those that it needs; LanguageError for a circle."""
+    order: dict[str, None] = {}
+    for start in needs:
+        path: dict[str, Iterator[str]] = {}
+        todo = [start]
+        while todo:
+            name = todo[-1]
+            if name in order:
+                todo.pop()
+                continue
+            rest = path.setdefault(name, iter(sorted(needs[name][0] & needs.keys())))
+            following = next((n for n in rest if n not in order), None)
+            if following is None:
+                order[name] = None
+                todo.pop()
+            elif following in path:
+                raise LanguageError(
+                    needs[following][1], f"the {what} {following} depends on itself."
+                )
+            else:
+                todo.append(following)
+    return list(order)
+
+
+def _renamed(base: Module, renaming: RenamedModule) -> Module:
+    """The copy of a module, after formulas have been substituted."""
+    names = dict(renaming.renaming)
+    memory: dict[int, Expression] = {}
+
+    def rename(e: Expression) -> Expression:
+        if (found := memory.get(id(e))) is not None:
+            return found
+        if e.operator == "name" and e.value in names:
+            found = replace(e, value=names[str(e.value)])
+        elif e.operands:
+            found = replace(e, operands=tuple([rename(x) for x in e.operands]))
+        else:
+            found = e
+        memory[id(e)] = found
+        return found
+
+    for d in base.declarations:
+        if d.name not in names:
+            raise LanguageError(
+                renaming.place,
+                f"the copy {renaming.name} does not rename {d.name}, a variable of {base.name}.",
+            )
+    copy = _Changed(rename).module(base)
+    return Module(
+        renaming.name,
+        tuple(replace(d, name=names[d.name], place=renaming.place) for d in copy.declarations),
+        tuple(
+            Command(
+                names.get(c.action, c.action),
+                c.guard,
+                tuple(
+                    replace(
+                        o,
+                        assignments=tuple(
+                            replace(a, variable=names.get(a.variable, a.variable))
+                            for a in o.assignments
+                        ),
+                    )
+                    for o in c.outcomes
+                ),
+                c.place,
+            )
+            for c in copy.commands
+        ),
+        renaming.place,
+    )
+
+
+def _used_names(modules: Iterable[Module], rewards: Iterable[RewardStructure]) -> set[str]:
+    found: set[str] = set()
+    for m in modules:
+        for c in m.commands:
+            names_in(c.guard, found)
+            for o in c.outcomes:
+                for e in (o.probability, o.upper, *(a.expression for a in o.assignments)):
+                    if e is not None:
+                        names_in(e, found)
+    for r in rewards:
+        for i in r.items:
+            names_in(i.value, found)
+    return found
+
+
+class _Checker:
+    """Types, owners of variables, and constants without a value."""
+
+    def __init__(self, program: Program, undefined: Mapping[str, int]) -> None:
+        self.program, self.undefined = program, undefined
+        self.types: dict[str, Type] = {v.name: v.type for v in program.variables}
+        self.with_parameters: dict[str, Type] = program.types
+        self.owner = {v.name: v.module for v in program.variables}
+        self.range = {v.name: v for v in program.variables}
+
+    def check(self) -> None:
+        program = self.program
+        sharing: dict[str, set[int]] = {}
+        for i, m in enumerate(program.modules):
+            for c in m.commands:
+                sharing.setdefault(c.action, set()).add(i)
+        shared = {a for a, where in sharing.items() if a and len(where) > 1}
+        for i, m in enumerate(program.modules):
+            for c in m.commands:
+                self.command(c, i, c.action in shared)
+        actions = {c.action for m in program.modules for c in m.commands}
+        for name, e in program.labels.items():
+            self.boolean(e, f'the label "{name}"')
+        for r in program.rewards:
+            for item in r.items:
+                self.boolean(item.guard, "the guard of a reward")
+                self.number(item.value, "a reward")
+        if program.initial is not None:
+            self.boolean(program.initial, "the init block")
+        self.players(actions)
+
+    def players(self, actions: set[str]) -> None:
+        program = self.program
+        if program.kind == "smg" and not program.players:
+            raise LanguageError(0, "the game has no player ... endplayer block.")
+        seen: set[str] = set()
+        modules = {m.name for m in program.modules}
+        for p in program.players:
+            for name, known in ((p.modules, modules), (p.actions, actions)):
+                for one in name:
+                    if one not in known:
+                        raise LanguageError(p.place, f"player {p.name}: there is no {one}.")
+            controlled = {*p.modules, *(f"[{a}]" for a in p.actions)}
+            if both := sorted(controlled & seen):
+                raise LanguageError(p.place, f"{both[0]} belongs to two players.")
+            seen |= controlled
+
+    def command(self, c: Command, module: int, shared: bool) -> None:
+        self.boolean(c.guard, "a guard")
+        for o in c.outcomes:
+            self.number(o.probability, "a probability")
+            if o.upper is not None:
+                self.number(o.upper, "a probability")
+            written: set[str] = set()
+            for a in o.assignments:
+                self.assignment(a, module, c.action if shared else "")
+                if a.variable in written:
+                    raise LanguageError(a.place, f"{a.variable} is assigned twice in one update.")
+                written.add(a.variable)
+
+    def assignment(self, a: Assignment, module: int, action: str) -> None:
+        if a.variable not in self.owner:
+            raise LanguageError(a.place, f"{a.variable} is no variable.")
+        owner = self.owner[a.variable]
+        if owner is None and action:
+            raise LanguageError(
+                a.place,
+                f"[{action}] synchronises modules and assigns the global variable {a.variable}; "
+                "only commands without synchronisation may.",
+            )
+        if owner not in (None, module):
+            name = self.program.modules[owner].name
+            raise LanguageError(
+                a.place, f"{a.variable} belongs to the module {name}; only it may assign it."
+            )
+        actual = self.type(a.expression, self.types)
+        expected = self.types[a.variable]
+        if actual != expected:
+            hint = "; use floor, ceil or round" if (expected, actual) == ("int", "double") else ""
+            raise LanguageError(
+                a.place,
+                f"{a.expression} of type {actual} is assigned to {a.variable} of type {expected}{hint}.",
+            )
+
+    def boolean(self, e: Expression, what: str) -> None:
+        if self.type(e, self.types) != "bool":
+            raise LanguageError(e.place, f"{e} is {what} and no Boolean.")
+
+    def number(self, e: Expression, what: str) -> None:
+        if self.type(e, self.with_parameters) == "bool":
+            raise LanguageError(e.place, f"{e} is {what} and no number.")
+
+    def type(self, e: Expression, types: Mapping[str, Type]) -> Type:
+        """The type; LanguageError that names a constant without a value."""
+        for name in names_in(e) - types.keys():
+            if name in self.undefined:
+                raise LanguageError(self.undefined[name], _no_value(name))
+        return type_of(e, types)

@@ -1,0 +1,208 @@
+"""Programs in the PRISM language as frozen trees."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from jaxltl.core.language.expressions import Expression, Type, Value
+from jaxltl.core.language.source import Source
+
+Kind = Literal["dtmc", "mdp", "smg"]
+
+
+@dataclass(frozen=True)
+class Constant:
+    """A constant; without an expression its value is given from outside."""
+
+    name: str
+    type: Type
+    expression: Expression | None
+    place: int
+
+
+@dataclass(frozen=True)
+class Declaration:
+    """A variable as it is declared: a range of integers, or without ends a Boolean."""
+
+    name: str
+    low: Expression | None
+    high: Expression | None
+    initial: Expression | None
+    place: int
+
+
+@dataclass(frozen=True)
+class Assignment:
+    """An assignment ``(variable' = expression)``; expressions read the old values."""
+
+    variable: str
+    expression: Expression
+    place: int
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """An update with its probability, or with an interval of probabilities."""
+
+    probability: Expression  # of an interval the lower end
+    upper: Expression | None  # the upper end of an interval, else None
+    assignments: tuple[Assignment, ...]
+
+
+@dataclass(frozen=True)
+class Command:
+    """A guarded command ``[action] guard -> p_1 : update_1 + ...``; no action is ``""``."""
+
+    action: str
+    guard: Expression
+    outcomes: tuple[Outcome, ...]
+    place: int
+
+
+@dataclass(frozen=True)
+class Module:
+    """A module with its declarations and commands."""
+
+    name: str
+    declarations: tuple[Declaration, ...]
+    commands: tuple[Command, ...]
+    place: int
+
+
+@dataclass(frozen=True)
+class RenamedModule:
+    """A module as a copy of another one, ``module name = base [old = new, ...] endmodule``."""
+
+    name: str
+    base: str
+    renaming: tuple[tuple[str, str], ...]
+    place: int
+
+
+@dataclass(frozen=True)
+class RewardItem:
+    """A reward ``guard : value`` of states, or ``[action] guard : value`` of choices."""
+
+    action: str | None  # None of states, "" of choices without an action
+    guard: Expression
+    value: Expression
+
+
+@dataclass(frozen=True)
+class RewardStructure:
+    """A reward structure, the sum of its items."""
+
+    name: str
+    items: tuple[RewardItem, ...]
+    place: int
+
+
+@dataclass(frozen=True)
+class Player:
+    """A player of a turn-based game: modules, whose unlabelled commands it controls, and actions."""
+
+    name: str
+    modules: tuple[str, ...]
+    actions: tuple[str, ...]
+    place: int
+
+
+@dataclass(frozen=True)
+class Syntax:
+    """A program as it is written; :func:`~jaxltl.core.language.parser.parse_program`."""
+
+    source: Source
+    kind: Kind
+    constants: tuple[Constant, ...]
+    formulas: tuple[tuple[str, Expression], ...]
+    variables: tuple[Declaration, ...]  # global ones
+    modules: tuple[Module | RenamedModule, ...]
+    labels: tuple[tuple[str, Expression], ...]
+    rewards: tuple[RewardStructure, ...]
+    initial: Expression | None
+    players: tuple[Player, ...]
+
+
+# --- after resolution -------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Variable:
+    """A bounded variable of a resolved program.
+
+    Attributes:
+      name: its name.
+      type: ``"int"`` or ``"bool"``.
+      low, high: the range, 0 and 1 of a Boolean.
+      initial: the initial value, which an ``init`` block overrides.
+      module: the number of its module; None for a global variable.
+      place: offset in the source.
+    """
+
+    name: str
+    type: Type
+    low: int
+    high: int
+    initial: int
+    module: int | None
+    place: int
+
+    @property
+    def bits(self) -> int:
+        """The number of bits of ``value - low``."""
+        return (self.high - self.low).bit_length()
+
+
+@dataclass(frozen=True)
+class Program:
+    """A program with constants folded, formulas substituted and modules renamed.
+
+    All expressions are over the variables and, in probabilities and values of rewards, over the
+    `parameters`. They are type-checked: guards, labels, and guards of rewards are Boolean.
+
+    Attributes:
+      source: the text, for errors: ``source.located(LanguageError(place, message))``.
+      kind: ``"dtmc"``, ``"mdp"`` or ``"smg"``.
+      constants: the value of each constant that has one.
+      parameters: constants of type double without a value.
+      formulas: the substituted expression of each formula.
+      variables: global ones first, then by module; the order of a state's values.
+      modules: the modules, without declarations.
+      labels: the substituted expression of each label.
+      rewards: the reward structures.
+      initial: the condition of the ``init`` block, or None.
+      players: the players of an smg.
+
+    Example:
+      >>> from jaxltl.core.language.resolve import read_program
+      >>> p = read_program("dtmc const int N; module m x : [0..N]; [] x<N -> (x'=x+1); endmodule",
+      ...                  {"N": 3})
+      >>> p.variables[0].high, str(p.modules[0].commands[0].guard)
+      (3, '(x < 3)')
+    """
+
+    source: Source
+    kind: Kind
+    constants: dict[str, Value]
+    parameters: tuple[str, ...]
+    formulas: dict[str, Expression]
+    variables: tuple[Variable, ...]
+    modules: tuple[Module, ...]
+    labels: dict[str, Expression]
+    rewards: tuple[RewardStructure, ...]
+    initial: Expression | None
+    players: tuple[Player, ...]
+
+    @property
+    def types(self) -> dict[str, Type]:
+        """The type of each variable and parameter."""
+        found: dict[str, Type] = {v.name: v.type for v in self.variables}
+        return found | dict.fromkeys(self.parameters, "double")
+
+    @property
+    def has_intervals(self) -> bool:
+        """True if some probability is an interval."""
+        return any(
+            o.upper is not None for m in self.modules for c in m.commands for o in c.outcomes
+        )
