@@ -14,12 +14,12 @@ from benchmarks import size
 
 PACKAGE = Path(jaxltl.__file__).parent
 LIMITS = {
-    "lines": 99_150,
-    "statements": 49_520,
-    "docstring lines": 16_190,
+    "lines": 100_560,
+    "statements": 50_360,
+    "docstring lines": 16_330,
     "functions with more than 6 parameters": 67,
     "functions with more than 9 parameters": 1,
-    "Any in annotations": 914,
+    "Any in annotations": 942,
     "modules of the largest folder": 20,
     "names at the top level": 80,
 }

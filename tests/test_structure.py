@@ -44,6 +44,7 @@ LAYERS = (
     "core.environments",
     "core.graphs",
     ("core.values", "core.games"),
+    "core.programs",
     "core.continuous",
     "algos",
     "envs",

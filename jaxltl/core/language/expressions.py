@@ -235,6 +235,8 @@ def _simplified(e: Expression, parts: tuple[Expression, ...]) -> Expression:
         parts = tuple(rest)
     elif all(x.is_literal for x in parts):
         return literal(apply(operator, [x.value for x in parts], e.place), e.place)
+    elif operator == "?:" and isinstance(parts[0].value, bool):
+        return parts[1] if parts[0].value else parts[2]
     if len(parts) == len(e.operands) and all(map(operator_is, parts, e.operands)):
         return e
     return Expression(operator, parts, e.value, e.place)

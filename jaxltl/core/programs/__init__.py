@@ -1,0 +1,1 @@
+"""Models of programs in the PRISM language."""

@@ -1,0 +1,370 @@
+"""Sparse models of programs in the PRISM language."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxltl.core import validation
+from jaxltl.core.array_types import Booleans, Floats, Integers
+from jaxltl.core.language.compiled import compile_expressions
+from jaxltl.core.language.expressions import Expression, literal
+from jaxltl.core.language.source import LanguageError
+from jaxltl.core.language.syntax import Program, RewardItem
+from jaxltl.core.models.game import Game, make_game
+from jaxltl.core.models.interval import IntervalMDP, interval_rows
+from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
+from jaxltl.core.programs.explore import Explored, Progress, explore
+from jaxltl.core.programs.initial import initial_states
+from jaxltl.core.programs.layout import Layout, Reader, Words, make_layout
+from jaxltl.core.programs.local_choices import state_text
+from jaxltl.core.programs.weights import Functions, Intervals, Numbers, Weight
+from jaxltl.core.sparse.rows import offsets_from_counts
+
+MAX_STATES = 10_000_000
+_PART = 2**17  # states on which labels and rewards are evaluated together
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Arrays of a model before its probabilities are numbers.
+
+    Attributes:
+      row_start, entry_start, successor, weight, initial, label, propositions, action,
+        action_names, valuation: as of :func:`~jaxltl.core.models.sparse.make_sparse`; `weight` has the
+        probabilities, their intervals ``[T, 2]``, or numbers of functions.
+      rewards: by name the parts on states and choices, None where they are zero.
+      functions: of a program with parameters, expressions by number.
+      owner: ``int32[S]``, the number of the player of each state of a game.
+    """
+
+    row_start: Integers
+    entry_start: Integers
+    successor: Integers
+    weight: Weight
+    initial: Floats
+    label: Booleans
+    propositions: tuple[str, ...]
+    action: Integers
+    action_names: tuple[str, ...]
+    valuation: dict[str, NDArray[Any]]
+    rewards: dict[str, tuple[NDArray[Any] | None, NDArray[Any] | None]]
+    functions: tuple[Expression, ...] = ()
+    owner: Integers | None = None
+
+    @property
+    def annotations(self) -> dict[str, Any]:
+        """Keyword arguments of ``make_sparse`` other than rewards."""
+        names = ("initial", "label", "propositions", "action", "action_names", "valuation")
+        return {name: getattr(self, name) for name in names}
+
+
+def build_model(
+    program: Program,
+    *,
+    coalition: Sequence[str] | None = None,
+    max_states: int = MAX_STATES,
+    progress: Progress | None = None,
+) -> SparseMDP | IntervalMDP | Game:
+    """The model of a program, with all reachable states.
+
+    The initial states come first. Deadlocks get a self-loop, with a warning. In a ``dtmc`` each of
+    several enabled commands has the same probability, with a warning. `valuation` has the variables
+    of each state, and the label ``"deadlock"`` is added where it differs from certain self-loops.
+
+    Args:
+      program: of :func:`~jaxltl.core.language.resolve.read_program`, without parameters.
+      coalition: players of an smg that are the system of the game; default: the first one.
+      max_states: the largest number of states, and a hundredth of that of transitions.
+      progress: is called with the numbers of states that are found and expanded.
+
+    Returns:
+      A SparseMDP; an IntervalMDP if some probability is an interval; a Game of an smg.
+
+    Raises:
+      ValueError: too many states, parameters, an update that leaves the range of a variable or is
+        no distribution, or a state of a game with choices of two players.
+
+    Example:
+      >>> from jaxltl.core.language.resolve import read_program
+      >>> text = "dtmc module m x : [0..2]; [] x<2 -> 0.5 : (x'=x+1) + 0.5 : (x'=2); [] x=2 -> true; endmodule"
+      >>> model = build_model(read_program(text))
+      >>> model.successor.tolist(), model.valuation["x"].tolist()
+      ([1, 2, 2, 2], [0, 1, 2])
+    """
+    if program.parameters:
+        name = program.parameters[0]
+        raise ValueError(
+            f"{program.source.name!r}: the constant {name} has no value; give constants="
+            f"{{{name!r}: ...}} (--const {name}=...), or read it as a parameter with read_parametric."
+        )
+    rows = build_rows(program, max_states=max_states, progress=progress)
+    rewards = {
+        name: Rewards(state=state, choice=choice) for name, (state, choice) in rows.rewards.items()
+    }
+    arrays = rows.row_start, rows.entry_start, rows.successor
+    with validation.errors_in(f"{program.source.name!r}: "):
+        model: SparseMDP | IntervalMDP
+        if rows.weight.ndim == 2:
+            model = interval_rows(
+                *arrays, rows.weight[:, 0], rows.weight[:, 1], rewards=rewards, **rows.annotations
+            )
+        else:
+            model = make_sparse(*arrays, rows.weight, rewards=rewards, **rows.annotations)
+        if rows.owner is None:
+            return model
+        return make_game(model, np.isin(rows.owner, _players(program, coalition)))
+
+
+def build_rows(
+    program: Program, *, max_states: int = MAX_STATES, progress: Progress | None = None
+) -> Rows:
+    """Rows of the model of a program, also of one with parameters; see :func:`build_model`."""
+    max_states = validation.integer("max_states", max_states, least=1, most=2**31 - 2)
+    layout = make_layout(program.variables)
+    weights: Numbers = (
+        Functions() if program.parameters else Intervals() if program.has_intervals else Numbers()
+    )
+    initial = initial_states(program, layout, max_states)
+    found = explore(program, layout, initial, weights, max_states=max_states, progress=progress)
+    try:
+        return _rows(program, found, weights)
+    except LanguageError as error:
+        raise program.source.located(error) from None
+
+
+def _rows(program: Program, found: Explored, weights: Numbers) -> Rows:
+    size = found.words[0].size
+    rewards = {r.name: _reward_parts(program, found, weights, r.items) for r in program.rewards}
+    owner = _owners(program, found) if program.kind == "smg" else None
+    deadlock = found.row_count == 0
+    if deadlock.any():
+        warnings.warn(
+            f"{program.source.name!r}: {int(deadlock.sum())} of {size} states are deadlocks; each "
+            "gets a self-loop.",
+            stacklevel=2,
+        )
+        found, rewards = _with_loops(found, weights, np.flatnonzero(deadlock), rewards)
+    if program.kind == "dtmc" and found.action.size > size:
+        warnings.warn(
+            f"{program.source.name!r}: several commands are enabled in "
+            f"{int((found.row_count > 1).sum())} states of a dtmc; each has the same probability.",
+            stacklevel=2,
+        )
+        found, rewards = _as_chain(found, weights, rewards)
+    initial = np.zeros(size)
+    initial[: found.num_initial] = 1 / found.num_initial
+    label = _label_columns(program, found, deadlock)
+    functions = tuple(weights.expressions) if isinstance(weights, Functions) else ()
+    return Rows(
+        offsets_from_counts(found.row_count),
+        offsets_from_counts(found.entry_count),
+        found.successor,
+        found.weight,
+        initial,
+        label[1],
+        label[0],
+        found.action,
+        found.actions,
+        {v.name: _column(found.layout, found.words, v.name) for v in program.variables},
+        rewards,
+        functions,
+        owner,
+    )
+
+
+def _column(layout: Layout, words: Words, name: str) -> NDArray[Any]:
+    """Values of a variable, in the smallest type."""
+    variable, values = layout.fields[name].variable, layout.values(words, name)
+    if variable.type == "bool":
+        return values
+    return values.astype(
+        np.result_type(*map(np.min_scalar_type, (min(variable.low, -1), variable.high)))
+    )
+
+
+def on_states(
+    layout: Layout, words: Words, expressions: Sequence[Expression]
+) -> list[NDArray[Any]]:
+    """Values of expressions in some states, ``[S]`` each."""
+    compiled, size = compile_expressions(expressions), words[0].size
+    parts: list[list[NDArray[Any]]] = [[] for _ in expressions]
+    for begin in range(0, size, _PART):
+        some = tuple(w[begin : begin + _PART] for w in words)
+        values = compiled(Reader(layout, some))
+        for part, value in zip(parts, values, strict=True):
+            part.append(np.broadcast_to(value, (some[0].size,)))
+    return [np.concatenate(part) for part in parts]
+
+
+def _label_columns(
+    program: Program, found: Explored, deadlock: Booleans
+) -> tuple[tuple[str, ...], Booleans]:
+    """Names and columns of the labels."""
+    names = tuple(program.labels)
+    columns = on_states(found.layout, found.words, [program.labels[n] for n in names])
+    only = np.flatnonzero(found.row_count == 1)
+    first = offsets_from_counts(found.row_count)[only]
+    entry = offsets_from_counts(found.entry_count)[first]
+    loops = np.zeros(deadlock.size, bool)
+    loops[only] = (found.entry_count[first] == 1) & (found.successor[entry] == only)
+    if not np.array_equal(loops, deadlock):
+        names, columns = (*names, "deadlock"), [*columns, deadlock]
+    if not columns:
+        return (), np.zeros((deadlock.size, 0), bool)
+    return names, np.stack(columns, 1)
+
+
+# --- rewards ----------------------------------------------------------------------------------
+
+
+def _reward_parts(
+    program: Program, found: Explored, weights: Numbers, items: Sequence[RewardItem]
+) -> tuple[NDArray[Any] | None, NDArray[Any] | None]:
+    """Rewards of states and of choices; numbers of functions in a program with parameters."""
+    states = [i for i in items if i.action is None]
+    size = found.words[0].size
+    state = None
+    if states:
+        state = _earned(program, found, weights, states, np.arange(size))
+    choices: NDArray[Any] | None = None
+    of_row = np.repeat(np.arange(size), found.row_count)
+    for action in dict.fromkeys(i.action for i in items if i.action is not None):
+        if action not in found.actions:
+            continue
+        rows = np.flatnonzero(found.action == found.actions.index(action))
+        some = [i for i in items if i.action == action]
+        earned = _earned(program, found, weights, some, of_row[rows])
+        choices = np.zeros(of_row.size, earned.dtype) if choices is None else choices
+        choices[rows] = earned
+    return state, choices
+
+
+def _earned(
+    program: Program,
+    found: Explored,
+    weights: Numbers,
+    items: Sequence[RewardItem],
+    states: Integers,
+) -> NDArray[Any]:
+    """The sum of some items in some states."""
+    if states.size == found.words[0].size:
+        words = found.words
+    else:
+        words = tuple(w[states] for w in found.words)
+    if isinstance(weights, Functions):
+        terms = [Expression("?:", (i.guard, i.value, literal(0))) for i in items]
+        total = Expression("+", (literal(0), *terms))
+        return weights.numbers(total, Reader(found.layout, words), states.size)
+    values = on_states(found.layout, words, [e for i in items for e in (i.guard, i.value)])
+    earned = np.zeros(states.size)
+    for item, guard, value in zip(items, values[::2], values[1::2], strict=True):
+        bad = guard & ~np.isfinite(value.astype(np.float64))
+        if bad.any():
+            raise LanguageError(item.value.place, f"the reward {item.value} is not finite.")
+        earned += np.where(guard, value, 0.0)
+    return earned
+
+
+# --- deadlocks and overlapping commands -------------------------------------------------------
+
+_Parts = Mapping[str, tuple[NDArray[Any] | None, NDArray[Any] | None]]
+
+
+def _with_loops(
+    found: Explored, weights: Numbers, states: Integers, rewards: _Parts
+) -> tuple[Explored, dict[str, tuple[NDArray[Any] | None, NDArray[Any] | None]]]:
+    """The model with a self-loop in each of some states without choices, and its rewards."""
+    row = offsets_from_counts(found.row_count)[states]
+    entry = offsets_from_counts(found.entry_count)[row]
+    row_count = found.row_count.copy()
+    row_count[states] = 1
+    changed = replace(
+        found,
+        row_count=row_count,
+        action=np.insert(found.action, row, 0),
+        owner=np.insert(found.owner, row, -1),
+        entry_count=np.insert(found.entry_count, row, 1),
+        successor=np.insert(found.successor, entry, states.astype(np.int32)),
+        weight=np.insert(found.weight, entry, 1, axis=0),
+    )
+    return changed, {
+        name: (state, None if choice is None else np.insert(choice, row, 0))
+        for name, (state, choice) in rewards.items()
+    }
+
+
+def _as_chain(
+    found: Explored, weights: Numbers, rewards: _Parts
+) -> tuple[Explored, dict[str, tuple[NDArray[Any] | None, NDArray[Any] | None]]]:
+    """The Markov chain that picks each enabled command with the same probability."""
+    starts = offsets_from_counts(found.row_count)[:-1]
+    share = np.repeat(found.row_count, found.row_count)
+    of_entry = np.repeat(share, found.entry_count)
+    if isinstance(weights, Functions):
+        scale = np.array([weights.constant(1 / n) for n in range(1, int(share.max()) + 1)])
+        weight = weights.product(found.weight, scale[of_entry - 1])
+    else:
+        shape = (-1,) + (1,) * (found.weight.ndim - 1)
+        weight = found.weight / of_entry.reshape(shape)
+    changed = replace(
+        found,
+        row_count=np.ones_like(found.row_count),
+        action=np.where(found.row_count == 1, found.action[starts], 0).astype(np.int32),
+        entry_count=np.add.reduceat(found.entry_count, starts),
+        weight=weight,
+    )
+    means: dict[str, tuple[NDArray[Any] | None, NDArray[Any] | None]] = {}
+    for name, (state, choice) in rewards.items():
+        if choice is not None and isinstance(weights, Functions):
+            raise LanguageError(
+                0,
+                "rewards of choices in a dtmc with overlapping commands and parameters are not "
+                "supported; make the guards disjoint.",
+            )
+        mean = None if choice is None else np.add.reduceat(choice / share, starts)
+        means[name] = (state, mean)
+    return changed, means
+
+
+# --- games ------------------------------------------------------------------------------------
+
+
+def _players(program: Program, coalition: Sequence[str] | None) -> list[int]:
+    """Numbers of the players of a coalition."""
+    names = [p.name for p in program.players]
+    if coalition is None:
+        return [0]
+    for name in coalition:
+        if name not in names:
+            raise ValueError(f"there is no player {name!r}; the players are {', '.join(names)}.")
+    return [names.index(name) for name in coalition]
+
+
+def _owners(program: Program, found: Explored) -> Integers:
+    """The player of each state; LanguageError for a state with choices of several players."""
+    modules = [m.name for m in program.modules]
+    of_module = np.full(len(modules) + 1, -1)
+    of_action = np.full(len(found.actions), -1)
+    for i, player in enumerate(program.players):
+        of_module[[modules.index(m) for m in player.modules]] = i
+        of_action[[found.actions.index(a) for a in player.actions]] = i
+    of_row = np.where(found.action > 0, of_action[found.action], of_module[found.owner])
+    state = np.repeat(np.arange(found.row_count.size), found.row_count)
+    owner = np.zeros(found.row_count.size, np.int64)
+    owner[state] = of_row
+    several = (owner[state] != of_row) | ((of_row < 0) & (found.row_count[state] > 1))
+    if several.any():
+        i = int(state[np.argmax(several)])
+        text = state_text(Reader(found.layout, tuple(w[i : i + 1] for w in found.words)), 0)
+        raise LanguageError(
+            0,
+            f"the choices of the state {text} belong to several players or to none; in a "
+            "turn-based game one player has all of them.",
+        )
+    return np.maximum(owner, 0)

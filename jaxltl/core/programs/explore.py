@@ -1,0 +1,305 @@
+"""Reachable states of a program, by levels of packed states."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxltl.core.array_types import Integers
+from jaxltl.core.language.source import LanguageError
+from jaxltl.core.language.syntax import Program
+from jaxltl.core.programs.hash_table import HashTable
+from jaxltl.core.programs.layout import Layout, Words
+from jaxltl.core.programs.local_choices import Choices, LocalTable, ModuleCode
+from jaxltl.core.programs.weights import Numbers, Weight
+from jaxltl.core.sparse.rows import concatenated_ranges
+
+Progress = Callable[[int, int], None]  # of the numbers of states found and expanded
+
+_CHUNK = 2**15  # states that are expanded together
+_ENTRIES = 2**19  # transitions that are numbered together; bounds the temporary memory
+_MAX_BRANCHING = 2**26  # transitions of a single state
+_TRANSITIONS = 100  # the most transitions per allowed state
+
+
+@dataclass(frozen=True)
+class Explored:
+    """The reachable part of a program.
+
+    Attributes:
+      layout, words: the states as packed words.
+      row_count: ``int32[S]``, choices of each state; 0 of a deadlock.
+      action: ``int32[R]``, index in `actions`.
+      entry_count: ``int64[R]``.
+      successor: ``int32[T]``.
+      weight: ``[T]``, see :mod:`~jaxltl.core.programs.weights`.
+      actions: names of actions, the first of which is ``""``.
+      owner: ``int32[R]``, the module of a choice without synchronisation, else -1.
+      num_initial: the initial states are the first ones.
+    """
+
+    layout: Layout
+    words: Words
+    row_count: NDArray[np.int32]
+    action: NDArray[np.int32]
+    owner: NDArray[np.int32]
+    entry_count: Integers
+    successor: NDArray[np.int32]
+    weight: Weight
+    actions: tuple[str, ...]
+    num_initial: int
+
+
+@dataclass(frozen=True)
+class _Column:
+    """A synchronisation: an action, or the commands without an action of a module."""
+
+    action: int
+    owner: int  # the module, or -1 for an action of several
+    parts: tuple[tuple[int, int], ...]  # modules, and the column of the action in each
+
+
+@dataclass
+class _Output:
+    """Parts of the arrays of :class:`Explored`."""
+
+    row_count: list[NDArray[np.int32]] = field(default_factory=list)
+    action: list[NDArray[np.int32]] = field(default_factory=list)
+    owner: list[NDArray[np.int32]] = field(default_factory=list)
+    entry_count: list[Integers] = field(default_factory=list)
+    successor: list[NDArray[np.int32]] = field(default_factory=list)
+    weight: list[Weight] = field(default_factory=list)
+
+
+def explore(
+    program: Program,
+    layout: Layout,
+    initial: Words,
+    weights: Numbers,
+    *,
+    max_states: int,
+    progress: Progress | None = None,
+) -> Explored:
+    """Breadth-first search from the initial states.
+
+    Raises:
+      ValueError: more than `max_states` states, or an update that is no distribution or leaves the
+        range of a variable, with the command and the state.
+    """
+    try:
+        return _Search(program, layout, weights, max_states).run(initial, progress)
+    except LanguageError as error:
+        raise program.source.located(error) from None
+
+
+class _Search:
+    """The state of a search."""
+
+    def __init__(self, program: Program, layout: Layout, weights: Numbers, max_states: int) -> None:
+        self.program, self.layout, self.weights = program, layout, weights
+        self.max_states = max_states
+        codes = [ModuleCode(program, m, layout, weights) for m in program.modules]
+        self.tables = [LocalTable(code) for code in codes]
+        names = sorted({a for code in codes for a in code.actions if a})
+        self.actions = ("", *names)
+        self.columns = _columns(codes, self.actions)
+        self.known = HashTable(layout.num_words)
+        self.output = _Output()
+        self.num_transitions = 0
+
+    def run(self, initial: Words, progress: Progress | None) -> Explored:
+        self.known.insert(initial)
+        num_initial = done = len(self.known)
+        done = 0
+        while done < len(self.known):
+            stop = min(len(self.known), done + _CHUNK)
+            self.expand(self.known.words(done, stop))
+            done = stop
+            if progress is not None:
+                progress(len(self.known), done)
+        out, width = self.output, self.weights.shape
+        empty = np.zeros(0, np.int32)
+        return Explored(
+            self.layout,
+            self.known.words(0, len(self.known)),
+            np.concatenate(out.row_count),
+            np.concatenate(out.action or [empty]),
+            np.concatenate(out.owner or [empty]),
+            np.concatenate(out.entry_count or [empty]),
+            np.concatenate(out.successor or [empty]),
+            np.concatenate(out.weight or [np.zeros((0, *width), self.weights.dtype)]),
+            self.actions,
+            num_initial,
+        )
+
+    def expand(self, words: Words) -> None:
+        """Adds the choices and successors of some states."""
+        size = words[0].size
+        local = [table.choices(words) for table in self.tables]
+        per_module = [
+            table.count if index is None else table.count[index] for table, index in local
+        ]
+        total = np.zeros((size, len(self.columns)))  # doubles do not wrap around
+        for i, column in enumerate(self.columns):
+            (m, c), *others = column.parts
+            total[:, i] = per_module[m][:, c]
+            for m, c in others:
+                total[:, i] *= per_module[m][:, c]
+        if total.size and total.max() > _MAX_BRANCHING:
+            raise LanguageError(
+                0, f"a state has {total.max():.3g} choices, more than {_MAX_BRANCHING}."
+            )
+        state, cell = np.nonzero(total)
+        total_of = total[state, cell].astype(np.int64)
+        self.output.row_count.append(total.sum(1).astype(np.int32))
+        place = concatenated_ranges(np.zeros(total_of.size, np.int64), total_of)
+        cells = np.arange(state.size).repeat(total_of)
+        rows = _Rows(state[cells], cell[cells], place, [None] * len(self.tables))
+        self._choose(rows, local, per_module)
+        for column_part, name in ((self.action_of, "action"), (self.owner_of, "owner")):
+            getattr(self.output, name).append(column_part[rows.column])
+        self._expand_rows(rows, [table for table, _ in local], words)
+
+    @property
+    def action_of(self) -> NDArray[np.int32]:
+        """The action of each column."""
+        return np.array([c.action for c in self.columns], np.int32)
+
+    @property
+    def owner_of(self) -> NDArray[np.int32]:
+        """The module of each column, or -1."""
+        return np.array([c.owner for c in self.columns], np.int32)
+
+    def _choose(
+        self, rows: _Rows, local: list[tuple[Choices, Integers | None]], counts: Sequence[Integers]
+    ) -> None:
+        """The command of each module in each joint choice: digits of its number in mixed radix."""
+        rest = rows.place
+        for m, (table, index) in enumerate(local):
+            column_of = np.full(len(self.columns), -1)
+            for i, column in enumerate(self.columns):
+                for module, c in column.parts:
+                    if module == m:
+                        column_of[i] = c
+            chosen = column_of[rows.column]
+            part = np.flatnonzero(chosen >= 0)
+            if not part.size:
+                continue
+            state, chosen = rows.state[part], chosen[part]
+            number = counts[m][state, chosen]
+            digit = rest[part] % number
+            rest[part] //= number
+            where = state if index is None else index[state]
+            rows.chosen[m] = part, table.first[where, chosen] + digit
+
+    def _expand_rows(self, rows: _Rows, tables: list[Choices], words: Words) -> None:
+        """Joint updates of the choices: sums of changes and products of probabilities."""
+        count = np.ones(rows.state.size)
+        for table, chosen in zip(tables, rows.chosen, strict=True):
+            if chosen is not None:
+                count[chosen[0]] *= table.width[chosen[1]]
+        if count.size and count.max() > _MAX_BRANCHING:
+            raise LanguageError(
+                0, f"a choice has {count.max():.3g} successors, more than {_MAX_BRANCHING}."
+            )
+        number = count.astype(np.int64)
+        self.output.entry_count.append(number)
+        end = np.cumsum(number)
+        self.num_transitions += int(end[-1]) if end.size else 0
+        if self.num_transitions > _TRANSITIONS * self.max_states:
+            raise LanguageError(
+                0,
+                f"more than {_TRANSITIONS * self.max_states} transitions from {len(self.known)} "
+                "states; the model is too large, or give a larger max_states.",
+            )
+        begin = 0
+        while begin < number.size:
+            limit = (end[begin - 1] if begin else 0) + _ENTRIES
+            stop = max(int(np.searchsorted(end, limit, "right")), begin + 1)
+            self._entries(rows, tables, words, number, begin, stop)
+            begin = stop
+
+    def _entries(
+        self,
+        rows: _Rows,
+        tables: list[Choices],
+        words: Words,
+        number: Integers,
+        begin: int,
+        stop: int,
+    ) -> None:
+        """Successors of the rows from `begin` to `stop`."""
+        number = number[begin:stop]
+        row = np.arange(stop - begin).repeat(number)
+        state = rows.state[begin:stop][row]
+        target = [w[state] for w in words]
+        weight: Weight | None = None
+        rest: Integers | None = None
+        for table, chosen in zip(tables, rows.chosen, strict=True):
+            if chosen is None:
+                continue
+            whole, of_whole = chosen
+            low, high = np.searchsorted(whole, (begin, stop))
+            if low == high:
+                continue
+            local = np.full(stop - begin, -1)
+            local[whole[low:high] - begin] = of_whole[low:high]
+            chosen_row = local[row]
+            everywhere = high - low == stop - begin
+            part = slice(None) if everywhere else np.flatnonzero(chosen_row >= 0)
+            chosen_row = chosen_row[part]
+            entry = table.start[chosen_row]
+            if table.width.max() > 1:
+                if rest is None:
+                    rest = concatenated_ranges(np.zeros(number.size, np.int64), number)
+                width = table.width[chosen_row]
+                entry = entry + rest[part] % width
+                rest[part] //= width
+            for one, change in zip(target, table.change, strict=True):
+                one[part] += change[entry]
+            more = table.weight[entry]
+            if weight is None:
+                weight = np.ones((row.size, *self.weights.shape), self.weights.dtype)
+                weight[part] = more
+            else:
+                weight[part] = self.weights.product(weight[part], more)
+        assert weight is not None
+        self.output.successor.append(self.known.insert(tuple(target)))
+        self.output.weight.append(weight)
+        if len(self.known) > self.max_states:
+            raise LanguageError(
+                0,
+                f"more than {self.max_states} states are reachable; give a larger max_states, or "
+                "smaller constants.",
+            )
+
+
+@dataclass
+class _Rows:
+    """Joint choices of some states."""
+
+    state: Integers  # of each choice, ascending
+    column: Integers
+    place: Integers  # number among those of the state and the column
+    # for each module the rows in which it takes part, and its row in them
+    chosen: list[tuple[Integers, Integers] | None]
+
+
+def _columns(codes: list[ModuleCode], actions: tuple[str, ...]) -> list[_Column]:
+    """The synchronisations of a program."""
+    found = []
+    for m, code in enumerate(codes):
+        for c, action in enumerate(code.actions):
+            if not action:
+                found.append(_Column(0, m, ((m, c),)))
+    for i, action in enumerate(actions[1:], 1):
+        parts = tuple(
+            (m, code.actions.index(action))
+            for m, code in enumerate(codes)
+            if action in code.actions
+        )
+        found.append(_Column(i, -1, parts))
+    return found

@@ -1,0 +1,84 @@
+"""Initial states of a program."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jaxltl.core.array_types import Integers
+from jaxltl.core.language.compiled import compile_expressions
+from jaxltl.core.language.expressions import conjuncts, names_in
+from jaxltl.core.language.source import LanguageError
+from jaxltl.core.language.syntax import Program
+from jaxltl.core.programs.layout import Layout, Words
+
+_CANDIDATES = 2**24  # partial assignments that are held at once
+
+
+def initial_states(program: Program, layout: Layout, max_states: int) -> Words:
+    """The initial states as packed words: one, or those that satisfy the ``init`` block.
+
+    Variables are assigned one after the other, and each conjunct of the condition is evaluated as
+    soon as its variables are.
+
+    Raises:
+      ValueError: no state satisfies the condition, or too many do.
+    """
+    if program.initial is None:
+        return layout.packed({v.name: np.array([v.initial]) for v in program.variables}, 1)
+    try:
+        columns, size = _assignments(program, max_states)
+    except LanguageError as error:
+        raise program.source.located(error) from None
+    return layout.packed(columns, size)
+
+
+def _assignments(program: Program, max_states: int) -> tuple[dict[str, Integers], int]:
+    assert program.initial is not None
+    parts = [(names_in(e), compile_expressions([e])) for e in conjuncts(program.initial)]
+    types = program.types
+    columns: dict[str, Integers] = {}
+    size = 1
+    limit = min(_CANDIDATES, max(max_states, 2**16))
+    for _, condition in [p for p in parts if not p[0]]:
+        if not condition({})[0]:
+            size = 0
+    todo = [p for p in parts if p[0]]
+    variables = {v.name: v for v in program.variables}
+    while len(columns) < len(variables):
+        # Next is a variable of the conjunct that needs the fewest combinations.
+        costs = [
+            (
+                np.prod(
+                    [float(variables[n].high - variables[n].low + 1) for n in names - set(columns)]
+                ),
+                i,
+            )
+            for i, (names, _) in enumerate(todo)
+        ]
+        if costs:
+            names, _ = todo[min(costs)[1]]
+            chosen = sorted(names - set(columns))
+        else:
+            chosen = [n for n in variables if n not in columns]
+        for name in chosen:
+            v = variables[name]
+            width = v.high - v.low + 1
+            if size * width > limit:
+                raise LanguageError(
+                    program.initial.place,
+                    f"the init block has more than {limit} candidates; restrict the variables "
+                    "one by one, as in x=0 & y<=3, or give a larger max_states.",
+                )
+            columns = {n: x.repeat(width) for n, x in columns.items()}
+            columns[name] = np.tile(np.arange(v.low, v.high + 1), size)
+            size *= width
+        ready = [p for p in todo if p[0] <= columns.keys()]
+        todo = [p for p in todo if not p[0] <= columns.keys()]
+        for _, condition in ready:
+            typed = {n: x != 0 if types[n] == "bool" else x for n, x in columns.items()}
+            holds = np.flatnonzero(np.broadcast_to(condition(typed)[0], (size,)))
+            columns = {n: x[holds] for n, x in columns.items()}
+            size = holds.size
+    if not size:
+        raise LanguageError(program.initial.place, "no state satisfies the init block.")
+    return columns, size

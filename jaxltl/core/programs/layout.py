@@ -1,0 +1,96 @@
+"""States of a program as unsigned 64-bit words, with a field of bits for each variable."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxltl.core.array_types import Integers
+from jaxltl.core.language.syntax import Variable
+
+Words = tuple[NDArray[np.uint64], ...]  # uint64[N] each
+_BITS = 64
+
+
+@dataclass(frozen=True)
+class Field:
+    """Place of a variable: ``value - low`` is in some bits of a word."""
+
+    variable: Variable
+    word: int
+    shift: int
+
+    @property
+    def mask(self) -> int:
+        """The bits of the word."""
+        return ((1 << self.variable.bits) - 1) << self.shift
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Fields of the variables, none of which lies in two words; :func:`make_layout`."""
+
+    fields: dict[str, Field]
+    num_words: int
+
+    def values(self, words: Words, name: str) -> NDArray[Any]:
+        """Values of a variable: ``int64[N]``, or ``bool[N]``."""
+        field = self.fields[name]
+        raw = words[field.word]
+        if field.shift:
+            raw = raw >> np.uint64(field.shift)
+        raw = raw & np.uint64((1 << field.variable.bits) - 1)
+        if field.variable.type == "bool":
+            return raw != 0
+        found = raw.astype(np.int64)
+        if field.variable.low:
+            found += field.variable.low
+        return found
+
+    def masks(self, names: Iterable[str]) -> tuple[int, ...]:
+        """The bits of some variables in each word."""
+        found = [0] * self.num_words
+        for name in names:
+            field = self.fields[name]
+            found[field.word] |= field.mask
+        return tuple(found)
+
+    def packed(self, columns: dict[str, Integers], size: int) -> Words:
+        """Words of N states from the values of all variables."""
+        words = [np.zeros(size, np.uint64) for _ in range(self.num_words)]
+        for name, field in self.fields.items():
+            raw = (np.asarray(columns[name]).astype(np.int64) - field.variable.low).astype(
+                np.uint64
+            )
+            words[field.word] |= raw << np.uint64(field.shift)
+        return tuple(words)
+
+
+class Reader:
+    """Values of variables in some states, unpacked on first use."""
+
+    def __init__(self, layout: Layout, words: Words) -> None:
+        self.layout, self.words = layout, words
+        self.known: dict[str, NDArray[Any]] = {}
+
+    def __call__(self, name: str) -> NDArray[Any]:
+        found = self.known.get(name)
+        if found is None:
+            found = self.known[name] = self.layout.values(self.words, name)
+        return found
+
+
+def make_layout(variables: Sequence[Variable]) -> Layout:
+    """Fields in the order of the variables, in as many words as they need."""
+    fields: dict[str, Field] = {}
+    word = shift = 0
+    for v in variables:
+        if shift + v.bits > _BITS:
+            word, shift = word + 1, 0
+        fields[v.name] = Field(v, word, shift if v.bits else 0)
+        shift += v.bits
+    return Layout(fields, word + 1)
