@@ -326,7 +326,8 @@ def test_what_is_written(learned):
     assert json.loads((place / "out" / "result.json").read_text()) == result
     page = (place / "out" / "report.html").read_text()
     # What has a live part is not shown twice: map and automaton of four worlds, three curves.
-    assert "data:image" not in page and page.count("<svg") == 4 * 2 + 3
+    # The front of probability and steps has no live part.
+    assert page.count("data:image") == 1 and page.count("<svg") == 4 * 2 + 3
     assert "http" not in page and "Test worlds" in page
 
 
