@@ -4,6 +4,7 @@ from . import (
     common as common,
     expected_sarsa as expected_sarsa,
     feasible as feasible,
+    grounding as grounding,
     interval_learning as interval_learning,
     many_tasks as many_tasks,
     maximin_q as maximin_q,

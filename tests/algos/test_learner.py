@@ -24,6 +24,7 @@ from jaxltl.algos import (
     cce,
     expected_sarsa,
     feasible,
+    grounding,
     interval_learning,
     maximin_q,
     mlirl,
@@ -325,6 +326,14 @@ def intervals():
     return Case(interval_learning, problem, setting(), setting(strength=1.0, exploration=0.5))
 
 
+def symbols():
+    """A goal without a label, and a trap."""
+    mdp, demonstrations = world()
+    problem = grounding.make_problem(mdp, np.eye(3), demonstrations, "!r U g")
+    setting = partial(grounding.Hparams, discount=0.5)
+    return Case(grounding, problem, setting(), setting(l2=0.1, hardness=0.1, learning_rate=0.01))
+
+
 def temporal_difference():
     problem = expected_sarsa.make_problem(world()[0], numbers(3, 2))
     setting = partial(expected_sarsa.Hparams, num_transitions=7, restart=0.3)
@@ -348,6 +357,7 @@ LEARNERS = {
     "cce": cross_entropy,
     "cloning": cloning,
     "feasible": parameters,
+    "grounding": symbols,
     "intervals": intervals,
     "sarsa": temporal_difference,
 }
@@ -584,7 +594,7 @@ REWARDS = {
 }
 
 
-@each([*REWARDS, "todirl", "intervals"])
+@each([*REWARDS, "todirl", "grounding", "intervals"])
 def test_what_is_not_available_changes_nothing(name):
     """Bit for bit: what was learned, and all figures."""
     module, problem, hparams, _ = case(name)

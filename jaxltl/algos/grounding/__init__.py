@@ -1,0 +1,28 @@
+"""Symbol grounding: learns from demonstrations what the symbols of a task mean."""
+
+from jaxltl.algos.grounding.hypotheses import (
+    Posterior as Posterior,
+    ambiguous_symbols as ambiguous_symbols,
+    credible_set as credible_set,
+    posterior as posterior,
+)
+from jaxltl.algos.grounding.learner import (
+    Metrics as Metrics,
+    Objective as Objective,
+    State as State,
+    init as init,
+    objective as objective,
+    policy as policy,
+    run as run,
+    run_until as run_until,
+    step as step,
+    train as train,
+    train_until as train_until,
+)
+from jaxltl.algos.grounding.problem import (
+    Hparams as Hparams,
+    LinearGrounding as LinearGrounding,
+    Problem as Problem,
+    event_reward as event_reward,
+    make_problem as make_problem,
+)

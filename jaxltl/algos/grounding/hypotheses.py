@@ -1,0 +1,320 @@
+"""Posterior weights of hard groundings: each symbol means one of a list of candidate meanings.
+
+With certain symbols the memory along a demonstration is known, so that a hypothesis h has exactly the
+likelihood of :mod:`jaxltl.algos.mlirl` in the product with its labels. The posterior weight sums over a
+grid of scales, ``w(h) ~ sum_b prod_n p(demonstration n | h, scale b)``, with a uniform prior.
+
+Example: two states look different; the demonstration moves to the second one and stays.
+  >>> import jax.numpy as jnp
+  >>> import jaxltl as jl
+  >>> from jaxltl.algos import grounding
+  >>> world = jl.from_dense([[[0, 1.0], [1.0, 0]], [[0, 1.0], [1.0, 0]]])
+  >>> shown = jl.make_trajectories(world, [[(0, 0), (1, 0)], [(0, 0)]])
+  >>> problem = grounding.make_problem(world, jnp.eye(2), shown, "G !trap")
+  >>> found = grounding.posterior(problem, grounding.Hparams())
+  >>> found.meaning_of(0)
+  {'trap': 'observation 0'}
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike
+
+from jaxltl.algos.common.settings import Number
+from jaxltl.algos.grounding.likelihood import certain_memory, motive
+from jaxltl.algos.grounding.problem import Hparams, Problem
+from jaxltl.core import struct
+from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.automata.language import is_equivalent
+from jaxltl.core.models.product import Product
+from jaxltl.core.pretty_print import brief
+from jaxltl.core.values.discounted.soft import policy_logits, soft_value
+
+Score = Callable[[np.ndarray], np.ndarray]
+SCALES = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0)
+_MOST = 20_000  # hypotheses that are enumerated; beyond, a beam search
+_BATCH = 64  # hypotheses in one program: bounds its memory
+_BEAM = 8
+_UNEXPLAINED = np.log(1e4)  # decisive evidence (Jeffreys) for random actions
+
+
+@brief
+@struct.dataclass
+class Posterior:
+    """Hard groundings with weights, in decreasing order.
+
+    Attributes:
+      assignment: ``int32[C, P]``, the meaning of each symbol.
+      weight: ``float64[C]``, posterior weights; they sum to 1.
+      scale: ``float64[C]``, the most likely scale on the grid.
+      log_likelihood: ``float64[C, N]``, of each demonstration at that scale.
+      meaning: ``bool[M, W, S]``, the states in which each candidate meaning holds.
+      symbols, names: of the P symbols and the M meanings; static.
+      complete: False if only a beam of the hypotheses was scored; static.
+    """
+
+    assignment: np.ndarray
+    weight: np.ndarray
+    scale: np.ndarray
+    log_likelihood: np.ndarray
+    meaning: np.ndarray
+    symbols: tuple[str, ...] = struct.field(pytree_node=False)
+    names: tuple[str, ...] = struct.field(pytree_node=False)
+    complete: bool = struct.field(pytree_node=False, default=True)
+
+    def meaning_of(self, index: int) -> dict[str, str]:
+        """The grounding of a row: the name of the meaning of each symbol."""
+        row = self.assignment[index]
+        return {p: self.names[m] for p, m in zip(self.symbols, row, strict=True)}
+
+    def labels(self, index: int) -> np.ndarray:
+        """``bool[W, S, P]``, the labels of all worlds by a row."""
+        return np.moveaxis(self.meaning[self.assignment[index]], 0, -1)
+
+
+def posterior(
+    problem: Problem,
+    hparams: Hparams,
+    *,
+    meanings: ArrayLike | None = None,
+    names: Sequence[str] | None = None,
+    scales: Sequence[float] = SCALES,
+) -> Posterior:
+    """Posterior weights of the hard groundings of a problem.
+
+    Args:
+      problem: with a task and demonstrations.
+      hparams: the discount of the demonstrator.
+      meanings: ``bool[M, W, S]``, candidate meanings of a symbol; default: each entry of the
+        observation that is 0 or 1 everywhere.
+      names: of the meanings; default ``"observation 0"`` and so on.
+      scales: grid of scales with a uniform prior.
+
+    Returns:
+      :class:`Posterior`. Groundings that differ by a symmetry of the formula are counted once. All
+      ``M ** P`` are scored up to 20,000, else a beam search visits those with the largest weights.
+
+    Raises:
+      ValueError: no candidate meaning, meanings of another shape, or a demonstration that no grounding
+        explains: under each of them uniformly random actions are 10,000 times as likely.
+    """
+    meaning, titles = _meanings(problem, meanings, names)
+    symmetries = symbol_symmetries(_automaton(problem))
+    score = partial(_scores, problem, hparams.discount, meaning, np.asarray(scales, float))
+    count = len(meaning) ** len(problem.symbols)
+    if count <= _MOST:
+        every = itertools.product(range(len(meaning)), repeat=len(problem.symbols))
+        rows = sorted({_canonical(row, symmetries) for row in every})
+        table = score(np.asarray(rows, np.int32))
+    else:
+        rows, table = _beam(score, len(meaning), len(problem.symbols), symmetries)
+    total = table.sum(-1)  # [C, B]
+    logs = np.logaddexp.reduce(total, axis=1)
+    order = np.argsort(-logs, kind="stable")
+    weight = np.exp(logs - np.logaddexp.reduce(logs))[order]
+    best = total.argmax(1)
+    found = Posterior(
+        assignment=np.asarray(rows, np.int32)[order],
+        weight=weight,
+        scale=np.asarray(scales, float)[best[order]],
+        log_likelihood=table[np.arange(len(rows)), best][order],
+        meaning=meaning,
+        symbols=problem.symbols,
+        names=titles,
+        complete=count <= _MOST,
+    )
+    _require_explained(problem, hparams, found, table)
+    return found
+
+
+def credible_set(found: Posterior, level: float = 0.95) -> np.ndarray:
+    """Rows ``int[]`` of the smallest set of groundings with total weight of at least `level`.
+
+    >>> import types
+    >>> credible_set(types.SimpleNamespace(weight=np.array([0.7, 0.2, 0.1])), 0.8).tolist()
+    [0, 1]
+    """
+    if not 0 < level < 1:
+        raise ValueError(f"level={level}; it must be above 0 and below 1.")
+    count = int(np.searchsorted(np.cumsum(found.weight), level)) + 1
+    return np.arange(min(count, len(found.weight)))
+
+
+def ambiguous_symbols(found: Posterior, level: float = 0.95) -> dict[str, tuple[str, ...]]:
+    """Symbols with several meanings in the credible set, with these meanings, likeliest first."""
+    rows = found.assignment[credible_set(found, level)]
+    several = {}
+    for p, symbol in enumerate(found.symbols):
+        chosen = tuple(dict.fromkeys(found.names[m] for m in rows[:, p]))
+        if len(chosen) > 1:
+            several[symbol] = chosen
+    return several
+
+
+def symbol_symmetries(automaton: Automaton) -> list[tuple[int, ...]]:
+    """Permutations of the symbols that leave the language unchanged, the identity included."""
+    count = len(automaton.propositions)
+    if count > 5:  # 720 comparisons and more
+        return [tuple(range(count))]
+    found = []
+    for order in itertools.permutations(range(count)):
+        renamed = replace(automaton, propositions=tuple(automaton.propositions[i] for i in order))
+        if order == tuple(range(count)) or is_equivalent(automaton, renamed):
+            found.append(order)
+    return found
+
+
+def _canonical(row: Sequence[int], symmetries: list[tuple[int, ...]]) -> tuple[int, ...]:
+    return min(tuple(row[i] for i in order) for order in symmetries)
+
+
+def _automaton(problem: Problem) -> Automaton:
+    return jax.tree.map(lambda x: np.asarray(x)[0], problem.model.automaton)
+
+
+def _meanings(
+    problem: Problem, meanings: ArrayLike | None, names: Sequence[str] | None
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    observation = np.asarray(problem.observation)
+    if meanings is None:
+        binary = ((observation == 0) | (observation == 1)).all((0, 1))
+        kept = np.flatnonzero(binary & (observation != 0).any((0, 1)))
+        if not kept.size:
+            raise ValueError(
+                "no entry of the observations is 0 or 1 in every state; give meanings=bool[M, W, S], "
+                "such as those of cluster_meanings."
+            )
+        table = np.moveaxis(observation[..., kept] > 0, -1, 0)
+        width = observation.shape[-1]
+        if names is not None and len(names) != width:
+            raise ValueError(f"there are {len(names)} names for {width} entries of observations.")
+        titles = names if names is not None else [f"observation {i}" for i in range(width)]
+        return table, tuple(titles[i] for i in kept.tolist())
+    table = np.asarray(meanings)
+    if table.dtype != bool or table.ndim != 3 or table.shape[1:] != observation.shape[:2]:
+        raise ValueError(
+            f"meanings is {table.dtype}{list(table.shape)}; expected "
+            f"bool['M', {observation.shape[0]}, {observation.shape[1]}]."
+        )
+    titles = [f"meaning {i}" for i in range(len(table))] if names is None else names
+    if len(titles) != len(table):
+        raise ValueError(f"there are {len(titles)} names for {len(table)} meanings.")
+    return table, tuple(titles)
+
+
+def letters_of(automaton: Automaton, labels: np.ndarray) -> np.ndarray:
+    """Letters ``int32[...]`` of labels ``bool[..., P]``; -1 where the automaton has none."""
+    letters = np.asarray(automaton.letters)
+    power = 1 << np.arange(letters.shape[1])
+    table = np.full(1 << letters.shape[1], -1, np.int32)
+    table[letters @ power] = np.arange(len(letters))
+    return table[labels @ power]
+
+
+def _scores(
+    problem: Problem, discount: Number, meaning: np.ndarray, scales: np.ndarray, rows: np.ndarray
+) -> np.ndarray:
+    """Log-likelihoods ``float64[C, B, N]`` of assignments ``int32[C, P]``."""
+    letters = letters_of(_automaton(problem), np.moveaxis(meaning[rows], 1, -1))  # [C, W, S]
+    possible = (letters >= 0).all((1, 2))
+    found = np.full((len(rows), len(scales), len(problem.length)), -np.inf)
+    chosen = np.flatnonzero(possible)
+    size = min(_BATCH, 1 << max(len(chosen) - 1, 0).bit_length())
+    for first in range(0, len(chosen), size):
+        part = chosen[first : first + size]
+        filled = np.resize(part, size)  # one program for all batches
+        table = _batch(problem, discount, jnp.asarray(letters[filled]), jnp.asarray(scales))
+        found[part] = np.asarray(table, float)[: len(part)]
+    return found
+
+
+@jax.jit
+def _batch(problem: Problem, discount: Number, letters: jax.Array, scales: jax.Array) -> jax.Array:
+    def one(letter: jax.Array) -> jax.Array:
+        return jax.vmap(
+            lambda scale: jnp.sum(step_log_likelihood(problem, discount, letter, scale), axis=1)
+        )(scales.astype(problem.model.dtype))
+
+    return jax.vmap(one)(letters)
+
+
+def step_log_likelihood(
+    problem: Problem, discount: Number, letter: jax.Array, scale: jax.Array
+) -> jax.Array:
+    """``log pi(a_t | s_t, q_t)``, ``float[N, T]``, with known letters ``int32[W, S]``; 0 in padding."""
+    models = replace(problem.model, letter=letter)
+
+    def lane(model: Product, features: jax.Array) -> jax.Array:
+        count = model.automaton.delta.shape[-1]
+        certain = jax.nn.one_hot(model.letter, count, dtype=model.dtype)
+        reward = scale * motive(model.mdp, certain, problem.event)  # features: weights unknown
+        solution = soft_value(model, reward, discount, tolerance=1e-3)
+        logits = policy_logits(model, reward, discount, solution.value)
+        return jax.nn.log_softmax(logits, axis=-1)
+
+    log_policy = jax.vmap(lane)(models, problem.features)
+
+    def demonstration(world: jax.Array, state: jax.Array, action: jax.Array) -> jax.Array:
+        model = jax.tree.map(lambda x: x[world], models)
+        return log_policy[world, state, certain_memory(model, state), action]
+
+    found = jax.vmap(demonstration)(problem.world, problem.state, problem.action)
+    inside = jnp.arange(found.shape[1]) < problem.length[:, None]
+    return jnp.where(inside, found, 0)
+
+
+def _beam(
+    score: Score, num_meanings: int, num_symbols: int, symmetries: list[tuple[int, ...]]
+) -> tuple[list[tuple[int, ...]], np.ndarray]:
+    """Assignments that differ in one symbol from the best ones so far, until these have no better."""
+    rng = np.random.default_rng(0)
+    starts = rng.integers(num_meanings, size=(_BEAM, num_symbols)).tolist()
+    frontier = {_canonical(row, symmetries) for row in starts}
+    known: dict[tuple[int, ...], np.ndarray] = {}
+    expanded: set[tuple[int, ...]] = set()
+    while True:
+        new = sorted(frontier - known.keys())
+        if new:
+            known |= dict(zip(new, score(np.asarray(new, np.int32)), strict=True))
+        best = sorted(known, key=lambda r: -np.logaddexp.reduce(known[r].sum(-1)))[:_BEAM]
+        fresh = [row for row in best if row not in expanded]
+        if not fresh:
+            return list(known), np.stack(list(known.values()))
+        expanded |= set(fresh)
+        frontier = {
+            _canonical((*row[:p], m, *row[p + 1 :]), symmetries)
+            for row in fresh
+            for p in range(num_symbols)
+            for m in range(num_meanings)
+        }
+
+
+def _require_explained(
+    problem: Problem, hparams: Hparams, found: Posterior, table: np.ndarray
+) -> None:
+    """Raises ValueError for a demonstration less likely under each grounding than random actions."""
+    available = np.asarray(problem.model.mdp.available)
+    world, state = np.asarray(problem.world)[:, None], np.asarray(problem.state)
+    inside = np.arange(state.shape[1]) < np.asarray(problem.length)[:, None]
+    uniform = np.where(inside, -np.log(available[world, state].sum(-1)), 0)
+    lost = uniform.sum(1) - table.max((0, 1))
+    n = int(lost.argmax())
+    if lost[n] > _UNEXPLAINED:
+        letter = letters_of(_automaton(problem), found.labels(0))
+        steps = jax.jit(step_log_likelihood)(
+            problem, hparams.discount, jnp.asarray(letter), jnp.asarray(found.scale[0])
+        )
+        t = int((np.asarray(steps) - uniform)[n].argmin())
+        raise ValueError(
+            f"demonstration {n} is explained by no grounding: random actions are exp({lost[n]:.0f}) "
+            f"times as likely under each; step {t} (state {state[n, t]}, action "
+            f"{int(problem.action[n, t])}) is the least likely. Leave it out, or change the task."
+        )

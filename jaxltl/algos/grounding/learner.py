@@ -1,0 +1,224 @@
+"""Symbol grounding by gradients: maximum likelihood over soft groundings and a hidden memory.
+
+The demonstrator follows the soft policy of the motive in the soft product of the world and the task.
+Parameters are those of the grounding ``g(symbol | observation)``, the logarithm of the motive's scale,
+and the weights of features. The likelihood is differentiated implicitly through
+:func:`~jaxltl.core.values.discounted.soft.soft_value`. Many random starts are a ``vmap`` over keys.
+
+Example: the goal is not labelled, but what is seen there differs.
+  >>> import jax, jax.numpy as jnp
+  >>> import jaxltl as jl
+  >>> from jaxltl.algos import grounding
+  >>> world = jl.from_dense([[[0, 1.0], [1.0, 0]], [[0, 1.0], [1.0, 0]]])
+  >>> shown = jl.make_trajectories(world, [[(0, 0), (1, 1)]])
+  >>> problem = grounding.make_problem(world, jnp.eye(2), shown, "F goal")
+  >>> hparams = grounding.Hparams(discount=0.5)
+  >>> state, metrics = grounding.train(jax.random.key(0), problem, hparams, num_steps=2)
+  >>> metrics.loss.shape, bool(metrics.loss[1] < metrics.loss[0])
+  ((2,), True)
+  >>> grounding.policy(state, problem, hparams).shape  # [W, S, Q, A]
+  (1, 2, 2, 2)
+  >>> loss, parts = grounding.objective(state.parameters, problem, hparams)
+  >>> parts.log_likelihood.shape  # [N]
+  (1,)
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import chex
+import jax
+import jax.numpy as jnp
+import optax
+
+from jaxltl.algos.common import learner, optimizers, trees
+from jaxltl.algos.grounding.likelihood import (
+    forward,
+    letter_log_probability,
+    memory_log_moves,
+    motive,
+    soft_product,
+)
+from jaxltl.algos.grounding.problem import Hparams, Problem
+from jaxltl.core import struct
+from jaxltl.core.models.protocols import PyTree
+from jaxltl.core.pretty_print import brief, history
+from jaxltl.core.types import Status
+from jaxltl.core.values.discounted.soft import policy_logits, soft_value
+
+
+@brief
+@struct.dataclass
+class State:
+    """Parameters of a run.
+
+    Attributes:
+      key, step: root key, and steps made, ``int32[]``.
+      parameters: ``{"grounding": of the network, "log_scale": float[], "weights": float[F]}``.
+      optimizer: optax's state.
+    """
+
+    key: jax.Array
+    step: jax.Array
+    parameters: PyTree
+    optimizer: PyTree
+
+
+@brief(facts=partial(history, codes={"status": Status}))
+@struct.dataclass
+class Metrics:
+    """Figures of the parameters before a step; scalars, of a run ``[T]``.
+
+    Attributes:
+      loss: the objective, with prior and hardness.
+      neg_log_likelihood: in nats, over all demonstrations.
+      entropy: mean entropy of the letters in all states, in nats.
+      gradient_norm: Euclidean.
+      status: of the solver, the worst over the worlds.
+    """
+
+    loss: jax.Array
+    neg_log_likelihood: jax.Array
+    entropy: jax.Array
+    gradient_norm: jax.Array
+    status: jax.Array
+
+
+@brief(codes={"status": Status})
+@struct.dataclass
+class Objective:
+    """Terms of the loss.
+
+    Attributes:
+      log_likelihood: ``float[N]``, of each demonstration, in nats.
+      entropy: ``float[]``, mean entropy of the letters.
+      policy: ``float[W, S, Q, A]``, the soft policy.
+      letter: ``float[W, S, L]``, probabilities of the letters.
+      status: ``int32[]``, of the solvers.
+    """
+
+    log_likelihood: jax.Array
+    entropy: jax.Array
+    policy: jax.Array
+    letter: jax.Array
+    status: jax.Array
+
+
+@struct.dataclass
+class _Lane:
+    """Arrays of one world: policy in log space, moves of the memory, letters and the status."""
+
+    log_policy: jax.Array
+    log_moves: jax.Array
+    letter: jax.Array
+    status: jax.Array
+
+
+def objective(
+    parameters: PyTree, problem: Problem, hparams: Hparams
+) -> tuple[jax.Array, Objective]:
+    """``-sum_n log sum_q prod_t pi(a_t | s_t, q_t) M(s_t, q_{t-1}, q_t) + penalties``.
+
+    The loss ``float[]`` adds ``l2 / 2`` times the squared parameters of grounding and features and
+    ``hardness`` times the number of demonstrated steps times the mean entropy of the letters.
+    Differentiable in the parameters, implicitly through the soft value.
+    """
+    lanes = _each_world(partial(_lane, problem, hparams, parameters), problem)
+    initial = jnp.asarray(problem.model.automaton.initial)[0]
+
+    def one(world: jax.Array, state: jax.Array, action: jax.Array, length: jax.Array) -> jax.Array:
+        moves = lanes.log_moves[world, state]  # [T, Q, Q]
+        emit = lanes.log_policy[world, state, :, action]
+        return forward(moves[0, initial], emit, moves[1:], length)
+
+    found = jax.vmap(one)(problem.world, problem.state, problem.action, problem.length)
+    letter = lanes.letter
+    entropy = -jnp.mean(jnp.sum(jax.scipy.special.xlogy(letter, letter), axis=-1))
+    penalized = (parameters["grounding"], parameters["weights"])
+    squares = sum(jnp.sum(x * x) for x in jax.tree.leaves(penalized))
+    loss = -jnp.sum(found) + hparams.l2 / 2 * squares
+    loss += hparams.hardness * jnp.sum(problem.length) * entropy
+    parts = Objective(
+        log_likelihood=found,
+        entropy=entropy,
+        policy=jnp.exp(lanes.log_policy),
+        letter=letter,
+        status=jnp.max(lanes.status),
+    )
+    return loss, parts
+
+
+def _lane(problem: Problem, hparams: Hparams, parameters: PyTree, index: jax.Array) -> _Lane:
+    """The soft policy and the moves of the memory in a world."""
+    model = jax.tree.map(lambda x: x[index], problem.model)
+    log_letter = letter_log_probability(
+        problem.network,
+        parameters["grounding"],
+        problem.observation[index],
+        model.automaton.letters,
+    )
+    log_moves = memory_log_moves(log_letter, model.automaton.delta)
+    letter = jnp.exp(log_letter)
+    world = soft_product(model.mdp, jnp.exp(log_moves))
+    reward = jnp.exp(parameters["log_scale"]) * motive(model.mdp, letter, problem.event)
+    reward += problem.features[index] @ parameters["weights"]
+    flat = reward.reshape(world.num_states, -1)
+    solution = soft_value(world, flat, hparams.discount)
+    logits = policy_logits(world, flat, hparams.discount, solution.value)
+    log_policy = jnp.where(world.available, jax.nn.log_softmax(logits, axis=-1), -jnp.inf)
+    return _Lane(log_policy.reshape(reward.shape), log_moves, letter, solution.status)
+
+
+def _each_world(function: PyTree, problem: Problem) -> _Lane:
+    """``vmap`` over worlds, but for a single one, so that a vmap over seeds stays fast."""
+    count = len(problem.model.letter)
+    if count == 1:
+        return jax.tree.map(lambda x: x[None], function(0))
+    return jax.vmap(function)(jnp.arange(count))
+
+
+def _init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
+    """A state at the network's own random start; the key is kept."""
+    dtype = problem.model.dtype
+    drawn = problem.network.init(learner.init_key(key), problem.observation)["params"]
+    parameters = {
+        "grounding": jax.tree.map(lambda x: jnp.asarray(x, dtype), drawn),
+        "log_scale": jnp.log(jnp.asarray(hparams.scale, dtype)),
+        "weights": jnp.zeros(problem.features.shape[-1], dtype),
+    }
+    optimizer = trees.strong(_optimizer(hparams).init(parameters))
+    return State(key, jnp.int32(0), trees.strong(parameters), optimizer)
+
+
+def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
+    """One step of the optimiser on :func:`objective`; deterministic given the state."""
+    (loss, parts), gradient = jax.value_and_grad(objective, has_aux=True)(
+        state.parameters, problem, hparams
+    )
+    updates, optimizer = _optimizer(hparams).update(gradient, state.optimizer, state.parameters)
+    metrics = Metrics(
+        loss=loss,
+        neg_log_likelihood=-jnp.sum(parts.log_likelihood),
+        entropy=parts.entropy,
+        gradient_norm=optax.tree.norm(gradient),
+        status=parts.status,
+    )
+    parameters = optax.apply_updates(state.parameters, updates)
+    return State(state.key, state.step + 1, parameters, optimizer), metrics
+
+
+def _optimizer(hparams: Hparams) -> optax.GradientTransformationExtraArgs:
+    return optimizers.optimizer(hparams.optimizer, hparams.learning_rate)
+
+
+# Metrics describe the state before a step.
+init, step, run, train, run_until, train_until = learner.bind(_init, _step)
+
+
+def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
+    """The soft policy in the soft products of all worlds: ``float[W, S, Q, A]``.
+
+    Zero at unavailable actions.
+    """
+    return objective(state.parameters, problem, hparams)[1].policy

@@ -1,0 +1,296 @@
+"""Problems and settings of symbol grounding from demonstrations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import linen as nn
+from numpy.typing import ArrayLike
+
+from jaxltl.algos.common import optimizers
+from jaxltl.algos.common.settings import Number, static, traced
+from jaxltl.core import struct
+from jaxltl.core.automata.automaton import Automaton
+from jaxltl.core.automata.language import is_empty, is_universal
+from jaxltl.core.automata.translate import to_automaton
+from jaxltl.core.logic.ltl import Formula
+from jaxltl.core.models.construct.batch import stack_observations, stack_products, unstack_product
+from jaxltl.core.models.mdp import MDP
+from jaxltl.core.models.ops.array_namespace import to_jax
+from jaxltl.core.models.product import Product
+from jaxltl.core.models.trajectories import Trajectories, make_trajectories
+from jaxltl.core.pretty_print import brief
+from jaxltl.core.validation import Range
+
+_MAX_SYMBOLS = 10  # 2^P letters
+
+
+class LinearGrounding(nn.Module):
+    """Logits of the symbols, linear in the observation: ``float[..., O] -> float[..., P]``.
+
+    Attributes:
+      num_symbols: P.
+
+    Example:
+      >>> network = LinearGrounding(2)
+      >>> jax.eval_shape(network.init_with_output, jax.random.key(0), jnp.zeros((5, 3)))[0].shape
+      (5, 2)
+    """
+
+    num_symbols: int
+
+    @nn.compact
+    def __call__(self, observation: jax.Array) -> jax.Array:
+        start = nn.initializers.normal(1.0)
+        return nn.Dense(self.num_symbols, kernel_init=start)(observation)
+
+
+@brief
+@struct.dataclass
+class Problem:
+    """Worlds, observations, demonstrations, and a task over symbols without a labelling.
+
+    Attributes:
+      model: products of W worlds with the task's automaton; their letters are unknown, and those
+        here have no meaning.
+      observation: ``float[W, S, O]``, of each world state.
+      world: ``int32[N]``, the world of each demonstration.
+      state, action: ``int32[N, T]``, the demonstrations, padded with zeros.
+      length: ``int32[N]``, their numbers of steps.
+      event: ``float[Q, L]``, the motive: the reward of a transition of the automaton, in units of
+        ``scale``; see :func:`event_reward`.
+      features: ``float[W, S, Q, A, F]`` of a linear reward added to the motive; F may be 0.
+      network: the grounding, ``float[..., O] -> float[..., P]`` logits; static.
+    """
+
+    model: Product
+    observation: jax.Array
+    world: jax.Array
+    state: jax.Array
+    action: jax.Array
+    length: jax.Array
+    event: jax.Array
+    features: jax.Array
+    network: nn.Module = struct.field(pytree_node=False)
+
+    @property
+    def symbols(self) -> tuple[str, ...]:
+        """`[P]` names, the propositions of the automaton."""
+        return self.model.automaton.propositions
+
+
+@brief
+@struct.dataclass
+class Hparams:
+    """Settings; numbers are traced.
+
+    Attributes:
+      discount: in [0, 1), of the demonstrator; default 0.95.
+      scale: positive; first value of the learned inverse temperature, the reward of an accepting
+        event; default 10.
+      l2: at least 0; precision of the Gaussian prior on the grounding's parameters and on the weights
+        of features; default 1e-2.
+      hardness: at least 0; weight of the mean entropy of the letters, which hardens the grounding;
+        default 0.
+      learning_rate: default 0.1.
+      optimizer: the name of one of optax; static; default ``"adam"``.
+    """
+
+    discount: Number = traced(Range(0, 1, open_above=True), default=0.95)
+    scale: Number = traced(Range(0, open_below=True, open_above=True), default=10.0)
+    l2: Number = traced(Range(0, open_above=True), default=1e-2)
+    hardness: Number = traced(Range(0, open_above=True), default=0.0)
+    learning_rate: Number = traced(Range(0, open_above=True), default=0.1)
+    optimizer: str = static(optimizers.NAMES, default="adam")
+
+
+def make_problem(
+    worlds: MDP | Sequence[MDP],
+    observation: ArrayLike | Sequence[ArrayLike],
+    demonstrations: Trajectories | Sequence[Trajectories],
+    task: Automaton | Formula | str,
+    *,
+    network: nn.Module | None = None,
+    features: ArrayLike | None = None,
+) -> Problem:
+    """A checked :class:`Problem`.
+
+    Args:
+      worlds: a world, or several with the same actions; their labels are not read.
+      observation: ``float[S, O]``, or one for each world: what is seen in each state.
+      demonstrations: of a world, or one batch for each world; states and actions alone.
+      task: a formula over P symbols without a meaning yet, or its automaton, co-safe, safety or Buchi.
+      network: the grounding, a flax module ``float[..., O] -> float[..., P]``; default
+        :class:`LinearGrounding`.
+      features: ``float[S, Q, A, F]``, or one for each world, of a linear reward added to the motive;
+        default none.
+
+    Returns:
+      :class:`Problem`.
+
+    Raises:
+      ValueError: a formula that no word or every word satisfies, or that needs parity acceptance;
+        observations, features or a network of another shape; demonstrations that do not fit.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> path = jl.make_mdp([[[1]], [[1]]], [[[1.0]], [[1.0]]])
+      >>> shown = jl.make_trajectories(path, [[(0, 0), (1, 0)]])
+      >>> make_problem(path, jnp.eye(2), shown, "F goal").symbols
+      ('goal',)
+    """
+    worlds = [worlds] if isinstance(worlds, MDP) else list(worlds)
+    several = [demonstrations] if isinstance(demonstrations, Trajectories) else demonstrations
+    automaton = require_task(task)
+    blank = [
+        replace(
+            world,
+            label=jnp.zeros((world.num_states, len(automaton.propositions)), bool),
+            propositions=automaton.propositions,
+        )
+        for world in worlds
+    ]
+    model = stack_products(blank, automaton, label_on="entry")
+    observation = stack_observations(model, _padded(observation, worlds))
+    world, state, action, length = _joined(worlds, several)
+    if network is None:
+        network = LinearGrounding(len(automaton.propositions))
+    _require_network(network, observation, len(automaton.propositions))
+    return Problem(
+        model=model,
+        observation=observation,
+        world=world,
+        state=state,
+        action=action,
+        length=length,
+        event=jnp.asarray(event_reward(automaton), model.dtype),
+        features=_features(model, features),
+        network=network,
+    )
+
+
+def require_task(task: Automaton | Formula | str) -> Automaton:
+    """The automaton of a task that some words satisfy and some violate; ValueError otherwise."""
+    automaton = task if isinstance(task, Automaton) else to_automaton(task)
+    text = f"the task {task}" if not isinstance(task, Automaton) else "the task"
+    if not automaton.propositions:
+        raise ValueError(f"{text} has no symbols; there is nothing to ground.")
+    if len(automaton.propositions) > _MAX_SYMBOLS:
+        raise ValueError(
+            f"{text} has {len(automaton.propositions)} symbols; at most {_MAX_SYMBOLS} are supported."
+        )
+    if is_empty(automaton):
+        raise ValueError(
+            f"{text} is unsatisfiable, so that no demonstration follows it; change it."
+        )
+    if is_universal(automaton):
+        raise ValueError(
+            f"{text} is satisfied by every word, so that nothing can be learned from it."
+        )
+    if automaton.is_parity:
+        raise ValueError(
+            f"{text} needs parity acceptance, which has no motive of single events; give a co-safe, "
+            "safety or Buchi task."
+        )
+    return automaton
+
+
+def event_reward(automaton: Automaton) -> np.ndarray:
+    """The motive ``float[Q, L]``: 1 where a task is completed, -1 where it is violated.
+
+    Of a co-safe task 1 on entering a final state; of a safety task -1 on leaving the final states; of
+    a Buchi task 1 on each accepting transition.
+
+    >>> event_reward(to_automaton("F a")).tolist()
+    [[0.0, 1.0], [0.0, 0.0]]
+    """
+    if not automaton.has_final_states:
+        return (np.asarray(automaton.priority) == 0).astype(float)
+    final = np.asarray(automaton.final)
+    return final[np.asarray(automaton.delta)].astype(float) - final[:, None]
+
+
+def _joined(worlds: Sequence[MDP], several: Sequence[Trajectories]) -> tuple[jax.Array, ...]:
+    """World, states, actions and lengths of the demonstrations of all worlds, checked."""
+    if len(several) != len(worlds):
+        raise ValueError(
+            f"there are demonstrations in {len(several)} worlds; expected {len(worlds)}."
+        )
+    batches, number = [], []
+    for w, (world, given) in enumerate(zip(worlds, several, strict=True)):
+        rows = [
+            list(zip(s[:n], a[:n], strict=True))
+            for s, a, n in zip(
+                np.asarray(given.state).tolist(),
+                np.asarray(given.action).tolist(),
+                np.asarray(given.length).tolist(),
+                strict=True,
+            )
+            if n
+        ]
+        if rows:
+            try:
+                batches.append(make_trajectories(world, rows))
+            except ValueError as error:
+                raise ValueError(f"demonstrations in world {w}: {error}") from error
+            number += [w] * len(rows)
+    if not batches:
+        raise ValueError("there are no demonstrations; give at least one.")
+    width = max(x.state.shape[1] for x in batches)
+
+    def wide(rows: jax.Array) -> np.ndarray:
+        return np.pad(np.asarray(rows), ((0, 0), (0, width - rows.shape[1])))
+
+    state = np.concatenate([wide(x.state) for x in batches])
+    action = np.concatenate([wide(x.action) for x in batches])
+    length = np.concatenate([np.asarray(x.length) for x in batches])
+    return to_jax((np.asarray(number, np.int32), state, action, length))
+
+
+def _padded(observation: ArrayLike | Sequence[ArrayLike], worlds: Sequence[MDP]) -> np.ndarray:
+    """Observations ``[W, S, O]`` of worlds padded to the largest; ValueError names the world."""
+    if isinstance(observation, list | tuple):
+        given = [np.asarray(x) for x in observation]
+        given = given if given and given[0].ndim > 1 else [np.asarray(observation)]
+    else:
+        table = np.asarray(observation)
+        given = list(table) if table.ndim == 3 else [table]
+    if len(given) != len(worlds):
+        raise ValueError(f"there are observations of {len(given)} worlds; expected {len(worlds)}.")
+    width = given[0].shape[1] if given[0].ndim == 2 else "O"
+    most = max(world.num_states for world in worlds)
+    for w, (x, world) in enumerate(zip(given, worlds, strict=True)):
+        if x.ndim != 2 or x.shape != (world.num_states, width):
+            raise ValueError(
+                f"world {w}: observation has shape {x.shape}; "
+                f"expected ({world.num_states}, {width}), one row for each state."
+            )
+    return np.stack([np.pad(x, ((0, most - len(x)), (0, 0))) for x in given])
+
+
+def _features(model: Product, features: ArrayLike | None) -> jax.Array:
+    lane = unstack_product(model, 0)
+    shape = (len(model.letter), *lane.state_shape, model.mdp.available.shape[-1])
+    if features is None:
+        return jnp.zeros((*shape, 0), model.dtype)
+    values = np.asarray(features)
+    values = values[None] if values.ndim == 4 else values
+    if values.shape[:-1] != shape:
+        raise ValueError(f"features have shape {values.shape}; expected {(*shape, 'F')}.")
+    if (wrong := np.argwhere(~np.isfinite(values))).size:
+        raise ValueError(f"feature at {tuple(wrong[0].tolist())} is not finite.")
+    return jnp.asarray(values, model.dtype)
+
+
+def _require_network(network: nn.Module, observation: jax.Array, num_symbols: int) -> None:
+    found = jax.eval_shape(lambda x: network.init_with_output(jax.random.key(0), x)[0], observation)
+    expected = (*observation.shape[:-1], num_symbols)
+    if getattr(found, "shape", None) != expected:
+        shape = getattr(found, "shape", type(found).__name__)
+        raise ValueError(
+            f"the grounding's logits have shape {shape}; expected {expected}, one for each symbol."
+        )

@@ -1,0 +1,289 @@
+"""Symbol grounding: laws of its likelihood against enumeration, differences and mlirl."""
+
+import itertools
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+
+import jaxltl as jl
+from jaxltl.algos import grounding, mlirl
+from jaxltl.algos.grounding.hypotheses import letters_of, step_log_likelihood
+from jaxltl.algos.grounding.likelihood import (
+    forward,
+    letter_log_probability,
+    memory_log_moves,
+    motive,
+)
+from jaxltl.algos.grounding.problem import event_reward
+from jaxltl.core.models.construct.lifting import lift_trajectories
+from jaxltl.envs.gridworld import gridworld
+
+TASK = "!c U (a & F b)"
+MAP = "a . b\n. c .\nd . ."
+
+
+@cache
+def world_of(text=MAP):
+    """A gridworld, and one-hot observations of its kinds of cells a to d."""
+    world = gridworld(text, slip=0.1)
+    cells = np.array([list(row.replace(" ", "")) for row in text.split("\n")]).ravel()
+    return world, np.stack([cells == kind for kind in "abcd"], axis=1).astype(float)
+
+
+soft_policy = jax.jit(lambda model, reward, discount: jl.soft_value(model, reward, discount).policy)
+
+
+def rollouts(model, policy, count, length, seed=0):
+    """Demonstrations ``(state, action)`` of a policy ``[S, Q, A]`` in a product, in its base model."""
+    rng, found = np.random.default_rng(seed), []
+    delta, letter = np.asarray(model.automaton.delta), np.asarray(model.letter)
+    policy = np.asarray(policy, float)
+    for _ in range(count):
+        s = rng.choice(model.mdp.num_states, p=np.asarray(model.mdp.initial, float))
+        q, pairs = delta[int(model.automaton.initial), letter[s]], []
+        for _ in range(length):
+            a = rng.choice(policy.shape[-1], p=policy[s, q] / policy[s, q].sum())
+            pairs.append((int(s), int(a)))
+            s = rng.choice(
+                np.asarray(model.mdp.successor)[s, a], p=np.asarray(model.mdp.probability)[s, a]
+            )
+            q = delta[q, letter[s]]
+        found.append(pairs)
+    return jl.make_trajectories(model.mdp, found)
+
+
+def demonstrator(world, task=TASK, scale=40.0, discount=0.95):
+    model = jl.product(world, task)
+    reward = scale * motive(
+        world,
+        jax.nn.one_hot(model.letter, model.automaton.delta.shape[1]),
+        jnp.asarray(event_reward(model.automaton)),
+    )
+    return model, soft_policy(model, reward, discount)
+
+
+objective = jax.jit(grounding.objective)
+
+
+def small_problem(count=3, length=5, task=TASK, **options):
+    world, seen = world_of()
+    model, policy = demonstrator(world)
+    return grounding.make_problem(
+        world, seen, rollouts(model, policy, count, length), task, **options
+    )
+
+
+def test_forward_is_the_sum_over_memory_paths():
+    rng = np.random.default_rng(0)
+    start, emit, move = (np.log(rng.random(shape)) for shape in ((3,), (4, 3), (3, 3, 3)))
+    for length in (1, 3, 4):
+        total = -np.inf
+        for path in itertools.product(range(3), repeat=length):
+            one = start[path[0]] + sum(emit[t, q] for t, q in enumerate(path))
+            one += sum(move[t, path[t], path[t + 1]] for t in range(length - 1))
+            total = np.logaddexp(total, one)
+        np.testing.assert_allclose(forward(start, emit, move, length), total, rtol=1e-12)
+
+
+def test_likelihood_is_the_sum_over_letters_and_memory_paths():
+    """Against a literal enumeration of the letters read along a demonstration."""
+    problem, hparams = small_problem(count=2, length=3), grounding.Hparams(scale=5.0)
+    state = grounding.init(jax.random.key(1), problem, hparams)
+    _, parts = objective(state.parameters, problem, hparams)
+    automaton = jax.tree.map(lambda x: x[0], problem.model.automaton)
+    logs = np.asarray(
+        letter_log_probability(
+            problem.network,
+            state.parameters["grounding"],
+            problem.observation[0],
+            automaton.letters,
+        )
+    )
+    np.testing.assert_allclose(np.exp(logs).sum(1), 1)
+    delta, policy = np.asarray(automaton.delta), np.asarray(parts.policy[0])
+    for n in range(2):
+        states, actions = np.asarray(problem.state[n]), np.asarray(problem.action[n])
+        total = 0.0
+        for word in itertools.product(range(delta.shape[1]), repeat=3):
+            q, chance = int(automaton.initial), 1.0
+            for s, a, letter in zip(states, actions, word, strict=True):
+                q = delta[q, letter]
+                chance *= np.exp(logs[s, letter]) * policy[s, q, a]
+            total += chance
+        np.testing.assert_allclose(parts.log_likelihood[n], np.log(total), rtol=1e-10)
+
+
+def test_gradient_is_that_of_differences():
+    features = np.random.default_rng(0).normal(size=(1, 9, 4, 4, 2))
+    problem = small_problem(features=features)
+    hparams = grounding.Hparams(scale=5.0, hardness=0.3)
+    start = grounding.init(jax.random.key(0), problem, hparams).parameters
+    flat, unravel = ravel_pytree(start)
+
+    @jax.jit
+    def loss(x):
+        return grounding.objective(unravel(x), problem, hparams)[0]
+
+    gradient, h = jax.jit(jax.grad(loss))(flat), 1e-5
+    for i in range(flat.size):
+        step = jnp.zeros_like(flat).at[i].set(h)
+        slope = (loss(flat + step) - loss(flat - step)) / (2 * h)
+        np.testing.assert_allclose(gradient[i], slope, rtol=2e-4, atol=1e-6)
+
+
+def certain_parameters(kinds, scale):
+    """Logits of plus or minus 1000: symbol p holds where kind ``kinds[p]`` is seen."""
+    kernel = np.zeros((4, len(kinds)))
+    kernel[list(kinds), np.arange(len(kinds))] = 2000.0
+    dense = {"kernel": jnp.asarray(kernel), "bias": jnp.full(len(kinds), -1000.0)}
+    return {
+        "grounding": {"Dense_0": dense},
+        "log_scale": jnp.log(scale),
+        "weights": jnp.zeros(0),
+    }
+
+
+def mlirl_log_likelihood(problem, kinds, scale, demonstrations):
+    """The likelihood by mlirl in the product with the labels of a grounding."""
+    world, seen = world_of()
+    labelled = world.replace(
+        label=jnp.asarray(seen[:, list(kinds)] > 0), propositions=problem.symbols
+    )
+    model = jl.product(labelled, TASK)
+    reward = motive(
+        labelled,
+        jax.nn.one_hot(model.letter, model.automaton.delta.shape[1]),
+        jnp.asarray(event_reward(model.automaton)),
+    )
+    same = mlirl.make_problem(model, reward[..., None], demonstrations)
+    hparams = mlirl.Hparams(discount=0.95, policy="soft", l2=0.0)
+    found = jax.jit(mlirl.objective)(jnp.array([scale]), same, hparams)
+    return -found[1].neg_log_likelihood
+
+
+@pytest.mark.parametrize("kinds", [(0, 1, 2), (2, 3, 0)])
+def test_a_certain_grounding_has_the_likelihood_of_mlirl(kinds):
+    world, seen = world_of()
+    shown = rollouts(*demonstrator(world), 3, 6)
+    problem, hparams = grounding.make_problem(world, seen, shown, TASK), grounding.Hparams()
+    expected = mlirl_log_likelihood(problem, kinds, 7.0, shown)
+    _, parts = objective(certain_parameters(kinds, 7.0), problem, hparams)
+    np.testing.assert_allclose(parts.log_likelihood.sum(), expected, rtol=1e-9)
+    automaton = jax.tree.map(lambda x: np.asarray(x)[0], problem.model.automaton)
+    letter = letters_of(automaton, seen[None][..., list(kinds)] > 0)
+    steps = jax.jit(step_log_likelihood)(problem, 0.95, jnp.asarray(letter), jnp.asarray(7.0))
+    np.testing.assert_allclose(steps.sum(), expected, rtol=1e-3)
+
+
+def test_permuted_symbols_permute_the_answer():
+    world, seen = world_of()
+    shown = rollouts(*demonstrator(world), 6, 12)
+    hparams = grounding.Hparams()
+    one = grounding.posterior(grounding.make_problem(world, seen, shown, TASK), hparams)
+    renamed = "!a U (b & F c)"  # a -> b, b -> c, c -> a
+    other = grounding.posterior(grounding.make_problem(world, seen, shown, renamed), hparams)
+    new = {"a": "b", "b": "c", "c": "a"}
+    found = {frozenset(one.meaning_of(i).items()): w for i, w in enumerate(one.weight)}
+    for i, w in enumerate(other.weight[:20]):
+        back = {x: other.meaning_of(i)[new[x]] for x in "abc"}
+        np.testing.assert_allclose(found[frozenset(back.items())], w, rtol=1e-6, atol=1e-12)
+
+
+def test_the_grounding_is_found():
+    world, seen = world_of("a . . b\n. c . .\n. . d .\n. c . .")
+    shown = rollouts(*demonstrator(world), 15, 12)
+    problem = grounding.make_problem(world, seen, shown, TASK)
+    found = grounding.posterior(problem, grounding.Hparams(), names=list("abcd"))
+    assert found.meaning_of(0) == {"a": "a", "b": "b", "c": "c"}
+    np.testing.assert_allclose(found.weight.sum(), 1)
+    assert (np.diff(found.weight) <= 0).all() and found.assignment.shape == (64, 3)
+    chosen = grounding.credible_set(found, 0.9)
+    assert found.weight[chosen].sum() >= 0.9 > found.weight[chosen[:-1]].sum()
+
+
+def test_symmetric_symbols_are_counted_once():
+    world, seen = world_of()
+    shown = rollouts(*demonstrator(world, "F (a | b)"), 3, 5)
+    found = grounding.posterior(
+        grounding.make_problem(world, seen, shown, "F (a | b)"), grounding.Hparams()
+    )
+    rows = {tuple(row) for row in found.assignment.tolist()}
+    assert len(rows) == 10 and all(a <= b for a, b in rows)
+
+
+def test_beam_search_finds_what_enumeration_finds(monkeypatch):
+    problem, hparams = small_problem(count=8, length=10), grounding.Hparams()
+    whole = grounding.posterior(problem, hparams)
+    monkeypatch.setattr("jaxltl.algos.grounding.hypotheses._MOST", 10)
+    found = grounding.posterior(problem, hparams)
+    assert whole.complete and not found.complete
+    assert found.assignment[0].tolist() == whole.assignment[0].tolist()
+
+
+def test_gradients_from_many_starts_find_the_grounding():
+    world, seen = world_of("a . . b\n. c . .\n. . d .\n. c . .")
+    shown = rollouts(*demonstrator(world), 15, 12)
+    problem = grounding.make_problem(world, seen, shown, TASK)
+    hparams = grounding.Hparams(scale=20.0, hardness=0.01)
+    train = jax.vmap(lambda key: grounding.train(key, problem, hparams, num_steps=60))
+    state, metrics = train(jax.random.split(jax.random.key(0), 8))
+    best = int(metrics.neg_log_likelihood[:, -1].argmin())
+    dense = jax.tree.map(lambda x: x[best], state.parameters["grounding"]["Dense_0"])
+    assert (dense["kernel"] + dense["bias"]).argmax(0).tolist() == [0, 1, 2]
+
+
+@pytest.mark.parametrize(
+    ("task", "observation", "message"),
+    [
+        ("F a & G !a", np.eye(9), "is unsatisfiable"),
+        ("F a | G !a", np.eye(9), "is satisfied by every word"),
+        ("F G a & (G F b)", np.eye(9), "needs parity acceptance"),
+        ("true", np.eye(9), "no symbols"),
+        ("F a", np.eye(8), r"world 0: observation has shape \(8, 8\); expected \(9, 8\)"),
+        ("F a", np.ones(9), "observation"),
+        ("F a", np.full((9, 1), np.nan), "world 0: the observation in state 0 is not finite"),
+    ],
+)
+def test_bad_input_is_refused(task, observation, message):
+    world, _ = world_of()
+    shown = jl.make_trajectories(world, [[(0, 0)]])
+    with pytest.raises(ValueError, match=message) as caught:
+        grounding.make_problem(world, observation, shown, task)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_demonstration_that_no_grounding_explains_is_named():
+    world = gridworld("a . . . . . . .", slip=0.0)
+    seen = np.stack([np.arange(8) == 0, np.arange(8) == 7], axis=1).astype(float)
+    left, right = [(s, 2) for s in (7, 6, 5, 4, 3, 2, 1)], [(s, 3) for s in range(7)]
+    into_wall = [(4, 0)] * 40
+    shown = jl.make_trajectories(world, [left, right[3:], into_wall])
+    problem = grounding.make_problem(world, seen, shown, "F a")
+    with pytest.raises(ValueError, match=r"demonstration 2 is explained by no grounding.*step"):
+        grounding.posterior(problem, grounding.Hparams(), scales=(50.0, 100.0))
+
+
+def test_network_of_other_shape_is_refused():
+    with pytest.raises(ValueError, match=r"logits have shape \(1, 9, 5\); expected \(1, 9, 3\)"):
+        small_problem(network=grounding.LinearGrounding(5))
+
+
+def test_lifted_demonstrations_agree_with_memory_paths():
+    """The memory that the hypothesis test reads is that of the product."""
+    world, _ = world_of()
+    model, policy = demonstrator(world)
+    shown = rollouts(model, policy, 3, 6)
+    lifted = lift_trajectories(model, shown).state % model.num_memory
+    moves = memory_log_moves(
+        jnp.log(jax.nn.one_hot(model.letter, model.automaton.delta.shape[1]) + 1e-300),
+        model.automaton.delta,
+    )
+    for n in range(3):
+        path = [int(jnp.argmax(moves[shown.state[n, 0], int(model.automaton.initial)]))]
+        for s in np.asarray(shown.state[n, 1:]):
+            path.append(int(jnp.argmax(moves[s, path[-1]])))
+        assert path == lifted[n].tolist()
