@@ -34,7 +34,7 @@ def world_of(text=MAP):
     return world, np.stack([cells == kind for kind in "abcd"], axis=1).astype(float)
 
 
-soft_policy = jax.jit(lambda model, reward, discount: jl.soft_value(model, reward, discount).policy)
+soft_policy = jax.jit(grounding.motive_policy)
 
 
 def rollouts(model, policy, count, length, seed=0):
@@ -56,14 +56,9 @@ def rollouts(model, policy, count, length, seed=0):
     return jl.make_trajectories(model.mdp, found)
 
 
-def demonstrator(world, task=TASK, scale=40.0, discount=0.95):
+def demonstrator(world, task=TASK):
     model = jl.product(world, task)
-    reward = scale * motive(
-        world,
-        jax.nn.one_hot(model.letter, model.automaton.delta.shape[1]),
-        jnp.asarray(event_reward(model.automaton)),
-    )
-    return model, soft_policy(model, reward, discount)
+    return model, soft_policy(model, 40.0, 0.95)
 
 
 objective = jax.jit(grounding.objective)
@@ -287,3 +282,71 @@ def test_lifted_demonstrations_agree_with_memory_paths():
         for s in np.asarray(shown.state[n, 1:]):
             path.append(int(jnp.argmax(moves[s, path[-1]])))
         assert path == lifted[n].tolist()
+
+
+# --- answers --------------------------------------------------------------------------------------
+
+
+def labels_of(kinds, text=MAP):
+    _, seen = world_of(text)
+    return seen[:, list(kinds)] > 0
+
+
+def test_a_robust_policy_holds_under_every_grounding():
+    """Bounds against an evaluation of the policy alone, and the maximin against both optima."""
+    world, _ = world_of()
+    world = world.replace(initial=jnp.asarray([0, 0.75, 0, 0, 0, 0.25, 0, 0, 0]))
+    members = [labels_of(kinds) for kinds in ((0, 1, 2), (0, 3, 2))]
+    robust = grounding.robust_policy(world, members, "abc", TASK)
+    assert robust.worst <= robust.upper and robust.upper - robust.worst <= 2e-4
+    for i, labels in enumerate(members):
+        alone = grounding.probability_under(robust, labels, "abc", TASK)
+        np.testing.assert_allclose(alone, robust.lower[i], atol=1e-5)
+        model = jl.product(grounding.with_labels(world, labels, "abc"), TASK)
+        optimum = float((jl.optimal_satisfaction(model).value * model.initial).sum())
+        assert robust.lower[i] <= optimum + 1e-9
+
+
+def test_groundings_that_exclude_each_other_share_the_probability():
+    """Two absorbing cells; only a mixture satisfies either grounding with probability a half."""
+    world = jl.from_dense(np.eye(3)[[[1, 2], [1, 1], [2, 2]]], initial=[1, 0, 0])
+    labels = [np.arange(3)[:, None] == 1, np.arange(3)[:, None] == 2]
+    robust = grounding.robust_policy(world, labels, ["g"], "F g")
+    np.testing.assert_allclose(robust.lower, 0.5, atol=1e-4)
+    np.testing.assert_allclose(robust.upper, 0.5, atol=1e-4)
+    nowhere = grounding.probability_under(robust, np.zeros((3, 1), bool), ["g"], "F g")
+    assert nowhere == 0
+    with pytest.raises(ValueError, match="there are 9 groundings; a robust policy takes 1 to 8"):
+        grounding.robust_policy(world, (labels * 5)[:9], ["g"], "F g")
+
+
+def test_the_query_has_the_largest_mutual_information():
+    found = grounding.posterior(small_problem(), grounding.Hparams(), names=list("abcd"))
+    labels = np.stack([found.labels(i)[0] for i in range(len(found.weight))])  # [C, S, P]
+    information = []
+    for s in range(labels.shape[1]):
+        joint = {}
+        for row, w in zip(labels[:, s], found.weight, strict=True):
+            joint[tuple(row)] = joint.get(tuple(row), 0) + w
+        prior = -(found.weight * np.log(np.maximum(found.weight, 1e-300))).sum()
+        after = 0.0
+        for seen, mass in joint.items():
+            inside = found.weight[[tuple(row) == seen for row in labels[:, s]]] / mass
+            after -= mass * (inside * np.log(np.maximum(inside, 1e-300))).sum()
+        information.append(prior - after)
+    query = grounding.best_query(found)
+    np.testing.assert_allclose(query.information, max(information), atol=1e-6)
+    np.testing.assert_allclose(information[query.state], max(information), atol=1e-6)
+    np.testing.assert_allclose(sum(w for _, w in query.labels), 1)
+
+
+def test_the_table_has_marginal_weights_and_decisive_steps():
+    problem, hparams = small_problem(count=6, length=8), grounding.Hparams()
+    found = grounding.posterior(problem, hparams, names=list("abcd"))
+    rows = grounding.grounding_table(problem, hparams, found)
+    assert [row.symbol for row in rows] == ["a", "b", "c"]
+    for p, row in enumerate(rows):
+        np.testing.assert_allclose(row.weight + sum(w for _, w in row.alternatives), 1)
+        chosen = found.assignment[:, p] == "abcd".index(row.meaning)
+        np.testing.assert_allclose(row.weight, found.weight[chosen].sum())
+        assert all(0 <= n < 6 and 0 <= t < 8 and gain > 0 for n, t, gain in row.steps)

@@ -1,5 +1,15 @@
 """Symbol grounding: learns from demonstrations what the symbols of a task mean."""
 
+from jaxltl.algos.grounding.answer import (
+    Query as Query,
+    RobustPolicy as RobustPolicy,
+    Row as Row,
+    best_query as best_query,
+    grounding_table as grounding_table,
+    probability_under as probability_under,
+    robust_policy as robust_policy,
+    with_labels as with_labels,
+)
 from jaxltl.algos.grounding.hypotheses import (
     Posterior as Posterior,
     ambiguous_symbols as ambiguous_symbols,
@@ -19,6 +29,7 @@ from jaxltl.algos.grounding.learner import (
     train as train,
     train_until as train_until,
 )
+from jaxltl.algos.grounding.likelihood import motive_policy as motive_policy
 from jaxltl.algos.grounding.problem import (
     Hparams as Hparams,
     LinearGrounding as LinearGrounding,

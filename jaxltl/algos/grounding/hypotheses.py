@@ -12,6 +12,8 @@ Example: two states look different; the demonstration moves to the second one an
   >>> shown = jl.make_trajectories(world, [[(0, 0), (1, 0)], [(0, 0)]])
   >>> problem = grounding.make_problem(world, jnp.eye(2), shown, "G !trap")
   >>> found = grounding.posterior(problem, grounding.Hparams())
+  >>> grounding.credible_set(found, 0.5), grounding.ambiguous_symbols(found, 0.5)
+  (array([0]), {})
   >>> found.meaning_of(0)
   {'trap': 'observation 0'}
 """
@@ -29,14 +31,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxltl.algos.common.settings import Number
-from jaxltl.algos.grounding.likelihood import certain_memory, motive
+from jaxltl.algos.grounding.likelihood import certain_memory, motive_log_policy
 from jaxltl.algos.grounding.problem import Hparams, Problem
 from jaxltl.core import struct
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.language import is_equivalent
 from jaxltl.core.models.product import Product
 from jaxltl.core.pretty_print import brief
-from jaxltl.core.values.discounted.soft import policy_logits, soft_value
 
 Score = Callable[[np.ndarray], np.ndarray]
 SCALES = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0)
@@ -107,7 +108,7 @@ def posterior(
         explains: under each of them uniformly random actions are 10,000 times as likely.
     """
     meaning, titles = _meanings(problem, meanings, names)
-    symmetries = symbol_symmetries(_automaton(problem))
+    symmetries = symbol_symmetries(automaton_of(problem))
     score = partial(_scores, problem, hparams.discount, meaning, np.asarray(scales, float))
     count = len(meaning) ** len(problem.symbols)
     if count <= _MOST:
@@ -176,7 +177,8 @@ def _canonical(row: Sequence[int], symmetries: list[tuple[int, ...]]) -> tuple[i
     return min(tuple(row[i] for i in order) for order in symmetries)
 
 
-def _automaton(problem: Problem) -> Automaton:
+def automaton_of(problem: Problem) -> Automaton:
+    """The automaton of a problem, on the host."""
     return jax.tree.map(lambda x: np.asarray(x)[0], problem.model.automaton)
 
 
@@ -223,7 +225,7 @@ def _scores(
     problem: Problem, discount: Number, meaning: np.ndarray, scales: np.ndarray, rows: np.ndarray
 ) -> np.ndarray:
     """Log-likelihoods ``float64[C, B, N]`` of assignments ``int32[C, P]``."""
-    letters = letters_of(_automaton(problem), np.moveaxis(meaning[rows], 1, -1))  # [C, W, S]
+    letters = letters_of(automaton_of(problem), np.moveaxis(meaning[rows], 1, -1))  # [C, W, S]
     possible = (letters >= 0).all((1, 2))
     found = np.full((len(rows), len(scales), len(problem.length)), -np.inf)
     chosen = np.flatnonzero(possible)
@@ -252,15 +254,10 @@ def step_log_likelihood(
     """``log pi(a_t | s_t, q_t)``, ``float[N, T]``, with known letters ``int32[W, S]``; 0 in padding."""
     models = replace(problem.model, letter=letter)
 
-    def lane(model: Product, features: jax.Array) -> jax.Array:
-        count = model.automaton.delta.shape[-1]
-        certain = jax.nn.one_hot(model.letter, count, dtype=model.dtype)
-        reward = scale * motive(model.mdp, certain, problem.event)  # features: weights unknown
-        solution = soft_value(model, reward, discount, tolerance=1e-3)
-        logits = policy_logits(model, reward, discount, solution.value)
-        return jax.nn.log_softmax(logits, axis=-1)
+    def lane(model: Product) -> jax.Array:
+        return motive_log_policy(model, problem.event, scale, discount)
 
-    log_policy = jax.vmap(lane)(models, problem.features)
+    log_policy = jax.vmap(lane)(models)
 
     def demonstration(world: jax.Array, state: jax.Array, action: jax.Array) -> jax.Array:
         model = jax.tree.map(lambda x: x[world], models)
@@ -308,7 +305,7 @@ def _require_explained(
     lost = uniform.sum(1) - table.max((0, 1))
     n = int(lost.argmax())
     if lost[n] > _UNEXPLAINED:
-        letter = letters_of(_automaton(problem), found.labels(0))
+        letter = letters_of(automaton_of(problem), found.labels(0))
         steps = jax.jit(step_log_likelihood)(
             problem, hparams.discount, jnp.asarray(letter), jnp.asarray(found.scale[0])
         )

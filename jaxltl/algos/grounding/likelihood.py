@@ -12,12 +12,15 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
-from jaxltl.algos.common.settings import applied
+from jaxltl.algos.common.settings import Number, applied
+from jaxltl.algos.grounding.problem import event_reward
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.ops.operators import expectation
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import PyTree
+from jaxltl.core.values.discounted.soft import policy_logits, soft_value
 
+_TOLERANCE = 1e-3  # of soft values: changes a log-likelihood by as much a step
 NEVER = -1e30  # logarithm of probability 0: finite, so that derivatives stay finite
 
 
@@ -65,6 +68,34 @@ def soft_product(world: MDP, moves: jax.Array) -> MDP:
 def motive(world: MDP, letter: jax.Array, event: jax.Array) -> jax.Array:
     """Expected reward ``float[S, Q, A]`` of the next event ``float[Q, L]``, by letters ``float[S, L]``."""
     return jax.vmap(lambda row: expectation(world, letter @ row), out_axes=1)(event)
+
+
+def motive_policy(model: Product, scale: Number, discount: Number) -> jax.Array:
+    """The demonstrator's policy for a task with known labels, ``float[S, Q, A]``.
+
+    The soft policy of the motive, the events of
+    :func:`~jaxltl.algos.grounding.problem.event_reward` times `scale`, at a `discount`.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> world = jl.from_dense([[[0, 1.0], [1.0, 0]], [[0, 1.0], [1.0, 0]]], label={"g": [1]})
+      >>> policy = motive_policy(jl.product(world, "F g"), 5.0, 0.9)
+      >>> round(policy[0, 0, 0].item(), 2)
+      0.69
+    """
+    event = jnp.asarray(event_reward(model.automaton), model.dtype)
+    return jnp.exp(motive_log_policy(model, event, scale, discount))
+
+
+def motive_log_policy(
+    model: Product, event: jax.Array, scale: Number, discount: Number
+) -> jax.Array:
+    """Logarithm of the soft policy of events ``float[Q, L]`` in a product, ``float[S, Q, A]``."""
+    letter = jax.nn.one_hot(model.letter, event.shape[1], dtype=model.dtype)
+    reward = scale * motive(model.mdp, letter, event)
+    solution = soft_value(model, reward, discount, tolerance=_TOLERANCE)
+    logits = policy_logits(model, reward, discount, solution.value)
+    return jax.nn.log_softmax(logits, axis=-1)
 
 
 def forward(start: jax.Array, emit: jax.Array, move: jax.Array, length: jax.Array) -> jax.Array:

@@ -20,7 +20,7 @@ from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.models.construct.batch import stack_observations, stack_products, unstack_product
 from jaxltl.core.models.mdp import MDP
-from jaxltl.core.models.ops.array_namespace import to_jax
+from jaxltl.core.models.ops.array_namespace import namespace, to_jax
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.trajectories import Trajectories, make_trajectories
 from jaxltl.core.pretty_print import brief
@@ -199,7 +199,7 @@ def require_task(task: Automaton | Formula | str) -> Automaton:
     return automaton
 
 
-def event_reward(automaton: Automaton) -> np.ndarray:
+def event_reward(automaton: Automaton) -> jax.Array:
     """The motive ``float[Q, L]``: 1 where a task is completed, -1 where it is violated.
 
     Of a co-safe task 1 on entering a final state; of a safety task -1 on leaving the final states; of
@@ -208,10 +208,10 @@ def event_reward(automaton: Automaton) -> np.ndarray:
     >>> event_reward(to_automaton("F a")).tolist()
     [[0.0, 1.0], [0.0, 0.0]]
     """
-    if not automaton.has_final_states:
-        return (np.asarray(automaton.priority) == 0).astype(float)
-    final = np.asarray(automaton.final)
-    return final[np.asarray(automaton.delta)].astype(float) - final[:, None]
+    _, own = namespace(automaton)
+    if not own.has_final_states:
+        return to_jax((own.priority == 0).astype(float))
+    return to_jax(own.final[own.delta].astype(float) - own.final[:, None])
 
 
 def _joined(worlds: Sequence[MDP], several: Sequence[Trajectories]) -> tuple[jax.Array, ...]:
