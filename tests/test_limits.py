@@ -14,9 +14,9 @@ from benchmarks import size
 
 PACKAGE = Path(jaxltl.__file__).parent
 LIMITS = {
-    "lines": 100_560,
-    "statements": 50_360,
-    "docstring lines": 16_330,
+    "lines": 101_840,
+    "statements": 50_890,
+    "docstring lines": 16_720,
     "functions with more than 6 parameters": 67,
     "functions with more than 9 parameters": 1,
     "Any in annotations": 942,

@@ -15,6 +15,7 @@ from jaxltl.algos.grounding.hypotheses import (
     ambiguous_symbols as ambiguous_symbols,
     credible_set as credible_set,
     posterior as posterior,
+    symbol_symmetries as symbol_symmetries,
 )
 from jaxltl.algos.grounding.learner import (
     Metrics as Metrics,

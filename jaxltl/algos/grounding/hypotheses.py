@@ -137,11 +137,22 @@ def posterior(
 
 
 def credible_set(found: Posterior, level: float = 0.95) -> np.ndarray:
-    """Rows ``int[]`` of the smallest set of groundings with total weight of at least `level`.
+    """Rows of the smallest set of groundings with total weight of at least `level`.
 
-    >>> import types
-    >>> credible_set(types.SimpleNamespace(weight=np.array([0.7, 0.2, 0.1])), 0.8).tolist()
-    [0, 1]
+    Args:
+      found: the posterior.
+      level: the nominal weight, above 0 and below 1.
+
+    Returns:
+      ``int[]``, rows of `found`, in its order.
+
+    Raises:
+      ValueError: a level outside this range.
+
+    Example:
+      >>> import types
+      >>> credible_set(types.SimpleNamespace(weight=np.array([0.7, 0.2, 0.1])), 0.8).tolist()
+      [0, 1]
     """
     if not 0 < level < 1:
         raise ValueError(f"level={level}; it must be above 0 and below 1.")
@@ -150,7 +161,15 @@ def credible_set(found: Posterior, level: float = 0.95) -> np.ndarray:
 
 
 def ambiguous_symbols(found: Posterior, level: float = 0.95) -> dict[str, tuple[str, ...]]:
-    """Symbols with several meanings in the credible set, with these meanings, likeliest first."""
+    """Symbols with several meanings in the credible set, with these meanings.
+
+    Args:
+      found: the posterior.
+      level: nominal weight of the set.
+
+    Returns:
+      For each such symbol its meanings, likeliest first; empty if the demonstrations decide all.
+    """
     rows = found.assignment[credible_set(found, level)]
     several = {}
     for p, symbol in enumerate(found.symbols):
@@ -161,7 +180,19 @@ def ambiguous_symbols(found: Posterior, level: float = 0.95) -> dict[str, tuple[
 
 
 def symbol_symmetries(automaton: Automaton) -> list[tuple[int, ...]]:
-    """Permutations of the symbols that leave the language unchanged, the identity included."""
+    """Permutations of the symbols that leave the language unchanged, the identity included.
+
+    Args:
+      automaton: over P symbols; with more than 5 only the identity is returned.
+
+    Returns:
+      Permutations of ``0 .. P - 1``.
+
+    Example:
+      >>> import jaxltl as jl
+      >>> symbol_symmetries(jl.to_automaton("F a & F b"))
+      [(0, 1), (1, 0)]
+    """
     count = len(automaton.propositions)
     if count > 5:  # 720 comparisons and more
         return [tuple(range(count))]

@@ -122,7 +122,7 @@ def objective(
 
     The loss ``float[]`` adds ``l2 / 2`` times the squared parameters of grounding and features and
     ``hardness`` times the number of demonstrated steps times the mean entropy of the letters.
-    Differentiable in the parameters, implicitly through the soft value.
+    Differentiable in the `parameters` of a `problem` with `hparams`, implicitly through the soft value.
     """
     lanes = _each_world(partial(_lane, problem, hparams, parameters), problem)
     initial = jnp.asarray(problem.model.automaton.initial)[0]

@@ -73,7 +73,7 @@ def motive(world: MDP, letter: jax.Array, event: jax.Array) -> jax.Array:
 def motive_policy(model: Product, scale: Number, discount: Number) -> jax.Array:
     """The demonstrator's policy for a task with known labels, ``float[S, Q, A]``.
 
-    The soft policy of the motive, the events of
+    The soft policy of the motive in a `model` with the task: the events of
     :func:`~jaxltl.algos.grounding.problem.event_reward` times `scale`, at a `discount`.
 
     Example:

@@ -202,7 +202,7 @@ def require_task(task: Automaton | Formula | str) -> Automaton:
 def event_reward(automaton: Automaton) -> jax.Array:
     """The motive ``float[Q, L]``: 1 where a task is completed, -1 where it is violated.
 
-    Of a co-safe task 1 on entering a final state; of a safety task -1 on leaving the final states; of
+    Of an `automaton` that is co-safe 1 on entering a final state; of a safety task -1 on leaving the final states; of
     a Buchi task 1 on each accepting transition.
 
     >>> event_reward(to_automaton("F a")).tolist()
