@@ -377,6 +377,12 @@ def _render(result: Automaton, form: str, formula: str) -> str:
 )
 @click.option("--json", "as_json", is_flag=True, help="End with the results as one JSON line.")
 @click.option(
+    "--const", "constants", metavar="NAME=VALUE,...", help="Constants of a program, as N=64,MAX=4."
+)
+@click.option(
+    "--max-states", type=click.IntRange(1), help="Most states of a program; default 10 million."
+)
+@click.option(
     "--checkpoint",
     type=click.Path(path_type=Path),
     metavar="DIRECTORY",
@@ -390,10 +396,14 @@ def solve(
     strategy: Path | None,
     tolerance: float,
     as_json: bool,
+    constants: str | None,
+    max_states: int | None,
     checkpoint: Path | None,
     devices: processes.DeviceOptions,
 ) -> None:
     """Solve properties of a Markov chain or decision process, with certified bounds.
+
+    MODEL is a model file, or a program in the PRISM language with --const for its constants.
 
     A PROPERTY is written as for PRISM and Storm, such as 'Pmax=? [ F "goal" ]',
     'R{"time"}min=? [ C<=10 ]', 'P>=0.9 [ G !"crash" ]', or any formula of linear temporal logic in
@@ -418,7 +428,10 @@ def solve(
         compilation.use_cache(True)
     from jaxltl.app import solve as solving
 
-    questions = solving.parse_queries(properties)
+    program, definitions = solving.read_source(model_file, constants, properties)
+    if program is not None and devices.mesh is not None:
+        raise ValueError(f"--mesh takes built models; {model_file} is a program.")
+    questions = solving.parse_queries(properties, definitions)
     if all(one.parsed is None for one in questions):
         raise ValueError("\n".join(str(one.error) for one in questions))
     from jaxltl.core.files import atomic_write
@@ -429,7 +442,7 @@ def solve(
     with written as file, processes.process_group(devices, launch, say) as group, double():
         if group.mesh is None:
             begin = time.perf_counter()
-            model = solving.load(model_file)
+            model = solving.load(model_file, program, max_states)
             entry = solving.model_entry(model, time.perf_counter() - begin)
             found = solving.solve(model, questions, tolerance)
         else:

@@ -14,9 +14,9 @@ from benchmarks import size
 
 PACKAGE = Path(jaxltl.__file__).parent
 LIMITS = {
-    "lines": 101_840,
-    "statements": 50_890,
-    "docstring lines": 16_720,
+    "lines": 102_200,
+    "statements": 51_100,
+    "docstring lines": 16_795,
     "functions with more than 6 parameters": 67,
     "functions with more than 9 parameters": 1,
     "Any in annotations": 942,

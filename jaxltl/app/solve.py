@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import re
+import sys
 import time
 import traceback
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -13,9 +16,13 @@ from typing import Any
 
 import numpy as np
 
+from jaxltl.core.language.resolve import constant_value, resolve
+from jaxltl.core.language.syntax import Program
+from jaxltl.core.logic.comparisons import Definitions, program_definitions
 from jaxltl.core.logic.properties import Property, parse_properties
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
+from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.types import NotConverged, Status
@@ -30,6 +37,7 @@ from jaxltl.app.wording import Record
 Found = Answer | Achievable | ConstrainedOptimum | Pareto
 
 PROPERTY_FILES = (".props", ".prop", ".pctl")
+_PROGRESS_SECONDS = 5.0
 SHOWN = 10  # initial states with printed values
 MAX_FILE = 2**24  # bytes of a property file
 
@@ -62,7 +70,7 @@ class Result:
         return SOLVED if self.answer.status == Status.CONVERGED else NOT_CONVERGED
 
 
-def parse_queries(arguments: Sequence[str]) -> list[Query]:
+def parse_queries(arguments: Sequence[str], definitions: Definitions | None = None) -> list[Query]:
     """Parses arguments: properties, or names of property files; errors are kept by property."""
     found = []
     for argument in arguments:
@@ -70,7 +78,7 @@ def parse_queries(arguments: Sequence[str]) -> list[Query]:
         if argument.lower().endswith(PROPERTY_FILES):
             place, text = f"{argument}: ", _text_of(Path(argument))
         try:
-            found += [Query(p.text, p) for p in parse_properties(text)]
+            found += [Query(p.text, p) for p in parse_properties(text, definitions)]
         except ValueError as error:
             found.append(Query(argument, error=f"{place}{error}"))
     return found
@@ -89,11 +97,50 @@ def _text_of(path: Path) -> str:
         raise ValueError(f"cannot read {str(path)!r}: {error.strerror}.") from None
 
 
-def load(path: Path) -> SparseMDP | IntervalMDP:
-    """A Markov chain or decision process, or an interval one, from a model file."""
+def read_source(
+    path: Path, constants: str | None, arguments: Sequence[str]
+) -> tuple[Program | None, Definitions | None]:
+    """The program of a file in the PRISM language, and the names that properties may use.
+
+    Constants that the program does not declare are those of the properties.
+    """
+    from jaxltl.io.model_files import is_program
+    from jaxltl.io.prism.program import constants_of, read_syntax
+
+    if not is_program(path):
+        if constants is not None:
+            raise ValueError(f"--const goes with programs in the PRISM language; {path} is none.")
+        return None, None
+    given, syntax = constants_of(constants), read_syntax(path)
+    declared = {c.name for c in syntax.constants}
+    program = resolve(syntax, {k: v for k, v in given.items() if k in declared})
+    rest = {k: constant_value(k, v) for k, v in given.items() if k not in declared}
+    texts = [_text_of(Path(x)) if x.lower().endswith(PROPERTY_FILES) else x for x in arguments]
+    for name in rest:
+        if not any(re.search(rf"\bconst\b[^;=]*\b{name}\b", text) for text in texts):
+            listed = ", ".join(sorted(declared)) or "none"
+            raise ValueError(f"--const: there is no constant {name}; {path} has {listed}.")
+    return program, program_definitions(program, rest)
+
+
+def load(
+    path: Path, program: Program | None = None, max_states: int | None = None
+) -> SparseMDP | IntervalMDP:
+    """A Markov chain or decision process, or an interval one, from a model file or a program."""
     from jaxltl.io.model_files import read_model
 
-    model = read_model(path)
+    model: Model
+    if program is None:
+        model = read_model(path, max_states=max_states)
+    else:
+        from jaxltl.core.programs.build import MAX_STATES, build_model
+
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            most = MAX_STATES if max_states is None else max_states
+            model = build_model(program, max_states=most, progress=_Progress())
+        for warning in caught:
+            print(f"warning: {warning.message}", file=sys.stderr, flush=True)
     if isinstance(model, Game):
         raise ValueError(
             f"{str(path)!r} is a game; properties of chains and decision processes "
@@ -105,6 +152,18 @@ def load(path: Path) -> SparseMDP | IntervalMDP:
             "decision processes are solved."
         )
     return model
+
+
+class _Progress:
+    """Prints the number of states of a long exploration every few seconds."""
+
+    def __init__(self) -> None:
+        self.last = time.monotonic()
+
+    def __call__(self, found: int, expanded: int) -> None:
+        if time.monotonic() - self.last > _PROGRESS_SECONDS:
+            self.last = time.monotonic()
+            print(f"{found} states found, {expanded} expanded", file=sys.stderr, flush=True)
 
 
 def solve(

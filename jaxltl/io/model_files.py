@@ -19,6 +19,7 @@ from jaxltl.io.hoa.game import read_hoa_game, write_hoa_game
 from jaxltl.io.npz import read_npz, write_npz
 from jaxltl.io.pgsolver import read_pgsolver, write_pgsolver
 from jaxltl.io.prism.explicit import read_prism, write_prism
+from jaxltl.io.prism.program import SUFFIXES, Constants, read_program_model
 from jaxltl.io.umb.umb import read_umb, write_umb
 
 _BEGINNING = 4096  # bytes inspected to detect the format
@@ -63,15 +64,23 @@ FORMATS = (
 )
 
 
-def read_model(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP | Game:
+def read_model(
+    path: str | os.PathLike[str],
+    *,
+    constants: Constants = None,
+    max_states: int | None = None,
+) -> SparseMDP | IntervalMDP | Game:
     """Model of a file, with the format detected by suffix or contents.
 
-    Formats: UMB (``.umb``), PRISM's explicit files (``.tra`` with its companions, ``.pexp``), DRN
-    (``.drn``), parity games of PGSolver (``.pg``, ``.gm``, ``.pgsolver``) and in extended HOA
-    (``.hoa``, ``.ehoa``), and ``.npz``; all but the last may be compressed (``.gz``, ``.xz``).
+    Formats: programs in the PRISM language (``.prism``, ``.pm``, ``.nm``, ``.sm``, ``.smg``), UMB
+    (``.umb``), PRISM's explicit files (``.tra`` with its companions, ``.pexp``), DRN (``.drn``),
+    parity games of PGSolver (``.pg``, ``.gm``, ``.pgsolver``) and in extended HOA (``.hoa``,
+    ``.ehoa``), and ``.npz``; all but the last may be compressed (``.gz``, ``.xz``).
 
     Args:
       path: the file.
+      constants: of a program, values in a dict or as a text such as ``"N=64,MAX=4"``.
+      max_states: of a program, the largest number of states; default 10 million.
 
     Returns:
       A SparseMDP, a Game over one, or an IntervalMDP. :func:`~jaxltl.io.pgsolver.objective_of`
@@ -88,7 +97,19 @@ def read_model(path: str | os.PathLike[str]) -> SparseMDP | IntervalMDP | Game:
       >>> read_model(path).propositions
       ('heads',)
     """
+    if is_program(path):
+        return read_program_model(path, constants, max_states)
+    if constants is not None or max_states is not None:
+        raise ValueError(
+            f"{str(path)!r} is no program; constants and max_states are for programs in the PRISM "
+            f"language ({', '.join(SUFFIXES)})."
+        )
     return (_by_name(path) or _by_beginning(path)).read(path)
+
+
+def is_program(path: str | os.PathLike[str]) -> bool:
+    """True if the suffix is one of programs in the PRISM language."""
+    return _suffix(path) in SUFFIXES
 
 
 def write_model(path: str | os.PathLike[str], model: Model) -> None:
@@ -110,6 +131,8 @@ def write_model(path: str | os.PathLike[str], model: Model) -> None:
       [1, 2, 1, 2]
     """
     form = _by_name(path)
+    if is_program(path):
+        raise ValueError(f"{str(path)!r}: programs are read, not written; write {_known()}.")
     if form is None:
         raise ValueError(f"{str(path)!r}: the suffix names no format; known are {_known()}.")
     is_game = isinstance(model, Game)
@@ -126,11 +149,17 @@ def write_model(path: str | os.PathLike[str], model: Model) -> None:
     form.write(path, model if isinstance(model, Game | IntervalMDP) else to_sparse(model))
 
 
-def _by_name(path: str | os.PathLike[str]) -> Format | None:
+def _suffix(path: str | os.PathLike[str]) -> str:
+    """The suffix, without that of a compression."""
     suffixes = [x.lower() for x in Path(path).suffixes]
     if suffixes and suffixes[-1] in (".gz", ".xz"):
         del suffixes[-1]
-    return next((x for x in FORMATS if suffixes and suffixes[-1] in x.suffixes), None)
+    return suffixes[-1] if suffixes else ""
+
+
+def _by_name(path: str | os.PathLike[str]) -> Format | None:
+    suffix = _suffix(path)
+    return next((x for x in FORMATS if suffix in x.suffixes), None)
 
 
 def _by_beginning(path: str | os.PathLike[str]) -> Format:

@@ -62,14 +62,20 @@ class GameTable(Table):
     system_stays: Key[bool | None, "True if the system may stay; default true.", "false"] = None
     environment_stays: Key[bool | None, "True if the other may stay; default false."] = None
     model: Key[Text | None, "Model file of a game; default none.", '"game.pg"'] = None
+    constants: Key[
+        Text | None, "Constants of a program (.prism); default none.", '"N=64,MAX=4"'
+    ] = None
     initial: Key[Text | None, "Formula of initial states; default the model's.", '"start"'] = None
 
     def __attrs_post_init__(self) -> None:
         self.require_one(("map", "model"), "a map or a model (a file)")
         if self.map is not None:
-            self.refuse(("initial",), "a model; on a map give system_start and environment_start")
+            self.refuse(
+                ("initial", "constants"),
+                "a model; on a map give system_start and environment_start",
+            )
             return
-        of_map = (key for key in self.given() if key not in ("model", "initial"))
+        of_map = (key for key in self.given() if key not in ("model", "initial", "constants"))
         self.refuse(of_map, "a map; a model has it in its arrays")
 
 
@@ -199,7 +205,7 @@ def load_game(file: GameFile) -> World:
     table = file.game
     with errors_in(f"{file.path}: [game] "):
         if table.model is not None:
-            return _from_model(file.path.parent / table.model, table.initial)
+            return _from_model(file.path.parent / table.model, table)
         assert table.map is not None
         text, wall = read_map(file.path, table.map), table.wall or "#"
         options = {key: value for key, value in table.given().items() if key != "map"}
@@ -210,14 +216,14 @@ def load_game(file: GameFile) -> World:
     return World(game, ACTIONS, text, wall, places(text, wall=wall))
 
 
-def _from_model(path: Path, initial: str | None) -> World:
-    found = read_padded(path, ("system",))
+def _from_model(path: Path, table: GameTable) -> World:
+    found = read_padded(path, ("system",), table.constants)
     if "system" not in found.more:
         raise ValueError(
             f"{str(path)!r} is no game: it lacks the array system: for each state True where the "
             "system moves and False where the environment does."
         )
-    mdp = initial_where(found.mdp, initial, path)
+    mdp = initial_where(found.mdp, table.initial, path)
     with errors_in(f"{str(path)!r}: "):
         game = make_game(mdp, found.more["system"])
     return World(game, found.actions, objective=found.objective)

@@ -34,8 +34,10 @@ class ReadModel:
     objective: Parity | None = None  # the parity objective of a parity game's file, or None
 
 
-def read_padded(path: Path, more: Sequence[str] = ()) -> ReadModel:
+def read_padded(path: Path, more: Sequence[str] = (), constants: str | None = None) -> ReadModel:
     """Model of a file, of a format of ``read_model`` or an ``.npz`` of padded arrays.
+
+    `constants` are those of a program in the PRISM language, such as ``"N=64,MAX=4"``.
 
     Actions have the names of choices if these are distinct in each state and at most 100, else
     the rank of a choice in its state.
@@ -52,7 +54,7 @@ def read_padded(path: Path, more: Sequence[str] = ()) -> ReadModel:
                 {k: arrays[k] for k in more if k in arrays},
             )
     del raw
-    model: Any = read_model(path)
+    model: Any = read_model(path, constants=constants)
     found: dict[str, np.ndarray] = {}
     objective = None
     if isinstance(model, IntervalMDP):

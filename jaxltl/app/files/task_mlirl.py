@@ -54,6 +54,9 @@ class WorldTable(GridTable):
 
     map: Key[Map | None, "Rows of a text map, or the file that has them; default none."] = None
     model: Key[Text | None, "Model file; default none.", '"model.umb"'] = None
+    constants: Key[
+        Text | None, "Constants of a program (.prism); default none.", '"N=64,MAX=4"'
+    ] = None
     transitions: Key[Text | None, "Log of transitions; default none.", '"log.csv"'] = None
     initial: Key[
         Initial | None,
@@ -83,6 +86,8 @@ class WorldTable(GridTable):
         sources = ("map", "model", "transitions")
         self.require_one(sources, "a map, a model (a file) or transitions (a log)")
         of_map = ("legend", "wall", "slip", "absorbing")
+        if self.model is None:
+            self.refuse(("constants",), "a model, a program in the PRISM language")
         if self.transitions is None:
             of_log = ("confidence", "labels", "terminal", "graph", "least_probability", "method")
             self.refuse(of_log, "transitions, a log")

@@ -62,7 +62,7 @@ def load_world(task: MlirlTask) -> World:
             from jaxltl.app.files.models import read_padded
 
             path = folder / table.model
-            found = read_padded(path)
+            found = read_padded(path, constants=table.constants)
             assert not isinstance(table.initial, list)
             return World(initial_where(found.mdp, table.initial, path), None, found.actions)
         assert table.map is not None

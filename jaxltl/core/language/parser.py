@@ -67,6 +67,7 @@ _LEVELS: dict[str, int] = {
 }
 _NOT = 5
 SIMPLE = 6  # the level of comparisons, in which no Boolean operator stands outside of parentheses
+ADDITIVE = 8  # the level of + and -
 _FLAT = ("&", "|", "+", "*")
 
 
@@ -146,7 +147,7 @@ class ExpressionParser(TokenReader):
         if kind == "quoted":
             return Expression("label", value=self.quoted("a label"), place=place)
         if not self.accept("("):
-            self.fail("an expression")
+            self.fail("an expression, such as a variable or a number")
         found = self.expression()
         self.expect(")", " or an operator")
         return found
@@ -167,9 +168,6 @@ class ExpressionParser(TokenReader):
             self.at -= 1
             self.fail("an expression")
         else:
-            if called:
-                self.at -= 1
-                self.fail(f"a variable, a constant, or one of {', '.join(FUNCTIONS)}")
             return Expression("name", value=text, place=place)
         if name not in FUNCTIONS:
             raise LanguageError(place, f"{name} is no function; there are {', '.join(FUNCTIONS)}.")

@@ -69,15 +69,15 @@ def read_program(
 
 def resolve(syntax: Syntax, constants: Mapping[str, object] | None = None) -> Program:
     """The program of a syntax tree; arguments, result and errors as of :func:`read_program`."""
-    given = {key: _given(key, value) for key, value in (constants or {}).items()}
+    given = {key: constant_value(key, value) for key, value in (constants or {}).items()}
     try:
         return _Resolver(syntax, given).program()
     except LanguageError as error:
         raise syntax.source.located(error) from None
 
 
-def _given(name: str, value: object) -> Value:
-    """A value that is given for a constant."""
+def constant_value(name: str, value: object) -> Value:
+    """A value that is given for a constant: a number, a Boolean, or the text of one."""
     if isinstance(value, str):
         try:
             parser = ExpressionParser(value)

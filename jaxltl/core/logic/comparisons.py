@@ -1,71 +1,68 @@
-"""Comparisons of a model's variables, such as ``x + y <= 3``, in properties."""
+"""Conditions on a model's variables, such as ``x + y <= 3``, in properties."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from fractions import Fraction
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxltl.core.array_types import Booleans
+from jaxltl.core.language.compiled import compile_expressions
+from jaxltl.core.language.expressions import Expression, Type, Value, literal, names_in, type_of
+from jaxltl.core.language.source import LanguageError
+from jaxltl.core.language.syntax import Program
 from jaxltl.core.pretty_print import brief
-
-RELATIONS: Mapping[str, np.ufunc] = {
-    "=": np.equal,
-    "!=": np.not_equal,
-    "<": np.less,
-    "<=": np.less_equal,
-    ">": np.greater,
-    ">=": np.greater_equal,
-}
-_OPERATIONS: Mapping[str, np.ufunc] = {
-    "+": np.add,
-    "-": np.subtract,
-    "*": np.multiply,
-    "/": np.divide,
-    **RELATIONS,
-}
 
 
 @brief(facts=lambda self: [self.text])
 @dataclass(frozen=True)
 class Comparison:
-    """A comparison of arithmetic expressions over variables.
+    """A Boolean expression over variables, such as a comparison.
 
     Attributes:
       text: as it was written.
-      program: numbers, names of variables and operators in postfix order.
+      expression: the tree, over the variables of a model.
 
     Example:
-      >>> both = Comparison("x < 2", ("x", Fraction(2), "<"))
+      >>> from jaxltl.core.language.parser import parse_expression
+      >>> both = Comparison("x < 2", parse_expression("x < 2"))
       >>> both.holds({"x": np.array([1, 2])}).tolist()
       [True, False]
     """
 
     text: str
-    program: tuple[str | Fraction, ...]
+    expression: Expression
 
     def holds(self, valuation: Mapping[str, ArrayLike]) -> Booleans:
         """The states ``bool[S]`` in which it holds; ValueError for an unknown variable."""
-        stack: list[NDArray[np.float64]] = []
-        for one in self.program:
-            if isinstance(one, Fraction):
-                stack.append(np.array(float(one)))
-            elif one in _OPERATIONS:
-                right, left = stack.pop(), stack.pop()
-                with np.errstate(all="ignore"):
-                    stack.append(_OPERATIONS[one](left, right))
-                if not np.isfinite(stack[-1]).all():
-                    raise ValueError(f"{self.text} divides by zero or overflows in some state.")
-            else:
-                stack.append(self._values(one, valuation))
+        names = sorted(names_in(self.expression))
+        values = {name: self._values(name, valuation) for name in names}
+        try:
+            kind = self._type(values)
+        except LanguageError as error:
+            # Files of other formats have Booleans as 0 and 1: ready=1.
+            values = {n: x.astype(np.int64) if x.dtype == bool else x for n, x in values.items()}
+            try:
+                kind = self._type(values)
+            except LanguageError:
+                raise ValueError(f"{self.text}: {error.message}") from None
+        if kind != "bool":
+            raise ValueError(f"{self.text} is a number; write a comparison, such as x>0.")
+        found, *parts = compile_expressions([self.expression, *_undefined(self.expression)])(values)
+        if not all(np.isfinite(x).all() for x in parts):
+            raise ValueError(f"{self.text} divides by zero or overflows in some state.")
         size = max((np.size(x) for x in valuation.values()), default=0)
-        found: Booleans = np.broadcast_to(stack.pop(), (size,))
-        return found
+        holds: Booleans = np.broadcast_to(np.asarray(found, bool), (size,))
+        return holds
 
-    def _values(self, name: str, valuation: Mapping[str, ArrayLike]) -> np.ndarray:
+    def _type(self, values: Mapping[str, NDArray[np.generic]]) -> Type:
+        types: dict[str, Type] = {n: _TYPES[x.dtype.kind] for n, x in values.items()}
+        return type_of(self.expression, types)
+
+    def _values(self, name: str, valuation: Mapping[str, ArrayLike]) -> NDArray[np.generic]:
         if name not in valuation:
             raise ValueError(
                 f"{self.text} mentions {name}, which is no variable of the model; it has "
@@ -74,4 +71,54 @@ class Comparison:
         values = np.asarray(valuation[name])
         if values.dtype.kind not in "biuf":
             raise ValueError(f"{self.text}: the variable {name} has no numbers as values.")
-        return values.astype(np.float64)
+        if values.dtype.kind in "iu":
+            return values.astype(np.int64)
+        return values.astype(np.float64) if values.dtype.kind == "f" else values
+
+
+def _undefined(expression: Expression) -> list[Expression]:
+    """The operands that are not finite everywhere."""
+    found = [x for operand in expression.operands for x in _undefined(operand)]
+    return [*found, expression] if expression.operator in ("/", "log", "pow") else found
+
+
+_TYPES: Mapping[str, Type] = {"b": "bool", "i": "int", "u": "int", "f": "double"}
+
+
+@dataclass(frozen=True)
+class Definitions:
+    """Names that properties may use, other than labels of the model.
+
+    Attributes:
+      names: the value of each constant and the expression of each formula.
+      variables: the variables of the model.
+      rewards: the names of the reward structures in their order, for ``R{2}`` and ``R=?``.
+      given: values of constants that a property file declares without one.
+
+    Example:
+      >>> from jaxltl.core.language.resolve import read_program
+      >>> p = read_program("dtmc const int N=3; module m x : [0..N]; [] true -> true; endmodule")
+      >>> sorted(program_definitions(p).names)
+      ['N']
+    """
+
+    names: Mapping[str, Expression] = field(default_factory=dict)
+    variables: tuple[str, ...] = ()
+    rewards: tuple[str, ...] = ()
+    given: Mapping[str, Value] = field(default_factory=dict)
+
+    @cached_property
+    def known(self) -> frozenset[str]:
+        """All names."""
+        return frozenset(self.names) | frozenset(self.variables)
+
+
+def program_definitions(program: Program, given: Mapping[str, Value] | None = None) -> Definitions:
+    """The constants, formulas, variables and rewards of a program."""
+    names = {name: literal(value) for name, value in program.constants.items()}
+    return Definitions(
+        names | program.formulas,
+        tuple(v.name for v in program.variables),
+        tuple(r.name for r in program.rewards),
+        given or {},
+    )

@@ -10,11 +10,13 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any, Literal
 
+from jaxltl.core.language.parser import SIMPLE
 from jaxltl.core.logic.bounded import Bounded, Earned, unfolded
-from jaxltl.core.logic.comparisons import RELATIONS, Comparison
+from jaxltl.core.logic.comparisons import Comparison, Definitions
 from jaxltl.core.logic.labels import is_boolean
 from jaxltl.core.logic.ltl import FALSE, TRUE, Formula
-from jaxltl.core.logic.property_tokens import Token, TokenStream
+from jaxltl.core.logic.property_expressions import ExpressionStream
+from jaxltl.core.logic.property_tokens import Token
 from jaxltl.core.pretty_print import brief
 
 Relation = Literal["<", "<=", ">", ">="]
@@ -80,7 +82,7 @@ class Property:
         return self.text
 
 
-def parse_properties(text: str) -> tuple[Property, ...]:
+def parse_properties(text: str, definitions: Definitions | None = None) -> tuple[Property, ...]:
     """The properties that a text writes, one after the other; a `;` may end each.
 
     Of a probability: `Pmax=? [ PATH ]`, `Pmin=?`, `P=?`, or a threshold such as `P>=0.9` or
@@ -100,8 +102,12 @@ def parse_properties(text: str) -> tuple[Property, ...]:
     `G F "a" & "b"` is `G F ("a" & "b")`. A property may have a name, `"p1": ...`, and `//`
     begins a comment.
 
+    A text may declare constants (``const int k = 3;``), formulas and labels as programs do, and
+    write constants in place of numbers.
+
     Args:
       text: one property or several.
+      definitions: names of a program that properties may use.
 
     Returns:
       The properties, in their order.
@@ -119,18 +125,19 @@ def parse_properties(text: str) -> tuple[Property, ...]:
     if not isinstance(text, str):
         raise ValueError(f"parse_properties: expected text, got {type(text).__name__} {text!r}.")
     try:
-        return _Parser(text).properties()
+        return _Parser(text, definitions or Definitions()).properties()
     except RecursionError:
         raise ValueError(
             "property: parentheses or operators are nested too deeply; split the formula."
         ) from None
 
 
-def parse_property(text: str) -> Property:
+def parse_property(text: str, definitions: Definitions | None = None) -> Property:
     """The one property in a text; see :func:`parse_properties`.
 
     Args:
       text: one property.
+      definitions: names of a program that it may use.
 
     Returns:
       The property.
@@ -142,7 +149,7 @@ def parse_property(text: str) -> Property:
       >>> print(parse_property('R{"steps"}min=? [ F "goal" ]').reward)
       steps
     """
-    found = parse_properties(text)
+    found = parse_properties(text, definitions)
     if len(found) != 1:
         raise ValueError(f"property: {text!r} holds {len(found)} properties; give one.")
     return found[0]
@@ -158,11 +165,11 @@ _Path = Formula | Bounded
 _STATE = "a state formula: labels in quotes, true, false, ! & | => <=>"
 
 
-class _Parser(TokenStream):
+class _Parser(ExpressionStream):
     """Recursive-descent parser; each method reads the construct of its name."""
 
-    def __init__(self, text: str) -> None:
-        super().__init__(text)
+    def __init__(self, text: str, known: Definitions) -> None:
+        super().__init__(text, known)
         self.definitions: dict[str, Comparison | Property] = {}  # of the property being read
 
     # --- properties ---
@@ -173,10 +180,8 @@ class _Parser(TokenStream):
             if self.accept(";"):
                 continue
             if self.token.text in ("const", "label", "formula") and self.token.kind == "word":
-                raise self.error(
-                    "a property; constants, labels and formulas are not read from "
-                    "property files: write numbers and the model's labels"
-                )
+                self.declaration()
+                continue
             name = None
             if self.token.kind == "quoted":
                 name = self.quoted()
@@ -199,9 +204,11 @@ class _Parser(TokenStream):
         operator, objective = ("LRA" if match[1] == "S" else match[1]), match[2]
         nature = match[3]
         reward = None
-        if operator == "R" and self.accept("{"):
-            reward = self.quoted()
-            self.expect("}")
+        if operator == "R":
+            reward = self.known.rewards[0] if self.known.rewards else None
+            if self.accept("{"):
+                reward = self.reward_name()
+                self.expect("}")
         if objective is None:  # R{"name"}max, with max after the name
             both = self.accept(*_DIRECTIONS) or ""
             objective, nature = both[:3] or None, both[3:] or None
@@ -344,9 +351,13 @@ class _Parser(TokenStream):
             name = self.quoted()
             if not name:
                 raise self.error("a label's name between the quotes", token)
+            if name in self.labels:
+                return self.defined(self.labels[name])
             return Formula("ap", proposition=name)
         if constant := self.accept("true", "false"):
             return Formula(constant)
+        if token.kind == "word" and token.text in self.known.known | self.names.keys():
+            return self.comparison_of_variables()
         if token.kind == "word" and token.text in "XFG":
             return self.prefixed()
         if token.kind == "word" and _OPERATOR.fullmatch(token.text):
@@ -371,6 +382,8 @@ class _Parser(TokenStream):
             self.expect("(")
             found = self.path()
             self.expect(")", " or an operator")
+            if self.token.text in _AFTER_OPERAND:
+                raise self.error("a Boolean operator")
             return found
         except ValueError:
             after, self.place, self.definitions = self.place, place, known
@@ -381,49 +394,31 @@ class _Parser(TokenStream):
 
     def comparison_of_variables(self) -> Formula:
         start = self.token
-        program = self.sum()
-        relation = self.accept(*RELATIONS)
-        if relation is None and len(program) == 1 and start.kind == "word":
+        found = self.expression(SIMPLE)
+        if found.is_literal and isinstance(found.value, bool):
+            return TRUE if found.value else FALSE
+        if found.operator == "name" and found.value not in self.known.variables:
             raise self.error(
                 f'a label in double quotes, such as "{start.text}", or a comparison of variables, '
                 f"such as {start.text}=1",
                 start,
             )
-        if relation is None:
+        if found.operator in _NUMBERS or found.is_literal:
             raise self.error("a comparison, such as x+1<=3")
-        program = (*program, *self.sum(), relation)
-        return self.defined(Comparison(self.text[start.start : self.last.end], program))
-
-    def sum(self) -> tuple[str | Fraction, ...]:
-        found = self.term()
-        while sign := self.accept("+", "-"):
-            found = (*found, *self.term(), sign)
-        return found
-
-    def term(self) -> tuple[str | Fraction, ...]:
-        found = self.factor()
-        while sign := self.accept("*", "/"):
-            found = (*found, *self.factor(), sign)
-        return found
-
-    def factor(self) -> tuple[str | Fraction, ...]:
-        if self.accept("-"):
-            return (Fraction(0), *self.factor(), "-")
-        if self.accept("("):
-            found = self.sum()
-            self.expect(")", " or an operator")
-            return found
-        if self.token.kind == "number":
-            return (self.plain_number(),)
-        if self.token.kind != "word":
-            raise self.error("a variable or a number")
-        return (self.take().text,)
+        return self.defined(Comparison(self.text[start.start : self.last.end], found))
 
     # --- bounds ---
 
     def bound(self) -> Bounded | None:
         """The bound after an operator, as one on nothing yet."""
         empty = Bounded("U", TRUE, TRUE)
+        if self.accept("^"):
+            self.expect("{", " and a bound on a reward")
+            self.expect("rew", " and the name of a reward")
+            self.expect("{", " and the name of a reward")
+            found = self.reward_bound()
+            self.expect("}")
+            return found
         if self.accept("rew"):
             self.expect("{", " and the name of a reward")
             return self.reward_bound()
@@ -452,7 +447,7 @@ class _Parser(TokenStream):
         )
 
     def reward_bound(self) -> Bounded:
-        reward = self.quoted()
+        reward = self.reward_name()
         self.expect("}")
         relation = self.accept("<=", "<")
         if relation is None:
@@ -535,6 +530,10 @@ class _Parser(TokenStream):
         if isinstance(found, Bounded) or found.operator != "F" or not is_boolean(found.operands[0]):
             raise self.error(wanted, start)
         return found
+
+
+_AFTER_OPERAND = ("=", "!=", "<", "<=", ">", ">=", "+", "-", "*", "/", "^", "?")
+_NUMBERS = ("+", "-", "*", "/", "neg", "min", "max", "floor", "ceil", "round", "pow", "mod", "log")
 
 
 _CONTENT: dict[str, Callable[[_Parser], Formula | Bounded | Earned]] = {

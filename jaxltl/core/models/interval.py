@@ -135,6 +135,10 @@ class IntervalMDP:
         """``bool[S]``, the states in which a proposition holds; ValueError for an unknown one."""
         return self.nominal.states_with_label(proposition)
 
+    def states_where(self, condition: str) -> np.ndarray:
+        """``bool[S]``, the states that satisfy a Boolean expression of variables, ``"x=3 & y>1"``."""
+        return self.nominal.states_where(condition)
+
     def changed(self, change: Callable[[SparseMDP], SparseMDP]) -> IntervalMDP:
         """The model after a change that drops, repeats or moves entries, but merges none."""
         ends = _travelling(self.lower, self.upper, self.center, self.radius)

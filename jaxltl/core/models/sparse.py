@@ -14,6 +14,8 @@ import numpy as np
 from jaxltl.core import struct
 from numpy.typing import DTypeLike
 
+from jaxltl.core.language.parser import parse_expression
+from jaxltl.core.logic.comparisons import Comparison
 from jaxltl.core.models import facts
 from jaxltl.core.models.mdp import checked_initial, checked_label
 from jaxltl.core.models.ops.array_namespace import is_traced
@@ -174,6 +176,10 @@ class SparseMDP:
                 f"{', '.join(self.propositions) or 'none'}."
             )
         return self.label[:, self.propositions.index(proposition)]
+
+    def states_where(self, condition: str) -> np.ndarray:
+        """``bool[S]``, the states that satisfy a Boolean expression of variables, ``"x=3 & y>1"``."""
+        return Comparison(condition, parse_expression(condition)).holds(self.valuation)
 
 
 def choice_reward(model: SparseMDP, reward: str | Rewards | chex.Array | None = None) -> np.ndarray:

@@ -7,7 +7,9 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
+from jaxltl.core.language.resolve import read_program
 from jaxltl.core.logic.bounded import Bounded, Earned, unfolded
+from jaxltl.core.logic.comparisons import program_definitions
 from jaxltl.core.logic.ltl import FALSE, TRUE, Formula, holds_on_lasso, parse_ltl
 from jaxltl.core.logic.properties import parse_properties, parse_property
 
@@ -253,7 +255,12 @@ WRONG = {
     'filter(min, P>=1 [ F "a" ])': ("'P'", "a number"),
     'filter(forall, P=? [ F "a" ])': ("'P'", "a threshold or a state formula"),
     'LRA=? [ F "a" ]': ("'F'", "a state formula"),
-    "const int k = 3;": ("'const'", "constants"),
+    "const int k = 3;": ("the end", "a property"),
+    "const int k = x; P=? [ F x=k ]": ("'k'", "constants"),
+    "const int k; P=? [ F x=k ]": ("'k'", "--const k="),
+    'const int k = 3; const int k = 4; P=? [ F "a" ]': ("'k'", "not declared yet"),
+    "P=? [ F x < ]": ("'\\]'", "an expression"),
+    "P=? [ F mod(x)=1 ]": ("'mod'", "mod takes 2 arguments"),
     'Q=? [ F "a" ]': ("'Q'", "a property"),
     'P=? [ F "a': ("'\"'", "never closed"),
     "P=? [ F # ]": ("'#'", "signs"),
@@ -296,3 +303,33 @@ def test_hostile_text_ends_soon():
         with pytest.raises(ValueError):
             parse_properties(text)
     assert time.process_time() - begin < 20
+
+
+def test_texts_declare_constants_formulas_and_labels():
+    text = """const int k = 2*3; const double p = 0.9; formula big = x > k; // a comment
+    label "far" = big & y; "first": P>=p [ F<=k "far" ]; R{"r"}<=k/2+1 [ F big ];
+    P>=1-p [ F[k-5,k] (x=k) ]"""
+    first, second, third = parse_properties(text)
+    assert (first.name, str(first.threshold), first.path.upper) == ("first", "9/10", 6)
+    ((_, far),) = first.definitions
+    assert str(far.expression) == "((x > 6) & y)"
+    assert (str(second.threshold), str(second.definitions[0][1].expression)) == ("4", "(x > 6)")
+    assert (third.path.lower, third.path.upper) == (1, 6)
+    assert float(third.threshold) == pytest.approx(0.1)
+
+
+def test_names_of_a_program_are_used_in_properties():
+    text = """mdp const int N = 4; formula even = mod(x, 2) = 0; module m x : [0..N]; T : bool;
+    [] true -> true; endmodule rewards true : 1; endrewards rewards "b" true : 1; endrewards"""
+    known = program_definitions(read_program(text), {"k": 3})
+    properties = """const int k; Pmax=? [ F even & !T & x<=N-k ]; R=? [ F T ]; R{2}max=? [ F T ];
+    Pmin=? [ F^{rew{"b"}<=N} (x = 0) ]; Pmin=? [ F{"b"}<=2 T ]; Pmin=? [ (T) U ((x+1)*2=N) ]"""
+    found = parse_properties(properties, known)
+    assert [str(d.expression) for _, d in found[0].definitions] == [
+        "(mod(x, 2) = 0)",
+        "T",
+        "(x <= 1)",
+    ]
+    assert [found[i].reward for i in (1, 2)] == ["", "b"]
+    assert (found[3].path.reward, found[3].path.limit) == ("b", 4)
+    assert len(found) == 6

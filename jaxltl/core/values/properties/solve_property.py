@@ -29,6 +29,7 @@ from jaxltl.core.values.properties.nested import filtered, with_definitions
 from jaxltl.core.values.properties.multi_objective import solve_multi_objective
 from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.logic.bounded import Bounded, Earned, unfolded
+from jaxltl.core.logic.comparisons import Definitions
 from jaxltl.core.logic.labels import is_boolean
 from jaxltl.core.logic.ltl import TRUE, Formula
 from jaxltl.core.logic.properties import MAX_UNFOLDED_STEPS, Property, parse_property
@@ -129,7 +130,9 @@ def solve_property(
       >>> solve_property(coin, 'P=? [ F "a" ]').value.tolist()
       [0.5]
     """
-    prop = parse_property(prop) if isinstance(prop, str) else prop
+    if isinstance(prop, str) and isinstance(model, SparseMDP | IntervalMDP):
+        known = Definitions(variables=tuple(_graph(model).valuation))
+        prop = parse_property(prop, known)
     if not isinstance(prop, Property):
         raise ValueError(f"prop is {validation.shorten(prop)}; give a property or its text.")
     if not isinstance(model, SparseMDP | IntervalMDP):
