@@ -14,12 +14,12 @@ from benchmarks import size
 
 PACKAGE = Path(jaxltl.__file__).parent
 LIMITS = {
-    "lines": 102_200,
-    "statements": 51_100,
-    "docstring lines": 16_795,
+    "lines": 102_580,
+    "statements": 51_335,
+    "docstring lines": 16_835,
     "functions with more than 6 parameters": 67,
     "functions with more than 9 parameters": 1,
-    "Any in annotations": 942,
+    "Any in annotations": 944,
     "modules of the largest folder": 20,
     "names at the top level": 80,
 }

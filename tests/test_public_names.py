@@ -31,6 +31,7 @@ PUBLIC = {
 }
 # Types inside of public ones that nobody has to name, in modules whose text tells of them.
 DOCUMENTED = (
+    "jaxltl.core.language",
     "jaxltl.algos",
     "jaxltl.envs.temporal_gridworld",
     "jaxltl.core.models.protocols",

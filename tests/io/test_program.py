@@ -47,7 +47,9 @@ def test_a_program_is_read_as_a_model(walk):
     x, tired = model.valuation["x"], model.valuation["tired"]
     assert model.states_where("x=3 | tired & x<1").tolist() == ((x == 3) | tired & (x < 1)).tolist()
     assert jl.solve_property(model, "Pmax=? [ F x=3 ]").value.tolist() == pytest.approx([0.5])
-    assert jl.solve_property(model, "Pmax=? [ F tired & x>2 ]").value.tolist() == pytest.approx([0.5])
+    assert jl.solve_property(model, "Pmax=? [ F tired & x>2 ]").value.tolist() == pytest.approx(
+        [0.5]
+    )
     assert model.states_where("tired=1 & x=3").sum() == 1
     with pytest.raises(ValueError, match="mentions y, which is no variable"):
         model.states_where("y=1")

@@ -1,4 +1,8 @@
-from .comparisons import Comparison as Comparison
+from .comparisons import (
+    Comparison as Comparison,
+    Definitions as Definitions,
+    program_definitions as program_definitions,
+)
 from .ltl import Formula as Formula, holds_on_lasso as holds_on_lasso, parse_ltl as parse_ltl
 from .properties import (
     Property as Property,

@@ -96,10 +96,8 @@ class Definitions:
       given: values of constants that a property file declares without one.
 
     Example:
-      >>> from jaxltl.core.language.resolve import read_program
-      >>> p = read_program("dtmc const int N=3; module m x : [0..N]; [] true -> true; endmodule")
-      >>> sorted(program_definitions(p).names)
-      ['N']
+      >>> sorted(Definitions(variables=("x", "y")).known)
+      ['x', 'y']
     """
 
     names: Mapping[str, Expression] = field(default_factory=dict)
@@ -114,7 +112,21 @@ class Definitions:
 
 
 def program_definitions(program: Program, given: Mapping[str, Value] | None = None) -> Definitions:
-    """The constants, formulas, variables and rewards of a program."""
+    """The constants, formulas, variables and rewards of a program, for ``parse_properties``.
+
+    Args:
+      program: of ``jaxltl.io.read_program``.
+      given: values of constants that the text of properties declares without one.
+
+    Returns:
+      :class:`Definitions`.
+
+    Example:
+      >>> from jaxltl.core.language.resolve import read_program
+      >>> p = read_program("dtmc const int N=3; module m x : [0..N]; [] true -> true; endmodule")
+      >>> sorted(program_definitions(p).known)
+      ['N', 'x']
+    """
     names = {name: literal(value) for name, value in program.constants.items()}
     return Definitions(
         names | program.formulas,

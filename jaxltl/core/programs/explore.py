@@ -14,6 +14,7 @@ from jaxltl.core.language.syntax import Program
 from jaxltl.core.programs.hash_table import HashTable
 from jaxltl.core.programs.layout import Layout, Words
 from jaxltl.core.programs.local_choices import Choices, LocalTable, ModuleCode
+from jaxltl.core.programs.narrow import LEVEL, search_narrow
 from jaxltl.core.programs.weights import Numbers, Weight
 from jaxltl.core.sparse.rows import concatenated_ranges
 
@@ -101,19 +102,20 @@ class _Search:
     def __init__(self, program: Program, layout: Layout, weights: Numbers, max_states: int) -> None:
         self.program, self.layout, self.weights = program, layout, weights
         self.max_states = max_states
-        codes = [ModuleCode(program, m, layout, weights) for m in program.modules]
-        self.tables = [LocalTable(code) for code in codes]
-        names = sorted({a for code in codes for a in code.actions if a})
+        self.codes = [ModuleCode(program, m, layout, weights) for m in program.modules]
+        self.tables = [LocalTable(code) for code in self.codes]
+        names = sorted({a for code in self.codes for a in code.actions if a})
         self.actions = ("", *names)
-        self.columns = _columns(codes, self.actions)
+        self.columns = _columns(self.codes, self.actions)
         self.known = HashTable(layout.num_words)
         self.output = _Output()
         self.num_transitions = 0
 
     def run(self, initial: Words, progress: Progress | None) -> Explored:
-        self.known.insert(initial)
-        num_initial = done = len(self.known)
-        done = 0
+        num_initial = initial[0].size
+        done = self._narrow(initial)
+        if progress is not None:
+            progress(len(self.known), done)
         while done < len(self.known):
             stop = min(len(self.known), done + _CHUNK)
             self.expand(self.known.words(done, stop))
@@ -134,6 +136,36 @@ class _Search:
             self.actions,
             num_initial,
         )
+
+    def _narrow(self, initial: Words) -> int:
+        """Expands small levels state by state; returns the number of states that are done."""
+        if type(self.weights) is not Numbers or initial[0].size >= LEVEL:
+            self.known.fill(initial)
+            return 0
+        parts = [column.parts for column in self.columns]
+        found = search_narrow(
+            self.program, self.codes, parts, self.layout, initial, self.max_states
+        )
+        self.known.fill(found.words(self.layout))
+        self._check_size()
+        rows, column, entries = found.arrays()
+        self.num_transitions = int(entries.sum())
+        out = self.output
+        out.row_count.append(rows)
+        out.action.append(self.action_of[column])
+        out.owner.append(self.owner_of[column])
+        out.entry_count.append(entries)
+        out.successor.append(np.array(found.successor, np.int32))
+        out.weight.append(np.array(found.weight, np.float64))
+        return found.done
+
+    def _check_size(self) -> None:
+        if len(self.known) > self.max_states:
+            raise LanguageError(
+                0,
+                f"more than {self.max_states} states are reachable; give a larger max_states, or "
+                "smaller constants.",
+            )
 
     def expand(self, words: Words) -> None:
         """Adds the choices and successors of some states."""
@@ -269,12 +301,7 @@ class _Search:
         assert weight is not None
         self.output.successor.append(self.known.insert(tuple(target)))
         self.output.weight.append(weight)
-        if len(self.known) > self.max_states:
-            raise LanguageError(
-                0,
-                f"more than {self.max_states} states are reachable; give a larger max_states, or "
-                "smaller constants.",
-            )
+        self._check_size()
 
 
 @dataclass

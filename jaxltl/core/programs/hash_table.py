@@ -44,6 +44,14 @@ class HashTable:
             found[part] = self._insert(tuple(w[part] for w in words))
         return found
 
+    def fill(self, words: Words) -> None:
+        """Numbers distinct keys in their order, in an empty table."""
+        self._grow(words[0].size)
+        for key, w in zip(self.keys, words, strict=True):
+            key[: w.size] = w
+        self.size = words[0].size
+        self._place_all()
+
     def _hash(self, words: Words) -> NDArray[np.int64]:
         mixed = words[0] * np.uint64(_FACTORS[0])
         for i, w in enumerate(words[1:], 1):
@@ -95,10 +103,13 @@ class HashTable:
             for k in self.keys
         ]
         self.slots = np.full(capacity, -1, np.int32)
+        self._place_all()
+
+    def _place_all(self) -> None:
         place = self._hash(self.words(0, self.size))
         number = np.arange(self.size, dtype=np.int32)
         while number.size:
             free = self.slots[place] < 0
             self.slots[place[free]] = number[free]
             rest = np.flatnonzero(self.slots[place] != number)
-            number, place = number[rest], (place[rest] + 1) & (capacity - 1)
+            number, place = number[rest], (place[rest] + 1) & (self.slots.size - 1)

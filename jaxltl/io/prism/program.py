@@ -11,7 +11,7 @@ from jaxltl.core.language.syntax import Program, Syntax
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.sparse import SparseMDP
-from jaxltl.core.programs.build import MAX_STATES, build_model
+from jaxltl.core.programs.build import MAX_STATES, build_model as build_model
 from jaxltl.io.files import read_text
 
 SUFFIXES = (".prism", ".pm", ".nm", ".sm", ".smg")

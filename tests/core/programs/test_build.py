@@ -3,12 +3,23 @@
 import numpy as np
 import pytest
 
+from jaxltl.core.language.expressions import literal, substitute
+from jaxltl.core.language.parser import parse_expression
 from jaxltl.core.language.resolve import read_program
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
-from jaxltl.core.programs import hash_table, local_choices
+from jaxltl.core.programs import explore, hash_table, local_choices, narrow
 from jaxltl.core.programs.build import build_model
 from jaxltl.core.values.properties.solve_property import solve_property
+
+
+@pytest.fixture(autouse=True, params=["single states", "arrays", "both"])
+def search(request, monkeypatch):
+    """Levels are expanded state by state, as arrays, or first in one way and then in the other."""
+    level = {"single states": 10**9, "arrays": 0, "both": 3}[request.param]
+    for module in (explore, narrow):
+        monkeypatch.setattr(module, "LEVEL", level)
+    return request.param
 
 
 def built(text, constants=None, **options):
@@ -199,8 +210,8 @@ def test_invalid_updates_name_command_and_state(command, says):
 
 def test_the_number_of_states_is_bounded():
     text = "mdp module m x : [0..1000000]; [] x<1000000 -> (x'=x+1); [] true -> (x'=0); endmodule"
-    with pytest.raises(ValueError, match="more than 5000 states"):
-        built(text, max_states=5000)
+    with pytest.raises(ValueError, match="more than 500 states"):
+        built(text, max_states=500)
     wide = "".join(
         f"module m{i} x{i} : [0..1]; {'[a] true -> true;' * 9} endmodule " for i in range(30)
     )
@@ -243,6 +254,38 @@ def test_many_wide_levels_need_parts_and_a_larger_table(monkeypatch):
     module n = m [x=y] endmodule module k = m [x=z] endmodule""")
     assert model.num_states == 41**3
     assert model.num_rows == 3 * 40 * 41**2 + 1
+
+
+EXPRESSIONS = [
+    "mod(x, 3) = 1 | mod(y - x, 2) = 0",
+    "x / 4 > y / 5 & floor(x / 2) <= ceil(y / 2)",
+    "(b ? x : y) >= min(3, x, y + 1)",
+    "max(x) != round(y / 2) => b",
+    "b <=> (x > y)",
+    "pow(x, 2) - 2 * y < log(y + 1, 2) * 3",
+    "!(x + 1 = y) & -x < -1",
+    "pow(2, x / 2) > y",
+]
+
+
+@pytest.mark.parametrize("guard", EXPRESSIONS)
+def test_guards_and_updates_are_those_of_folded_literals(guard):
+    """Every combination of values is an initial state, and a self-loop where the guard holds."""
+    update = "(x'=min(4, mod(x * 3 + y, 7))) & (b'=(x > 2) = b)"
+    text = f"""mdp module m x : [0..4]; y : [0..5]; b : bool; go : bool;
+    [yes] !go & {guard.join("()")} -> x/8 : {update} & (go'=true) + 1-x/8 : (go'=true);
+    [no] !go & !({guard}) -> (go'=true); [] go -> true; endmodule init !go endinit"""
+    model, tree = built(text), parse_expression(guard)
+    for (x, y, b, go), choices in rows(model).items():
+        if go:
+            continue
+        values = {"x": literal(x), "y": literal(y), "b": literal(bool(b))}
+        holds = substitute(tree, values).value
+        ((action, successors),) = choices
+        assert action == ("yes" if holds else "no")
+        if holds and x:
+            target = min(4, (x * 3 + y) % 7), y, int((x > 2) == bool(b)), 1
+            assert successors[target] == pytest.approx(x / 8 if target != (x, y, b, 1) else 1)
 
 
 def test_progress_is_reported():

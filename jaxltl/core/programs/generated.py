@@ -1,0 +1,135 @@
+"""Python code of the commands of a module, for the expansion of single states."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+from jaxltl.core.language.expressions import SCALAR, Expression, names_in
+from jaxltl.core.language.syntax import Command, Module
+from jaxltl.core.programs.layout import Layout
+from jaxltl.core.validation import ROW_SUM_TOLERANCE
+
+# Joint updates of a state as (difference of the packed state, probability).
+Updates = tuple[tuple[int, float], ...]
+Local = Callable[[int], tuple[list[Updates], ...]]  # of a packed state, for each action
+
+_MAX_SIZE = 20_000  # nodes of a module's expressions; compilation takes a microsecond for each
+_INFIX = {
+    "&": " and ",
+    "|": " or ",
+    "=": " == ",
+    "<=>": " == ",
+    "!=": " != ",
+    **{x: f" {x} " for x in ("<", "<=", ">", ">=", "+", "-", "*")},
+}
+
+
+class Unsupported(Exception):
+    """A state or a program that is left to the vectorised search, which also names errors."""
+
+
+def generate(module: Module, actions: tuple[str, ...], layout: Layout) -> Local:
+    """A function of packed states to the enabled commands of a module, for each of its actions.
+
+    Raises:
+      Unsupported: the module is too large or too deep for Python's compiler.
+    """
+    expressions = [e for c in module.commands for e in _expressions(c)]
+    if sum(e.size for e in expressions) > _MAX_SIZE:
+        raise Unsupported
+    names = sorted({n for e in expressions for n in names_in(e)} | _assigned(module))
+    local = {name: f"v{i}" for i, name in enumerate(names)}
+    lines = ["def local(s):"]
+    for name in names:
+        field = layout.fields[name]
+        v, shift = field.variable, field.shift + 64 * field.word
+        low = f" + {v.low}" if v.low else ""
+        lines.append(f"    {local[name]} = ((s >> {shift}) & {(1 << v.bits) - 1}){low}")
+    lines += [f"    a{i} = []" for i in range(len(actions))]
+    for c in module.commands:
+        lines.append(f"    if {_source(c.guard, local)}:")
+        lines += [f"        {x}" for x in _command(c, actions.index(c.action), layout, local)]
+    lines.append(f"    return {', '.join(f'a{i}' for i in range(len(actions)))},")
+    space: dict[str, Any] = {"apply": SCALAR, "check": _check, "Unsupported": Unsupported}
+    try:
+        exec(compile("\n".join(lines), "<generated>", "exec"), space)
+    except (SyntaxError, RecursionError, MemoryError):
+        raise Unsupported from None
+    found: Local = space["local"]
+    return found
+
+
+def _expressions(c: Command) -> list[Expression]:
+    outcomes = [
+        e for o in c.outcomes for e in (o.probability, *(a.expression for a in o.assignments))
+    ]
+    return [c.guard, *outcomes]
+
+
+def _assigned(module: Module) -> set[str]:
+    return {a.variable for c in module.commands for o in c.outcomes for a in o.assignments}
+
+
+def _command(c: Command, column: int, layout: Layout, local: dict[str, str]) -> list[str]:
+    """Lines that append the updates of an enabled command."""
+    lines, pairs, constant = [], [], True
+    for k, o in enumerate(c.outcomes):
+        change = []
+        for i, a in enumerate(o.assignments):
+            field = layout.fields[a.variable]
+            v, shift = field.variable, field.shift + 64 * field.word
+            new = f"n{k}_{i}"
+            lines.append(f"{new} = {_source(a.expression, local)}")
+            if v.type == "int" and not _in_range(a.expression, v.low, v.high):
+                lines.append(f"if {new} < {v.low} or {new} > {v.high}: raise Unsupported")
+            difference = f"{new} - {local[a.variable]}"
+            change.append(f"(({difference}) << {shift})" if shift else f"({difference})")
+        constant = constant and o.probability.is_literal
+        pairs.append(f"({' + '.join(change) or '0'}, {_source(o.probability, local)})")
+    updates = f"({', '.join(pairs)},)"
+    values = [o.probability.value for o in c.outcomes]
+    if constant:
+        _check([(0, float(x)) for x in values if x is not None and not isinstance(x, str)])
+        if all(values):
+            return [*lines, f"a{column}.append({updates})"]
+    return [*lines, f"a{column}.append(check({updates}))"]
+
+
+def _in_range(e: Expression, low: int, high: int) -> bool:
+    return e.is_literal and isinstance(e.value, int) and low <= e.value <= high
+
+
+def _check(updates: Any) -> Updates:
+    """Updates with positive probabilities, which must sum to one."""
+    total = sum([p for _, p in updates])
+    if not abs(total - 1) <= ROW_SUM_TOLERANCE or min([p for _, p in updates]) < 0:
+        raise Unsupported
+    return tuple([(d, float(p)) for d, p in updates if p])
+
+
+def _source(e: Expression, local: dict[str, str]) -> str:
+    """An expression as Python code."""
+    if e.operator == "literal":
+        if isinstance(e.value, float) and not math.isfinite(e.value):
+            raise Unsupported
+        return (
+            f"({e.value!r})"
+            if not isinstance(e.value, bool) and str(e.value)[0] == "-"
+            else repr(e.value)
+        )
+    if e.operator == "name":
+        return local[str(e.value)]
+    parts = [_source(x, local) for x in e.operands]
+    if e.operator in _INFIX:
+        return f"({_INFIX[e.operator].join(parts)})"
+    if e.operator == "?:":
+        return f"({parts[1]} if {parts[0]} else {parts[2]})"
+    if e.operator == "!":
+        return f"(not {parts[0]})"
+    if e.operator == "neg":
+        return f"(-{parts[0]})"
+    if e.operator in ("min", "max") and len(parts) > 1:
+        return f"{e.operator}({', '.join(parts)})"
+    return f"apply[{e.operator!r}]({', '.join(parts)})"

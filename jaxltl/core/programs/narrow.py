@@ -1,0 +1,184 @@
+"""Breadth-first search state by state, while levels are too small for arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxltl.core.language.syntax import Program
+from jaxltl.core.programs.generated import Local, Unsupported, Updates, generate
+from jaxltl.core.programs.layout import Layout, Words
+from jaxltl.core.programs.local_choices import ModuleCode
+
+LEVEL = 400  # states of a level from which arrays are faster (benchmarks/programs.py)
+_MAX_UPDATES = 2**12  # of a state
+_WORD = 2**64 - 1
+
+# Of a module: choices of its own with the number of their column, and joint ones by column.
+_Choices = tuple[list[tuple[int, Updates]], dict[int, list[Updates]]]
+
+
+@dataclass
+class Narrow:
+    """States that were expanded one by one, and their choices; lists of Python's numbers."""
+
+    known: dict[int, int]
+    keys: list[int]
+    done: int = 0  # states that are expanded
+    row_count: list[int] = field(default_factory=list)
+    column: list[int] = field(default_factory=list)
+    entry_count: list[int] = field(default_factory=list)
+    successor: list[int] = field(default_factory=list)
+    weight: list[float] = field(default_factory=list)
+
+    def words(self, layout: Layout) -> Words:
+        """The states as packed words."""
+        return tuple(
+            np.array([k >> (64 * w) & _WORD for k in self.keys], np.uint64)
+            for w in range(layout.num_words)
+        )
+
+    def arrays(self) -> tuple[NDArray[np.int32], NDArray[np.int64], NDArray[np.int64]]:
+        """Numbers of choices, columns of choices, and numbers of successors."""
+        return (
+            np.array(self.row_count, np.int32),
+            np.array(self.column, np.int64),
+            np.array(self.entry_count, np.int64),
+        )
+
+
+def search_narrow(
+    program: Program,
+    codes: Sequence[ModuleCode],
+    parts: Sequence[tuple[tuple[int, int], ...]],
+    layout: Layout,
+    initial: Words,
+    max_states: int,
+) -> Narrow:
+    """Expands levels of fewer than 400 states, up to the first larger one.
+
+    A level is not expanded, and the search ends, if it has a state that is left to the vectorised
+    search: one with very many successors or an invalid update.
+
+    Args:
+      parts: of each column (synchronisation) the modules and their columns.
+    """
+    keys = [0] * initial[0].size
+    for w, word in enumerate(initial):
+        keys = [k | x << (64 * w) for k, x in zip(keys, word.tolist(), strict=True)]
+    found = Narrow({k: i for i, k in enumerate(keys)}, keys)
+    try:
+        modules = [
+            _Module(generate(m, code.actions, layout), i, code, parts)
+            for i, (m, code) in enumerate(zip(program.modules, codes, strict=True))
+        ]
+    except Unsupported:
+        return found
+    while found.done < len(keys) <= max_states and len(keys) - found.done < LEVEL:
+        marks = [len(x) for x in (keys, found.row_count, found.column, found.successor)]
+        try:
+            for key in keys[found.done : marks[0]]:
+                _expand(key, modules, parts, found)
+            found.done = marks[0]
+        except (Unsupported, ArithmeticError, ValueError):
+            _undo(found, marks)
+            break
+    return found
+
+
+class _Module:
+    """Choices of a module by the bits of the variables that it uses."""
+
+    def __init__(
+        self,
+        local: Local,
+        number: int,
+        code: ModuleCode,
+        parts: Sequence[tuple[tuple[int, int], ...]],
+    ) -> None:
+        self.local = local
+        self.mask = sum(m << (64 * w) for w, m in enumerate(code.support))
+        self.known: dict[int, _Choices] = {}
+        self.alone: list[tuple[int, int]] = []  # column, and the module's own
+        self.joint: list[tuple[int, int]] = []
+        for i, part in enumerate(parts):
+            for m, c in part:
+                if m == number:
+                    (self.alone if len(part) == 1 else self.joint).append((i, c))
+
+    def choices(self, key: int) -> _Choices:
+        found = self.known.get(key & self.mask)
+        if found is None:
+            rows = self.local(key)
+            own = [(i, updates) for i, c in self.alone for updates in rows[c]]
+            joint = {i: rows[c] for i, c in self.joint if rows[c]}
+            found = self.known[key & self.mask] = own, joint
+        return found
+
+
+def _expand(
+    key: int, modules: list[_Module], parts: Sequence[tuple[tuple[int, int], ...]], found: Narrow
+) -> None:
+    """Adds the choices and the new successors of a state."""
+    local = [m.choices(key) for m in modules]
+    before = len(found.column)
+    for m, (own, joint) in enumerate(local):
+        for column, updates in own:
+            _add(key, column, updates, found)
+        for column, rows in joint.items():
+            first, *others = parts[column]
+            if first[0] != m:
+                continue
+            together = [rows]
+            for other, _ in others:
+                more = local[other][1].get(column)
+                if more is None:
+                    break
+                together.append(more)
+            else:
+                for updates in _joint(together):
+                    _add(key, column, updates, found)
+    found.row_count.append(len(found.column) - before)
+
+
+def _joint(together: list[list[Updates]]) -> list[Updates]:
+    """The joint updates of every combination of commands."""
+    size = 1
+    for rows in together:
+        size *= sum(map(len, rows))
+    if size > _MAX_UPDATES:
+        raise Unsupported
+    found = together[0]
+    for rows in together[1:]:
+        found = [
+            tuple([(d + e, p * q) for d, p in one for e, q in other])
+            for one, other in product(found, rows)
+        ]
+    return found
+
+
+def _add(key: int, column: int, updates: Updates, found: Narrow) -> None:
+    known = found.known
+    for change, probability in updates:
+        target = key + change
+        number = known.get(target)
+        if number is None:
+            number = known[target] = len(found.keys)
+            found.keys.append(target)
+        found.successor.append(number)
+        found.weight.append(probability)
+    found.column.append(column)
+    found.entry_count.append(len(updates))
+
+
+def _undo(found: Narrow, marks: list[int]) -> None:
+    """Removes the choices and successors of a level."""
+    size, states, rows, entries = marks
+    for key in found.keys[size:]:
+        del found.known[key]
+    del found.keys[size:], found.row_count[states:], found.column[rows:], found.entry_count[rows:]
+    del found.successor[entries:], found.weight[entries:]
