@@ -376,12 +376,8 @@ def _render(result: Automaton, form: str, formula: str) -> str:
     help="Width of the bounds: absolute for probabilities, else relative.",
 )
 @click.option("--json", "as_json", is_flag=True, help="End with the results as one JSON line.")
-@click.option(
-    "--const", "constants", metavar="NAME=VALUE,...", help="Constants of a program, as N=64,MAX=4."
-)
-@click.option(
-    "--max-states", type=click.IntRange(1), help="Most states of a program; default 10 million."
-)
+@click.option("--const", "constants", metavar="N=64,MAX=4", help="Constants of a program.")
+@click.option("--max-states", type=click.IntRange(1), help="Most states of a program.")
 @click.option(
     "--checkpoint",
     type=click.Path(path_type=Path),
@@ -401,9 +397,7 @@ def solve(
     checkpoint: Path | None,
     devices: processes.DeviceOptions,
 ) -> None:
-    """Solve properties of a Markov chain or decision process, with certified bounds.
-
-    MODEL is a model file, or a program in the PRISM language with --const for its constants.
+    """Solve properties of a model, or of a program in the PRISM language, with certified bounds.
 
     A PROPERTY is written as for PRISM and Storm, such as 'Pmax=? [ F "goal" ]',
     'R{"time"}min=? [ C<=10 ]', 'P>=0.9 [ G !"crash" ]', or any formula of linear temporal logic in
@@ -418,22 +412,15 @@ def solve(
     launch = processes.launched(devices)
     say = _say_once(launch)
     say(_first_line(f"solving {model_file}"))
-    for option, given, with_mesh in (
-        ("--strategy", strategy, False),
-        ("--checkpoint", checkpoint, True),
-    ):
+    options = (("--strategy", strategy, False), ("--checkpoint", checkpoint, True))
+    for option, given, with_mesh in options:
         if given is not None and (devices.mesh is not None) != with_mesh:
             raise ValueError(f"{option} goes {'with' if with_mesh else 'without'} --mesh alone.")
     if devices.mesh is not None:
         compilation.use_cache(True)
     from jaxltl.app import solve as solving
 
-    program, definitions = solving.read_source(model_file, constants, properties)
-    if program is not None and devices.mesh is not None:
-        raise ValueError(f"--mesh takes built models; {model_file} is a program.")
-    questions = solving.parse_queries(properties, definitions)
-    if all(one.parsed is None for one in questions):
-        raise ValueError("\n".join(str(one.error) for one in questions))
+    program, questions = solving.read_queries(model_file, constants, properties, devices.mesh)
     from jaxltl.core.files import atomic_write
 
     # Before the work, since the directory may not be writable.

@@ -97,7 +97,20 @@ def _text_of(path: Path) -> str:
         raise ValueError(f"cannot read {str(path)!r}: {error.strerror}.") from None
 
 
-def read_source(
+def read_queries(
+    path: Path, constants: str | None, arguments: Sequence[str], mesh: object = None
+) -> tuple[Program | None, list[Query]]:
+    """The program, if the model file is one, and the properties; ValueError if none is well-formed."""
+    program, definitions = _read_source(path, constants, arguments)
+    if program is not None and mesh is not None:
+        raise ValueError(f"--mesh takes built models; {path} is a program.")
+    queries = parse_queries(arguments, definitions)
+    if all(one.parsed is None for one in queries):
+        raise ValueError("\n".join(str(one.error) for one in queries))
+    return program, queries
+
+
+def _read_source(
     path: Path, constants: str | None, arguments: Sequence[str]
 ) -> tuple[Program | None, Definitions | None]:
     """The program of a file in the PRISM language, and the names that properties may use.

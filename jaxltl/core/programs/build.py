@@ -238,6 +238,8 @@ def _reward_parts(
         if action not in found.actions:
             continue
         rows = np.flatnonzero(found.action == found.actions.index(action))
+        if not rows.size:
+            continue
         some = [i for i in items if i.action == action]
         earned = _earned(program, found, weights, some, of_row[rows])
         choices = np.zeros(of_row.size, earned.dtype) if choices is None else choices

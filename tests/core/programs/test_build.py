@@ -93,7 +93,8 @@ def test_overlapping_commands_of_a_chain_are_equally_likely():
 
 def test_rewards_of_states_and_of_actions():
     model = built("""mdp module m x : [0..2]; [a] x<2 -> (x'=x+1); [] x=1 -> true; [b] x=2 -> true;
-    endmodule rewards "r" x>0 : 2*x; true : 1; [a] x=0 : 5; [] true : 7; [b] x=0 : 9; [c] true : 4;
+    [off] x>5 -> true; endmodule
+    rewards "r" x>0 : 2*x; [off] true : 1; true : 1; [a] x=0 : 5; [] true : 7; [b] x=0 : 9; [c] true : 4;
     endrewards rewards true : 1; endrewards""")
     assert set(model.rewards) == {"r", ""}
     assert model.rewards["r"].state.tolist() == [1, 3, 5]
