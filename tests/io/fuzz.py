@@ -8,9 +8,11 @@ import gzip
 import io
 import json
 import lzma
+import re
 import resource
 import tarfile
 import time
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,6 +25,7 @@ from jaxltl.io.drn.drn import read_drn, write_drn
 from jaxltl.io.drn.parametric import read_parametric
 from jaxltl.io.hoa.game import read_hoa_game
 from jaxltl.io.log import read_log
+from jaxltl.io.model_files import read_model
 from jaxltl.io.npz import read_npz, write_npz
 from jaxltl.io.pgsolver import read_pgsolver
 from jaxltl.io.prism.explicit import read_prism, write_prism
@@ -35,6 +38,7 @@ from tests.io.test_drn import MDP as DRN
 from tests.io.test_hoa_game import ARBITER
 from tests.io.test_parametric import CHAIN as PARAMETRIC
 from tests.io.test_pgsolver import EXAMPLE
+from tests.io.test_program import PROGRAMS
 from tests.io.test_reward_machine import OFFICE
 
 MOST_SECONDS = 5.0  # of processor time, for one small file
@@ -388,7 +392,37 @@ def _texts(*samples: str) -> Callable[[Path], list[bytes]]:
 
 _drn = _written(write_drn, "sample.drn")
 
+_WORDS = (
+    b"module endmodule init endinit rewards endrewards player endplayer label formula const int "
+    b"double bool global true false x y -> => <=> ? : [ ] .. ' ( ) = != & | ! + - * / ^ , ; min( "
+    b"pow( mod( log( floor( 0.5 0 -1 1e400 10000000000 99999999999999999999 " + b"(" * 70
+).split()
+
+
+def damaged_program(rng: np.random.Generator, data: bytes) -> bytes:
+    """A program with its bytes changed, or some of its words and signs."""
+    if rng.integers(2):
+        return mutated(rng, data)
+    words = re.split(rb"(\W)", data)
+    for i in rng.integers(len(words), size=rng.integers(1, 4)):
+        words[i] = _WORDS[rng.integers(len(_WORDS))]
+    return b"".join(words)
+
+
+def _read_program(path: Path) -> Any:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            return read_model(path, constants="N=4", max_states=10_000)
+        except ValueError as error:
+            assert "\n" not in str(error), error
+            placed = ", line " in str(error) and ", column " in str(error)
+            assert placed or "has no constant" in str(error) or "UTF-8" in str(error), error
+            raise
+
+
 READERS = {
+    "program": Reader(_read_program, ".prism", _texts(*PROGRAMS), damaged_program),
     "umb": Reader(read_umb, ".umb", umb_samples, damaged_archive),
     "npz": Reader(read_npz, ".npz", npz_samples, damaged_arrays),
     "drn": Reader(read_drn, ".drn", lambda folder: [DRN.encode(), *_drn(folder)]),

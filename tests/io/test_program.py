@@ -26,6 +26,29 @@ endmodule
 label "lost" = x=0;
 rewards "time" [slow] true : 2; [fast] true : 1; endrewards
 """
+RELAY = """// a token passed on through copies of a module, with losses
+dtmc
+const int N; const double loss = 1 / (2 * N); global lost : [0..N];
+formula all = t1 + t2;
+module m1
+  t1 : [0..1] init 1;
+  [pass] t1=1 -> (t1'=0);
+  [] t1=0 & lost<N & t2=0 -> loss : (t1'=1) & (lost'=min(lost+1, N)) + 1-loss : (t1'=1);
+endmodule
+module m2 = m1 [t1=t2, t2=t1, pass=back] endmodule
+module ticks c : [0..3]; [pass] true -> (c'=mod(c+1, 4)); [back] c!=2 -> true; endmodule
+rewards all>1 : 2; [pass] true : lost/N; endrewards
+label "late" = lost=N & !(c=3);
+"""
+GAME = """smg
+const int N; player a m endplayer player b n endplayer
+global turn : [0..1];
+module m x : [0..N]; [] turn=0 & x<N -> [0.4,0.6] : (x'=x+1) & (turn'=1) + [0.4,0.6] : (turn'=1);
+  [] turn=0 -> (turn'=1); endmodule
+module n y : [0..1]; [] turn=1 -> (turn'=0) & (y'=1-y); endmodule
+label "goal" = x=N;
+"""
+PROGRAMS = (WALK, RELAY, GAME)
 PROPERTIES = """const int k; // given from outside
 const double half = 1/2; label "there" = far;
 "win": Pmax=? [ F "there" ]; "time": R{"time"}min=? [ F far | "lost" ];
@@ -120,11 +143,8 @@ def test_deadlocks_are_reported_by_the_command(tmp_path, capsys):
 
 
 def test_game_files_take_programs(tmp_path):
-    (tmp_path / "g.prism").write_text("""smg const int N; player a m endplayer player b n endplayer
-    global turn : [0..1];
-    module m x : [0..N]; [] turn=0 & x<N -> (x'=x+1) & (turn'=1); [] turn=0 -> (turn'=1); endmodule
-    module n y : [0..1]; [] turn=1 -> (turn'=0) & (y'=1-y); endmodule
-    label "goal" = x=N;""")
+    game = GAME.replace("[0.4,0.6] : (turn", "0.5 : (turn").replace("[0.4,0.6]", "0.5")
+    (tmp_path / "g.prism").write_text(game)
     path = tmp_path / "g.toml"
     path.write_text('[game]\nmodel = "g.prism"\nconstants = "N=2"\n[task]\nformula = "F goal"\n')
     world = load_game(read_game(path))

@@ -11,6 +11,8 @@ import numpy as np
 
 from jaxltl.core.language.expressions import Expression
 
+_UNDEFINED = -(2**30)  # a value beyond the ranges of variables, which updates refuse
+
 
 @dataclass(frozen=True)
 class Compiled:
@@ -35,7 +37,7 @@ class Compiled:
 
         Returns:
           An array for each expression; those without variables are scalars. Division by zero is
-          infinite or NaN, and a modulus by a number that is not positive is 0.
+          infinite or NaN, and a modulus by a number that is not positive is -2^30.
         """
         read = values if callable(values) else values.__getitem__
         slots: list[Any] = [read(name) for name in self.names]
@@ -105,7 +107,7 @@ def _operations(xp: Any) -> dict[str, Callable[..., Any]]:
     """Operators on arrays of a namespace."""
 
     def modulo(a: Any, b: Any) -> Any:
-        return xp.where(xp.asarray(b) > 0, xp.mod(a, xp.maximum(b, 1)), 0)
+        return xp.where(xp.asarray(b) > 0, xp.mod(a, xp.maximum(b, 1)), _UNDEFINED)
 
     def power(a: Any, b: Any) -> Any:
         if xp.result_type(a, b).kind in "iu":
@@ -152,6 +154,6 @@ def _operations(xp: Any) -> dict[str, Callable[..., Any]]:
 
 
 def _integers(xp: Any, a: Any) -> Any:
-    """Whole doubles as integers; those that are not finite become the least integer."""
+    """Whole doubles as integers; others become a number beyond every range."""
     dtype = np.int64 if xp is np else xp.asarray(0).dtype
-    return xp.where(xp.abs(a) < 2**53, a, -(2**30)).astype(dtype)
+    return xp.where(xp.abs(a) < 2**53, a, _UNDEFINED).astype(dtype)

@@ -147,7 +147,8 @@ class _Resolver:
         modules = self.renamed(
             tuple(
                 _Changed(expand).module(m) if isinstance(m, Module) else m for m in syntax.modules
-            )
+            ),
+            formulas,
         )
         self.check_names(modules)
         constants = self.constant_values(expand)
@@ -194,7 +195,9 @@ class _Resolver:
             done[name] = substitute(table[name], done)
         return {name: done[name] for name in table}
 
-    def renamed(self, modules: tuple[Module | RenamedModule, ...]) -> list[Module]:
+    def renamed(
+        self, modules: tuple[Module | RenamedModule, ...], formulas: Mapping[str, Expression]
+    ) -> list[Module]:
         found: dict[str, Module] = {}
         for m in modules:
             if m.name in found:
@@ -205,7 +208,7 @@ class _Resolver:
                         m.place,
                         f"there is no module {m.base} before {m.name} that could be copied.",
                     )
-                m = _renamed(found[m.base], m)
+                m = _renamed(found[m.base], m, formulas)
             found[m.name] = m
         return list(found.values())
 
@@ -348,7 +351,7 @@ def _in_order(needs: Mapping[str, tuple[set[str], int]], what: str) -> list[str]
     return list(order)
 
 
-def _renamed(base: Module, renaming: RenamedModule) -> Module:
+def _renamed(base: Module, renaming: RenamedModule, formulas: Mapping[str, Expression]) -> Module:
     """The copy of a module, after formulas have been substituted."""
     names = dict(renaming.renaming)
     memory: dict[int, Expression] = {}
@@ -365,6 +368,14 @@ def _renamed(base: Module, renaming: RenamedModule) -> Module:
         memory[id(e)] = found
         return found
 
+    for old, new in renaming.renaming:
+        # PRISM renames within the formula, Storm takes the other formula.
+        if old in formulas and new in formulas and rename(formulas[old]) != formulas[new]:
+            raise LanguageError(
+                renaming.place,
+                f"the formula {old} with renamed variables is not the formula {new}; rename the "
+                "variables alone, or make them equal.",
+            )
     for d in base.declarations:
         if d.name not in names:
             raise LanguageError(
