@@ -9,7 +9,7 @@ coordinate of the state; the rest of the noise is treated as chosen by an advers
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -19,11 +19,10 @@ import scipy.optimize
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.continuous.grid import Grid
-from jaxltl.core.continuous.noise_gains import conditioning_order, gain_bounds, gain_program
+from jaxltl.core.continuous.noise_gains import Step, conditioning_order, gain_bounds, gain_program
 from jaxltl.core.enclosures.interval import Interval
 from jaxltl.core.enclosures.linear_bounds import AffineForm, propagate
-from jaxltl.core.enclosures.program import Program, make_program
-from jaxltl.core.models.protocols import PyTree
+from jaxltl.core.enclosures.program import Program
 from jaxltl.core.pretty_print import brief
 
 LARGEST_BLOCK = 16  # cells along an axis; each level of blocks is a quarter as long
@@ -78,9 +77,6 @@ class NoiseBox:
     lost: float = 0.0
 
 
-Step = Callable[[PyTree, PyTree, PyTree], PyTree]
-
-
 def image_boxes(
     step: Step, grid: Grid, cells: Integers, actions: Floats, noise: NoiseBox
 ) -> Images:
@@ -90,7 +86,9 @@ def image_boxes(
       ValueError: if `step` cannot be traced or enclosed, with the place.
     """
     cells = np.asarray(cells)
-    programs = _programs(step, grid.num_axes, actions.shape[1], len(noise.low))
+    sizes = grid.num_axes, actions.shape[1], len(noise.low)
+    with jax.enable_x64(True):
+        program = gain_program(step, [jax.ShapeDtypeStruct((k,), np.float64) for k in sizes])
     num_actions, n = len(actions), grid.num_axes
     low = np.empty((len(cells), num_actions, n))
     high, gain, varying = np.empty_like(low), np.empty_like(low), np.empty_like(low)
@@ -104,7 +102,7 @@ def image_boxes(
         # The largest blocks are few, and decide the order of the coordinates for all cells.
         many = max(len(start), 1) if usual is None else max(_ROWS // num_actions, 1)
         for first in range(0, len(start), many):
-            form = _forms(programs, grid, start[first : first + many], size, actions, noise)
+            form = _forms(program, grid, start[first : first + many], size, actions, noise)
             if usual is None:
                 order, noise_of = _assigned(form, noise)
             random = _random_part(form, noise, noise_of, usual)
@@ -141,14 +139,6 @@ def _compact(rows: Floats) -> Floats:
     return np.broadcast_to(rows[0].copy(), rows.shape) if (rows == rows[:1]).all() else rows
 
 
-def _programs(step: Step, n: int, m: int, k: int) -> tuple[Program, Program | None]:
-    """The step function and its gains as programs on state, action and noise in float64."""
-    with jax.enable_x64(True):
-        specs = [jax.ShapeDtypeStruct((size,), np.float64) for size in (n, m, k)]
-        program = make_program(lambda x, u, w: step(x, u, w), *specs)
-        return program, gain_program(program, step, specs) if k else None
-
-
 def _block_sizes(shape: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
     size = LARGEST_BLOCK
     while size >= 1:
@@ -173,7 +163,7 @@ class _Forms:
 
 
 def _forms(
-    programs: tuple[Program, Program | None],
+    program: Program,
     grid: Grid,
     start: Integers,
     size: tuple[int, ...],
@@ -192,12 +182,12 @@ def _forms(
         block, action = row // num_actions, actions[row % num_actions]
         wide = np.broadcast_to(noise.low, (len(row), k)), np.broadcast_to(noise.high, (len(row), k))
         boxes = [Interval(first[block], last[block]), Interval(action, action), Interval(*wide)]
-        known = propagate(programs[0], boxes)
-        (y,) = programs[0].outputs
+        known = propagate(program, boxes)
+        y = program.outputs[0]
         bounds, form = known.intervals[y], known.forms.get(y)
         if form is None:  # the output does not depend on the inputs
             form = AffineForm(np.zeros((1, 0, n)), bounds.middle, bounds.radius)
-        gains = gain_bounds(programs[1], boxes, n)
+        gains = gain_bounds(known, (len(row), k, n))
         found = (bounds.low, bounds.high, form.middle, form.slope, form.error, *gains)
         return tuple(np.broadcast_to(x, (len(row), *x.shape[1:])) for x in found)
 

@@ -9,57 +9,44 @@ derivative differs from the gain that was taken out.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats
-from jaxltl.core.enclosures.interval import Interval
-from jaxltl.core.enclosures.linear_bounds import propagate
+from jaxltl.core.enclosures.linear_bounds import Enclosed
 from jaxltl.core.enclosures.program import Elementwise, MatrixProduct, Program, make_program
+from jaxltl.core.models.protocols import PyTree
 
+Step = Callable[[PyTree, PyTree, PyTree], PyTree]
 _UNDERFLOW = 1e-200  # of products with 0 that are rounded outward
 # Functions that may jump: their derivatives do not bound their variation.
 _JUMPS = {"sign", "floor", "ceil", "round", "lt", "le", "gt", "ge", "eq", "ne", "atan2", "pow"}
 
 
-def gain_program(
-    program: Program, step: object, specs: Sequence[jax.ShapeDtypeStruct]
-) -> Program | None:
-    """Derivatives ``[k, n]`` of a step in the noise, flat; None where they bound no variation.
+def gain_program(step: Step, specs: Sequence[jax.ShapeDtypeStruct]) -> Program:
+    """A step, and its derivatives ``[k, n]`` in the noise unless they bound no variation.
+
+    One program for both, since the derivatives need what the step computes: of a policy, say.
 
     Args:
-      program: of the step, with the noise as its last input.
       step: JAX function of state, action and noise.
       specs: of the three arguments.
     """
-    assert callable(step)
-    if jumps(program):
-        return None
+    program = make_program(lambda x, u, w: step(x, u, w), *specs)
+    if specs[2].shape[0] == 0 or jumps(program):
+        return program
 
-    def gains(x: jax.Array, u: jax.Array, w: jax.Array) -> jax.Array:
-        units = jnp.eye(specs[2].shape[0], dtype=w.dtype)
-        return jnp.stack([jax.jvp(lambda v: step(x, u, v), (w,), (unit,))[1] for unit in units])
+    def gains(x: jax.Array, u: jax.Array, w: jax.Array) -> tuple[PyTree, jax.Array]:
+        following, push = jax.linearize(lambda v: step(x, u, v), w)
+        return following, jnp.stack([push(unit) for unit in jnp.eye(len(w), dtype=w.dtype)])
 
     try:
-        return _needed(make_program(gains, *specs))
+        return make_program(gains, *specs)
     except ValueError:  # a derivative without an enclosure
-        return None
-
-
-def _needed(program: Program) -> Program:
-    """The program without operations on which no output depends."""
-    used, kept = set(program.outputs), []
-    for operation in reversed(program.operations):
-        if operation.output in used:
-            kept.append(operation)
-            used.update(
-                (operation.input,) if isinstance(operation, MatrixProduct) else operation.inputs
-            )
-    return replace(program, operations=tuple(reversed(kept)))
+        return program
 
 
 def jumps(program: Program) -> bool:
@@ -77,20 +64,16 @@ def jumps(program: Program) -> bool:
     return False
 
 
-def gain_bounds(
-    program: Program | None, boxes: list[Interval], num_states: int
-) -> tuple[Floats, Floats]:
+def gain_bounds(known: Enclosed, shape: tuple[int, ...]) -> tuple[Floats, Floats]:
     """Bounds ``[C, k, n]`` of the derivatives over boxes; infinite where none is known."""
-    shape = (len(boxes[0].low), boxes[-1].low.shape[-1], num_states)
-    if program is None:
+    if len(known.program.outputs) == 1:
         return np.full(shape, -np.inf), np.full(shape, np.inf)
-    found = propagate(program, boxes).intervals[program.outputs[0]]
-    sides = (np.broadcast_to(x.reshape(-1, *shape[1:]), shape) for x in (found.low, found.high))
-    low, high = sides
-    known = np.isfinite(low) & np.isfinite(high)
+    found = known.intervals[known.program.outputs[1]]
+    low, high = (np.broadcast_to(x.reshape(-1, *shape[1:]), shape) for x in (found.low, found.high))
+    finite = np.isfinite(low) & np.isfinite(high)
     zero = np.maximum(np.abs(low), np.abs(high)) < _UNDERFLOW
     low, high = np.where(zero, 0.0, low), np.where(zero, 0.0, high)
-    return np.where(known, low, -np.inf), np.where(known, high, np.inf)
+    return np.where(finite, low, -np.inf), np.where(finite, high, np.inf)
 
 
 def conditioning_order(
