@@ -350,3 +350,48 @@ def test_the_table_has_marginal_weights_and_decisive_steps():
         chosen = found.assignment[:, p] == "abcd".index(row.meaning)
         np.testing.assert_allclose(row.weight, found.weight[chosen].sum())
         assert all(0 <= n < 6 and 0 <= t < 8 and gain > 0 for n, t, gain in row.steps)
+
+
+# --- automata -------------------------------------------------------------------------------------
+
+
+@cache
+def learned_delivery():
+    world = gridworld("a . . . b", slip=0.1)
+    model = jl.product(world, "F (a & F b)")
+    shown = jl.models.rollout(
+        model,
+        soft_policy(model, 40.0, 0.9),
+        jax.random.key(0),
+        num_trajectories=20,
+        num_steps=12,
+        stop=model.final,
+    )
+    shown = jl.models.project_trajectories(model, shown)
+    return model, shown, grounding.learn_automaton(world, shown, 3, discount=0.9, num_starts=1)
+
+
+@pytest.mark.slow
+def test_an_ordered_delivery_is_learned():
+    _, _, found = learned_delivery()
+    assert jl.automata.is_equivalent(found.automaton, "F (a & F b)")
+    again = jl.io.read_hoa(jl.io.write_hoa(found.automaton))
+    assert jl.automata.is_equivalent(again, found.automaton)
+
+
+@pytest.mark.slow
+def test_the_likelihood_of_a_learned_automaton_is_that_of_its_policy():
+    _, shown, found = learned_delivery()
+    model = jl.product(gridworld("a . . . b", slip=0.1), found.automaton)
+    policy = np.asarray(soft_policy(model, found.scale, 0.9))
+    lifted = lift_trajectories(model, shown)
+    place = np.asarray(lifted.state), np.asarray(lifted.action)
+    chance = policy.reshape(-1, policy.shape[-1])[place]
+    expected = np.log(chance[np.asarray(lifted.mask)]).sum()
+    np.testing.assert_allclose(found.log_likelihood, expected, rtol=1e-2)
+
+
+def test_an_automaton_has_two_states_at_least():
+    with pytest.raises(ValueError, match=r"num_memory=1; an automaton that is learned has"):
+        world, _ = world_of()
+        grounding.learn_automaton(world, jl.make_trajectories(world, [[(0, 0)]]), 1)

@@ -10,6 +10,10 @@ from jaxltl.algos.grounding.answer import (
     robust_policy as robust_policy,
     with_labels as with_labels,
 )
+from jaxltl.algos.grounding.automaton_search import (
+    LearnedAutomaton as LearnedAutomaton,
+    learn_automaton as learn_automaton,
+)
 from jaxltl.algos.grounding.hypotheses import (
     Posterior as Posterior,
     ambiguous_symbols as ambiguous_symbols,

@@ -156,7 +156,7 @@ def make_problem(
     ]
     model = stack_products(blank, automaton, label_on="entry")
     observation = stack_observations(model, _padded(observation, worlds))
-    world, state, action, length = _joined(worlds, several)
+    world, state, action, length = joined_demonstrations(worlds, several)
     if network is None:
         network = LinearGrounding(len(automaton.propositions))
     _require_network(network, observation, len(automaton.propositions))
@@ -214,7 +214,9 @@ def event_reward(automaton: Automaton) -> jax.Array:
     return to_jax(own.final[own.delta].astype(float) - own.final[:, None])
 
 
-def _joined(worlds: Sequence[MDP], several: Sequence[Trajectories]) -> tuple[jax.Array, ...]:
+def joined_demonstrations(
+    worlds: Sequence[MDP], several: Sequence[Trajectories]
+) -> tuple[jax.Array, ...]:
     """World, states, actions and lengths of the demonstrations of all worlds, checked."""
     if len(several) != len(worlds):
         raise ValueError(

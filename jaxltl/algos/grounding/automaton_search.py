@@ -1,0 +1,242 @@
+"""Automata learned from demonstrations: local search over transitions with exact likelihoods.
+
+What is visible in each state is known, and so are the letters; the task is not, except its number of
+memory states. A candidate is a table ``delta`` and a set of events, transitions that are rewarded; its
+likelihood is that of :mod:`jaxltl.algos.grounding.likelihood`. The search starts from the likeliest
+sequences of letters, which end or repeat, and changes one transition at a time, as long as the likelihood
+minus a penalty for each transition that moves the memory increases.
+
+Example: after the first symbol the second one.
+  >>> import jax
+  >>> import jaxltl as jl
+  >>> from jaxltl.algos import grounding
+  >>> from jaxltl.envs import gridworld
+  >>> world = gridworld("a . . . b", slip=0.1)
+  >>> model = jl.product(world, "F (a & F b)")
+  >>> shown = jl.models.rollout(model, grounding.motive_policy(model, 50.0, 0.9), jax.random.key(0),
+  ...                           num_trajectories=20, num_steps=12, stop=model.final)
+  >>> shown = jl.models.project_trajectories(model, shown)
+  >>> found = grounding.learn_automaton(world, shown, 3, discount=0.9, num_starts=1)
+  >>> jl.automata.is_equivalent(found.automaton, "F (a & F b)")
+  True
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxltl.algos.common.settings import Number
+from jaxltl.algos.grounding.hypotheses import step_log_likelihood
+from jaxltl.algos.grounding.problem import LinearGrounding, Problem, joined_demonstrations
+from jaxltl.core.automata.automaton import Automaton, make_automaton
+from jaxltl.core.models.construct.batch import stack_products
+from jaxltl.core.models.mdp import MDP
+from jaxltl.core.models.product import distinct_labels
+from jaxltl.core.models.trajectories import Trajectories
+
+SCALES = (10.0, 25.0, 50.0, 100.0)
+_BATCH = 32
+_PENALTY = 2.0  # nats for each moving transition and each event: suppresses chance improvements
+_MOST_STEPS = 60
+_SEQUENCES = 500  # starts of each kind that are scored, drawn if there are more
+
+
+class LearnedAutomaton(NamedTuple):
+    """An automaton that explains demonstrations.
+
+    Attributes:
+      automaton: co-safe if its events end in a state without further moves, else Buchi with the events
+        as accepting transitions.
+      log_likelihood: of all demonstrations, in nats.
+      scale: the reward of an event, on the grid.
+      scores: ``float64[starts]``, penalised log-likelihood of the local optimum of each start.
+    """
+
+    automaton: Automaton
+    log_likelihood: float
+    scale: float
+    scores: np.ndarray
+
+
+def learn_automaton(
+    worlds: MDP | Sequence[MDP],
+    demonstrations: Trajectories | Sequence[Trajectories],
+    num_memory: int,
+    *,
+    discount: float = 0.95,
+    num_starts: int = 4,
+    seed: int = 0,
+) -> LearnedAutomaton:
+    """An automaton with a given number of states that makes demonstrations likely.
+
+    Args:
+      worlds: labelled worlds; their distinct labels are the letters.
+      demonstrations: of a world, or one batch for each.
+      num_memory: number of states of the automaton, at least 2.
+      discount: of the demonstrator, in [0, 1).
+      num_starts: starts of the search, the likeliest sequences.
+      seed: of the sequences that are scored, if there are more than 500.
+
+    Returns:
+      :class:`LearnedAutomaton`. Compare it by :func:`~jaxltl.core.automata.language.is_equivalent`;
+      states are numbered by the search.
+
+    Raises:
+      ValueError: fewer than 2 memory states, or demonstrations that do not fit.
+    """
+    if num_memory < 2:
+        raise ValueError(f"num_memory={num_memory}; an automaton that is learned has at least 2.")
+    worlds = [worlds] if isinstance(worlds, MDP) else list(worlds)
+    several = [demonstrations] if isinstance(demonstrations, Trajectories) else demonstrations
+    rows = np.unique(np.concatenate([distinct_labels(w) for w in worlds]), axis=0)
+    letters = rows.astype(bool)
+    delta = np.repeat(np.arange(num_memory)[:, None], len(letters), axis=1)
+    blank = make_automaton(
+        delta, 0, letters, worlds[0].propositions, accepting=np.zeros(delta.shape, bool)
+    )
+    model = stack_products(worlds, blank, label_on="entry")
+    world, state, action, length = joined_demonstrations(worlds, several)
+    problem = Problem(
+        model=model,
+        observation=jnp.zeros((*model.letter.shape, 1), model.dtype),
+        world=world,
+        state=state,
+        action=action,
+        length=length,
+        event=jnp.zeros(delta.shape, model.dtype),
+        features=jnp.zeros((0,), model.dtype),
+        network=LinearGrounding(len(worlds[0].propositions)),
+    )
+    near = _sequences(num_memory, letters, np.random.default_rng(seed))
+    tables = np.stack([n[0] for n in near]), np.stack([n[1] for n in near])
+    found = _scores(problem, discount, *tables).max(1)
+    order = np.argsort(-found, kind="stable")[:num_starts]
+    runs = [_climb(problem, discount, *near[i]) for i in order.tolist()]
+    best = max(runs, key=lambda run: run[0])
+    score, moves, event, scale = best
+    automaton = _as_automaton(moves, event, letters, worlds[0].propositions)
+    total = score + _PENALTY * _size(moves, event)
+    return LearnedAutomaton(automaton, float(total), scale, np.array([run[0] for run in runs]))
+
+
+def _sequences(
+    num_memory: int, letters: np.ndarray, rng: np.random.Generator
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Automata of the sequences of letters: all states in order, then the end or the first again."""
+    moving = np.flatnonzero(letters.any(1)).tolist()
+    found = []
+    for cyclic in (False, True):
+        length = num_memory if cyclic else num_memory - 1
+        count = len(moving) ** length
+        kept = (
+            range(count) if count <= _SEQUENCES else rng.integers(count, size=_SEQUENCES).tolist()
+        )
+        for code in kept:
+            word = [moving[code // len(moving) ** i % len(moving)] for i in range(length)]
+            moves = np.repeat(np.arange(num_memory)[:, None], len(letters), axis=1)
+            moves[range(length), word] = (np.arange(length) + 1) % num_memory
+            event = np.zeros(moves.shape, bool)
+            event[range(length) if cyclic else length - 1, word if cyclic else word[-1]] = True
+            found.append((moves, event))
+    return found
+
+
+def _size(moves: np.ndarray, event: np.ndarray) -> int:
+    return int((moves != np.arange(len(moves))[:, None]).sum() + event.sum())
+
+
+def _climb(
+    problem: Problem, discount: float, moves: np.ndarray, event: np.ndarray
+) -> tuple[float, np.ndarray, np.ndarray, float]:
+    """Steepest ascent over changes of one transition: score, table, events and scale."""
+    score, best, scale = -np.inf, (moves, event), SCALES[0]
+    for _ in range(_MOST_STEPS):
+        near = _neighbours(*best)
+        tables = np.stack([n[0] for n in near]), np.stack([n[1] for n in near])
+        found = _scores(problem, discount, *tables)
+        sizes = np.array([_size(*n) for n in near])
+        value = found.max(1) - _PENALTY * sizes
+        top = int(value.argmax())
+        if value[top] <= score + 1e-6:
+            break
+        score, best, scale = float(value[top]), near[top], SCALES[int(found[top].argmax())]
+    return score, *best, scale
+
+
+def _neighbours(moves: np.ndarray, event: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """The candidate and those with one other transition, to states in the order of first use."""
+    found, (num_memory, width) = [(moves, event)], moves.shape
+    used = _reachable(moves)
+    fresh = [q for q in range(num_memory) if q not in used][:1]  # the others are alike
+    for q in sorted(used):
+        for letter in range(width):
+            for to in [*sorted(used), *fresh]:
+                for rewarded in (False, True):
+                    same = moves[q, letter] == to and event[q, letter] == rewarded
+                    if same or (rewarded and to == q):
+                        continue
+                    new, events = moves.copy(), event.copy()
+                    new[q, letter], events[q, letter] = to, rewarded
+                    found.append((new, events))
+    return found
+
+
+def _reachable(moves: np.ndarray) -> set[int]:
+    seen, queue = {0}, [0]
+    while queue:
+        new = {int(q) for q in moves[queue.pop()]} - seen
+        seen |= new
+        queue += sorted(new)
+    return seen
+
+
+def _scores(problem: Problem, discount: float, moves: np.ndarray, event: np.ndarray) -> np.ndarray:
+    """Log-likelihoods ``float64[C, B]`` of candidates at all scales."""
+    found = np.zeros((len(moves), len(SCALES)))
+    for first in range(0, len(moves), _BATCH):
+        part = np.arange(first, min(first + _BATCH, len(moves)))
+        filled = np.resize(part, _BATCH)
+        table = _batch(problem, discount, jnp.asarray(moves[filled]), jnp.asarray(event[filled]))
+        found[part] = np.asarray(table, float)[: len(part)]
+    return found
+
+
+@jax.jit
+def _batch(problem: Problem, discount: Number, moves: jax.Array, event: jax.Array) -> jax.Array:
+    def one(delta: jax.Array, rewarded: jax.Array) -> jax.Array:
+        model = problem.model
+        wide = jnp.broadcast_to(delta, (len(model.letter), *delta.shape)).astype(jnp.int32)
+        model = replace(
+            model, automaton=replace(model.automaton, delta=cast(NDArray[np.int32], wide))
+        )
+        own = replace(problem, model=model, event=rewarded.astype(model.dtype))
+        return jax.vmap(
+            lambda scale: jnp.sum(
+                step_log_likelihood(own, discount, jnp.asarray(model.letter), scale)
+            )
+        )(jnp.asarray(SCALES, model.dtype))
+
+    return jax.vmap(one)(moves, event)
+
+
+def _as_automaton(
+    moves: np.ndarray, event: np.ndarray, letters: np.ndarray, propositions: tuple[str, ...]
+) -> Automaton:
+    """The reachable part, co-safe if every event enters a state that nothing leaves."""
+    kept = sorted(_reachable(moves))
+    number = {q: i for i, q in enumerate(kept)}
+    delta = np.array([[number[int(q)] for q in moves[k]] for k in kept])
+    events = event[kept]
+    ends = (delta == np.arange(len(kept))[:, None]).all(1) & ~events.any(1)
+    targets = np.unique(delta[events])
+    if ends.any() and ends[targets].any():
+        final = ends & np.isin(np.arange(len(kept)), targets)
+        return make_automaton(delta, 0, letters, propositions, final=final, acceptance="cosafe")
+    return make_automaton(delta, 0, letters, propositions, accepting=events)
