@@ -19,7 +19,7 @@ LIMITS = {
     "docstring lines": 16_880,
     "functions with more than 6 parameters": 67,
     "functions with more than 9 parameters": 1,
-    "Any in annotations": 944,
+    "Any in annotations": 277,
     "modules of the largest folder": 20,
     "names at the top level": 80,
 }

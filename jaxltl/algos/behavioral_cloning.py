@@ -31,7 +31,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
 
 import chex
 import jax
@@ -273,7 +272,7 @@ def policy_in_world(
     `observation` ``float[S, O]``. Differentiable in the parameters.
     """
     memory = jnp.eye(model.num_memory, dtype=observation.dtype)[None]
-    scores: Any = network.apply(parameters, observation[:, None], memory)
+    scores: PyTree = network.apply(parameters, observation[:, None], memory)
     return jax.nn.softmax(jnp.where(model.available, scores, -jnp.inf), axis=-1)
 
 
@@ -330,7 +329,7 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
     def loss_of(parameters: PyTree) -> jax.Array:
         w, s, q, a = pairs
         memory = jax.nn.one_hot(q, problem.counts.shape[2], dtype=problem.observation.dtype)
-        scores: Any = problem.network.apply(parameters, problem.observation[w, s], memory)
+        scores: PyTree = problem.network.apply(parameters, problem.observation[w, s], memory)
         log_policy = _log_policy(scores, problem.available[w, s])
         fit = -jnp.mean(jnp.take_along_axis(log_policy, a[:, None], axis=-1))
         squares = sum(jnp.sum(x * x) for x in jax.tree.leaves(parameters))

@@ -45,7 +45,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import chex
 import flax.linen as nn
@@ -192,7 +192,7 @@ def stack_plans(plans: Sequence[Plan]) -> Plan:
         )
     states, most = (max(shape[i] for shape in shapes) for i in range(2))
 
-    def padded(x: Any) -> np.ndarray:
+    def padded(x: ArrayLike) -> np.ndarray:
         x = np.asarray(x)
         rest = [(0, 0)] * (x.ndim - 2)
         return np.pad(x, [(0, states - x.shape[0]), (0, most - x.shape[1]), *rest])

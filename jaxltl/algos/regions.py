@@ -30,7 +30,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -38,6 +38,7 @@ from numpy.typing import ArrayLike, NDArray
 from jaxltl.core import validation
 from jaxltl.core.models.interval import IntervalMDP, make_interval
 from jaxltl.core.models.parametric.parametric import ParametricMDP, box_of
+from jaxltl.core.models.protocols import Array
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.interval.reachability import reachability
 from jaxltl.core.sparse.interval.robust_values import Query
@@ -137,7 +138,9 @@ def _box(problem: Problem, low: Corner, high: Corner) -> tuple[Point, Point]:
     return low, high
 
 
-def _bounds(problem: Problem, model: IntervalMDP, reward: Any, large: bool) -> tuple[float, float]:
+def _bounds(
+    problem: Problem, model: IntervalMDP, reward: Array, large: bool
+) -> tuple[float, float]:
     """Bounds of the mean over the initial distribution with maximising or minimising nature."""
     maximize = problem.objective == "max"
     query = Query(maximize, large, depth=problem.model.roundings)
@@ -210,7 +213,7 @@ def _require_problem(problem: object) -> None:
         )
 
 
-def _limit(threshold: Any) -> float:
+def _limit(threshold: ArrayLike) -> float:
     """A threshold, which may be infinite."""
     found = validation.float_array("threshold", threshold)
     if found.ndim or np.isnan(found):

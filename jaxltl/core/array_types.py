@@ -7,10 +7,12 @@ from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     import jax
+    from scipy.sparse import csr_array
 
     Array = jax.Array | NDArray[Any]
+    SparseMatrix: TypeAlias = csr_array
 else:  # packages without JAX import this module
-    Array = np.ndarray
+    Array = SparseMatrix = np.ndarray
 
 PyTree: TypeAlias = Any  # a tree of arrays, such as the state of a simulated environment
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -64,7 +63,7 @@ def _code(counts: ArrayLike) -> NDArray[np.int64]:
 _DIGIT = np.append(10 ** np.arange(len(COLORS)), 10 ** len(COLORS))  # the last: a free cell
 
 
-def find_kinds(colors: NDArray[Any], codes: NDArray[np.int64]) -> NDArray[np.int32]:
+def find_kinds(colors: np.ndarray, codes: NDArray[np.int64]) -> NDArray[np.int32]:
     """Kind of each cell by its 3 x 3 patch, -1 for none; undrawn cells have no colour."""
     digit = _DIGIT[colors]
     across = digit[:, :-2] + digit[:, 1:-1] + digit[:, 2:]
@@ -93,7 +92,7 @@ def codes_of(kinds: Kinds) -> NDArray[np.int64]:
     return _code(np.array([row for _, row in kinds]).reshape(-1, len(COLORS)))
 
 
-def _crop(colors: NDArray[Any], width: int) -> NDArray[Any]:
+def _crop(colors: np.ndarray, width: int) -> np.ndarray:
     return colors[width : colors.shape[0] - width, width : colors.shape[1] - width]
 
 

@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike
 from jaxltl.core import validation
 from jaxltl.core.environments.environment import Environment, Timestep, make_box, make_environment
 from jaxltl.core.environments.time_limit import with_time_limit, without_time_limit
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.pretty_print import brief
 
 # Colour, place and radius of each disc.
@@ -256,7 +257,11 @@ def _begin_at(place: chex.Array, key: chex.PRNGKey) -> FlatState:
 
 
 def _move(
-    number: chex.Array, moves: chex.Array | None, world: FlatState, action: Any, key: chex.PRNGKey
+    number: chex.Array,
+    moves: chex.Array | None,
+    world: FlatState,
+    action: PyTree,
+    key: chex.PRNGKey,
 ) -> Timestep:
     del key
     velocity = jnp.clip(action, -1, 1) if moves is None else jnp.asarray(moves)[action]

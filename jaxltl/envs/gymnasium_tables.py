@@ -130,11 +130,13 @@ def _read(env: Any) -> _Table:
     )  # fmt: skip
 
 
-def _is_whole(value: Any) -> bool:
+def _is_whole(value: object) -> bool:
     return isinstance(value, int | np.integer) and bool(value >= 0)
 
 
-def _branch(place: str, branch: Any, table: Sized) -> tuple[float, int, float, bool]:
+def _branch(
+    place: str, branch: tuple[float, int, float, bool], table: Sized
+) -> tuple[float, int, float, bool]:
     try:
         probability, successor, reward, terminated = branch
         found = float(probability), int(successor), float(reward), bool(terminated)

@@ -10,7 +10,7 @@ the logarithm is returned; and the constraint, there ``1 - max_t max(low - u_t, 
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import chex
 import jax
@@ -18,9 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxltl.core import struct
 from jax import lax
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, DTypeLike
 
 from jaxltl.core.environments.environment import Environment, Timestep, make_box, make_environment
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.pretty_print import brief
 from jaxltl.envs.networks import Network, apply_lanes, make_network, weighted
 
@@ -174,7 +175,7 @@ def _fitting(world: LQR, network: Network | str) -> Network:
 
 @jax.jit  # so that calls outside of jit share one compilation
 def _evaluate(
-    network: Network, world: LQR, parameters: jax.Array, key: Any
+    network: Network, world: LQR, parameters: jax.Array, key: object
 ) -> tuple[jax.Array, jax.Array]:
     del key
     total, violation = _scores(network, world, parameters)
@@ -201,7 +202,7 @@ def _simulate(network: Network, world: LQR, parameters: jax.Array) -> Run:
     world = _as(world, parameters)
     start = _start(world, parameters)
 
-    def step(carry: Any, _: None) -> Any:
+    def step(carry: PyTree, _: None) -> PyTree:
         carry, control = _step(network, world, parameters, carry)
         return carry, (carry[0], control)
 
@@ -273,8 +274,8 @@ _scores = jax.custom_batching.custom_vmap(_plain)
 
 @_scores.def_vmap
 def _lanes_last(
-    size: int, batched: Any, network: Network, world: LQR, parameters: jax.Array
-) -> Any:
+    size: int, batched: PyTree, network: Network, world: LQR, parameters: jax.Array
+) -> PyTree:
     _, varied, many = batched
     if any(jax.tree.leaves(varied)):
         axes = (None, jax.tree.map(lambda b: 0 if b else None, varied), 0 if many else None)
@@ -305,7 +306,7 @@ class Plant(NamedTuple):
     time: jax.Array
 
 
-def as_environment(world: LQR, dtype: Any = None) -> Environment:
+def as_environment(world: LQR, dtype: DTypeLike | None = None) -> Environment:
     """The regulator `world` as an environment with numbers of a `dtype`, terminated after N controls.
 
     Rewards add up to -J, and costs, the increments of the largest violation, to the violation. States
@@ -329,7 +330,7 @@ def as_environment(world: LQR, dtype: Any = None) -> Environment:
     )
 
 
-def _first_state(world: LQR, key: Any) -> Plant:
+def _first_state(world: LQR, key: object) -> Plant:
     del key
     start = jnp.asarray(world.start)
     return Plant(start, jnp.zeros((), start.dtype), jnp.int32(0))
@@ -339,7 +340,7 @@ def _observed(plant: Plant) -> jax.Array:
     return plant.state
 
 
-def _controlled(world: LQR, plant: Plant, control: jax.Array, key: Any) -> Timestep:
+def _controlled(world: LQR, plant: Plant, control: jax.Array, key: object) -> Timestep:
     del key
     world = jax.tree.map(jnp.asarray, world)
     none = jnp.zeros_like(plant.violation)

@@ -207,7 +207,10 @@ def policy_network(world: Navigation, hidden: Sequence[int] = (30, 30)) -> Netwo
 
 
 def start_states(
-    world: Navigation, key: chex.PRNGKey, shape: tuple[int, ...] = (), dtype: Any = None
+    world: Navigation,
+    key: chex.PRNGKey,
+    shape: tuple[int, ...] = (),
+    dtype: np.dtype | type | None = None,
 ) -> State:
     """The initial states, uniform in the start box of `world` and in the heading, drawn from `key`.
 

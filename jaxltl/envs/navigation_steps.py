@@ -6,7 +6,7 @@ includes the quantities on which increments depend (least distance, visits); obs
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import chex
 import jax
@@ -46,11 +46,15 @@ class _Settings:
 
     task: jax.Array
     absorbing: jax.Array
-    dtype: Any = struct.field(pytree_node=False)
+    dtype: np.dtype | type | None = struct.field(pytree_node=False)
 
 
 def as_environment(
-    world: Navigation, task: int, *, absorbing: bool | None = None, dtype: Any = None
+    world: Navigation,
+    task: int,
+    *,
+    absorbing: bool | None = None,
+    dtype: np.dtype | type | None = None,
 ) -> Environment:
     """An environment of one of the four tasks, with episodes of ``world.horizon`` steps.
 
@@ -108,7 +112,7 @@ def _observe(settings: _Settings, world: Navigation, place: Place) -> jax.Array:
 
 
 def _step(
-    settings: _Settings, world: Navigation, place: Place, action: jax.Array, key: Any
+    settings: _Settings, world: Navigation, place: Place, action: jax.Array, key: object
 ) -> Timestep:
     del key
     task, dtype = settings.task, settings.dtype

@@ -8,7 +8,7 @@ are numbered in rows from the upper left, 0 to 8; `light` is 1 where the light i
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -17,8 +17,9 @@ import numpy as np
 from jaxltl.core.automata.automaton import Automaton, make_automaton
 from jaxltl.core.models.construct.restrict import restrict
 from jaxltl.core.models.game import Game, make_game
-from jaxltl.core.models.mdp import make_mdp
+from jaxltl.core.models.mdp import MDP, make_mdp
 from jaxltl.core.models.product import product
+from jaxltl.core.models.protocols import base_model
 from jaxltl.core.pretty_print import brief
 from jaxltl.envs.gridworld import ACTIONS as MOVES
 from jaxltl.envs.gridworld import gridworld
@@ -95,7 +96,7 @@ def surveillance() -> Automaton:
     )
 
 
-def patrol_reward(game: Any) -> jax.Array:
+def patrol_reward(game: Game) -> jax.Array:
     """The reward of the system for patrolling the dangerous block, ``float[S, A]``.
 
     1 for a move into the dangerous block, and for a move inside it that goes round it counterclockwise
@@ -118,9 +119,7 @@ def patrol_reward(game: Any) -> jax.Array:
             f"the game has states and actions {shape}; give post_offices() or a product of it, "
             "and of a restricted game take the rows at its base_state."
         )
-    world = game
-    while hasattr(world, "mdp"):
-        world = world.mdp
+    world = cast(MDP, base_model(game))
     cell, light, turn = np.unravel_index(np.arange(_WORLD_STATES), (_CELLS, 2, 2))
     target = np.asarray(world.successor)[:, :, 0] // 4
     paid = _paid_moves()[light[:, None], cell[:, None], target]

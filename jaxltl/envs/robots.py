@@ -8,7 +8,7 @@ robots' places, 0 to C - 1, and `turn` is 1 where the system moves: the inverse 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -157,7 +157,7 @@ def places(text: str, *, wall: str = "#") -> np.ndarray:
     return np.argwhere(parse_map(text) != wall)
 
 
-def arrival_reward(game: Any, condition: States) -> jax.Array:
+def arrival_reward(game: Game, condition: States) -> jax.Array:
     """The probability that a move of the system leads to a state of a set: ``float[S, A]``.
 
     ``R(s, a) = sum_t P(t | s, a) [t satisfies the condition]`` in the system's states of the `game`,
@@ -174,7 +174,7 @@ def arrival_reward(game: Any, condition: States) -> jax.Array:
     return jnp.where(counts, operators.expectation(game, arrives), 0)
 
 
-def diagonal_reward(game: Any) -> jax.Array:
+def diagonal_reward(game: Game) -> jax.Array:
     """The :func:`arrival_reward` of ``diagonal`` in a `game` of robots (dissertation, section 5.5).
 
     Example:

@@ -102,7 +102,7 @@ def _blank(shape: Sequence[int], slip: float) -> MDP:
 
 
 def _assemble(
-    blank: MDP, colors: NDArray[Any], kind: NDArray[np.int32], kinds: Kinds, margin: int
+    blank: MDP, colors: np.ndarray, kind: NDArray[np.int32], kinds: Kinds, margin: int
 ) -> World:
     start = (kind < 0).ravel()
     if not start.any():
@@ -314,7 +314,7 @@ def _is_feasible(family: _Family, kind: NDArray[np.int32]) -> bool:
 
 
 def _can_finish(
-    successor: NDArray[Any], step: NDArray[Any], final: NDArray[np.bool_]
+    successor: np.ndarray, step: np.ndarray, final: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
     """World and memory states from which acceptance is reachable, ``bool[S, Q]``, in NumPy for speed."""
     columns = [np.ascontiguousarray(c) for c in successor.reshape(len(successor), -1).T]
@@ -369,7 +369,7 @@ def observations(world: World, radius: int = 1) -> jax.Array:
     return hot.reshape(hot.shape[0], -1)
 
 
-def _distance(automaton: Any) -> jax.Array:
+def _distance(automaton: Automaton) -> jax.Array:
     """Distance to a final state in letters: ``float[Q]``, infinite after a violation."""
     delta, final = jnp.asarray(automaton.delta), jnp.asarray(automaton.final)
 

@@ -6,8 +6,8 @@ Models are recognised by their fields, since importing their types would load JA
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -23,6 +23,7 @@ from jaxltl.plot.maps import grid
 from jaxltl.plot.style import ACCENT, FAINT, GOOD, INK, MUTED, PAPER, plain_axes
 
 if TYPE_CHECKING:
+    from jaxltl.core.models.protocols import PyTree
     from jaxltl.core.types import Solution
 
 MOST_CELLS, MOST_STATES, MOST_ARROWS = 900, 16, 40  # up to which something is drawn
@@ -30,7 +31,7 @@ _MOST_PANELS = 9
 _WALL = "#"
 
 
-def model(model: Any) -> Figure:
+def model(model: PyTree) -> Figure:
     """The grid map of a model with moves between adjacent cells, else its graph.
 
     A map needs four actions, each with its likeliest successor one cell up, down, left or right, or
@@ -64,7 +65,9 @@ def model(model: Any) -> Figure:
     return _graph(inner, None if system is None else np.asarray(system), None, None)
 
 
-def solution(solution: Solution, model: Any = None, *, memories: Any = None) -> Figure:
+def solution(
+    solution: Solution, model: PyTree = None, *, memories: Sequence[str] | None = None
+) -> Figure:
     """The values and policy of a solution on the map or graph of a model, or values alone.
 
     Args:
@@ -176,7 +179,7 @@ def _strip(found: Solution) -> Figure:
 # --- maps -----------------------------------------------------------------------------------------
 
 
-def map_of(world: Any) -> NDArray[np.str_] | None:
+def map_of(world: PyTree) -> NDArray[np.str_] | None:
     """The cells of a map on which a model's moves lie, ``str[rows, columns]``, or None."""
     if hasattr(world, "row_start") or not (hasattr(world, "successor") or _is_dense(world)):
         return None
@@ -217,11 +220,11 @@ def map_of(world: Any) -> NDArray[np.str_] | None:
     return None if _WALL in world.propositions else names.reshape(-1, columns)
 
 
-def _is_dense(world: Any) -> bool:
+def _is_dense(world: PyTree) -> bool:
     return hasattr(world, "transition")
 
 
-def _likeliest(world: Any) -> NDArray[np.int64]:
+def _likeliest(world: PyTree) -> NDArray[np.int64]:
     """``int[S, A]``, the most likely successor."""
     if _is_dense(world):
         return np.argmax(np.asarray(world.transition), axis=-1)
@@ -230,7 +233,7 @@ def _likeliest(world: Any) -> NDArray[np.int64]:
     return np.asarray(found, np.int64)
 
 
-def board_of_robots(game: Any) -> Board | None:
+def board_of_robots(game: PyTree) -> Board | None:
     """The board of a game of two robots in turns, read off the system's moves, or None."""
     world, count = game.mdp, round((game.num_states / 2) ** 0.5)
     known = (
@@ -283,7 +286,7 @@ class _Arrow(NamedTuple):
     probability: float
 
 
-def _arrows_of(world: Any) -> Iterator[_Arrow]:
+def _arrows_of(world: PyTree) -> Iterator[_Arrow]:
     """All transitions of a model, choice by choice."""
     if hasattr(world, "row_start"):
         rows, entries = np.asarray(world.row_start), np.asarray(world.entry_start)
@@ -305,7 +308,7 @@ def _arrows_of(world: Any) -> Iterator[_Arrow]:
 
 
 def _graph(
-    world: Any,
+    world: PyTree,
     system: NDArray[np.bool_] | None,
     values: np.ndarray | None,
     policy: NDArray[np.int64] | None,
@@ -376,7 +379,7 @@ def _square(axes: Axes, center: NDArray[np.float64], text: str, good: bool) -> N
     )
 
 
-def _notes(world: Any, values: np.ndarray | None) -> list[str]:
+def _notes(world: PyTree, values: np.ndarray | None) -> list[str]:
     """Labels and values by state, as text."""
     label = np.asarray(world.label)
     lines = []

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
 
 import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from jaxltl.core import validation
 from jaxltl.core.models.mesh import lanes
@@ -16,7 +16,7 @@ from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.types import require_shape
 
 
-def per_cost(name: str, value: Any, num_costs: int) -> np.ndarray:
+def per_cost(name: str, value: ArrayLike, num_costs: int) -> np.ndarray:
     """One number for each cost, broadcast from a scalar."""
     value = validation.float_array(name, value)
     if value.ndim:
@@ -49,7 +49,7 @@ def split(value: PyTree) -> tuple[jax.Array, jax.Array]:
 
 
 def evaluate_all(
-    problem: Any, hparams: Any, samples: jax.Array, key: chex.PRNGKey
+    problem: PyTree, hparams: PyTree, samples: jax.Array, key: chex.PRNGKey
 ) -> tuple[jax.Array, jax.Array]:
     """Objectives ``[n]`` and costs ``[n, C]`` of a population."""
     keys = jax.random.split(key, len(samples))
@@ -59,7 +59,9 @@ def evaluate_all(
     return lanes.replicate(found, hparams.sharding)
 
 
-def scores(problem: Any, parameters: jax.Array, key: chex.PRNGKey) -> tuple[jax.Array, jax.Array]:
+def scores(
+    problem: PyTree, parameters: jax.Array, key: chex.PRNGKey
+) -> tuple[jax.Array, jax.Array]:
     """Objective and costs ``[C]`` of one evaluation."""
     objective, cost = split(problem.evaluate(parameters, key))
     require_shape("the cost that evaluate returned", cost, problem.limit.shape)

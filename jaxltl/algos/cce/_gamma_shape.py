@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -47,7 +46,7 @@ def shape_of_gap(gap: jax.Array) -> jax.Array:
     gap = jnp.maximum(gap, jnp.finfo(gap.dtype).tiny * 16)
     start = (3 - gap + jnp.sqrt(jnp.square(gap - 3) + 24 * gap)) / (12 * gap)
 
-    def newton(_: Any, log_shape: jax.Array) -> jax.Array:
+    def newton(_: object, log_shape: jax.Array) -> jax.Array:
         def log_gap(x: jax.Array) -> jax.Array:
             return jnp.log(log_digamma_gap(jnp.exp(x)))
 

@@ -17,6 +17,8 @@ from typing import Any, BinaryIO, NamedTuple
 import jax
 import numpy as np
 
+from jaxltl.core.models.protocols import PyTree
+
 Write = Callable[[Path], contextlib.AbstractContextManager[BinaryIO]]
 
 
@@ -38,7 +40,7 @@ class Stored(NamedTuple):
     pieces: list[tuple[list[int], list[int], str, str]]
 
 
-def write(path: Path, arrays: Mapping[str, Any], create: Write) -> dict[str, Stored]:
+def write(path: Path, arrays: Mapping[str, PyTree], create: Write) -> dict[str, Stored]:
     """Writes this process's part of arrays, and waits until the others have written theirs."""
     from jax.experimental.multihost_utils import process_allgather
 

@@ -27,7 +27,7 @@ Example:
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import chex
 import flax.linen as nn
@@ -125,7 +125,7 @@ class _Layers(nn.Module):
         return dense(self.outputs, self.last_scale, "out")(x)
 
 
-def _heads(module: Any, x: jax.Array) -> tuple[PyTree, jax.Array]:
+def _heads(module: ActorCritic | RecurrentActorCritic, x: jax.Array) -> tuple[PyTree, jax.Array]:
     """Action parameters and value, by two networks that share nothing."""
     hidden = tuple(module.hidden)
     outputs = module.num_actions or int(np.prod(module.shape))

@@ -29,7 +29,6 @@ import os
 import types
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -59,7 +58,7 @@ def save(
     stored = parts.write(path, apart, atomic_write) if apart else {}
     if jax.process_index() and any(parts.is_shared(leaf) for _, leaf in named):
         return
-    arrays: dict[str, Any] = {_GIVEN: np.array(json.dumps(dict(given or {})))}
+    arrays: dict[str, PyTree] = {_GIVEN: np.array(json.dumps(dict(given or {})))}
     arrays |= {name: np.asarray(leaf) for name, leaf in named if name not in apart}
     if stored:
         arrays[_PARTS] = np.array(json.dumps({name: list(x) for name, x in stored.items()}))
@@ -95,7 +94,7 @@ def load(
         try:
             # An open file of our own is closed even where a damaged archive is given up.
             with open(path, "rb") as file:
-                arrays: dict[str, Any] = read_arrays(file)
+                arrays: dict[str, PyTree] = read_arrays(file)
             before = json.loads(str(arrays.pop(_GIVEN)))
             stored = json.loads(str(arrays.pop(_PARTS, "{}")))
             arrays |= {name: parts.Stored(*x) for name, x in stored.items()}
@@ -115,7 +114,7 @@ class _Another(Exception):
     """An array of another learner or problem."""
 
 
-def _loaded(path: str, name: str, leaf: Any, found: PyTree, others: parts.Parts) -> Any:
+def _loaded(path: str, name: str, leaf: PyTree, found: PyTree, others: parts.Parts) -> PyTree:
     """An array on its devices, from the file or from the parts."""
     expected = _data(leaf)
     if found is None or not _fits(found, expected):
@@ -158,7 +157,7 @@ def _require_same(path: str, before: dict[str, str], now: dict[str, str]) -> Non
         )
 
 
-def _named(tree: PyTree) -> list[tuple[str, Any]]:
+def _named(tree: PyTree) -> list[tuple[str, PyTree]]:
     """Leaves with distinct file-safe names, numbered to distinguish nested paths."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
     return [
@@ -167,7 +166,7 @@ def _named(tree: PyTree) -> list[tuple[str, Any]]:
     ]
 
 
-def _array_of(leaf: Any) -> Any:
+def _array_of(leaf: PyTree) -> PyTree:
     """As ``jnp.asarray``, but NumPy arrays stay on the host, where nothing is compiled."""
     if not isinstance(leaf, np.ndarray):
         return jnp.asarray(leaf)

@@ -248,7 +248,9 @@ def value_is_stable(tolerance: chex.Numeric) -> loops.Until:
     return Partial(_value_is_stable, tolerance)
 
 
-def _value_is_stable(tolerance: Any, before: State, after: State, metrics: Metrics) -> jax.Array:
+def _value_is_stable(
+    tolerance: chex.Numeric, before: State, after: State, metrics: Metrics
+) -> jax.Array:
     change = jnp.max(jnp.abs(after.value - before.value))
     new = jnp.any((before.visits == 0) & (after.visits > 0))
     return ((change <= tolerance) & ~new) | jnp.isnan(change)  # a run of NaN ends: NONFINITE
@@ -422,7 +424,9 @@ def _sample(game: Game, key: jax.Array, state: jax.Array, action: jax.Array) -> 
 def _restart(key: jax.Array, state: State, problem: Problem, hparams: Hparams) -> State:
     """Chains restart with probability ``restart``, and drop their pending action."""
 
-    def redraw(position: jax.Array, pending: jax.Array | None) -> Any:
+    def redraw(
+        position: jax.Array, pending: jax.Array | None
+    ) -> tuple[jax.Array, jax.Array | None]:
         words = jax.random.bits(key, (2, hparams.num_chains), jnp.uint32)
         anew = splitmix.uniform(words[0], state.value.dtype) < hparams.restart
         pending = None if pending is None else jnp.where(anew, -1, pending)

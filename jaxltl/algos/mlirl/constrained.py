@@ -5,10 +5,11 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
+
+from jaxltl.core.models.protocols import Array
 
 _MARGIN = 1e-8  # of the probability over the required one, for rounding and certified bounds
 _PRECISION = 1e-10  # of the loss, at which SLSQP has converged
@@ -23,7 +24,7 @@ class Point:
     probability: float  # of satisfaction
     gradient: np.ndarray  # float[F], of the loss
     slope: np.ndarray  # float[F], of the probability
-    value: Any  # the fixed point of the policy's reward, from which the next one starts
+    value: Array  # the fixed point of the policy's reward, from which the next one starts
 
     @property
     def is_finite(self) -> bool:

@@ -17,7 +17,6 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -195,7 +194,7 @@ def _task_values(
     return _stacked(columns, done)
 
 
-def _chances(model: Product, regions: Sequence[Any]) -> list[jax.Array]:
+def _chances(model: Product, regions: Sequence[Array]) -> list[jax.Array]:
     """Probabilities ``float[S, Q, A]`` of each region after a step, traced once for all regions."""
     if not regions:
         return []

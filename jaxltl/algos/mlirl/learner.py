@@ -34,7 +34,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import chex
 import jax
@@ -249,7 +248,7 @@ def make_problem(
     kept = allowed_steps(model, demonstrations)
     if isinstance(model, Product):
         demonstrations = lift_trajectories(model, demonstrations)
-    weight: Any = satisfaction_over
+    weight: PyTree = satisfaction_over
     if isinstance(weight, str):
         if weight not in ("initial", "all"):
             raise ValueError(f'satisfaction_over={weight!r}; choose "initial", "all" or weights.')

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -97,9 +96,9 @@ def make_problem(
     *,
     held_out: float | Trajectories | Sequence[Trajectories] | None = 0.2,
     network: nn.Module | None = None,
-    weight: Any = None,
+    weight: PyTree = None,
     horizon: int | None = None,
-    allowed: Any = None,
+    allowed: PyTree = None,
 ) -> Problem:
     """A checked :class:`Problem`, on the host.
 

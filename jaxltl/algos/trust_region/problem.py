@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import chex
 import jax
@@ -98,5 +97,5 @@ def action_size(problem: Problem) -> int:
 
 def as_action(problem: Problem, action: jax.Array) -> jax.Array:
     """The clipped action of a vector ``float[A]``."""
-    actions: Any = problem.environment.actions
+    actions: PyTree = problem.environment.actions
     return clipped_action(actions, action.reshape(actions.shape).astype(actions.dtype))

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxltl.core.array_types import Integers
 from jaxltl.core.automata.automaton import Automaton, complement, make_automaton
-from jaxltl.core.automata.emerson_lei import to_parity
+from jaxltl.core.automata.emerson_lei import Condition, to_parity
 from jaxltl.core.automata.parity import simplify
 from jaxltl.core.automata.runs import EVEN, ODD, Lasso, align, find_lasso, joint_runs, some_loop
 from jaxltl.core.automata.translate import Task, as_automaton
@@ -149,13 +148,13 @@ def _combine(a: Task, b: Task, connective: str) -> Automaton:
     )
 
 
-def _colored(priority: Integers, first: int) -> tuple[NDArray[np.int64], tuple[Any, ...], int]:
+def _colored(priority: Integers, first: int) -> tuple[NDArray[np.int64], Condition, int]:
     """Priorities as sets of colours and a condition on the colours met infinitely often."""
     values, place = np.unique(priority, return_inverse=True)
     level_of = np.concatenate([[0], np.cumsum(np.diff(values % 2) != 0)])
     level = level_of[place.reshape(priority.shape)]
     last = int(level_of[-1])
-    condition: tuple[Any, ...] = ("true",) if values[-1] % 2 == 0 else ("false",)
+    condition: Condition = ("true",) if values[-1] % 2 == 0 else ("false",)
     for i in reversed(range(last)):
         if (values[0] + i) % 2 == 0:
             condition = ("or", ("inf", first + i), condition)

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxltl.core.array_types import Integers
+from jaxltl.core.array_types import Integers, SparseMatrix
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.sparse.graph.components import forward_reachable, strong_components
 
@@ -219,7 +219,7 @@ def _states_that_may(automaton: Automaton, parity: int) -> NDArray[np.bool_]:
     return _reaching(delta, good)
 
 
-def _graph(delta: NDArray[np.int32], allowed: NDArray[np.bool_]) -> Any:
+def _graph(delta: NDArray[np.int32], allowed: NDArray[np.bool_]) -> SparseMatrix:
     """The allowed transitions as a sparse matrix."""
     from scipy.sparse import csr_array
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -69,9 +68,7 @@ def enclose(
     return shaped
 
 
-def linear_bounds(
-    function: Callable[[PyTree], PyTree],
-) -> Callable[[PyTree, PyTree], PyTree]:
+def linear_bounds(function: Callable[[PyTree], PyTree]) -> Callable[[PyTree, PyTree], PyTree]:
     """Linear lower and upper bounds of a function's values over boxes of its argument.
 
     By backward propagation (CROWN, Zhang et al. 2018). With the box's middle m and radius r, in the
@@ -106,7 +103,7 @@ def over_boxes(
     function: Callable[[PyTree], PyTree], low: PyTree, high: PyTree, linear: bool = True
 ) -> Enclosed:
     """The function's variables over a batch of boxes, with a leading axis C of all arrays."""
-    structure: Any = jax.tree.structure(low)
+    structure: PyTree = jax.tree.structure(low)
     if structure != jax.tree.structure(high):
         raise ValueError("low and high differ in structure; both have that of the argument.")
     _, low, high = namespace(low, high)

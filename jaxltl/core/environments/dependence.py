@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
+from jax.extend.core import Jaxpr
+
+from jaxltl.core.models.protocols import PyTree
 
 
-def reads_key(function: Callable[..., Any], *arguments: Any) -> bool:
+def reads_key(function: Callable[..., PyTree], *arguments: PyTree) -> bool:
     """True if a result may depend on the last argument; False is a proof, by the jaxpr."""
     program = jax.make_jaxpr(function)(*arguments).jaxpr
     count = len(jax.tree.leaves(arguments[-1]))
@@ -16,7 +18,7 @@ def reads_key(function: Callable[..., Any], *arguments: Any) -> bool:
     return any(marked_results(program, marked))
 
 
-def marked_results(program: Any, given: list[bool]) -> list[bool]:
+def marked_results(program: Jaxpr, given: list[bool]) -> list[bool]:
     """The results that may depend on marked arguments."""
     marks = {id(x) for x, mark in zip(program.invars, given, strict=True) if mark}
     for line in program.eqns:

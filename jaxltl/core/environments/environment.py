@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple, TypedDict, Unpack
+from typing import NamedTuple, TypedDict, Unpack
 
 import chex
 import jax
@@ -28,7 +28,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxltl.core import struct
 from jax.tree_util import Partial
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, DTypeLike
+from jax.extend.core import ClosedJaxpr
 
 from jaxltl.core import validation
 from jaxltl.core.models import facts
@@ -75,7 +76,10 @@ class Box:
 
 
 def make_box(
-    low: ArrayLike, high: ArrayLike, shape: Sequence[int] | None = None, dtype: Any = None
+    low: ArrayLike,
+    high: ArrayLike,
+    shape: Sequence[int] | None = None,
+    dtype: DTypeLike | None = None,
 ) -> Box:
     """A checked :class:`Box`.
 
@@ -203,8 +207,8 @@ class Environment:
     observations: PyTree
     propositions: tuple[str, ...] = struct.field(pytree_node=False)
     horizon: int | None = struct.field(pytree_node=False, default=None)
-    starts: Callable[..., Any] | None = None
-    outcomes: Callable[..., Any] | None = None
+    starts: Callable[..., PyTree] | None = None
+    outcomes: Callable[..., PyTree] | None = None
     ending: str = struct.field(pytree_node=False, default="repeat")
 
 
@@ -276,7 +280,7 @@ def make_environment(
         raise ValueError(f"actions={actions!r}; give Finite(number), or make_box(low, high).")
     if isinstance(actions, Finite) and actions.num < 1:
         raise ValueError(f"actions: Finite({actions.num}); there must be at least one.")
-    functions: dict[str, Any] = {"reset": reset, "step": step, "observe": observe}
+    functions: dict[str, PyTree] = {"reset": reset, "step": step, "observe": observe}
     for name, function in functions.items():
         validation.function(name, function)
     functions |= {n: options.get(n) for n in ("labels", "allowed", "starts", "outcomes")}
@@ -284,7 +288,7 @@ def make_environment(
         if names:
             raise ValueError(f"propositions={list(names)}, but no labels; give both or neither.")
         functions["labels"] = Partial(no_labels)
-    parts: dict[str, Any] = {
+    parts: dict[str, PyTree] = {
         name: None if f is None else as_partial(f, name) for name, f in functions.items()
     }
     made = Environment(
@@ -298,7 +302,7 @@ def make_environment(
     seen = _check_functions(made)
     if observations is None:
 
-        def free(x: Any) -> Box:
+        def free(x: jax.Array) -> Box:
             return make_box(-np.inf, np.inf, x.shape, x.dtype)
 
         made = replace(made, observations=jax.tree.map(free, seen))
@@ -307,14 +311,14 @@ def make_environment(
     return made
 
 
-def as_partial(function: Callable[..., Any], name: str = "function") -> Partial:
+def as_partial(function: Callable[..., PyTree], name: str = "function") -> Partial:
     """A function as a pytree, which compiled functions accept as an argument."""
     return (
         function if isinstance(function, Partial) else Partial(validation.function(name, function))
     )
 
 
-def require_environment(environment: Any) -> Environment:
+def require_environment(environment: object) -> Environment:
     """An :class:`Environment`, or that of an object with the property `environment`; else ValueError."""
     environment = getattr(environment, "environment", environment)
     found: Environment = validation.instance(
@@ -323,7 +327,7 @@ def require_environment(environment: Any) -> Environment:
     return found
 
 
-def require_key(key: Any) -> chex.PRNGKey:
+def require_key(key: chex.PRNGKey) -> chex.PRNGKey:
     """Raises ValueError for anything but a single random key."""
     dtype = getattr(key, "dtype", None)
     typed = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key)
@@ -382,7 +386,7 @@ def allowed_in(environment: Environment, world: PyTree) -> jax.Array | None:
 # --- checks ---------------------------------------------------------------------------------------
 
 
-def _check_functions(made: Environment) -> Any:
+def _check_functions(made: Environment) -> PyTree:
     """Checks the shapes of all results; returns those of an observation."""
     key = jax.random.key(0)
     world = traced("reset", made.reset, key)
@@ -424,7 +428,7 @@ def _check_functions(made: Environment) -> Any:
     return seen
 
 
-def require_labels(label: Any, propositions: Sequence[str]) -> None:
+def require_labels(label: object, propositions: Sequence[str]) -> None:
     """Raises ValueError unless labels are ``bool[P]``."""
     if getattr(label, "shape", None) != (len(propositions),) or not _is_bool(label):
         raise ValueError(
@@ -433,11 +437,11 @@ def require_labels(label: Any, propositions: Sequence[str]) -> None:
         )
 
 
-def _is_bool(x: Any) -> bool:
+def _is_bool(x: object) -> bool:
     return np.dtype(getattr(x, "dtype", type(x))) == np.bool_
 
 
-def _as_arrays(observations: PyTree) -> Any:
+def _as_arrays(observations: PyTree) -> PyTree:
     for leaf in jax.tree.leaves(observations, is_leaf=lambda b: isinstance(b, Box)):
         validation.instance("observations", leaf, Box, "a tree of make_box(low, high)")
     return jax.tree.map(
@@ -447,15 +451,15 @@ def _as_arrays(observations: PyTree) -> Any:
     )
 
 
-def _alike(described: Any, other: Any) -> bool:
+def _alike(described: PyTree, other: PyTree) -> bool:
     """True if two trees agree; node classes may define another ``==``."""
-    same: Any = jax.tree.structure(described)
+    same: PyTree = jax.tree.structure(described)
     return same == jax.tree.structure(other) and (
         jax.tree.leaves(described) == jax.tree.leaves(other)
     )
 
 
-def _described(tree: Any) -> Any:
+def _described(tree: PyTree) -> PyTree:
     return jax.tree.map(
         lambda x: f"{x.dtype}{list(x.shape)}" if hasattr(x, "dtype") else type(x).__name__, tree
     )
@@ -464,7 +468,7 @@ def _described(tree: Any) -> Any:
 # --- purity ---------------------------------------------------------------------------------------
 
 
-def traced(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
+def traced(name: str, function: Callable[..., PyTree], *arguments: PyTree) -> PyTree:
     """Shapes of the results of a function that is pure, as far as tracing it twice shows."""
     try:
         try:
@@ -495,7 +499,9 @@ def traced(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
     return shapes
 
 
-def _twice(function: Callable[..., Any], *arguments: Any) -> tuple[Any, Any, Any]:
+def _twice(
+    function: Callable[..., PyTree], *arguments: PyTree
+) -> tuple[ClosedJaxpr, ClosedJaxpr, PyTree]:
     first, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
     # Another object, so that the second trace is not the first, remembered.
     return first, jax.make_jaxpr(lambda *given: function(*given))(*arguments), shapes
@@ -512,7 +518,7 @@ def _kept_by_jax(problem: Exception) -> bool:
     )
 
 
-def _same(first: Any, again: Any) -> bool:
+def _same(first: ClosedJaxpr, again: ClosedJaxpr) -> bool:
     constants = zip(first.consts, again.consts, strict=False)
     return (
         len(first.consts) == len(again.consts)

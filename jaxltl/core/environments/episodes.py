@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import chex
 import jax
@@ -26,7 +26,7 @@ from jaxltl.core.models import facts
 from jaxltl.core.pretty_print import brief
 
 
-def require_agent(agent: Any) -> Agent:
+def require_agent(agent: object) -> Agent:
     """Raises ValueError for anything but an :class:`Agent`."""
     found: Agent = validation.instance(
         "agent",
@@ -79,9 +79,9 @@ def _without_memory(
     function: Callable[..., PyTree],
     memory: PyTree,
     observation: PyTree,
-    allowed: Any,
+    allowed: object,
     key: chex.PRNGKey,
-) -> tuple[Any, Any]:
+) -> tuple[PyTree, PyTree]:
     del allowed
     return function(observation, key), memory
 
@@ -229,7 +229,7 @@ def continue_episode(
 
 def auto_reset_step(
     environment: Environment, world: PyTree, action: PyTree, key: chex.PRNGKey
-) -> tuple[Any, Timestep]:
+) -> tuple[PyTree, Timestep]:
     """A step that resets the environment where an episode ends.
 
     Args:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
 
 import chex
 import jax
@@ -17,6 +16,7 @@ from jaxltl.core.models.construct.convert import to_padded
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.ops.operators import sample_successor
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.models.sparse import SparseMDP
 
 
@@ -24,7 +24,7 @@ def model_environment(
     model: MDP | DenseMDP | SparseMDP | Game,
     *,
     reward: ArrayLike | None = None,
-    observe: Any = None,
+    observe: PyTree = None,
     opponent: ArrayLike | None = None,
 ) -> Environment:
     """The simulated environment of a finite MDP, or of a game against a given opponent.
@@ -148,7 +148,7 @@ def _opponent(model: MDP | DenseMDP, system: np.ndarray, policy: ArrayLike | Non
 def _step_of_two(
     opponent: jax.Array,
     system: jax.Array,
-    step: Any,
+    step: PyTree,
     state: jax.Array,
     action: jax.Array,
     key: chex.PRNGKey,
@@ -161,7 +161,7 @@ def _step_of_two(
 
 
 def _outcomes_of_two(
-    opponent: jax.Array, system: jax.Array, outcomes: Any, state: jax.Array, action: jax.Array
+    opponent: jax.Array, system: jax.Array, outcomes: PyTree, state: jax.Array, action: jax.Array
 ) -> tuple[Timestep, jax.Array]:
     weight = jax.nn.softmax(jnp.asarray(opponent)[state])
     mine = jnp.arange(len(weight)) == action

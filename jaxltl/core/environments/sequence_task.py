@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence as Ordered
 from dataclasses import replace
 from itertools import combinations
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import chex
 import jax
@@ -253,7 +253,7 @@ def sequence_environment(
         )
     shape = (len(sampler.length), len(rows))
     marks, steps = make_box(0, 1, shape, bool), make_box(0, np.inf, (), np.int32)
-    spaces: Any = Sequence(marks, marks, steps)  # type: ignore[arg-type]
+    spaces: PyTree = Sequence(marks, marks, steps)  # type: ignore[arg-type]
     numbers = np.array(
         [
             validation.finite_number("violation", violation),

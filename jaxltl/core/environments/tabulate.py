@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxltl.core import struct
 
 from jaxltl.core import validation
@@ -24,7 +25,7 @@ from jaxltl.core.environments.environment import (
 )
 from jaxltl.core.environments.time_limit import without_time_limit
 from jaxltl.core.models import facts
-from jaxltl.core.models.protocols import PyTree
+from jaxltl.core.models.protocols import Array, PyTree
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.rows import offsets_from_counts
@@ -64,9 +65,9 @@ class Table:
 
     model: SparseMDP
     world: PyTree
-    start: Any
-    terminated: Any
-    truncated: Any
+    start: Array
+    terminated: Array
+    truncated: Array
     num_steps: int | None = struct.field(pytree_node=False, default=None)
     evidence: str = struct.field(pytree_node=False, default="keys")
 
@@ -78,7 +79,7 @@ def tabulate(
     max_states: int = 100_000,
     num_keys: int = 4,
     key: chex.PRNGKey | None = None,
-    distinct: Callable[[Any], Any] | None = None,
+    distinct: Callable[[PyTree], PyTree] | None = None,
 ) -> Table:
     """The reachable states of an environment and their transition probabilities, as a model.
 
@@ -144,7 +145,7 @@ def tabulate(
     )
 
 
-def _itself(world: PyTree) -> Any:
+def _itself(world: PyTree) -> PyTree:
     return world
 
 
@@ -152,29 +153,29 @@ class _Kind(NamedTuple):
     """The environment, the distinguishing part of its states, test keys, and an example state."""
 
     environment: Environment
-    distinct: Callable[[Any], Any]
-    keys: Any
+    distinct: Callable[[PyTree], PyTree]
+    keys: Array
     like: PyTree
 
 
 # --- worlds as bytes ------------------------------------------------------------------------------
 
 
-def _is_key(x: Any) -> bool:
+def _is_key(x: ArrayLike) -> bool:
     return jnp.issubdtype(
         jnp.asarray(x).dtype if not hasattr(x, "dtype") else x.dtype, jax.dtypes.prng_key
     )
 
 
-def _plain(world: PyTree) -> Any:
+def _plain(world: PyTree) -> PyTree:
     """The state with keys as integers, for NumPy."""
     return jax.tree.map(lambda x: jax.random.key_data(x) if _is_key(x) else jnp.asarray(x), world)
 
 
-def _typed(kind: _Kind, plain: PyTree) -> Any:
+def _typed(kind: _Kind, plain: PyTree) -> PyTree:
     """The inverse of :func:`_plain`."""
 
-    def back(x: Any, y: Any) -> Any:
+    def back(x: Array, y: Array) -> Array:
         if not _is_key(y):
             return x
         return jax.random.wrap_key_data(jnp.asarray(x), impl=jax.random.key_impl(y))
@@ -207,7 +208,7 @@ def _rows(table: np.ndarray) -> np.ndarray:
 # --- where it begins ------------------------------------------------------------------------------
 
 
-def _begin(kind: _Kind, environment: Environment, worlds: PyTree) -> tuple[Any, np.ndarray, str]:
+def _begin(kind: _Kind, environment: Environment, worlds: PyTree) -> tuple[PyTree, np.ndarray, str]:
     """Initial states, their probabilities, and the evidence."""
     inner = kind.environment
     shape = jax.eval_shape(inner.reset, kind.keys[0])
@@ -249,7 +250,7 @@ def _begin(kind: _Kind, environment: Environment, worlds: PyTree) -> tuple[Any, 
 
 
 @jax.jit
-def _resets(kind: _Kind) -> Any:
+def _resets(kind: _Kind) -> PyTree:
     return jax.vmap(lambda key: _plain(kind.environment.reset(key)))(kind.keys)
 
 
@@ -271,15 +272,15 @@ def _told_apart(kind: _Kind, plain: PyTree) -> np.ndarray:
     )
 
 
-def _fits(worlds: PyTree, shape: Any) -> bool:
-    same: Any = jax.tree.structure(shape)
+def _fits(worlds: PyTree, shape: PyTree) -> bool:
+    same: PyTree = jax.tree.structure(shape)
     return same == jax.tree.structure(worlds) and all(
         np.shape(x)[1:] == y.shape and _same_type(x, y)
         for x, y in zip(jax.tree.leaves(worlds), jax.tree.leaves(shape), strict=True)
     )
 
 
-def _same_type(x: Any, like: PyTree) -> bool:
+def _same_type(x: ArrayLike, like: PyTree) -> bool:
     """True also for NumPy's double-precision numbers in single precision."""
     kind = getattr(x, "dtype", None)
     return kind == like.dtype or (
@@ -289,7 +290,7 @@ def _same_type(x: Any, like: PyTree) -> bool:
     )
 
 
-def _count(name: str, worlds: PyTree, shape: Any) -> int:
+def _count(name: str, worlds: PyTree, shape: PyTree) -> int:
     lengths = {np.shape(x)[:1] for x in jax.tree.leaves(worlds)}
     if not _fits(worlds, shape) or len(lengths) != 1 or lengths & {(), (0,)}:
         raise ValueError(
@@ -303,7 +304,7 @@ def _left_out_is_idle(kind: _Kind) -> bool:
     """True proves that no result depends on the parts that `distinct` leaves out."""
     environment = kind.environment
 
-    def listed(world: PyTree, action: PyTree, key: chex.PRNGKey) -> Any:
+    def listed(world: PyTree, action: PyTree, key: chex.PRNGKey) -> PyTree:
         found = Timestep(*environment.step(world, action, key))
         told = None
         if environment.outcomes is not None:
@@ -329,12 +330,12 @@ class _Followers(NamedTuple):
     """Successors of a batch ``[B, A, K]``, with bytes of states `seen` and of samples `drawn` by key."""
 
     world: PyTree
-    seen: Any
-    probability: Any
-    reward: Any
-    cost: Any
-    allowed: Any
-    drawn: Any
+    seen: Array
+    probability: Array
+    reward: Array
+    cost: Array
+    allowed: Array
+    drawn: Array
 
 
 class _Listed(NamedTuple):
@@ -461,7 +462,7 @@ def _search(kind: _Kind, begun: PyTree, max_states: int) -> _Listed:
     )
 
 
-def _batches(frontier: PyTree, count: int, size: int) -> Iterator[tuple[int, Any]]:
+def _batches(frontier: PyTree, count: int, size: int) -> Iterator[tuple[int, PyTree]]:
     """Batches of one size, the last one padded, with their numbers of valid rows."""
     for begin in range(0, count, size):
         place = np.minimum(np.arange(begin, begin + size), count - 1)

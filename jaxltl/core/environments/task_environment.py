@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, NamedTuple, TypeVar, Unpack, cast
+from typing import NamedTuple, TypeVar, Unpack, cast
 
 import chex
 import jax
@@ -40,7 +40,7 @@ from jaxltl.core.environments.task_reward import RewardOptions, make_task_reward
 from jaxltl.core.logic.labels import require_known
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.models.ops.annotated_pytree import register_annotated_pytree
-from jaxltl.core.models.protocols import PyTree
+from jaxltl.core.models.protocols import Array, PyTree
 from jaxltl.core.pretty_print import brief
 
 _Tree = TypeVar("_Tree")
@@ -112,19 +112,19 @@ class TaskTables:
       ([[0, 1], [1, 1]], [0, 1], [0.0, 1.0, 0.0])
     """
 
-    weight: Any
-    letter: Any
-    delta: Any
-    initial: Any
-    verdict: Any
-    repeated: Any
-    accepting: Any
-    reward: Any
-    discount: Any
-    decided: Any
-    potential: Any
-    learner_discount: Any
-    embedding: Any
+    weight: Array
+    letter: Array
+    delta: Array
+    initial: Array
+    verdict: Array
+    repeated: Array
+    accepting: Array
+    reward: Array
+    discount: Array
+    decided: Array
+    potential: Array
+    learner_discount: Array
+    embedding: Array
     state_names: tuple[str, ...] = ()
 
 
@@ -259,7 +259,7 @@ def task_environment(
     environment = require_environment(environment)
     names = environment.propositions if propositions is None else propositions
     kept = ("allowed", "observations", "horizon", "starts", "outcomes")
-    others: Any = {name: getattr(environment, name) for name in kept}
+    others: dict[str, PyTree] = {name: getattr(environment, name) for name in kept}
     inner = make_environment(
         environment.reset,
         environment.step,
@@ -291,8 +291,8 @@ def with_task_tables(environment: Environment, tables: TaskTables) -> Environmen
     """The task environment with another task over the same propositions; runs under ``jit`` and ``vmap``."""
     task_tables(environment)
     validation.instance("tables", tables, TaskTables, "those of make_task_tables")
-    made: Any = environment
-    parts: Any = {
+    made: PyTree = environment
+    parts: dict[str, PyTree] = {
         name: None if (part := getattr(made, name)) is None else part.args[-1]
         for name in ("reset", "step", "observe", "labels", "allowed", "starts", "outcomes")
     }
@@ -392,7 +392,7 @@ def _beside(inner: Environment, tables: TaskTables) -> Environment:
         memory = make_box(0, 1, tables.delta.shape[-2:-1])
     else:
         memory = make_box(-np.inf, np.inf, tables.embedding.shape[1:])
-    spaces: Any = TaskObservation(inner.observations, memory)  # type: ignore[arg-type]
+    spaces: PyTree = TaskObservation(inner.observations, memory)  # type: ignore[arg-type]
     return replace(
         inner,
         reset=Partial(_reset, tables, inner.labels, inner.reset),
@@ -502,7 +502,7 @@ def _observe(
     return TaskObservation(observe(joint.world), memory)
 
 
-def _of_world(function: Callable[..., PyTree], joint: TaskWorld) -> Any:
+def _of_world(function: Callable[..., PyTree], joint: TaskWorld) -> PyTree:
     return function(joint.world)
 
 
@@ -535,7 +535,7 @@ def _padded(tables: Sequence[TaskTables]) -> list[TaskTables]:
                 f"{shapes[1]} a state; give them one width."
             )
 
-    def grow(array: Any, rows: int, columns: int | None = None, fill: Any = 0) -> np.ndarray:
+    def grow(array: Array, rows: int, columns: int | None = None, fill: float = 0) -> np.ndarray:
         array = np.asarray(array)
         wide = [(0, rows - array.shape[0])]
         wide += [] if array.ndim == 1 else [(0, 0 if columns is None else columns - array.shape[1])]
@@ -566,6 +566,6 @@ def _stacked(trees: Sequence[_Tree]) -> _Tree:
     return made
 
 
-def _structure(tree: Any) -> Any:
+def _structure(tree: PyTree) -> PyTree:
     leaves, shape = jax.tree.flatten(tree)
     return [np.shape(leaf) for leaf in leaves], shape

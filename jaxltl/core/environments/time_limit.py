@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import chex
 import jax
@@ -66,7 +65,7 @@ def without_time_limit(environment: Environment) -> tuple[Environment, int | Non
     return replace(environment, horizon=None, **parts), int(timed.step.args[1])
 
 
-def _reset_clock(reset: Callable[..., PyTree], key: chex.PRNGKey) -> Any:
+def _reset_clock(reset: Callable[..., PyTree], key: chex.PRNGKey) -> PyTree:
     return reset(key), jnp.int32(0)
 
 
@@ -83,7 +82,7 @@ def _step_clock(
     )
 
 
-def _start_clock(starts: Callable[..., PyTree]) -> Any:
+def _start_clock(starts: Callable[..., PyTree]) -> PyTree:
     worlds, probability = starts()
     return (worlds, jnp.zeros(jnp.shape(probability), jnp.int32)), probability
 
@@ -99,5 +98,5 @@ def _clocked(
     ), probability
 
 
-def _of_first(function: Callable[..., PyTree], timed: PyTree) -> Any:
+def _of_first(function: Callable[..., PyTree], timed: PyTree) -> PyTree:
     return function(timed[0])

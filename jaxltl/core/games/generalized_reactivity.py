@@ -6,7 +6,7 @@ Piterman, Pnueli and Sa'ar (2006), "Synthesis of reactive(1) designs", with chan
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -75,12 +75,12 @@ def _keep(arena: _Arena, moves: Array, inside: Array, counters: Array) -> tuple[
     return inside & ~out.region, graph.xp.where(inside & out.region, out.action, counters)
 
 
-def _within(arena: _Arena, moves: Array, inside: Array) -> Any:
+def _within(arena: _Arena, moves: Array, inside: Array) -> Array:
     """Moves of the system that surely stay inside, and all moves of the environment."""
     return moves & (arena.graph.forall(inside) | ~arena.graph.on_choices(arena.system))
 
 
-def _near(arena: _Arena, found: Array) -> Any:
+def _near(arena: _Arena, found: Array) -> Array:
     """The environment's moves that may lead to a set: ``bool[S, A]``. They help the system."""
     return arena.graph.exists(found) & ~arena.graph.on_choices(arena.system)
 
@@ -110,7 +110,7 @@ def _pursue(arena: _Arena, j: int, inside: Array, allowed: Array) -> tuple[Array
 
 def _waiting(
     arena: _Arena, i: int, inside: Array, allowed: Array, near: Array, found: Array
-) -> Any:
+) -> Array:
     """States in which assumption i fails while the play is not near the set `found`."""
     missed = inside & ~near
     forced = attract(
@@ -123,7 +123,7 @@ def _waiting(
     return inside & ~forced.region
 
 
-def _prevent(arena: _Arena, inside: Array, allowed: Array, found: Array) -> Any:
+def _prevent(arena: _Arena, inside: Array, allowed: Array, found: Array) -> Array:
     """Moves of the environment, ``int32[M, S]``, that meet every assumption and avoid a set."""
     graph, system, objective = arena
     missed = inside & ~found

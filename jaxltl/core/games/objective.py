@@ -6,7 +6,7 @@ Sets of states are Boolean arrays, or Boolean formulas over the propositions of 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, TypeAlias
+from typing import TypeAlias, cast
 
 import chex
 import jax
@@ -18,6 +18,7 @@ from jaxltl.core.logic.labels import satisfying
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.models.ops.array_namespace import is_traced, namespace, to_jax
 from jaxltl.core.models.product import distinct_labels, letters_by_state
+from jaxltl.core.models.protocols import Array, LabelledModel, Model, base_model
 from jaxltl.core.pretty_print import brief
 
 States: TypeAlias = chex.Array | Formula | str  # a set of states
@@ -70,7 +71,7 @@ class GR1:
     lost: jax.Array | np.ndarray
 
 
-def states_with_label(model: Any, condition: States, place: str = "condition") -> jax.Array:
+def states_with_label(model: Model, condition: States, place: str = "condition") -> jax.Array:
     """A set of states as ``bool[S]``: of an array, or of a Boolean formula over propositions.
 
     Args:
@@ -94,9 +95,7 @@ def states_with_label(model: Any, condition: States, place: str = "condition") -
         # Of traced games too.
         return to_jax(np.full(model.state_shape, condition == "true"))
     if isinstance(condition, str | Formula):
-        world = model
-        while hasattr(world, "mdp"):
-            world = world.mdp
+        world = cast(LabelledModel, base_model(model))
         holds = satisfying(distinct_labels(world), world.propositions, condition, place)
         xp, holds = namespace(letters_by_state(world, np.asarray(holds)))
         extra = len(model.state_shape) - 1
@@ -110,7 +109,7 @@ def states_with_label(model: Any, condition: States, place: str = "condition") -
     return to_jax(condition)
 
 
-def safety(game: Any, safe: States) -> Parity:
+def safety(game: Model, safe: States) -> Parity:
     """Safety objective: stay in `safe` for ever, ``G safe``.
 
     Args:
@@ -132,7 +131,7 @@ def safety(game: Any, safe: States) -> Parity:
     return _parity(game, 0, 1, safe)
 
 
-def reach(game: Any, goal: States, *, safe: States = "true") -> Parity:
+def reach(game: Model, goal: States, *, safe: States = "true") -> Parity:
     """Reachability objective: reach `goal` through `safe` states, ``safe U goal``.
 
     Args:
@@ -154,7 +153,7 @@ def reach(game: Any, goal: States, *, safe: States = "true") -> Parity:
     return _parity(game, 1, 2, safe, won=states_with_label(game, goal, "goal"))
 
 
-def buchi(game: Any, accepting: States, *, safe: States = "true") -> Parity:
+def buchi(game: Model, accepting: States, *, safe: States = "true") -> Parity:
     """Buchi objective: meet `accepting` infinitely often, ``G F accepting & G safe``.
 
     Args:
@@ -177,7 +176,7 @@ def buchi(game: Any, accepting: States, *, safe: States = "true") -> Parity:
     return _parity(game, xp.where(accepting, 0, 1), 2, safe)
 
 
-def cobuchi(game: Any, persistent: States, *, safe: States = "true") -> Parity:
+def cobuchi(game: Model, persistent: States, *, safe: States = "true") -> Parity:
     """Co-Buchi objective: eventually stay in `persistent`, ``F G persistent & G safe``.
 
     Args:
@@ -201,7 +200,7 @@ def cobuchi(game: Any, persistent: States, *, safe: States = "true") -> Parity:
 
 
 def parity(
-    game: Any, priority: chex.Array, *, safe: States = "true", num_priorities: int | None = None
+    game: Model, priority: chex.Array, *, safe: States = "true", num_priorities: int | None = None
 ) -> Parity:
     """Parity objective: the least priority met infinitely often is even, and ``G safe``.
 
@@ -238,7 +237,9 @@ def parity(
     return _parity(game, priority, num_priorities, safe)
 
 
-def _parity(game: Any, priority: Any, num_priorities: int, safe: States, won: Any = None) -> Parity:
+def _parity(
+    game: Model, priority: Array, num_priorities: int, safe: States, won: Array = None
+) -> Parity:
     """A parity objective with unsafe states lost, except for won ones."""
     priority = priority if is_traced(priority) else np.asarray(priority)
     won = np.zeros(game.state_shape, bool) if won is None else won
@@ -251,7 +252,7 @@ def _parity(game: Any, priority: Any, num_priorities: int, safe: States, won: An
     )
 
 
-def generalized_buchi(game: Any, sets: Sequence[States], *, safe: States = "true") -> GR1:
+def generalized_buchi(game: Model, sets: Sequence[States], *, safe: States = "true") -> GR1:
     """Generalised Buchi objective: meet each of several sets infinitely often, and ``G safe``.
 
     Args:
@@ -275,7 +276,11 @@ def generalized_buchi(game: Any, sets: Sequence[States], *, safe: States = "true
 
 
 def gr1(
-    game: Any, assumptions: Sequence[States], guarantees: Sequence[States], *, safe: States = "true"
+    game: Model,
+    assumptions: Sequence[States],
+    guarantees: Sequence[States],
+    *,
+    safe: States = "true",
 ) -> GR1:
     """GR(1) objective ``G safe & ((G F A_1 & ... & G F A_M) -> (G F G_1 & ... & G F G_J))``.
 
@@ -300,7 +305,9 @@ def gr1(
     def rows(sets: Sequence[States], name: str) -> jax.Array:
         if isinstance(sets, str | Formula):
             raise ValueError(f"{name} is {str(sets)!r}; give a list of sets of states.")
-        found: list[Any] = [states_with_label(game, x, f"{name}[{i}]") for i, x in enumerate(sets)]
+        found: list[Array] = [
+            states_with_label(game, x, f"{name}[{i}]") for i, x in enumerate(sets)
+        ]
         xp, *found = namespace(*found or [np.ones(game.state_shape, bool)])
         return to_jax(xp.stack(found))
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import chex
 import jax
@@ -25,6 +26,7 @@ from jaxltl.core.models.mesh.sharded import refuse_sharded
 from jaxltl.core.models.ops import operators
 from jaxltl.core.models.ops.array_namespace import namespace, to_jax
 from jaxltl.core.models.product import Product
+from jaxltl.core.models.protocols import Array, Model, PyTree
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.graph.row_graph import RowGraph
 from jaxltl.core.sparse.rows import first_action
@@ -66,7 +68,7 @@ class Permissive:
 
 
 def permissive_strategy(
-    game: Any,
+    game: Model,
     spec: Parity | GR1 | Automaton | Formula | str,
     *,
     method: str = "auto",
@@ -111,13 +113,13 @@ def permissive_strategy(
         raise ValueError(f"method={method!r}; choose one of {', '.join(METHODS)}.")
     if bound is not None and bound < 1:
         raise ValueError(f"bound={bound}; it must be at least 1.")
-    game, goal = on_states(as_padded_game(game), spec)
-    graph = concrete_graph(game, goal)
-    objective: Any
-    game, objective = jax.tree.map(np.asarray, (game, goal))
+    world, goal = on_states(as_padded_game(game), spec)
+    graph = concrete_graph(world, goal)
+    objective: PyTree
+    world, objective = jax.tree.map(np.asarray, (world, goal))
     if isinstance(objective, Parity) and not _closed(graph, objective.won):
-        game, objective, origin = _remember_won(game, objective)
-        found = permissive_strategy(game, objective, method=method, bound=bound)
+        world, objective, origin = _remember_won(world, objective)
+        found = permissive_strategy(world, objective, method=method, bound=bound)
         state = np.asarray(found.base_state)
         return replace(
             found,
@@ -126,9 +128,9 @@ def permissive_strategy(
         )
     if isinstance(objective, Parity):
         objective = _without_won(objective)
-    arena = _Arena(game, graph, objective)
+    arena = _Arena(world, graph, objective)
     region = _region(arena)
-    _require_start(game, region)
+    _require_start(world, region)
     stay = staying(graph, region)
     maximal = _always_wins(arena, region, stay)
     if method == "auto":
@@ -140,7 +142,7 @@ def permissive_strategy(
                 "win, so no strategy includes every winning one; choose rank, counter or parity."
             )
         return _on(
-            game,
+            world,
             region,
             stay,
             True,
@@ -203,7 +205,9 @@ def shield_policy(policy: jax.Array, allowed: jax.Array) -> jax.Array:
             "the mask allows no move in any state; the specification is "
             "unrealizable, or the mask is of another game."
         )
-    first_of: Any = first_action if xp is np else operators.first_action
+    first_of: Callable[..., tuple[Array, Array]] = (
+        first_action if xp is np else operators.first_action
+    )
     some, first = first_of(allowed)
     if operators.is_deterministic(policy):
         if policy.shape != allowed.shape[:-1]:
@@ -227,12 +231,12 @@ def shield_policy(policy: jax.Array, allowed: jax.Array) -> jax.Array:
 class _Arena(NamedTuple):
     """A game in NumPy arrays, its graph, and the system's objective."""
 
-    game: Any
+    game: Game
     graph: RowGraph
-    objective: Any
+    objective: PyTree
 
 
-def concrete_graph(game: Game, objective: Any = None) -> RowGraph:
+def concrete_graph(game: Game, objective: Parity | GR1 | None = None) -> RowGraph:
     """The graph of a concrete padded game; ValueError for others."""
     refuse_sharded(game)
     graph = graph_of(game, objective)
@@ -245,7 +249,7 @@ def concrete_graph(game: Game, objective: Any = None) -> RowGraph:
 
 
 def _region(arena: _Arena) -> np.ndarray:
-    solve: Any = solve_gr1 if isinstance(arena.objective, GR1) else solve_parity
+    solve: Callable[..., PyTree] = solve_gr1 if isinstance(arena.objective, GR1) else solve_parity
     return solve(arena.graph, arena.game.system, arena.objective).region
 
 
@@ -280,11 +284,11 @@ def _always_wins(arena: _Arena, region: np.ndarray, mask: np.ndarray) -> bool:
     return bool(np.all(solve(graph, hostile, within, mask).region | ~region))
 
 
-def _is_buchi(objective: Any) -> bool:
+def _is_buchi(objective: Parity | GR1) -> bool:
     return isinstance(objective, Parity) and objective.num_priorities == 2
 
 
-def _choose(objective: Any, maximal: bool, bound: int | None) -> str:
+def _choose(objective: Parity | GR1, maximal: bool, bound: int | None) -> str:
     if maximal:
         return "stay"
     if _is_buchi(objective):
@@ -318,7 +322,7 @@ def _explicit(
     return _Arena(model, concrete_graph(model), _at(objective, origin)), found
 
 
-def _at(objective: Any, origin: np.ndarray) -> Any:
+def _at(objective: Parity | GR1, origin: np.ndarray) -> PyTree:
     return jax.tree.map(np.asarray, objective_at(objective, origin))
 
 
@@ -334,11 +338,11 @@ def _beside(game: Game, delta: np.ndarray, initial: int, letter: chex.Array, lab
         acceptance="parity",
     )
     joint = Product(game.mdp, automaton, np.asarray(letter, np.int32), label_on)
-    system: Any = np.broadcast_to(game.system[:, None], joint.state_shape)
+    system: Array = np.broadcast_to(game.system[:, None], joint.state_shape)
     return Game(joint, system)
 
 
-def _closed(graph: RowGraph, region: Any) -> bool:
+def _closed(graph: RowGraph, region: Array) -> bool:
     return bool(np.all(~region[..., None] | ~graph.available | graph.forall(region)))
 
 
@@ -388,7 +392,7 @@ def _by_rank(arena: _Arena, region, stay, bound) -> Permissive:
     if not _is_buchi(objective):
         raise ValueError('method="rank" is for Buchi and GR(1) objectives; choose parity.')
     goal = region & (objective.priority == 0)
-    near: Any = attract(graph, goal, stay, rule=game.system, among=region)
+    near: PyTree = attract(graph, goal, stay, rule=game.system, among=region)
     nearer = _some_nearer(graph, near.rank, region) | goal[..., None]
     mask = stay & (nearer | ~game.system[..., None])
     return _on(
@@ -411,7 +415,7 @@ def _some_nearer(graph: RowGraph, rank: np.ndarray, region: np.ndarray) -> np.nd
 def _by_layers(arena: _Arena, region, stay) -> Permissive:
     arena, origin = _explicit(arena, region, stay)
     game, graph, objective = arena
-    layers: Any = gr1_layers(graph, game.system, objective)
+    layers: PyTree = gr1_layers(graph, game.system, objective)
     region = layers.region
     stay = staying(graph, region)
     num_goals, num_assumptions = layers.round.shape[:2]

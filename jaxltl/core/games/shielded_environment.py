@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import chex
 import jax
@@ -25,6 +25,7 @@ from jaxltl.core.environments.environment import (
 from jaxltl.core.games.permissive import Permissive, apply_strategy, concrete_graph, staying
 from jaxltl.core.games.winning import Winning
 from jaxltl.core.models.mdp import MDP
+from jaxltl.core.models.protocols import Array, PyTree
 from jaxltl.core.pretty_print import brief
 
 
@@ -42,7 +43,7 @@ class ShieldedWorld(NamedTuple):
       3
     """
 
-    world: Any
+    world: PyTree
     state: jax.Array
 
 
@@ -50,16 +51,16 @@ class ShieldedWorld(NamedTuple):
 class _Guide:
     """A permissive strategy as tables over its G reachable states."""
 
-    base: Any  # int32[G], the state of the world's model
-    initial: Any  # bool[G]
-    after: Any  # int32[G, N], the possible successors; -1 is padding
-    allowed: Any  # bool[G, A]
+    base: Array  # int32[G], the state of the world's model
+    initial: Array  # bool[G]
+    after: Array  # int32[G, N], the possible successors; -1 is padding
+    allowed: Array  # bool[G, A]
 
 
 def shield_environment(
     environment: Environment,
     strategy: Permissive | Winning | ArrayLike,
-    state_of: Callable[..., Any] | None = None,
+    state_of: Callable[..., PyTree] | None = None,
 ) -> Environment:
     """Environment with the action mask of a strategy of its model, ``allowed(world)``.
 
@@ -139,7 +140,7 @@ def shield_environment(
     )
 
 
-def _require_actions(mask: Any, num_actions: int) -> None:
+def _require_actions(mask: Array, num_actions: int) -> None:
     if mask.shape[-1] != num_actions:
         raise ValueError(
             f"the shield is of {mask.shape[-1]} actions, and the world has "
@@ -147,7 +148,7 @@ def _require_actions(mask: Any, num_actions: int) -> None:
         )
 
 
-def _require_places(environment: Environment, place: Callable[..., Any], count: int) -> None:
+def _require_places(environment: Environment, place: Callable[..., PyTree], count: int) -> None:
     found = jax.eval_shape(lambda key: place(environment.reset(key)), jax.random.key(0))
     parts = found if isinstance(found, tuple) else (found,)
     if len(parts) != count or any(
@@ -164,8 +165,8 @@ def _guide(strategy: Permissive | Winning) -> _Guide:
     if isinstance(strategy, Winning):
         graph = concrete_graph(strategy.game)
         region = np.asarray(strategy.region)
-        every: Any = np.arange(strategy.game.state_shape[0], dtype=np.int32)
-        allowed: Any = staying(graph, region)
+        every: Array = np.arange(strategy.game.state_shape[0], dtype=np.int32)
+        allowed: Array = staying(graph, region)
         strategy = Permissive(
             strategy.game, strategy.region, allowed, every, every, False, "what stays"
         )
@@ -186,34 +187,34 @@ def _guide(strategy: Permissive | Winning) -> _Guide:
     )
 
 
-def _itself(world: Any) -> Any:
+def _itself(world: PyTree) -> PyTree:
     return world
 
 
 def _reset(
-    guide: _Guide, place: Callable[..., Any], reset: Callable[..., Any], key: chex.PRNGKey
+    guide: _Guide, place: Callable[..., PyTree], reset: Callable[..., PyTree], key: chex.PRNGKey
 ) -> ShieldedWorld:
     return _begin(guide, place, reset(key))
 
 
 def _starts(
-    guide: _Guide, place: Callable[..., Any], starts: Callable[..., Any]
+    guide: _Guide, place: Callable[..., PyTree], starts: Callable[..., PyTree]
 ) -> tuple[ShieldedWorld, jax.Array]:
     worlds, probability = starts()
     return jax.vmap(lambda world: _begin(guide, place, world))(worlds), probability
 
 
-def _begin(guide: _Guide, place: Callable[..., Any], world: Any) -> ShieldedWorld:
+def _begin(guide: _Guide, place: Callable[..., PyTree], world: PyTree) -> ShieldedWorld:
     fits = jnp.asarray(guide.initial) & (jnp.asarray(guide.base) == place(world))
     return ShieldedWorld(world, _some(fits, jnp.arange(len(guide.base))))
 
 
 def _step(
     guide: _Guide,
-    place: Callable[..., Any],
+    place: Callable[..., PyTree],
     step: Callable[..., Timestep],
     before: ShieldedWorld,
-    action: Any,
+    action: PyTree,
     key: chex.PRNGKey,
 ) -> Timestep:
     found = Timestep(*step(before.world, action, key))
@@ -222,10 +223,10 @@ def _step(
 
 def _outcomes(
     guide: _Guide,
-    place: Callable[..., Any],
-    outcomes: Callable[..., Any],
+    place: Callable[..., PyTree],
+    outcomes: Callable[..., PyTree],
     before: ShieldedWorld,
-    action: Any,
+    action: PyTree,
 ) -> tuple[Timestep, jax.Array]:
     found, probability = outcomes(before.world, action)
     worlds = jax.vmap(lambda world: _follow(guide, place, before.state, world))(found[0])
@@ -233,7 +234,7 @@ def _outcomes(
 
 
 def _follow(
-    guide: _Guide, place: Callable[..., Any], state: jax.Array, world: Any
+    guide: _Guide, place: Callable[..., PyTree], state: jax.Array, world: PyTree
 ) -> ShieldedWorld:
     # The previous state and the new state of the world determine the memory: all moves between them
     # lead to the same memory state.
@@ -246,21 +247,24 @@ def _some(fits: jax.Array, states: jax.Array) -> jax.Array:
     return jnp.where(fits.any(), states[jnp.argmax(fits)], -1).astype(jnp.int32)
 
 
-def _allowed(guide: _Guide, inner: Callable[..., Any] | None, shielded: ShieldedWorld) -> Any:
+def _allowed(guide: _Guide, inner: Callable[..., PyTree] | None, shielded: ShieldedWorld) -> PyTree:
     sure = jnp.asarray(guide.allowed)[jnp.maximum(shielded.state, 0)] & (shielded.state >= 0)
     return _within(sure, inner, shielded.world)
 
 
 def _looked_up(
-    mask: jax.Array, place: Callable[..., Any], inner: Callable[..., Any] | None, world: Any
-) -> Any:
+    mask: jax.Array,
+    place: Callable[..., PyTree],
+    inner: Callable[..., PyTree] | None,
+    world: PyTree,
+) -> PyTree:
     return _within(jnp.asarray(mask)[place(world)], inner, world)
 
 
-def _within(sure: jax.Array, inner: Callable[..., Any] | None, world: Any) -> jax.Array:
+def _within(sure: jax.Array, inner: Callable[..., PyTree] | None, world: PyTree) -> jax.Array:
     every = jnp.ones_like(sure) if inner is None else inner(world)
     return jnp.where((sure & every).any(), sure & every, every)
 
 
-def _of_world(function: Callable[..., Any], shielded: ShieldedWorld) -> Any:
+def _of_world(function: Callable[..., PyTree], shielded: ShieldedWorld) -> PyTree:
     return function(shielded.world)

@@ -7,15 +7,15 @@ solver.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaxltl.core.array_types import Booleans, Integers
 from jaxltl.core.games.objective import GR1, Parity
+from jaxltl.core.games.winning import Winning
 from jaxltl.core.models.compiled.compiled import compiled_form
-from jaxltl.core.models.game import as_game
+from jaxltl.core.models.game import Game, as_game
 from jaxltl.core.models.mdp import DenseMDP, support
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief
@@ -48,7 +48,7 @@ class Verification(NamedTuple):
         return self.system and self.environment
 
 
-def verify(winning: Any) -> Verification:
+def verify(winning: Winning) -> Verification:
     """Verifies a winning region and the strategies of both players, on the host.
 
     *The system's claim.* With its actions fixed, every run stays in the region until it is won, and no
@@ -112,7 +112,7 @@ class _Claim(NamedTuple):
     guarantees: Booleans
 
 
-def _claim(winning: Any) -> _Claim:
+def _claim(winning: Winning) -> _Claim:
     game, objective = as_game(winning.game), winning.objective
     shape = game.state_shape
     if isinstance(objective, GR1):
@@ -127,7 +127,7 @@ def _claim(winning: Any) -> _Claim:
     else:
         raise ValueError(f"objective is a {type(objective).__name__}; give a Parity or a GR1.")
 
-    def flat(name: str, width: int) -> NDArray[Any]:
+    def flat(name: str, width: int) -> np.ndarray:
         value = np.asarray(getattr(winning, name))
         expected = (*shape, width) if isinstance(objective, GR1) and width else shape
         if value.shape != expected:
@@ -299,7 +299,7 @@ def _fix(claim: _Claim, owner: Booleans, action: Integers, goals: Booleans) -> _
     return _Play(source, pair, target, pair[order], start, of_pair, nodes, memories)
 
 
-def _moves(game: Any) -> _Moves:
+def _moves(game: Game) -> _Moves:
     """All moves of a game, with sparse products made explicit."""
     model = game.mdp
     if isinstance(model, SparseMDP):

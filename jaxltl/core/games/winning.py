@@ -7,7 +7,8 @@ both win surely. Regions are computed on supports, exactly, as fixed points of a
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -27,6 +28,7 @@ from jaxltl.core.models.game import Game, as_game, as_padded_game
 from jaxltl.core.models.mdp import make_mdp, support
 from jaxltl.core.models.ops.array_namespace import namespace, to_jax
 from jaxltl.core.models.product import product
+from jaxltl.core.models.protocols import Model, PyTree
 from jaxltl.core.pretty_print import brief
 
 
@@ -69,7 +71,7 @@ class Winning:
 
 
 def winning_region(
-    game: Any, spec: Parity | GR1 | Automaton | Formula | str, *, chance: str = "random"
+    game: Model, spec: Parity | GR1 | Automaton | Formula | str, *, chance: str = "random"
 ) -> Winning:
     """Winning region of the system, and winning strategies of both players.
 
@@ -101,12 +103,12 @@ def winning_region(
     """
     if chance not in ("random", "adversarial"):
         raise ValueError(f"chance={chance!r}; choose random or adversarial.")
-    game = as_game(game) if chance == "random" else as_padded_game(game)
-    game, objective = on_states(game, spec)
+    given = as_game(game) if chance == "random" else as_padded_game(game)
+    given, objective = on_states(given, spec)
     if chance == "adversarial":
-        game, origin = adversarial_chance(game)
+        given, origin = adversarial_chance(given)
         objective = objective_at(objective, origin)
-    return solve(game, objective)
+    return solve(given, objective)
 
 
 def solve(game: Game, objective: Parity | GR1, moves: jax.Array | None = None) -> Winning:
@@ -115,7 +117,7 @@ def solve(game: Game, objective: Parity | GR1, moves: jax.Array | None = None) -
     graph = graph_of(form, objective, moves)
     owner, goal, moves = take(graph, (form.system, _flat(form, objective), moves))
     if isinstance(objective, GR1):
-        found: Any = solve_gr1(graph, owner, goal, moves)
+        found: Sequence[Array] = solve_gr1(graph, owner, goal, moves)
     else:
         region, action = solve_parity(graph, owner, goal, moves)
         found = region, action, action
@@ -124,7 +126,7 @@ def solve(game: Game, objective: Parity | GR1, moves: jax.Array | None = None) -
     return Winning(game, objective, *to_jax(tuple(found)))
 
 
-def _flat(form: Game, objective: Parity | GR1) -> Any:
+def _flat(form: Game, objective: Parity | GR1) -> PyTree:
     """The objective with the states of a compiled form, which may number those of a product."""
     more = objective.lost.ndim - len(form.state_shape)
     if not more:
@@ -134,7 +136,7 @@ def _flat(form: Game, objective: Parity | GR1) -> Any:
     )
 
 
-def almost_sure_buchi(game: Any, accepting: States) -> Winning:
+def almost_sure_buchi(game: Model, accepting: States) -> Winning:
     """Almost-sure winning region of a Buchi objective.
 
     Args:
@@ -181,12 +183,12 @@ def task_game(game: Game, spec: Automaton | Formula | str) -> tuple[Game, Parity
     return joint, Parity(to_jax(priority[:, letter].T), none, none, highest + 1)
 
 
-def objective_at(objective: Parity | GR1, origin: jax.Array | np.ndarray) -> Any:
+def objective_at(objective: Parity | GR1, origin: jax.Array | np.ndarray) -> PyTree:
     """The objective on states of another game, each with an original state."""
     _, arrays, origin = namespace(objective, origin)
     states = objective.lost.ndim
 
-    def pick(x: Any) -> jax.Array:
+    def pick(x: Array) -> jax.Array:
         return to_jax(x.reshape(*x.shape[: x.ndim - states], -1)[..., origin])
 
     return jax.tree.map(pick, arrays)

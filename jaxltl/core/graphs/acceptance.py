@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -12,6 +12,7 @@ from jaxltl.core.graphs.end_components import closed_components, components_with
 from jaxltl.core.graphs.graph import graph_of, take
 from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.models.product import Product
+from jaxltl.core.models.protocols import Array
 
 
 class Accepting(NamedTuple):
@@ -34,7 +35,7 @@ def accepting_end_components(model: Product) -> Accepting:
     priority = take(graph, model.automaton.priority)
     everywhere = xp.ones(graph.state_shape, bool)
 
-    def body(half: Any, found: Accepting) -> Accepting:
+    def body(half: Array, found: Accepting) -> Accepting:
         least = 2 * half
         allowed = available & ~graph.reads(priority < least)
         components = components_within(graph, everywhere, allowed)
@@ -66,7 +67,7 @@ def accepting_bottom_components(model: Product, policy: jax.Array) -> jax.Array:
     bottom = closed_components(graph, policy > 0)
     inside = bottom.inside.any(-1)
 
-    def body(i: Any, least: Any) -> Any:
+    def body(i: Array, least: Array) -> Array:
         # In descending order, so that the least is written last.
         p = priority.max() - i
         met = (bottom.inside & graph.reads(priority == p)).any(-1)

@@ -7,7 +7,7 @@ in the transitions. Of a sparse model allowed actions are ``bool[R]``, and an ac
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -15,6 +15,7 @@ import numpy as np
 from jaxltl.core.array_types import Array
 from jaxltl.core.graphs.graph import Graph, graph_of, take
 from jaxltl.core.models.ops.array_namespace import to_jax
+from jaxltl.core.models.protocols import Model
 from jaxltl.core.pretty_print import brief
 
 
@@ -43,7 +44,7 @@ class Attractor(NamedTuple):
 
 
 def attractor(
-    model: Any,
+    model: Model,
     goal: jax.Array,
     allowed: jax.Array | None = None,
     *,
@@ -80,7 +81,7 @@ def attractor(
     if isinstance(rule, str):
         if rule not in ("exists", "forall"):
             raise ValueError(f"rule={rule!r}; choose exists or forall, or give bool[S].")
-        exists: Any = rule == "exists"
+        exists: Array | bool = rule == "exists"
     else:
         exists = rule
     if chance not in ("some", "all"):
@@ -112,7 +113,7 @@ def attract(
     )
 
 
-def avoidable(model: Any, goal: jax.Array, allowed: jax.Array | None = None) -> jax.Array:
+def avoidable(model: Model, goal: jax.Array, allowed: jax.Array | None = None) -> jax.Array:
     """States from which some policy surely never reaches the goal: ``bool[S]``.
 
     The complement of the ``"forall"`` attractor: the minimal reachability probability is zero exactly there.
@@ -140,7 +141,7 @@ def avoid(graph: Graph, goal: Array, allowed: Array | None = None) -> Array:
 
 
 def almost_surely_reaching(
-    model: Any,
+    model: Model,
     goal: jax.Array,
     allowed: jax.Array | None = None,
     *,

@@ -8,22 +8,24 @@ always bad. The number of sweeps is at most the length of a longest shortest pat
 
 from __future__ import annotations
 
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
 from jaxltl.core.models.ops import operators
+from jaxltl.core.models.protocols import PyTree
 
 
 def components_by_sweeps(
-    graph: Any, core: jax.Array, allowed: jax.Array, closed: bool
+    graph: PyTree, core: jax.Array, allowed: jax.Array, closed: bool
 ) -> tuple[jax.Array, jax.Array]:
     """Components ``int32[S]`` and inner actions ``bool[S, A]``, as ``RowGraph.components``."""
     stay = allowed & graph.available & core[..., None]
 
-    def prune(carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[Any, ...]:
+    def prune(
+        carry: tuple[jax.Array, jax.Array, jax.Array],
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
         stay, _, _ = carry
         label = strong_components(graph, core, stay)
         inside = (graph.least(label) == label[..., None]) & (
@@ -43,7 +45,7 @@ def components_by_sweeps(
     return jnp.where(alive, label, _numbers(core.shape)), kept
 
 
-def strong_components(graph: Any, states: jax.Array, moves: jax.Array) -> jax.Array:
+def strong_components(graph: PyTree, states: jax.Array, moves: jax.Array) -> jax.Array:
     """The least state of the component of each state under some actions; itself outside of `states`."""
     number = _numbers(states.shape)
     none = jnp.int32(number.size)
@@ -71,7 +73,7 @@ def strong_components(graph: Any, states: jax.Array, moves: jax.Array) -> jax.Ar
 
         return lax.while_loop(lambda carry: carry[1], spread, (root, jnp.bool_(True)))[0]
 
-    def body(carry: Any) -> Any:
+    def body(carry: PyTree) -> PyTree:
         label, left, forward = carry
         rank = jnp.where(forward, number, none - 1 - number)
         colours = colour(rank, left)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -11,6 +11,7 @@ from jaxltl.core.array_types import Array
 from jaxltl.core.graphs.attractor import avoid
 from jaxltl.core.graphs.graph import Graph, graph_of, take
 from jaxltl.core.models.ops.array_namespace import to_jax
+from jaxltl.core.models.protocols import Model
 from jaxltl.core.pretty_print import brief
 
 
@@ -36,7 +37,7 @@ class EndComponents(NamedTuple):
 
 
 def end_components(
-    model: Any, region: jax.Array, allowed: jax.Array | None = None
+    model: Model, region: jax.Array, allowed: jax.Array | None = None
 ) -> EndComponents:
     """Maximal end components that lie within a region (de Alfaro 1997).
 
@@ -73,7 +74,7 @@ def components_within(graph: Graph, region: Array, allowed: Array | None = None)
     return EndComponents(*graph.components(core, allowed, closed=False))
 
 
-def bottom_components(model: Any, allowed: jax.Array) -> EndComponents:
+def bottom_components(model: Model, allowed: jax.Array) -> EndComponents:
     """Bottom strongly connected components of the chain that takes all allowed actions."""
     graph = graph_of(model, allowed)
     return to_jax(closed_components(graph, take(graph, allowed)))

@@ -6,9 +6,10 @@ nothing; traced ones use a :class:`TracedGraph` of the primitives. The results a
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +28,7 @@ from jaxltl.core.models.ops.choices import choice_shape, choices
 from jaxltl.core.models.ops.host_callback import host_callback
 from jaxltl.core.models.ops.latest import keep_latest
 from jaxltl.core.models.product import Product, reads
+from jaxltl.core.models.protocols import Array, Model, PyTree
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.sparse.graph.row_graph import RowGraph, product_graph
 from jaxltl.core.sparse.mdp import HostGraph
@@ -37,7 +39,7 @@ from jaxltl.core.sparse.rows import rows_from_dense, rows_from_padded
 class TracedGraph:
     """The operations of a RowGraph by the operators of a model, inside ``jit`` and ``vmap``."""
 
-    model: Any
+    model: Model
 
     xp = jnp
 
@@ -69,7 +71,7 @@ class TracedGraph:
 
     def reads(self, marked: jax.Array) -> jax.Array:
         """Mask of actions that may read a marked transition of the automaton: ``bool[S, Q, A]``."""
-        return self.available & reads(self.model, marked)
+        return self.available & reads(cast(Product, self.model), marked)
 
     def first(self, mask: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Mask of states with an action in a mask ``bool[S, A]``, and the first such action (or 0)."""
@@ -106,11 +108,11 @@ class TracedGraph:
         label = component.ravel()
         return jnp.zeros(label.size, bool).at[label].max(mark.ravel())[component]
 
-    def repeat(self, body: Any, start: tuple[Any, ...]) -> tuple[Any, ...]:
+    def repeat(self, body: Callable[[PyTree], PyTree], start: PyTree) -> PyTree:
         """Repeats `body` while the last entry of the carry is true."""
         return lax.while_loop(lambda carry: carry[-1], body, start)
 
-    def times(self, count: Any, body: Any, start: Any) -> Any:
+    def times(self, count: Array, body: Callable[..., PyTree], start: PyTree) -> PyTree:
         """``body(i, carry)`` for i below a count."""
         return lax.fori_loop(0, count, body, start)
 
@@ -139,7 +141,7 @@ def _sweeps(graph: TracedGraph, goal, allowed, rule, among, *, chance):
     return lax.while_loop(lambda carry: carry[3], body, start)[:3]
 
 
-def graph_of(model: Any, *arguments: Any) -> Graph:
+def graph_of(model: Model, *arguments: PyTree) -> Graph:
     """The graph of a model: the host's, unless the model or an argument is traced."""
     world = model.mdp if isinstance(model, Game) else model
     if isinstance(world, SparseMDP):
@@ -148,10 +150,11 @@ def graph_of(model: Any, *arguments: Any) -> Graph:
         model = compiled_form(model)[0]
     if is_traced((model, arguments)) or not is_table(model):
         return TracedGraph(lax.stop_gradient(model))  # supports have no derivative
-    return host_graph(model.mdp if isinstance(model, Game) else model)
+    lazy = model.mdp if isinstance(model, Game) else model
+    return host_graph(cast(MDP | DenseMDP | Product, lazy))
 
 
-def is_table(model: Any) -> bool:
+def is_table(model: Model) -> bool:
     """True for an MDP or DenseMDP, or a product or game of one."""
     lazy = model.mdp if isinstance(model, Game) else model
     world = lazy.mdp if isinstance(lazy, Product) else lazy
@@ -182,6 +185,6 @@ def host_graph(model: MDP | DenseMDP | Product) -> RowGraph:
     )
 
 
-def take(graph: Graph, tree: Any) -> Any:
+def take(graph: Graph, tree: PyTree) -> PyTree:
     """A tree with the arrays of a graph's namespace."""
     return jax.tree.map(graph.xp.asarray, tree)

@@ -19,7 +19,7 @@ from jaxltl.core.models.mdp import MDP, DenseMDP, support
 from jaxltl.core.models.ops import operators
 from jaxltl.core.models.ops.array_namespace import is_traced, namespace, to_jax
 from jaxltl.core.models.ops.choices import choice_shape, choices
-from jaxltl.core.models.protocols import Model, base_model
+from jaxltl.core.models.protocols import Array, Model, PyTree, base_model
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief
 from jaxltl.core import validation
@@ -136,7 +136,7 @@ def _name(state: tuple[int, ...]) -> str:
     return str(state[0]) if len(state) == 1 else str(state)
 
 
-def _owners(system: Any, shape: tuple[int, ...]) -> np.ndarray:
+def _owners(system: Array, shape: tuple[int, ...]) -> np.ndarray:
     owner = np.asarray(system)
     if owner.shape != shape:
         least = min(owner.shape[0] if owner.ndim else 0, shape[0])
@@ -188,7 +188,7 @@ def swap_players(game: Game) -> Game:
 # --- the primitives: those of the model -----------------------------------------------------
 
 
-def _register_on_base(primitive: Any) -> None:
+def _register_on_base(primitive: PyTree) -> None:
     primitive.register(Game, lambda game, *given, **named: primitive(game.mdp, *given, **named))
 
 

@@ -91,7 +91,7 @@ class IntervalMDP:
         return self.nominal.state_shape
 
     @property
-    def dtype(self) -> Any:
+    def dtype(self) -> np.dtype:
         """The dtype of the nominal probabilities."""
         return self.nominal.dtype
 
@@ -166,7 +166,7 @@ def refuse_ball(model: IntervalMDP, why: str) -> None:
         )
 
 
-def _travelling(lower: Any, upper: Any, center: Any, radius: Any) -> dict[str, Rewards]:
+def _travelling(lower: Array, upper: Array, center: Array, radius: Array) -> dict[str, Rewards]:
     found = {
         _ENTRIES["lower"]: Rewards(transition=lower),
         _ENTRIES["upper"]: Rewards(transition=upper),
@@ -361,7 +361,7 @@ def interval_rows(
 
 
 def _ball(
-    center: Any, radius: Any, entries: tuple[int, ...], num_rows: int
+    center: Array, radius: Array, entries: tuple[int, ...], num_rows: int
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Center and radius with checked shapes, or None."""
     if center is None and radius is None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import chex
 import jax
@@ -15,7 +14,7 @@ from numpy.typing import DTypeLike
 from jaxltl.core.models import facts
 from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
 from jaxltl.core.models.ops.underflow import target_dtype, underflow_text, underflows
-from jaxltl.core.models.protocols import Model
+from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.pretty_print import brief
 from jaxltl.core import validation
 
@@ -284,7 +283,7 @@ def to_dense(mdp: MDP) -> DenseMDP:
     num_states, num_actions = mdp.num_states, mdp.num_actions
     shape = num_states, num_actions, num_states
     place = np.arange(num_states)[:, None, None], np.arange(num_actions)[:, None]
-    transition: Any
+    transition: Array
     if is_traced(mdp):
         empty = jnp.zeros(shape, mdp.dtype)
         transition = empty.at[*place, mdp.successor].add(mdp.probability)

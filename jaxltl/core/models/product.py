@@ -6,7 +6,7 @@ the value of a successor is read.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from functools import singledispatch
 from typing import Any, overload
 
@@ -27,7 +27,7 @@ from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.ops import kernels, operators
 from jaxltl.core.models.ops.annotated_pytree import register_annotated_pytree
 from jaxltl.core.models.ops.array_namespace import namespace, to_jax
-from jaxltl.core.models.protocols import LabelledModel
+from jaxltl.core.models.protocols import Array, LabelledModel
 from jaxltl.core.pretty_print import brief
 
 
@@ -393,7 +393,7 @@ def _(model: Product, policy: jax.Array) -> jax.Array:
 
 
 @operators.policy_operator.register
-def _(model: Product, policy: jax.Array) -> Any:
+def _(model: Product, policy: jax.Array) -> Callable[[jax.Array], jax.Array]:
     if isinstance(model.mdp, MDP | DenseMDP):
         return operators.chain_operator(operators.induced_chain(model, policy))
 
@@ -405,8 +405,8 @@ def _(model: Product, policy: jax.Array) -> Any:
 
 
 @operators.unpadded_states.register
-def _(model: Product) -> Any:
-    found: Any = operators.unpadded_states(model.mdp)
+def _(model: Product) -> Array:
+    found: Array = operators.unpadded_states(model.mdp)
     return found if found is True else found[:, None]
 
 

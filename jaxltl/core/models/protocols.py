@@ -15,7 +15,10 @@ A game satisfies what its model does. Quantities on states have the shape ``stat
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, Protocol, TypeAlias, TypeVar, runtime_checkable
+
+import numpy as np
 
 from jaxltl.core.array_types import PyTree as PyTree
 
@@ -38,7 +41,7 @@ class Model(Protocol):
         """``float[S]``, the initial distribution."""
 
     @property
-    def dtype(self) -> Any:
+    def dtype(self) -> np.dtype:
         """The dtype of the probabilities."""
 
 
@@ -94,7 +97,7 @@ class RowModel(LabelledModel, Protocol):
         """True for a Markov chain: one row in each state."""
 
     @property
-    def rewards(self) -> Any:
+    def rewards(self) -> Mapping[str, PyTree]:
         """Reward structures by name."""
 
     def states_with_label(self, proposition: str) -> Array:

@@ -150,7 +150,7 @@ class SparseMDP:
         return (self.num_states,)
 
     @property
-    def dtype(self) -> Any:
+    def dtype(self) -> np.dtype:
         """The dtype of the probabilities."""
         return self.probability.dtype
 
@@ -249,7 +249,7 @@ def _sizes(model: SparseMDP) -> tuple[tuple[int, str], ...]:
     )
 
 
-def _traced_reward(model: SparseMDP, reward: Rewards) -> Any:
+def _traced_reward(model: SparseMDP, reward: Rewards) -> Array:
     total = jnp.zeros(model.num_rows, jax.dtypes.canonicalize_dtype(model.dtype))
     if reward.state is not None:
         total += gather(reward.state, segment_ids(model.row_start, model.num_rows))
@@ -262,11 +262,11 @@ def _traced_reward(model: SparseMDP, reward: Rewards) -> Any:
     return total
 
 
-def _listed(names: Mapping[str, Any]) -> str:
+def _listed(names: Mapping[str, object]) -> str:
     return ", ".join(map(repr, names)) or "none"
 
 
-def _shaped(model: SparseMDP, reward: Any) -> Rewards:
+def _shaped(model: SparseMDP, reward: Array) -> Rewards:
     reward = reward if isinstance(reward, jax.Array) else validation.float_array("reward", reward)
     for size, name in _sizes(model):
         if reward.shape == (size,):
@@ -399,7 +399,7 @@ def sparse_part(
     )
 
 
-def checked_starts(name: str, start: Any, total: int, of: str) -> np.ndarray:
+def checked_starts(name: str, start: Array, total: int, of: str) -> np.ndarray:
     """Validated span starts as ``int64``: ascending from 0 to `total`."""
     start = np.asarray(start)
     if start.ndim != 1 or not start.size or not np.issubdtype(start.dtype, np.integer):
@@ -485,7 +485,7 @@ def _checked_rewards(
 ) -> Rewards:
     if not isinstance(reward, Rewards):
         raise ValueError(f"reward {name!r} is {validation.shorten(reward)}; give Rewards.")
-    parts: dict[str, Any] = {}
+    parts: dict[str, Array] = {}
     for part, size, first in zip(("state", "choice", "transition"), sizes, begins, strict=True):
         given = getattr(reward, part)
         if given is None:
@@ -502,7 +502,7 @@ def _checked_rewards(
     return Rewards(**parts)
 
 
-def _checked_action(action: Any, num_rows: int, names: tuple[str, ...]) -> np.ndarray:
+def _checked_action(action: Array, num_rows: int, names: tuple[str, ...]) -> np.ndarray:
     action = np.asarray(action)
     if action.shape != (num_rows,) or not np.issubdtype(action.dtype, np.integer):
         raise ValueError(
@@ -526,7 +526,7 @@ def _canonical(
     state: int,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, Rewards]]:
     """Sorted entries without repetitions and zeros; `state` is the number of the first state."""
-    index: Any = np.int32 if successor.size < 2**31 else np.int64
+    index: type[np.signedinteger] = np.int32 if successor.size < 2**31 else np.int64
     first = np.zeros(successor.size + 1, bool)
     first[entry_start] = True
     ascends = successor[1:] > successor[:-1]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from jaxltl.core.statistics.empirical_bernstein import bounded_mean
 from jaxltl.core.status import Status
 
 
-def _evaluation_facts(value: Any) -> Iterator[str]:
+def _evaluation_facts(value: Evaluation) -> Iterator[str]:
     yield value.status.name
     yield count(value.num_episodes, "episode")
     for name in ("success", "reward", "cost", "length"):
@@ -31,7 +31,7 @@ def _evaluation_facts(value: Any) -> Iterator[str]:
         yield f"threshold {value.threshold:g} {known}"
 
 
-def _estimate_facts(value: Any) -> Iterator[str]:
+def _estimate_facts(value: Estimate) -> Iterator[str]:
     yield f"{number(value.mean)} in [{value.lower:.6g}, {value.upper:.6g}]"
     yield value.method
 
@@ -203,7 +203,7 @@ def evaluation_of(
             for name, code in _SHARES.items()
         }
 
-    def bounded(x: Any, low: float, high: float) -> Estimate | None:
+    def bounded(x: Array | None, low: float, high: float) -> Estimate | None:
         planned = total if fixed else None
         return None if x is None else _bounded_estimate(x, low, high, failure, planned)
 
@@ -254,7 +254,7 @@ def share_estimate(count: int, total: int, failure: float, fixed: bool = True) -
     )
 
 
-def _mean_estimate(x: Any, failure: float) -> Estimate:
+def _mean_estimate(x: Array, failure: float) -> Estimate:
     from scipy.special import stdtrit  # a tenth of a second
 
     mean, error = _mean_error(x)
@@ -263,7 +263,7 @@ def _mean_estimate(x: Any, failure: float) -> Estimate:
 
 
 def _bounded_estimate(
-    x: Any, low: float, high: float, failure: float, planned: int | None
+    x: Array, low: float, high: float, failure: float, planned: int | None
 ) -> Estimate:
     mean, error = _mean_error(x)
     size = high - low
@@ -275,7 +275,7 @@ def _bounded_estimate(
     return Estimate(mean, low + size * lower, low + size * upper, error, method)
 
 
-def _mean_error(x: Any) -> tuple[float, float]:
+def _mean_error(x: Array) -> tuple[float, float]:
     """The mean and its standard error, which is infinite for one number."""
     x = np.asarray(x, np.float64)
     with np.errstate(invalid="ignore", over="ignore"):

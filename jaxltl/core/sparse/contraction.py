@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -115,7 +114,7 @@ def quotient(mdp: HostMDP, component: Integers, inside: Booleans, cost: Floats) 
     row = np.flatnonzero(kept)
     row = row[np.argsort(leader[row], kind="stable")]
     leaders = np.flatnonzero(is_leader)
-    number: Any = np.zeros(size, np.int32)
+    number: Integers = np.zeros(size, np.int32)
     number[leaders] = np.arange(leaders.size)
     node = number[component]
     count = np.bincount(node[mdp.state[row]], minlength=leaders.size)

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxltl.core.array_types import Booleans, Floats, Integers
+from jaxltl.core.array_types import Booleans, Floats, Integers, SparseMatrix
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.rows import Rows, concatenated_ranges, offsets_from_counts
 
@@ -102,7 +101,7 @@ class HostMDP(HostGraph):
     probability: Floats  # float64[T], positive; a row sums to one up to rounding
 
     @cached_property
-    def matrix(self) -> Any:
+    def matrix(self) -> SparseMatrix:
         """The transition matrix, SciPy's sparse ``float64[R, S]``."""
         from scipy import sparse  # slow to import; only products need it
 
@@ -116,7 +115,7 @@ class HostMDP(HostGraph):
             return np.add.reduceat(weighted, self.entry_start[:-1])
         return self.matrix @ value
 
-    def over_choices(self, operation: np.ufunc, quantity: NDArray[Any]) -> NDArray[Any]:
+    def over_choices(self, operation: np.ufunc, quantity: np.ndarray) -> np.ndarray:
         """A reduction, such as ``np.maximum``, over the choices of each state: ``[R]`` to ``[S]``."""
         if self.is_chain:
             return quantity

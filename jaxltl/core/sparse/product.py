@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +40,7 @@ class SparseProduct(NamedTuple):
 
 def sparse_product(
     host: HostMDP,
-    delta: NDArray[Any],
+    delta: np.ndarray,
     letter: Integers,
     state: Integers,
     memory: Integers,
@@ -161,7 +162,9 @@ def _searched(world: _World, start: Integers) -> Booleans:
     return seen
 
 
-def _written(world: _World, code: Integers, number: Any, start: Integers) -> SparseProduct:
+def _written(
+    world: _World, code: Integers, number: Callable[[Integers], Integers], start: Integers
+) -> SparseProduct:
     """The rows of the reachable pairs."""
     host = world.host
     state, memory = np.divmod(code, world.num_memory)

@@ -8,12 +8,10 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from jaxltl.core.array_types import Booleans, Integers
+from jaxltl.core.array_types import Booleans, Integers, SparseMatrix
 
 SCIPY_SIZE = 100_000  # entries from which importing SciPy pays
 _READY = 20_000  # entries from which it is faster, once it is imported
@@ -38,7 +36,7 @@ class Rows:
         return np.diff(self.entry_start)
 
     @cached_property
-    def matrix(self) -> Any:
+    def matrix(self) -> SparseMatrix:
         """The sparse matrix of ones, ``[R, S]``."""
         from scipy import sparse  # slow to import; only large models need it
 
@@ -57,11 +55,11 @@ class Rows:
             return self.matrix @ region.astype(self.matrix.dtype) > 0
         return self.reduce(np.logical_or, region[self.successor], False)
 
-    def least(self, value: NDArray[Any], default: Any) -> NDArray[Any]:
+    def least(self, value: np.ndarray, default: float) -> np.ndarray:
         """The smallest value among the successors, ``[R]``; the default for empty rows."""
         return self.reduce(np.minimum, value[self.successor], default)
 
-    def reduce(self, operation: np.ufunc, entries: NDArray[Any], default: Any) -> NDArray[Any]:
+    def reduce(self, operation: np.ufunc, entries: np.ndarray, default: float) -> np.ndarray:
         """A reduction over the entries of each row, ``[R]``; the default for empty rows."""
         found = np.full(self.num_rows, default, entries.dtype)
         full = self.count > 0
@@ -96,7 +94,7 @@ def offsets_from_counts(count: Integers) -> Integers:
     >>> offsets_from_counts(np.array([2, 0, 1])).tolist()
     [0, 2, 2, 3]
     """
-    found: Any = np.zeros(count.size + 1, np.int64)
+    found: Integers = np.zeros(count.size + 1, np.int64)
     np.cumsum(count, out=found[1:])
     return found.astype(np.int32) if found[-1] < 2**31 else found
 
@@ -153,7 +151,7 @@ def rows_from_padded(successor: Integers, used: Booleans, num_states: int) -> Ro
     ([0, 1, 3], [1, 0, 1])
     """
     width = used.shape[-1]
-    index: Any = np.int32 if used.size < 2**31 else np.int64
+    index: type[np.signedinteger] = np.int32 if used.size < 2**31 else np.int64
     if used.all():
         every: Integers = np.arange(0, used.size + 1, width, dtype=index)
         return Rows(every, successor.reshape(-1), num_states)

@@ -36,7 +36,7 @@ _EPS = float(np.finfo(np.float64).eps)
 _MOST = 2**53  # throws of a row, up to which doubles count
 
 
-def _facts(sets: Any) -> Iterator[str]:
+def _facts(sets: ConfidenceSets) -> Iterator[str]:
     yield count(sets.num_samples.size, "row")
     samples, low, high = (readable(x) for x in (sets.num_samples, sets.lower, sets.upper))
     yield count(samples.sum(), "sample") if samples is not None else ""
@@ -82,14 +82,14 @@ class ConfidenceSets:
 
 
 def intervals_from_counts(
-    counts: Any,
+    counts: ArrayLike,
     confidence: float,
     *,
     method: Method = "clopper-pearson",
-    entry_start: Any = None,
-    used: Any = None,
-    rows: Any = None,
-    num_outcomes: Any = None,
+    entry_start: ArrayLike | None = None,
+    used: ArrayLike | None = None,
+    rows: ArrayLike | None = None,
+    num_outcomes: ArrayLike | None = None,
     num_claims: int | None = None,
 ) -> ConfidenceSets:
     """Confidence sets of the probabilities of all rows, simultaneously valid.
@@ -236,7 +236,9 @@ def check_confidence(confidence: float) -> None:
         )
 
 
-def _entries(counts: Any, entry_start: Any, used: Any) -> tuple[Integers, Integers, Booleans]:
+def _entries(
+    counts: ArrayLike, entry_start: ArrayLike | None, used: ArrayLike | None
+) -> tuple[Integers, Integers, Booleans]:
     """Counts of listed successors, their number per row, and their mask."""
     counts = np.asarray(counts)
     if entry_start is not None:
@@ -287,7 +289,7 @@ def _entries(counts: Any, entry_start: Any, used: Any) -> tuple[Integers, Intege
     return whole[is_entry].astype(np.int64), listed, is_entry
 
 
-def _outcomes(num_outcomes: Any, listed: Integers, shape: tuple[int, ...]) -> Integers:
+def _outcomes(num_outcomes: ArrayLike | None, listed: Integers, shape: tuple[int, ...]) -> Integers:
     if num_outcomes is None:
         return listed
     given = np.asarray(num_outcomes)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import chex
 import jax
@@ -12,7 +11,9 @@ import numpy as np
 from jax.tree_util import Partial
 
 from jaxltl.core.environments.environment import Environment, Timestep, make_box, make_environment
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.envs.adapters.common import (
+    Foreign,
     Held,
     arrays,
     copied,
@@ -25,7 +26,10 @@ from jaxltl.envs.adapters.common import (
 
 
 def from_brax(
-    env: Any, *, labels: Callable[..., jax.Array] | None = None, propositions: Sequence[str] = ()
+    env: Foreign,
+    *,
+    labels: Callable[..., jax.Array] | None = None,
+    propositions: Sequence[str] = (),
 ) -> Environment:
     """A Brax environment without its auto-reset and batch wrappers.
 
@@ -74,11 +78,11 @@ def from_brax(
         )
 
 
-def _reset(held: Held, key: chex.PRNGKey) -> Any:
+def _reset(held: Held, key: chex.PRNGKey) -> PyTree:
     return arrays(held.it.reset(key))
 
 
-def _step(held: Held, world: Any, action: Any, key: chex.PRNGKey) -> Timestep:
+def _step(held: Held, world: PyTree, action: PyTree, key: chex.PRNGKey) -> Timestep:
     del key
     found = held.it.step(copied(world), action)
     done = found.done > 0
@@ -86,5 +90,5 @@ def _step(held: Held, world: Any, action: Any, key: chex.PRNGKey) -> Timestep:
     return timestep(found, world, found.reward, done & ~truncated, truncated)
 
 
-def _observe(world: Any) -> Any:
+def _observe(world: PyTree) -> PyTree:
     return world.obs

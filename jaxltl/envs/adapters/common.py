@@ -6,23 +6,28 @@ import contextlib
 import importlib
 import warnings
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.tree_util import Partial
+from jax.typing import ArrayLike
 
 from jaxltl.core import validation
 from jaxltl.core.environments.environment import Timestep, as_partial
+from jaxltl.core.models.protocols import Array, PyTree
 from jaxltl.core.pretty_print import brief
+
+
+Foreign: TypeAlias = Any  # an object, a type or a module of a package that may be missing
 
 
 @jax.tree_util.register_static
 class Held:
     """A static pytree leaf `it`: an object of a package, compared by identity."""
 
-    def __init__(self, it: Any) -> None:
+    def __init__(self, it: Foreign) -> None:
         self.it = it
 
     def __eq__(self, other: object) -> bool:
@@ -36,11 +41,11 @@ class Held:
 class Seen(NamedTuple):
     """The package's state of an environment together with its last observation."""
 
-    state: Any
-    observation: Any
+    state: PyTree
+    observation: PyTree
 
 
-def package(name: str) -> Any:
+def package(name: str) -> Foreign:
     """Imports a module of another package; ImportError with the command that installs it."""
     root = name.partition(".")[0]
     try:
@@ -54,7 +59,7 @@ def package(name: str) -> Any:
         ) from problem
 
 
-def require_environment(root: str, env: Any, kinds: Any, remedy: str) -> None:
+def require_environment(root: str, env: Foreign, kinds: Foreign, remedy: str) -> None:
     """Raises ValueError unless the argument is an environment of the package."""
     if not isinstance(env, kinds):
         kind = type(env)
@@ -64,7 +69,7 @@ def require_environment(root: str, env: Any, kinds: Any, remedy: str) -> None:
         )
 
 
-def params_of(root: str, params: Any, own: Any) -> Any:
+def params_of(root: str, params: Foreign, own: Foreign) -> Foreign:
     """The given parameters or the environment's default ones; ValueError for another type."""
     if params is None:
         return own
@@ -77,7 +82,7 @@ def params_of(root: str, params: Any, own: Any) -> Any:
 
 
 @contextlib.contextmanager
-def own_errors(root: str, env: Any) -> Iterator[None]:
+def own_errors(root: str, env: Foreign) -> Iterator[None]:
     """Context manager that attributes errors raised while tracing to the package."""
     try:
         yield
@@ -92,7 +97,7 @@ def own_errors(root: str, env: Any) -> Iterator[None]:
         ) from problem
 
 
-def refuse_wrappers(root: str, env: Any, attribute: str, kinds: Any, remedy: str) -> None:
+def refuse_wrappers(root: str, env: Foreign, attribute: str, kinds: Foreign, remedy: str) -> None:
     """Raises ValueError for auto-reset or batch wrappers in any layer of an environment."""
     for layer in layers(env, attribute):
         if isinstance(layer, kinds):
@@ -102,26 +107,26 @@ def refuse_wrappers(root: str, env: Any, attribute: str, kinds: Any, remedy: str
             )
 
 
-def layers(env: Any, attribute: str) -> Iterator[Any]:
+def layers(env: Foreign, attribute: str) -> Iterator[Foreign]:
     """An environment and the environments that it wraps, outermost first."""
     while env is not None:
         yield env
         env = vars(env).get(attribute) if hasattr(env, "__dict__") else None
 
 
-def copied(tree: Any) -> Any:
+def copied(tree: PyTree) -> PyTree:
     """A copy of the containers of a tree, since some packages modify their arguments."""
     return jax.tree.map(lambda x: x, tree)
 
 
-def arrays(tree: Any, like: Any = None) -> Any:
+def arrays(tree: PyTree, like: PyTree = None) -> PyTree:
     """Leaves as arrays with strong dtypes, those of a reference tree of the same structure if given."""
     like = tree if like is None else like
-    kind: Any = jax.tree.structure(like)
+    kind: PyTree = jax.tree.structure(like)
     if kind != jax.tree.structure(tree):
         return tree
 
-    def typed(x: Any, y: Any) -> Any:
+    def typed(x: ArrayLike, y: ArrayLike) -> ArrayLike:
         dtype = jnp.result_type(y)
         if jnp.issubdtype(dtype, jax.dtypes.extended):  # a key
             return x
@@ -130,7 +135,9 @@ def arrays(tree: Any, like: Any = None) -> Any:
     return jax.tree.map(typed, tree, like)
 
 
-def timestep(world: Any, before: Any, reward: Any, terminated: Any, truncated: Any) -> Timestep:
+def timestep(
+    world: PyTree, before: PyTree, reward: Array, terminated: Array, truncated: Array
+) -> Timestep:
     """A :class:`Timestep` with the dtypes of the protocol and zero costs."""
     return Timestep(
         arrays(world, before),
@@ -146,11 +153,11 @@ def labels_of_state(labels: Callable[..., jax.Array] | None) -> Partial | None:
     return None if labels is None else Partial(_label_state, as_partial(labels))
 
 
-def _label_state(labels: Callable[..., jax.Array], world: Any) -> jax.Array:
+def _label_state(labels: Callable[..., jax.Array], world: Seen) -> jax.Array:
     return labels(world.state)
 
 
-def observation_of(world: Any) -> Any:
+def observation_of(world: Seen) -> PyTree:
     """The observation stored in a wrapped state."""
     return world.observation
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import chex
 import jax
@@ -11,7 +10,9 @@ import jax.numpy as jnp
 from jax.tree_util import Partial
 
 from jaxltl.core.environments.environment import Environment, Timestep, make_environment
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.envs.adapters.common import (
+    Foreign,
     Held,
     arrays,
     copied,
@@ -24,8 +25,8 @@ from jaxltl.envs.adapters.gymnax import space_of_actions
 
 
 def from_craftax(
-    env: Any,
-    params: Any = None,
+    env: Foreign,
+    params: Foreign = None,
     *,
     labels: Callable[..., jax.Array] | None = None,
     propositions: Sequence[str] = (),
@@ -73,12 +74,14 @@ def from_craftax(
     )
 
 
-def _reset(held: Held, params: Any, key: chex.PRNGKey) -> Any:
+def _reset(held: Held, params: Foreign, key: chex.PRNGKey) -> PyTree:
     _, state = held.it.reset_env(key, params)
     return arrays(state)
 
 
-def _step(held: Held, params: Any, world: Any, action: Any, key: chex.PRNGKey) -> Timestep:
+def _step(
+    held: Held, params: Foreign, world: PyTree, action: PyTree, key: chex.PRNGKey
+) -> Timestep:
     env = held.it
     _, state, reward, _, _ = env.step_env(key, copied(world), action, params)
     endless = params.replace(max_timesteps=jnp.iinfo(jnp.int32).max)
@@ -91,5 +94,5 @@ def _step(held: Held, params: Any, world: Any, action: Any, key: chex.PRNGKey) -
     )
 
 
-def _observe(held: Held, world: Any) -> Any:
+def _observe(held: Held, world: PyTree) -> PyTree:
     return held.it.get_obs(world)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import chex
 import jax
@@ -17,7 +16,9 @@ from jaxltl.core.environments.environment import (
     make_box,
     make_environment,
 )
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.envs.adapters.common import (
+    Foreign,
     Held,
     Seen,
     arrays,
@@ -32,8 +33,8 @@ from jaxltl.envs.adapters.common import (
 
 
 def from_gymnax(
-    env: Any,
-    params: Any = None,
+    env: Foreign,
+    params: Foreign = None,
     *,
     labels: Callable[..., jax.Array] | None = None,
     propositions: Sequence[str] = (),
@@ -83,7 +84,7 @@ def from_gymnax(
     )
 
 
-def space_of_actions(root: str, space: Any) -> Finite | Box:
+def space_of_actions(root: str, space: Foreign) -> Finite | Box:
     """Action space from a gymnax space."""
     if hasattr(space, "n"):
         return Finite(int(space.n))
@@ -92,12 +93,12 @@ def space_of_actions(root: str, space: Any) -> Finite | Box:
     raise ValueError(f"from_{root}: actions are {space!r}; they must be finite or in a box.")
 
 
-def _reset(held: Held, params: Any, key: chex.PRNGKey) -> Seen:
+def _reset(held: Held, params: Foreign, key: chex.PRNGKey) -> Seen:
     observation, state = held.it.reset(key, params)
     return arrays(Seen(state, observation))
 
 
-def _step(held: Held, params: Any, world: Seen, action: Any, key: chex.PRNGKey) -> Timestep:
+def _step(held: Held, params: Foreign, world: Seen, action: PyTree, key: chex.PRNGKey) -> Timestep:
     env = held.it
     observation, state, reward, terminated, _ = env.step_env(
         key, copied(world.state), action, params

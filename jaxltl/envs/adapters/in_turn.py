@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import chex
 import jax
@@ -17,6 +17,7 @@ from jax import lax
 from jax.tree_util import Partial
 
 from jaxltl.core.environments.environment import Environment, Timestep, make_environment
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.pretty_print import brief
 from jaxltl.envs.adapters.common import Held
 
@@ -25,7 +26,7 @@ from jaxltl.envs.adapters.common import Held
 class PartWorld(NamedTuple):
     """The inner state, the components ``int32[N]`` chosen so far (else 0), and the current one."""
 
-    world: Any
+    world: PyTree
     parts: jax.Array
     turn: jax.Array
 
@@ -34,7 +35,7 @@ class PartWorld(NamedTuple):
 class PartObservation(NamedTuple):
     """The inner observation, the chosen components ``bool[N, M]``, and the current one ``bool[N]``."""
 
-    world: Any
+    world: PyTree
     parts: jax.Array
     turn: jax.Array
 
@@ -43,9 +44,9 @@ class PartObservation(NamedTuple):
 class Inner:
     """Functions of an environment with vectors of components as actions."""
 
-    reset: Callable[..., Any]
+    reset: Callable[..., PyTree]
     step: Callable[..., Timestep]  # (world, int32[N], key)
-    observe: Callable[..., Any]
+    observe: Callable[..., PyTree]
     labels: Partial | None
     mask: Callable[..., jax.Array] | None  # world -> bool of all combinations, or bool[N, M]
 
@@ -67,16 +68,20 @@ def in_turn(
     )
 
 
-def _nothing(counts: Held, world: Any) -> PartWorld:
+def _nothing(counts: Held, world: PyTree) -> PartWorld:
     return PartWorld(world, jnp.zeros(len(counts.it), jnp.int32), jnp.int32(0))
 
 
-def _begin(counts: Held, reset: Callable[..., Any], key: chex.PRNGKey) -> PartWorld:
+def _begin(counts: Held, reset: Callable[..., PyTree], key: chex.PRNGKey) -> PartWorld:
     return _nothing(counts, reset(key))
 
 
 def _choose(
-    counts: Held, step: Callable[..., Timestep], now: PartWorld, action: Any, key: chex.PRNGKey
+    counts: Held,
+    step: Callable[..., Timestep],
+    now: PartWorld,
+    action: jax.Array,
+    key: chex.PRNGKey,
 ) -> Timestep:
     last = now.turn == len(counts.it) - 1
     parts = now.parts.at[now.turn].set(action)
@@ -95,7 +100,7 @@ def _choose(
     return found._replace(world=jax.tree.map(lambda x, y: jnp.where(last, x, y), fresh, going))
 
 
-def _seen(counts: Held, observe: Callable[..., Any], now: PartWorld) -> PartObservation:
+def _seen(counts: Held, observe: Callable[..., PyTree], now: PartWorld) -> PartObservation:
     number = jnp.arange(len(counts.it))
     chosen = jax.nn.one_hot(now.parts, max(counts.it), dtype=bool)
     return PartObservation(

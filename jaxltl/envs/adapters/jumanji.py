@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import chex
 import jax
@@ -22,7 +21,9 @@ from jaxltl.core.environments.environment import (
     make_box,
     make_environment,
 )
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.envs.adapters.common import (
+    Foreign,
     Held,
     Seen,
     arrays,
@@ -44,7 +45,7 @@ _MOST_ACTIONS = 2**20
 
 
 def from_jumanji(
-    env: Any,
+    env: Foreign,
     *,
     in_turn: bool = False,
     labels: Callable[..., jax.Array] | None = None,
@@ -124,7 +125,7 @@ def from_jumanji(
     )
 
 
-def _without_limit(env: Any) -> Any:
+def _without_limit(env: Foreign) -> PyTree:
     """A copy of an environment without its time limit, in all layers."""
     endless = copy.copy(env)
     for name, found in vars(env).items():
@@ -135,7 +136,7 @@ def _without_limit(env: Any) -> Any:
     return endless
 
 
-def _parts(env: Any) -> tuple[int, ...] | None:
+def _parts(env: Foreign) -> tuple[int, ...] | None:
     """Numbers of values of the integer components of an action; () for a scalar action."""
     spec = env.action_spec
     if hasattr(spec, "num_values"):
@@ -148,7 +149,7 @@ def _parts(env: Any) -> tuple[int, ...] | None:
     return tuple(int(min(n, most)) for n in high.astype(int) - low + 1)
 
 
-def _actions(spec: Any, parts: tuple[int, ...] | None) -> Finite | Box:
+def _actions(spec: Foreign, parts: tuple[int, ...] | None) -> Finite | Box:
     if parts is not None:
         count = math.prod(parts) if spec.shape else int(spec.num_values)
         if count > _MOST_ACTIONS:
@@ -163,12 +164,12 @@ def _actions(spec: Any, parts: tuple[int, ...] | None) -> Finite | Box:
     return make_box(spec.minimum, spec.maximum, spec.shape, spec.dtype)
 
 
-def _mask_of(env: Any) -> Any:
+def _mask_of(env: Foreign) -> PyTree:
     seen = jax.eval_shape(lambda key: env.reset(key)[1].observation, jax.random.key(0))
     return getattr(seen, "action_mask", None)
 
 
-def _mask(env: Any, parts: tuple[int, ...] | None) -> Partial | None:
+def _mask(env: Foreign, parts: tuple[int, ...] | None) -> Partial | None:
     mask = None if parts is None else _mask_of(env)
     if parts is None or mask is None:
         return None
@@ -203,14 +204,14 @@ def _reset(held: Held, key: chex.PRNGKey) -> Seen:
 
 
 def _step(
-    held: Held, endless: Held, parts: Held, world: Seen, action: Any, key: chex.PRNGKey
+    held: Held, endless: Held, parts: Held, world: Seen, action: PyTree, key: chex.PRNGKey
 ) -> Timestep:
     if parts.it:
         action = jnp.stack(jnp.unravel_index(action, parts.it))
     return _moved(held, endless, world, action, key)
 
 
-def _moved(held: Held, endless: Held, world: Seen, action: Any, key: chex.PRNGKey) -> Timestep:
+def _moved(held: Held, endless: Held, world: Seen, action: PyTree, key: chex.PRNGKey) -> Timestep:
     """A step with a scalar action, or with a vector of components."""
     del key  # the state has one
     spec = held.it.action_spec

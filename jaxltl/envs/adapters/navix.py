@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import chex
 import jax
@@ -11,7 +10,9 @@ import jax.numpy as jnp
 from jax.tree_util import Partial
 
 from jaxltl.core.environments.environment import Environment, Timestep, make_environment
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.envs.adapters.common import (
+    Foreign,
     Held,
     arrays,
     copied,
@@ -24,7 +25,10 @@ from jaxltl.envs.adapters.common import (
 
 
 def from_navix(
-    env: Any, *, labels: Callable[..., jax.Array] | None = None, propositions: Sequence[str] = ()
+    env: Foreign,
+    *,
+    labels: Callable[..., jax.Array] | None = None,
+    propositions: Sequence[str] = (),
 ) -> Environment:
     """A Navix environment.
 
@@ -64,11 +68,11 @@ def from_navix(
     )
 
 
-def _reset(held: Held, key: chex.PRNGKey) -> Any:
+def _reset(held: Held, key: chex.PRNGKey) -> PyTree:
     return arrays(held.it.reset(key))
 
 
-def _step(held: Held, world: Any, action: Any, key: chex.PRNGKey) -> Timestep:
+def _step(held: Held, world: PyTree, action: PyTree, key: chex.PRNGKey) -> Timestep:
     del key  # the state has one
     running = copied(world).replace(step_type=jnp.zeros_like(world.step_type))
     found = held.it.step(running, action)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import chex
 import jax
@@ -13,8 +13,10 @@ from jax import lax
 from jax.tree_util import Partial
 
 from jaxltl.core.environments.environment import Environment, Timestep, as_partial, make_environment
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.pretty_print import brief
 from jaxltl.envs.adapters.common import (
+    Foreign,
     Held,
     arrays,
     copied,
@@ -30,13 +32,13 @@ from jaxltl.envs.adapters.common import (
 class Turn(NamedTuple):
     """Pgx's state at a turn of the player or at the end, and the reward `owed` for earlier moves."""
 
-    state: Any
+    state: PyTree
     owed: jax.Array
 
 
 def from_pgx(
-    env: Any,
-    opponent: Callable[..., Any] | None = None,
+    env: Foreign,
+    opponent: Callable[..., jax.Array] | None = None,
     player: int = 0,
     *,
     labels: Callable[..., jax.Array] | None = None,
@@ -94,14 +96,19 @@ def from_pgx(
     )
 
 
-def _reset(held: Held, player: Any, opponent: Any, key: chex.PRNGKey) -> Turn:
+def _reset(held: Held, player: int, opponent: Partial | None, key: chex.PRNGKey) -> Turn:
     start, others = jax.random.split(key)
     state = arrays(held.it.init(start))
     return Turn(*_await_turn(held, player, opponent, state, jnp.zeros(()), others))
 
 
 def _step(
-    held: Held, player: Any, opponent: Any, world: Turn, action: Any, key: chex.PRNGKey
+    held: Held,
+    player: int,
+    opponent: Partial | None,
+    world: Turn,
+    action: PyTree,
+    key: chex.PRNGKey,
 ) -> Timestep:
     own, others = jax.random.split(key)
     state = arrays(held.it.step(copied(world.state), action, own), world.state)
@@ -112,17 +119,22 @@ def _step(
 
 
 def _await_turn(
-    held: Held, player: Any, opponent: Any, state: Any, earned: jax.Array, key: chex.PRNGKey
-) -> tuple[Any, jax.Array]:
+    held: Held,
+    player: int,
+    opponent: Partial | None,
+    state: PyTree,
+    earned: jax.Array,
+    key: chex.PRNGKey,
+) -> tuple[PyTree, jax.Array]:
     """Plays the others' moves until the player moves or the game ends; state and reward."""
     if opponent is None:
         return state, earned
 
-    def waits(carry: Any) -> jax.Array:
+    def waits(carry: PyTree) -> jax.Array:
         state = carry[0]
         return ~(state.terminated | state.truncated) & (state.current_player != player)
 
-    def move(carry: Any) -> Any:
+    def move(carry: PyTree) -> PyTree:
         state, earned, key = carry
         key, choose, go = jax.random.split(key, 3)
         action = jnp.asarray(opponent(copied(state), choose))
@@ -138,7 +150,7 @@ def _await_turn(
     return state, earned
 
 
-def _observe(held: Held, player: Any, world: Turn) -> Any:
+def _observe(held: Held, player: int, world: Turn) -> PyTree:
     # The public attribute gives the next player, which differs at the end of a game.
     return lax.stop_gradient(held.it._observe(world.state, player))
 

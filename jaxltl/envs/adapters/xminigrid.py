@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import chex
 import jax
 from jax.tree_util import Partial
 
 from jaxltl.core.environments.environment import Environment, Timestep, make_environment
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.envs.adapters.common import (
+    Foreign,
     Held,
     arrays,
     copied,
@@ -25,8 +26,8 @@ from jaxltl.envs.adapters.common import (
 
 
 def from_xminigrid(
-    env: Any,
-    params: Any = None,
+    env: Foreign,
+    params: Foreign = None,
     *,
     labels: Callable[..., jax.Array] | None = None,
     propositions: Sequence[str] = (),
@@ -80,11 +81,13 @@ def from_xminigrid(
     )
 
 
-def _reset(held: Held, params: Any, key: chex.PRNGKey) -> Any:
+def _reset(held: Held, params: Foreign, key: chex.PRNGKey) -> PyTree:
     return arrays(held.it.reset(params, key))
 
 
-def _step(held: Held, params: Any, world: Any, action: Any, key: chex.PRNGKey) -> Timestep:
+def _step(
+    held: Held, params: Foreign, world: PyTree, action: PyTree, key: chex.PRNGKey
+) -> Timestep:
     del key
     found = held.it.step(params, copied(world), action)
     over = found.discount == 0

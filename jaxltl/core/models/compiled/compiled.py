@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,8 +15,8 @@ from jaxltl.core.models.ops.array_namespace import is_traced
 from jaxltl.core.models.ops.kernels import gather, segment_ids
 from jaxltl.core.models.ops.operators import is_deterministic
 from jaxltl.core.models.product import Product, flat_successor
-from jaxltl.core.models.protocols import Model
-from jaxltl.core.models.sparse import SparseMDP, reward_structure
+from jaxltl.core.models.protocols import Array, Model, PyTree
+from jaxltl.core.models.sparse import Reward, SparseMDP, reward_structure
 from jaxltl.core.types import Solution
 
 
@@ -26,7 +25,7 @@ def is_sparse(model: Model) -> bool:
     return isinstance(model.mdp if isinstance(model, Product) else model, SparseMDP)
 
 
-def compiled_form(model: Model, reward: Any = None) -> tuple[Any, Any]:
+def compiled_form(model: Model, reward: Reward = None) -> tuple[PyTree, Array]:
     """A model and a reward for compiled solvers; only sparse models change."""
     # A product becomes a sparse model with the rows of `to_sparse`, inside `jit` too. Names, rewards
     # and variables, for which programs would be recompiled, are dropped.
@@ -48,7 +47,7 @@ def compiled_form(model: Model, reward: Any = None) -> tuple[Any, Any]:
     ), reward
 
 
-def _named_reward(model: Model, reward: Any) -> tuple[Any, Any]:
+def _named_reward(model: Model, reward: Reward) -> tuple[Model, Array]:
     if isinstance(reward, str):
         rewards = getattr(model, "rewards", {})
         if reward not in rewards:
@@ -79,7 +78,7 @@ def reshape_solution(model: Model, solution: Solution) -> Solution:
     )
 
 
-def flatten_policy(model: Model, policy: Any) -> Any:
+def flatten_policy(model: Model, policy: Array) -> Array:
     """A policy for the compiled form: of a product of a sparse model rows ``int32[S * Q]``."""
     if is_sparse(model) and isinstance(model, Product) and np.ndim(policy) == 2:
         return policy.reshape(-1)
@@ -87,7 +86,7 @@ def flatten_policy(model: Model, policy: Any) -> Any:
 
 
 def _written_out(model: Product) -> SparseMDP:
-    world: Any = model.mdp
+    world: SparseMDP = model.mdp
     num_memory = model.num_memory
     row_start, entry_start = jnp.asarray(world.row_start), jnp.asarray(world.entry_start)
     # Rows of (s, q) are those of s, in order: state first, memory next, choice last.

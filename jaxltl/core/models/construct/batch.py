@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +18,7 @@ from jaxltl.core.models.construct.lifting import allowed_steps, memory_along
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.product import Product, occurring_letters, product
 from jaxltl.core.models.construct.restrict import with_allowed
-from jaxltl.core.models.protocols import Model
+from jaxltl.core.models.protocols import Array, Model, PyTree
 from jaxltl.core.models.trajectories import Trajectories, make_trajectories, require_states
 
 
@@ -114,7 +113,7 @@ def pad_states(mdp: MDP, num_states: int) -> MDP:
     stays = np.zeros(shape, mdp.dtype)
     stays[..., 0] = 1
 
-    def below(array: Any, rows: np.ndarray) -> jax.Array:
+    def below(array: Array, rows: np.ndarray) -> jax.Array:
         return to_jax(np.concatenate([np.asarray(array), rows]))
 
     return replace(
@@ -165,7 +164,7 @@ def unstack_product(model: Product, number: int) -> Product:
     return to_jax(jax.tree.map(lambda x: np.asarray(x)[number], model))
 
 
-def restrict_stacked_actions(models: Product, allowed: Any) -> Product:
+def restrict_stacked_actions(models: Product, allowed: PyTree) -> Product:
     """Stacked products restricted to masks ``bool[W, S, Q, A]``; ValueError names the product."""
     masks = allowed if isinstance(allowed, list | tuple) or np.ndim(allowed) > 3 else [allowed]
     if len(masks) != num_worlds(models):
@@ -227,12 +226,12 @@ def stack_models(models: Product | Sequence[Product]) -> Product:
 def _equal(one: Automaton, other: Automaton) -> bool:
     if one.propositions != other.propositions:
         return False
-    kinds: list[Any] = [jax.tree.structure(x) for x in (one, other)]
+    kinds: list[PyTree] = [jax.tree.structure(x) for x in (one, other)]
     pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=False)
     return bool(kinds[0] == kinds[1]) and all(np.array_equal(x, y) for x, y in pairs)
 
 
-def _shapes(tree: Any) -> list[tuple[int, ...]]:
+def _shapes(tree: PyTree) -> list[tuple[int, ...]]:
     return [np.shape(x) for x in jax.tree.leaves(tree)]
 
 
@@ -309,7 +308,7 @@ def demonstration_counts(
     return to_jax(np.stack(found).astype(models.dtype))
 
 
-def stack_observations(models: Product, observation: Any) -> jax.Array:
+def stack_observations(models: Product, observation: PyTree) -> jax.Array:
     """Checked observations of the states of each model, ``float[W, S, O]``."""
     if isinstance(observation, list | tuple):
         observation = np.stack([np.asarray(x) for x in observation])
@@ -333,7 +332,7 @@ def training_counts(
     horizon: int | None = None,
 ) -> tuple[jax.Array, jax.Array]:
     """Counts of training and of held-out trajectories, or of the last fraction `held_out`."""
-    test: Any = held_out
+    test: PyTree = held_out
     if held_out is None or isinstance(held_out, int | float):
         demonstrations, test = split_trajectories(demonstrations, held_out or 0.0)
     counts = demonstration_counts(models, demonstrations, horizon=horizon)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
 
 import numpy as np
+from jax.typing import ArrayLike
 
 from jaxltl.core import validation
 from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
@@ -62,7 +62,7 @@ def to_sparse(model: Model) -> SparseMDP:
     )
 
 
-def _distribution(initial: Any) -> np.ndarray:
+def _distribution(initial: ArrayLike) -> np.ndarray:
     initial = np.asarray(initial, np.float64)
     return initial / initial.sum()
 

@@ -6,10 +6,10 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from jaxltl.core.statistics.graph_assumption import LeastProbability, require_graph
 from jaxltl.core import validation
@@ -24,6 +24,8 @@ _INTEGER = re.compile(r"-?[1-9][0-9]{0,17}|0")
 MOST_SAMPLES = 2**53  # the largest range of exact integers in double precision
 _MOST_ENTRIES = 10**8
 _ANY = "any"  # the only action of an unvisited state
+
+Initial = str | int | Mapping[str, float] | Mapping[int, float] | Sequence[str | int]
 
 
 @brief(facts=facts.counts)
@@ -56,10 +58,10 @@ class TransitionCounts:
 
 
 def make_counts(
-    state: Any,
-    action: Any,
-    successor: Any,
-    count: Any = None,
+    state: ArrayLike,
+    action: ArrayLike,
+    successor: ArrayLike,
+    count: ArrayLike | None = None,
     *,
     states: Sequence[str] | None = None,
     actions: Sequence[str] | None = None,
@@ -334,10 +336,10 @@ def place_of(
 def model_from_counts(
     counts: TransitionCounts,
     *,
-    initial: str | int | Mapping[Any, float] | Sequence[Any],
+    initial: Initial,
     graph: Literal["seen", "complete"] | LeastProbability,
-    labels: Mapping[str, Iterable[Any]] | None = None,
-    terminal: Iterable[Any] = (),
+    labels: Mapping[str, Iterable[object]] | None = None,
+    terminal: Iterable[object] = (),
 ) -> tuple[SparseMDP, NDArray[np.int64]]:
     """Empirical model of the counted choices, and the counts of its transitions.
 
@@ -411,7 +413,7 @@ def model_from_counts(
     return model, count
 
 
-def _may_miss(graph: str | LeastProbability, samples: NDArray[Any]) -> NDArray[np.bool_]:
+def _may_miss(graph: str | LeastProbability, samples: np.ndarray) -> NDArray[np.bool_]:
     """Choices with possible transitions that may not have been observed."""
     if isinstance(graph, LeastProbability):
         return samples < graph.sufficient_samples(samples.size)
@@ -450,7 +452,7 @@ def _nominal(count: Integers, start: Integers) -> NDArray[np.float64]:
     return more / np.repeat(np.add.reduceat(more, start[:-1]), width)
 
 
-def _require_counts(counts: Any) -> None:
+def _require_counts(counts: object) -> None:
     if not isinstance(counts, TransitionCounts):
         raise ValueError(
             f"counts is {validation.shorten(counts)}; give TransitionCounts, as make_counts and "
@@ -458,13 +460,13 @@ def _require_counts(counts: Any) -> None:
         )
 
 
-def _variable(names: tuple[str, ...]) -> NDArray[Any]:
+def _variable(names: tuple[str, ...]) -> np.ndarray:
     if all(map(_INTEGER.fullmatch, names)):
         return np.array([int(name) for name in names], np.int64)
     return np.array(names, object)
 
 
-def _numbers(names: Iterable[Any], number: Mapping[str, int], what: str) -> list[int]:
+def _numbers(names: object, number: Mapping[str, int], what: str) -> list[int]:
     found = []
     for name in [names] if isinstance(names, str | int) else validation.sequence(what, names):
         if str(name) not in number:
@@ -475,7 +477,7 @@ def _numbers(names: Iterable[Any], number: Mapping[str, int], what: str) -> list
     return found
 
 
-def _initial(initial: Any, number: Mapping[str, int]) -> NDArray[np.float64]:
+def _initial(initial: Initial, number: Mapping[str, int]) -> NDArray[np.float64]:
     found = np.zeros(len(number))
     weight = (
         validation.float_array("initial", list(initial.values()))

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+from jax.sharding import AbstractMesh, AxisType, Mesh, NamedSharding, PartitionSpec
 
 from jaxltl.core import validation
 from jaxltl.core.models.protocols import PyTree
@@ -22,7 +22,7 @@ def vmap_over_mesh(
     mesh: Mesh,
     axis: str | Sequence[str] | None = None,
     *,
-    in_axes: Any = 0,
+    in_axes: PyTree = 0,
 ) -> Callable[..., PyTree]:
     """``jax.vmap(function, in_axes)`` with the batch distributed over the devices of a mesh.
 
@@ -55,7 +55,7 @@ def vmap_over_mesh(
     validation.instance("mesh", mesh, Mesh, "a jax.sharding.Mesh, such as jax.make_mesh makes")
     names = axes_of(mesh, axis)
 
-    def over(*arguments: PyTree, **options: Any) -> PyTree:
+    def over(*arguments: PyTree, **options: object) -> PyTree:
         lanes = tuple(_spread(in_axes, arguments))
         number = _number(lanes, arguments)
         if not any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(arguments)):
@@ -79,7 +79,7 @@ def on_host(tree: PyTree) -> PyTree:
       [0, 1, 2]
     """
 
-    def one(x: Any) -> PyTree:
+    def one(x: PyTree) -> PyTree:
         if not isinstance(x, jax.Array):
             return np.asarray(x)
         if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
@@ -121,14 +121,14 @@ def _here(mesh: Any) -> PyTree:
     return automatic(mesh) if ambient.empty else ambient
 
 
-def _count(mesh: Any, axes: Sequence[str]) -> int:
+def _count(mesh: Mesh | AbstractMesh, axes: Sequence[str]) -> int:
     return math.prod(mesh.shape[name] for name in axes)
 
 
 # --- within a lane --------------------------------------------------------------------------------
 
 
-def require_split(name: str, sharding: Any, **sizes: int) -> None:
+def require_split(name: str, sharding: NamedSharding | None, **sizes: int) -> None:
     """Raises ValueError if a sharding does not split axes of the given sizes evenly; None is valid."""
     if sharding is None:
         return
@@ -169,7 +169,7 @@ def shard_function(
     function: Callable[..., PyTree],
     sharding: NamedSharding | None,
     axes: Sequence[int | None],
-    out_axes: Any,
+    out_axes: PyTree,
 ) -> Callable[..., PyTree]:
     """A function on each device's share of the arguments, split along `axes`, under ``jit``; None: unchanged."""
     if sharding is None:
@@ -190,7 +190,7 @@ def shard_function(
 
 
 def vmap_split(
-    function: Callable[..., PyTree], sharding: NamedSharding | None, in_axes: Any
+    function: Callable[..., PyTree], sharding: NamedSharding | None, in_axes: PyTree
 ) -> PyTree:
     """:func:`vmap_over_mesh` over the devices of a sharding; ``vmap`` for None."""
     if sharding is None:
@@ -220,10 +220,10 @@ def running_sum(
 # --- arguments ------------------------------------------------------------------------------------
 
 
-def _spread(in_axes: Any, arguments: tuple[Any, ...]) -> list[bool]:
+def _spread(in_axes: PyTree, arguments: tuple[PyTree, ...]) -> list[bool]:
     """``bool`` for each array of the arguments: True if it is batched."""
 
-    def is_none(x: Any) -> bool:
+    def is_none(x: PyTree) -> bool:
         return x is None
 
     axes = list(in_axes) if isinstance(in_axes, list | tuple) else [in_axes] * len(arguments)
@@ -269,7 +269,7 @@ def _placed(
     even = number % _count(mesh, axes) == 0
     own, all_ = (NamedSharding(mesh, PartitionSpec(*x)) for x in ((axes,), ()))
 
-    def one(x: Any, sharding: NamedSharding) -> PyTree:
+    def one(x: PyTree, sharding: NamedSharding) -> PyTree:
         if not isinstance(x, jax.Array | np.ndarray):
             return x  # a weakly typed number
         if not isinstance(x, jax.Array) or x.is_fully_addressable:
@@ -285,7 +285,7 @@ def _placed(
     )
 
 
-def _from_each(x: Any, sharding: NamedSharding) -> jax.Array:
+def _from_each(x: PyTree, sharding: NamedSharding) -> jax.Array:
     """An array over the devices of several processes, from each process's part."""
     if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
         return jax.random.wrap_key_data(
@@ -300,7 +300,7 @@ def _copied(x: jax.Array, mesh: Mesh) -> jax.Array:
     return _constrained(x, mesh, PartitionSpec())
 
 
-def _constrained(x: jax.Array, mesh: Any, spec: PartitionSpec) -> jax.Array:
+def _constrained(x: jax.Array, mesh: Mesh | AbstractMesh, spec: PartitionSpec) -> jax.Array:
     sharding = NamedSharding(mesh, spec)
     if AxisType.Explicit in mesh.axis_types:
         return jax.sharding.reshard(x, sharding)
@@ -316,7 +316,7 @@ def _mapped(
     mesh: Mesh,
     axes: tuple[str, ...],
     lanes: tuple[bool, ...],
-    options: tuple[tuple[str, Any], ...],
+    options: tuple[tuple[str, object], ...],
     arguments: PyTree,
 ) -> PyTree:
     here = _here(mesh)

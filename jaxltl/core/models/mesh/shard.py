@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
 from jax.sharding import Mesh
+from numpy.typing import ArrayLike, DTypeLike
 
 from jaxltl.core import validation
 from jaxltl.core.models import facts
@@ -18,7 +19,7 @@ from jaxltl.core.models.mesh.lanes import on_host
 from jaxltl.core.models.mesh.layout import StateLayout, state_layout
 from jaxltl.core.models.mesh.sharded import RowTable, ShardedMDP
 from jaxltl.core.models.ops.underflow import target_dtype, underflow_text, underflows
-from jaxltl.core.models.protocols import Model
+from jaxltl.core.models.protocols import Array, Model, PyTree
 from jaxltl.core.models.sparse import (
     SparseMDP,
     check_entries,
@@ -168,7 +169,7 @@ def ranges_of(num_states: int, mesh: Mesh, axis: str | None = None) -> list[tupl
     return [layout.span(d) for d in layout.mine]
 
 
-def to_mesh(model: ShardedMDP, quantity: Any, fill: Any = 0) -> jax.Array:
+def to_mesh(model: ShardedMDP, quantity: Array, fill: Array = 0) -> jax.Array:
     """A quantity of the original model on the mesh.
 
     Args:
@@ -252,7 +253,7 @@ def from_mesh(model: ShardedMDP, quantity: jax.Array) -> np.ndarray:
 # --- parts ----------------------------------------------------------------------------------------
 
 
-def _order(model: SparseMDP, order: Any) -> np.ndarray:
+def _order(model: SparseMDP, order: ArrayLike) -> np.ndarray:
     host = model.host
     if isinstance(order, str):
         if order not in ("given", "near"):
@@ -288,7 +289,12 @@ class _Piece(NamedTuple):
 
 
 def _assembled(
-    part: Any, ordered: Any, num_states: int, mesh: Mesh, axis: str | None, propositions: Any
+    part: Callable[[int, int], ModelPart],
+    ordered: Array,
+    num_states: int,
+    mesh: Mesh,
+    axis: str | None,
+    propositions: tuple[str, ...],
 ) -> ShardedMDP:
     layout = state_layout(num_states, mesh, axis)._replace(order=ordered)
     parts = {d: _checked(part, layout, d, len(propositions)) for d in layout.mine}
@@ -332,7 +338,9 @@ class _Range(NamedTuple):
     row: np.ndarray | None
 
 
-def _checked(part: Any, layout: StateLayout, d: int, num_labels: int) -> _Range:
+def _checked(
+    part: Callable[[int, int], ModelPart], layout: StateLayout, d: int, num_labels: int
+) -> _Range:
     start, stop = layout.span(d)
     found = part(start, stop)
     if not isinstance(found, ModelPart):
@@ -412,7 +420,7 @@ class _Halo(NamedTuple):
     """The communication before a sweep."""
 
     layout: StateLayout
-    rounds: Any
+    rounds: PyTree
     sent: list[dict[int, np.ndarray]]
     asked: list[np.ndarray] | None  # the states that each range asks for, in order
     first: dict[tuple[int, int], int]  # the first place of each received range
@@ -519,7 +527,7 @@ def _of_states(
     state = np.repeat(np.arange(here), np.diff(part.row_start))
     pair = state, part.action
 
-    def on_choices(x: np.ndarray, fill: Any, dtype: Any) -> np.ndarray:
+    def on_choices(x: np.ndarray, fill: float, dtype: DTypeLike) -> np.ndarray:
         found = np.full((layout.size, num_actions), fill, dtype)
         found[pair] = x
         return found

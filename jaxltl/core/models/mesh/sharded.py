@@ -6,7 +6,8 @@ first, then those received before a sweep by one exchange, of a halo or of all v
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +20,7 @@ from jaxltl.core.models import facts
 from jaxltl.core.models.ops import kernels, operators
 from jaxltl.core.models.ops.underflow import is_positive
 from jaxltl.core.models.product import distinct_labels, letters_by_state
-from jaxltl.core.models.protocols import Model
+from jaxltl.core.models.protocols import Array, Model, PyTree
 from jaxltl.core.pretty_print import brief
 from jaxltl.core import validation
 
@@ -27,8 +28,8 @@ from jaxltl.core import validation
 class RowTable(NamedTuple):
     """Rows of one width, by local places."""
 
-    successor: Any  # int32[M, W]
-    probability: Any  # float[M, W], zero in padding
+    successor: Array  # int32[M, W]
+    probability: Array  # float[M, W], zero in padding
 
 
 @brief(facts=facts.sharded)
@@ -100,7 +101,7 @@ class ShardedMDP:
         return max(table.successor.shape[1] for table in self.tables)
 
     @property
-    def dtype(self) -> Any:
+    def dtype(self) -> np.dtype:
         """The dtype of the probabilities."""
         return self.tables[0].probability.dtype
 
@@ -143,7 +144,7 @@ def refuse_sharded(model: Model) -> None:
         raise ValueError(validation.unsupported_model(model))
 
 
-def over_devices(model: ShardedMDP, function: Any, *arguments: Any) -> Any:
+def over_devices(model: ShardedMDP, function: Callable[..., PyTree], *arguments: PyTree) -> PyTree:
     """``function(*arguments)`` on each device's share of the arguments."""
     spec = PartitionSpec(model.axis)
     return jax.shard_map(function, mesh=model.mesh, in_specs=spec, out_specs=spec)(*arguments)
@@ -161,7 +162,9 @@ def seen_by(model: ShardedMDP, sent: tuple[jax.Array, ...], value: jax.Array) ->
 
 @operators.combined.register
 def _(model: ShardedMDP, value: jax.Array, term: kernels.Term, combine: kernels.Term) -> jax.Array:
-    def one(tables: Any, place: Any, sent: Any, available: Any, value: jax.Array) -> jax.Array:
+    def one(
+        tables: PyTree, place: Array, sent: PyTree, available: Array, value: jax.Array
+    ) -> jax.Array:
         seen = seen_by(model, sent, value)
         if place is None:
             shape = (*available.shape, -1)
@@ -195,7 +198,7 @@ def _rows(table: RowTable, seen: jax.Array, term: kernels.Term, combine: kernels
 
 @operators.greatest_predecessor.register
 def _(model: ShardedMDP, quantity: jax.Array) -> jax.Array:
-    def one(tables: Any, place: Any, sent: Any, quantity: jax.Array) -> jax.Array:
+    def one(tables: PyTree, place: Array, sent: PyTree, quantity: jax.Array) -> jax.Array:
         size = quantity.shape[0]
         wide = (*quantity.shape[1:-1],)
         last = jnp.moveaxis(quantity, -1, 1)
@@ -257,8 +260,10 @@ def _(model: ShardedMDP) -> jax.Array:
 
 
 @operators.policy_operator.register
-def _(model: ShardedMDP, policy: jax.Array) -> Any:
-    def one(tables: Any, place: Any, sent: Any, available: Any, policy: Any, value: Any) -> Any:
+def _(model: ShardedMDP, policy: jax.Array) -> Callable[[jax.Array], jax.Array]:
+    def one(
+        tables: PyTree, place: Array, sent: PyTree, available: Array, policy: Array, value: Array
+    ) -> Array:
         seen = seen_by(model, sent, value)
         if place is None:
             shape = (*available.shape, -1)

@@ -5,14 +5,16 @@ Operations of ``jax.numpy`` outside of ``jit`` compile a program for each shape;
 
 from __future__ import annotations
 
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
+
+from jaxltl.core.array_types import PyTree
 
 
-def is_traced(tree: Any) -> bool:
+def is_traced(tree: PyTree) -> bool:
     """True if the host cannot read a tree: an array is a tracer, or lies on several devices."""
     return any(
         isinstance(x, jax.core.Tracer) or (isinstance(x, jax.Array) and not x.is_fully_replicated)
@@ -20,16 +22,16 @@ def is_traced(tree: Any) -> bool:
     )
 
 
-def namespace(*trees: Any) -> tuple[Any, ...]:
+def namespace(*trees: PyTree) -> tuple[PyTree, ...]:
     """``numpy`` and the trees as NumPy arrays; with traced ones, ``jax.numpy`` and JAX arrays."""
     xp = jnp if is_traced(trees) else np
     return (xp, *jax.tree.map(xp.asarray, trees))
 
 
-def to_jax(tree: Any) -> Any:
+def to_jax(tree: PyTree) -> PyTree:
     """A tree with JAX arrays, without compilation."""
 
-    def one(x: Any) -> jax.Array:
+    def one(x: ArrayLike) -> jax.Array:
         # device_put may share memory with its argument, hence the copy.
         return x if isinstance(x, jax.Array) else jax.device_put(np.array(x))
 

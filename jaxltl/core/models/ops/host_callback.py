@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxltl.core.models.protocols import Array, PyTree
 
-def host_callback(function: Callable[..., Any], result: Any, *arguments: Any) -> Any:
+
+def host_callback(function: Callable[..., PyTree], result: PyTree, *arguments: PyTree) -> PyTree:
     """``function(*arguments)`` on NumPy arrays, inside ``jit``; sequential under ``vmap``."""
     # JAX rounds the arrays of a callback to single precision if double precision is enabled for the
     # calling thread only. 64-bit numbers are therefore passed as pairs of 32-bit words.
@@ -19,11 +20,11 @@ def host_callback(function: Callable[..., Any], result: Any, *arguments: Any) ->
     given = jax.tree.map(lambda x: np.dtype(x.dtype), arguments)
     kinds = jax.tree.map(lambda x: np.dtype(jax.dtypes.canonicalize_dtype(x.dtype)), result)
 
-    def on_host(*words: Any) -> Any:
+    def on_host(*words: PyTree) -> PyTree:
         found = function(*jax.tree.map(_from_words, words, given))
         return jax.tree.map(lambda kind, x: _to_words(np.asarray(x, kind)), kinds, found)
 
-    def words_of(x: Any, kind: np.dtype) -> jax.ShapeDtypeStruct:
+    def words_of(x: jax.Array, kind: np.dtype) -> jax.ShapeDtypeStruct:
         wide = kind.itemsize == 8
         return jax.ShapeDtypeStruct(
             (*x.shape, 2) if wide else x.shape, jnp.uint32 if wide else kind
@@ -50,6 +51,6 @@ def _to_words(x: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(x[..., None]).view(np.uint32) if x.itemsize == 8 else x
 
 
-def _from_words(words: Any, kind: np.dtype) -> np.ndarray:
+def _from_words(words: Array, kind: np.dtype) -> np.ndarray:
     x = np.asarray(words)
     return np.ascontiguousarray(x).view(kind)[..., 0] if kind.itemsize == 8 else x

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import reduce
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxltl.core.array_types import Array
 from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
 from jaxltl.core.models.ops.underflow import is_positive
 
@@ -26,7 +26,7 @@ UNROLL = 16
 Term = Callable[[jax.Array, jax.Array], jax.Array]
 
 
-def gather(value: Any, index: Any) -> jax.Array:
+def gather(value: Array, index: Array) -> jax.Array:
     """Rows ``value[index]`` without bounds checks."""
     return jnp.asarray(value).at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
@@ -94,7 +94,11 @@ def folded(
     """The reduction :func:`fold` along the successor axis of whole tables, in one pass."""
     rows = gather(value, successor)
     terms = term(weight.reshape(weight.shape + (1,) * (rows.ndim - weight.ndim)), rows)
-    wholes: dict[Any, Any] = {jnp.add: jnp.sum, jnp.logical_or: jnp.any, jnp.minimum: jnp.min}
+    wholes: dict[Term, Callable[..., jax.Array]] = {
+        jnp.add: jnp.sum,
+        jnp.logical_or: jnp.any,
+        jnp.minimum: jnp.min,
+    }
     return wholes[combine](terms, axis=axis) if combine in wholes else tree(combine, terms, axis)
 
 
@@ -118,7 +122,7 @@ def where_positive(weight: jax.Array, value: jax.Array) -> jax.Array:
     return jnp.where(is_positive(weight), value, dtype_max(value.dtype))
 
 
-def dtype_max(dtype: Any) -> Any:
+def dtype_max(dtype: jnp.dtype) -> float:
     """Largest value of a dtype, infinity for floats."""
     is_float = jnp.issubdtype(dtype, jnp.floating)
     return jnp.inf if is_float else jnp.iinfo(dtype).max
@@ -127,7 +131,7 @@ def dtype_max(dtype: Any) -> Any:
 # --- segments ------------------------------------------------------------------------------------
 
 
-def segment_ids(start: Any, total: int) -> jax.Array:
+def segment_ids(start: Array, total: int) -> jax.Array:
     """The segment of each position, ``int32[total]``, from the starts of nonempty segments."""
     count = start.shape[-1] - 1
     if not is_traced(start):
@@ -141,6 +145,8 @@ def segment_ids(start: Any, total: int) -> jax.Array:
     return jnp.cumsum(begins, dtype=jnp.int32)
 
 
-def segment_reduce(operation: Any, quantity: jax.Array, owner: jax.Array, count: int) -> jax.Array:
+def segment_reduce(
+    operation: Callable[..., jax.Array], quantity: jax.Array, owner: jax.Array, count: int
+) -> jax.Array:
     """A segment reduction such as ``jax.ops.segment_sum`` with sorted ids."""
     return operation(quantity, owner, count, indices_are_sorted=True, mode="promise_in_bounds")

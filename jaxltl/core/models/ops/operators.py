@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import singledispatch
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import chex
 import jax
@@ -29,7 +29,7 @@ from jaxltl.core.models.ops.choices import first_action as first_action
 from jaxltl.core.models.ops.choices import is_deterministic as is_deterministic
 from jaxltl.core.models.ops.choices import row_entries
 from jaxltl.core.models.ops.kernels import where_positive
-from jaxltl.core.models.protocols import Model, base_model
+from jaxltl.core.models.protocols import Array, Model, PyTree, base_model
 from jaxltl.core.models.ops.underflow import is_positive, is_subnormal, underflow_text, underflows
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.sparse.mdp import HostMDP
@@ -361,7 +361,7 @@ def _(model: SparseMDP, key: chex.PRNGKey, state: jax.Array, action: jax.Array) 
     probability, start = jnp.asarray(model.probability), jnp.asarray(model.entry_start)
     end = start[action + 1]
 
-    def step(carry: Any) -> Any:
+    def step(carry: PyTree) -> PyTree:
         entry, last, rest = carry
         real = probability[entry] > 0
         return entry + 1, jnp.where(real, entry, last), rest - probability[entry]
@@ -389,7 +389,7 @@ def _(model: SparseMDP, policy: jax.Array) -> Callable[[jax.Array], jax.Array]:
 # --- policies ------------------------------------------------------------------------------
 
 
-def policy_distribution(model: Model, policy: Any) -> jax.Array:
+def policy_distribution(model: Model, policy: Array) -> jax.Array:
     """A policy as a distribution ``float[S, A]`` or ``float[R]``; ValueError for a wrong shape."""
     states, pairs = model.state_shape, choice_shape(model)
     if is_deterministic(policy):
@@ -434,7 +434,7 @@ def valid_policy(model: Model, policy: jax.Array, where: jax.Array | bool = True
     return Policy(used, lax.stop_gradient(given), valid, is_representable(model))
 
 
-def require_policy(model: Model, policy: Any, where: Any = True) -> None:
+def require_policy(model: Model, policy: Array, where: Array = True) -> None:
     """Raises ValueError, naming the state, for a concrete policy that is not valid."""
     if is_traced((model, policy, where)) or unpadded_states(model) is not True:
         return
@@ -473,7 +473,7 @@ def require_policy(model: Model, policy: Any, where: Any = True) -> None:
         )
 
 
-def row_weights(model: SparseMDP, policy: Any, where: Any = True) -> np.ndarray:
+def row_weights(model: SparseMDP, policy: Array, where: Array = True) -> np.ndarray:
     """A concrete policy of a sparse model as checked row weights ``float64[R]``; `where` as in :func:`valid_policy`."""
     host, policy = model.host, np.asarray(policy)
     if is_deterministic(policy):
@@ -506,7 +506,9 @@ def row_weights(model: SparseMDP, policy: Any, where: Any = True) -> np.ndarray:
     return weight
 
 
-def require_weights(host: HostMDP, weight: np.ndarray, tolerance: float, where: Any = True) -> None:
+def require_weights(
+    host: HostMDP, weight: np.ndarray, tolerance: float, where: Array = True
+) -> None:
     """Raises ValueError unless row weights are a distribution in each state."""
     total = host.over_choices(np.add, weight)
     off = ~((np.abs(total - 1) <= tolerance) & (host.over_choices(np.minimum, weight) >= 0))

@@ -8,7 +8,7 @@ transposed sweep gathers from predecessor lists, since XLA on a CPU runs scatter
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +24,7 @@ from jaxltl.core.models.ops.choices import Columns
 from jaxltl.core.models.ops.choices import action_columns as action_columns
 from jaxltl.core.models.ops.choices import RowEntries, row_entries
 from jaxltl.core.models.product import Product
-from jaxltl.core.models.protocols import Model
+from jaxltl.core.models.protocols import Model, PyTree
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief
 
@@ -91,7 +91,9 @@ class ShardedSuccessorTable:
 
     def expectation(self, value: jax.Array) -> list[jax.Array]:
 
-        def one(successor: Any, probability: Any, sent: Any, value: jax.Array) -> list[jax.Array]:
+        def one(
+            successor: PyTree, probability: PyTree, sent: PyTree, value: jax.Array
+        ) -> list[jax.Array]:
             seen = seen_by(self.model, sent, value)
             pairs = zip(successor, probability, strict=True)
             return [kernels.fold(targets, weights, seen) for targets, weights in pairs]
@@ -174,7 +176,7 @@ def _columns(entries: jax.Array) -> list[list[jax.Array]] | jax.Array:
     return [[entries[:, a, k] for k in range(width)] for a in range(num_actions)]
 
 
-def predecessor_table(models: Sequence[Any]) -> PredecessorTable | None:
+def predecessor_table(models: Sequence[Model]) -> PredecessorTable | None:
     """Predecessor tables of models of one shape, ``[W, P, N]``; None where padding would waste too much."""
     table_of = jax.jit(successor_table)
     tables = [table_of(model) for model in models]

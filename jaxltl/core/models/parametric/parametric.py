@@ -12,10 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxltl.core import struct
 from jax.tree_util import Partial
+from numpy.typing import ArrayLike
 
 from jaxltl.core.models import facts
 from jaxltl.core.models.ops.array_namespace import is_traced
-from jaxltl.core.models.protocols import Array
+from jaxltl.core.models.protocols import Array, PyTree
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
 from jaxltl.core.pretty_print import brief
 from jaxltl.core import validation
@@ -48,10 +49,10 @@ class ParametricMDP:
     """
 
     model: Any
-    numbers: Any
-    low: Any
-    high: Any
-    inside: Any
+    numbers: PyTree
+    low: Array
+    high: Array
+    inside: Array
     parameters: tuple[str, ...] = struct.field(pytree_node=False)
     exact: Callable[[np.ndarray], SparseMDP] | None = struct.field(pytree_node=False, default=None)
     roundings: int = struct.field(pytree_node=False, default=0)
@@ -68,7 +69,7 @@ class ParametricMDP:
             )
         return self._at(point)
 
-    def inside_of(self, name: str, points: Any) -> np.ndarray:
+    def inside_of(self, name: str, points: ArrayLike) -> np.ndarray:
         """Validated points of the box, ``float64[N, D]``."""
         found, names = validation.float_array(f"{name}s", points), self.parameters
         if found.ndim != 2 or found.shape[1] != len(names) or not len(found):
@@ -106,7 +107,7 @@ class ParametricMDP:
 
 def make_parametric(
     model: SparseMDP,
-    numbers: Callable[[jax.Array], Any],
+    numbers: Callable[[jax.Array], PyTree],
     low: Ends,
     high: Ends,
     *,
@@ -163,7 +164,9 @@ def make_parametric(
     return ParametricMDP(found, numbers, low, high, inside, names)
 
 
-def _paired(numbers: Any, state: Any, x: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
+def _paired(
+    numbers: Callable[[jax.Array], PyTree], state: Array, x: jax.Array
+) -> tuple[jax.Array, dict[str, jax.Array]]:
     """Probabilities and rewards of choices."""
     found = numbers(x)
     probability, rewards = found if isinstance(found, tuple) else (found, {})
@@ -174,7 +177,9 @@ def _paired(numbers: Any, state: Any, x: jax.Array) -> tuple[jax.Array, dict[str
     }
 
 
-def _check_shapes(numbers: Any, model: SparseMDP, num_parameters: int) -> None:
+def _check_shapes(
+    numbers: Callable[[jax.Array], PyTree], model: SparseMDP, num_parameters: int
+) -> None:
     x = jax.ShapeDtypeStruct((num_parameters,), jnp.zeros(()).dtype)
     probability, rewards = jax.eval_shape(numbers, x)
     shapes = {
@@ -187,11 +192,13 @@ def _check_shapes(numbers: Any, model: SparseMDP, num_parameters: int) -> None:
 
 
 @jax.jit
-def _evaluate(numbers: Any, x: jax.Array) -> Any:
+def _evaluate(numbers: Callable[[jax.Array], PyTree], x: jax.Array) -> PyTree:
     return numbers(x)
 
 
-def _evaluated(model: SparseMDP, numbers: Any, point: np.ndarray) -> SparseMDP:
+def _evaluated(
+    model: SparseMDP, numbers: Callable[[jax.Array], PyTree], point: np.ndarray
+) -> SparseMDP:
     """The validated model at a point."""
     found = _evaluate(numbers, np.asarray(point, jnp.zeros(()).dtype))
     probability, rewards = jax.tree.map(lambda x: np.asarray(x, np.float64), found)
@@ -248,7 +255,7 @@ def box_of(low: Ends, high: Ends, names: Sequence[str]) -> tuple[np.ndarray, np.
     return ends[0], ends[1]
 
 
-def _point(of: str, values: Any, names: Sequence[str]) -> np.ndarray:
+def _point(of: str, values: PyTree, names: Sequence[str]) -> np.ndarray:
     """A number for each name, ``float64[D]``."""
     if isinstance(values, Mapping):
         if set(values) != set(names):

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxltl.core import struct
+from jaxltl.core.models.protocols import Array
 
 from jaxltl.core.pretty_print import brief
 
@@ -21,10 +21,10 @@ Terms = Mapping[tuple[int, ...], Fraction]  # the coefficient of each monomial, 
 class Polynomials:
     """Polynomials, evaluated together."""
 
-    factor: Any  # int32[M, W]; 0: one; 1 + k D + d: the power 2^k of parameter d
-    owner: Any  # int32[C], the polynomial of each term, ascending
-    monomial: Any  # int32[C]
-    coefficient: Any  # float[C]
+    factor: Array  # int32[M, W]; 0: one; 1 + k D + d: the power 2^k of parameter d
+    owner: Array  # int32[C], the polynomial of each term, ascending
+    monomial: Array  # int32[C]
+    coefficient: Array  # float[C]
     count: int = struct.field(pytree_node=False)  # of polynomials
     squares: int = struct.field(pytree_node=False)  # the most repeated squarings
 

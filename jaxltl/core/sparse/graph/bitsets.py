@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from jaxltl.core.array_types import Booleans, Integers
 
 LARGEST = 64  # number of memory states of a word
+Part = slice | Integers  # of the states
 _BLOCK = 2**15  # states of a block
 _SWEEPS = 400  # maximal number of sweeps of a search
 
@@ -25,7 +26,7 @@ class BitGraph:
     permitted: list[Words]  # for each action word[S], the memory states in which it is available
     after: list[Words]  # per byte word[L * 256], the predecessors of its memory states by letter
     letter: Integers  # int64[S], 256 times the letter of each state
-    full: Any  # the word of all memory states
+    full: Words  # the word of all memory states
 
     @property
     def num_states(self) -> int:
@@ -36,10 +37,10 @@ class BitGraph:
         """The empty set."""
         return np.zeros(self.num_states, self.permitted[0].dtype)
 
-    def read(self, words: Words, part: Any) -> Words:
+    def read(self, words: Words, part: Part) -> Words:
         """The memory states in which entering a state of a block leads to a pair of a set."""
         letter = self.letter[part]
-        found: Any = self.after[0][letter + (words & 255).astype(np.int64)]
+        found: Words = self.after[0][letter + (words & 255).astype(np.int64)]
         for i, table in enumerate(self.after[1:], 1):
             found |= table[letter + (words >> (8 * i) & 255).astype(np.int64)]
         return found
@@ -50,7 +51,7 @@ class BitGraph:
         found[:-1] = self.read(words, slice(None))
         return found
 
-    def hits(self, action: int, seen: Words, part: Any) -> Words:
+    def hits(self, action: int, seen: Words, part: Part) -> Words:
         """The memory states in which an action may lead to a set, for some states."""
         first, *others = self.columns[action]
         found = seen[first[part]]
@@ -75,7 +76,7 @@ class BitGraph:
             for a in range(0, self.num_states, _BLOCK):
                 block = slice(a, min(a + _BLOCK, self.num_states))
                 open_ = among[block] & ~region[block]
-                part: Any = block
+                part: Part = block
                 if np.count_nonzero(open_) * 2 < open_.size:
                     part = np.flatnonzero(open_)
                     if not part.size:
@@ -93,7 +94,7 @@ class BitGraph:
     def _joining(
         self,
         open_: Words,
-        part: Any,
+        part: Part,
         seen: Words,
         forced: bool,
         kept: list[Words],
@@ -117,7 +118,7 @@ class BitGraph:
         return [x & ~self.hits(a, seen, slice(None)) for a, x in enumerate(self.permitted)]
 
 
-def _note(action: Integers, part: Any, words: Words, number: int) -> None:
+def _note(action: Integers, part: Part, words: Words, number: int) -> None:
     """Writes a number at the pairs of a set."""
     state = np.flatnonzero(words)
     if not state.size:
@@ -138,7 +139,7 @@ def _first(action: Integers, words: Words, kept: list[Words]) -> None:
 def pack(mask: Booleans) -> Words:
     """Words of bits, the q-th of which is ``mask[..., q]``."""
     size = mask.shape[-1]
-    kind: Any = next(
+    kind: type[np.unsignedinteger] = next(
         k for k in (np.uint8, np.uint16, np.uint32, np.uint64) if np.iinfo(k).bits >= size
     )
     words = np.zeros(mask.shape[:-1], kind)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -117,7 +117,7 @@ def _labels(
     number[node] = np.arange(node.size)
     stays = ~leaves[of]
     found = strong_components(number[state[of[stays]]], number[target[stays]], node.size)
-    label: Any = np.full(candidates.size, -1)
+    label: Integers = np.full(candidates.size, -1)
     label[node] = node[found]
     return label
 

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from jaxltl.core.array_types import Booleans, Integers
+from jaxltl.core.array_types import Booleans, Integers, PyTree
 from jaxltl.core.sparse.graph.attractor import attracted
 from jaxltl.core.sparse.graph.components import strong_components
 from jaxltl.core.sparse.graph.qualitative import end_components
@@ -123,13 +122,13 @@ class RowGraph:
 
     # --- loops --------------------------------------------------------------------------------
 
-    def repeat(self, body: Callable[[Any], Any], start: tuple[Any, ...]) -> tuple[Any, ...]:
+    def repeat(self, body: Callable[[PyTree], PyTree], start: PyTree) -> PyTree:
         """Repeats `body` while the last entry of the carry is true."""
         while start[-1]:
             start = body(start)
         return start
 
-    def times(self, count: int, body: Callable[[int, Any], Any], start: Any) -> Any:
+    def times(self, count: int, body: Callable[[int, PyTree], PyTree], start: PyTree) -> PyTree:
         """``body(i, carry)`` for i below a count."""
         for i in range(int(count)):
             start = body(i, start)

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxltl.core.array_types import Floats, Integers
+from jaxltl.core.array_types import Floats, Integers, SparseMatrix
 from jaxltl.core.sparse.linear.krylov import iterate
 
 # Limits of elimination; measured on the models of benchmarks.real_models and on random graphs.
@@ -41,8 +41,8 @@ class _Block(NamedTuple):
     """Some components, on which no earlier block depends."""
 
     order: Integers  # int[B], states in elimination order; ascending for a Krylov method
-    inner: Any  # float64[B, B], the policy's matrix on these
-    outer: Any  # float64[B, M], on earlier blocks; None without any
+    inner: SparseMatrix  # float64[B, B], the policy's matrix on these
+    outer: SparseMatrix | None  # float64[B, M], on earlier blocks; None without any
     factor: Any  # of SuperLU; None for a Krylov method
     fill: int  # entries of the first factors in this order
     min_degree: bool = False  # states of least degree first, wherever that may help
@@ -51,7 +51,7 @@ class _Block(NamedTuple):
 class Factors(NamedTuple):
     """The system of a policy, ready to be solved."""
 
-    rows: Any  # SciPy's float64[R, M], all rows
+    rows: SparseMatrix  # SciPy's float64[R, M], all rows
     label: Integers  # int[M], components in topological order
     blocks: tuple[_Block, ...]  # in the order of solution
 
@@ -118,7 +118,7 @@ class Factors(NamedTuple):
         return self._replace(blocks=tuple(found))
 
 
-def factorize(rows: Any, label: Integers, chosen: Integers) -> Factors | None:
+def factorize(rows: SparseMatrix, label: Integers, chosen: Integers) -> Factors | None:
     """Factors of a policy's system; None if it is singular."""
     matrix, size = rows[chosen], np.bincount(label)
     if min(_between(matrix, label, size)) <= _MOST_BETWEEN:
@@ -149,7 +149,7 @@ def _parts(label: Integers, size: Integers) -> list[Integers]:
     return np.split(np.argsort(part, kind="stable"), np.bincount(part).cumsum()[:-1])
 
 
-def _between(matrix: Any, label: Integers, size: Integers) -> tuple[int, int]:
+def _between(matrix: SparseMatrix, label: Integers, size: Integers) -> tuple[int, int]:
     """Bounds of the fill between components: with earlier ones first, and with later ones first."""
     source = np.repeat(label, np.diff(matrix.indptr))
     target = label[matrix.indices]
@@ -157,7 +157,9 @@ def _between(matrix: Any, label: Integers, size: Integers) -> tuple[int, int]:
     return int(size[target[between]].sum()), int(size[source[between]].sum())
 
 
-def elimination_order(matrix: Any, label: Integers, work: float = np.inf) -> Integers | None:
+def elimination_order(
+    matrix: SparseMatrix, label: Integers, work: float = np.inf
+) -> Integers | None:
     """Order by component, and within each by reverse Cuthill-McKee; None where that would not help."""
     from scipy.sparse import csgraph
 
@@ -188,7 +190,7 @@ def elimination_order(matrix: Any, label: Integers, work: float = np.inf) -> Int
 
 
 def _block(
-    rows: Any,
+    rows: SparseMatrix,
     label: Integers,
     order: Integers,
     chosen: Integers,
@@ -234,7 +236,7 @@ def _block(
     return _Block(order, inner, outer, factor, int(factor.nnz), min_degree)
 
 
-def _bandwidth(matrix: Any) -> float:
+def _bandwidth(matrix: SparseMatrix) -> float:
     """The mean distance of the first entries of rows and columns from the diagonal."""
     size = matrix.shape[0]
     source = np.repeat(np.arange(size), np.diff(matrix.indptr))
@@ -250,7 +252,7 @@ def _first_entries(source: Integers, target: Integers, size: int) -> tuple[Integ
     return left, top
 
 
-def _too_much(matrix: Any, label: Integers) -> bool:
+def _too_much(matrix: SparseMatrix, label: Integers) -> bool:
     """True if elimination in the order of the states fills more than the limit.
 
     Factors fill nothing before the first entry of a row and of a column (George and Liu 1981). In
@@ -306,7 +308,7 @@ def _counted(source: Integers, target: Integers, size: int) -> float:
     return total * size / len(sampled)
 
 
-def _transposed_system(matrix: Any) -> Any:
+def _transposed_system(matrix: SparseMatrix) -> SparseMatrix:
     """``(I - P)^T`` in compressed columns, from P in compressed rows."""
     from scipy import sparse
 
@@ -320,7 +322,7 @@ def _transposed_system(matrix: Any) -> Any:
     return sparse.csc_array((data, indices, start), shape=matrix.shape)
 
 
-def _swept(matrix: Any, b: Floats) -> Floats:
+def _swept(matrix: SparseMatrix, b: Floats) -> Floats:
     """Solution by BiCGSTAB (van der Vorst 1992), then by sweeps while the residual shrinks."""
     size = np.abs(b).max(initial=0)
     x, left = np.zeros(b.size), np.array(b)

@@ -15,14 +15,15 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxltl.core.array_types import Booleans, Floats, Integers
+from jaxltl.core.array_types import Booleans, Floats, Integers, SparseMatrix
 from jaxltl.core.sparse.rows import first_hits
 
+T = TypeVar("T")
 Values = NDArray[np.floating[Any]]  # in either precision
 
 _EPS32 = float(np.finfo(np.float32).eps)
@@ -49,10 +50,10 @@ class RowBlocks:
     """Rows in blocks of states, in both precisions."""
 
     row_start: Integers  # int[N + 1], the first row of each node, and R
-    matrix: Any  # SciPy's float64[R, M]
+    matrix: SparseMatrix  # SciPy's float64[R, M]
     node: list[int]  # the first node of each block, and N
-    single: list[Any]  # the rows of each block
-    double: list[Any]  # the same in double precision
+    single: list[SparseMatrix]  # the rows of each block
+    double: list[SparseMatrix]  # the same in double precision
     width: int  # the number of rows of every node; 0 where they differ
 
 
@@ -67,8 +68,8 @@ def row_blocks(
     first = entry_start[row_start]  # of each node
     node = np.unique(np.searchsorted(first, np.arange(0, entries, most))).tolist()
     node = sorted({0, *node, size})
-    single: list[Any] = []
-    double: list[Any] = []
+    single: list[SparseMatrix] = []
+    double: list[SparseMatrix] = []
     for a, b in pairwise(node):
         start = entry_start[row_start[a] : row_start[b] + 1]
         part, index = slice(int(start[0]), int(start[-1])), start - start[0]
@@ -136,7 +137,7 @@ def solve_by_sweeps(
 
 def _solve(search: _Search, start: Floats | None, time: float | None) -> SweptBounds | None:
     problem = search.problem
-    value: Any = problem.outer.astype(np.float32)
+    value: Values = problem.outer.astype(np.float32)
     live = np.flatnonzero(problem.live)
     value[live] = 0 if start is None else start[live]
     if time is None:
@@ -195,7 +196,7 @@ class _Search:
     def sign(self) -> int:
         return self.settings.sign
 
-    def in_pairs(self, one: Callable[[int], Any]) -> Iterator[list[tuple[int, Any]]]:
+    def in_pairs(self, one: Callable[[int], T]) -> Iterator[list[tuple[int, T]]]:
         """Results for all blocks, for one of either half at a time."""
         half = (len(self.parts) + 1) // 2
         for i in range(half):
@@ -232,7 +233,7 @@ class _Search:
         """Sweeps in place until little changes; False where that would take too long."""
         kind = value.dtype.type
         shift = kind(self.sign * extra)
-        before: Any = None
+        before: Values | None = None
         rate, since, changes = 0.0, 0, []
 
         def one(i: int) -> Values:
@@ -246,7 +247,7 @@ class _Search:
                     if extra:
                         found += shift
                     np.copyto(value[a:b], found, where=self.problem.live[a:b])
-            change: Any = np.subtract(value, old, out=old)
+            change: Values = np.subtract(value, old, out=old)
             self.sweeps += 1
             largest = float(np.abs(change).max(initial=0))
             if not np.isfinite(largest):
@@ -298,12 +299,12 @@ class _Search:
                 best[a:b], row[a:b] = found, self.problem.blocks.row_start[a] + first
         return np.where(self.problem.interior, best, 0), row
 
-    def chain(self, row: Integers) -> tuple[Any, Floats | None]:
+    def chain(self, row: Integers) -> tuple[SparseMatrix, Floats | None]:
         """The rows of a policy, and their costs."""
         cost = None if self.problem.cost is None else self.problem.cost[row]
         return self.problem.blocks.matrix[row], cost
 
-    def truncated_time(self, chain: Any) -> tuple[Values, float] | None:
+    def truncated_time(self, chain: SparseMatrix) -> tuple[Values, float] | None:
         """Lower bound of a chain's expected time, and min ``t - P t``; None if it stays too long."""
         from scipy import sparse
 
@@ -311,9 +312,9 @@ class _Search:
         rows = sparse.csr_array(
             (chain.data.astype(np.float32), chain.indices, chain.indptr), shape=chain.shape
         )
-        stays: Any = np.zeros(self.problem.live.size, np.float32)
+        stays: Values = np.zeros(self.problem.live.size, np.float32)
         stays[: live.size] = live
-        time: Any = np.zeros(self.problem.live.size, np.float32)
+        time: Values = np.zeros(self.problem.live.size, np.float32)
         for _ in range(_STEPS):
             time += stays
             stays[: live.size] = (rows @ stays) * live

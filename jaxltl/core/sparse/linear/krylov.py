@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
-from jaxltl.core.array_types import Floats
+from jaxltl.core.array_types import Floats, SparseMatrix
 
 _RESTARTS = 3
 _NOISE = 32 * float(np.finfo(np.float64).eps)
 
 
 def bicgstab(
-    matrix: Any,
+    matrix: SparseMatrix,
     b: Floats,
     x: Floats,
     residual: float,
@@ -38,7 +37,7 @@ def bicgstab(
 
 
 def iterate(
-    matrix: Any,
+    matrix: SparseMatrix,
     b: Floats,
     x: Floats,
     residual: float,

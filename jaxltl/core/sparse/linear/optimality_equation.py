@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from jaxltl.core.array_types import Floats, Integers
+from jaxltl.core.array_types import Floats, Integers, SparseMatrix
 from jaxltl.core.sparse.choice_order import Choices
 from jaxltl.core.sparse.rows import concatenated_ranges, group_starts
 
@@ -22,7 +21,7 @@ _RELATIVE_GAIN = 0.01
 class OptimalityEquation:
     """``x_i = opt_r (c_r + sum_j P_rj x_j)`` over the rows r of unknown i."""
 
-    matrix: Any  # SciPy's float64[R, M], without self-loops
+    matrix: SparseMatrix  # SciPy's float64[R, M], without self-loops
     cost: Floats  # float64[R], at least 0, with the share of terminal states
     leaving: Floats  # float64[R], the probability of leaving the unknowns
     choices: Choices  # the order of the unknowns and of their rows
@@ -72,7 +71,7 @@ def propagate_improvements(
     back = matrix.tocsc()
     in_degree = np.diff(back.indptr)
     value, policy = value.copy(), policy.copy()
-    rows: Any = np.arange(owner.size)
+    rows: Integers = np.arange(owner.size)
     image = equation.backup(value)
     budget = _RELATIVE_WORK * matrix.nnz + _ROUND_OVERHEAD * _MIN_ROUNDS
     while True:

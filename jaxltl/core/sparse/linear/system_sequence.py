@@ -9,11 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from jaxltl.core.array_types import Floats, Integers
+from jaxltl.core.array_types import Floats, Integers, SparseMatrix
 from jaxltl.core.sparse.linear.elimination import Factors, factorize
 from jaxltl.core.sparse.linear.krylov import bicgstab
 
@@ -29,9 +28,11 @@ class SystemSequence:
     label: Callable[[], Integers]  # SCCs int[M] in topological order
     mixes: bool  # True if few steps lead to many unknowns
     factors: Factors | None = None  # of the earlier system `matrix`
-    matrix: Any = None
+    matrix: SparseMatrix | None = None
 
-    def solve(self, matrix: Any, b: Floats, start: Floats, residual: float) -> Floats | None:
+    def solve(
+        self, matrix: SparseMatrix, b: Floats, start: Floats, residual: float
+    ) -> Floats | None:
         """The solution up to a residual, or up to rounding if that is more; None if singular."""
         if self.mixes:
             found = bicgstab(matrix, b, start, residual, steps=_STEPS)
@@ -45,7 +46,7 @@ class SystemSequence:
                 return found
         return self.solve_directly(matrix, b)
 
-    def solve_directly(self, matrix: Any, b: Floats) -> Floats | None:
+    def solve_directly(self, matrix: SparseMatrix, b: Floats) -> Floats | None:
         """The solution by factors of this system; None if it is singular."""
         if self.matrix is not matrix and not self._factor(matrix):
             return None
@@ -53,7 +54,7 @@ class SystemSequence:
         x = self.factors.solve(b)
         return x if np.isfinite(x).all() else None
 
-    def _factor(self, matrix: Any) -> bool:
+    def _factor(self, matrix: SparseMatrix) -> bool:
         rows = np.arange(matrix.shape[0])
         if self.factors is None:
             self.factors = factorize(matrix, self.label(), rows)

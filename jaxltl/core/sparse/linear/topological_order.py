@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -49,7 +49,7 @@ def topological_levels(back: Edges, number: Integers, among: Booleans) -> Levels
         source = back.target[concatenated_ranges(first, back.start[frontier + 1] - first)]
         decrement(number, source)
         frontier = sorted_unique(source[(number[source] == 0) & among[source]], number.size)
-    none: Any = np.zeros(0, np.int64)
+    none: Integers = np.zeros(0, np.int64)
     return Levels(np.concatenate(found) if found else none, start)
 
 
