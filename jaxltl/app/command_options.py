@@ -117,9 +117,7 @@ def over_devices(command: Callable[..., None]) -> Callable[..., None]:
         help="Number of devices, or all. With srun or mpirun, those of all processes.",
     )
     @click.option(
-        "--coordinator",
-        metavar="HOST:PORT",
-        help="Address of process 0, without such a launcher.",
+        "--coordinator", metavar="HOST:PORT", help="Address of process 0, without such a launcher."
     )
     @click.option("--process", type=click.IntRange(0), metavar="I", help="Number of this process.")
     @click.option(

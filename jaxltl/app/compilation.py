@@ -15,10 +15,7 @@ from pathlib import Path
 
 # About 10 % less processor time for a first `learn`; loops over successors and matrix products,
 # which come from a library, run as fast (docs/benchmarks.md).
-FAST_COMPILATION = {
-    "xla_cpu_use_fusion_emitters": "false",
-    "xla_backend_optimization_level": "1",
-}
+FAST_COMPILATION = {"xla_cpu_use_fusion_emitters": "false", "xla_backend_optimization_level": "1"}
 # XLA ends the process for a flag that it does not know. Those used here and in the tests are known
 # to the first and the last of these versions of jaxlib; other versions get none.
 _TESTED = ((0, 7), (0, 11))

@@ -17,11 +17,7 @@ from typing import Any
 from jaxltl.core.validation import errors_in
 from jaxltl.app.files.task_environment import EnvironmentTask
 from jaxltl.core.continuous.dynamics import Dynamics
-from jaxltl.core.environments.environment import (
-    Environment,
-    make_environment,
-    require_environment,
-)
+from jaxltl.core.environments.environment import Environment, make_environment, require_environment
 from jaxltl.core.environments.time_limit import with_time_limit
 from jaxltl.envs.continuous_worlds import BenchmarkWorld
 

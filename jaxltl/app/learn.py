@@ -28,14 +28,7 @@ from jaxltl.app.files.demonstrations import load_demonstrations, synthetic_demon
 from jaxltl.app.files.task_mlirl import MlirlTask, read_task as read_task
 from jaxltl.app.files.worlds import World, load_world
 from jaxltl.algos.mlirl.constrained import Point, constrained_points
-from jaxltl.app.guarantee import (
-    Attempt,
-    Guarantee,
-    ask,
-    Search,
-    check_formula,
-    kept,
-)
+from jaxltl.app.guarantee import Attempt, Guarantee, ask, Search, check_formula, kept
 from jaxltl.app.practical import StepBound, about_steps, neg_log_likelihood, step_bound
 from jaxltl.app.job import (
     about,

@@ -327,10 +327,7 @@ def summary(outcome: Outcome) -> Record:
             "num_memory": len(setup.automaton.delta),
             "acceptance": setup.automaton.acceptance,
             "trivial": setup.trivial,
-            "policy": {
-                "made_of": setup.method.description,
-                "acts": setup.acts,
-            },
+            "policy": {"made_of": setup.method.description, "acts": setup.acts},
             "evaluation": _as_numbers(kept),
             "training": {
                 "steps": task.learner.steps,

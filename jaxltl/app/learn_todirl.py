@@ -30,15 +30,7 @@ from jaxltl.app.todirl.guarantee import (
     within_steps,
 )
 from jaxltl.app.todirl.summary import summary as summary
-from jaxltl.app.todirl.results import (
-    LENGTH,
-    Judged,
-    Learned,
-    Outcome,
-    Setup,
-    Worlds,
-    part_of,
-)
+from jaxltl.app.todirl.results import LENGTH, Judged, Learned, Outcome, Setup, Worlds, part_of
 from jaxltl.app.protocols import Training
 from jaxltl.app.reports import learn_todirl as report  # noqa: F401 - part of the job
 from jaxltl.app.reports.todirl_pictures import (
@@ -82,10 +74,7 @@ from jaxltl.core.policies.policy_file import save_policy
 from jaxltl.core.types import Solution, status_code
 from jaxltl.core.values.discounted.soft import soft_value
 from jaxltl.core.values.undiscounted.optimal_actions import optimal_actions
-from jaxltl.core.values.undiscounted.performance import (
-    Performance,
-    task_performances,
-)
+from jaxltl.core.values.undiscounted.performance import Performance, task_performances
 from jaxltl.core.values.undiscounted.satisfaction import optimal_satisfaction
 from jaxltl.envs import temporal_gridworld
 from jaxltl.envs.cell_kinds import COLORS
@@ -384,11 +373,7 @@ def _judge(
 
 
 def _plans(
-    setup: Setup,
-    network: Any,
-    parameters: PyTree,
-    hparams: todirl.Hparams,
-    count: int,
+    setup: Setup, network: Any, parameters: PyTree, hparams: todirl.Hparams, count: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Plans of all and of optimal actions in the first worlds, one at a time, and statuses."""
     worlds, masks = setup.worlds, np.stack([x.allowed for x in setup.sure or ()])

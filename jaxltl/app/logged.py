@@ -61,11 +61,7 @@ def load_logged(folder: Path, table: WorldTable) -> tuple[MDP, tuple[str, ...], 
         option="{} = ",
     )
     mdp, actions, column = padded(evidence.model)
-    return (
-        mdp,
-        actions,
-        Logged(evidence, column, confidence, table.method or "anytime"),
-    )
+    return (mdp, actions, Logged(evidence, column, confidence, table.method or "anytime"))
 
 
 def guaranteed(logged: Logged, model: Product, formula: str, policy: Any) -> Record:

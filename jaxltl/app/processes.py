@@ -342,10 +342,7 @@ def _join(launch: Launch, wait: float) -> None:
     address, bind = launch.coordinator, None
     if address is not None and _host_and_port(address)[0] in ("127.0.0.1", "localhost"):
         bind = address  # local, so not open to other machines
-    later: Record = {
-        "heartbeat_timeout_seconds": seconds,
-        "shutdown_timeout_seconds": _TO_THE_END,
-    }
+    later: Record = {"heartbeat_timeout_seconds": seconds, "shutdown_timeout_seconds": _TO_THE_END}
     known = inspect.signature(jax.distributed.initialize).parameters  # depends on JAX's version
     jax.distributed.initialize(
         address,

@@ -137,9 +137,7 @@ def bands(
             axes.axhline(limits[row][column], color=INK, lw=1, ls="--")
     bottom_labels(panels, [label] * len(panels))
     legend_below(
-        figure,
-        [Line2D([], [], color=SERIES[i % len(SERIES)]) for i in range(len(names))],
-        names,
+        figure, [Line2D([], [], color=SERIES[i % len(SERIES)]) for i in range(len(names))], names
     )
     return figure
 
@@ -226,9 +224,7 @@ def lines(
             axes.plot(np.asarray(reference, float), color=SERIES[1], lw=1.3, ls="--")
     bottom_labels(panels, labels)
     legend_below(
-        figure,
-        [Line2D([], [], color=ACCENT), Line2D([], [], color=SERIES[1], ls="--")],
-        names,
+        figure, [Line2D([], [], color=ACCENT), Line2D([], [], color=SERIES[1], ls="--")], names
     )
     return figure
 
@@ -333,10 +329,6 @@ def paths(
     ends = [
         Line2D([], [], ls="", marker=m, color=c, ms=4) for m, c in (("o", INK), ("s", SERIES[1]))
     ]
-    legend_below(
-        figure,
-        [*handles, *ends],
-        [*boxes, "first", "last"],
-    )
+    legend_below(figure, [*handles, *ends], [*boxes, "first", "last"])
     settle(figure)
     return figure

@@ -293,10 +293,7 @@ def _figures(
 
 
 def compare(
-    values: Mapping[str, ArrayLike],
-    *,
-    groups: Sequence[str] | None = None,
-    label: str = "value",
+    values: Mapping[str, ArrayLike], *, groups: Sequence[str] | None = None, label: str = "value"
 ) -> Figure:
     """The values of the same states under several strategies, one column per state.
 

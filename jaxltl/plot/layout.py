@@ -180,10 +180,7 @@ def _framed(
 
 
 def _positions(
-    delta: NDArray[np.integer],
-    initial: int,
-    doomed: NDArray[np.bool_],
-    texts: Mapping[Key, Rows],
+    delta: NDArray[np.integer], initial: int, doomed: NDArray[np.bool_], texts: Mapping[Key, Rows]
 ) -> Points:
     layer = _layers(delta, initial)
     upper = [np.flatnonzero((layer == i) & ~doomed) for i in range(layer.max() + 1)]

@@ -361,12 +361,7 @@ def live_curve(name: str, values: ArrayLike, steps: ArrayLike) -> str:
 
 
 def _svg(
-    name: str,
-    kind: str,
-    box: Sequence[float],
-    parts: Iterable[str],
-    label: str,
-    zoom: float = 1.0,
+    name: str, kind: str, box: Sequence[float], parts: Iterable[str], label: str, zoom: float = 1.0
 ) -> str:
     sides = " ".join(f"{x:.0f}" for x in box)
     return (

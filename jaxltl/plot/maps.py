@@ -28,17 +28,7 @@ from jaxltl.plot.board import (
     shade_cells,
     short_name,
 )
-from jaxltl.plot.style import (
-    FAINT,
-    INK,
-    KINDS,
-    PAPER,
-    head,
-    note,
-    scale_bar,
-    settle,
-    value_limits,
-)
+from jaxltl.plot.style import FAINT, INK, KINDS, PAPER, head, note, scale_bar, settle, value_limits
 
 TINY = 16  # cells a side, beyond which they have no room for names and numbers
 _HATCH = "#9aa5b1"

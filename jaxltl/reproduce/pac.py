@@ -41,10 +41,7 @@ PUBLISHED = {
 _MAP = ". . p1\n. . .\np2 . ."
 _DANGER = {"on": (0, 1, 3, 4), "off": (4, 5, 7, 8)}
 _HPARAMS = rmax.Hparams(
-    discount=DISCOUNT,
-    reward_bound=REWARD_BOUND,
-    epsilon=EPSILON,
-    failure=FAILURE,
+    discount=DISCOUNT, reward_bound=REWARD_BOUND, epsilon=EPSILON, failure=FAILURE
 )
 
 

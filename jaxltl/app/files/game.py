@@ -43,10 +43,7 @@ Start = Annotated[
     Text | tuple[int, int],
     Meta("a Boolean formula over the map's propositions, or a cell as [row, column], from 1"),
 ]
-Formulas = Annotated[
-    list[str],
-    Meta('a list of Boolean formulas, such as ["a", "b & !c"]', bool),
-]
+Formulas = Annotated[list[str], Meta('a list of Boolean formulas, such as ["a", "b & !c"]', bool)]
 
 
 @table

@@ -29,10 +29,7 @@ _SLOW = 10  # ratio to the quickest policy's steps that is reported
 
 
 def page(
-    result: Result,
-    parts: Sequence[Part],
-    pictures: Sequence[tuple[Picture, bytes]],
-    task_text: str,
+    result: Result, parts: Sequence[Part], pictures: Sequence[tuple[Picture, bytes]], task_text: str
 ) -> str:
     """The report in HTML."""
     return render_page(

@@ -15,10 +15,7 @@ _PROBABILITIES = ("success", "violation", "undecided")
 
 
 def page(
-    result: Result,
-    parts: Sequence[Part],
-    pictures: Sequence[tuple[Picture, bytes]],
-    task_text: str,
+    result: Result, parts: Sequence[Part], pictures: Sequence[tuple[Picture, bytes]], task_text: str
 ) -> str:
     """The report in HTML."""
     visits = [] if _is_finite(result) else ["visits"]

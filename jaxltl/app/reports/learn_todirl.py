@@ -31,10 +31,7 @@ _EXPERT = {
 
 
 def page(
-    result: Result,
-    parts: Sequence[Part],
-    pictures: Sequence[tuple[Picture, bytes]],
-    task_text: str,
+    result: Result, parts: Sequence[Part], pictures: Sequence[tuple[Picture, bytes]], task_text: str
 ) -> str:
     """The report in HTML."""
     titles = (("test", "Test worlds"), ("training", "Training worlds"))

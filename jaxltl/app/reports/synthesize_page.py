@@ -30,10 +30,7 @@ _TITLES = {
 
 
 def page(
-    result: Result,
-    found: Synthesis,
-    pictures: Iterable[tuple[str, bytes]],
-    file_text: str,
+    result: Result, found: Synthesis, pictures: Iterable[tuple[str, bytes]], file_text: str
 ) -> str:
     """The report in HTML."""
     part = play_explorer(found)
