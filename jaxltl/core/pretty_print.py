@@ -36,10 +36,7 @@ def brief(cls: Class, /) -> Class: ...
 
 @overload
 def brief(
-    *,
-    facts: Facts | None = None,
-    drawn: bool = False,
-    codes: Mapping[str, Any] = ...,
+    *, facts: Facts | None = None, drawn: bool = False, codes: Mapping[str, Any] = ...
 ) -> Callable[[Class], Class]: ...
 
 

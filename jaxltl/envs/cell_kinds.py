@@ -84,16 +84,13 @@ def categories(
     """
     kinds = make_kinds(objects, obstacles)
     colors = check_colors(colors, margin)
-    return find_kinds(_crop(colors, margin - 1), codes_of(kinds))
+    rows, columns = (slice(margin - 1, n - margin + 1) for n in colors.shape[:2])
+    return find_kinds(colors[rows, columns], codes_of(kinds))
 
 
 def codes_of(kinds: Kinds) -> NDArray[np.int64]:
     """Code of each kind from its colour counts."""
     return _code(np.array([row for _, row in kinds]).reshape(-1, len(COLORS)))
-
-
-def _crop(colors: np.ndarray, width: int) -> np.ndarray:
-    return colors[width : colors.shape[0] - width, width : colors.shape[1] - width]
 
 
 def check_margin(margin: int) -> None:

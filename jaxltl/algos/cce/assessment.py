@@ -173,7 +173,7 @@ def result(
         both["best"] = both["mean"]
     feasible = [name for name in both if bool(both[name].feasible)]
     name = max(feasible, key=lambda n: float(both[n].objective), default=None)
-    violation = float(min((float(a.excess) for a in both.values()), key=_nan_last))
+    violation = float(np.fmin.reduce([float(a.excess) for a in both.values()]))
     if name is None:
         seen = "" if bool(state.best.found) else " and no sample was"
         message = (
@@ -195,10 +195,6 @@ def result(
         num_evaluations,
         message,
     )
-
-
-def _nan_last(x: float) -> float:
-    return math.inf if math.isnan(x) else x
 
 
 def require_run(problem: Problem, hparams: Hparams) -> None:

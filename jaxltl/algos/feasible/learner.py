@@ -190,11 +190,6 @@ def _is_chain(prepared: Prepared) -> bool:
     return prepared.num_rows == prepared.num_states
 
 
-def _has_variable_cost(prepared: Prepared) -> bool:
-    """True if the work of a solve depends on the numbers."""
-    return not is_direct(prepared) if _is_chain(prepared) else prepared.cyclic
-
-
 def _init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
     """A point drawn uniformly from the box."""
     share = jax.random.uniform(learner.init_key(key), problem.low.shape, problem.low.dtype)
@@ -395,7 +390,9 @@ def _search(
             state = start_at(point, key, problem, hparams)
         return run_until(state, problem, hparams, until=until, num_steps=most)
 
-    if _has_variable_cost(problem.prepared):
+    prepared = problem.prepared
+    # The work of a solve depends on the numbers.
+    if not is_direct(prepared) if _is_chain(prepared) else prepared.cyclic:
         return lax.map(lambda start: one(*start), (keys, points))
     return jax.vmap(one)(keys, points)
 

@@ -103,7 +103,7 @@ def propagate(program: Program, boxes: list[Interval], linear: bool = True) -> E
     forms: dict[int, AffineForm] = {}
     if linear:
         forms |= zip(program.inputs, _input_forms(boxes, radius), strict=True)
-    last_use = _last_uses(program)
+    last_use = {x: i for i, each in enumerate(program.operations) for x in _inputs(each)}
     for position, operation in enumerate(program.operations):
         y = operation.output
         inputs = _inputs(operation)
@@ -142,10 +142,6 @@ def _bounds(
 
 def _inputs(operation: Select | MatrixProduct | Elementwise) -> tuple[int, ...]:
     return (operation.input,) if isinstance(operation, MatrixProduct) else operation.inputs
-
-
-def _last_uses(program: Program) -> dict[int, int]:
-    return {x: i for i, operation in enumerate(program.operations) for x in _inputs(operation)}
 
 
 def _input_forms(boxes: list[Interval], radius: Array) -> list[AffineForm]:

@@ -100,7 +100,10 @@ def write_c_policy(
         memories=step.shape[1],
         actions=policy.num_actions,
         ignored="" if policy.is_random else ", ignored",
-        names="".join(f"/* action {i}: {_comment(x)} */\n" for i, x in enumerate(policy.actions)),
+        names="".join(
+            f"/* action {i}: {' '.join(x.replace('*/', '* /').splitlines())} */\n"
+            for i, x in enumerate(policy.actions)
+        ),
         tables="\n".join(_table(f"{name}_{key}", x) for key, x in tables.items()),
         unread="state" if on_entry else "successor",
         read="successor" if on_entry else "state",
@@ -135,7 +138,3 @@ def _braces(values: list[int] | int) -> str:
     inside = [_braces(x) for x in values]
     between = ",\n  " if inside and inside[0].startswith("{") else ", "
     return "{" + between.join(inside) + "}"
-
-
-def _comment(text: str) -> str:
-    return text.replace("*/", "* /").replace("\n", " ")

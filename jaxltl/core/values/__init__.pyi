@@ -61,9 +61,7 @@ from .prepared.prepared import (
     prepare as prepare,
     solve_prepared as solve_prepared,
 )
-from .prepared.prepared_interval import (
-    PreparedInterval as PreparedInterval,
-)
+from .prepared.prepared_interval import PreparedInterval as PreparedInterval
 from .properties.solve_property import (
     Answer as Answer,
     PropertyStrategy as PropertyStrategy,
@@ -91,9 +89,7 @@ from .undiscounted.satisfaction_steps import (
     quickest_policy as quickest_policy,
     satisfaction_steps as satisfaction_steps,
 )
-from .undiscounted.sparse_satisfaction import (
-    Satisfaction as Satisfaction,
-)
+from .undiscounted.sparse_satisfaction import Satisfaction as Satisfaction
 from .undiscounted.step_bounded import (
     bounded_reachability as bounded_reachability,
     cumulative_reward as cumulative_reward,

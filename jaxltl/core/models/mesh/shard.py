@@ -216,16 +216,14 @@ def _refuse_underflow(weight: np.ndarray, dtype: np.dtype) -> None:
 
 
 def _rows_of(model: ShardedMDP, shape: tuple[int, ...]) -> jax.Array:
-    if model.row is None or shape != (_num_rows(model),):
+    available = int(jax.jit(lambda x: x.sum())(model.available))
+    # The states that fill the last device have one choice each.
+    if model.row is None or shape != (available - (model.num_states - model.num_given),):
         raise ValueError(
             f"the quantity has shape {shape}; expected ({model.num_given}, ...), a number for each "
             "state or each pair of a state and an action, or for each choice of a sparse model."
         )
     return model.row
-
-
-def _num_rows(model: ShardedMDP) -> int:
-    return int(jax.jit(lambda x: x.sum())(model.available)) - (model.num_states - model.num_given)
 
 
 def from_mesh(model: ShardedMDP, quantity: jax.Array) -> np.ndarray:

@@ -257,14 +257,7 @@ class FrontSearch:
             return ConstrainedOptimum(nan, nan, nan, False, None, self.front(), Status.CONVERGED)
         while True:
             lower = np.stack(self.lower)
-            known = frontier.largest(
-                lower,
-                self.half_spaces,
-                index,
-                wanted,
-                self.scale,
-                share,
-            )
+            known = frontier.largest(lower, self.half_spaces, index, wanted, self.scale, share)
             size = max(1.0 if self.parts[index].kind == "sure" else abs(known.upper), 1e-300)
             narrow = known.upper - known.lower <= tolerance * size
             if narrow or known.vector is None or len(lower) >= max_points:

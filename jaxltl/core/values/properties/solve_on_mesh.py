@@ -82,7 +82,7 @@ def question_on_mesh(model: ShardedMDP, prop: Property) -> Question:
     states = np.asarray(on_host(_pick(model, starts, model.number)))
     if path.operator == "F" and is_boolean(path.operands[0]):
         holds = satisfying(np.asarray(model.shown), model.propositions, path.operands[0], prop.text)
-        target = _shown_by(model, holds)
+        target = jax.jit(lambda kind: kernels.gather(jnp.asarray(holds), kind))(model.kind)
         if prop.operator == "P":
             advance = partial(_reach, model, target, objective)
         else:
@@ -180,11 +180,6 @@ def _pick_memory(both: Product, places: jax.Array, quantity: jax.Array) -> jax.A
         return x[i, both.initial_memory[i]]
 
     return jax.jit(one, out_shardings=_everywhere(both.mdp))(both, places, quantity)
-
-
-def _shown_by(model: ShardedMDP, holds: np.ndarray) -> jax.Array:
-    """Mask of the states with a marked label."""
-    return jax.jit(lambda kind: kernels.gather(jnp.asarray(holds), kind))(model.kind)
 
 
 @partial(jax.jit, static_argnames="objective")
