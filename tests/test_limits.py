@@ -14,12 +14,12 @@ from benchmarks import size
 
 PACKAGE = Path(jaxltl.__file__).parent
 LIMITS = {
-    "lines": 102_800,
+    "lines": 102_810,
     "statements": 51_450,
     "docstring lines": 16_880,
     "functions with more than 6 parameters": 67,
     "functions with more than 9 parameters": 1,
-    "Any in annotations": 277,
+    "Any in annotations": 343,
     "modules of the largest folder": 20,
     "names at the top level": 80,
 }
