@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax import linen as nn
 from jax.flatten_util import ravel_pytree
 
 import jaxltl as jl
@@ -200,6 +201,18 @@ def test_the_grounding_is_found():
     assert found.weight[chosen].sum() >= 0.9 > found.weight[chosen[:-1]].sum()
 
 
+def test_some_demonstrations_have_the_posterior_of_their_own_problem():
+    world, seen = world_of()
+    shown = rollouts(*demonstrator(world), 4, 6)
+    hparams = grounding.Hparams()
+    whole = grounding.posterior(grounding.make_problem(world, seen, shown, TASK), hparams)
+    some = jax.tree.map(lambda x: x[2:], shown)
+    alone = grounding.posterior(grounding.make_problem(world, seen, some, TASK), hparams)
+    found = grounding.select_demonstrations(whole, [2, 3])
+    assert (found.assignment[:5] == alone.assignment[:5]).all()
+    np.testing.assert_allclose(found.weight, alone.weight, rtol=1e-6, atol=1e-12)
+
+
 def test_symmetric_symbols_are_counted_once():
     world, seen = world_of()
     shown = rollouts(*demonstrator(world, "F (a | b)"), 3, 5)
@@ -350,6 +363,49 @@ def test_the_table_has_marginal_weights_and_decisive_steps():
         chosen = found.assignment[:, p] == "abcd".index(row.meaning)
         np.testing.assert_allclose(row.weight, found.weight[chosen].sum())
         assert all(0 <= n < 6 and 0 <= t < 8 and gain > 0 for n, t, gain in row.steps)
+
+
+# --- noisy observations -----------------------------------------------------------------------------
+
+
+class Small(nn.Module):
+    """A network of one hidden layer for three symbols."""
+
+    @nn.compact
+    def __call__(self, observation):
+        return nn.Dense(3)(nn.relu(nn.Dense(8)(observation)))
+
+
+@pytest.mark.slow
+def test_noisy_observations_are_grounded_by_a_network():
+    """Gaussian clusters in ten dimensions; fresh noise is labelled right, and training continues."""
+    text, rng = "a . . b\n. c . .\n. . d .\n. c . .", np.random.default_rng(0)
+    world, seen = world_of(text)
+    kind = np.where(seen.any(1), seen.argmax(1), 4)
+    centers = rng.normal(size=(5, 10)) * 3
+    noisy = centers[kind] + rng.normal(size=(16, 10)) * 0.5
+    shown = rollouts(*demonstrator(world), 15, 12)
+    problem = grounding.make_problem(world, noisy, shown, TASK, network=Small())
+    hparams = grounding.Hparams()
+    meaning = grounding.cluster_meanings(problem, 5)
+    found = grounding.posterior(problem, hparams, meanings=meaning)
+    assert (found.labels(0)[0] == (seen[:, :3] > 0)).all()
+    state = grounding.init(jax.random.key(0), problem, hparams)
+    fitted = grounding.fit_labels(state, problem, found.labels(0))
+    fresh = jnp.asarray(centers[kind] + rng.normal(size=(16, 10)) * 0.5)
+    assert (grounding.network_labels(fitted, problem, fresh) == (seen[:, :3] > 0)).all()
+    before, _ = objective(state.parameters, problem, hparams)
+    after, _ = objective(fitted.parameters, problem, hparams)
+    assert after < before
+
+
+def test_clusters_and_labels_of_another_size_are_refused():
+    problem = small_problem()
+    with pytest.raises(ValueError, match=r"num_clusters=6; it must be at least 2 and at most 5"):
+        grounding.cluster_meanings(problem, 6)
+    state = grounding.init(jax.random.key(0), problem, grounding.Hparams())
+    with pytest.raises(ValueError, match=r"labels has shape \(9, 3\); expected \(1, 9, 3\)"):
+        grounding.fit_labels(state, problem, np.zeros((9, 3), bool))
 
 
 # --- automata -------------------------------------------------------------------------------------

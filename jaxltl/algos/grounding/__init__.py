@@ -14,11 +14,17 @@ from jaxltl.algos.grounding.automaton_search import (
     LearnedAutomaton as LearnedAutomaton,
     learn_automaton as learn_automaton,
 )
+from jaxltl.algos.grounding.clusters import (
+    cluster_meanings as cluster_meanings,
+    fit_labels as fit_labels,
+    network_labels as network_labels,
+)
 from jaxltl.algos.grounding.hypotheses import (
     Posterior as Posterior,
     ambiguous_symbols as ambiguous_symbols,
     credible_set as credible_set,
     posterior as posterior,
+    select_demonstrations as select_demonstrations,
     symbol_symmetries as symbol_symmetries,
 )
 from jaxltl.algos.grounding.learner import (

@@ -14,6 +14,8 @@ Example: two states look different; the demonstration moves to the second one an
   >>> found = grounding.posterior(problem, grounding.Hparams())
   >>> grounding.credible_set(found, 0.5), grounding.ambiguous_symbols(found, 0.5)
   (array([0]), {})
+  >>> grounding.select_demonstrations(found, [0]).log_likelihood.shape
+  (2, 8, 1)
   >>> found.meaning_of(0)
   {'trap': 'observation 0'}
 """
@@ -56,7 +58,8 @@ class Posterior:
       assignment: ``int32[C, P]``, the meaning of each symbol.
       weight: ``float64[C]``, posterior weights; they sum to 1.
       scale: ``float64[C]``, the most likely scale on the grid.
-      log_likelihood: ``float64[C, N]``, of each demonstration at that scale.
+      log_likelihood: ``float64[C, B, N]``, of each demonstration at each scale of the grid.
+      scales: ``float64[B]``, the grid.
       meaning: ``bool[M, W, S]``, the states in which each candidate meaning holds.
       symbols, names: of the P symbols and the M meanings; static.
       complete: False if only a beam of the hypotheses was scored; static.
@@ -66,6 +69,7 @@ class Posterior:
     weight: np.ndarray
     scale: np.ndarray
     log_likelihood: np.ndarray
+    scales: np.ndarray
     meaning: np.ndarray
     symbols: tuple[str, ...] = struct.field(pytree_node=False)
     names: tuple[str, ...] = struct.field(pytree_node=False)
@@ -117,23 +121,48 @@ def posterior(
         table = score(np.asarray(rows, np.int32))
     else:
         rows, table = _beam(score, len(meaning), len(problem.symbols), symmetries)
-    total = table.sum(-1)  # [C, B]
-    logs = np.logaddexp.reduce(total, axis=1)
-    order = np.argsort(-logs, kind="stable")
-    weight = np.exp(logs - np.logaddexp.reduce(logs))[order]
-    best = total.argmax(1)
-    found = Posterior(
-        assignment=np.asarray(rows, np.int32)[order],
-        weight=weight,
-        scale=np.asarray(scales, float)[best[order]],
-        log_likelihood=table[np.arange(len(rows)), best][order],
-        meaning=meaning,
-        symbols=problem.symbols,
-        names=titles,
-        complete=count <= _MOST,
+    found = _weighed(
+        Posterior(
+            assignment=np.asarray(rows, np.int32),
+            weight=np.zeros(len(rows)),
+            scale=np.zeros(len(rows)),
+            log_likelihood=table,
+            scales=np.asarray(scales, float),
+            meaning=meaning,
+            symbols=problem.symbols,
+            names=titles,
+            complete=count <= _MOST,
+        )
     )
     _require_explained(problem, hparams, found, table)
     return found
+
+
+def _weighed(found: Posterior) -> Posterior:
+    """The groundings with the weights of their likelihoods, in decreasing order."""
+    total = found.log_likelihood.sum(-1)  # [C, B]
+    logs = np.logaddexp.reduce(total, axis=1)
+    order = np.argsort(-logs, kind="stable")
+    return replace(
+        found,
+        assignment=found.assignment[order],
+        weight=np.exp(logs - np.logaddexp.reduce(logs))[order],
+        scale=found.scales[total.argmax(1)[order]],
+        log_likelihood=found.log_likelihood[order],
+    )
+
+
+def select_demonstrations(found: Posterior, chosen: ArrayLike) -> Posterior:
+    """The posterior of some of the demonstrations, without scoring any grounding again.
+
+    Args:
+      found: the posterior of all N demonstrations.
+      chosen: ``int[]`` or ``bool[N]``, those that count.
+
+    Returns:
+      :class:`Posterior` of the same groundings, in the order of their new weights.
+    """
+    return _weighed(replace(found, log_likelihood=found.log_likelihood[..., np.asarray(chosen)]))
 
 
 def credible_set(found: Posterior, level: float = 0.95) -> np.ndarray:
