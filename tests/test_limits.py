@@ -14,9 +14,9 @@ from benchmarks import size
 
 PACKAGE = Path(jaxltl.__file__).parent
 LIMITS = {
-    "lines": 102_980,
-    "statements": 51_500,
-    "docstring lines": 16_960,
+    "lines": 103_540,
+    "statements": 51_825,
+    "docstring lines": 17_040,
     "functions with more than 6 parameters": 67,
     "functions with more than 9 parameters": 1,
     "Any in annotations": 343,

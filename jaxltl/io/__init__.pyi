@@ -43,7 +43,12 @@ from .pgsolver import (
     write_pgsolver as write_pgsolver,
 )
 from .prism.explicit import read_prism as read_prism, write_prism as write_prism
-from .prism.program import build_model as build_model, read_program as read_program
+from .prism.program import (
+    build_model as build_model,
+    program_actions as program_actions,
+    program_environment as program_environment,
+    read_program as read_program,
+)
 from .reward_machine import (
     RewardMachine as RewardMachine,
     machine_reward as machine_reward,

@@ -12,6 +12,10 @@ from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.programs.build import MAX_STATES, build_model as build_model
+from jaxltl.core.programs.simulation import (
+    program_actions as program_actions,
+    program_environment as program_environment,
+)
 from jaxltl.io.files import read_text
 
 SUFFIXES = (".prism", ".pm", ".nm", ".sm", ".smg")
@@ -61,7 +65,8 @@ def read_program(path: str | os.PathLike[str], constants: Constants = None) -> P
       constants: values of constants, in a dict or as a text such as ``"N=64,MAX=4"``.
 
     Returns:
-      :class:`~jaxltl.core.language.syntax.Program`, for ``jaxltl.io.build_model``.
+      :class:`~jaxltl.core.language.syntax.Program`, for ``jaxltl.io.build_model`` and
+      ``jaxltl.io.program_environment``.
 
     Raises:
       ValueError: with file, line and column, as

@@ -1,0 +1,438 @@
+"""Programs in the PRISM language as simulated environments; no state is explored."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cache, reduce
+from types import ModuleType
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.tree_util import Partial
+from numpy.typing import NDArray
+
+from jaxltl.core.environments.environment import Environment, Timestep, make_box, make_environment
+from jaxltl.core.language.compiled import Compiled, compile_expressions
+from jaxltl.core.language.expressions import FALSE, Expression
+from jaxltl.core.language.source import LanguageError
+from jaxltl.core.language.syntax import Command, Program, Variable
+from jaxltl.core.models.protocols import PyTree
+from jaxltl.core.programs.choices import Choice, Group, list_choices
+from jaxltl.core.programs.initial import initial_states
+from jaxltl.core.programs.layout import make_layout
+
+World = dict[str, jax.Array]  # int32[] or bool[] of each variable
+_SUM_TOLERANCE = 1e-4  # of probabilities in single precision
+_MAX_STARTS = 2**20
+
+
+def program_environment(
+    program: Program,
+    *,
+    reward: str | None = None,
+    labels: Sequence[str] | None = None,
+    observe: Callable[[World], PyTree] | None = None,
+) -> Environment:
+    """The simulated environment of a program in the PRISM language, without building its model.
+
+    A state is a dict with ``int32[]`` or ``bool[]`` of each variable. An action of an mdp is a
+    number in :func:`program_actions`; a choice that is not available changes nothing, as does a step
+    in a deadlock, where action 0 is available. A dtmc has one action, and several enabled commands
+    have the same probability. Episodes have no end: see ``with_time_limit``.
+
+    The arithmetic is JAX's: 32-bit integers, and doubles of the default precision, in which
+    probabilities are exact to 1e-7. An update that leaves the range of a variable is clipped, and
+    the reward of a step with such an update, or with probabilities that do not sum to 1, is NaN.
+
+    Args:
+      program: of ``jl.io.read_program``, a dtmc or an mdp, without parameters.
+      reward: the name of a reward structure, whose rewards of the state and of the choice before
+        each step are added; ``""`` is the one without a name. Default: zero.
+      labels: names of labels; ``"deadlock"`` marks states without choices. Default: all labels of
+        the program.
+      observe: ``state -> observation``; default: ``float[V]``, each variable scaled to 0..1.
+
+    Returns:
+      :class:`~jaxltl.core.environments.environment.Environment`.
+
+    Raises:
+      ValueError: games, intervals, parameters, unknown names, more than 4096 choices in a state, or
+        integers of more than 32 bits.
+
+    Example:
+      >>> from jaxltl.core.language.resolve import read_program
+      >>> program = read_program('''mdp module m x : [0..2]; [up] x<2 -> 0.5 : (x'=x+1) + 0.5 : true;
+      ...     [down] x>0 -> (x'=x-1); endmodule label "top" = x=2;''')
+      >>> walk = program_environment(program)
+      >>> world = walk.step(walk.reset(jax.random.key(0)), 1, jax.random.key(3)).world
+      >>> program_actions(program), int(world["x"]), walk.allowed(world).tolist()
+      (('down', 'up'), 1, [True, True])
+    """
+    _require_simulated(program)
+    names = tuple(program.labels) if labels is None else tuple(labels)
+    rewards = {r.name: r.items for r in program.rewards}
+    if reward is not None:
+        _require_name(program, "reward structure", reward, rewards)
+    for name in names:
+        _require_name(program, "label", name, {*program.labels, "deadlock"})
+    try:
+        _check_integers(program)
+        items = () if reward is None else rewards[reward]
+        made = _simulation(program, [(i.action, i.guard, i.value) for i in items], names)
+        columns, size = _initial_columns(program)
+    except LanguageError as error:
+        raise program.source.located(error) from None
+    chain = program.kind == "dtmc"
+    variables = len(program.variables)
+    return make_environment(
+        Partial(_reset, columns),
+        Partial(made.step),
+        Partial(made.observe) if observe is None else observe,
+        actions=1 if chain else len(made.choices),
+        allowed=None if chain else Partial(made.allowed),
+        labels=Partial(made.labels),
+        propositions=names,
+        observations=make_box(0, 1, (variables,), jnp.result_type(float))
+        if observe is None
+        else None,
+        starts=Partial(_starts, columns, np.full(size, 1 / size, jnp.result_type(float))),
+    )
+
+
+def program_actions(program: Program) -> tuple[str, ...]:
+    """Names of the actions of the environment of an mdp.
+
+    A choice is an action with a command of each of its modules, or a command without an action of
+    one module. Commands that exclude each other share a number; where several may be enabled, the
+    names are numbered.
+
+    Args:
+      program: of ``jl.io.read_program``.
+
+    Returns:
+      By number the name of the action, or of the module of commands without an action.
+
+    Raises:
+      ValueError: more than 4096 choices.
+
+    Example:
+      >>> from jaxltl.core.language.resolve import read_program
+      >>> program_actions(read_program('''mdp module m x : [0..2];
+      ...     [] x<2 -> (x'=x+1); [] x<1 -> true; [] x=2 -> true; endmodule'''))
+      ('m 1', 'm 2')
+    """
+    return tuple(choice.name for choice in list_choices(program)[1])
+
+
+def _require_name(program: Program, kind: str, name: str, known: Iterable[str]) -> None:
+    if name not in known:
+        raise ValueError(
+            f"{program.source.name!r}: there is no {kind} {name!r}; there are {sorted(known)}."
+        )
+
+
+def _require_simulated(program: Program) -> None:
+    """Raises ValueError for what has no simulation."""
+    found, remedy = "", ""
+    if program.kind == "smg":
+        found, remedy = "an smg", "build the model, for model_environment"
+    elif program.has_intervals:
+        found, remedy = "a program with intervals of probabilities", "give numbers"
+    elif program.parameters:
+        found, remedy = f"a program whose constant {program.parameters[0]} has no value", "give it"
+    if found:
+        raise ValueError(f"{program.source.name!r}: {found} is not simulated; {remedy}.")
+
+
+# --- functions of the environment -----------------------------------------------------------------
+
+
+def _reset(columns: World, key: chex.PRNGKey) -> World:
+    size = len(next(iter(columns.values())))
+    index = jax.random.randint(key, (), 0, size) if size > 1 else 0
+    return {name: jnp.asarray(x)[index] for name, x in columns.items()}
+
+
+def _starts(columns: World, probability: jax.Array) -> tuple[World, jax.Array]:
+    return columns, probability
+
+
+@dataclass(frozen=True, eq=False)
+class _Simulation:
+    """A program as functions of one state."""
+
+    variables: tuple[Variable, ...]
+    groups: tuple[Group, ...]
+    choices: tuple[Choice, ...]
+    chain: bool
+    guards: Compiled  # by group and command
+    updates: Compiled  # guards; by command probabilities and assigned values; rewards
+    earned: tuple[str | None, ...]  # action of each reward
+    conditions: Compiled  # labels
+    deadlock: int  # the label of states without choices, or -1
+
+    def step(self, world: World, action: jax.Array, key: chex.PRNGKey) -> Timestep:
+        values = map(jnp.asarray, self.updates(world, _arrays()))
+        guards = self._by_group(values)
+        mask = self._available(guards)
+        # The last draw chooses among the enabled commands of a chain.
+        draws = 1 + max(g.draw for g in self.groups) + (len(self.choices) > 1)
+        uniform = jax.random.uniform(key, (draws if self.chain else max(1, draws - 1),))
+        chosen = self._chosen(mask, action, uniform[-1])
+        new = dict(world)
+        invalid = jnp.bool_(False)
+        for i, (group, enabled) in enumerate(zip(self.groups, guards, strict=True)):
+            picked = _any([chosen[k] for k, c in enumerate(self.choices) if i in c.groups])
+            for command, guard in zip(group.commands, enabled, strict=True):
+                active = picked & guard
+                invalid = invalid | active & _update(
+                    command, active, uniform[group.draw], values, new
+                )
+        for v in self.variables:
+            if v.type == "int":
+                inside = jnp.clip(new[v.name], v.low, v.high)
+                invalid = invalid | (inside != new[v.name])
+                new[v.name] = inside
+        earned = self._reward(values, chosen)
+        reward = jnp.where(invalid, jnp.nan, earned).astype(jnp.result_type(float))
+        return Timestep(new, reward, terminated=jnp.bool_(False))
+
+    def _by_group(self, values: Iterator[jax.Array]) -> list[list[jax.Array]]:
+        return [[next(values) for _ in g.commands] for g in self.groups]
+
+    def _available(self, guards: list[list[jax.Array]]) -> list[jax.Array]:
+        """Enabledness of each choice."""
+        of_group = [_any(some) for some in guards]
+        return [_all([of_group[g] for g in c.groups]) for c in self.choices]
+
+    def _chosen(
+        self, mask: list[jax.Array], action: jax.Array, uniform: jax.Array
+    ) -> list[jax.Array]:
+        """Marks of the chosen one among the available choices."""
+        if not self.chain:
+            return [m & (action == k) for k, m in enumerate(mask)]
+        if len(mask) == 1:
+            return mask
+        count = reduce(jnp.add, [m.astype(jnp.int32) for m in mask])
+        number = jnp.minimum((uniform * count).astype(jnp.int32), count - 1)
+        found, before = [], jnp.int32(0)
+        for m in mask:
+            found.append(m & (before == number))
+            before = before + m
+        return found
+
+    def _reward(self, values: Iterator[jax.Array], chosen: list[jax.Array]) -> jax.Array:
+        total = jnp.zeros((), jnp.result_type(float))
+        for action in self.earned:
+            guard, value = next(values), next(values)
+            if action is not None:
+                marks = zip(self.choices, chosen, strict=True)
+                guard = guard & _any([m for c, m in marks if c.action == action])
+            total = total + jnp.where(guard, value, 0)
+        return total
+
+    def allowed(self, world: World) -> jax.Array:
+        mask = self._available(self._by_group(map(jnp.asarray, self.guards(world, _arrays()))))
+        return jnp.stack([mask[0] | ~_any(mask), *mask[1:]])
+
+    def labels(self, world: World) -> jax.Array:
+        found = [jnp.asarray(x) for x in self.conditions(world, _arrays())]
+        if self.deadlock >= 0:
+            guards = self._by_group(map(jnp.asarray, self.guards(world, _arrays())))
+            found[self.deadlock] = ~_any(self._available(guards))
+        return jnp.stack(found) if found else jnp.zeros(0, bool)
+
+    def observe(self, world: World) -> jax.Array:
+        scaled = [(world[v.name] - v.low) / max(1, v.high - v.low) for v in self.variables]
+        return jnp.stack(scaled).astype(jnp.result_type(float))
+
+
+def _simulation(
+    program: Program,
+    rewards: Sequence[tuple[str | None, Expression, Expression]],
+    labels: Sequence[str],
+) -> _Simulation:
+    groups, choices = list_choices(program)
+    commands = [c for g in groups for c in g.commands]
+    guards = [c.guard for c in commands]
+    updates = [e for c in commands for e in _command_expressions(c)]
+    earned = [e for _, guard, value in rewards for e in (guard, value)]
+    conditions = [program.labels.get(name, FALSE) for name in labels]
+    implicit = "deadlock" in labels and "deadlock" not in program.labels
+    return _Simulation(
+        program.variables,
+        groups,
+        choices,
+        program.kind == "dtmc",
+        compile_expressions(guards),
+        compile_expressions([*guards, *updates, *earned]),
+        tuple(action for action, *_ in rewards),
+        compile_expressions(conditions),
+        labels.index("deadlock") if implicit else -1,
+    )
+
+
+def _command_expressions(command: Command) -> list[Expression]:
+    """Probabilities and assigned values, in the order in which :func:`_update` reads them."""
+    found = [o.probability for o in command.outcomes]
+    return found + [a.expression for o in command.outcomes for a in o.assignments]
+
+
+def _update(
+    command: Command, active: jax.Array, uniform: jax.Array, values: Iterator[jax.Array], new: World
+) -> jax.Array:
+    """Assigns the variables of a random outcome; returns True for an invalid distribution."""
+    weights = [next(values) for _ in command.outcomes]
+    marks = _outcome_marks(weights, uniform)
+    for outcome, mark in zip(command.outcomes, marks, strict=True):
+        for a in outcome.assignments:
+            old = new[a.variable]
+            value = next(values).astype(old.dtype)
+            new[a.variable] = jnp.where(active & mark, value, old)
+    total = reduce(jnp.add, weights)
+    valid = (total >= 1 - _SUM_TOLERANCE) & (total <= 1 + _SUM_TOLERANCE)
+    for weight in weights:
+        valid = valid & (weight >= 0)
+    return ~valid
+
+
+def _outcome_marks(weights: Sequence[jax.Array], uniform: jax.Array) -> list[jax.Array]:
+    """Marks of the outcome of a uniform number; one of probability 0 never has it."""
+    sums = [weights[0]]
+    for weight in weights[1:]:
+        sums.append(sums[-1] + weight)
+    scaled = uniform * sums[-1]
+    # From the last one on: the first outcome that is possible and has its sum above the number, or
+    # the last possible one, where rounding leaves none.
+    number = jnp.asarray(-1, jnp.int32)
+    for k in range(len(weights) - 1, -1, -1):
+        number = jnp.where((weights[k] > 0) & ((scaled < sums[k]) | (number < 0)), k, number)
+    return [number == k for k in range(len(weights))] if len(weights) > 1 else [jnp.bool_(True)]
+
+
+def _any(marks: Sequence[jax.Array]) -> jax.Array:
+    return reduce(jnp.logical_or, marks, jnp.bool_(False))
+
+
+def _all(marks: Sequence[jax.Array]) -> jax.Array:
+    return reduce(jnp.logical_and, marks)
+
+
+@cache
+def _arrays() -> ModuleType:
+    """The namespace of JAX arrays, with rounded quotients.
+
+    XLA multiplies by the reciprocal of a constant, and floor(49 / 49) would be 0.
+    """
+    found = ModuleType("arrays")
+    found.__dict__.update(vars(jnp))
+
+    def true_divide(a: chex.Numeric, b: chex.Numeric) -> jax.Array:
+        return jnp.true_divide(a, jax.lax.optimization_barrier(jnp.asarray(b)))
+
+    found.__dict__["true_divide"] = true_divide
+    return found
+
+
+# --- checks and initial states --------------------------------------------------------------------
+
+
+def _initial_columns(program: Program) -> tuple[dict[str, NDArray[np.generic]], int]:
+    """Values of each variable in the initial states."""
+    layout = make_layout(program.variables)
+    words = initial_states(program, layout, _MAX_STARTS)
+    size = words[0].size
+    found: dict[str, NDArray[np.generic]] = {}
+    for v in program.variables:
+        values = layout.values(words, v.name)
+        found[v.name] = values if v.type == "bool" else values.astype(np.int32)
+    return found, size
+
+
+_Ends = tuple[float, float, bool]  # least and largest value, and True for integers
+
+
+def _check_integers(program: Program) -> None:
+    """Raises LanguageError for integers that may not fit into 32 bits."""
+    known: dict[int, _Ends] = {}
+    ranges: dict[str, _Ends] = {}
+    for v in program.variables:
+        ranges[v.name] = float(v.low), float(v.high), v.type == "int"
+        _require_32_bits(ranges[v.name], v.place, v.name)
+    expressions = list(program.labels.values())
+    for m in program.modules:
+        for c in m.commands:
+            expressions += [c.guard, *_command_expressions(c)]
+    expressions += [e for r in program.rewards for i in r.items for e in (i.guard, i.value)]
+    for e in expressions:
+        _ends(e, ranges, known)
+
+
+def _require_32_bits(ends: _Ends, place: int, shown: object) -> None:
+    if ends[2] and not (ends[0] > -(2**31) and ends[1] < 2**31):
+        raise LanguageError(
+            place,
+            f"the integer {shown} may be {ends[0]:.9g} to {ends[1]:.9g}; a simulation has 32-bit "
+            "integers. Write 1.0 * for a double, or build the model.",
+        )
+
+
+def _ends(e: Expression, ranges: dict[str, _Ends], known: dict[int, _Ends]) -> _Ends:
+    """Bounds of an expression by interval arithmetic."""
+    if (found := known.get(id(e))) is None:
+        parts = [_ends(x, ranges, known) for x in e.operands]
+        found = known[id(e)] = _node_ends(e, parts, ranges)
+        _require_32_bits(found, e.place, e)
+    return found
+
+
+def _node_ends(e: Expression, parts: list[_Ends], ranges: dict[str, _Ends]) -> _Ends:
+    operator = e.operator
+    if operator == "literal":
+        value = float(e.value) if isinstance(e.value, bool | int | float) else 0.0
+        return value, value, type(e.value) is int
+    if operator == "name":
+        return ranges[str(e.value)]
+    if operator in ("floor", "ceil", "round"):
+        low, high, whole = parts[0]
+        return (low, high, True) if whole else (low - 1, high + 1, True)
+    if operator == "?:":
+        parts = parts[1:]
+    whole = all(p[2] for p in parts)
+    lows, highs = [p[0] for p in parts], [p[1] for p in parts]
+    if operator == "neg":
+        return -highs[0], -lows[0], whole
+    if operator == "+":
+        return sum(lows), sum(highs), whole
+    if operator == "-":
+        return lows[0] - highs[1], highs[0] - lows[1], whole
+    if operator == "*":
+        size = math.prod(max(abs(a), abs(b)) for a, b, _ in parts)
+        return (0.0 if min(lows) >= 0 else -size), size, whole
+    if operator in ("?:", "min", "max"):
+        return min(lows), max(highs), whole
+    if operator == "mod":
+        return 0.0, max(highs[1] - 1, 0.0), True
+    if operator in ("/", "pow", "log"):
+        return _power_ends(parts) if operator == "pow" else _quotient_ends(operator, parts)
+    return 0.0, 1.0, False  # Boolean
+
+
+def _power_ends(parts: list[_Ends]) -> _Ends:
+    (low, high, _), (_, exponent, _) = parts
+    size = max(abs(low), abs(high), 1.0)
+    power = math.inf if exponent * math.log2(size) > 60 else size ** max(exponent, 0.0)
+    whole = all(p[2] for p in parts)
+    return (0.0 if low >= 0 else -power), power if whole else math.inf, whole
+
+
+def _quotient_ends(operator: str, parts: list[_Ends]) -> _Ends:
+    (low, high, _), (least, most, _) = parts
+    if operator == "log" or least <= 0 <= most:
+        return -math.inf, math.inf, False
+    size = max(abs(low), abs(high)) / min(abs(least), abs(most))
+    return -size, size, False
