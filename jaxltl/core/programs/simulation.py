@@ -326,7 +326,7 @@ def _all(marks: Sequence[jax.Array]) -> jax.Array:
 def _arrays() -> ModuleType:
     """The namespace of JAX arrays, with rounded quotients.
 
-    XLA multiplies by the reciprocal of a constant, and floor(49 / 49) would be 0.
+    XLA multiplies by the reciprocal of a constant, and floor(41 / 41) would be 0.
     """
     found = ModuleType("arrays")
     found.__dict__.update(vars(jnp))

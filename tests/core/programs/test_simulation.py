@@ -181,9 +181,9 @@ def test_tasks_and_time_limits_take_the_environment_of_a_program():
     assert episode.label[:, 0].argmax() == episode.valid.sum()  # ends in the first state with top
 
 
-@pytest.mark.parametrize("divisor", [7, 49, 93])
+@pytest.mark.parametrize("divisor", [7, 41, 194])
 def test_floors_of_quotients_are_exact(divisor):
-    """Multiplication by the reciprocal of 49 gives floor(49/49) = 0 in single precision."""
+    """Multiplication by the reciprocal of 41 gives floor(41/41) = 0 in single precision."""
     program = read_program(
         "dtmc const int d; module m x : [0..999]; q : [0..999]; "
         "[] true -> (q'=floor(x/d)) & (x'=min(x+1,999)); endmodule",
