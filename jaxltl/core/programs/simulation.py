@@ -324,7 +324,7 @@ def _all(marks: Sequence[jax.Array]) -> jax.Array:
 
 @cache
 def _arrays() -> ModuleType:
-    """The namespace of JAX arrays, with rounded quotients.
+    """The namespace of JAX arrays, where integers have quotients with exact integral parts.
 
     XLA multiplies by the reciprocal of a constant, and floor(41 / 41) would be 0.
     """
@@ -332,7 +332,13 @@ def _arrays() -> ModuleType:
     found.__dict__.update(vars(jnp))
 
     def true_divide(a: chex.Numeric, b: chex.Numeric) -> jax.Array:
-        return jnp.true_divide(a, jax.lax.optimization_barrier(jnp.asarray(b)))
+        quotient = jnp.true_divide(a, b)
+        if not jnp.issubdtype(jnp.result_type(a, b), jnp.integer):
+            return quotient
+        divisor = jnp.where(jnp.equal(b, 0), 1, b)
+        whole = jnp.floor_divide(a, divisor)
+        exact = whole + jnp.true_divide(a - whole * divisor, divisor)
+        return jnp.where(jnp.equal(b, 0), quotient, exact)
 
     found.__dict__["true_divide"] = true_divide
     return found
