@@ -85,6 +85,7 @@ def _undefined(expression: Expression) -> list[Expression]:
 _TYPES: Mapping[str, Type] = {"b": "bool", "i": "int", "u": "int", "f": "double"}
 
 
+@brief(facts=lambda self: [f"{len(self.known)} names"])
 @dataclass(frozen=True)
 class Definitions:
     """Names that properties may use, other than labels of the model.

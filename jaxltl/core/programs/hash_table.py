@@ -1,4 +1,4 @@
-"""Vectorised hash table: numbers of distinct keys in the order of their first insertion."""
+"""Vectorised hash table: consecutive numbers of distinct keys."""
 
 from __future__ import annotations
 
@@ -18,8 +18,9 @@ class HashTable:
 
     Example:
       >>> table = HashTable(1)
-      >>> table.insert((np.array([7, 9, 7], np.uint64),)).tolist(), len(table)
-      ([0, 1, 0], 2)
+      >>> first, other, same = table.insert((np.array([7, 9, 7], np.uint64),)).tolist()
+      >>> first == same, first == other, len(table)
+      (True, False, 2)
     """
 
     def __init__(self, num_words: int) -> None:

@@ -65,8 +65,8 @@ def program_environment(
 
     Example:
       >>> from jaxltl.core.language.resolve import read_program
-      >>> program = read_program('''mdp module m x : [0..2]; [up] x<2 -> 0.5 : (x'=x+1) + 0.5 : true;
-      ...     [down] x>0 -> (x'=x-1); endmodule label "top" = x=2;''')
+      >>> program = read_program('''mdp module m x : [0..2]; [up] x<2 -> (x'=x+1);
+      ...     [down] x>0 -> 0.5 : (x'=x-1) + 0.5 : true; endmodule label "top" = x=2;''')
       >>> walk = program_environment(program)
       >>> world = walk.step(walk.reset(jax.random.key(0)), 1, jax.random.key(3)).world
       >>> program_actions(program), int(world["x"]), walk.allowed(world).tolist()

@@ -229,5 +229,5 @@ def test_renamed_formulas_must_mean_their_renamed_variables():
     text = """mdp formula f = x > 0; formula g = {}; formula h = f;
     module m x : [0..1]; [] h -> true; endmodule module n = m [x = y, f = g] endmodule"""
     assert str(read_program(text.format("y > 0")).modules[1].commands[0].guard) == "(y > 0)"
-    with pytest.raises(ValueError, match="line 2, column 59: the formula f with renamed variables"):
+    with pytest.raises(ValueError, match="line 2, column 57: the formula f with renamed variables"):
         read_program(text.format("y = 0"))
