@@ -48,7 +48,7 @@ def _say_once(launch: processes.Launch) -> Callable[[str], None]:
     return _say if launch.process == 0 else lambda text: None
 
 
-def _print_json(result: Any) -> None:
+def _print_json(result: object) -> None:
     click.echo(json.dumps(result, allow_nan=False))
 
 

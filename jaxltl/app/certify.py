@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -272,7 +272,7 @@ def certify_and_write(
     target, picture = outputs.policy, outputs.curve
     if picture is not None and picture.suffix not in PICTURES:
         raise ValueError(f"--curve {picture}: the name must end in {', '.join(PICTURES)}.")
-    nothing: Any = contextlib.nullcontext()
+    nothing = contextlib.nullcontext()
     with (
         nothing if target is None else atomic_write(target) as file,
         nothing if picture is None else atomic_write(picture) as drawing,

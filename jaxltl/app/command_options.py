@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 from collections.abc import Callable, Iterator
-from typing import IO, Any
+from typing import IO
 
 import click
 
@@ -26,7 +26,7 @@ def plain_errors(command: Callable[..., None]) -> Callable[..., None]:
     """Reports expected errors without a traceback; others are bugs, and keep it."""
 
     @functools.wraps(command)
-    def run(*args: Any, **options: Any) -> None:
+    def run(*args: object, **options: object) -> None:
         try:
             command(*args, **options)
         except (ValueError, RuntimeError) as error:
@@ -75,7 +75,7 @@ def compiling(*, fast: bool) -> Callable[[Callable[..., None]], Callable[..., No
             help="Neither read nor write the cache of compiled programs.",
         )
         @functools.wraps(command)
-        def run(*args: Any, no_cache: bool, **options: Any) -> None:
+        def run(*args: object, no_cache: bool, **options: object) -> None:
             compilation.use_cache(not no_cache)
             if fast:
                 compilation.compile_fast()
@@ -137,13 +137,13 @@ def over_devices(command: Callable[..., None]) -> Callable[..., None]:
     )
     @functools.wraps(command)
     def run(
-        *args: Any,
+        *args: object,
         mesh: int | None,
         coordinator: str | None,
         process: int | None,
         num_processes: int | None,
         wait: float,
-        **options: Any,
+        **options: object,
     ) -> None:
         devices = processes.DeviceOptions(mesh, coordinator, process, num_processes, wait)
         command(*args, devices=devices, **options)

@@ -80,7 +80,7 @@ def _first_states(
 ) -> PyTree:
     """The initial states of N seeds, by one program."""
 
-    def first(n: Any) -> Any:
+    def first(n: object) -> Any:
         return _first_of(init)(n, seed, problem, hparams)
 
     if num_seeds == 1:  # a smaller program than with vmap
@@ -151,7 +151,7 @@ def took(seconds: float) -> Record:
     return {"seconds": round(seconds, 2), "versions": versions}
 
 
-def plain(value: Any) -> Any:
+def plain(value: object) -> Any:
     """A value of JSON: arrays become lists, NaN and infinity become None."""
     if isinstance(value, Mapping):
         return {str(k): plain(v) for k, v in value.items()}

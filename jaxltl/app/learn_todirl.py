@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -373,7 +372,7 @@ def _judge(
 
 
 def _plans(
-    setup: Setup, network: Any, parameters: PyTree, hparams: todirl.Hparams, count: int
+    setup: Setup, network: object, parameters: PyTree, hparams: todirl.Hparams, count: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Plans of all and of optimal actions in the first worlds, one at a time, and statuses."""
     worlds, masks = setup.worlds, np.stack([x.allowed for x in setup.sure or ()])

@@ -276,7 +276,7 @@ def _over_states(values: list[Any]) -> Any:
     return plain[0] if len(plain) == 1 else plain
 
 
-def _number(x: Any) -> Any:
+def _number(x: object) -> Any:
     if isinstance(x, float) and not np.isfinite(x):
         return None if np.isnan(x) else "inf" if x > 0 else "-inf"
     return x + 0.0 if isinstance(x, float) else x  # no negative zero; JSON has no infinity

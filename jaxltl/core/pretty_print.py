@@ -41,7 +41,7 @@ def brief(
 
 
 def brief(
-    cls: Any = None,
+    cls: object = None,
     /,
     *,
     facts: Facts | None = None,
@@ -67,7 +67,7 @@ def _repr(self: Any) -> str:
     return laid_out(type(self).__name__, self._brief_facts(self))
 
 
-def _safe(facts: Facts, plain: Facts, value: Any) -> list[str]:
+def _safe(facts: Facts, plain: Facts, value: object) -> list[str]:
     """The facts of an object; JAX temporarily stores axes and shardings in the fields of trees."""
     for told in (facts, plain):
         try:
@@ -97,7 +97,7 @@ def laid_out(name: str, facts: Sequence[str]) -> str:
     return "\n".join(lines)
 
 
-def nested_repr(value: Any, width: int = _HEAD) -> str:
+def nested_repr(value: object, width: int = _HEAD) -> str:
     """The ``repr`` of an object inside another: its name and as many facts as fit."""
     facts = getattr(type(value), "_brief_facts", None)
     if facts is None:
@@ -159,7 +159,7 @@ def batch_text(shape: Sequence[int]) -> str:
 # --- arrays ---------------------------------------------------------------------------------------
 
 
-def is_array(value: Any) -> bool:
+def is_array(value: object) -> bool:
     """True for objects with a shape and a dtype, abstract ones included."""
     return hasattr(value, "shape") and hasattr(value, "dtype")
 
@@ -201,13 +201,13 @@ def array_text(value: Any) -> str:
     return f"{text} on {devices} devices" if devices > 1 else text
 
 
-def number(value: Any) -> str:
+def number(value: object) -> str:
     """A number, with six digits unless it is an integer."""
     whole = isinstance(value, bool | np.bool_ | int | np.integer)
     return str(value) if whole else f"{value:.6g}"
 
 
-def value_range(value: Any) -> str:
+def value_range(value: object) -> str:
     """The values of an array: all of a few, the range of many.
 
     >>> value_range(np.array([0.25, np.nan])), value_range(np.arange(9)), value_range(np.zeros(9, bool))
@@ -235,7 +235,7 @@ def value_range(value: Any) -> str:
     return f"{text}, {missing:,} nan" if missing else text
 
 
-def bounds_text(lower: Any, upper: Any) -> str:
+def bounds_text(lower: object, upper: object) -> str:
     """The largest width of certified bounds, and the number of states without.
 
     >>> bounds_text(np.zeros(3), np.array([0, 1e-6, np.inf])), bounds_text(-np.inf, np.inf)
@@ -266,7 +266,7 @@ def rounded_outward(bound: float, up: bool, digits: int = 5) -> str:
     return f"{float(context.create_decimal(float(bound))):.{digits}g}"
 
 
-def enum_counts(value: Any, codes: Iterable[enum.IntEnum]) -> str:
+def enum_counts(value: object, codes: Iterable[enum.IntEnum]) -> str:
     """The name of a code; for an array the number of each code."""
     read = readable(value)
     if read is None or read.dtype.kind not in "iu":
@@ -296,7 +296,7 @@ def fields(value: Any, codes: Mapping[str, Any] | None = None) -> Iterator[str]:
             yield field(name, given, (codes or {}).get(name))
 
 
-def field(name: str, value: Any, codes: Iterable[enum.IntEnum] | None = None) -> str:
+def field(name: str, value: object, codes: Iterable[enum.IntEnum] | None = None) -> str:
     """A field with its value."""
     if codes is not None and is_array(value):
         return f"{name}={enum_counts(value, codes)}"
@@ -322,7 +322,7 @@ def describe(value: Any) -> str:
     return _tree(value)
 
 
-def _tree(value: Any) -> str:
+def _tree(value: object) -> str:
     """A description of a tree or function: its type or name, and the number of arrays."""
     leaves = [x for x in _leaves(value) if is_array(x)]
     inner = value
@@ -339,7 +339,7 @@ def _tree(value: Any) -> str:
     return what if plain else f"{truncate(name)}({what})"
 
 
-def _leaves(value: Any) -> list[Any]:
+def _leaves(value: object) -> list[Any]:
     """The leaves of a tree."""
     jax = sys.modules.get("jax")
     if jax is not None:
@@ -376,7 +376,7 @@ def picture(value: object) -> str | None:
     return None
 
 
-def _svg(self: Any) -> str | None:
+def _svg(self: object) -> str | None:
     """The SVG for notebooks; None for text."""
     try:
         importlib.import_module(_DRAWING)  # on first use, since matplotlib is slow to import
@@ -386,7 +386,7 @@ def _svg(self: Any) -> str | None:
     return None if found is None or len(found) > _DRAWN else found
 
 
-def _html(self: Any) -> str | None:
+def _html(self: object) -> str | None:
     """The SVG above the text; None without a picture."""
     found = _svg(self)
     if found is None:

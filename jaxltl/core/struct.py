@@ -26,10 +26,10 @@ def register(cls: type, array_fields: Iterable[str], static_fields: Iterable[str
     arrays, static = tuple(array_fields), tuple(static_fields)
     keys = tuple(jax.tree_util.GetAttrKey(name) for name in arrays)
 
-    def flatten(x: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+    def flatten(x: object) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         return tuple(getattr(x, f) for f in arrays), tuple(getattr(x, f) for f in static)
 
-    def flatten_with_keys(x: Any) -> tuple[tuple[tuple[Any, Any], ...], tuple[Any, ...]]:
+    def flatten_with_keys(x: object) -> tuple[tuple[tuple[Any, Any], ...], tuple[Any, ...]]:
         children, aux = flatten(x)
         return tuple(zip(keys, children, strict=True)), aux
 

@@ -197,7 +197,7 @@ def worst(*statuses: chex.Array, axis: int | None = None) -> jax.Array:
     return found
 
 
-def row_tolerance(dtype: Any) -> float:
+def row_tolerance(dtype: object) -> float:
     """Largest admitted deviation from one of the sum of a policy's row."""
     return max(1e-6, 128 * float(jnp.finfo(dtype).eps))
 

@@ -74,7 +74,7 @@ RANGES = {
 }
 
 
-def is_concrete(value: Any) -> bool:
+def is_concrete(value: object) -> bool:
     """True if a scalar's value is known: it is not traced by JAX."""
     try:
         np.asarray(value)
@@ -111,7 +111,7 @@ def require_real(name: str, value: Any) -> None:
         raise ValueError(f"{name} is {dtype}{list(np.shape(value))}; give real numbers.")
 
 
-def shorten(value: Any) -> str:
+def shorten(value: object) -> str:
     """The representation of a value, abbreviated for error messages."""
     if isinstance(value, np.ndarray) and value.size <= _MAX_REPR:
         value = value.tolist()
@@ -119,7 +119,7 @@ def shorten(value: Any) -> str:
     return text if len(text) <= _MAX_REPR else f"{text[:_MAX_REPR]}..."
 
 
-def float_array(name: str, value: Any) -> Floats:
+def float_array(name: str, value: object) -> Floats:
     """Converts to an array in double precision."""
     try:
         if np.asarray(value).dtype.kind != "c":
@@ -129,7 +129,7 @@ def float_array(name: str, value: Any) -> Floats:
     raise ValueError(f"{name} is {shorten(value)}; give numbers.")
 
 
-def boolean_array(name: str, value: Any) -> Booleans:
+def boolean_array(name: str, value: object) -> Booleans:
     """Converts to a Boolean array; the numbers 0 and 1 are accepted."""
     try:
         array = np.asarray(value)
@@ -140,7 +140,7 @@ def boolean_array(name: str, value: Any) -> Booleans:
     return array.astype(bool)
 
 
-def integer_array(name: str, value: Any) -> Integers:
+def integer_array(name: str, value: object) -> Integers:
     """Converts to an array of integers."""
     array = float_array(name, value)
     if not (np.abs(array) < _INEXACT).all() or (array != np.floor(array)).any():
@@ -148,7 +148,7 @@ def integer_array(name: str, value: Any) -> Integers:
     return array.astype(np.int64)
 
 
-def finite_number(name: str, value: Any) -> float:
+def finite_number(name: str, value: object) -> float:
     """Converts to a float."""
     array = float_array(name, np.nan if value is None else value)
     if array.ndim or not np.isfinite(array):
@@ -171,7 +171,7 @@ def integer(name: str, value: Any, *, least: int = 0, most: int = 2**63 - 1) -> 
     return number
 
 
-def choice(name: str, value: Any, known: Sequence[str]) -> str:
+def choice(name: str, value: object, known: Sequence[str]) -> str:
     """Returns `value` if it is one of some words."""
     if not isinstance(value, str) or value not in known:
         raise ValueError(f"{name}={shorten(value)}; choose one of {', '.join(known)}.")
@@ -187,7 +187,7 @@ def boolean(name: str, value: Any) -> bool:
     raise ValueError(f"{name}={shorten(value)}; give True or False.")
 
 
-def fraction(name: str, value: Any, *, ends: tuple[bool, bool] = (True, True)) -> float:
+def fraction(name: str, value: object, *, ends: tuple[bool, bool] = (True, True)) -> float:
     """Converts to a float from 0 to 1; `ends` are whether 0 and 1 are valid."""
     number = finite_number(name, value)
     valid = Range(0, 1, open_below=not ends[0], open_above=not ends[1])
@@ -211,7 +211,7 @@ def instance(name: str, value: Any, kind: Any, remedy: str) -> Any:
     return value
 
 
-def sequence(name: str, value: Any) -> list[Any]:
+def sequence(name: str, value: object) -> list[Any]:
     """Converts an iterable to a list; a text becomes the list of its letters."""
     if isinstance(value, Iterable):
         with contextlib.suppress(TypeError):  # a scalar array
@@ -219,7 +219,7 @@ def sequence(name: str, value: Any) -> list[Any]:
     raise ValueError(f"{name} is {shorten(value)}; give a list.")
 
 
-def distinct_names(name: str, value: Any) -> tuple[str, ...]:
+def distinct_names(name: str, value: object) -> tuple[str, ...]:
     """Converts an iterable of distinct strings to a tuple."""
     found = sequence(name, value)
     for one in found:
@@ -230,7 +230,7 @@ def distinct_names(name: str, value: Any) -> tuple[str, ...]:
     return tuple(found)
 
 
-def unsupported_model(model: Any) -> str:
+def unsupported_model(model: object) -> str:
     """The error message for a model without exact probabilities on one device."""
     name = type(model).__name__
     if hasattr(model, "nominal"):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import chex
 import jax
@@ -139,7 +139,7 @@ def flat_world(
         reset = Partial(_begin_at, np.asarray(start, np.float32))
     else:
         reset = Partial(_begin, _free_places(scene, extent, num_starts, seed))
-    velocity: Any = 9 if discrete else make_box(-1, 1, (2,), np.float32)
+    velocity = 9 if discrete else make_box(-1, 1, (2,), np.float32)
     most = extent + time_step  # of the step that leaves the square the place outside is seen
     world = make_environment(
         reset,

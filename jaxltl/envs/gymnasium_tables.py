@@ -13,7 +13,10 @@ from jaxltl.envs.gymnasium_runner import TERMINATED
 
 
 def from_gymnasium(
-    env: Any, *, labels: Mapping[str, Sequence[int]] | None = None, initial: ArrayLike | None = None
+    env: object,
+    *,
+    labels: Mapping[str, Sequence[int]] | None = None,
+    initial: ArrayLike | None = None,
 ) -> SparseMDP:
     """The MDP of the transition table of a Gymnasium environment.
 
@@ -70,7 +73,7 @@ def from_gymnasium(
     )
 
 
-def _made(env: Any) -> Any:
+def _made(env: object) -> Any:
     if isinstance(env, str):
         try:
             import gymnasium
@@ -99,7 +102,7 @@ class _Table(NamedTuple):
     terminated: np.ndarray
 
 
-def _read(env: Any) -> _Table:
+def _read(env: object) -> _Table:
     table, name = getattr(env, "P", None), type(env).__name__
     if not isinstance(table, Mapping) or not table or set(table) != set(range(len(table))):
         found = "none" if table is None else f"a {type(table).__name__} that is not such a table"

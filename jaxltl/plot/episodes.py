@@ -161,7 +161,7 @@ def scene_of(environment: Environment, episode: Episode) -> Scene:
     return _upright(float(numbers.extent), zones, track, heading, shown)
 
 
-def _place_of(world: Any) -> Any:
+def _place_of(world: object) -> Any:
     """The innermost world that has places, below wrappers such as time limits and tasks."""
     while not isinstance(world, LetterState | FlatState | ZoneState):
         place = world.get("place") if isinstance(world, dict) else getattr(world, "place", None)

@@ -7,7 +7,6 @@ import re
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -30,7 +29,7 @@ _STATES, _ARROWS = 40, 120  # of an automaton, up to which it is drawn
 _PLACES, _SOME_PLACES = 9, 64  # of a board, up to which there is a map for each, and for some
 
 
-def svg(draw: Callable[..., Figure], *arguments: Any, text: str, **options: Any) -> str:
+def svg(draw: Callable[..., Figure], *arguments: object, text: str, **options: object) -> str:
     """A figure as an inline SVG with a text alternative."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of signs that the font lacks, which stay boxes

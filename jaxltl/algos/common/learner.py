@@ -275,7 +275,7 @@ def bind(
         return loops.run(checked_step, state, problem, hparams, **options)
 
     def train(
-        key: chex.PRNGKey, problem: ProblemT, hparams: HparamsT, **options: Any
+        key: chex.PRNGKey, problem: ProblemT, hparams: HparamsT, **options: object
     ) -> tuple[StateT, MetricsT]:
         return run(checked_init(key, problem, hparams), problem, hparams, **options)
 
@@ -284,7 +284,7 @@ def bind(
         return loops.run_until(early, state, problem, hparams, **options)
 
     def train_until(
-        key: chex.PRNGKey, problem: ProblemT, hparams: HparamsT, **options: Any
+        key: chex.PRNGKey, problem: ProblemT, hparams: HparamsT, **options: object
     ) -> Learned:
         return run_until(checked_init(key, problem, hparams), problem, hparams, **options)
 

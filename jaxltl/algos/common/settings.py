@@ -56,7 +56,7 @@ class _Valid(NamedTuple):
     may_be_schedule: bool
 
 
-def traced(valid: Range, *, default: Any = dataclasses.MISSING, schedule: bool = False) -> Any:
+def traced(valid: Range, *, default: object = dataclasses.MISSING, schedule: bool = False) -> Any:
     """A dataclass field with a traced number in the range `valid`, or if `schedule` a schedule of them.
 
     A field with `default` None may be None.
@@ -65,7 +65,7 @@ def traced(valid: Range, *, default: Any = dataclasses.MISSING, schedule: bool =
     return struct.field(default=default, metadata=metadata)
 
 
-def static(valid: Range | tuple[str, ...] | type[bool], *, default: Any) -> Any:
+def static(valid: Range | tuple[str, ...] | type[bool], *, default: object) -> Any:
     """A dataclass field with a static integer (or a tuple of them), word or truth value.
 
     `valid` is the range, the words, or bool; a field with `default` None may be None.
@@ -168,7 +168,7 @@ def require_arrays(**trees: PyTree) -> None:
                 )
 
 
-def _is_array(leaf: Any) -> bool:
+def _is_array(leaf: object) -> bool:
     if isinstance(leaf, bool | float | complex | jax.Array):
         return True
     if isinstance(leaf, int):

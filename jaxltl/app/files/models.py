@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -54,7 +53,7 @@ def read_padded(path: Path, more: Sequence[str] = (), constants: str | None = No
                 {k: arrays[k] for k in more if k in arrays},
             )
     del raw
-    model: Any = read_model(path, constants=constants)
+    model = read_model(path, constants=constants)
     found: dict[str, np.ndarray] = {}
     objective = None
     if isinstance(model, IntervalMDP):

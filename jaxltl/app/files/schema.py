@@ -242,19 +242,19 @@ def _converted(value: Any, kind: Any) -> Any:
     raise TypeError
 
 
-def _parts(kind: Any) -> Iterator[Any]:
+def _parts(kind: object) -> Iterator[Any]:
     """A type and its arguments, outermost first."""
     yield kind
     for part in get_args(kind) if get_origin(kind) is not Literal else ():
         yield from _parts(part)
 
 
-def _table_of(kind: Any) -> type[Table] | None:
+def _table_of(kind: object) -> type[Table] | None:
     tables = (x for x in _parts(kind) if isinstance(x, type) and issubclass(x, Table))
     return next(tables, None)
 
 
-def requirement(kind: Any) -> str:
+def requirement(kind: object) -> str:
     """Requirement on values of a type, as text.
 
     Example:
@@ -305,7 +305,7 @@ def keys_of(schema: type[Table]) -> list[KeyHelp]:
     return entries
 
 
-def _example(kind: Any, default: Any) -> str:
+def _example(kind: object, default: object) -> str:
     """Example of a type: of its requirement, or an option that is not the default."""
     for part in _parts(kind):
         for meta in getattr(part, "__metadata__", ()):
@@ -319,7 +319,7 @@ def _example(kind: Any, default: Any) -> str:
     return ""
 
 
-def _default(default: Any) -> Any:
+def _default(default: object) -> Any:
     if default is attrs.NOTHING:
         return ...
     return default.factory() if hasattr(default, "factory") else default

@@ -41,12 +41,12 @@ class Picture:
 Artist = Callable[[Drawing], Callable[[], bytes]]
 
 
-def drawing(function: str, *arguments: Any, **options: Any) -> Drawing:
+def drawing(function: str, *arguments: object, **options: object) -> Drawing:
     """A deferred call of a function of :mod:`jaxltl.plot`, with NumPy arrays."""
     return Drawing(function, tuple(map(_on_the_host, arguments)), options)
 
 
-def _on_the_host(argument: Any) -> Any:
+def _on_the_host(argument: object) -> Any:
     """A dataclass with NumPy arrays: unpickling JAX arrays would import JAX."""
     if not dataclasses.is_dataclass(argument) or isinstance(argument, type):
         return argument

@@ -182,7 +182,7 @@ class _Dynamics:
 
 
 def _dynamics(model: Product) -> _Dynamics:
-    mdp: Any = model.mdp
+    mdp = model.mdp
     return _Dynamics(
         np.asarray(mdp.successor),
         np.asarray(mdp.probability),

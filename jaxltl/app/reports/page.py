@@ -37,7 +37,7 @@ def render_page(
     parts: Sequence[Part],
     pictures: Iterable[tuple[Picture, bytes]],
     file_text: str,
-    **context: Any,
+    **context: object,
 ) -> str:
     """A page that needs no other file and no network."""
     explorers = [(part, drawn) for part, drawn in parts if isinstance(part, Explorer)]

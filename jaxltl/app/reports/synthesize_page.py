@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
 
@@ -88,7 +87,7 @@ def play_explorer(found: Synthesis) -> Explorer | TooLarge:
     if found.play is not None:
         runs.append(Run("the environment wins", _counter_play(found)))
     visited = {state for run in runs for state, _, _ in run.steps}
-    place: Any = None
+    place = None
     cells: dict[int, list[int]] = {}
     caption = "Step by step."
     if world.text is not None and world.places is not None:
@@ -140,7 +139,7 @@ def _strategy_play(found: Synthesis) -> list[tuple[int, int, int | None]]:
     assert found.strategy is not None and found.restricted is not None
     game, nodes, rng = found.restricted.model, found.nodes, np.random.default_rng(0)
     base = np.asarray(found.strategy.base_state)[np.asarray(found.restricted.base_state)]
-    mdp: Any = game.mdp
+    mdp = game.mdp
     successor, chance = np.asarray(mdp.successor), np.asarray(mdp.probability, float)
     allowed, system = np.asarray(game.available), np.asarray(game.system)
     count = len(found.world.actions)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -165,7 +164,7 @@ def _look_into(outcome: Outcome, one: _Drawn) -> Explorer | TooLarge:
     layers[START] = Layer("initial states", np.where(starts, one.value, np.nan), None)
     model = part_of(one.worlds.model, one.w)
     shown = [] if one.demonstrations is None else demonstrated_runs(model, one.demonstrations)
-    place: Any = scene.cells if scene.colored is None else part_of(scene.colored, ...)
+    place = scene.cells if scene.colored is None else part_of(scene.colored, ...)
     return explorer(
         View(
             name=one.live,

@@ -312,7 +312,7 @@ def to_environment(dynamics: Dynamics) -> Environment:
 def _environment_step(
     next_state: Callable[..., jax.Array],
     inside: Callable[..., jax.Array],
-    choices: Any,
+    choices: object,
     state: jax.Array,
     action: jax.Array,
     key: chex.PRNGKey,
@@ -355,7 +355,7 @@ def _bounds(name: str, given: tuple[ArrayLike, ArrayLike]) -> Bounds:
     return low, high
 
 
-def _actions(given: Any) -> Bounds | Floats | None:
+def _actions(given: object) -> Bounds | Floats | None:
     """The box, the grid, or None."""
     if given is None:
         return None

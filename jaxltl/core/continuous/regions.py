@@ -66,7 +66,7 @@ class Region:
     def contains(self, x: Array) -> Array:
         """``bool[...]``: membership of the states ``x float[..., n]``, NumPy or JAX; no derivative."""
         numpy = isinstance(x, np.ndarray)
-        xp: Any = np if numpy else jnp
+        xp = np if numpy else jnp
         low, high, normal, offset = (
             xp.asarray(y, x.dtype) for y in (self.low, self.high, self.normal, self.offset)
         )

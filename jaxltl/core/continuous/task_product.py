@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,7 +67,7 @@ class TaskProduct:
 
     def _least(self, value: NDArray[Number], moves: Booleans) -> NDArray[Number]:
         greatest = True if value.dtype == bool else np.inf
-        found: Any = np.full(value.shape[1:], greatest, value.dtype)
+        found = np.full(value.shape[1:], greatest, value.dtype)
         for q in np.flatnonzero(moves.any(0)):
             here = moves[:, q][self.label_class]
             found = np.where(here, np.minimum(found, value[q]), found)

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -94,7 +93,7 @@ class Enclosed:
 def propagate(program: Program, boxes: list[Interval], linear: bool = True) -> Enclosed:
     """Enclosures of all variables over boxes with arrays [C, n], from the first operation on."""
     intervals: dict[int, Interval] = {}
-    xp: Any = module_of(boxes[0].low) if boxes else np
+    xp = module_of(boxes[0].low) if boxes else np
     for x, value in program.known.items():
         intervals[x] = point(xp.asarray(value)[None])
     intervals |= dict(zip(program.inputs, boxes, strict=True))

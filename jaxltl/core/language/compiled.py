@@ -28,7 +28,9 @@ class Compiled:
     code: tuple[tuple[str, tuple[int, ...], Any], ...]
     outputs: tuple[int, ...]
 
-    def __call__(self, values: Mapping[str, Any] | Callable[[str], Any], xp: Any = np) -> list[Any]:
+    def __call__(
+        self, values: Mapping[str, Any] | Callable[[str], Any], xp: object = np
+    ) -> list[Any]:
         """Values of the expressions.
 
         Args:

@@ -64,7 +64,7 @@ def _more(model: Any) -> Iterator[str]:
         yield f"variables {names_text(model.valuation)}"
 
 
-def _begins(initial: Any) -> str:
+def _begins(initial: object) -> str:
     """The initial states, unless all are."""
     read = readable(initial)
     if read is None or read.ndim != 1:

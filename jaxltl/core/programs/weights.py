@@ -52,7 +52,7 @@ class Intervals(Numbers):
             [e for o in command.outcomes for e in (o.probability, o.upper or o.probability)]
         )
 
-    def of(self, compiled: Any, read: Reader, size: int) -> list[Weight]:
+    def of(self, compiled: object, read: Reader, size: int) -> list[Weight]:
         ends = super().of(compiled, read, size)
         return [np.stack(pair, 1) for pair in zip(ends[::2], ends[1::2], strict=True)]
 
