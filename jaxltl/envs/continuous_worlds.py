@@ -61,7 +61,10 @@ def _grid(*axes: tuple[float, float, float]) -> NDArray[np.float64]:
 
 
 def _matrices(
-    a: NDArray[np.float64], b: NDArray[np.float64], w: NDArray[np.float64], offset: NDArray[np.float64] | float = 0.0
+    a: NDArray[np.float64],
+    b: NDArray[np.float64],
+    w: NDArray[np.float64],
+    offset: NDArray[np.float64] | float = 0.0,
 ) -> Step:
     """The step ``A x + B u + W w + c`` with u as it is given."""
 

@@ -18,7 +18,7 @@ visible; :func:`~jaxltl.core.environments.episodes.auto_reset_step` resets.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple, TypedDict, Unpack
 
@@ -32,7 +32,8 @@ from numpy.typing import ArrayLike, DTypeLike
 from jax.extend.core import ClosedJaxpr
 
 from jaxltl.core import validation
-from jaxltl.core.models import facts
+from jaxltl.core.pretty_print import count, nested_repr, propositions_text
+from jaxltl.core.pretty_print import value_range
 from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.types import require_shape
@@ -54,7 +55,13 @@ class Finite:
     num: int = struct.field(pytree_node=False)
 
 
-@brief(facts=facts.space)
+def _space_facts(value: Box) -> Iterator[str]:
+    yield f"{value.dtype}[{', '.join(str(n) for n in value.shape)}]"
+    low, high = (value_range(x) for x in (value.low, value.high))
+    yield f"from {low} to {high}" if max(len(low), len(high)) < 40 else ""
+
+
+@brief(facts=_space_facts)
 @struct.dataclass
 class Box:
     """A space of arrays between two bounds; :func:`make_box` builds a checked one.
@@ -173,7 +180,31 @@ class Timestep(NamedTuple):
     discount: chex.Numeric = 1.0
 
 
-@brief(facts=facts.environment)
+def _spaces(tree: PyTree) -> str:
+    if hasattr(tree, "low"):
+        return nested_repr(tree)
+    inner = (
+        tree.items()
+        if isinstance(tree, dict)
+        else zip(getattr(tree, "_fields", map(str, range(len(tree)))), tree, strict=True)
+    )
+    return f"({', '.join(f'{name}: {_spaces(x)}' for name, x in inner)})"
+
+
+def _facts(value: Environment) -> Iterator[str]:
+    one = value.actions
+    yield count(one.num, "action") if isinstance(one, Finite) else f"actions {nested_repr(one)}"
+    yield f"observations {_spaces(value.observations)}"
+    yield propositions_text(value.propositions)
+    if value.horizon is not None:
+        yield f"at most {count(value.horizon, 'step')}"
+    if value.allowed is not None:
+        yield "actions are masked"
+    if value.outcomes is not None:
+        yield "chances are told"
+
+
+@brief(facts=_facts)
 @struct.dataclass
 class Environment:
     """A simulated environment; :func:`make_environment` builds a checked one.

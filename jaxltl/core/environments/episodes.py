@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import chex
@@ -22,7 +22,7 @@ from jaxltl.core.environments.environment import (
     require_environment,
     require_key,
 )
-from jaxltl.core.models import facts
+from jaxltl.core.pretty_print import array_text, batch_text, count, readable, value_range
 from jaxltl.core.pretty_print import brief
 
 
@@ -86,7 +86,24 @@ def _without_memory(
     return function(observation, key), memory
 
 
-@brief(facts=facts.episode)
+def _facts(value: Episode) -> Iterator[str]:
+    *more, steps = value.valid.shape
+    yield batch_text(more)
+    yield f"at most {count(steps, 'step')}"
+    read = readable(value.valid)
+    if read is None:
+        yield f"reward {array_text(value.reward)}"
+        return
+    yield f"made {value_range(read.sum(-1))}"
+    for name in ("reward", "cost"):
+        numbers = readable(getattr(value, name))
+        if numbers is not None and (name == "reward" or numbers.any()):
+            yield f"{name} {value_range(numbers.sum(-1))}"
+    for name in ("terminated", "truncated"):
+        yield f"{name} {value_range(getattr(value, name))}"
+
+
+@brief(facts=_facts)
 class Episode(NamedTuple):
     """A trajectory of T steps; a batch has leading axes.
 

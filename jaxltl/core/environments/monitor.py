@@ -7,7 +7,7 @@ verification for LTL and TLTL"). The letter of a terminal state repeats for ever
 
 from __future__ import annotations
 
-from functools import partial
+from collections.abc import Iterator
 
 import chex
 import jax
@@ -22,11 +22,19 @@ from jaxltl.core.automata.verdicts import (
     verdict as verdict,
     verdicts as verdicts,
 )
-from jaxltl.core.models import facts
+from jaxltl.core.pretty_print import batch_text, count, enum_counts
 from jaxltl.core.pretty_print import brief
 
 
-@brief(facts=partial(facts.monitor, codes=Verdict))
+def _facts(value: Monitor) -> Iterator[str]:
+    *more, states, letters = value.delta.shape
+    yield batch_text(more)
+    yield count(states, "state")
+    yield count(letters, "letter")
+    yield enum_counts(value.verdict, Verdict)
+
+
+@brief(facts=_facts)
 @struct.dataclass
 class Monitor:
     """A runtime monitor: an automaton with a verdict in each state.

@@ -24,7 +24,7 @@ from jaxltl.core.environments.environment import (
     require_key,
 )
 from jaxltl.core.environments.time_limit import without_time_limit
-from jaxltl.core.models import facts
+from jaxltl.core.pretty_print import count, nested_repr, value_range
 from jaxltl.core.models.protocols import Array, PyTree
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
 from jaxltl.core.pretty_print import brief
@@ -35,7 +35,17 @@ _BYTES = 2**26  # bytes of the successors of a batch, at most
 _LIVE, _TERMINATED, _TRUNCATED = range(3)
 
 
-@brief(facts=facts.table)
+def _facts(value: Table) -> Iterator[str]:
+    yield nested_repr(value.model, 92)
+    yield count(value.start.shape[-1], "beginning")
+    for name in ("terminated", "truncated"):
+        yield f"{name} {value_range(getattr(value, name))}"
+    if value.num_steps is not None:
+        yield f"at most {count(value.num_steps, 'step')}"
+    yield f"evidence {value.evidence!r}"
+
+
+@brief(facts=_facts)
 @struct.dataclass
 class Table:
     """A tabulated environment; see :func:`tabulate`.

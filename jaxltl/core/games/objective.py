@@ -5,7 +5,7 @@ Sets of states are Boolean arrays, or Boolean formulas over the propositions of 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import TypeAlias, cast
 
 import chex
@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from jaxltl.core import struct
 
-from jaxltl.core.games import facts
+from jaxltl.core.pretty_print import count, value_range
 from jaxltl.core.logic.labels import satisfying
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.models.ops.array_namespace import is_traced, namespace, to_jax
@@ -24,7 +24,14 @@ from jaxltl.core.pretty_print import brief
 States: TypeAlias = chex.Array | Formula | str  # a set of states
 
 
-@brief(facts=facts.parity)
+def _parity_facts(value: Parity) -> Iterator[str]:
+    yield f"priorities below {value.num_priorities}"
+    yield count(value.priority.size, "state")
+    for name in ("won", "lost"):
+        yield f"{name} {value_range(getattr(value, name))}"
+
+
+@brief(facts=_parity_facts)
 @struct.dataclass
 class Parity:
     """Parity objective: the least priority met infinitely often is even.
@@ -47,7 +54,14 @@ class Parity:
     num_priorities: int = struct.field(pytree_node=False)
 
 
-@brief(facts=facts.gr1)
+def _gr1_facts(value: GR1) -> Iterator[str]:
+    yield count(value.assumptions.shape[-2], "assumption")
+    yield count(value.guarantees.shape[-2], "guarantee")
+    yield count(value.lost.shape[-1], "state")
+    yield f"lost {value_range(value.lost)}"
+
+
+@brief(facts=_gr1_facts)
 @struct.dataclass
 class GR1:
     """Generalised reactivity of rank one (Piterman, Pnueli and Sa'ar 2006).

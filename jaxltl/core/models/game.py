@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxltl.core import struct
 
-from jaxltl.core.models import facts
+from jaxltl.core.pretty_print import array_text, count, nested_repr, readable
 from jaxltl.core.models.construct.padded import to_padded
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.mdp import MDP, DenseMDP, support
@@ -25,7 +25,16 @@ from jaxltl.core.pretty_print import brief
 from jaxltl.core import validation
 
 
-@brief(facts=facts.game, drawn=True)
+def _facts(value: Game) -> Iterator[str]:
+    read = readable(value.system)
+    if read is None:
+        yield f"system: {array_text(value.system)}"
+    else:
+        yield f"the system moves in {np.count_nonzero(read):,} of {count(read.size, 'state')}"
+    yield nested_repr(value.mdp, 92)
+
+
+@brief(facts=_facts, drawn=True)
 @struct.dataclass
 class Game:
     """Turn-based stochastic game of the system against the environment; see :func:`make_game`.

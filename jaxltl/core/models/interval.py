@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -11,6 +11,7 @@ import numpy as np
 from jaxltl.core import struct
 
 from jaxltl.core.models import facts
+from jaxltl.core.pretty_print import number, readable, value_range
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import (
@@ -35,7 +36,16 @@ _ENTRIES = {"lower": "\0lower", "upper": "\0upper", "center": "\0center"}
 _RADIUS = "\0radius"
 
 
-@brief(facts=facts.interval)
+def _facts(model: IntervalMDP) -> Iterator[str]:
+    yield from facts.sparse(model.nominal)
+    low, high = readable(model.lower), readable(model.upper)
+    if low is not None and high is not None and low.size:
+        yield f"intervals at most {number(float((high - low).max()))} wide"
+    if model.radius is not None:
+        yield f"radius {value_range(model.radius)}"
+
+
+@brief(facts=_facts)
 @struct.dataclass
 class IntervalMDP:
     """Labelled MDP with uncertain transition probabilities: intervals, and optional L1 balls.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import chex
 import jax
@@ -12,6 +12,7 @@ from jaxltl.core import struct
 from numpy.typing import DTypeLike
 
 from jaxltl.core.models import facts
+from jaxltl.core.pretty_print import array_text, batch_text, count, propositions_text, readable
 from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
 from jaxltl.core.models.ops.underflow import target_dtype, underflow_text, underflows
 from jaxltl.core.models.protocols import Array, Model
@@ -38,7 +39,23 @@ class _PaddedShape:
         return (self.num_states,)
 
 
-@brief(facts=facts.padded, drawn=True)
+def _facts(model: MDP | DenseMDP) -> Iterator[str]:
+    yield batch_text(model.available.shape[:-2])
+    yield count(model.num_states, "state")
+    yield count(model.num_actions, "action")
+    weights = model.probability if isinstance(model, MDP) else model.transition
+    weight, available = readable(weights), readable(model.available)
+    if weight is None or available is None:
+        yield array_text(weights)
+    else:
+        yield count(np.count_nonzero((weight > 0) & available[..., None]), "transition")
+    yield propositions_text(model.propositions)
+    yield facts.initial_states(model.initial)
+    if weight is not None:
+        yield str(weights.dtype)
+
+
+@brief(facts=_facts, drawn=True)
 @struct.dataclass
 class MDP(_PaddedShape):
     """Labelled Markov decision process with padded successor lists; :func:`make_mdp` builds one.
@@ -84,7 +101,7 @@ class MDP(_PaddedShape):
         return self.probability.dtype
 
 
-@brief(facts=facts.padded, drawn=True)
+@brief(facts=_facts, drawn=True)
 @struct.dataclass
 class DenseMDP(_PaddedShape):
     """Labelled Markov decision process with a full matrix, for small batched problems.

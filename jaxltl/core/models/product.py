@@ -6,7 +6,7 @@ the value of a successor is read.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from functools import singledispatch
 from typing import Any, overload
 
@@ -21,7 +21,7 @@ from jaxltl.core.automata.automaton import Automaton, letter_index
 from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.logic.labels import distinct_rows, require_known
 from jaxltl.core.logic.ltl import Formula, parse_ltl
-from jaxltl.core.models import facts
+from jaxltl.core.pretty_print import batch_text, count, describe, nested_repr
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.ops import kernels, operators
@@ -39,7 +39,18 @@ register_annotated_pytree(
 )
 
 
-@brief(facts=facts.product, drawn=True)
+def _facts(model: Product) -> Iterator[str]:
+    yield batch_text(model.automaton.delta.shape[:-2])
+    memories = count(model.num_memory, "memory", "memories")
+    yield f"{count(model.num_states, 'state')} with {memories}"
+    yield nested_repr(model.mdp, 92)
+    yield f"beside {nested_repr(model.automaton, 92)}"
+    yield f"labels read on {model.label_on}"
+    if model.allowed is not None:
+        yield f"allowed: {describe(model.allowed)}"
+
+
+@brief(facts=_facts, drawn=True)
 @struct.dataclass
 class Product:
     """Product of a model and an automaton that tracks the progress of a task.

@@ -85,6 +85,10 @@ class RowModel(LabelledModel, Protocol):
     """A model with choices as rows without padding."""
 
     @property
+    def row_start(self) -> Array:
+        """``int32[S + 1]``, where the rows of each state begin."""
+
+    @property
     def num_rows(self) -> int:
         """R."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 
 import chex
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxltl.core import struct, validation
 
-from jaxltl.core.models import facts
+from jaxltl.core.pretty_print import batch_text, count, value_range
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.ops.annotated_pytree import register_annotated_pytree
 from jaxltl.core.models.ops.array_namespace import is_traced, namespace, to_jax
@@ -30,7 +30,16 @@ register_annotated_pytree(
 )
 
 
-@brief(facts=facts.trajectories)
+def _facts(value: Trajectories) -> Iterator[str]:
+    *more, number_of, longest = value.state.shape
+    yield batch_text(more)
+    yield f"{number_of:,} of at most {count(longest, 'step')}"
+    yield f"lengths {value_range(value.length)}"
+    if value.state_shape is not None:
+        yield f"states {value.state_shape}"
+
+
+@brief(facts=_facts)
 @struct.dataclass
 class Trajectories:
     """N sequences of state-action pairs, padded with zeros to length T.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -15,7 +15,7 @@ from jaxltl.core.statistics.graph_assumption import LeastProbability, require_gr
 from jaxltl.core import validation
 from jaxltl.core.sparse.rows import offsets_from_counts
 from jaxltl.core.array_types import Integers
-from jaxltl.core.models import facts
+from jaxltl.core.pretty_print import count, names_text, readable
 from jaxltl.core.models.mdp import MDP, DenseMDP, support
 from jaxltl.core.models.sparse import SparseMDP, make_sparse
 from jaxltl.core.pretty_print import brief
@@ -28,7 +28,15 @@ _ANY = "any"  # the only action of an unvisited state
 Initial = str | int | Mapping[str, float] | Mapping[int, float] | Sequence[str | int]
 
 
-@brief(facts=facts.counts)
+def _facts(value: TransitionCounts) -> Iterator[str]:
+    samples = readable(value.count)
+    yield count(samples.sum(), "sample") if samples is not None else ""
+    yield f"of {count(len(value.count), 'transition')}"
+    yield f"{count(len(value.states), 'state')}: {names_text(value.states)}"
+    yield f"{count(len(value.actions), 'action')}: {names_text(value.actions)}"
+
+
+@brief(facts=_facts)
 @dataclass(frozen=True)
 class TransitionCounts:
     """Counts of observed transitions, each once and in lexicographic order.

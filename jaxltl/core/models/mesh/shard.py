@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, DTypeLike
 
 from jaxltl.core import validation
 from jaxltl.core.models import facts
+from jaxltl.core.pretty_print import count
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.construct.padded import row_actions
 from jaxltl.core.models.mesh.lanes import on_host
@@ -36,7 +37,15 @@ _PADDED = 1.25  # size of a single table of all rows, relative to the transition
 _HALO = 0.6  # fraction of the other devices' values from which on all of them are sent
 
 
-@brief(facts=facts.part)
+def _part_facts(value: ModelPart) -> Iterator[str]:
+    rows = len(value.entry_start) - 1
+    yield count(rows if value.row_start is None else len(value.row_start) - 1, "state")
+    yield count(rows, "choice")
+    yield count(len(value.successor), "transition")
+    yield from facts.named_annotations(value)
+
+
+@brief(facts=_part_facts)
 @dataclass(frozen=True)
 class ModelPart:
     """A range of states of a model, with their choices.

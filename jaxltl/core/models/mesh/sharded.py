@@ -6,7 +6,7 @@ first, then those received before a sweep by one exchange, of a halo or of all v
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import jax
@@ -17,6 +17,7 @@ from jax import lax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxltl.core.models import facts
+from jaxltl.core.pretty_print import count, propositions_text, truncate
 from jaxltl.core.models.ops import kernels, operators
 from jaxltl.core.models.ops.underflow import is_positive
 from jaxltl.core.models.product import distinct_labels, letters_by_state
@@ -32,7 +33,18 @@ class RowTable(NamedTuple):
     probability: Array  # float[M, W], zero in padding
 
 
-@brief(facts=facts.sharded)
+def _facts(model: ShardedMDP) -> Iterator[str]:
+    yield count(model.num_given, "state")
+    yield count(model.num_actions, "action")
+    rows = " and ".join(f"{t.successor.shape[0]:,} of {t.successor.shape[1]}" for t in model.tables)
+    yield f"rows {truncate(rows)}"
+    yield propositions_text(model.propositions)
+    yield from facts.named_annotations(model)
+    yield f"on {count(model.mesh.shape[model.axis], 'device')} along {model.axis!r}"
+    yield str(model.dtype)
+
+
+@brief(facts=_facts)
 @struct.dataclass
 class ShardedMDP:
     """Labelled MDP distributed over the devices of a mesh axis; see :func:`~jaxltl.models.shard`.

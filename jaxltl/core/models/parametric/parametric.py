@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -14,7 +14,7 @@ from jaxltl.core import struct
 from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 
-from jaxltl.core.models import facts
+from jaxltl.core.pretty_print import names_text, nested_repr
 from jaxltl.core.models.ops.array_namespace import is_traced
 from jaxltl.core.models.protocols import Array, PyTree
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
@@ -25,7 +25,13 @@ Ends = Array  # for all parameters, for each name, or float[D]
 _TRIALS = 64  # candidate points for a valid model
 
 
-@brief(facts=facts.parametric)
+def _facts(model: ParametricMDP) -> Iterator[str]:
+    ends = zip(model.parameters, np.asarray(model.low), np.asarray(model.high), strict=True)
+    yield f"{names_text((f'{name} in [{low:.6g}, {high:.6g}]' for name, low, high in ends), 90)}"
+    yield nested_repr(model.model, 92)
+
+
+@brief(facts=_facts)
 @struct.dataclass
 class ParametricMDP:
     """Markov chain or MDP with probabilities that depend on parameters in a box, with a constant graph.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,14 +23,28 @@ from jaxltl.core.statistics.confidence_sets import ConfidenceSets, Method, inter
 from jaxltl.core.types import require_shape
 from jaxltl.core import validation
 from jaxltl.core.models.protocols import RowModel
-from jaxltl.core.values import facts
+from jaxltl.core.pretty_print import count, nested_repr, readable
 from jaxltl.core.values.interval.robust import require_objective
 from jaxltl.core.values.interval.satisfaction import robust_satisfaction
 from jaxltl.core.values.engine.state_quantities import safe_mean
 from jaxltl.core.values.undiscounted.sparse_satisfaction import Satisfaction
 
 
-@brief(facts=facts.guarantee)
+def _facts(value: DataGuarantee) -> Iterator[str]:
+    yield (
+        f"at least {value.bound:.6g}"
+        if value.bound <= value.optimistic
+        else (f"at most {value.bound:.6g}")
+    )
+    yield f"no policy beyond {value.optimistic:.6g}"
+    yield f"confidence {value.confidence:g}"
+    samples = readable(value.sets.num_samples)
+    yield count(samples.sum(), "sample") if samples is not None else ""
+    yield nested_repr(value.model, 92)
+    yield nested_repr(value.satisfaction.automaton, 92)
+
+
+@brief(facts=_facts)
 @dataclass(frozen=True)
 class DataGuarantee:
     """A policy for a task, and bounds on its satisfaction probability with a confidence.

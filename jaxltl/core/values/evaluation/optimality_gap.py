@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import NamedTuple
 
@@ -27,7 +27,7 @@ from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.product import sparse_product
 from jaxltl.core.sparse.solvers import step_bounded as host
 from jaxltl.core.types import Solution
-from jaxltl.core.values import facts
+from jaxltl.core.pretty_print import count, number, readable
 from jaxltl.core.values.engine.host_solution import induced_chain
 from jaxltl.core.values.undiscounted.sparse_satisfaction import (
     sparse_mdp_of_product,
@@ -40,7 +40,20 @@ _BATCH = 4096  # pairs of a world and a memory that are shown to an agent at onc
 _SUM = 1e-4  # by how much a network's distribution may miss one; it is scaled
 
 
-@brief(facts=facts.gap)
+def _facts(value: OptimalityGap) -> Iterator[str]:
+    yield count(len(value.start), "beginning")
+    for name, ends in (
+        ("gap", value.mean),
+        ("value", value.mean_value),
+        ("optimum", value.mean_optimum),
+    ):
+        yield f"mean {name} in [{ends[0]:.6g}, {ends[1]:.6g}]"
+    most = readable(value.upper)
+    yield f"gap at most {number(most.max(initial=0.0))}" if most is not None else ""
+    yield f"evidence {value.evidence!r}"
+
+
+@brief(facts=_facts)
 class OptimalityGap(NamedTuple):
     """Result of :func:`optimality_gap`, for each of the N initial states.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -16,14 +16,22 @@ from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.multi_objective.weighted_sum import WeightedProblem
 from jaxltl.core.sparse.product import SparseProduct, sparse_product
-from jaxltl.core.values import facts
+from jaxltl.core.pretty_print import describe
 from jaxltl.core.values.undiscounted.sparse_satisfaction import automaton_and_letters
 from jaxltl.core.values.engine.state_quantities import finite_reward, state_mask
 
 _MOST = 8  # probabilities at once, of which all sets are looked at
 
 
-@brief(facts=facts.objective)
+def _facts(value: Objective) -> Iterator[str]:
+    for name in ("formula", "target", "stay", "avoid", "reward", "threshold"):
+        given = getattr(value, name)
+        if given is not None:
+            yield f"{name}={describe(given)}"
+    yield f"direction={value.direction!r}"
+
+
+@brief(facts=_facts)
 @dataclass(frozen=True, eq=False)
 class Objective:
     """One of several objectives: a probability or an expected reward.

@@ -14,7 +14,7 @@ from jax import lax
 from jaxltl.core.models.interval import IntervalMDP, refuse_ball
 from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
 from jaxltl.core.models.ops.operators import is_deterministic, row_weights
-from jaxltl.core.pretty_print import brief
+from jaxltl.core.pretty_print import array_text, brief, count
 from jaxltl.core.sparse.interval.robust_values import Query
 from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
 from jaxltl.core.sparse.prepared.interval_plan import (
@@ -27,7 +27,6 @@ from jaxltl.core.types import Solution, Status, require_shape, status_code
 from jaxltl.core import validation
 from jaxltl.core.models.protocols import Array
 from jaxltl.core.models.sparse import Reward
-from jaxltl.core.values import facts
 from jaxltl.core.values.engine.implicit_diff import implicit
 from jaxltl.core.values.engine.iterate import in_turn
 from jaxltl.core.values.interval.contest import (
@@ -45,7 +44,18 @@ from jaxltl.core.values.engine.state_quantities import state_mask
 _LOOSE = 1e-6  # how far ends may miss a distribution, as in the models
 
 
-@brief(facts=facts.prepared)
+def _facts(value: PreparedInterval) -> list[str]:
+    return [
+        value.question,
+        value.objective,
+        count(value.num_states, "state"),
+        count(value.num_rows, "choice"),
+        count(value.entry_row.shape[-1], "transition"),
+        array_text(value.lower),
+    ]
+
+
+@brief(facts=_facts)
 @struct.dataclass
 class PreparedInterval:
     """Preprocessed question about an interval model, see :class:`Prepared`.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from jaxltl.core.models.protocols import Array
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.types import Status
-from jaxltl.core.values import facts
+from jaxltl.core.pretty_print import bounds_text, count, truncate, value_range
 from jaxltl.core.values.undiscounted.sparse_satisfaction import Satisfaction
 
 
@@ -38,7 +39,17 @@ class PropertyStrategy(NamedTuple):
     nature: Array | None = None
 
 
-@brief(facts=facts.answer)
+def _facts(value: Answer) -> Iterator[str]:
+    yield value.status.name
+    yield count(len(value.states), "state")
+    yield f"value {value_range(value.value)}"
+    yield bounds_text(value.lower, value.upper)
+    if value.holds is not None:
+        yield f"holds {truncate(str(value.holds))}"
+    yield f"by {value.method}"
+
+
+@brief(facts=_facts)
 class Answer(NamedTuple):
     """The result of a property.
 

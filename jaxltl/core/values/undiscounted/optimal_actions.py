@@ -7,6 +7,7 @@ rest. docs/optimal-actions.md has the proofs.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import jax
@@ -23,7 +24,7 @@ from jaxltl.core.models.product import Product
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.graph.qualitative import backward_reachable
 from jaxltl.core.types import Solution, Status
-from jaxltl.core.values import facts
+from jaxltl.core.pretty_print import describe, enum_counts, value_range
 from jaxltl.core.values.engine.certificates import rounding_unit
 from jaxltl.core.values.engine.host_solution import solution_from_enclosure
 from jaxltl.core.values.engine.host_solution import complement_event
@@ -46,7 +47,14 @@ from jaxltl.core.values.engine.validated import validated
 Booleans = NDArray[np.bool_]
 
 
-@brief(facts=facts.optimal_actions)
+def _facts(value: OptimalActions) -> Iterator[str]:
+    yield enum_counts(value.status, Status)
+    yield f"allowed {describe(value.allowed)}"
+    yield f"loses at most {value_range(value.loss)}"
+    yield f"best {describe(value.best.value)}"
+
+
+@brief(facts=_facts)
 @struct.dataclass
 class OptimalActions:
     """A mask of optimal actions of a product.

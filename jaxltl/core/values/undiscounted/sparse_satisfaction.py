@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -23,7 +24,7 @@ from jaxltl.core.sparse.graph.accepting import accepting_region
 from jaxltl.core.sparse.product import SparseProduct, sparse_product, product_without_memory
 from jaxltl.core.sparse.solvers.reachability import reachability
 from jaxltl.core.types import Solution, require_shape
-from jaxltl.core.values import facts
+from jaxltl.core.pretty_print import count, nested_repr
 from jaxltl.core.values.engine.state_quantities import reduction_for
 from jaxltl.core.values.engine.host_solution import (
     Chain,
@@ -34,7 +35,13 @@ from jaxltl.core.values.engine.host_solution import (
 from jaxltl.core.values.engine.host_solution import complement_event
 
 
-@brief(facts=facts.satisfaction)
+def _facts(value: Satisfaction) -> Iterator[str]:
+    yield nested_repr(value.solution, 92)
+    yield nested_repr(value.automaton, 92)
+    yield f"{count(len(value.product.base_state), 'state')} of the product"
+
+
+@brief(facts=_facts)
 class Satisfaction(NamedTuple):
     """Optimal satisfaction probability, with a finite-memory policy.
 
