@@ -138,6 +138,7 @@ def tilted(state):
     return jnp.abs(state.obs[1])[None] > 0.15
 
 
+@pytest.mark.filterwarnings("ignore:Brax System", "ignore:Accessing .* directly from `Data`")
 @pytest.mark.usefixtures("single_precision")
 def test_brax(tmp_path):
     envs = pytest.importorskip("brax.envs")

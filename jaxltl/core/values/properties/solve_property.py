@@ -130,16 +130,15 @@ def solve_property(
       >>> solve_property(coin, 'P=? [ F "a" ]').value.tolist()
       [0.5]
     """
-    if isinstance(prop, str) and isinstance(model, SparseMDP | IntervalMDP):
-        known = Definitions(variables=tuple(_graph(model).valuation))
-        prop = parse_property(prop, known)
-    if not isinstance(prop, Property):
-        raise ValueError(f"prop is {validation.shorten(prop)}; give a property or its text.")
     if not isinstance(model, SparseMDP | IntervalMDP):
         raise ValueError(
             f"properties of {type(model).__name__} are not supported; give a SparseMDP "
             "(see to_sparse) or an IntervalMDP."
         )
+    if isinstance(prop, str):
+        prop = parse_property(prop, Definitions(variables=tuple(_graph(model).valuation)))
+    if not isinstance(prop, Property):
+        raise ValueError(f"prop is {validation.shorten(prop)}; give a property or its text.")
     if prop.definitions:
         model = with_definitions(
             model,
