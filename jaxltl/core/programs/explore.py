@@ -14,7 +14,7 @@ from jaxltl.core.language.syntax import Program
 from jaxltl.core.programs.hash_table import HashTable
 from jaxltl.core.programs.layout import Layout, Words
 from jaxltl.core.programs.local_choices import Choices, LocalTable, ModuleCode
-from jaxltl.core.programs.narrow import LEVEL, search_narrow
+from jaxltl.core.programs.narrow import search_narrow
 from jaxltl.core.programs.weights import Numbers, Weight
 from jaxltl.core.sparse.rows import concatenated_ranges
 
@@ -139,7 +139,7 @@ class _Search:
 
     def _narrow(self, initial: Words) -> int:
         """Expands small levels state by state; returns the number of states that are done."""
-        if type(self.weights) is not Numbers or initial[0].size >= LEVEL:
+        if type(self.weights) is not Numbers:
             self.known.fill(initial)
             return 0
         parts = [column.parts for column in self.columns]

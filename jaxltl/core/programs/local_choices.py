@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -11,9 +12,10 @@ from numpy.typing import NDArray
 
 from jaxltl.core.array_types import Integers
 from jaxltl.core.language.compiled import Compiled, compile_expressions
-from jaxltl.core.language.expressions import names_in
+from jaxltl.core.language.expressions import conjuncts, names_in
 from jaxltl.core.language.source import LanguageError
-from jaxltl.core.language.syntax import Command, Module, Program
+from jaxltl.core.language.syntax import Assignment, Command, Module, Program
+from jaxltl.core.programs.hash_table import HashTable
 from jaxltl.core.programs.layout import Field, Layout, Reader, Words
 from jaxltl.core.programs.weights import Numbers, Weight
 from jaxltl.core.validation import ROW_SUM_TOLERANCE
@@ -44,7 +46,8 @@ class _Code:
     column: int  # of the action, among those of the module
     weights: Any
     right: Compiled  # right sides of the assignments of all updates
-    targets: tuple[tuple[Field, ...], ...]  # assigned variables by update
+    targets: tuple[tuple[tuple[Field, bool], ...], ...]  # variables by update; may leave the range
+    fixed: NDArray[np.float64] | None  # probabilities of all updates, if they are positive literals
 
 
 class ModuleCode:
@@ -53,18 +56,27 @@ class ModuleCode:
     def __init__(self, program: Program, module: Module, layout: Layout, weights: Numbers) -> None:
         self.program, self.layout, self.weights = program, layout, weights
         self.actions = tuple(dict.fromkeys(c.action for c in module.commands))
-        self.guards = compile_expressions([c.guard for c in module.commands])
+        parts = [{str(e): e for e in conjuncts(c.guard)} for c in module.commands]
+        conditions = {text: e for part in parts for text, e in part.items()}
+        number = {text: i for i, text in enumerate(conditions)}
+        self.guards = [[number[text] for text in part] for part in parts]
+        self.conditions = compile_expressions(list(conditions.values()))
         self.codes = [self._code(c) for c in module.commands]
         self.support = _support(module, layout)
 
     def _code(self, c: Command) -> _Code:
         assigned = [a for o in c.outcomes for a in o.assignments]
+        fields = self.layout.fields
         return _Code(
             c,
             self.actions.index(c.action),
             self.weights.compiled(c),
             compile_expressions([a.expression for a in assigned]),
-            tuple(tuple(self.layout.fields[a.variable] for a in o.assignments) for o in c.outcomes),
+            tuple(
+                tuple((fields[a.variable], _may_leave(a, fields)) for a in o.assignments)
+                for o in c.outcomes
+            ),
+            _fixed(c) if type(self.weights) is Numbers else None,
         )
 
     def choices(self, words: Words) -> Choices:
@@ -73,8 +85,13 @@ class ModuleCode:
         read = Reader(self.layout, words)
         count = np.zeros(size * width, np.int32)
         enabled: list[tuple[_Code, Integers]] = []
-        for code, guard in zip(self.codes, self.guards(read), strict=True):
-            holds = np.flatnonzero(np.broadcast_to(guard, (size,)))
+        met = self.conditions(read)
+        possible = [np.any(x) for x in met]  # most commands fail by one condition on all states
+        for code, guard in zip(self.codes, self.guards, strict=True):
+            if not all(map(possible.__getitem__, guard)):
+                continue
+            mask = reduce(np.logical_and, [met[i] for i in guard], True)
+            holds = np.broadcast_to(mask, (size,)).nonzero()[0]
             if holds.size:
                 enabled.append((code, holds))
                 count[holds * width + code.column] += 1
@@ -113,30 +130,28 @@ class ModuleCode:
         self, code: _Code, read: Reader, size: int
     ) -> tuple[Integers, tuple[NDArray[np.uint64], ...], Weight]:
         """Number of updates of each row, and changes and weights of all, row by row."""
-        weights = self.weights.of(code.weights, read, size)
-        possible = [self.weights.possible(w) for w in weights]
-        self._check_weights(code.command, weights, read)
+        outcomes = len(code.targets)
+        possible: list[NDArray[np.bool_]] | None = None
+        if code.fixed is None:
+            weights = self.weights.of(code.weights, read, size)
+            possible = [self.weights.possible(w) for w in weights]
+            self._check_weights(code.command, weights, read)
         values = iter(code.right(read))
-        outcomes = len(weights)
         change = [np.zeros((size, outcomes), np.uint64) for _ in range(self.layout.num_words)]
         for k, fields in enumerate(code.targets):
-            for field in fields:
-                new = np.broadcast_to(np.asarray(next(values), np.int64), (size,))
-                name, low = field.variable.name, field.variable.low
-                outside = ((new < low) | (new > field.variable.high)) & possible[k]
-                if outside.any():
-                    self._refuse_range(code.command, field, new, int(np.argmax(outside)), read)
-                moved = (new - read(name)).astype(np.uint64)
+            for field, may_leave in fields:
+                new = np.asarray(next(values), np.int64)
+                if may_leave:
+                    self._check_range(code.command, field, new, possible and possible[k], read)
+                moved = (new - read(field.variable.name)).view(np.uint64)
                 change[field.word][:, k] += moved << np.uint64(field.shift)
-        table = np.stack(weights, 1)
-        kept = np.stack(possible, 1)
+        flat = tuple(x.reshape(-1) for x in change)
+        if possible is None:
+            return np.full(size, outcomes), flat, np.tile(code.fixed, size)
+        table, kept = np.stack(weights, 1), np.stack(possible, 1)
         number = kept.sum(1)
         if number.sum() == kept.size:
-            return (
-                number,
-                tuple(x.reshape(-1) for x in change),
-                table.reshape(-1, *table.shape[2:]),
-            )
+            return number, flat, table.reshape(-1, *table.shape[2:])
         return number, tuple(x[kept] for x in change), table[kept]
 
     def _check_weights(self, command: Command, weights: list[Weight], read: Reader) -> None:
@@ -162,15 +177,41 @@ class ModuleCode:
                 f"{state_text(read, i)}; they must be at least 0 and sum to 1.",
             )
 
-    def _refuse_range(
-        self, command: Command, field: Field, new: Integers, i: int, read: Reader
+    def _check_range(
+        self,
+        command: Command,
+        field: Field,
+        new: Integers,
+        possible: NDArray[np.bool_] | None,
+        read: Reader,
     ) -> None:
+        """Raises LanguageError if an update that is possible leaves the range of a variable."""
         v = field.variable
-        raise LanguageError(
-            command.place,
-            f"{_shown(command)} sets {v.name} to {new[i]} in the state {state_text(read, i)}; its "
-            f"range is [{v.low}..{v.high}].",
-        )
+        outside = (new < v.low) | (new > v.high)
+        if possible is not None:
+            outside = outside & possible
+        if outside.any():
+            i = int(np.argmax(outside))
+            shown = np.broadcast_to(new, read(v.name).shape)[i]
+            raise LanguageError(
+                command.place,
+                f"{_shown(command)} sets {v.name} to {shown} in the state {state_text(read, i)}; its "
+                f"range is [{v.low}..{v.high}].",
+            )
+
+
+def _may_leave(a: Assignment, fields: Mapping[str, Field]) -> bool:
+    """False for values that are in the range of a variable."""
+    v, e = fields[a.variable].variable, a.expression
+    return v.type == "int" and not (isinstance(e.value, int) and v.low <= e.value <= v.high)
+
+
+def _fixed(c: Command) -> NDArray[np.float64] | None:
+    """The probabilities of a command, if they are positive literals with the sum one."""
+    values = [o.probability.value for o in c.outcomes if o.probability.is_literal]
+    found = np.array(values, np.float64)
+    valid = found.size == len(c.outcomes) and (found > 0).all()
+    return found if valid and abs(found.sum() - 1) <= ROW_SUM_TOLERANCE else None
 
 
 def _shown(command: Command) -> str:
@@ -202,7 +243,8 @@ def _support(module: Module, layout: Layout) -> tuple[int, ...]:
     return layout.masks(names & layout.fields.keys())
 
 
-_DENSE_BITS = 20  # of a module's variables, up to which choices are kept in a table
+_DENSE_BITS = 20  # of a module's variables, up to which a table of numbers has all combinations
+_TRIAL, _GAIN = 2**13, 4  # combinations after which they must be this much fewer than states
 
 
 class LocalTable:
@@ -213,30 +255,46 @@ class LocalTable:
         self.pieces = _runs(code.support)
         bits = sum(width for *_, width in self.pieces)
         self.number = np.full(1 << bits, -1, np.int32) if bits <= _DENSE_BITS else None
-        self.size = 0
+        self.known = HashTable(len(code.support)) if self.number is None else None
+        self.asked = self.size = 0
         self.table: Choices | None = None
 
     def choices(self, words: Words) -> tuple[Choices, Integers | None]:
         """Choices, and the index of each state among those that they are of; None for all in order."""
-        if self.number is None:
+        self.asked += words[0].size
+        if self.number is not None:
+            index = self._dense(self.number, words)
+        elif self.known is not None and (self.size < _TRIAL or _GAIN * self.size < self.asked):
+            index = self.known.insert(
+                tuple(w & np.uint64(m) for w, m in zip(words, self.code.support, strict=True))
+            )
+        else:
+            self.known = None
             return self.code.choices(words), None
+        new = np.flatnonzero(index >= self.size)
+        if new.size:
+            some = np.empty(int(index.max()) + 1 - self.size, np.int64)
+            some[index[new] - self.size] = new  # a state of each combination
+            self.size += some.size
+            self._extend(self.code.choices(tuple(w[some] for w in words)))
+        assert self.table is not None
+        return self.table, index
+
+    def _dense(self, number: NDArray[np.int32], words: Words) -> Integers:
+        """Numbers of the combinations of a module's variables, from 0."""
         key = np.zeros(words[0].size, np.int64)
         place = 0
         for word, shift, width in self.pieces:
             part = (words[word] >> np.uint64(shift)) & np.uint64((1 << width) - 1)
             key |= part.astype(np.int64) << place
             place += width
-        index = self.number[key]
-        if index.min(initial=0) < 0:
-            new = np.flatnonzero(index < 0)
-            _, first = np.unique(key[new], return_index=True)
-            some = new[first]
-            self.number[key[some]] = np.arange(self.size, self.size + some.size)
-            self.size += some.size
-            self._extend(self.code.choices(tuple(w[some] for w in words)))
-            index = self.number[key]
-        assert self.table is not None
-        return self.table, index
+        index: Integers = number[key]
+        new = key[index < 0]
+        if new.size:
+            new = np.unique(new)
+            number[new] = np.arange(self.size, self.size + new.size)
+            index = number[key]
+        return index
 
     def _extend(self, more: Choices) -> None:
         if self.table is None:

@@ -14,7 +14,8 @@ from jaxltl.core.programs.generated import Local, Unsupported, Updates, generate
 from jaxltl.core.programs.layout import Layout, Words
 from jaxltl.core.programs.local_choices import ModuleCode
 
-LEVEL = 400  # states of a level from which arrays are faster (benchmarks/programs.py)
+# States of a level from which arrays are faster, by command and in all (benchmarks/programs.py).
+PER_COMMAND, LEVEL = 8, 400
 _MAX_UPDATES = 2**12  # of a state
 _WORD = 2**64 - 1
 
@@ -59,7 +60,7 @@ def search_narrow(
     initial: Words,
     max_states: int,
 ) -> Narrow:
-    """Expands levels of fewer than 400 states, up to the first larger one.
+    """Expands levels of few states, up to the first larger one.
 
     A level is not expanded, and the search ends, if it has a state that is left to the vectorised
     search: one with very many successors or an invalid update.
@@ -78,7 +79,8 @@ def search_narrow(
         ]
     except Unsupported:
         return found
-    while found.done < len(keys) <= max_states and len(keys) - found.done < LEVEL:
+    level = min(LEVEL, PER_COMMAND * sum(len(m.commands) for m in program.modules))
+    while found.done < len(keys) <= max_states and len(keys) - found.done < level:
         marks = [len(x) for x in (keys, found.row_count, found.column, found.successor)]
         try:
             for key in keys[found.done : marks[0]]:
