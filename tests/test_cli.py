@@ -464,7 +464,13 @@ def test_check(write):  # noqa: F811
         "log_patrol",
         *(
             pytest.param(name, marks=pytest.mark.slow)
-            for name in ("slippery_delivery", "one_demonstration", "patrol_two", "patrol_anywhere")
+            for name in (
+                "slippery_delivery",
+                "one_demonstration",
+                "patrol_two",
+                "patrol_anywhere",
+                "unlabelled_delivery",
+            )
         ),
     ],
 )

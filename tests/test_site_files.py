@@ -15,6 +15,7 @@ from jaxltl.app.files import (
     schema,
     task,
     task_environment,
+    task_grounding,
     task_mlirl,
     task_todirl,
 )
@@ -49,6 +50,7 @@ COMPLETIONS = {
     task_todirl.WorldTable: ("", "legend"),
     task_todirl.DemonstrationsTable: ("files", "synthetic", "synthetic discount"),
     task_todirl.TestTable: ("maps", "generate"),
+    task_grounding.DemonstrationsTable: ("files", "synthetic meaning"),
     task_environment.WorldTable: ("", "environment", "environment labels propositions"),
     task_environment.CceTable: ("", "cost limit"),
     game.GameTable: ("map", "model"),

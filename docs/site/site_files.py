@@ -5,7 +5,7 @@ import re
 from typing import Any, NamedTuple
 
 from jaxltl.algos import cce, mlirl, ppo, todirl, trust_region
-from jaxltl.app.files import game, schema, task_environment, task_mlirl, task_todirl
+from jaxltl.app.files import game, schema, task_environment, task_grounding, task_mlirl, task_todirl
 from jaxltl.app.files.schema import File, KeyHelp, Table
 
 
@@ -33,6 +33,14 @@ PAGES = {
         "``jaxltl learn`` reads training worlds, a formula and demonstrations, learns a "
         ":doc:`reward that transfers </docs/guides/todirl>`, and evaluates it in test worlds.",
         "in_order.toml",
+    ),
+    "task-file-grounding": FilePage(
+        "Task files: symbols of unknown meaning",
+        task_grounding.GroundingFile,
+        "``jaxltl learn`` reads maps, a formula over symbols without a meaning, observations and "
+        "demonstrations, learns :doc:`what the symbols mean </docs/guides/grounding>`, and certifies "
+        "a policy in each map.",
+        "unlabelled_delivery.toml",
     ),
     "task-file-environment": FilePage(
         "Task files: environments",

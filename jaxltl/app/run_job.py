@@ -60,12 +60,16 @@ class Console:
 
 def job_of(task_file: Path) -> Job[Any, Any, Any]:
     """The kind of job that a task file describes."""
-    from jaxltl.app.files.task import is_environment_task, method_of
+    from jaxltl.app.files.task import is_environment_task, is_grounding_task, method_of
 
     if is_environment_task(task_file):
         from jaxltl.app import learn_environment
 
         return learn_environment
+    if is_grounding_task(task_file):
+        from jaxltl.app.grounding import job
+
+        return job
     if method_of(task_file) == "todirl":
         from jaxltl.app import learn_todirl
 

@@ -79,7 +79,7 @@ def learn_automaton(
     Args:
       worlds: labelled worlds; their distinct labels are the letters.
       demonstrations: of a world, or one batch for each.
-      num_memory: number of states of the automaton, at least 2.
+      num_memory: exact number of states of the automaton, at least 2.
       discount: of the demonstrator, in [0, 1).
       num_starts: starts of the search, the likeliest sequences.
       seed: of the sequences that are scored, if there are more than 500.
@@ -171,20 +171,17 @@ def _climb(
 
 
 def _neighbours(moves: np.ndarray, event: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """The candidate and those with one other transition, to states in the order of first use."""
+    """The candidate and those with one other transition in which all states are reachable."""
     found, (num_memory, width) = [(moves, event)], moves.shape
-    used = _reachable(moves)
-    fresh = [q for q in range(num_memory) if q not in used][:1]  # the others are alike
-    for q in sorted(used):
-        for letter in range(width):
-            for to in [*sorted(used), *fresh]:
-                for rewarded in (False, True):
-                    same = moves[q, letter] == to and event[q, letter] == rewarded
-                    if same or (rewarded and to == q):
-                        continue
-                    new, events = moves.copy(), event.copy()
-                    new[q, letter], events[q, letter] = to, rewarded
-                    found.append((new, events))
+    for q, letter, to in np.ndindex(num_memory, width, num_memory):
+        for rewarded in (False, True):
+            same = moves[q, letter] == to and event[q, letter] == rewarded
+            if same or (rewarded and to == q):
+                continue
+            new, events = moves.copy(), event.copy()
+            new[q, letter], events[q, letter] = to, rewarded
+            if len(_reachable(new)) == num_memory:
+                found.append((new, events))
     return found
 
 
@@ -229,14 +226,11 @@ def _batch(problem: Problem, discount: Number, moves: jax.Array, event: jax.Arra
 def _as_automaton(
     moves: np.ndarray, event: np.ndarray, letters: np.ndarray, propositions: tuple[str, ...]
 ) -> Automaton:
-    """The reachable part, co-safe if every event enters a state that nothing leaves."""
-    kept = sorted(_reachable(moves))
-    number = {q: i for i, q in enumerate(kept)}
-    delta = np.array([[number[int(q)] for q in moves[k]] for k in kept])
-    events = event[kept]
-    ends = (delta == np.arange(len(kept))[:, None]).all(1) & ~events.any(1)
-    targets = np.unique(delta[events])
+    """The automaton, co-safe if every event enters a state that nothing leaves."""
+    delta, count = moves, np.arange(len(moves))
+    ends = (delta == count[:, None]).all(1) & ~event.any(1)
+    targets = np.unique(delta[event])
     if ends.any() and ends[targets].any():
-        final = ends & np.isin(np.arange(len(kept)), targets)
+        final = ends & np.isin(count, targets)
         return make_automaton(delta, 0, letters, propositions, final=final, acceptance="cosafe")
-    return make_automaton(delta, 0, letters, propositions, accepting=events)
+    return make_automaton(delta, 0, letters, propositions, accepting=event)

@@ -109,7 +109,8 @@ def posterior(
 
     Raises:
       ValueError: no candidate meaning, meanings of another shape, or a demonstration that no grounding
-        explains: under each of them uniformly random actions are 10,000 times as likely.
+        explains: at the most likely scale of the others, uniformly random actions are 10,000 times as
+        likely under each.
     """
     meaning, titles = _meanings(problem, meanings, names)
     symmetries = symbol_symmetries(automaton_of(problem))
@@ -362,7 +363,10 @@ def _require_explained(
     world, state = np.asarray(problem.world)[:, None], np.asarray(problem.state)
     inside = np.arange(state.shape[1]) < np.asarray(problem.length)[:, None]
     uniform = np.where(inside, -np.log(available[world, state].sum(-1)), 0)
-    lost = uniform.sum(1) - table.max((0, 1))
+    table = table[np.isfinite(table).all((1, 2))]
+    other = table.sum(-1, keepdims=True) - table  # of the other demonstrations, which set the scale
+    best = table.max(0)[other.max(0).argmax(0), np.arange(len(state))]
+    lost = uniform.sum(1) - best
     n = int(lost.argmax())
     if lost[n] > _UNEXPLAINED:
         letter = letters_of(automaton_of(problem), found.labels(0))

@@ -197,6 +197,11 @@ def method_of(path: str | Path) -> object:
     return learner.get("method") if isinstance(learner, dict) else None
 
 
+def is_grounding_task(path: str | Path) -> bool:
+    """True if the symbols of a task file's formula have no meaning yet."""
+    return "grounding" in read_toml(Path(path), TaskFile.KIND)[0]
+
+
 ENVIRONMENT_METHODS = ("ppo", "cce", "cpo")
 
 

@@ -1,0 +1,139 @@
+"""Task files with a table ``[grounding]``: formulas over symbols of unknown meaning."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal
+from typing import Annotated as Key
+
+from jaxltl.app.files import schema
+from jaxltl.app.files.schema import (
+    Confidence,
+    Count,
+    Discount,
+    Meta,
+    NonNegative,
+    Table,
+    Text,
+    table,
+)
+from jaxltl.app.files.task import GridTable, SyntheticTable
+from jaxltl.app.files.task_todirl import Files, Maps, map_file
+
+Observations = Annotated[
+    Literal["cells"] | list[str],
+    Meta('"cells", or a list of tables, one per map, such as ["seen.csv"]', bool),
+]
+Meanings = Annotated[
+    dict[str, str], Meta('a table of symbols and propositions, such as { goal = "a" }', bool)
+]
+
+
+@table
+class WorldTable(GridTable):
+    """``[world]``: maps; what their legend states is observed and has no other meaning."""
+
+    maps: Key[Maps, "Maps with demonstrations."]
+    initial: Key[Text | None, "Formula of initial cells; default all cells.", '"a"'] = None
+
+
+@table
+class FormulaTable(Table):
+    """``[task]``: the formula."""
+
+    formula: Key[Text, "Formula of linear temporal logic over symbols.", '"!trap U goal"']
+
+
+@table
+class GroundingTable(Table):
+    """``[grounding]``: observations, and how their meaning is learned."""
+
+    observations: Key[
+        Observations,
+        "Observations: the propositions of the legend, or tables (CSV) of [world] maps and then of "
+        "[test] maps, with a line of names and a line of numbers for each cell.",
+    ]
+    clusters: Key[
+        Count | None, "Number of clusters of noisy observations; default none, all are 0 or 1.", "6"
+    ] = None
+    level: Key[Confidence, "Posterior weight of the credible set of groundings."] = 0.95
+
+
+@table
+class DemonstrationsTable(SyntheticTable):
+    """``[demonstrations]``: files, or simulated ones by a soft optimal policy."""
+
+    discount: Key[Discount, "Discount of the demonstrator."] = 0.95
+    files: Key[Files | None, "Files of demonstrations, one per map; default none."] = None
+    meaning: Key[Meanings | None, "Hidden meanings, for simulations; default none."] = None
+    scale: Key[NonNegative, "Reward of an event, for simulations."] = 40.0
+
+    def __attrs_post_init__(self) -> None:
+        self.require_one(("files", "synthetic"), "files = [...] or synthetic = N")
+        self.require_one(("files", "meaning"), "files = [...] or meaning = {...}, with synthetic")
+
+
+@table
+class TestTable(Table):
+    """``[test]``: further maps in which policies are certified."""
+
+    maps: Key[Maps, "Maps without demonstrations."]
+
+
+@table
+class GroundingFile(schema.File):
+    """Tables of a task file with a table ``[grounding]``."""
+
+    KIND: ClassVar[str] = "the task file"
+    world: Key[WorldTable, "The worlds with demonstrations."]
+    task: Key[FormulaTable, "The formula over symbols."]
+    grounding: Key[GroundingTable, "Observations, and how their meaning is learned."]
+    demonstrations: Key[DemonstrationsTable, "What was demonstrated."]
+    test: Key[TestTable | None, "Further worlds."] = None
+
+
+@dataclass(frozen=True)
+class Method:
+    """The learner of the protocol of jobs: posterior weights in one step."""
+
+    method: str = "grounding"
+    steps: int = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class GroundingTask:
+    """A checked task file with a table ``[grounding]``."""
+
+    path: Path
+    name: str
+    formula: str
+    digest: str
+    file: GroundingFile
+    maps: list[str | dict[str, str]]  # with demonstrations, then those of [test]
+    learner: Method = Method()
+
+
+def read_task(path: str | Path) -> GroundingTask:
+    """Checked contents of a task file; ValueError names the key and the fix."""
+    path = Path(path)
+    data, raw = schema.read_toml(path, GroundingFile.KIND)
+    file = schema.convert(path, GroundingFile, data)
+    maps = [*file.world.maps, *(file.test.maps if file.test else ())]
+    seen, shown = file.grounding.observations, file.demonstrations.files or []
+    tables = [] if seen == "cells" else list(seen)
+    for key, found, count in (
+        ("[grounding] observations", tables, len(maps)),
+        ("[demonstrations] files", shown, len(file.world.maps)),
+    ):
+        if found and len(found) != count:
+            raise ValueError(f"{path}: {key} has {len(found)} files for {count} maps.")
+    names = [*filter(None, map(map_file, maps)), *tables, *shown]
+    return GroundingTask(
+        path=path,
+        name=file.name or path.stem,
+        formula=file.task.formula,
+        digest=schema.digest(path, raw, names),
+        file=file,
+        maps=maps,
+    )

@@ -1,0 +1,1 @@
+"""Jobs of task files with a table ``[grounding]``."""

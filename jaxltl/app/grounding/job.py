@@ -1,0 +1,324 @@
+"""Symbol grounding from a task file: the job of files with a table ``[grounding]``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxltl.algos import grounding
+from jaxltl.algos.grounding.problem import require_task
+from jaxltl.app.files.demonstrations import read_demonstrations
+from jaxltl.app.files.schema import read_bytes, read_map
+from jaxltl.app.files.task_grounding import GroundingTask, read_task as read_task
+from jaxltl.app.files.task_todirl import map_file
+from jaxltl.app.files.worlds import World, grid_options
+from jaxltl.app.job import about, automaton_picture, fingerprint as fingerprint, plain, took
+from jaxltl.app.protocols import Training
+from jaxltl.app.reports import learn_grounding as report  # noqa: F401 - part of the job
+from jaxltl.app.reports.drawing import Picture, drawing
+from jaxltl.app.wording import Record, many
+from jaxltl.core.models.construct.lifting import project_policy, project_trajectories
+from jaxltl.core.models.construct.restrict import with_allowed
+from jaxltl.core.models.product import Product, product
+from jaxltl.core.models.trajectories import Trajectories, rollout
+from jaxltl.core.policies.policy_file import save_policy
+from jaxltl.core.types import Solution, Status
+from jaxltl.core.validation import errors_in
+from jaxltl.core.values.undiscounted.mixture import at_starts
+from jaxltl.core.values.undiscounted.optimal_actions import optimal_actions
+from jaxltl.core.values.undiscounted.satisfaction import satisfaction_probability
+from jaxltl.envs.gridworld import ACTIONS, gridworld
+from jaxltl.envs.text_map import parse_map
+
+DOUBLE = True
+_MOST = 8  # groundings of a robust policy
+
+
+@dataclass(frozen=True)
+class Setup:
+    """A task, ready for learning."""
+
+    task: GroundingTask
+    worlds: list[World]  # W maps with demonstrations, then those of [test]
+    meaning: np.ndarray  # bool[M, W', S], candidate meanings in all of them
+    names: tuple[str, ...]  # of the meanings
+    problem: grounding.Problem
+    hparams: grounding.Hparams
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Policies in a world under the most likely grounding, and the robust one."""
+
+    model: Product
+    policy: jax.Array  # float[S, Q, A], the demonstrator's, restricted to optimal actions
+    attained: Solution  # its satisfaction probability
+    best: Solution
+    robust: grounding.RobustPolicy | None  # None for a single grounding
+
+
+@dataclass
+class Outcome:
+    """The posterior and its answers."""
+
+    setup: Setup
+    found: grounding.Posterior
+    members: np.ndarray  # rows of the credible set
+    table: list[grounding.Row]
+    query: grounding.Query
+    answers: list[Answer]
+    seconds: float = 0.0
+
+
+def prepare(task: GroundingTask, seed: int) -> Setup:
+    """Worlds, observations and demonstrations of a task; ValueError for one that does not fit."""
+    file, path = task.file, task.path
+    texts = []
+    for entry in task.maps:
+        name = map_file(entry)
+        texts.append(read_map(path, {"file": name} if name is not None else str(entry)))
+    options = grid_options(file.world)
+    wall = file.world.wall or "#"
+    with errors_in(f"{path}: [world] "):
+        kinds = sorted(
+            {str(kind) for text in texts for kind in np.unique(parse_map(text))} - {wall}
+        )
+        options.setdefault("legend", {kind: [] if kind == "." else [kind] for kind in kinds})
+        worlds = [World(gridworld(text, **options), parse_map(text), ACTIONS) for text in texts]
+    names, seen = _observations(task, worlds)
+    count, hparams = len(file.world.maps), grounding.Hparams(discount=file.demonstrations.discount)
+    shown = _demonstrations(task, worlds[:count], seed)
+    with errors_in(f"{path}: "):
+        mdps = [world.mdp for world in worlds]
+        problem = grounding.make_problem(mdps[:count], seen[:count], shown, task.formula)
+        size = max(world.num_states for world in mdps)
+        wide = np.stack([np.pad(x, ((0, size - len(x)), (0, 0))) for x in seen])
+        if file.grounding.clusters is None:
+            meaning = np.moveaxis(wide, -1, 0) > 0
+            if not ((wide == 0) | (wide == 1)).all():
+                raise ValueError(
+                    "[grounding] observations are not all 0 or 1; give clusters = N, the number of "
+                    "kinds of states."
+                )
+        else:
+            every = replace(problem, observation=jnp.asarray(wide))
+            meaning = grounding.cluster_meanings(every, file.grounding.clusters)
+            names = tuple(f"cluster {m + 1}" for m in range(len(meaning)))
+    return Setup(task, worlds, meaning, names, problem, hparams)
+
+
+def _observations(
+    task: GroundingTask, worlds: list[World]
+) -> tuple[tuple[str, ...], list[np.ndarray]]:
+    """Names of the columns, and observations ``float[S, O]`` of each world."""
+    given = task.file.grounding.observations
+    if given == "cells":
+        return worlds[0].mdp.propositions, [np.asarray(x.mdp.label, float) for x in worlds]
+    names, seen = (), []
+    for name, world in zip(given, worlds, strict=True):
+        path = task.path.parent / name
+        head, *lines = read_bytes(path, "the observations").decode().splitlines()
+        with errors_in(f"{path}: "):
+            table = np.loadtxt(lines, delimiter=",", ndmin=2)
+            names = tuple(x.strip() for x in head.split(","))
+            if table.shape != (world.mdp.num_states, len(names)) or not np.isfinite(table).all():
+                raise ValueError(
+                    f"the table has shape {table.shape}; expected ({world.mdp.num_states}, "
+                    f"{len(names)}), a line of finite numbers for each cell."
+                )
+        seen.append(table)
+    return names, seen
+
+
+def _demonstrations(task: GroundingTask, worlds: list[World], seed: int) -> list[Trajectories]:
+    """Demonstrations in each world, read or simulated with the hidden meanings."""
+    shown, found = task.file.demonstrations, []
+    if shown.files is not None:
+        files = [task.path.parent / name for name in shown.files]
+        return [read_demonstrations(x, world) for x, world in zip(files, worlds, strict=True)]
+    with errors_in(f"{task.path}: "):
+        automaton, meaning = require_task(task.formula), shown.meaning or {}
+        for symbol in automaton.propositions:
+            if meaning.get(symbol) not in (known := worlds[0].mdp.propositions):
+                raise ValueError(
+                    f"[demonstrations] meaning of {symbol} is {meaning.get(symbol)!r}; it must be "
+                    f"one of {', '.join(known)}."
+                )
+    for w, world in enumerate(worlds):
+        columns = [world.mdp.propositions.index(meaning[p]) for p in automaton.propositions]
+        labels = np.asarray(world.mdp.label)[:, columns]
+        mdp = grounding.with_labels(world.mdp, labels, automaton.propositions)
+        model = product(mdp, automaton)
+        policy = grounding.motive_policy(model, shown.scale, shown.discount)
+        runs = rollout(
+            model,
+            policy,
+            jax.random.fold_in(jax.random.key(seed), w),
+            num_trajectories=shown.synthetic or 0,
+            num_steps=shown.length or 200,
+            stop=model.final if automaton.is_cosafe else None,
+        )
+        found.append(project_trajectories(model, runs))
+    return found
+
+
+def describe(setup: Setup) -> str:
+    """Numbers of worlds, meanings and demonstrations, as text."""
+    problem, tests = setup.problem, len(setup.worlds) - len(setup.problem.observation)
+    return (
+        f"{many(len(problem.observation), 'map')}, {tests} further, "
+        f"{many(len(problem.symbols), 'symbol')} of {many(len(setup.names), 'possible meaning')}, "
+        f"{many(len(problem.length), 'demonstration')} of {int(jnp.sum(problem.length))} steps"
+    )
+
+
+def learn(setup: Setup, training: Training) -> Outcome:
+    """Weighs the groundings, and certifies policies in all worlds."""
+    task, problem, hparams = setup.task, setup.problem, setup.hparams
+    count, size = problem.observation.shape[:2]
+    with errors_in(f"{task.path}: "):
+        found = grounding.posterior(
+            problem, hparams, meanings=setup.meaning[:, :count, :size], names=setup.names
+        )
+    training.stage("certifying")
+    members = grounding.credible_set(found, task.file.grounding.level)
+    return Outcome(
+        setup,
+        found,
+        members,
+        grounding.grounding_table(problem, hparams, found),
+        grounding.best_query(found),
+        [_answer(setup, found, members[:_MOST], w) for w in range(len(setup.worlds))],
+    )
+
+
+def labels_of(setup: Setup, found: grounding.Posterior, row: int, w: int) -> np.ndarray:
+    """``bool[S, P]``, the labels of a world by a row of the posterior."""
+    return setup.meaning[found.assignment[row], w, : setup.worlds[w].mdp.num_states].T
+
+
+def _answer(setup: Setup, found: grounding.Posterior, members: np.ndarray, w: int) -> Answer:
+    mdp, automaton = setup.worlds[w].mdp, setup.task.formula
+    labels = [labels_of(setup, found, i, w) for i in members]
+    model = product(grounding.with_labels(mdp, labels[0], found.symbols), automaton)
+    inside = optimal_actions(model)
+    policy = grounding.motive_policy(
+        with_allowed(model, inside.allowed), found.scale[0], setup.hparams.discount
+    )
+    robust = None
+    if len(labels) > 1:
+        robust = grounding.robust_policy(mdp, labels, found.symbols, automaton)
+    return Answer(model, policy, satisfaction_probability(model, policy), inside.best, robust)
+
+
+def postfix(figures: Mapping[str, np.ndarray]) -> dict[str, str]:
+    """No metrics: there are no steps of learning."""
+    return {}
+
+
+def _mean(answer: Answer, solution: Solution) -> Record:
+    """A probability from the initial distribution, with its bounds."""
+    parts = {name: getattr(solution, name) for name in ("value", "lower", "upper")}
+    found: Record = {name: at_starts(answer.model, x, "mean")[0] for name, x in parts.items()}
+    return {**found, "status": Status(int(solution.status)).name}
+
+
+def _steps(setup: Setup, row: grounding.Row) -> list[Record]:
+    """The decisive steps of a symbol, with the numbers of maps and demonstrations from 1."""
+    found, problem = [], setup.problem
+    for n, t, gain in row.steps:
+        w = int(problem.world[n])
+        number = n - int(np.argmax(np.asarray(problem.world) == w)) + 1
+        where = setup.worlds[w].where(int(problem.state[n, t]))
+        place = {"map": w + 1, "demonstration": number, "step": t + 1, **where}
+        found.append({**place, "action": ACTIONS[int(problem.action[n, t])], "gain": gain})
+    return found
+
+
+def summary(outcome: Outcome) -> Record:
+    """The results for ``result.json``."""
+    setup, found, query = outcome.setup, outcome.found, outcome.query
+    task, problem, members = setup.task, setup.problem, outcome.members
+    level, first = task.file.grounding.level, members[:_MOST].tolist()
+    result = {
+        **about(task),
+        "demonstrations": {
+            "number": len(problem.length),
+            "pairs": int(jnp.sum(problem.length)),
+            "synthetic": task.file.demonstrations.synthetic is not None,
+        },
+        "num_demonstrated": len(problem.observation),
+        "meanings": setup.names,
+        "grounding": [{**x._asdict(), "steps": _steps(setup, x)} for x in outcome.table],
+        "groundings": [{"weight": found.weight[i], "meaning": found.meaning_of(i)} for i in first],
+        "credible_set": {
+            "level": level,
+            "number": len(members),
+            "robust_weight": found.weight[first].sum(),
+        },
+        "ambiguous": grounding.ambiguous_symbols(found, level),
+        "complete": found.complete,
+        "query": {
+            "map": query.world + 1,
+            **setup.worlds[query.world].where(query.state),
+            "information": query.information,
+            "labels": [{"symbols": sorted(x), "weight": weight} for x, weight in query.labels],
+        },
+        "worlds": [
+            {
+                "attained": _mean(x, x.attained),
+                "best_achievable": _mean(x, x.best),
+                "robust": x.robust
+                and {"worst": x.robust.worst, "lower": x.robust.lower, "upper": x.robust.upper},
+            }
+            for x in outcome.answers
+        ],
+        **took(outcome.seconds),
+    }
+    return plain(result)
+
+
+def save(out: Path, outcome: Outcome) -> None:
+    """Writes ``policy_1.npz`` and so on, the policy in each world."""
+    for path in [*out.glob("policy_*.npz"), *out.glob("map_*.svg")]:
+        path.unlink()
+    for w, answer in enumerate(outcome.answers):
+        policy = project_policy(answer.model, answer.policy, actions=ACTIONS)
+        bounds = {name: getattr(answer.attained, name) for name in ("lower", "upper")}
+        save_policy(out / f"policy_{w + 1}.npz", policy, bounds)
+
+
+def task_pictures(setup: Setup) -> list[Picture]:
+    """Picture of the formula's automaton."""
+    automaton = jax.tree.map(lambda x: np.asarray(x)[0], setup.problem.model.automaton)
+    return [automaton_picture(automaton, "")]
+
+
+def pictures(outcome: Outcome) -> list[Picture]:
+    """The grounding on each map: for each symbol the posterior probability of its label."""
+    setup, found = outcome.setup, outcome.found
+    heavy = np.flatnonzero(found.weight > 1e-9).tolist()
+    drawn = []
+    for w, world in enumerate(setup.worlds):
+        weight = sum(found.weight[i] * labels_of(setup, found, i, w) for i in heavy)
+        titles = [f"{row.symbol}: {row.meaning}" for row in outcome.table]
+        picture = drawing("grid", world.cells, np.asarray(weight).T, titles=titles, label="weight")
+        drawn.append(
+            Picture(
+                f"map_{w + 1}.svg",
+                f"Grounding on map {w + 1}",
+                picture,
+                "For each symbol the posterior probability that it holds in a cell.",
+            )
+        )
+    return drawn
+
+
+def live(outcome: Outcome) -> list[Picture]:
+    """There are no interactive parts."""
+    return []
