@@ -23,6 +23,7 @@ import jaxltl
 from jaxltl.app.command_options import Failure, compiling, float64, over_devices, plain_errors
 from jaxltl.app import compilation, processes, run_job
 from jaxltl.app.reports.drawing import artist
+from jaxltl.app.wording import Record
 
 if TYPE_CHECKING:
     from jaxltl.app.protocols import Job
@@ -379,6 +380,13 @@ def _render(result: Automaton, form: str, formula: str) -> str:
 @click.option("--const", "constants", metavar="N=64,MAX=4", help="Constants of a program.")
 @click.option("--max-states", type=click.IntRange(1), help="Most states of a program.")
 @click.option(
+    "--method",
+    type=click.Choice(["build", "partial"]),
+    default="build",
+    show_default=True,
+    help="Of a program: build the model, or explore some states until the bounds are narrow.",
+)
+@click.option(
     "--checkpoint",
     type=click.Path(path_type=Path),
     metavar="DIRECTORY",
@@ -394,6 +402,7 @@ def solve(
     as_json: bool,
     constants: str | None,
     max_states: int | None,
+    method: str,
     checkpoint: Path | None,
     devices: processes.DeviceOptions,
 ) -> None:
@@ -421,13 +430,18 @@ def solve(
     from jaxltl.app import solve as solving
 
     program, questions = solving.read_queries(model_file, constants, properties, devices.mesh)
+    if method == "partial" and (program is None or strategy is not None):
+        raise ValueError("--method partial is for programs, and without --strategy.")
     from jaxltl.core.files import atomic_write
 
     # Before the work, since the directory may not be writable.
     written = contextlib.nullcontext() if strategy is None else atomic_write(strategy)
     double = contextlib.nullcontext if devices.mesh is None else float64
     with written as file, processes.process_group(devices, launch, say) as group, double():
-        if group.mesh is None:
+        if program is not None and method == "partial":
+            entry: Record = {"kind": program.kind}
+            found = solving.solve(program, questions, tolerance, max_states)
+        elif group.mesh is None:
             begin = time.perf_counter()
             model = solving.load(model_file, program, max_states)
             entry = solving.model_entry(model, time.perf_counter() - begin)
@@ -439,7 +453,7 @@ def solve(
             solver = solve_on_mesh.MeshSolver(group, sharded, fingerprint, tolerance, checkpoint)
             solver.agree(list(properties))
             found = solver.solve(questions)
-        if group.is_first:
+        if group.is_first and "states" in entry:
             click.echo(
                 "{kind} of {states} states, {choices} choices, {transitions} transitions, "
                 "read in {seconds:.3f} s".format(**entry)

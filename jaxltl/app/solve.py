@@ -180,9 +180,15 @@ class _Progress:
 
 
 def solve(
-    model: SparseMDP | IntervalMDP, queries: Sequence[Query], tolerance: float
+    model: SparseMDP | IntervalMDP | Program,
+    queries: Sequence[Query],
+    tolerance: float,
+    max_states: int | None = None,
 ) -> Iterator[Result]:
-    """Yields the result of each property in order; errors of one do not end the others."""
+    """Yields the result of each property in order; errors of one do not end the others.
+
+    Of a program, some states are explored for each property.
+    """
     from scipy.sparse import csgraph, linalg  # noqa: F401 - not in the first property's time
 
     for one in queries:
@@ -191,7 +197,10 @@ def solve(
         error, fault = one.error, INVALID
         if one.parsed is not None:
             try:
-                found = solve_property(model, one.parsed, tolerance=tolerance)
+                if isinstance(model, Program):
+                    found = _explored(model, one.parsed, tolerance, max_states)
+                else:
+                    found = solve_property(model, one.parsed, tolerance=tolerance)
             except ValueError as mistake:
                 error = str(mistake)
             except NotConverged as failure:
@@ -200,6 +209,30 @@ def solve(
                 traceback.print_exc()
                 error, fault = f"{type(failure).__name__}: {failure}", NOT_CONVERGED
         yield Result(one, found, time.perf_counter() - begin, error, fault)
+
+
+def _explored(program: Program, prop: Property, tolerance: float, max_states: int | None) -> Answer:
+    """The answer of a partial exploration, with bounds on the way for long ones."""
+    from jaxltl.core.programs.build import MAX_STATES
+    from jaxltl.core.programs.partial import solve_program
+
+    last = time.monotonic()
+
+    def report(found: int, expanded: int, answer: Answer) -> None:
+        nonlocal last
+        if time.monotonic() - last > _PROGRESS_SECONDS:
+            last = time.monotonic()
+            bounds = f"{answer.lower.min():.6g} to {answer.upper.max():.6g}"
+            print(f"{found} states found, {expanded} expanded: {bounds}", file=sys.stderr)
+
+    return solve_program(
+        program,
+        prop,
+        method="partial",
+        tolerance=tolerance,
+        max_states=MAX_STATES if max_states is None else max_states,
+        report=report,
+    )
 
 
 # --- output -----------------------------------------------------------------------------------

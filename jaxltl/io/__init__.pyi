@@ -48,6 +48,7 @@ from .prism.program import (
     program_actions as program_actions,
     program_environment as program_environment,
     read_program as read_program,
+    solve_program as solve_program,
 )
 from .reward_machine import (
     RewardMachine as RewardMachine,

@@ -116,6 +116,15 @@ def test_the_command_answers_the_properties_of_a_file(walk, tmp_path):
     assert found["count"] == 3
 
 
+def test_the_command_explores_a_part_of_a_program(walk):
+    options = ["--const", "N=3", "--method", "partial", "--json"]
+    run = CliRunner().invoke(main, ["solve", str(walk), "Pmax=? [ F x=N ]", *options])
+    assert run.exit_code == 0, run.output
+    record = json.loads(run.output.splitlines()[-1])
+    assert record["results"][0]["value"] == pytest.approx(0.5)
+    assert record["results"][0]["method"].startswith("partial exploration")
+
+
 @pytest.mark.parametrize(
     ("options", "says"),
     [

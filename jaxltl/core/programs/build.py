@@ -149,14 +149,14 @@ def _rows(program: Program, found: Explored, weights: Numbers) -> Rows:
             "gets a self-loop.",
             stacklevel=2,
         )
-        found, rewards = _with_loops(found, weights, np.flatnonzero(deadlock), rewards)
+        found, rewards = with_loops(found, weights, np.flatnonzero(deadlock), rewards)
     if program.kind == "dtmc" and found.action.size > size:
         warnings.warn(
             f"{program.source.name!r}: several commands are enabled in "
             f"{int((found.row_count > 1).sum())} states of a dtmc; each has the same probability.",
             stacklevel=2,
         )
-        found, rewards = _as_chain(found, weights, rewards)
+        found, rewards = as_chain(found, weights, rewards)
     initial = np.zeros(size)
     initial[: found.num_initial] = 1 / found.num_initial
     label = _label_columns(program, found, deadlock)
@@ -278,7 +278,7 @@ def _earned(
 _Parts = Mapping[str, tuple[NDArray[Any] | None, NDArray[Any] | None]]
 
 
-def _with_loops(
+def with_loops(
     found: Explored, weights: Numbers, states: Integers, rewards: _Parts
 ) -> tuple[Explored, dict[str, tuple[NDArray[Any] | None, NDArray[Any] | None]]]:
     """The model with a self-loop in each of some states without choices, and its rewards."""
@@ -301,7 +301,7 @@ def _with_loops(
     }
 
 
-def _as_chain(
+def as_chain(
     found: Explored, weights: Numbers, rewards: _Parts
 ) -> tuple[Explored, dict[str, tuple[NDArray[Any] | None, NDArray[Any] | None]]]:
     """The Markov chain that picks each enabled command with the same probability."""

@@ -91,12 +91,12 @@ def explore(
         range of a variable, with the command and the state.
     """
     try:
-        return _Search(program, layout, weights, max_states).run(initial, progress)
+        return Search(program, layout, weights, max_states).run(initial, progress)
     except LanguageError as error:
         raise program.source.located(error) from None
 
 
-class _Search:
+class Search:
     """The state of a search."""
 
     def __init__(self, program: Program, layout: Layout, weights: Numbers, max_states: int) -> None:

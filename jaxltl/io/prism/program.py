@@ -12,6 +12,7 @@ from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.programs.build import MAX_STATES, build_model as build_model
+from jaxltl.core.programs.partial import solve_program as solve_program
 from jaxltl.core.programs.simulation import (
     program_actions as program_actions,
     program_environment as program_environment,

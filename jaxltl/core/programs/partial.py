@@ -1,0 +1,399 @@
+"""Properties of programs, also of programs that are too large to build: partial exploration."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, NamedTuple, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxltl.core import validation
+from jaxltl.core.array_types import Booleans, Floats, Integers
+from jaxltl.core.language.compiled import compile_expressions
+from jaxltl.core.language.source import LanguageError
+from jaxltl.core.language.syntax import Program
+from jaxltl.core.logic.bounded import Bounded, Earned
+from jaxltl.core.logic.comparisons import Comparison, program_definitions
+from jaxltl.core.logic.labels import is_boolean, require_known, satisfying
+from jaxltl.core.logic.ltl import FALSE, TRUE, Formula
+from jaxltl.core.logic.properties import Property, parse_property
+from jaxltl.core.models.game import Game
+from jaxltl.core.models.protocols import Array
+from jaxltl.core.models.sparse import make_sparse
+from jaxltl.core.programs.build import MAX_STATES, as_chain, build_model, with_loops
+from jaxltl.core.programs.explore import Explored, Search
+from jaxltl.core.programs.initial import initial_states
+from jaxltl.core.programs.layout import Reader, make_layout
+from jaxltl.core.programs.weights import Numbers
+from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
+from jaxltl.core.types import Solution, Status
+from jaxltl.core.values.engine.host_solution import complement_event
+from jaxltl.core.values.interval.robust import width_asked
+from jaxltl.core.values.properties.answers import Answer
+from jaxltl.core.values.properties.solve_property import TOLERANCE, as_answer, solve_property
+
+Method = Literal["build", "partial"]
+Report = Callable[[int, int, Answer], None]  # of the numbers of states found and expanded
+
+_FIRST = 1000  # states before the first solve; each further one has twice as many
+_NEAR = 0.1  # states with this share of the largest weight are expanded together
+_SHARE = 50  # at least 1 of so many known states is expanded, so that batches are large
+_WORK = 30  # entries visited for the weights, as a multiple of the transitions
+_STEP = 100  # entries that take as long as the rest of a step
+_FINE = 0.1  # share of the tolerance for the errors of the solver
+_REST = 1e-9  # share of the weight of states that the guiding policy does not reach
+
+
+def solve_program(
+    program: Program,
+    prop: Property | str,
+    *,
+    method: Method = "build",
+    tolerance: float = TOLERANCE,
+    max_states: int = MAX_STATES,
+    report: Report | None = None,
+) -> Answer:
+    """The value of a property in the initial states of a program, with certified bounds.
+
+    ``"build"`` builds the model and solves it as
+    :func:`~jaxltl.core.values.properties.solve_property.solve_property`. ``"partial"`` explores some
+    of its states, for probabilities of ``F``, ``G``, ``U``, ``W`` and ``R`` over state formulas, also
+    within a number of steps (Brazdil et al. 2014, "Verification of Markov decision processes using
+    learning algorithms"; Ashok et al. 2019). States that are not expanded count as 0 for the
+    lower bound and as 1 for the upper bound, and both models are solved exactly as others are, with
+    their end components, so that the bounds are certified. The states that a policy which is
+    optimal for the bound on the optimistic side reaches most likely are expanded next, until the
+    explored part has twice the states.
+
+    Args:
+      program: of ``jl.io.read_program``. Of an mdp or a dtmc without intervals for ``"partial"``.
+      prop: a property or its text, which may use the names of the program.
+      method: ``"build"`` or ``"partial"``.
+      tolerance: width of the bounds.
+      max_states: the number of states after which an exploration ends with its bounds.
+      report: is called after each solve of ``"partial"``.
+
+    Returns:
+      :class:`~jaxltl.core.values.properties.answers.Answer`, whose `method` has the numbers of
+      states. If `max_states` is too small, its status is MAX_STEPS and its bounds are certified.
+
+    Raises:
+      ValueError: too many states for ``"build"``, another kind of program or of property for
+        ``"partial"``, or an error of the program in an explored state.
+
+    Example:
+      >>> from jaxltl.core.language.resolve import read_program
+      >>> program = read_program('''dtmc module m x : [0..1000000] init 1;
+      ...     [] x>0 -> 0.1 : (x'=min(x+1, 1000000)) + 0.9 : (x'=x-1); [] x=0 -> true; endmodule''')
+      >>> found = solve_program(program, "P=? [ F x=30 ]", method="partial")
+      >>> bool(found.lower[0] <= (9 - 1) / (9**30 - 1) <= found.upper[0]), found.status.name
+      (True, 'CONVERGED')
+    """
+    if isinstance(prop, str):
+        prop = parse_property(prop, program_definitions(program))
+    if method == "build":
+        model = build_model(program, max_states=max_states)
+        if isinstance(model, Game):
+            raise ValueError(
+                f"{program.source.name!r} is a game; properties of games are not solved."
+            )
+        found = solve_property(model, prop, tolerance=tolerance)
+        assert isinstance(found, Answer)
+        return found
+    validation.choice("method", method, ("build", "partial"))
+    tolerance = width_asked(tolerance)
+    max_states = validation.integer("max_states", max_states, least=1, most=2**31 - 2)
+    if program.kind == "smg" or program.has_intervals or program.parameters:
+        raise ValueError(
+            f"{program.source.name!r}: games and programs with intervals or parameters are not "
+            "explored in part; build the model."
+        )
+    try:
+        return _narrowed(
+            _Part(program, _event(program, prop), prop, max_states), prop, tolerance, report
+        )
+    except LanguageError as error:
+        raise program.source.located(error) from None
+
+
+class _Event(NamedTuple):
+    """The event ``stay U goal``, or its complement, within some steps, and the optimum."""
+
+    stay: Formula
+    goal: Formula
+    complement: bool
+    steps: int | None
+    objective: Literal["max", "min"]
+
+
+def _narrowed(part: _Part, prop: Property, tolerance: float, report: Report | None) -> Answer:
+    """Expands states until the bounds are within the tolerance or decide the threshold."""
+    lower, upper = np.zeros(part.num_initial), np.ones(part.num_initial)
+    size = _FIRST
+    while True:
+        part.expand_to(size)
+        low, high = part.solve(tolerance * _FINE)
+        lower, upper = np.maximum(lower, low), np.minimum(upper, high)
+        answer = _answer(part, prop, lower, upper, tolerance)
+        if report is not None:
+            report(part.num_states, part.num_expanded, answer)
+        if answer.status == Status.CONVERGED or not part.frontier.any() or part.room <= 0:
+            return answer
+        size = 2 * part.num_expanded
+
+
+def _answer(part: _Part, prop: Property, lower: Floats, upper: Floats, tolerance: float) -> Answer:
+    narrow = bool((upper - lower <= tolerance).all())
+    status = Status.MAX_STEPS if part.frontier.any() else Status.PRECISION
+    bounds: dict[str, Array] = {"value": (lower + upper) / 2, "lower": lower, "upper": upper}
+    none: Array = np.zeros(0, np.int32)
+    error, steps = np.float64(0), np.int32(part.num_expanded)
+    code = np.int32(Status.CONVERGED if narrow else status)
+    more: dict[str, Array] = {"residual": error, "num_steps": steps, "status": code}
+    solution = Solution(policy=none, **bounds, **more)
+    if part.event.complement:
+        solution = complement_event(solution)
+    method = f"partial exploration of {part.num_states} states, {part.num_expanded} expanded"
+    found = as_answer(prop, np.arange(lower.size), solution, tolerance, method)
+    return found if found.status == Status.CONVERGED else found._replace(status=status)
+
+
+def _event(program: Program, prop: Property) -> _Event:
+    """The event of a property; ValueError for properties of another kind."""
+    path, steps = prop.path, None
+    operator: str
+    if prop.operator != "P" or prop.aggregate is not None or isinstance(path, Earned):
+        raise _unsupported(prop)
+    direction = prop.direction
+    if direction is None and program.kind == "mdp":
+        raise ValueError(f"{prop.text}: ask for Pmax=? or Pmin=? of an mdp.")
+    if isinstance(path, Bounded):
+        if path.reward is not None or path.lower or path.upper is None:
+            raise _unsupported(prop)
+        steps, operator, left, right = path.upper, path.operator, path.left, path.right
+    else:
+        operator, operands = path.operator, path.operands
+        if operator not in tuple("FGUWR") or not all(map(is_boolean, operands)):
+            raise _unsupported(prop)
+        left, right = operands[0], operands[-1]
+    objective = direction or "max"
+    if operator in ("F", "U"):
+        return _Event(TRUE if operator == "F" else left, right, False, steps, objective)
+    stay, goal = {
+        "G": (TRUE, ~right),
+        "W": (~right, ~left & ~right),
+        "R": (TRUE if left == FALSE else ~left, ~right),
+    }[operator]
+    return _Event(stay, goal, True, steps, "min" if objective == "max" else "max")
+
+
+def _unsupported(prop: Property) -> ValueError:
+    return ValueError(
+        f"{prop.text}: partial exploration is for probabilities of F, G, U, W and R over state "
+        "formulas, also within steps (F<=k); build the model for others."
+    )
+
+
+# --- the explored part ----------------------------------------------------------------------------
+
+
+class _Conditions:
+    """State formulas on states that need not be expanded."""
+
+    def __init__(self, program: Program, formulas: Sequence[Formula], prop: Property) -> None:
+        self.formulas, self.text = formulas, prop.text
+        self.names = tuple(dict.fromkeys(name for f in formulas for name in f.propositions))
+        self.variables = tuple(v.name for v in program.variables)
+        self.comparisons: dict[str, Comparison] = {}
+        for name, found in prop.definitions:
+            if isinstance(found, Property):
+                raise _unsupported(prop)
+            self.comparisons[name] = found
+        labels = [n for n in self.names if n not in self.comparisons and n != "init"]
+        if "deadlock" in labels and "deadlock" not in program.labels:
+            raise ValueError(
+                f'{prop.text}: whether "deadlock" holds is known of expanded states alone; build '
+                "the model."
+            )
+        require_known(labels, (*program.labels, "init"), prop.text)
+        self.labels = {n: compile_expressions([program.labels[n]]) for n in labels}
+
+    def holds(self, read: Reader, size: int, initial: bool) -> list[Booleans]:
+        """The truth ``bool[N]`` of each formula in N states."""
+        columns = np.zeros((size, len(self.names)), bool)
+        for i, name in enumerate(self.names):
+            if name in self.comparisons:
+                columns[:, i] = self.comparisons[name].holds({v: read(v) for v in self.variables})
+            else:
+                columns[:, i] = self.labels[name](read)[0] if name in self.labels else initial
+        return [satisfying(columns, self.names, f, self.text) for f in self.formulas]
+
+
+class _Part:
+    """The known states of a program, in the order in which they are found, and their choices.
+
+    States where the event is decided need no expansion; the frontier has the others that are not
+    expanded.
+    """
+
+    def __init__(self, program: Program, event: _Event, prop: Property, max_states: int) -> None:
+        self.program, self.event, self.max_states = program, event, max_states
+        self.conditions = _Conditions(program, (event.stay, event.goal), prop)
+        self.layout = make_layout(program.variables)
+        self.search = Search(program, self.layout, Numbers(), 2**31 - 2)
+        initial = initial_states(program, self.layout, max_states)
+        self.num_initial = initial[0].size
+        self.search.known.fill(initial)
+        self.order: list[Integers] = []  # expanded states
+        self.stay, self.goal, self.expanded = (np.zeros(0, bool) for _ in range(3))
+        self.weight = np.zeros(0)  # estimates of reach probabilities, of the frontier
+        self.widest = 1.0  # new states of an expanded one
+        self._add(np.ones(self.num_initial))
+        self._expand(np.arange(self.num_initial))
+
+    @property
+    def num_states(self) -> int:
+        return len(self.search.known)
+
+    @property
+    def num_expanded(self) -> int:
+        return sum(x.size for x in self.order)
+
+    @property
+    def frontier(self) -> Booleans:
+        """States that are not expanded and do not decide the event."""
+        found: Booleans = self.stay & ~self.goal & ~self.expanded
+        return found
+
+    @property
+    def room(self) -> int:
+        """The number of states that may be expanded before there are too many."""
+        return int((self.max_states - self.num_states) / self.widest)
+
+    def expand_to(self, size: int) -> None:
+        """Expands the frontier states with the largest weights until `size` states are expanded."""
+        expanded = self.num_expanded
+        while expanded < size and self.room > 0 and (states := np.flatnonzero(self.frontier)).size:
+            weight = self.weight[states]
+            near = int(np.count_nonzero(weight >= _NEAR * weight.max()))
+            count = min(max(near, expanded // _SHARE), self.room, size - expanded, states.size)
+            if count < states.size:
+                states = np.sort(states[np.argpartition(-weight, count - 1)[:count]])
+            self._expand(states)
+            expanded += states.size
+
+    def _add(self, weight: Floats) -> None:
+        """Truths of the state formulas in the states that were found last."""
+        before = self.stay.size
+        words = self.search.known.words(before, self.num_states)
+        found = self.conditions.holds(Reader(self.layout, words), words[0].size, before == 0)
+        self.stay, self.goal = np.append(self.stay, found[0]), np.append(self.goal, found[1])
+        self.expanded = np.append(self.expanded, np.zeros(weight.size, bool))
+        self.weight = np.append(self.weight, weight)
+
+    def _expand(self, states: Integers) -> None:
+        before, out = self.num_states, self.search.output
+        parts: tuple[list[NDArray[Any]], ...] = (
+            *(out.row_count, out.entry_count, out.successor, out.weight),
+        )
+        begin = [len(part) for part in parts]
+        self.search.expand(tuple(k[states] for k in self.search.known.keys))
+        rows, entries, successor, probability = (
+            np.concatenate(part[i:]) if len(part) > i else np.zeros(0, np.int64)
+            for part, i in zip(parts, begin, strict=True)
+        )
+        self.order.append(states)
+        self.expanded[states] = True
+        self.widest = max(self.widest, (self.num_states - before) / states.size)
+        self._add(np.zeros(self.num_states - before))
+        # Reach probabilities of a chain; of an mdp those of the most likely paths.
+        mass = self.weight[states].repeat(rows).repeat(entries) * probability
+        merge = np.add if self.program.kind == "dtmc" else np.maximum
+        merge.at(self.weight, successor, mass)
+
+    def guide(self, row: Integers, gap: Floats) -> None:
+        """Sets the weights of the frontier to its reach probabilities under a policy.
+
+        States whose bounds agree up to `_REST` are not passed.
+        """
+        host, frontier = self.model.host, self.frontier[self.states]
+        first, last = host.entry_start[row], host.entry_start[row + 1]
+        passed = (self.stay & ~self.goal & self.expanded)[self.states] & (gap > _REST)
+        state = np.arange(self.num_initial)
+        mass, reached = np.full(state.size, 1 / state.size), np.zeros(host.num_states)
+        work, steps = _WORK * host.num_transitions, self.event.steps
+        while state.size and work > 0 and steps != 0:
+            inner = passed[state] & (mass > _REST * _REST)
+            state, mass = state[inner], mass[inner]
+            count = last[state] - first[state]
+            entry = concatenated_ranges(first[state], count)
+            state, number = np.unique(host.successor[entry], return_inverse=True)
+            mass = np.bincount(number, mass.repeat(count) * host.probability[entry], state.size)
+            reached[state] += mass
+            work -= entry.size + _STEP
+            steps = None if steps is None else steps - 1
+        weight = reached + _REST * self.weight[self.states]
+        self.weight[self.states] = np.where(frontier, weight, 0)
+
+    def build(self) -> None:
+        """Makes the model of the explored part: `model`, whose states are those of `states`."""
+        out, size = self.search.output, self.num_states
+        done = np.concatenate(self.order)
+        self.states = np.concatenate([done, np.flatnonzero(~self.expanded)])
+        place = np.empty(size, np.int32)
+        place[self.states] = np.arange(size, dtype=np.int32)
+        empty = np.zeros(0, np.int32)
+        found = Explored(
+            self.layout,
+            self.search.known.words(0, 0),
+            np.concatenate([*out.row_count, np.zeros(size - done.size, np.int32)]),
+            np.concatenate(out.action or [empty]),
+            np.concatenate(out.owner or [empty]),
+            np.concatenate(out.entry_count or [empty]),
+            place[np.concatenate(out.successor or [empty])],
+            np.concatenate(out.weight or [np.zeros(0)]),
+            self.search.actions,
+            self.num_initial,
+        )
+        found, _ = with_loops(found, Numbers(), np.flatnonzero(found.row_count == 0), {})
+        if self.program.kind == "dtmc" and found.action.size > size:
+            found, _ = as_chain(found, Numbers(), {})
+        initial = np.zeros(size)
+        initial[: self.num_initial] = 1 / self.num_initial
+        truths = (self.stay, self.goal, self.frontier)
+        self.model = make_sparse(
+            offsets_from_counts(found.row_count),
+            offsets_from_counts(found.entry_count),
+            found.successor,
+            found.weight,
+            initial=initial,
+            label=np.stack([x[self.states] for x in truths], 1),
+            propositions=("stay", "goal", "frontier"),
+        )
+
+    def solve(self, tolerance: float) -> tuple[Floats, Floats]:
+        """Bounds in the initial states, and new weights of the frontier."""
+        self.build()
+        stay, goal, frontier = (Formula("ap", proposition=x) for x in self.model.propositions)
+        objective, steps = self.event.objective, self.event.steps
+        states = np.arange(self.model.num_states)
+
+        def solved(left: Formula, right: Formula) -> Answer:
+            path = (
+                Formula("U", (left, right))
+                if steps is None
+                else Bounded("U", left, right, 0, steps)
+            )
+            prop = Property("partial exploration", "P", objective, path=path)
+            found = solve_property(self.model, prop, states=states, tolerance=tolerance)
+            return cast(Answer, found)
+
+        lower, upper = solved(stay & ~frontier, goal), solved(stay, goal | frontier)
+        row = states
+        if not self.model.is_chain:
+            guiding = upper if objective == "max" else lower
+            assert guiding.strategy is not None
+            row = guiding.strategy.row
+        self.guide(row, upper.upper - lower.lower)
+        return lower.lower[: self.num_initial], upper.upper[: self.num_initial]
