@@ -25,6 +25,11 @@ def test_the_page_on_installing_has_every_extra():
     assert sorted(rows) == sorted(PROJECT["project"]["optional-dependencies"])
 
 
+def test_gymnax_is_installed_with_six_which_it_does_not_declare():
+    extra = PROJECT["project"]["optional-dependencies"]["gymnax"]
+    assert any(x.startswith("six") for x in extra)
+
+
 def test_citations_agree():
     page, cited = ((ROOT / x).read_text() for x in ("docs/cite.md", "CITATION.cff"))
     for text in ("Reinforcement Learning With High-Level Task Specifications", "2019", "Wen"):

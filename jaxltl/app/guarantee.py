@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 import numpy as np
 
 from jaxltl.app.files.worlds import World
+from jaxltl.app.practical import neg_log_likelihood
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.environments.monitor import Verdict, verdicts
 from jaxltl.core.models.construct.lifting import memory_along
@@ -216,6 +217,15 @@ class Attempt:
     learned: Any  # the underlying result of learning
 
 
+def is_weighable(model: Product) -> bool:
+    """True if rewards matter: the uniform policy satisfies the formula sometimes.
+
+    Softmax policies have full support; else none of them satisfies it, for any reward.
+    """
+    available = np.asarray(model.available)
+    return attained(model, available / available.sum(-1, keepdims=True), "mean", _COARSE) > 0
+
+
 Learned = TypeVar("Learned")
 
 
@@ -239,55 +249,31 @@ class Search(Generic[Learned]):
         quickest one of optimal actions.
         """
         asked = float(self.guarantee.asked)
-        first = self._attempt(self.policy_of(free), free, 0.0, 0.0)
+        first = self._attempt(free, 0.0)
         if first.attained >= asked:
             return first
-        below: list[Attempt] = [first]
-        found: list[Attempt] = []
-        for learned, weight in self.constrained() if self._is_weighable() else ():
-            tried = self._attempt(self.policy_of(learned), learned, weight, 0.0)
-            (found if tried.attained >= asked else below).append(tried)
+        more = self.constrained() if is_weighable(self.model) else []
+        tried = [first, *(self._attempt(learned, weight) for learned, weight in more)]
+        found = [one for one in tried if one.attained >= asked]
         quickest = np.asarray(self.guarantee.best.policy)[..., None] == np.arange(policy.shape[-1])
         # A learned policy that delays satisfaction leaves no share for other actions.
         for sure in (policy, quickest.astype(float)):
-            found += [
-                self._between(one, Attempt(sure, self.loss(sure), 1.0, None, 1.0, inside))
-                for one in below
-            ]
+            found += [self._mixed(one, sure, inside) for one in tried if one.attained < asked]
         likeliest = sorted(found, key=lambda one: one.neg_log_likelihood)[:_KEPT]
-        return min(likeliest, key=lambda one: self.loss(self.within_steps(one.policy)))
+        return min(likeliest, key=lambda one: self._loss(self.within_steps(one.policy)))
 
-    def _is_weighable(self) -> bool:
-        """True if rewards matter: the uniform policy satisfies the formula sometimes.
+    def _loss(self, policy: np.ndarray) -> float:
+        return neg_log_likelihood(policy, self.counts)
 
-        Softmax policies have full support; else none of them satisfies it, for any reward.
-        """
-        available = np.asarray(self.model.available)
-        uniform = available / available.sum(-1, keepdims=True)
-        return attained(self.model, uniform, "mean", _COARSE) > 0
+    def _attempt(self, learned: Learned, weight: float) -> Attempt:
+        policy, asked = self.policy_of(learned), float(self.guarantee.asked)
+        reached = attained_if_near(self.model, policy, self.guarantee.over, asked)
+        return Attempt(policy, self._loss(policy), reached, weight, 0.0, learned)
 
-    def loss(self, policy: np.ndarray) -> float:
-        """Negative log-likelihood of the demonstrations."""
-        seen = self.counts > 0
-        with np.errstate(divide="ignore"):
-            return float(-np.sum(self.counts[seen] * np.log(policy[seen])))
-
-    def _attempt(
-        self, policy: np.ndarray, learned: Learned, weight: float | None, share: float
-    ) -> Attempt:
+    def _mixed(self, below: Attempt, sure: np.ndarray, inside: Learned) -> Attempt:
+        """The mixture with the least share of a policy of optimal actions."""
         asked, over = float(self.guarantee.asked), self.guarantee.over
-        reached = attained_if_near(self.model, policy, over, asked)
-        return Attempt(policy, self.loss(policy), reached, weight, share, learned)
-
-    def _between(self, below: Attempt, above: Attempt) -> Attempt:
-        """The mixture of two policies with the least share of the second."""
-        asked, over = float(self.guarantee.asked), self.guarantee.over
-        found = probable_mixture(self.model, below.policy, above.policy, asked, over)
-        loss = self.loss(found.policy)
-        return replace(
-            above,
-            policy=found.policy,
-            neg_log_likelihood=loss,
-            attained=found.attained,
-            share=found.share,
+        found = probable_mixture(self.model, below.policy, sure, asked, over)
+        return Attempt(
+            found.policy, self._loss(found.policy), found.attained, None, found.share, inside
         )

@@ -197,6 +197,7 @@ def _with_guarantee(setup: Setup, training: Training) -> tuple[Learned, int, Att
         lambda: _constrained(setup, free, hparams, training.seed),
         lambda one: one if setup.bound is None else setup.bound.keep(setup.model, one).policy,
     )
+    training.stage("searching")
     if policy is None:
         policy = np.asarray(actions.policy if actions else free.policy[0])
     found = search.at_least(free, policy, inside or free)

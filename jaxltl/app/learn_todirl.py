@@ -23,7 +23,6 @@ from jaxltl.algos.common import learner
 from jaxltl.app.todirl.guarantee import (
     check_attainable,
     hold,
-    is_weighable,
     likeliest,
     step_bounds,
     within_steps,
@@ -47,7 +46,7 @@ from jaxltl.app.files.scenes import (
 )
 
 from jaxltl.app.files.task_todirl import TodirlTask, read_task as read_task
-from jaxltl.app.guarantee import check_formula, mistakes, used_steps
+from jaxltl.app.guarantee import check_formula, is_weighable, mistakes, used_steps
 from jaxltl.app.job import (
     fingerprint as fingerprint,
     one_seed,
@@ -251,7 +250,9 @@ def learn(setup: Setup, training: Training) -> Outcome:
         allowed=masks if masks is None else masks[: len(scenes), : model.mdp.num_states],
     )
     hparams = settings(todirl.Hparams, table.given())
-    if setup.is_probability and is_weighable(setup):
+    if setup.is_probability and any(
+        is_weighable(part_of(setup.worlds.model, w)) for w in range(setup.num_training)
+    ):
         hparams = replace(hparams, mu=0.0)  # not None, so that one program serves all weights
     learned = _train(setup, problem, hparams, training)
     chosen = _least_loss(learned)
@@ -308,7 +309,7 @@ def _weighed(
 ) -> Learned:
     """The network of one seed with the best weight of the satisfaction probability."""
 
-    def train(mu: float, _: Learned) -> Learned:
+    def train(mu: float) -> Learned:
         return _train(setup, problem, replace(hparams, mu=mu), Training(seed, 1))
 
     def plans(learned: Learned) -> tuple[np.ndarray, np.ndarray]:
@@ -330,7 +331,7 @@ def _judge(
 ) -> Judged:
     worlds = setup.worlds
     performances, policies, codes = [], [], []
-    held, held_steps = None, dict[str, np.ndarray]()
+    kept = dict[str, np.ndarray]()  # of the chosen seed
     for i in range(len(learned.held_out)):
         parameters = part_of(learned.parameters, i)
         if setup.is_probability:
@@ -338,7 +339,9 @@ def _judge(
                 setup, network, parameters, replace(hparams, mu=None), len(worlds.scenes)
             )
             held = hold(setup, free, inside)
-            policy = jnp.asarray(held.policy)
+            policy = jnp.asarray(np.stack([one.policy for one in held]))
+            if i == chosen:
+                kept |= {k: np.array([getattr(x, k) for x in held]) for k in ("share", "attained")}
         else:
             policy, status = _plan(network, parameters, worlds.model, worlds.observation, hparams)
         if setup.bounds is not None:
@@ -347,7 +350,7 @@ def _judge(
             if i == chosen:
                 times = [one.steps[:3] for one in steps if one.steps is not None]
                 shares = [one.share for one in steps]
-                held_steps = {"steps": np.array(times), "quick_share": np.array(shares)}
+                kept |= {"steps": np.array(times), "quick_share": np.array(shares)}
         lifted = policy if setup.memory is setup.judge else lift_memory_policy(policy, setup.judge)
         performances.append(_probability(worlds.judged, lifted, hparams.horizon))
         policies.append(policy if i == chosen else None)
@@ -358,7 +361,7 @@ def _judge(
     blind = jnp.broadcast_to(blind, (*expert.shape[:-1], blind.shape[-1]))
     horizon = hparams.horizon
     return Judged(
-        **held_steps,
+        **kept,
         policy=np.asarray(policies[chosen]),
         status=np.asarray(codes[chosen]),
         performance={
@@ -367,7 +370,6 @@ def _judge(
             "random": _probability(judged, blind.astype(expert.dtype), horizon),
         },
         seeds=np.stack([np.asarray(found.mean) for found in performances]),
-        **({} if held is None else {"share": held.share, "attained": held.attained}),
     )
 
 

@@ -259,7 +259,8 @@ def _progress_bar(total: int, *, shown: bool) -> Iterator[tqdm[Any]]:
                 self.stage, self.since = stage, now
                 steps = f", {self.n} of {self.total} steps" if self.n else ""
                 figures = f", {self.postfix}" if self.postfix else ""
-                print(f"{stage}{steps}{figures}", file=sys.stderr, flush=True)
+                elapsed = f", {self.format_dict['elapsed']:.0f} s"
+                print(f"{stage}{steps}{figures}{elapsed}", file=sys.stderr, flush=True)
 
     terminal, done = sys.stderr.isatty(), threading.Event()
     file = None if terminal else io.StringIO()

@@ -10,14 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from jaxltl.app.todirl.results import Learned, Setup, part_of
 from jaxltl.app.wording import place as name_of
 from jaxltl.app.files.scenes import Scene
-from jaxltl.app.practical import StepBound, step_bound
+from jaxltl.app.practical import StepBound, neg_log_likelihood, step_bound
 from jaxltl.core.validation import errors_in
 from jaxltl.core.values.undiscounted.mixture import (
     WINDOW,
@@ -31,15 +30,6 @@ from jaxltl.core.values.undiscounted.satisfaction_steps import Clock
 _AIM = WINDOW / 4  # margin of the certified probability over the asked one
 _WEIGHTS = 10.0 ** np.arange(-1, 5.5, 0.5)  # of the satisfaction probability, in this order
 _HALVINGS = 5  # few bisections of the weight, since the mixture closes the gap
-
-
-@dataclass(frozen=True)
-class Held:
-    """Policies with the asked probability."""
-
-    policy: np.ndarray  # float[W, S, Q, A]
-    share: np.ndarray  # float[W], of optimal actions
-    attained: np.ndarray  # float[W], certified, of the mean or the worst initial state
 
 
 def check_attainable(setup: Setup) -> None:
@@ -65,26 +55,14 @@ def check_attainable(setup: Setup) -> None:
             ) from None
 
 
-def hold(setup: Setup, policy: Any, inside: Any) -> Held:
+def hold(setup: Setup, policy: np.ndarray, inside: np.ndarray) -> list[Mixture]:
     """Mixes plans ``[W, S, Q, A]`` of all actions and of optimal ones, in the first W worlds."""
     assert setup.sure is not None
-    found = []
-    for w, sure in enumerate(setup.sure[: len(policy)]):
-        found.append(
-            reaching(
-                part_of(setup.worlds.model, w),
-                np.asarray(policy[w]),
-                np.asarray(inside[w]),
-                sure.best,
-                float(setup.asked),
-                over=setup.task.over,
-            )
-        )
-    return Held(
-        np.stack([one.policy for one in found]),
-        np.array([one.share for one in found]),
-        np.array([one.attained for one in found]),
-    )
+    asked, over = float(setup.asked), setup.task.over
+    return [
+        reaching(part_of(setup.worlds.model, w), policy[w], inside[w], sure.best, asked, over=over)
+        for w, sure in enumerate(setup.sure[: len(policy)])
+    ]
 
 
 def step_bounds(setup: Setup) -> list[StepBound] | None:
@@ -120,74 +98,48 @@ class _Tried:
     neg_log_likelihood: float  # of the demonstrations, after mixing
 
 
-def is_weighable(setup: Setup) -> bool:
-    """True if a weight has an effect: the uniform policy satisfies the formula sometimes.
-
-    Soft policies have full support; else none of them satisfies it, for any reward.
-    """
-    for w in range(setup.num_training):
-        model = part_of(setup.worlds.model, w)
-        available = np.asarray(model.available)
-        if attained(model, available / available.sum(-1, keepdims=True), "mean") > 0:
-            return True
-    return False
-
-
 def likeliest(
     setup: Setup,
     counts: np.ndarray,
     free: Learned,
-    train: Callable[[float, Learned], Learned] | None,
+    train: Callable[[float], Learned] | None,
     plans: Callable[[Learned], tuple[np.ndarray, np.ndarray]],
 ) -> tuple[Learned, float]:
     """The network of greatest likelihood over some weights, and its weight."""
     models = [part_of(setup.worlds.model, w) for w in range(setup.num_training)]
-    seen = counts > 0
 
     def judged(learned: Learned, weight: float) -> _Tried:
         policy, inside = plans(learned)
-        held = hold(setup, policy, inside).policy[:, : counts.shape[1]]
-        with np.errstate(divide="ignore"):
-            loss = -np.sum(counts[seen] * np.log(held[seen]))
+        held = np.stack([one.policy for one in hold(setup, policy, inside)])
+        loss = neg_log_likelihood(held[:, : counts.shape[1]], counts)
         each = [attained(m, p, setup.task.over) for m, p in zip(models, policy, strict=True)]
-        return _Tried(learned, weight, min(each), float(loss))
+        return _Tried(learned, weight, min(each), loss)
 
     first = judged(free, 0.0)
     found = [first]
     if first.attained < float(setup.asked) and train is not None:
-        found += _bracket(train, first, judged, float(setup.asked))
+        found += _bracket(lambda mu: judged(train(mu), mu), float(setup.asked))
     best = min(found, key=lambda one: np.nan_to_num(one.neg_log_likelihood, nan=np.inf))
     return best.learned, best.weight
 
 
-def _bracket(
-    train: Callable[[float, Learned], Learned],
-    first: _Tried,
-    judged: Callable[[Learned, float], _Tried],
-    asked: float,
-) -> Iterator[_Tried]:
-    """Yields attempts with increasing weights until one suffices, then by bisection.
-
-    Each starts from the result of the next smaller weight: the likelihood has several maxima, and
-    those found from too large a weight are lower.
-    """
-    low, below = 0.0, first
+def _bracket(tried: Callable[[float], _Tried], asked: float) -> Iterator[_Tried]:
+    """Yields attempts with increasing weights until one suffices, then by bisection."""
+    # The likelihood has several maxima, and those found from too large a weight are lower.
+    low = 0.0
     for high in map(float, _WEIGHTS):
-        last = judged(train(high, below.learned), high)
+        last = tried(high)
         yield last
         if last.attained >= asked:
             break
-        low, below = high, last
+        low = high
     else:
         return
     low = low or high * 1e-3
     for _ in range(_HALVINGS):
-        if asked <= last.attained <= asked + _AIM or high / low < 1 + 1e-9:
+        if asked <= last.attained <= asked + _AIM:
             return
         middle = float(np.sqrt(low * high))
-        last = judged(train(middle, below.learned), middle)
+        last = tried(middle)
         yield last
-        if last.attained >= asked:
-            high = middle
-        else:
-            low, below = middle, last
+        low, high = (low, middle) if last.attained >= asked else (middle, high)

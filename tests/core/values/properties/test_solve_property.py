@@ -228,7 +228,7 @@ def test_mistakes_are_named(text, message):
 
 def test_other_models_are_named_before_the_property():
     world = jl.make_mdp([[[0]]], [[[1.0]]], label={"a": [0]})
-    with pytest.raises(ValueError, match="properties of MDP are not supported.*to_sparse"):
+    with pytest.raises(ValueError, match=r"properties of MDP are not supported.*to_sparse"):
         solve_property(world, 'P=? [ F "a" ]')
     with pytest.raises(ValueError, match="give a property or its text"):
         solve_property(chance(0.5), 0.5)

@@ -346,6 +346,8 @@ def test_errors_name_the_argument(cases):
     mdp = as_mdp(cases[0][0])
     with pytest.raises(ValueError, match=r"target has shape \(5,\); expected \(6,\)"):
         jl.reachability_probability(mdp, np.zeros(5, bool))
+    with pytest.raises(ValueError, match=r"of state numbers, np.isin\(np.arange\(6\), \[3\]\)"):
+        jl.reachability_probability(mdp, [3])
     with pytest.raises(ValueError, match="objective='best'; it must be"):
         jl.reachability_probability(mdp, np.zeros(6, bool), objective="best")
     with pytest.raises(ValueError, match=r"policy has shape \(2,\)"):
