@@ -41,15 +41,18 @@ class Compiled:
           An array for each expression; those without variables are scalars. Division by zero is
           infinite or NaN, and a modulus by a number that is not positive is -2^30.
         """
-        read = values if callable(values) else values.__getitem__
+        with np.errstate(all="ignore"):
+            return self.evaluate(values if callable(values) else values.__getitem__, xp)
+
+    def evaluate(self, read: Callable[[str], Any], xp: Any = np) -> list[Any]:
+        """The values, with the caller's treatment of floating-point errors."""
         slots: list[Any] = [read(name) for name in self.names]
         table = _operations(xp)
-        with np.errstate(all="ignore"):
-            for operator, operands, value in self.code:
-                if operator == "literal":
-                    slots.append(value)
-                else:
-                    slots.append(table[operator](*[slots[i] for i in operands]))
+        for operator, operands, value in self.code:
+            if operator == "literal":
+                slots.append(value)
+            else:
+                slots.append(table[operator](*[slots[i] for i in operands]))
         return [slots[i] for i in self.outputs]
 
 

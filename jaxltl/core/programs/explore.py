@@ -217,7 +217,7 @@ class Search:
                     if module == m:
                         column_of[i] = c
             chosen = column_of[rows.column]
-            part = np.flatnonzero(chosen >= 0)
+            part = (chosen >= 0).nonzero()[0]
             if not part.size:
                 continue
             state, chosen = rows.state[part], chosen[part]
@@ -281,7 +281,7 @@ class Search:
             local[whole[low:high] - begin] = of_whole[low:high]
             chosen_row = local[row]
             everywhere = high - low == stop - begin
-            part = slice(None) if everywhere else np.flatnonzero(chosen_row >= 0)
+            part = slice(None) if everywhere else (chosen_row >= 0).nonzero()[0]
             chosen_row = chosen_row[part]
             entry = table.start[chosen_row]
             if table.width.max() > 1:

@@ -71,7 +71,7 @@ class HashTable:
         slots, last = self.slots, self.slots.size - 1
         while todo.size:
             holder = slots[place]
-            free = np.flatnonzero(holder < 0)
+            free = (holder < 0).nonzero()[0]
             if free.size:
                 # Several keys may claim one slot: the last one that is written has it.
                 claim = todo[free]
@@ -87,7 +87,7 @@ class HashTable:
             for key, w in zip(self.keys[1:], words[1:], strict=True):
                 same &= key[holder] == w[todo]
             result[todo[same]] = holder[same]
-            rest = np.flatnonzero(~same)
+            rest = (~same).nonzero()[0]
             todo = todo[rest]
             place = (place[rest] + 1) & last
         return result
@@ -112,5 +112,5 @@ class HashTable:
         while number.size:
             free = self.slots[place] < 0
             self.slots[place[free]] = number[free]
-            rest = np.flatnonzero(self.slots[place] != number)
+            rest = (self.slots[place] != number).nonzero()[0]
             number, place = number[rest], (place[rest] + 1) & (self.slots.size - 1)

@@ -79,14 +79,17 @@ class ModuleCode:
             _fixed(c) if type(self.weights) is Numbers else None,
         )
 
+    @np.errstate(all="ignore")
     def choices(self, words: Words) -> Choices:
         """Choices of the module in N states; raises LanguageError for an invalid update."""
         size, width = words[0].size, len(self.actions)
         read = Reader(self.layout, words)
         count = np.zeros(size * width, np.int32)
         enabled: list[tuple[_Code, Integers]] = []
-        met = self.conditions(read)
-        possible = [np.any(x) for x in met]  # most commands fail by one condition on all states
+        met = self.conditions.evaluate(read)
+        possible = [
+            np.asarray(x).any() for x in met
+        ]  # most commands fail by one condition on all states
         for code, guard in zip(self.codes, self.guards, strict=True):
             if not all(map(possible.__getitem__, guard)):
                 continue
@@ -131,22 +134,24 @@ class ModuleCode:
     ) -> tuple[Integers, tuple[NDArray[np.uint64], ...], Weight]:
         """Number of updates of each row, and changes and weights of all, row by row."""
         outcomes = len(code.targets)
-        possible: list[NDArray[np.bool_]] | None = None
+        weights: list[Weight] = []
+        possible: list[NDArray[np.bool_]] = []
         if code.fixed is None:
             weights = self.weights.of(code.weights, read, size)
             possible = [self.weights.possible(w) for w in weights]
             self._check_weights(code.command, weights, read)
-        values = iter(code.right(read))
+        values = iter(code.right.evaluate(read))
         change = [np.zeros((size, outcomes), np.uint64) for _ in range(self.layout.num_words)]
         for k, fields in enumerate(code.targets):
             for field, may_leave in fields:
                 new = np.asarray(next(values), np.int64)
                 if may_leave:
-                    self._check_range(code.command, field, new, possible and possible[k], read)
+                    held = possible[k] if possible else np.True_
+                    self._check_range(code.command, field, new, held, read)
                 moved = (new - read(field.variable.name)).view(np.uint64)
                 change[field.word][:, k] += moved << np.uint64(field.shift)
         flat = tuple(x.reshape(-1) for x in change)
-        if possible is None:
+        if code.fixed is not None:
             return np.full(size, outcomes), flat, np.tile(code.fixed, size)
         table, kept = np.stack(weights, 1), np.stack(possible, 1)
         number = kept.sum(1)
@@ -182,14 +187,12 @@ class ModuleCode:
         command: Command,
         field: Field,
         new: Integers,
-        possible: NDArray[np.bool_] | None,
+        possible: NDArray[np.bool_] | np.bool_,
         read: Reader,
     ) -> None:
         """Raises LanguageError if an update that is possible leaves the range of a variable."""
         v = field.variable
-        outside = (new < v.low) | (new > v.high)
-        if possible is not None:
-            outside = outside & possible
+        outside = ((new < v.low) | (new > v.high)) & possible
         if outside.any():
             i = int(np.argmax(outside))
             shown = np.broadcast_to(new, read(v.name).shape)[i]
@@ -271,7 +274,7 @@ class LocalTable:
         else:
             self.known = None
             return self.code.choices(words), None
-        new = np.flatnonzero(index >= self.size)
+        new = (index >= self.size).nonzero()[0]
         if new.size:
             some = np.empty(int(index.max()) + 1 - self.size, np.int64)
             some[index[new] - self.size] = new  # a state of each combination
