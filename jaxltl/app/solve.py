@@ -117,8 +117,7 @@ def _read_source(
 
     Constants that the program does not declare are those of the properties.
     """
-    from jaxltl.io.model_files import is_program
-    from jaxltl.io.prism.program import constants_of, read_syntax
+    from jaxltl.io.prism.program import constants_of, is_program, read_syntax
 
     if not is_program(path):
         if constants is not None:

@@ -25,10 +25,10 @@ from .log import read_labels as read_labels, read_log as read_log
 from .model_files import read_model as read_model, write_model as write_model
 from .episodes import from_episodes as from_episodes
 from .npz import read_npz as read_npz, write_npz as write_npz
-from .drn.parametric import (
+from .drn.parametric import read_parametric as read_parametric
+from .parametric_model import (
     ParametricModel as ParametricModel,
     RationalFunction as RationalFunction,
-    read_parametric as read_parametric,
 )
 from .network_policy import NetworkPolicy as NetworkPolicy, save_network as save_network
 from .policies import (

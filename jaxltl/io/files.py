@@ -220,3 +220,11 @@ def write_bytes(
                 yield packed  # type: ignore[misc]
         else:
             yield file
+
+
+def suffix_of(path: str | os.PathLike[str]) -> str:
+    """The suffix, without that of a compression."""
+    suffixes = [x.lower() for x in Path(path).suffixes]
+    if suffixes and suffixes[-1] in (".gz", ".xz"):
+        del suffixes[-1]
+    return suffixes[-1] if suffixes else ""

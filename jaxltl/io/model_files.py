@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
 from jaxltl.core.models.construct.convert import to_sparse
@@ -13,13 +12,13 @@ from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import SparseMDP
-from jaxltl.io.files import pieces, raw_bytes, write_bytes
+from jaxltl.io.files import pieces, raw_bytes, suffix_of, write_bytes
 from jaxltl.io.drn.drn import read_drn, write_drn
 from jaxltl.io.hoa.game import read_hoa_game, write_hoa_game
 from jaxltl.io.npz import read_npz, write_npz
 from jaxltl.io.pgsolver import read_pgsolver, write_pgsolver
 from jaxltl.io.prism.explicit import read_prism, write_prism
-from jaxltl.io.prism.program import SUFFIXES, Constants, read_program_model
+from jaxltl.io.prism.program import SUFFIXES, Constants, is_program, read_program_model
 from jaxltl.io.umb.umb import read_umb, write_umb
 
 _BEGINNING = 4096  # bytes inspected to detect the format
@@ -107,11 +106,6 @@ def read_model(
     return (_by_name(path) or _by_beginning(path)).read(path)
 
 
-def is_program(path: str | os.PathLike[str]) -> bool:
-    """True if the suffix is one of programs in the PRISM language."""
-    return _suffix(path) in SUFFIXES
-
-
 def write_model(path: str | os.PathLike[str], model: Model) -> None:
     """Writes a model in the format of the file suffix, atomically.
 
@@ -149,16 +143,8 @@ def write_model(path: str | os.PathLike[str], model: Model) -> None:
     form.write(path, model if isinstance(model, Game | IntervalMDP) else to_sparse(model))
 
 
-def _suffix(path: str | os.PathLike[str]) -> str:
-    """The suffix, without that of a compression."""
-    suffixes = [x.lower() for x in Path(path).suffixes]
-    if suffixes and suffixes[-1] in (".gz", ".xz"):
-        del suffixes[-1]
-    return suffixes[-1] if suffixes else ""
-
-
 def _by_name(path: str | os.PathLike[str]) -> Format | None:
-    suffix = _suffix(path)
+    suffix = suffix_of(path)
     return next((x for x in FORMATS if suffix in x.suffixes), None)
 
 

@@ -151,8 +151,8 @@ class _Resolver:
             formulas,
         )
         self.check_names(modules)
-        constants = self.constant_values(expand)
-        known = {name: literal(value) for name, value in constants.items()}
+        constants, derived = self.constant_values(expand)
+        known = derived | {name: literal(value) for name, value in constants.items()}
         fold = _substitution(known)
         both: Change = lambda e: fold(expand(e))  # noqa: E731
         modules = [_Changed(fold).module(m) for m in modules]
@@ -232,12 +232,13 @@ class _Resolver:
                 f"{self.syntax.source.name!r} has no constant {unknown[0]}; it has {listed}."
             )
 
-    def constant_values(self, expand: Change) -> dict[str, Value]:
-        """The value of each constant that is defined or given."""
+    def constant_values(self, expand: Change) -> tuple[dict[str, Value], dict[str, Expression]]:
+        """The value of each constant that is defined or given, and expressions over parameters."""
         table = {c.name: c for c in self.syntax.constants}
         texts = {c.name: expand(c.expression) for c in table.values() if c.expression is not None}
         order = _in_order({n: (names_in(e), table[n].place) for n, e in texts.items()}, "constant")
         found: dict[str, Value] = {}
+        derived: dict[str, Expression] = {}
         for name, value in self.given.items():
             if name in texts:
                 raise LanguageError(table[name].place, f"the constant {name} has a value already.")
@@ -250,9 +251,12 @@ class _Resolver:
             if e.is_literal:
                 found[name] = _typed(table[name], e.value)
                 known[name] = literal(found[name])
-            elif missing := sorted(names_in(e) & set(table)):
-                raise LanguageError(table[name].place, _no_value(missing[0]))
-        return found
+                continue
+            for missing in sorted(names_in(e) & set(table)):
+                if types[name] != "double" or types[missing] != "double":
+                    raise LanguageError(table[name].place, _no_value(missing))
+            known[name] = derived[name] = e
+        return found, derived
 
     def variable(self, d: Declaration, module: int | None) -> Variable:
         if d.low is None or d.high is None:

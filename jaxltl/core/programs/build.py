@@ -101,7 +101,7 @@ def build_model(
         name = program.parameters[0]
         raise ValueError(
             f"{program.source.name!r}: the constant {name} has no value; give constants="
-            f"{{{name!r}: ...}} (--const {name}=...), or read it as a parameter with read_parametric."
+            f"{{{name!r}: ...}} (--const {name}=...), or read it as a parameter with jl.io.read_parametric."
         )
     rows = build_rows(program, max_states=max_states, progress=progress)
     rewards = {

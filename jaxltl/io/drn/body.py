@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import TypedDict
+from typing import NotRequired, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -382,6 +382,7 @@ class Names(TypedDict):
     propositions: tuple[str, ...]
     action: Integers | None
     action_names: tuple[str, ...]
+    valuation: NotRequired[dict[str, NDArray[np.generic]]]
 
 
 def names_of(header: Header, body: Body) -> Names:

@@ -5,300 +5,85 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from fractions import Fraction
-from functools import cached_property
-from hashlib import sha256
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import struct
-from numpy.typing import ArrayLike
 
-from jaxltl.core.models.parametric.parametric import Ends, ParametricMDP, box_of, point_inside
-from jaxltl.core.models.parametric.ranges import Ends as Ranges, ranges
-from jaxltl.core.models.parametric.rational import Rationals, make_rationals
-from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
-from jaxltl.core.pretty_print import brief
-from jaxltl.core import validation
-from jaxltl.io.drn.body import Names, Numbers, names_of, read_body, read_header, rewards_of
-from jaxltl.io.files import read_bytes
 from jaxltl.core.array_types import Integers
+from jaxltl.io.drn.body import Numbers, names_of, read_body, read_header, rewards_of
+from jaxltl.io.files import read_bytes
+from jaxltl.io.parametric_model import (
+    MOST_DEPTH,
+    MOST_POWER,
+    Malformed,
+    ParametricModel,
+    RationalFunction,
+    add,
+    constant,
+    divide,
+    multiply,
+)
+from jaxltl.io.prism.parametric import parametric_program
+from jaxltl.io.prism.program import Constants, is_program
 from jaxltl.io.tokens import Block, Text, as_fraction, numbered, refuse
 
 _TOKEN = re.compile(
     r"\s*(?:(\d+(?:\.\d*)?(?:[eE][+-]?\d+)?|\.\d+(?:[eE][+-]?\d+)?)"
     r"|([A-Za-z_][\w.\[\]]*)|(\*\*|[-+*/^()]))"
 )
-# Far above the needs of models; they prevent short texts from exhausting the memory.
-_MOST_TERMS, _MOST_DEPTH, _MOST_POWER, _MOST_BITS = 10_000, 50, 1_000, 20_000
-
-# The coefficient of each monomial, which is the power of each parameter: 3 p q^2 is {(1, 2): 3}.
-Polynomial = dict[tuple[int, ...], Fraction]
-Term = tuple[Fraction, list[tuple[int, int]]]  # a coefficient, and parameters with their powers
 
 
-@brief
-@dataclass(frozen=True)
-class RationalFunction:
-    """Quotient of two polynomials in the parameters; ``at`` evaluates it exactly.
+def read_parametric(
+    path: str | os.PathLike[str],
+    *,
+    constants: Constants = None,
+    max_states: int | None = None,
+) -> ParametricModel:
+    """Parametric Markov chain or MDP from a DRN file or a program in the PRISM language.
 
-    Attributes:
-      numerator, denominator: polynomials, as maps from exponents to exact coefficients.
-
-    Example:
-      >>> third = RationalFunction({(1,): Fraction(1)}, {(0,): Fraction(3)})  # p / 3
-      >>> str(third.at((Fraction(1, 4),)))
-      '1/12'
-    """
-
-    numerator: Polynomial
-    denominator: Polynomial
-
-    def at(self, point: tuple[Fraction, ...]) -> Fraction:
-        """Exact value at a point; raises ZeroDivisionError at a pole."""
-        above, below = (_value(factors, point) for factors in self._factors)
-        return above / below
-
-    @cached_property
-    def _factors(self) -> tuple[list[Term], list[Term]]:
-        """Terms of numerator and denominator, with nonzero exponents only."""
-        above, below = (
-            [(c, [(d, k) for d, k in enumerate(powers) if k]) for powers, c in of.items()]
-            for of in (self.numerator, self.denominator)
-        )
-        return above, below
-
-
-@brief
-@dataclass(frozen=True)
-class ParametricModel:
-    """Markov chain or MDP with rational functions as probabilities and rewards.
-
-    Same layout as :class:`~jaxltl.core.models.sparse.SparseMDP`, with the successors of a row in
-    the order of the file.
-
-    Attributes:
-      parameters: names of the parameters.
-      functions: distinct functions, the first of which is zero.
-      row_start, entry_start, successor: transitions.
-      probability: function index of each transition, ``int32[T]``.
-      rewards: function indices on states, ``int32[S]``, and choices, ``int32[R]``, by name.
-      names: labels, initial states and actions, as arguments of ``make_sparse``.
-    """
-
-    parameters: tuple[str, ...]
-    functions: tuple[RationalFunction, ...]
-    row_start: Integers
-    entry_start: Integers
-    successor: Integers
-    probability: Integers
-    rewards: dict[str, tuple[Integers, Integers]]
-    names: Names
-
-    def at(self, values: Mapping[str, float | Fraction]) -> SparseMDP:
-        """Instantiates the model at a point, in exact arithmetic rounded to doubles.
-
-        Args:
-          values: a finite number for each parameter.
-
-        Raises:
-          ValueError: for missing or unknown parameters, a pole, or rows that are no distributions.
-        """
-        if not isinstance(values, Mapping):
-            raise ValueError(
-                f"values is {validation.shorten(values)}; give a number for each name, in a dict."
-            )
-        if set(values) != set(self.parameters):
-            raise ValueError(
-                f"values are given for {', '.join(sorted(values)) or 'nothing'}; the "
-                f"parameters are {', '.join(self.parameters) or 'none'}."
-            )
-        for name, x in values.items():
-            validation.finite_number(f"values[{name!r}]", x)
-        point = tuple(Fraction(values[name]) for name in self.parameters)
-        try:
-            value = np.array([float(f.at(point)) for f in self.functions])
-        except (ZeroDivisionError, OverflowError):
-            raise ValueError(f"a function has a pole at {dict(values)}, or is too large.") from None
-        rewards = {
-            name: Rewards(
-                state=value[state] if state.any() else None,
-                choice=value[choice] if choice.any() else None,
-            )
-            for name, (state, choice) in self.rewards.items()
-        }
-        return make_sparse(
-            self.row_start,
-            self.entry_start,
-            self.successor,
-            value[self.probability],
-            rewards=rewards,
-            **self.names,
-        )
-
-    def over(self, low: Ends, high: Ends) -> ParametricMDP:
-        """Parametric MDP in JAX over a box of parameters in which no probability vanishes.
-
-        Args:
-          low, high: bounds, as one number, a number per name, or ``float[D]``.
-
-        Raises:
-          ValueError: for missing names, crossed bounds, or rows that are no distributions in the
-            box.
-        """
-        low, high = box_of(low, high, self.parameters)
-        some = np.array([bool(f.numerator) for f in self.functions])[self.probability]
-        row = np.repeat(np.arange(self.entry_start.size - 1), np.diff(self.entry_start))
-        row, successor, function = (x[some] for x in (row, self.successor, self.probability))
-        order = np.lexsort((successor, row))
-        row, successor, function = (x[order] for x in (row, successor, function))
-        new = np.ones(row.size, bool)
-        new[1:] = (row[1:] != row[:-1]) | (successor[1:] != successor[:-1])
-        exact = _Exact(self, successor[new])
-        inside, model = point_inside(low, high, exact)
-        states = np.repeat(np.arange(self.row_start.size - 1), np.diff(self.row_start))
-        pairs = [(f.numerator, f.denominator) for f in self.functions]
-        numbers = _Numbers(
-            make_rationals(pairs, len(self.parameters)),
-            function.astype(np.int32),
-            None if new.all() else (new.cumsum() - 1).astype(np.int32),
-            {
-                name: (of_state[states].astype(np.int32), of_choice.astype(np.int32))
-                for name, (of_state, of_choice) in self.rewards.items()
-            },
-            int(new.sum()),
-        )
-        widest = int(np.bincount(row).max(initial=1))
-        return ParametricMDP(
-            replace(model, valuation={}),
-            numbers,
-            low,
-            high,
-            inside,
-            self.parameters,
-            exact,
-            2 * widest + 6,
-        )
-
-
-@struct.dataclass
-class _Numbers:
-    """Probabilities and rewards as functions of the parameters."""
-
-    functions: Rationals  # all functions
-    function: Integers  # function of each nonzero entry, int32[E]
-    # transition to which each entry contributes, int32[E]; None for one entry each
-    entry: Integers | None
-    # functions on the state of each choice and on the choice, int32[R] both
-    rewards: dict[str, tuple[Integers, Integers]]
-    num_transitions: int = struct.field(pytree_node=False)  # static
-
-    def __call__(self, x: ArrayLike) -> tuple[jax.Array, dict[str, jax.Array]]:
-        value = self.functions(jnp.asarray(x))
-        probability = value[self.function]
-        if self.entry is not None:
-            probability = jax.ops.segment_sum(
-                probability, self.entry, self.num_transitions, indices_are_sorted=True
-            )
-        rewards = {
-            name: value[of_state] + value[of_choice]
-            for name, (of_state, of_choice) in self.rewards.items()
-        }
-        return probability, rewards
-
-    def ranges(self, low: np.ndarray, high: np.ndarray) -> tuple[Ranges, dict[str, Ranges]]:
-        """Enclosures of probabilities and rewards over a box of non-negative parameters (host)."""
-        value = ranges(self.functions, low, high)
-        lower, upper = (x[self.function] for x in value)
-        if self.entry is not None:
-            count = np.bincount(self.entry, minlength=self.num_transitions)
-            slack = 1 + count * np.finfo(np.float64).eps
-            lower, upper = (
-                np.bincount(self.entry, x, self.num_transitions) for x in (lower, upper)
-            )
-            lower, upper = lower / slack, upper * slack
-        rewards = {
-            name: Ranges(*(x[of_state] + x[of_choice] for x in value))
-            for name, (of_state, of_choice) in self.rewards.items()
-        }
-        return Ranges(np.clip(lower, 0, 1), np.clip(upper, 0, 1)), rewards
-
-
-class _Exact:
-    """Exact instantiation, hashed by content: reading a file again triggers no recompilation."""
-
-    def __init__(self, model: ParametricModel, successor: Integers) -> None:
-        self.model, self.successor = model, successor
-        parts = repr((model.parameters, model.functions, sorted(model.rewards))).encode()
-        arrays = (
-            model.row_start,
-            model.entry_start,
-            model.successor,
-            model.probability,
-            *(x for name in sorted(model.rewards) for x in model.rewards[name]),
-        )
-        self.digest = sha256(
-            parts + b"".join(np.asarray(x, np.int64).tobytes() for x in arrays)
-        ).hexdigest()
-
-    def __call__(self, point: np.ndarray) -> SparseMDP:
-        model = self.model.at(dict(zip(self.model.parameters, point.tolist(), strict=True)))
-        if not np.array_equal(model.successor, self.successor):
-            raise ValueError(
-                "some transitions are gone; keep the box away from where probabilities become zero."
-            )
-        return model
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Exact) and self.digest == other.digest
-
-    def __hash__(self) -> int:
-        return hash(self.digest)
-
-    def __repr__(self) -> str:
-        return f"exact {self.digest[:16]}"
-
-
-def read_parametric(path: str | os.PathLike[str]) -> ParametricModel:
-    """Parametric Markov chain or MDP from a DRN file.
-
-    Functions consist of exact numbers, parameters, sums, products, quotients and integer powers,
-    without blanks: ``(-1)*p+1``, ``p^2/(p+q)``.
+    Functions of a DRN file consist of exact numbers, parameters, sums, products, quotients and integer
+    powers, without blanks: ``(-1)*p+1``, ``p^2/(p+q)``. The parameters of a program (``.prism``,
+    ``.pm``, ``.nm``, ``.sm``) are its constants of type double without a value; decimals are exact.
 
     Args:
       path: the file, plain or compressed with gzip or xz.
+      constants: of a program, values of the other constants, as in ``read_model``.
+      max_states: of a program, the largest number of states; default 10 million.
 
     Returns:
       :class:`ParametricModel`; :meth:`~ParametricModel.over` is differentiable in the parameters.
 
     Raises:
-      ValueError: with file and line, as :func:`~jaxltl.io.drn.drn.read_drn`.
+      ValueError: with file and line, as :func:`~jaxltl.io.drn.drn.read_drn`; a program without
+        parameters, or one whose probabilities are no rational functions.
 
     Example:
       >>> import pathlib, tempfile
-      >>> path = pathlib.Path(tempfile.mkdtemp()) / "coin.drn"
-      >>> _ = path.write_text("@type: DTMC\\n@parameters\\np\\n@nr_states\\n2\\n@model\\n"
-      ...     "state 0 init\\n\\taction 0\\n\\t\\t0 : 1-p\\n\\t\\t1 : p\\n"
-      ...     "state 1\\n\\taction 0\\n\\t\\t1 : 1\\n")
+      >>> path = pathlib.Path(tempfile.mkdtemp()) / "coin.prism"
+      >>> _ = path.write_text("dtmc const double p; module coin x : [0..1]; "
+      ...     "[] x=0 -> p : (x'=1) + 1-p : true; [] x=1 -> true; endmodule")
       >>> coin = read_parametric(path)
       >>> coin.at({"p": 0.25}).probability.tolist()
       [0.75, 0.25, 1.0]
       >>> coin.over(0.01, 0.99).numbers(np.array([0.25]))[0].tolist()
       [0.75, 0.25, 1.0]
     """
+    if is_program(path):
+        return parametric_program(path, constants, max_states)
+    if constants is not None or max_states is not None:
+        raise ValueError(f"{str(path)!r} is no program; constants and max_states are for programs.")
     name, data = str(path), read_bytes(path)
     header = read_header(Text(name, data, 0, len(data)))
     if len(set(header.parameters)) < len(header.parameters):
         refuse(name, "a parameter is named twice.")
     index_of_text = {b"0": 0}
-    functions = [RationalFunction({}, _constant(header.parameters, 1))]
+    functions = [RationalFunction({}, constant(header.parameters, 1))]
     placeholders: dict[str, RationalFunction] = {}
     for place, text in header.placeholders.items():
         try:
             placeholders[place.decode()] = _parsed(text, header.parameters, placeholders)
-        except _Malformed as error:
+        except Malformed as error:
             refuse(
                 name,
                 f"the placeholder {place.decode()} stands for {text[:60].decode()!r}, "
@@ -311,7 +96,7 @@ def read_parametric(path: str | os.PathLike[str]) -> ParametricModel:
         for text in list(index_of_text)[len(functions) :]:
             try:
                 functions.append(_parsed(text, header.parameters, placeholders))
-            except _Malformed as error:
+            except Malformed as error:
                 expected = f"a function of {', '.join(header.parameters) or 'no parameter'}"
                 raise block.error(
                     int(token[texts.index(text)]), f"{expected} (it is {error})"
@@ -350,99 +135,28 @@ def _starts(owner: Integers, size: int) -> Integers:
 # --- functions ------------------------------------------------------------------------------
 
 
-class _Malformed(ValueError):
-    """Syntax error in a rational function; the message completes "it is ..."."""
-
-
-def _constant(parameters: tuple[str, ...], value: Fraction | int) -> Polynomial:
-    return {(0,) * len(parameters): Fraction(value)} if value else {}
-
-
-def _value(terms: list[Term], point: tuple[Fraction, ...]) -> Fraction:
-    total = Fraction(0)
-    for coefficient, factors in terms:
-        for d, power in factors:
-            coefficient *= point[d] ** power
-        total += coefficient
-    return total
-
-
-def _checked(polynomial: Polynomial) -> Polynomial:
-    result = {powers: c for powers, c in polynomial.items() if c}
-    if len(result) > _MOST_TERMS or any(max(powers, default=0) > _MOST_POWER for powers in result):
-        raise _Malformed("too large")
-    if any(
-        max(c.numerator.bit_length(), c.denominator.bit_length()) > _MOST_BITS
-        for c in result.values()
-    ):
-        raise _Malformed("too large")
-    return result
-
-
-def _sum(a: Polynomial, b: Polynomial) -> Polynomial:
-    result = dict(a)
-    for powers, c in b.items():
-        result[powers] = result.get(powers, Fraction(0)) + c
-    return _checked(result)
-
-
-def _times(a: Polynomial, b: Polynomial) -> Polynomial:
-    if len(a) * len(b) > _MOST_TERMS:
-        raise _Malformed("too large")
-    result: Polynomial = {}
-    for p, c in a.items():
-        for q, d in b.items():
-            powers = tuple(i + j for i, j in zip(p, q, strict=True))
-            result[powers] = result.get(powers, Fraction(0)) + c * d
-    return _checked(result)
-
-
-def _add(a: RationalFunction, b: RationalFunction) -> RationalFunction:
-    if a.denominator == b.denominator:
-        return RationalFunction(_sum(a.numerator, b.numerator), a.denominator)
-    return RationalFunction(
-        _sum(_times(a.numerator, b.denominator), _times(b.numerator, a.denominator)),
-        _times(a.denominator, b.denominator),
-    )
-
-
-def _multiply(a: RationalFunction, b: RationalFunction) -> RationalFunction:
-    return RationalFunction(_times(a.numerator, b.numerator), _times(a.denominator, b.denominator))
-
-
-def _divide(a: RationalFunction, b: RationalFunction) -> RationalFunction:
-    if not b.numerator:
-        raise _Malformed("divided by zero")
-    if len(b.numerator) == 1 and not any(next(iter(b.numerator))):  # by a number
-        ((powers, number),) = b.numerator.items()
-        b = RationalFunction(
-            {powers: Fraction(1)}, {q: c / number for q, c in b.denominator.items()}
-        )
-    return _multiply(a, RationalFunction(b.denominator, b.numerator))
-
-
 def _parsed(
     text: bytes, parameters: tuple[str, ...], placeholders: Mapping[str, RationalFunction]
 ) -> RationalFunction:
     try:
         string = text.decode()
     except UnicodeDecodeError:
-        raise _Malformed("not UTF-8") from None
+        raise Malformed("not UTF-8") from None
     if string.startswith("$"):
         if string not in placeholders:
-            raise _Malformed("no placeholder that is defined before")
+            raise Malformed("no placeholder that is defined before")
         return placeholders[string]
     tokens, place = [], 0
     while place < len(string):
         match = _TOKEN.match(string, place)
         if match is None:
-            raise _Malformed(f"malformed at {string[place : place + 20]!r}")
+            raise Malformed(f"malformed at {string[place : place + 20]!r}")
         tokens.append(match[0].strip())
         place = match.end()
     reader = _Reader(tokens, parameters)
     result = reader.sum(0)
     if reader.place < len(tokens):
-        raise _Malformed(f"malformed at {tokens[reader.place][:20]!r}")
+        raise Malformed(f"malformed at {tokens[reader.place][:20]!r}")
     return result
 
 
@@ -462,22 +176,22 @@ class _Reader:
         return self.tokens[self.place - 1] if self.place <= len(self.tokens) else ""
 
     def number(self, value: Fraction | int) -> RationalFunction:
-        return RationalFunction(_constant(self.parameters, value), _constant(self.parameters, 1))
+        return RationalFunction(constant(self.parameters, value), constant(self.parameters, 1))
 
     def sum(self, depth: int) -> RationalFunction:
-        if depth > _MOST_DEPTH:
-            raise _Malformed("nested too deeply")
+        if depth > MOST_DEPTH:
+            raise Malformed("nested too deeply")
         result = self.product(depth)
         while self.next() in ("+", "-"):
             sign = self.take()
             other = self.product(depth)
-            result = _add(result, other if sign == "+" else _multiply(self.number(-1), other))
+            result = add(result, other if sign == "+" else multiply(self.number(-1), other))
         return result
 
     def product(self, depth: int) -> RationalFunction:
         result = self.power(depth)
         while self.next() in ("*", "/"):
-            combine: Callable[..., RationalFunction] = _multiply if self.take() == "*" else _divide
+            combine: Callable[..., RationalFunction] = multiply if self.take() == "*" else divide
             result = combine(result, self.power(depth))
         return result
 
@@ -489,26 +203,26 @@ class _Reader:
         if self.next() in ("^", "**"):
             self.take()
             exponent = self.take()
-            if not re.fullmatch(r"[0-9]{1,4}", exponent) or int(exponent) > _MOST_POWER:
-                raise _Malformed("no whole power up to 1000")
+            if not re.fullmatch(r"[0-9]{1,4}", exponent) or int(exponent) > MOST_POWER:
+                raise Malformed("no whole power up to 1000")
             base, result = result, self.number(1)
-            if (max(len(base.numerator), len(base.denominator)) - 1) * int(exponent) > _MOST_POWER:
-                raise _Malformed("too large")
+            if (max(len(base.numerator), len(base.denominator)) - 1) * int(exponent) > MOST_POWER:
+                raise Malformed("too large")
             for _ in range(int(exponent)):
-                result = _multiply(result, base)
-        return result if sign == 1 else _multiply(self.number(-1), result)
+                result = multiply(result, base)
+        return result if sign == 1 else multiply(self.number(-1), result)
 
     def atom(self, depth: int) -> RationalFunction:
         token = self.take()
         if token == "(":
             result = self.sum(depth + 1)
             if self.take() != ")":
-                raise _Malformed("without a closing bracket")
+                raise Malformed("without a closing bracket")
             return result
         if token in self.parameters:
             powers = tuple(int(name == token) for name in self.parameters)
-            return RationalFunction({powers: Fraction(1)}, _constant(self.parameters, 1))
+            return RationalFunction({powers: Fraction(1)}, constant(self.parameters, 1))
         number = as_fraction(token.encode())
         if number is None:
-            raise _Malformed(f"malformed at {token[:20]!r}" if token else "cut")
+            raise Malformed(f"malformed at {token[:20]!r}" if token else "cut")
         return self.number(number)

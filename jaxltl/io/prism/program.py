@@ -17,7 +17,7 @@ from jaxltl.core.programs.simulation import (
     program_actions as program_actions,
     program_environment as program_environment,
 )
-from jaxltl.io.files import read_text
+from jaxltl.io.files import read_text, suffix_of
 
 SUFFIXES = (".prism", ".pm", ".nm", ".sm", ".smg")
 MAX_BYTES = 2**24  # of a program
@@ -81,6 +81,11 @@ def read_program(path: str | os.PathLike[str], constants: Constants = None) -> P
       3
     """
     return resolve(read_syntax(path), constants_of(constants))
+
+
+def is_program(path: str | os.PathLike[str]) -> bool:
+    """True if the suffix is one of programs in the PRISM language."""
+    return suffix_of(path) in SUFFIXES
 
 
 def read_syntax(path: str | os.PathLike[str]) -> Syntax:
