@@ -179,6 +179,9 @@ def kept(
         found["loss"] = guarantee.actions.loss
     if attempt is not None:
         found |= {"attained": attempt.attained, "weight": attempt.weight, "share": attempt.share}
+        state, action = np.asarray(shown.state), np.asarray(shown.action)
+        taken = attempt.policy[state, memory_along(model, state), action] > 0
+        found["never"] = int((np.asarray(shown.mask) & ~guarantee.unused(shown) & ~taken).sum())
     if unused := int(guarantee.unused(shown).sum()):
         found["unused"] = {"steps": unused, "of": int(np.sum(shown.length))}
     left = guarantee.forbidden & ~guarantee.unused(shown)

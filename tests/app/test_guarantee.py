@@ -11,7 +11,7 @@ import jaxltl as jl
 from benchmarks.mistakes import losses
 from jaxltl.app import learn as job
 from jaxltl.app.protocols import Training
-from jaxltl.app.reports.learn import _nearly_best, remarks
+from jaxltl.app.reports.learn import _nearly_best, remarks, table
 from jaxltl.core.values.undiscounted.mixture import WINDOW, at_starts
 from tests.algos.test_guaranteed import bottoms, evaluate
 from tests.app.test_task import write  # noqa: F401
@@ -434,8 +434,12 @@ def test_where_any_loss_is_all_the_sure_policy_is_what_there_is(write):  # noqa:
     outcome, result = learned(write(asking(0.5), ("!r U y", "G F b & G !r"), shown=shown))
     assert result["guarantee"]["share"] == 1 and result["guarantee"]["attained"] == 1
     assert result["neg_log_likelihood"] is None  # a demonstrated step is never taken
+    never = result["guarantee"]["never"]
     (text,) = (text for kind, text in remarks(result) if kind == "good")
     assert "the only policy found that attains it is one of optimal actions alone." in text
+    assert never > 0 and f"It never takes {never} of the demonstrated steps" in text
+    shown_in = table(result)
+    assert "negative log-likelihood  infinite" in shown_in and "unknown" not in shown_in
     _, sure = evaluate(outcome.setup.model, kept_policy(outcome))
     assert sure[3, int(outcome.setup.model.initial_memory[3])]
 

@@ -67,7 +67,7 @@ def table(result: Result) -> str:
         *([f"  {_guaranteed(result['data'])}"] if "data" in result else []),
         *steps.lines(result["expected_steps"]),
         "",
-        f"negative log-likelihood  {number(result['neg_log_likelihood'])}",
+        f"negative log-likelihood  {_likelihood(result)}",
         "weights",
         *(f"  {name:{width}} {weight:>9}  {meaning}" for name, weight, meaning in weights),
     ]
@@ -109,6 +109,12 @@ def _evidence(result: Result) -> list[tuple[str, ...]]:
     ]
 
 
+def _likelihood(result: Result) -> str:
+    """The negative log-likelihood, infinite if a demonstrated step has probability 0."""
+    never = result["guarantee"].get("never")
+    return "infinite" if never else number(result["neg_log_likelihood"])
+
+
 def _all_equal(evidence: Result) -> bool:
     """True if all initial states have the same probability, to four places."""
     mean, least = evidence["mean"], evidence["minimum"]
@@ -131,7 +137,7 @@ def _tiles(result: Result) -> list[tuple[str, str]]:
         *([] if _all_equal(learned) else [_minimum(learned["minimum"])]),
         (probability(best["mean"]["value"]), f"maximal mean probability{by}"),
         (
-            number(result["neg_log_likelihood"]),
+            _likelihood(result),
             Markup('negative log-likelihood; <span class="{}">{}</span> in {} steps').format(
                 *ended, training["steps"]
             ),
@@ -291,14 +297,17 @@ def _attained(guarantee: Result) -> str:
         f"Asked for {probability(guarantee['asked'])} {over}, certified "
         f"{probability(guarantee['attained'])}: "
     )
-    share, weight = guarantee["share"], guarantee["weight"]
+    share, weight, never = guarantee["share"], guarantee["weight"], guarantee.get("never")
     if share:
-        other = "optimal actions" if weight is None else f"the policy of mu = {weight:.3g}"
         if share == 1:
-            return f"{text}the only policy found that attains it is one of {other} alone."
+            text += "the only policy found that attains it is one of optimal actions alone."
+            lost = f" It never takes {never} of the demonstrated steps, whose likelihood is then 0."
+            return text + lost * bool(never)
         if share > 0.99:
-            return f"{text}a share of {1 - share:.2g} of the likeliest policy is left in {other}."
-        return f"{text}a share of {share:.3g} of {other} is mixed into the likeliest policy."
+            return f"{text}a share of {1 - share:.2g} of the likeliest policy is left in optimal actions."
+        return (
+            f"{text}a share of {share:.3g} of optimal actions is mixed into the likeliest policy."
+        )
     if weight:
         return f"{text}the weight of the satisfaction probability is mu = {weight:.3g}."
     return f"{text}the likeliest policy attains it without a weight."

@@ -71,6 +71,10 @@ def mixing(steps: Result | None) -> list[Remark]:
         return []
     before = steps["likelihood"][0]
     after = next(x for x in steps["likelihood"] if x["share"] == steps["share"])
+    losses = [x["neg_log_likelihood"] for x in (before, after)]
+    change = (
+        f"; the negative log-likelihood changes from {number(losses[0])} to {number(losses[1])}"
+    )
     fix = (
         "steps_factor in [task] sets the multiple."
         if steps["factor"]
@@ -81,9 +85,7 @@ def mixing(steps: Result | None) -> list[Remark]:
             "note",
             f"The policy of the learned reward takes {_steps(before['steps']['value'])} steps on "
             f"average, so a share of {steps['share']:.3g} of a quick policy with the guarantee is "
-            f"mixed in; the negative log-likelihood changes from "
-            f"{number(before['neg_log_likelihood'])} to {number(after['neg_log_likelihood'])}. "
-            f"{fix}",
+            f"mixed in{'' if None in losses else change}. {fix}",
         )
     ]
 
