@@ -134,8 +134,8 @@ def run(directory: Path, place: Any) -> None:
         goal,
         0.01,
         num_steps=STEPS,
-        lanes=True,
         options=Options(
+            lanes=True,
             chunk=50,
             checkpoint=path,
             mesh=place.mesh,

@@ -45,7 +45,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TypedDict, Unpack
 
 import chex
 import flax.linen as nn
@@ -400,6 +400,14 @@ class Staged:
     seconds: np.ndarray
 
 
+class Stages(TypedDict, total=False):
+    """Options of :func:`train_in_stages`, described there."""
+
+    num_steps: int
+    enough: float | Sequence[float]
+    report: Callable[[int, int, PyTree], None] | None
+
+
 def train_in_stages(
     key: chex.PRNGKey,
     problems: Sequence[PyTree],
@@ -408,9 +416,7 @@ def train_in_stages(
     init: Callable[..., PyTree],
     run: Callable[..., PyTree],
     num_chunks: int,
-    num_steps: int = 10,
-    enough: float | Sequence[float] = 0.9,
-    report: Callable[[int, int, PyTree], None] | None = None,
+    **options: Unpack[Stages],
 ) -> Staged:
     """A curriculum: a learner on one problem after the other, each once the previous is mastered.
 
@@ -421,21 +427,23 @@ def train_in_stages(
       hparams: of the learner.
       init, run: the learner's, ``ppo.init`` and ``ppo.run``.
       num_chunks: number of calls of `run`.
-      num_steps: steps of the learner in each.
+      num_steps: steps of the learner in each; default 10.
       enough: mean return of a chunk's episodes at which the next problem begins; a number, or one for
-        each problem but the last.
+        each problem but the last; default 0.9.
       report: called after each chunk with its number, its stage and its metrics.
 
     Raises:
       ValueError: no problem, or a number of thresholds that does not fit.
     """
+    validation.keywords("train_in_stages", options, Stages)
+    num_steps, report = options.get("num_steps", 10), options.get("report")
     problems = validation.sequence("problems", problems)
     for name, function in (("init", init), ("run", run), ("report", report)):
         if function is not None or name != "report":
             validation.function(name, function)
     count = len(problems)
     num_chunks = validation.integer("num_chunks", num_chunks, least=1)
-    bars = validation.float_array("enough", enough)
+    bars = validation.float_array("enough", options.get("enough", 0.9))
     bars = np.full(max(count - 1, 0), bars) if bars.ndim == 0 else bars
     if count == 0 or bars.shape != (count - 1,) or np.isnan(bars).any():
         raise ValueError(

@@ -40,8 +40,8 @@ def run_seeds(
     hparams: PyTree,
     training: Training,
     *,
-    chunk: int | None = None,
-    **options: Any,
+    num_steps: int,
+    options: Options | None = None,
 ) -> tuple[Chunks, dict[str, np.ndarray]]:
     """Runs a learner from N seeds in parallel; returns chunks and metrics ``[T, N]`` by name."""
     mesh = training.mesh if training.num_seeds > 1 else None
@@ -60,14 +60,14 @@ def run_seeds(
         states,
         problem,
         hparams,
-        lanes=True,
-        options=Options(
-            chunk=chunk,
+        num_steps=num_steps,
+        options=dataclasses.replace(
+            options or Options(),
+            lanes=True,
             report=report and (lambda step, metrics: report(step, vars(metrics))),
             checkpoint=training.checkpoint,
             mesh=mesh,
         ),
-        **options,
     )
     if mesh is not None:  # later work is done in each process
         found = found._replace(state=jax.tree.map(jnp.asarray, on_host(found.state)))

@@ -30,6 +30,7 @@ from jaxltl.app.files.worlds import World, load_world
 from jaxltl.algos.mlirl.constrained import Point, constrained_points
 from jaxltl.app.guarantee import Attempt, Guarantee, ask, Search, check_formula, kept
 from jaxltl.app.practical import StepBound, about_steps, neg_log_likelihood, step_bound
+from jaxltl.algos.common.chunks import Options
 from jaxltl.app.job import (
     about,
     compile_in_background,
@@ -135,8 +136,7 @@ def _train(
         hparams,
         training,
         num_steps=num_steps or table.steps,
-        keep="before",
-        until=Partial(_ends, table.tolerance),
+        options=Options(until=Partial(_ends, table.tolerance), keep="before"),
     )
     wait()
     states = jax.device_get(dataclasses.replace(found.state, key=None))

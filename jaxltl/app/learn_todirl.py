@@ -47,6 +47,7 @@ from jaxltl.app.files.scenes import (
 
 from jaxltl.app.files.task_todirl import TodirlTask, read_task as read_task
 from jaxltl.app.guarantee import check_formula, is_weighable, mistakes, used_steps
+from jaxltl.algos.common.chunks import Options
 from jaxltl.app.job import (
     fingerprint as fingerprint,
     one_seed,
@@ -275,7 +276,7 @@ def _train(
         hparams,
         training,
         num_steps=setup.task.learner.steps,
-        until=learner.has_stopped,
+        options=Options(until=learner.has_stopped),
     )
     states, best = found.state, found.state.best
     score = np.asarray(best.neg_log_likelihood)

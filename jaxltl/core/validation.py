@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -250,6 +250,13 @@ def unsupported_model(model: object) -> str:
         f"{name} has no transitions; give an MDP, a DenseMDP, a SparseMDP, or a product of one of "
         "them."
     )
+
+
+def options(function: str, given: Mapping[str, object], **defaults: Any) -> tuple[Any, ...]:
+    """The values of optional keywords with these defaults; TypeError for another, as Python raises."""
+    if unknown := sorted(given.keys() - defaults.keys()):
+        raise TypeError(f"{function}() got an unexpected keyword argument {unknown[0]!r}")
+    return tuple({**defaults, **given}.values())
 
 
 def keywords(function: str, given: Iterable[str], options: type) -> None:

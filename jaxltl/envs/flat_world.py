@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TypedDict, Unpack
 
 import chex
 import jax
@@ -69,6 +69,14 @@ class Discs:
     extent: chex.Array
 
 
+class Starts(TypedDict, total=False):
+    """Initial positions of :func:`flat_world`, described there."""
+
+    start: Sequence[float] | None
+    num_starts: int
+    seed: int
+
+
 def flat_world(
     *,
     discs: Sequence[tuple[str, float, float, float]] = DISCS,
@@ -76,9 +84,7 @@ def flat_world(
     time_step: float = 0.08,
     horizon: int | None = 500,
     discrete: bool = False,
-    start: Sequence[float] | None = None,
-    num_starts: int = 2**16,
-    seed: int = 0,
+    **starts: Unpack[Starts],
 ) -> Environment:
     """FlatWorld as an environment.
 
@@ -90,7 +96,7 @@ def flat_world(
       discrete: nine actions (up, right, down, left, the four diagonals, each with velocity one, and
         rest) instead of a box.
       start: the initial position; default: uniform outside of all discs.
-      num_starts, seed: size and seed of the table of initial positions.
+      num_starts, seed: size (default 2^16) and seed (0) of the table of initial positions.
 
     Returns:
       :class:`~jaxltl.core.environments.environment.Environment` with states :class:`FlatState`.
@@ -104,6 +110,9 @@ def flat_world(
       >>> world.propositions
       ('aqua', 'blue', 'green', 'magenta', 'orange', 'red', 'yellow')
     """
+    start, num_starts, seed = validation.options(
+        "flat_world", starts, start=None, num_starts=2**16, seed=0
+    )
     rows = [tuple(validation.sequence("discs", row)) for row in validation.sequence("discs", discs)]
     if not all(len(row) == 4 and isinstance(row[0], str) for row in rows):
         raise ValueError(

@@ -43,16 +43,18 @@ class LetterState(NamedTuple):
 
 
 class Maps(TypedDict, total=False):
-    """Optional settings of random maps.
+    """Optional settings of random maps and of observations.
 
     Attributes:
       connected: draw maps in which all cells are reachable across empty ones; default: True.
       num_maps, seed: size (default: 1024, before symmetries) and seed (0) of the table of such maps.
+      flat: whether observations are vectors; default: False.
     """
 
     connected: bool
     num_maps: int
     seed: int
+    flat: bool
 
 
 def letter_world(
@@ -63,7 +65,6 @@ def letter_world(
     horizon: int | None = 75,
     layout: str | ArrayLike | None = None,
     start: int | None = None,
-    flat: bool = False,
     **maps: Unpack[Maps],
 ) -> Environment:
     """LetterWorld with a random map per episode, or with a given map.
@@ -78,7 +79,7 @@ def letter_world(
       horizon: the time limit, or None.
       layout: the map of every episode: a text (see :func:`~jaxltl.envs.text_map.parse_map`) with
         ``.`` for empty cells, or ``int[size, size]``, numbers of letters, -1 for none.
-      start, flat: the initial cell in a given layout (default: any empty one); flat observations.
+      start: the initial cell in a given layout; default: any empty one.
       maps: see :class:`Maps`.
 
     Returns:
@@ -96,7 +97,7 @@ def letter_world(
     validation.keywords("letter_world", maps, Maps)
     names, starts = _names(letters), None
     connected = validation.boolean("connected", maps.get("connected", True))
-    flat = validation.boolean("flat", flat)
+    flat = validation.boolean("flat", maps.get("flat", False))
     copies = validation.integer("copies", copies)
     num_maps = validation.integer(
         "num_maps", maps.get("num_maps", 1024), least=int(connected), most=2**24

@@ -8,7 +8,7 @@ robots' places, 0 to C - 1, and `turn` is 1 where the system moves: the inverse 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypedDict, Unpack
 
 import jax
 import jax.numpy as jnp
@@ -71,6 +71,13 @@ def robots(size: int) -> Game:
     )
 
 
+class Reading(TypedDict, total=False):
+    """How :func:`grid_game` reads its map, described there."""
+
+    legend: Mapping[str, Collection[str]] | None
+    wall: str
+
+
 def grid_game(
     text: str,
     *,
@@ -79,8 +86,7 @@ def grid_game(
     slip: float = 0.0,
     system_stays: bool = True,
     environment_stays: bool = False,
-    legend: Mapping[str, Collection[str]] | None = None,
-    wall: str = "#",
+    **reading: Unpack[Reading],
 ) -> Game:
     """The game of two robots on a text map, in turns.
 
@@ -111,6 +117,7 @@ def grid_game(
       >>> game.num_states
       50
     """
+    legend, wall = validation.options("grid_game", reading, legend=None, wall="#")
     world = gridworld(text, slip=slip, legend=legend, wall=wall)
     system_stays = validation.boolean("system_stays", system_stays)
     environment_stays = validation.boolean("environment_stays", environment_stays)

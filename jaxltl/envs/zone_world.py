@@ -16,7 +16,7 @@ proximities; and constant sensors are omitted.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypedDict, Unpack
 
 import chex
 import jax
@@ -65,6 +65,13 @@ class _Numbers:
     gain: np.float32
 
 
+class Placements(TypedDict, total=False):
+    """The table of placements of :func:`zone_world`, described there."""
+
+    num_maps: int
+    seed: int
+
+
 def zone_world(
     *,
     colors: Sequence[str] = COLORS,
@@ -73,8 +80,7 @@ def zone_world(
     extent: float = 2.5,
     horizon: int | None = 1000,
     saturation: float = 0.05,
-    num_maps: int = 1024,
-    seed: int = 0,
+    **placements: Unpack[Placements],
 ) -> Environment:
     """ZoneEnv as an environment.
 
@@ -90,7 +96,8 @@ def zone_world(
       radius, extent: of a zone, and half a side of the square.
       horizon: the time limit, or None.
       saturation: the action from which on the thrust is full; as published, .05.
-      num_maps, seed: size of the table of placements, before symmetries and colours, and its seed.
+      num_maps, seed: size of the table of placements, before symmetries and colours (default 1024), and
+        its seed (0).
 
     Returns:
       :class:`~jaxltl.core.environments.environment.Environment` with states :class:`ZoneState`.
@@ -103,6 +110,7 @@ def zone_world(
       >>> world.propositions, world.observations.shape, world.actions.shape
       (('green', 'yellow', 'blue', 'magenta'), (75,), (2,))
     """
+    num_maps, seed = validation.options("zone_world", placements, num_maps=1024, seed=0)
     names = validation.distinct_names("colors", colors)
     zones, num_maps = (
         validation.integer("zones", zones),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Unpack
+
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -12,6 +14,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Circle
 from numpy.typing import ArrayLike, NDArray
 
+from jaxltl.core import validation
 from jaxltl.plot.board import (
     DIRECTIONS,
     LOSES,
@@ -31,6 +34,7 @@ from jaxltl.plot.board import (
     shade_cells,
 )
 from jaxltl.plot.style import (
+    MapOptions,
     ACCENT,
     FAINT,
     INK,
@@ -52,11 +56,8 @@ def game_values(
     board: int | str,
     *,
     policy: ArrayLike | None = None,
-    actions: Sequence[str] = tuple(DIRECTIONS),
     environment: Sequence[int] | None = None,
-    label: str = "",
-    limits: tuple[float, float] | None = None,
-    wall: str = "#",
+    **look: Unpack[MapOptions],
 ) -> Figure:
     """The values on the system's turns: one map of the system's cell per cell of the environment.
 
@@ -78,6 +79,9 @@ def game_values(
       >>> len(game_values(np.linspace(0, 1, 32), 2, label="value").axes)  # four maps and a scale
       5
     """
+    actions, label, limits, wall = validation.options(
+        "game_values", look, actions=tuple(DIRECTIONS), label="", limits=None, wall="#"
+    )
     world = board_of(board, wall)
     table = _of_turns(np.asarray(values, float), world, "values")
     allowed = None
@@ -147,9 +151,7 @@ def game_moves(
     region: ArrayLike | None = None,
     available: ArrayLike | None = None,
     system: int | None = None,
-    actions: Sequence[str] = tuple(DIRECTIONS),
-    titles: Sequence[str] | str = "",
-    wall: str = "#",
+    **look: Unpack[MapOptions],
 ) -> Figure:
     """The allowed moves of the system in each cell (a triangle, or a dot for staying).
 
@@ -170,6 +172,9 @@ def game_moves(
       >>> len(game_moves(np.ones((32, 5), bool), 2, environment=3, system=0).axes)
       1
     """
+    actions, titles, wall = validation.options(
+        "game_moves", look, actions=tuple(DIRECTIONS), titles="", wall="#"
+    )
     world = board_of(board, wall)
     _require_place(world, environment)
     require_directions(actions)

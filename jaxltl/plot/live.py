@@ -8,18 +8,19 @@ from __future__ import annotations
 
 import html
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple, TYPE_CHECKING, Unpack
 
 import numpy as np
 from matplotlib.colors import to_hex, to_rgb
 from numpy.typing import ArrayLike, NDArray
 
+from jaxltl.core import validation
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.plot import layout
 from jaxltl.plot.automata import edge_texts, on_the_host
 from jaxltl.plot.board import STEPS
 from jaxltl.plot.maps import kind_colors, kind_marks
-from jaxltl.plot.style import SCALE
+from jaxltl.plot.style import MapOptions, SCALE
 from jaxltl.plot.worlds import TINTS
 
 if TYPE_CHECKING:
@@ -162,9 +163,8 @@ def live_map(
     *,
     runs: Sequence[Sequence[int]] = (),
     marked: Iterable[tuple[int, int, int]] = (),
-    actions: Sequence[str] = ("up", "down", "left", "right"),
-    wall: str = "#",
     pieces: int = 1,
+    **look: Unpack[MapOptions],
 ) -> str:
     """A map as SVG, with one layer per memory state, the first of which is visible.
 
@@ -184,6 +184,7 @@ def live_map(
       >>> text.startswith("<svg"), "data-run" in text
       (True, True)
     """
+    actions, wall = validation.options("live_map", look, actions=tuple(STEPS), wall="#")
     ground = _ground(place, wall)
     rows, columns = ground.shape
     parts = ['<g class="ground">']

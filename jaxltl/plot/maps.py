@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Unpack
+
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,6 +14,7 @@ from matplotlib.image import AxesImage
 from matplotlib.patches import Rectangle
 from numpy.typing import ArrayLike, NDArray
 
+from jaxltl.core import validation
 from jaxltl.envs.text_map import parse_map, plain_kind
 from jaxltl.plot.board import (
     STEPS,
@@ -28,7 +31,18 @@ from jaxltl.plot.board import (
     shade_cells,
     short_name,
 )
-from jaxltl.plot.style import FAINT, INK, KINDS, PAPER, head, note, scale_bar, settle, value_limits
+from jaxltl.plot.style import (
+    MapOptions,
+    FAINT,
+    INK,
+    KINDS,
+    PAPER,
+    head,
+    note,
+    scale_bar,
+    settle,
+    value_limits,
+)
 
 TINY = 16  # cells a side, beyond which they have no room for names and numbers
 _HATCH = "#9aa5b1"
@@ -41,12 +55,7 @@ def grid(
     cells: str | NDArray[np.str_],
     values: ArrayLike | None = None,
     policy: ArrayLike | None = None,
-    *,
-    titles: Sequence[str] | str = "",
-    label: str = "",
-    limits: tuple[float, float] | None = (0.0, 1.0),
-    actions: Sequence[str] = ("up", "down", "left", "right"),
-    wall: str = "#",
+    **look: Unpack[MapOptions],
 ) -> Figure:
     """A map, with a value in each cell as a colour, and a policy as arrows.
 
@@ -69,6 +78,9 @@ def grid(
       >>> len(figure.axes)  # a map for each, and a scale
       3
     """
+    titles, label, limits, actions, wall = validation.options(
+        "grid", look, titles="", label="", limits=(0.0, 1.0), actions=tuple(STEPS), wall="#"
+    )
     kinds = parse_map(cells) if isinstance(cells, str) else np.asarray(cells)
     panels, arrows = _panels(kinds, values, policy, len(actions))
     if policy is not None:
@@ -248,11 +260,9 @@ def strategies(
     *,
     marked: ArrayLike | None = None,
     mark: str = "",
-    titles: Sequence[str] | str = "",
     across: int = 4,
     seldom: float = 0.01,
-    actions: Sequence[str] = ("up", "down", "left", "right"),
-    wall: str = "#",
+    **look: Unpack[MapOptions],
 ) -> Figure:
     """The mixed strategies on a map: large arrows for likely moves, small ones for rare moves.
 
@@ -276,6 +286,9 @@ def strategies(
       >>> len(strategies(". .", play, seldom=0.05).axes)
       1
     """
+    titles, actions, wall = validation.options(
+        "strategies", look, titles="", actions=tuple(STEPS), wall="#"
+    )
     require_directions(actions)
     kinds = parse_map(cells) if isinstance(cells, str) else np.asarray(cells)
     world = Board(kinds, np.argwhere(np.ones(kinds.shape, bool)), wall)

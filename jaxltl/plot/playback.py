@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TypedDict, Unpack
+
 import html
 import re
 from collections.abc import Sequence
@@ -10,12 +12,21 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jaxltl.core import validation
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.envs.text_map import parse_map
 from jaxltl.plot.live import CELL, live_automaton, live_map
 from jaxltl.plot.style import ACCENT, FAINT, GOOD, INK, MUTED, PAPER
 
 _RUN, _GAP, _REST = "#c2571a", 24.0, 2.0
+
+
+class Playing(TypedDict, total=False):
+    """Rarely needed options of :func:`playback`, described there."""
+
+    wait: float
+    times: int
+    wall: str
 
 
 def playback(
@@ -25,9 +36,7 @@ def playback(
     automaton: Automaton | None = None,
     memory: ArrayLike | None = None,
     label: str = "",
-    wait: float = 0.4,
-    times: int = 3,
-    wall: str = "#",
+    **playing: Unpack[Playing],
 ) -> str:
     """An animated SVG of a trajectory on a map, next to the state of the task's automaton.
 
@@ -38,7 +47,8 @@ def playback(
       states: ``int[T]``, the cells of the run, in order.
       automaton, memory: an automaton and ``int[T]``, its state at each of the steps; or neither.
       label: the text alternative; default the number of steps.
-      wait, times, wall: seconds for each step, the number of repetitions, and the kind of walls.
+      wait, times, wall: seconds for each step (default 0.4), the number of repetitions (3), and the
+        kind of walls.
 
 
     Raises:
@@ -48,6 +58,7 @@ def playback(
       >>> "from a to b" in playback("a . b", [0, 1, 2], label="from a to b")
       True
     """
+    wait, times, wall = validation.options("playback", playing, wait=0.4, times=3, wall="#")
     kinds = parse_map(cells) if isinstance(cells, str) else np.asarray(cells)
     run = _whole("states", states, kinds.size, "cells")
     panes = [_plain(live_map(kinds, "run", {}, runs=[run], wall=wall))]

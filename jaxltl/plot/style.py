@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -142,6 +142,16 @@ def legend_below(figure: Figure, handles: Sequence[Artist], names: Sequence[str]
         fontsize=8.5,
         labelcolor=INK,
     )
+
+
+class MapOptions(TypedDict, total=False):
+    """Rarely needed options of maps; the help of each function describes those that it takes."""
+
+    actions: Sequence[str]
+    label: str
+    limits: tuple[float, float] | None
+    titles: Sequence[str] | str
+    wall: str
 
 
 def head(axes: Axes, text: str) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Unpack
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -14,6 +14,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
 from numpy.typing import ArrayLike, NDArray
 
+from jaxltl.core import validation
 from jaxltl.plot.board import (
     STEPS,
     draw_arrows,
@@ -24,7 +25,17 @@ from jaxltl.plot.board import (
     shade_cells,
 )
 from jaxltl.plot.maps import TINY, kind_marks
-from jaxltl.plot.style import ACCENT, INK, PAPER, SERIES, head, note, scale_bar, value_limits
+from jaxltl.plot.style import (
+    MapOptions,
+    ACCENT,
+    INK,
+    PAPER,
+    SERIES,
+    head,
+    note,
+    scale_bar,
+    value_limits,
+)
 
 if TYPE_CHECKING:
     from jaxltl.core.models.trajectories import Trajectories
@@ -44,9 +55,7 @@ def temporal_gridworld(
     value: ArrayLike | None = None,
     *,
     title: str | Sequence[str] = "",
-    label: str = "value",
-    limits: tuple[float, float] | None = None,
-    actions: Sequence[str] = ("up", "down", "left", "right"),
+    **look: Unpack[MapOptions],
 ) -> Figure:
     """The map of a coloured world and its objects, with a policy as arrows and trajectories as lines.
 
@@ -69,6 +78,9 @@ def temporal_gridworld(
       >>> len(temporal_gridworld(world, np.full((2, 4), 0.25), value=[0.5, 1.0]).axes)
       3
     """
+    label, limits, actions = validation.options(
+        "temporal_gridworld", look, label="value", limits=None, actions=tuple(STEPS)
+    )
     chosen = [memory] if isinstance(memory, int | np.integer) else list(memory)
     size, shape = int(np.prod(world.shape)), world.shape
     moves = _of_memory(policy, chosen, size, (len(actions),), "policy")

@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxltl.algos import mlirl as irl
 from jaxltl.algos.common import learner
-from jaxltl.algos.common.chunks import run_in_chunks
+from jaxltl.algos.common.chunks import Options, run_in_chunks
 from jaxltl.app.job import plain
 from jaxltl.core.models.construct.lifting import lift_policy
 from jaxltl.core.models.construct.restrict import restrict
@@ -93,9 +93,7 @@ def learn_cases(
         problem,
         hparams,
         num_steps=400,
-        lanes=True,
-        until=learner.gradient_vanishes(1e-6),
-        keep="before",
+        options=Options(until=learner.gradient_vanishes(1e-6), keep="before", lanes=True),
     )
     states, last = learned.state, jax.tree.map(lambda x: x[-1], learned.metrics)
     shape = (len(mus), len(STARTS))

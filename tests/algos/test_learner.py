@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import inspect
 import pickle
+from dataclasses import replace
 from functools import cache, partial
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -699,14 +700,10 @@ def test_lanes_end_each_for_itself():
 )
 def test_runs_that_make_no_sense_are_refused(options, message):
     module, problem, hparams, _ = case("toy")
+    given = (problem, hparams, Partial(reaches, 1), options.get("num_steps", 3))
+    options = {k: x for k, x in options.items() if k != "num_steps"}
     with pytest.raises(ValueError, match=message):
-        loops.run_until(
-            module.step,
-            start("toy"),
-            problem,
-            hparams,
-            **{"until": Partial(reaches, 1), "num_steps": 3, **options},
-        )
+        loops.run_until(module.step, start("toy"), given, **options)
 
 
 def test_a_loop_of_lanes_is_a_while_loop():
@@ -763,15 +760,13 @@ def test_runs_side_by_side_in_chunks():
     """Each with its own number and its own end."""
     module, problem, _, _ = case("toy")
     given = np.array([0.1, 0.2, 0.3])
-    chunks = partial(
-        run_in_chunks, module.step, problem=problem, num_steps=9, options=Options(chunk=4)
-    )
-    found = chunks(
-        starts("toy"),
-        hparams=given,
+    chunks = partial(run_in_chunks, module.step, problem=problem, num_steps=9)
+    options = Options(
+        chunk=4,
         lanes=True,
         until=lambda before, after, metrics: metrics.at >= 20 * given[0] + 3 * (after.step == 4),
     )
+    found = chunks(starts("toy"), hparams=given, options=options)
     assert found.step.tolist() == [1, 2, 3, 4] and found.done.all()
     assert found.state.step.tolist() == [3, 3, 3]
     for i in range(3):
@@ -782,9 +777,7 @@ def test_runs_side_by_side_in_chunks():
     one = chunks(
         jax.tree.map(lambda x: x[None], start("toy")),
         hparams=0.1,
-        lanes=True,
-        keep="before",
-        until=Partial(reaches, 2),
+        options=replace(options, keep="before", until=Partial(reaches, 2)),
     )
     assert one.done.tolist() == [True] and one.state.step.tolist() == [2]
 

@@ -73,7 +73,6 @@ def select(
     num: int,
     count: jax.Array | int | None = None,
     scale: jax.Array | float = 1.0,
-    active: jax.Array | bool = True,
 ) -> Elites:
     """The k feasible samples with the highest objective, or if there are fewer, with the least excess.
 
@@ -81,7 +80,7 @@ def select(
     of them. Samples with an objective NaN or plus infinity, or a cost NaN, are last and never taken.
     """
     count = num if count is None else count
-    usable = active & (objective < jnp.inf) & ~jnp.isnan(cost).any(-1)
+    usable = (objective < jnp.inf) & ~jnp.isnan(cost).any(-1)
     feasible = usable & (cost <= limit).all(-1)
     excess = jnp.max((cost - limit) / scale, axis=-1, initial=-jnp.inf)
     enough = jnp.sum(feasible) >= count

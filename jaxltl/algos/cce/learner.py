@@ -146,13 +146,12 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
         pool = jax.tree.map(lambda x, y: jnp.concatenate([x, y]), fresh, state.elites)
     limit = problem.limit - hparams.margin
     chosen = select(
-        pool.objective,
+        jnp.where(pool.active, pool.objective, jnp.inf),
         pool.cost,
         limit,
         num=num_elites(hparams.rho, hparams.population),
         count=count,
         scale=problem.scale,
-        active=pool.active,
     )
     elites = replace(rows_of(pool, chosen.index), active=chosen.taken)
     rate = jnp.asarray(at(hparams.rate, state.step), samples.dtype)

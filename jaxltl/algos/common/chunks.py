@@ -12,8 +12,8 @@ Example: a contraction to a fixed point, for two lanes.
   ...     guess = state.guess + hparams * (problem - state.guess)
   ...     return State(state.step + 1, guess), {"guess": guess}
   >>> start = State(jnp.zeros(2, jnp.int32), jnp.zeros(2))
-  >>> chunks = run_in_chunks(step, start, 5.0, 0.5, num_steps=4, lanes=True,
-  ...                        options=Options(chunk=2))
+  >>> chunks = run_in_chunks(step, start, 5.0, 0.5, num_steps=4,
+  ...                        options=Options(lanes=True, chunk=2))
   >>> chunks.state.step.tolist(), chunks.step.tolist(), chunks.metrics["guess"].shape
   ([4, 4], [1, 2, 3, 4], (4, 2))
 """
@@ -50,6 +50,9 @@ class Options:
     """Options of :func:`run_in_chunks`.
 
     Attributes:
+      until, keep: as for :meth:`~jaxltl.algos.common.learner.Learner.run_until`.
+      lanes: whether there are N runs: the state has a first axis of N, and hyperparameters are shared
+        or one for each, ``[N]``.
       chunk: steps between reports; default `max_rows`, or a hundredth of the steps.
       max_rows: bound on the rows of metrics of a chunk.
       report: called with the number of steps and the newest metrics after each chunk.
@@ -62,6 +65,9 @@ class Options:
     10
     """
 
+    until: Until | None = None
+    keep: str = "after"
+    lanes: bool = False
     chunk: int | None = None
     max_rows: int = 10
     report: Callable[[int, PyTree], None] | None = None
@@ -93,24 +99,19 @@ def run_in_chunks(
     hparams: PyTree,
     *,
     num_steps: int,
-    until: Until | None = None,
-    keep: str = "after",
-    lanes: bool = False,
     options: Options = Options(),
 ) -> Chunks:
     """The :class:`Chunks` of steps in compiled chunks, with a report and a checkpoint after each.
 
-    With `lanes` there are N runs: `state` has a first axis of N, and `hparams` are shared or one for
-    each, ``[N]``. Steps of the learner's `step` with its `problem` are made until `num_steps`; a state
-    with ``state.step`` steps makes the rest. `until` and `keep` are as for
-    :meth:`~jaxltl.algos.common.learner.Learner.run_until`: a finished run stays unchanged, so that lanes
-    are independent; the loop ends when all have finished. See :class:`Options` for `options`.
+    Steps of the learner's `step` with its `problem` are made until `num_steps`; a state with
+    ``state.step`` steps makes the rest. A run in which the condition of the :class:`Options` holds
+    stays unchanged, so that lanes are independent; the loop ends when all have finished.
 
     Raises:
       ValueError: a hyperparameter is out of range, or the checkpoint belongs to another learner,
         problem or hyperparameters.
     """
-    lanes = validation.boolean("lanes", lanes)
+    lanes, until = validation.boolean("lanes", options.lanes), options.until
     chunk = options.chunk or max(options.max_rows, -(-num_steps // 100))
     checkpoint, mesh = options.checkpoint, options.mesh
     num_lanes = len(state.step) if lanes else None
@@ -125,7 +126,7 @@ def run_in_chunks(
         if os.path.exists(checkpoint):
             now, rows = files.load(checkpoint, (now, rows), given)
     advance: Callable[..., tuple[PyTree, PyTree]]
-    single = _progress_step(step, keep)
+    single = _progress_step(step, options.keep)
     if not lanes:
         advance = partial(run_blocks, single)
     elif mesh is None:

@@ -279,12 +279,20 @@ def bind(
     ) -> tuple[StateT, MetricsT]:
         return run(checked_init(key, problem, hparams), problem, hparams, **options)
 
-    def run_until(state: StateT, problem: ProblemT, hparams: HparamsT, **options: Any) -> Learned:
+    def run_until(
+        state: StateT,
+        problem: ProblemT,
+        hparams: HparamsT,
+        *,
+        until: Until[StateT, MetricsT],
+        num_steps: chex.Numeric,
+        **options: Any,
+    ) -> Learned:
         options = {"keep": keep, "idle": step_if is not None, **options}
-        return loops.run_until(early, state, problem, hparams, **options)
+        return loops.run_until(early, state, (problem, hparams, until, num_steps), **options)
 
     def train_until(
-        key: chex.PRNGKey, problem: ProblemT, hparams: HparamsT, **options: object
+        key: chex.PRNGKey, problem: ProblemT, hparams: HparamsT, **options: Any
     ) -> Learned:
         return run_until(checked_init(key, problem, hparams), problem, hparams, **options)
 

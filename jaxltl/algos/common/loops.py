@@ -130,16 +130,17 @@ class Learned:
 def run_until(
     step: Callable[..., tuple[StateT, MetricsT]],
     state: StateT,
-    problem: ProblemT,
-    hparams: HparamsT,
+    given: tuple[ProblemT, HparamsT, Until[StateT, MetricsT], chex.Numeric],
     *,
-    until: Until[StateT, MetricsT],
-    num_steps: chex.Numeric,
     check_every: int = 1,
     keep: str = "after",
     idle: bool = False,
 ) -> Learned:
-    """The ``run_until`` of a learner; with `idle`, a fourth argument False keeps the state."""
+    """The ``run_until`` of a learner, `given` the problem, hyperparameters, condition and most steps.
+
+    With `idle`, a fourth argument False of `step` keeps the state.
+    """
+    problem, hparams, until, num_steps = given
     if keep not in ("after", "before"):
         raise ValueError(f'keep={keep!r}; choose "after" or "before".')
     if idle and (check_every, keep) != (1, "after"):
@@ -150,8 +151,8 @@ def run_until(
     until = until if isinstance(until, Partial) else Partial(validation.function("until", until))
     require_arrays(state=state, problem=problem, hparams=hparams, until=until)
     require_hparams(hparams)
-    given = (problem, hparams, until, jnp.asarray(num_steps, jnp.int32))
-    return _run_until(step, state, given, check_every, keep, idle)
+    arrays = (problem, hparams, until, jnp.asarray(num_steps, jnp.int32))
+    return _run_until(step, state, arrays, check_every, keep, idle)
 
 
 @struct.dataclass

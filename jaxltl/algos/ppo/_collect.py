@@ -129,20 +129,17 @@ def _walked(
     begin, pool = _starts(reset_key, environment, hparams)
     step = (state.parameters, state.moments, problem, hparams, pool)
     walk = lanes.shard_function(
-        partial(_walk, sharding=hparams.sharding), hparams.sharding, (0, 0, 1, 1, 1, None), (0, 1)
+        partial(_walk, sharding=hparams.sharding), hparams.sharding, (0, 0, 1, None), (0, 1)
     )
-    walkers, path = walk(
-        lanes.device_ranks(hparams.sharding), state.walkers, begin, noise, keys, step
-    )
+    rows = (begin, noise, keys)
+    walkers, path = walk(lanes.device_ranks(hparams.sharding), state.walkers, rows, step)
     return trees.strong(walkers), path
 
 
 def _walk(
     rank: jax.Array,
     walkers: Walkers,
-    begin: PyTree,
-    noise: jax.Array,
-    keys: jax.Array,
+    rows: PyTree,
     given: PyTree,
     *,
     sharding: NamedSharding | None,
@@ -189,7 +186,7 @@ def _walk(
             start = jax.vmap(environment.reset)(start)
         return (jax.vmap(restarted)(walkers, start, row), used), row
 
-    (walkers, _), path = lax.scan(move, (walkers, jnp.int32(0)), (begin, noise, keys))
+    (walkers, _), path = lax.scan(move, (walkers, jnp.int32(0)), rows)
     return walkers, path
 
 

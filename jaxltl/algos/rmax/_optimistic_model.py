@@ -12,7 +12,7 @@ from jaxltl.algos.common.play import take
 from jaxltl.algos.rmax._rollout import Rollout
 from jaxltl.algos.rmax.problem import Problem
 from jaxltl.algos.rmax.state import Hparams, State
-from jaxltl.core.values.discounted.warm_start import span_iteration
+from jaxltl.core.values.discounted.warm_start import Models, span_iteration
 
 
 def update_model(state: State, rollout: Rollout, problem: Problem, hparams: Hparams) -> State:
@@ -67,12 +67,14 @@ def _solve(carry: _Values, model: tuple[jax.Array, jax.Array, Problem, Hparams])
     value, width, quantity = span_iteration(
         problem.game,
         problem.allowed,
-        gain,
-        probability,
-        value,
-        jnp.asarray(hparams.discount, dtype),
-        enough=solver_tolerance(problem, hparams),
-        active=changed,
+        Models(
+            gain,
+            probability,
+            value,
+            jnp.asarray(hparams.discount, dtype),
+            solver_tolerance(problem, hparams),
+            changed,
+        ),
     )
     # Within eps_1 minus twice the error by these values implies within eps_1 by the exact values.
     tolerance = pac.action_tolerance(hparams.epsilon, hparams.discount)

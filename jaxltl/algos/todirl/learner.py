@@ -49,7 +49,7 @@ from jax import lax
 
 from jaxltl.algos.common import learner, optimizers, trees
 from jaxltl.algos.common.early_stopping import Best, stop_early
-from jaxltl.algos.todirl.planning import backward_induction, plan, reward, soft_plan
+from jaxltl.algos.todirl.planning import backward_induction, reward, soft_plan
 from jaxltl.algos.todirl.problem import Hparams, Problem, network_inputs
 from jaxltl.core import struct
 from jaxltl.core.models.ops.successor_tables import PredecessorTable
@@ -122,7 +122,8 @@ def solve(
     """
 
     def world(model: Product, observation: jax.Array, initial: jax.Array) -> Solution:
-        return plan(problem.network, parameters, model, observation, hparams, initial=initial)
+        rewards = reward(problem.network, parameters, model, observation)
+        return soft_plan(rewards, model, hparams, initial)
 
     return _each_world(world, problem.model, problem.observation, _initial(problem, initial))
 

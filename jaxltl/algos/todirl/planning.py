@@ -40,7 +40,6 @@ def plan(
     observation: jax.Array,
     hparams: Hparams,
     *,
-    initial: jax.Array | None = None,
     allowed: jax.Array | None = None,
 ) -> Solution:
     """The soft value and policy (3.4), (3.5) of a learned reward in any world.
@@ -50,7 +49,6 @@ def plan(
       model: the product; its automaton has as many states as that of the training worlds.
       observation: ``float[S, O]``.
       hparams: discount, tolerance, method and horizon are read.
-      initial: ``float[S, Q]``, initial value of the solver.
       allowed: ``bool[S, Q, A]``, action mask in this world; default all. Inside the optimal actions
         of its task the policy attains the optimal satisfaction probability.
 
@@ -62,11 +60,11 @@ def plan(
       ValueError: unknown method, or a mask that does not fit.
     """
     model = model if allowed is None else with_allowed(model, allowed)
-    return soft_plan(reward(network, parameters, model, observation), model, hparams, initial)
+    return soft_plan(reward(network, parameters, model, observation), model, hparams)
 
 
 def soft_plan(
-    rewards: jax.Array, model: Product, hparams: Hparams, initial: jax.Array | None
+    rewards: jax.Array, model: Product, hparams: Hparams, initial: jax.Array | None = None
 ) -> Solution:
     """The soft value and policy of `rewards` in a `model`, by `hparams`, started at `initial`."""
     if hparams.horizon is not None:

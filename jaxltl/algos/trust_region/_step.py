@@ -11,7 +11,7 @@ from jax import lax
 from jax.scipy.sparse.linalg import cg
 
 from jaxltl.algos.trust_region._cpo_dual import Case, Dual, cpo_dual, cpo_weights, ratio
-from jaxltl.algos.trust_region._policy_networks import gaussian, kl_divergence, log_density
+from jaxltl.algos.trust_region._policy_networks import kl_divergence, log_density
 from jaxltl.algos.trust_region._value_fit import positive
 from jaxltl.algos.trust_region.state import Hparams
 from jaxltl.core.models.protocols import PyTree
@@ -31,16 +31,13 @@ def fisher_product(divergence: Callable[[jax.Array], jax.Array], parameters: jax
 
 
 def surrogate(
-    parameters: PyTree,
+    new: tuple[jax.Array, jax.Array],
     old: tuple[jax.Array, jax.Array],
-    inputs: jax.Array,
     action: jax.Array,
     weighted: jax.Array,
     valid: jax.Array,
-    hparams: Hparams,
 ) -> tuple[jax.Array, jax.Array]:
     """Gains ``sum_i (pi(a_i) / old(a_i) - 1) A_i``, ``float[V]``, and the mean divergence."""
-    new = gaussian(parameters, hparams, inputs)
     log_ratio = log_density(action, *new) - log_density(action, *old)
     gains = weighted @ jnp.where(valid, jnp.expm1(log_ratio), 0)
     divergence = jnp.where(valid, kl_divergence(old, new), 0)

@@ -264,15 +264,8 @@ def _improved(
     old = gaussian(parameters, hparams, samples[0])
 
     def judged(flat: jax.Array) -> Surrogate:
-        gains, kl = surrogate(
-            unravel(flat),
-            old,
-            samples[0],
-            samples[1],
-            weighted.reshape(len(weighted), -1),
-            samples[2],
-            hparams,
-        )
+        new = gaussian(unravel(flat), hparams, samples[0])
+        gains, kl = surrogate(new, old, samples[1], weighted.reshape(len(weighted), -1), samples[2])
         return Surrogate(gains[0], gains[1] if constrained else jnp.zeros((), dtype), kl)
 
     def divergence(flat: jax.Array) -> jax.Array:

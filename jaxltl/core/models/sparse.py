@@ -325,7 +325,7 @@ def make_sparse(
       >>> model.num_states, model.num_rows, model.num_transitions, model.is_chain
       (2, 3, 4, False)
     """
-    model = sparse_part(row_start, entry_start, successor, probability, annotations)
+    model = sparse_part(row_start, entry_start, successor, probability, **annotations)
     return replace(model, initial=checked_initial(initial, model.num_states))
 
 
@@ -334,9 +334,9 @@ def sparse_part(
     entry_start: chex.Array,
     successor: chex.Array,
     probability: chex.Array,
-    annotations: Annotations,
     begins: tuple[int, int, int] = (0, 0, 0),
     num_states: int | None = None,
+    **annotations: Unpack[Annotations],
 ) -> SparseMDP:
     """Validated states of a larger model, from the state, choice and transition numbers `begins` on."""
     successor, probability = (

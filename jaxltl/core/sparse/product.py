@@ -42,13 +42,12 @@ def sparse_product(
     host: HostMDP,
     delta: np.ndarray,
     letter: Integers,
-    state: Integers,
-    memory: Integers,
+    start: tuple[Integers, Integers],
     *,
     on_entry: bool = True,
     still: Booleans | None = None,
 ) -> SparseProduct:
-    """The part of the product that is reachable from some pairs.
+    """The part of the product that is reachable from pairs of a state and a memory, `start`.
 
     A step leads from ``(s, q)`` to ``(t, delta[q, letter[t]])``, or to ``(t, delta[q, letter[s]])``
     where letters are read on exit.
@@ -62,14 +61,14 @@ def sparse_product(
     step = delta.T.astype(np.int64)  # [L, Q], so that one letter's column is together
     still = np.zeros(num_memory, bool) if still is None else still
     world = _World(host, step, np.asarray(letter), still, on_entry)
-    start = np.asarray(state, np.int64) * num_memory + np.asarray(memory)
-    seen = _reached(world, start)
+    first = np.asarray(start[0], np.int64) * num_memory + np.asarray(start[1])
+    seen = _reached(world, first)
     code = np.flatnonzero(seen)
     if host.num_states * num_memory <= _DENSE:
         number = np.zeros(seen.size, np.int32)
         number[code] = np.arange(code.size, dtype=np.int32)
-        return _written(world, code, number.__getitem__, start)
-    return _written(world, code, lambda x: np.searchsorted(code, x).astype(np.int32), start)
+        return _written(world, code, number.__getitem__, first)
+    return _written(world, code, lambda x: np.searchsorted(code, x).astype(np.int32), first)
 
 
 def product_without_memory(host: HostMDP, state: Integers) -> SparseProduct:

@@ -321,7 +321,7 @@ def _part(
             initial = read_bits(contents[_IS_INITIAL], index.states) / some
     with errors_in(place):
         model = sparse_part(
-            row_start, entry_start, target, probability, annotations, index.begins, num_states
+            row_start, entry_start, target, probability, index.begins, num_states, **annotations
         )
         refuse_negative(initial, first=index.begins[0])
     part = ModelPart(

@@ -69,7 +69,7 @@ def test_products_are_what_a_search_finds(on_entry, way, monkeypatch):
         state = rng.integers(0, num_states, rng.integers(1, 3))
         memory = rng.integers(0, num_memory, state.size)
         still = rng.random(num_memory) < 0.3
-        found = sparse_product(mdp, delta, letter, state, memory, on_entry=on_entry, still=still)
+        found = sparse_product(mdp, delta, letter, (state, memory), on_entry=on_entry, still=still)
         starts = list(zip(state.tolist(), memory.tolist(), strict=True))
         wanted = searched(mdp, delta, letter, starts, on_entry, still)
         pairs = list(zip(found.base_state.tolist(), found.memory.tolist(), strict=True))
@@ -100,7 +100,7 @@ def test_a_deep_product_is_handed_over():
         np.append(np.arange(1, size), 0).astype(np.int32),
         np.ones(size),
     )
-    found = sparse_product(mdp, np.array([[1], [0]]), np.zeros(size, int), [0], [0])
+    found = sparse_product(mdp, np.array([[1], [0]]), np.zeros(size, int), ([0], [0]))
     assert found.base_state.size == size  # an even ring: memory goes with the place
     assert (found.memory == found.base_state % 2).all()
     assert (found.host.successor == np.append(np.arange(1, size), 0)).all()
@@ -115,7 +115,7 @@ def test_products_beyond_all_bounds_are_refused():
         np.ones(size),
     )
     with pytest.raises(ValueError, match="smaller formula"):
-        sparse_product(mdp, np.zeros((4096, 1), int), np.zeros(size, int), [0], [0])
+        sparse_product(mdp, np.zeros((4096, 1), int), np.zeros(size, int), ([0], [0]))
 
 
 # --- acceptance -------------------------------------------------------------------------------

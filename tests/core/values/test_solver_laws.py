@@ -563,3 +563,9 @@ def test_evidence_has_no_derivative(name):
 
     with jax.debug_nans(False):
         assert jax.grad(evidence)(0.5) == 0
+
+
+@pytest.mark.parametrize("option", ["max_step", "evaluation_sweeps", "start"])
+def test_an_option_of_another_solver_is_refused(option):
+    with pytest.raises(TypeError, match=f"unexpected keyword argument '{option}'"):
+        jl.values.soft_value(jl.from_dense([[[1.0]]]), np.ones((1, 1)), 0.5, **{option: 1})

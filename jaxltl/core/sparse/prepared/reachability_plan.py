@@ -81,26 +81,6 @@ def plan_optimum(reduced: ReducedProblem, cost: Floats | None) -> Plan:
         if reduced.problem.allowed is not None:
             kept &= reduced.problem.allowed
         rows = np.flatnonzero(kept)
-    nodes, loops = _optimum_nodes(mdp, small, origin, open_, rows, codes, cost)
-    order = schedule(
-        nodes, mdp.num_transitions + mdp.num_rows, mdp.num_transitions + mdp.num_rows + 1
-    )
-    codes = order.size - 1 - codes
-    codes[open_] = order.place
-    own, row = _own(reduced, codes)
-    cycles = _circles(reduced)
-    return Plan(order, codes[node].astype(np.int32), own, row, loops, cycles, _terms(loops))
-
-
-def _optimum_nodes(
-    mdp: HostMDP,
-    small: HostMDP,
-    origin: Integers,
-    open_: Booleans,
-    rows: Integers,
-    codes: Integers,
-    cost: Floats | None,
-) -> tuple[Nodes, Loops | None]:
     found = _entries(mdp, small, origin, rows)
     state = small.state[rows]
     loop = found.target == state[found.row]
@@ -120,7 +100,14 @@ def _optimum_nodes(
     entries = _Entries(found.row[kept], target[kept], found.source[kept])
     entries = _with_costs(entries, origin[rows], cost, mdp.num_transitions)
     nodes = Nodes(int(open_.sum()), number[state], origin[rows].astype(np.int64), *entries)
-    return nodes, loops
+    order = schedule(
+        nodes, mdp.num_transitions + mdp.num_rows, mdp.num_transitions + mdp.num_rows + 1
+    )
+    codes = order.size - 1 - codes
+    codes[open_] = order.place
+    own, row = _own(reduced, codes)
+    cycles = _circles(reduced)
+    return Plan(order, codes[node].astype(np.int32), own, row, loops, cycles, _terms(loops))
 
 
 def _entries(mdp: HostMDP, small: HostMDP, origin: Integers, rows: Integers) -> _Entries:

@@ -347,14 +347,13 @@ def reached_within(
 
 def total(
     mdp: HostMDP,
-    reward: Floats,
-    magnitude: Floats,
-    start: Floats,
+    rewards: tuple[Floats, Floats, Floats],
     num_steps: int,
     operation: np.ufunc,
     by_step: bool = False,
 ) -> Steps:
-    """Optimal expected reward of n steps, plus a terminal reward."""
+    """Optimal expected reward of n steps; `rewards` are of rows, their magnitudes, and terminal."""
+    reward, magnitude, start = rewards
     _require_memory(mdp, num_steps, by_step)
     backup = backup_on(mdp, np.arange(mdp.num_states), operation)
     every: list[Integers] | None = [] if by_step else None

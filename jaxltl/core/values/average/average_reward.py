@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 
 import numpy as np
 
@@ -71,12 +72,13 @@ def average_reward(
     )
     small = 1e-6 if (earned >= 0).all() else 1e-3
     error = np.maximum(found.upper - found.value, found.value - found.lower)
-    return solution_from_error(
+    least = small * float(magnitude.max())
+    solution = solution_from_error(
         sign * found.value,
         error,
         found.row.astype(np.int32),
         found.rounds,
-        tolerance=tolerance,
-        least=small * float(magnitude.max()),
-        residual=found.residual,
+        enough=tolerance * np.maximum(np.abs(found.value), least),
     )
+    residual: Array = np.float64(found.residual)
+    return replace(solution, residual=residual)

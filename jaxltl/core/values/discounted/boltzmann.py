@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial, reduce
-from typing import NamedTuple
+from typing import NamedTuple, Unpack
 
 import chex
 import jax
@@ -12,7 +12,8 @@ import numpy as np
 from jax import lax
 from jax.typing import ArrayLike
 
-from jaxltl.core.values.engine.validated import validated
+from jaxltl.core.values.engine.validated import SolverOptions, validated
+from jaxltl.core import validation
 from jaxltl.core.models.compiled.compiled import compiled_form, reshape_solution
 from jaxltl.core.models.ops.choices import Layout, Quantity, choices
 from jaxltl.core.models.ops.successor_tables import sweep_operator
@@ -68,10 +69,9 @@ def boltzmann_value(
     discount: jax.Array | float,
     *,
     initial: jax.Array | None = None,
-    adjoint: str = "exact",
     method: str = "damped",
     tolerance: jax.Array | float | None = None,
-    max_steps: jax.Array | int = 5_000,
+    **options: Unpack[SolverOptions],
 ) -> Solution:
     """Boltzmann value: the value of a policy that is the softmax of its action values (2.1)-(2.3).
 
@@ -83,12 +83,12 @@ def boltzmann_value(
     Args:
       model, reward, discount: as in :func:`~jaxltl.core.values.discounted.discounted.optimal_value`.
       initial: ``float[S]``, the first iterate; default zero.
-      adjoint: ``"exact"``, or ``"approximate"``: the sensitivity (2.7), with the policy constant.
       method: ``"damped"``, or ``"newton"`` for Newton steps only, which may also find repelling
         fixed points.
       tolerance: width of the enclosure where the operator contracts, of the residual elsewhere;
         default: what the dtype allows.
-      max_steps: damped steps at most.
+      max_steps: damped steps at most; default 5,000.
+      adjoint: ``"exact"``, or ``"approximate"``: the sensitivity (2.7), with the policy constant.
 
     Returns:
       :class:`Solution`; `policy` is ``float[S, A]``, of a sparse model ``float[R]``, the softmax.
@@ -103,6 +103,9 @@ def boltzmann_value(
       >>> round(boltzmann_value(mdp, jnp.ones((1, 2)), 0.5).value.item(), 4)
       2.0
     """
+    adjoint, max_steps = validation.options(
+        "boltzmann_value", options, adjoint="exact", max_steps=5_000
+    )
     form, reward = compiled_form(model, reward)
     return reshape_solution(
         model,
@@ -130,11 +133,9 @@ def _boltzmann_value(
     damping = jnp.where(given.contracts | (method == "newton"), 0.0, 0.5).astype(model.dtype)
     value, image, n, _ = newton.solve(
         sweep_operator(model),
-        softmax_mean,
-        _judge,
+        newton.Method(softmax_mean, _judge, monotone=False),
         newton.Backup(gains(model, reward), discount, damping, given),
         start,
-        monotone=False,
         first_sweeps=4 if method == "damped" else 0,
         max_steps=max_steps,
     )

@@ -12,15 +12,16 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple, cast
+from typing import NamedTuple, Unpack, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxltl.core.values.engine.validated import validated
+from jaxltl.core.values.engine.validated import SolverOptions, validated
 from jaxltl.core.values.interval.robust import refuse_nature, robust_discounted_value
+from jaxltl.core import validation
 from jaxltl.core.models.compiled.compiled import compiled_form, flatten_policy, reshape_solution
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.ops.array_namespace import is_traced
@@ -199,7 +200,7 @@ def policy_value(
     *,
     nature: str | None = None,
     tolerance: jax.Array | float | None = None,
-    max_steps: jax.Array | int | None = None,
+    **options: Unpack[SolverOptions],
 ) -> Solution:
     """Expected discounted reward of a policy.
 
@@ -226,6 +227,7 @@ def policy_value(
       >>> round(policy_value(mdp, jnp.array([0]), jnp.ones((1, 1)), 0.5).value.item(), 4)
       2.0
     """
+    (max_steps,) = validation.options("policy_value", options, max_steps=None)
     if isinstance(model, IntervalMDP):
         if max_steps is not None:
             raise ValueError("interval models are solved by policy iteration; give no max_steps.")
@@ -262,8 +264,7 @@ def _policy_value(model, policy, reward, discount, tolerance, max_steps) -> Solu
 
     value, image, n, _ = newton.solve(
         rows,
-        combine,
-        judge,
+        newton.Method(combine, judge),
         newton.Backup(over.columns(reward), given.discount, jnp.zeros_like(given.discount), given),
         jnp.zeros(model.num_states, model.dtype),
         max_steps=max_steps,
@@ -292,8 +293,7 @@ def optimal_value(
     nature: str | None = None,
     method: str = "auto",
     tolerance: jax.Array | float | None = None,
-    max_steps: jax.Array | int | None = None,
-    evaluation_sweeps: jax.Array | int | None = None,
+    **options: Unpack[SolverOptions],
 ) -> Solution:
     """Largest expected discounted reward, ``V = max_a R + discount * P V``.
 
@@ -330,8 +330,12 @@ def optimal_value(
       >>> [round(v, 4) for v in best.value.tolist()], best.policy.tolist()
       ([1.0, 2.0], [1, 0])
     """
+    max_steps, evaluation_sweeps = validation.options(
+        "optimal_value", options, max_steps=None, evaluation_sweeps=None
+    )
+    limited = max_steps is not None or evaluation_sweeps is not None
     if isinstance(model, IntervalMDP):
-        if method != "auto" or max_steps is not None or evaluation_sweeps is not None:
+        if method != "auto" or limited:
             raise ValueError(
                 "interval models are solved by policy iteration; give no method, max_steps or "
                 "evaluation_sweeps."
@@ -341,8 +345,7 @@ def optimal_value(
         )
     refuse_nature(nature)
     concrete = not is_traced((model, reward, discount, tolerance))
-    default = method == "auto" and max_steps is None and evaluation_sweeps is None
-    if is_sparse(model) and concrete and default:
+    if is_sparse(model) and concrete and method == "auto" and not limited:
         return discounted(model, reward, discount, tolerance=tolerance)
     form, reward = compiled_form(model, reward)
     return reshape_solution(
@@ -353,8 +356,10 @@ def optimal_value(
             discount_words(discount, form.dtype),
             method=method,
             tolerance=tolerance,
-            max_steps=MAX_STEPS if max_steps is None else max_steps,
-            evaluation_sweeps=_SWEEPS if evaluation_sweeps is None else evaluation_sweeps,
+            limits=(
+                MAX_STEPS if max_steps is None else max_steps,
+                _SWEEPS if evaluation_sweeps is None else evaluation_sweeps,
+            ),
         ),
     )
 
@@ -367,9 +372,9 @@ def _optimal_value(
     *,
     method: str,
     tolerance: jax.Array | float | None,
-    max_steps: jax.Array | int,
-    evaluation_sweeps: jax.Array | int,
+    limits: tuple[jax.Array | int, jax.Array | int],
 ) -> Solution:
+    max_steps, evaluation_sweeps = limits
     if method == "auto":
         few = math.prod(model.state_shape) <= DENSE_LIMIT
         method = "policy_iteration" if few else "modified_policy_iteration"
@@ -383,13 +388,11 @@ def _optimal_value(
     else:
         value, image, n, _ = newton.solve(
             sweep_operator(model),
-            best_action,
-            judge,
+            newton.Method(best_action, judge, newton=method == "policy_iteration"),
             newton.Backup(
                 gains(model, reward), given.discount, jnp.zeros_like(given.discount), given
             ),
             zero,
-            newton=method == "policy_iteration",
             max_steps=max_steps,
         )
     q = reward + given.discount * expectation(model, value.reshape(model.state_shape))
@@ -529,6 +532,6 @@ def _modified_policy_iteration(model, reward, given: Parameters, max_steps, swee
     zero = jnp.zeros(model.num_states, model.dtype)
     start = lax.stop_gradient((zero, *greedy(zero)))
     (value, image, _), n = lax.stop_gradient(
-        iterate(step, finished, None, start, None, max_steps=max_steps, lanes="mapped")
+        iterate(step, finished, (None, start, None), max_steps=max_steps, lanes="mapped")
     )
     return value, image, n

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, Unpack
 
 import chex
 import jax
@@ -17,7 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxltl.core.values.engine.validated import validated
+from jaxltl.core import validation
+from jaxltl.core.values.engine.validated import SolverOptions, validated
 from jaxltl.core.graphs.attractor import attract
 from jaxltl.core.graphs.graph import Graph, graph_of, take
 from jaxltl.core.models.compiled.compiled import compiled_form, flatten_policy, reshape_solution
@@ -61,7 +62,7 @@ def minimax_value(
     method: str = "policy_iteration",
     allowed: chex.Array | None = None,
     tolerance: chex.Numeric | None = None,
-    max_steps: chex.Numeric = 100_000,
+    **options: Unpack[SolverOptions],
 ) -> Solution:
     """Minimax value: discounted reward that the system secures against every environment.
 
@@ -84,7 +85,7 @@ def minimax_value(
         moves. A state without any has the value minus infinity.
       tolerance: width of the enclosure; default: as narrow as the dtype allows.
       max_steps: maximal number of backups, or of strategies in strategy iteration, without those
-        for h.
+        for h; default 100,000.
 
     Returns:
       :class:`Solution`; `policy` is ``int32[S]``, greedy for both players: the system's part
@@ -105,6 +106,7 @@ def minimax_value(
       >>> [round(v, 4) for v in best.value.tolist()], best.policy.tolist()
       ([4.0, 4.0], [1, 0])
     """
+    (max_steps,) = validation.options("minimax_value", options, max_steps=100_000)
     given = as_game(game)
     form, reward = compiled_form(given, reward)
     if allowed is not None:
@@ -134,7 +136,7 @@ def strategy_value(
     environment: chex.Array | str = "adversarial",
     method: str = "policy_iteration",
     tolerance: chex.Numeric | None = None,
-    max_steps: chex.Numeric = 100_000,
+    **options: Unpack[SolverOptions],
 ) -> Solution:
     """Discounted value of a strategy, against the worst case or a policy of the environment.
 
@@ -167,6 +169,7 @@ def strategy_value(
       >>> [round(v, 4) for v in worst.value.tolist()]
       [2.0, 2.0]
     """
+    (max_steps,) = validation.options("strategy_value", options, max_steps=100_000)
     asked = as_game(game)
     form, reward = compiled_form(asked, reward)
     if isinstance(environment, str):
@@ -332,8 +335,7 @@ def _horizon(
         ones = jax.tree.map(lambda m: jnp.ones(m.shape, tau.dtype), moves)
         tau, after, *_ = newton.solve(
             rows,
-            lambda over, q, given: _chosen(over, q, given[0]),
-            judge,
+            newton.Method(lambda over, q, given: _chosen(over, q, given[0]), judge),
             newton.Backup(
                 _gains(rows, slow, ones, moves, free),
                 free.astype(tau.dtype),
@@ -470,12 +472,9 @@ def _approached(
     else:
         value, image, num_steps, chosen = newton.solve(
             rows,
-            _chosen,
-            _judge,
+            newton.Method(_chosen, _judge, newton=policies, monotone=False),
             numbers,
             zero,
-            newton=policies,
-            monotone=False,
             first_sweeps=_FIRST_SWEEPS if zero.size > DENSE_LIMIT else 0,
             max_steps=max_steps,
         )
@@ -538,5 +537,5 @@ def _strategy_iteration(
         jnp.int32(-1),
         jnp.bool_(False),
     )
-    last, n = iterate(step, lambda k, _: k.done, rows, start, numbers, max_steps=max_steps)
+    last, n = iterate(step, lambda k, _: k.done, (rows, start, numbers), max_steps=max_steps)
     return last.value, last.image, n

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Unpack
+
 import math
 from dataclasses import replace
 from functools import partial
@@ -10,7 +12,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxltl.core.values.engine.validated import validated
+from jaxltl.core.values.engine.validated import SolverOptions, validated
+from jaxltl.core import validation
 from jaxltl.core.models.compiled.compiled import compiled_form, reshape_solution
 from jaxltl.core.models.ops.choices import Layout, Quantity, choices
 from jaxltl.core.models.ops.operators import expectation, pushforward
@@ -42,7 +45,7 @@ def soft_value(
     initial: jax.Array | None = None,
     method: str = "newton",
     tolerance: jax.Array | float | None = None,
-    max_steps: jax.Array | int = 100_000,
+    **options: Unpack[SolverOptions],
 ) -> Solution:
     """Soft (maximum-entropy) value, ``V = log sum_a exp(R + discount * P V)`` (3.4).
 
@@ -51,7 +54,7 @@ def soft_value(
         :func:`~jaxltl.core.values.discounted.discounted.optimal_value`.
       initial: ``float[S]``, the first iterate; default zero.
       method: ``"newton"`` (soft policy iteration) or ``"value_iteration"``.
-      max_steps: maximal number of steps of the method.
+      max_steps: maximal number of steps of the method; default 100,000.
 
     Returns:
       :class:`Solution`; `policy` is ``float[S, A]``, ``exp(Q - V)``, of a sparse model
@@ -67,6 +70,7 @@ def soft_value(
       >>> round(soft_value(mdp, jnp.zeros((1, 2)), 0.5).value.item(), 4)  # 2 log 2
       1.3863
     """
+    (max_steps,) = validation.options("soft_value", options, max_steps=100_000)
     form, reward = compiled_form(model, reward)
     return reshape_solution(
         model, _soft_value(form, reward, discount, initial, (tolerance, max_steps), method=method)
@@ -89,11 +93,9 @@ def _soft_value(
     start = jnp.zeros(model.num_states, model.dtype) if initial is None else initial.ravel()
     value, image, n, _ = newton.solve(
         sweep_operator(model),
-        soft_maximum,
-        judge,
+        newton.Method(soft_maximum, judge, newton=method == "newton"),
         newton.Backup(gains(model, reward), given.discount, jnp.zeros_like(given.discount), given),
         start,
-        newton=method == "newton",
         max_steps=max_steps,
     )
     solution = solution_of(model, given, value, image, value, n)
@@ -188,9 +190,7 @@ def soft_policy_adjoint(
     (x, r), _ = iterate(
         step,
         finished,
-        predecessors,
-        start,
-        lax.stop_gradient((weight, discount, target)),
+        (predecessors, start, lax.stop_gradient((weight, discount, target))),
         max_steps=max_steps,
         every=_SWEEPS_BETWEEN,
         lanes="mapped" if predecessors is None else "side by side",

@@ -30,7 +30,7 @@ class _Graph(NamedTuple):
     sign: jax.Array  # [S], 1 where the system moves and -1 elsewhere
 
 
-class _Models(NamedTuple):
+class Models(NamedTuple):
     """Data of each lane, lanes on the last axis."""
 
     gain: jax.Array  # [S, A]
@@ -44,13 +44,7 @@ class _Models(NamedTuple):
 def span_iteration(
     game: Game,
     allowed: jax.Array,
-    gain: jax.Array,
-    probability: jax.Array,
-    value: jax.Array,
-    discount: jax.Array,
-    *,
-    enough: jax.Array,
-    active: jax.Array | bool = True,
+    models: Models,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Value iteration of a discounted game from a first guess, with MacQueen bounds.
 
@@ -60,15 +54,9 @@ def span_iteration(
     """
     dtype = game.dtype
     graph = _Graph(game.mdp.successor, allowed, jnp.where(game.system, 1, -1).astype(dtype))
-    models = _Models(
-        gain,
-        probability,
-        value,
-        jnp.asarray(discount, dtype),
-        jnp.asarray(enough, dtype),
-        jnp.asarray(active),
-    )
-    return _iterate(graph, models)
+    discount, enough = (jnp.asarray(x, dtype) for x in (models.discount, models.enough))
+    active = jnp.asarray(models.active)
+    return _iterate(graph, models._replace(discount=discount, enough=enough, active=active))
 
 
 class _Sweeps(NamedTuple):
@@ -80,7 +68,7 @@ class _Sweeps(NamedTuple):
     number: jax.Array
 
 
-def _plain(graph: _Graph, models: _Models) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _plain(graph: _Graph, models: Models) -> tuple[jax.Array, jax.Array, jax.Array]:
     start = _Sweeps(
         models.value,
         _change(graph, models, models.value),
@@ -95,11 +83,11 @@ def _plain(graph: _Graph, models: _Models) -> tuple[jax.Array, jax.Array, jax.Ar
     return found.value, found.error, jnp.stack(_quantities(graph, models, found.value), axis=1)
 
 
-def _unfinished(models: _Models, now: _Sweeps) -> jax.Array:
+def _unfinished(models: Models, now: _Sweeps) -> jax.Array:
     return models.active & (now.error > models.enough) & (now.number < _MOST_SWEEPS)
 
 
-def _swept(graph: _Graph, models: _Models, start: _Sweeps, few: int = 0) -> _Sweeps:
+def _swept(graph: _Graph, models: Models, start: _Sweeps, few: int = 0) -> _Sweeps:
     """Sweeps until at most `few` lanes have not converged."""
     live = _beside(models, graph.allowed.any(-1))
     ahead = models.discount / (1 - models.discount)
@@ -120,7 +108,7 @@ def _swept(graph: _Graph, models: _Models, start: _Sweeps, few: int = 0) -> _Swe
     return lax.while_loop(left, sweep, start)
 
 
-def _last_lanes(graph: _Graph, models: _Models, found: _Sweeps, few: int) -> _Sweeps:
+def _last_lanes(graph: _Graph, models: Models, found: _Sweeps, few: int) -> _Sweeps:
     """Continues with the lanes that have not converged: most models need few sweeps, some many."""
     going = _unfinished(models, found)
     place = jnp.cumsum(going) - 1
@@ -134,12 +122,12 @@ def _last_lanes(graph: _Graph, models: _Models, found: _Sweeps, few: int) -> _Sw
     )
 
 
-def _beside(models: _Models, x: jax.Array) -> jax.Array:
+def _beside(models: Models, x: jax.Array) -> jax.Array:
     """Broadcasts shared data over the lanes."""
     return x.reshape(x.shape + (1,) * models.active.ndim)
 
 
-def _change(graph: _Graph, models: _Models, value: jax.Array) -> jax.Array:
+def _change(graph: _Graph, models: Models, value: jax.Array) -> jax.Array:
     """``T v - v``; zero where there is no move."""
     allowed, sign = _beside(models, graph.allowed), _beside(models, graph.sign)
     best = jnp.full_like(value, -jnp.inf)
@@ -148,7 +136,7 @@ def _change(graph: _Graph, models: _Models, value: jax.Array) -> jax.Array:
     return jnp.where(_beside(models, graph.allowed.any(-1)), sign * best - value, 0)
 
 
-def _quantities(graph: _Graph, models: _Models, value: jax.Array) -> list[jax.Array]:
+def _quantities(graph: _Graph, models: Models, value: jax.Array) -> list[jax.Array]:
     """``gain + discount * P v``, one column per action for contiguous reads."""
     num_actions, width = graph.successor.shape[1:]
 
@@ -174,7 +162,7 @@ _iterate = jax.custom_batching.custom_vmap(_plain)
 
 
 @_iterate.def_vmap
-def _lanes_last(size: int, batched: PyTree, graph: _Graph, models: _Models) -> PyTree:
+def _lanes_last(size: int, batched: PyTree, graph: _Graph, models: Models) -> PyTree:
     shared, own = batched
     if any(shared):
         axes = jax.tree.map(lambda b: 0 if b else None, (shared, own))

@@ -55,13 +55,15 @@ def sweep(
     x: jax.Array,
     *,
     maximize: bool,
-    factor: float = 1.0,
-    shift: float | jax.Array = 0.0,
-    keep: jax.Array | None = None,
-    put: jax.Array | None = None,
+    rounding: tuple[float, float | jax.Array] = (1.0, 0.0),
+    fixed: tuple[jax.Array, jax.Array] | None = None,
     choose: bool = False,
 ) -> tuple[jax.Array, jax.Array | None]:
-    """One pass: ``x = opt_a sum_w weight * x`` from the first block on, in place."""
+    """One pass: ``x = opt_a sum_w weight * x`` from the first block on, in place.
+
+    Images are mapped by the factor and summand of `rounding`, and by those of each place, `fixed`.
+    """
+    factor, shift = rounding
     count, _, _, size = blocks.target.shape
     if not count:
         return x, jnp.zeros((0, size), jnp.int32) if choose else None
@@ -79,9 +81,9 @@ def sweep(
             best = best * factor
         if isinstance(shift, jax.Array) or shift != 0.0:
             best = jnp.maximum(best + shift, 0)
-        if keep is not None and put is not None:
-            best = best * lax.dynamic_slice(keep, (start,), (size,))
-            best = best + lax.dynamic_slice(put, (start,), (size,))
+        if fixed is not None:
+            keep, put = (lax.dynamic_slice(x, (start,), (size,)) for x in fixed)
+            best = best * keep + put
         return lax.dynamic_update_slice(x, best, (start,)), rank if choose else None
 
     numbers = jnp.arange(count, dtype=jnp.int32)

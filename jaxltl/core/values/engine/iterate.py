@@ -26,15 +26,16 @@ _ROW = 16  # the floats of the widest vector unit
 def iterate(
     step: Callable[[Table, Carry, Given], Carry],
     finished: Callable[[Carry, Given], jax.Array],
-    table: Table,
-    carry: Carry,
-    given: Given,
+    start: tuple[Table, Carry, Given],
     *,
     max_steps: jax.Array | int,
     lanes: str = "in turn",
     every: int = 1,
 ) -> tuple[Carry, jax.Array]:
-    """Repeats ``carry = step(table, carry, given)`` until ``finished(carry, given)``, at least once."""
+    """Repeats ``carry = step(table, carry, given)`` until ``finished(carry, given)``, at least once.
+
+    `start` has the table, the first carry and what is given, trees of arrays.
+    """
 
     def loop(table: Table, carry: Carry, given: Given, most: jax.Array) -> tuple[Carry, jax.Array]:
         def one(carry: Carry, n: jax.Array, active: jax.Array) -> tuple[Carry, jax.Array]:
@@ -53,14 +54,14 @@ def iterate(
             return carry, n, active & ~finished(carry, given) & (n < most)
 
         n = jnp.zeros(most.shape, jnp.int32)
-        start = (carry, n, jnp.ones(most.shape, bool))
-        return lax.while_loop(lambda state: jnp.any(state[2]), body, start)[:2]
+        first = (carry, n, jnp.ones(most.shape, bool))
+        return lax.while_loop(lambda state: jnp.any(state[2]), body, first)[:2]
 
     most = jnp.maximum(jnp.asarray(max_steps, jnp.int32), 1)
     if lanes == "mapped":
-        return loop(table, carry, given, most)
+        return loop(*start, most)
     run = side_by_side if lanes == "side by side" else in_turn
-    return run(loop, table, carry, given, most)
+    return run(loop, *start, most)
 
 
 def in_turn(function: Callable[..., Result], *arguments: object) -> Result:

@@ -299,11 +299,11 @@ def solve_linear(
     def flat(table: None, given: tuple[()], x: jax.Array) -> jax.Array:
         return matvec(x.reshape(b.shape)).ravel()
 
-    x, _ = _krylov(flat, None, (), b.ravel(), tolerance, max_steps, lanes="mapped")
+    x, _ = _krylov(flat, None, (), b.ravel(), tolerance, max_steps)
     return x.reshape(b.shape)
 
 
-def _krylov(matvec, table, given, b, tolerance, max_steps, *, lanes: str = "in turn"):
+def _krylov(matvec, table, given, b, tolerance, max_steps):
     """The solution ``[N]`` of ``matvec(table, given, x) = b``, and the steps made."""
     if tolerance is None:
         tolerance = float(jnp.finfo(b.dtype).eps) ** 0.8
@@ -333,11 +333,9 @@ def _krylov(matvec, table, given, b, tolerance, max_steps, *, lanes: str = "in t
     last, n = iterate(
         step,
         lambda k, _: k.phase == _DONE,
-        table,
-        start,
-        (given, goal),
+        (table, start, (given, goal)),
         max_steps=max_steps,
-        lanes=lanes,
+        lanes="mapped" if table is None else "in turn",
     )
     return last.best, n
 

@@ -46,6 +46,15 @@ class Backup(NamedTuple):
     extra: PyTree  # what `combine` and `judge` read besides
 
 
+class Method(NamedTuple):
+    """A search: by steps of Newton's method or by sweeps alone, of a backup that may be monotone."""
+
+    combine: Combine
+    judge: Judge
+    newton: bool = True
+    monotone: bool = True
+
+
 class _Search(NamedTuple):
     """State of the search of a lane: the next argument of P, and its purpose."""
 
@@ -70,13 +79,10 @@ _LOOK, _FIRST, _SECOND, _DIRECT = range(4)
 
 def solve(
     table: SweepOperator,
-    combine: Combine,
-    judge: Judge,
+    method: Method,
     backup: Backup,
     value: jax.Array,
     *,
-    newton: bool = True,
-    monotone: bool = True,
     first_sweeps: int = 0,
     max_steps: jax.Array | int,
 ) -> tuple[jax.Array, ...]:
@@ -87,12 +93,13 @@ def solve(
     # monotone and convex also if its system was solved; if not, ever more sweeps come before the
     # next.
     # Elsewhere an exact step is no better than another.
-    small = monotone and is_small(table, value.shape[0])
+    newton = method.newton
+    small = method.monotone and is_small(table, value.shape[0])
     over = table.choices
 
     def step(table: SweepOperator, k: _Search, given: Backup) -> _Search:
         over, ahead = table.choices, table.expectation(k.z)
-        branches = [partial(_look, over, combine, judge, newton, monotone, given)]
+        branches = [partial(_look, over, method, given)]
         if newton:
             branches += [partial(_first, over, given), partial(_second, over, small, given)]
         if newton and small:
@@ -123,23 +130,21 @@ def solve(
     # Side by side wins where a row of lanes fills a vector unit, which doubles do not.
     lanes = "side by side" if not newton and value.dtype.itemsize <= 4 else "in turn"
     last, n = iterate(
-        step, lambda k, _: k.done, table, start, backup, max_steps=max_steps, lanes=lanes
+        step, lambda k, _: k.done, (table, start, backup), max_steps=max_steps, lanes=lanes
     )
     return last.value, last.image, n, last.weight
 
 
-def _look(
-    over, combine, judge, newton: bool, monotone: bool, given: Backup, k: _Search, ahead: Quantity
-) -> _Search:
+def _look(over: Layout, method: Method, given: Backup, k: _Search, ahead: Quantity) -> _Search:
     """Judges z by its image, and says what follows."""
-    image, weight = combine(over, action_values(over, given, ahead), given.extra)
-    done, error = judge(k.z, image, given.extra)
-    if not newton:
+    image, weight = method.combine(over, action_values(over, given, ahead), given.extra)
+    done, error = method.judge(k.z, image, given.extra)
+    if not method.newton:
         sweep = k.z + (1 - given.damping) * (image - k.z)
         return k._replace(z=sweep, value=k.z, image=image, error=error, done=done)
     weight = over.packed(weight)
     kept = ~k.newton | (error <= k.error / 2)  # false for NaN
-    if monotone:
+    if method.monotone:
         kept |= k.solved & jnp.isfinite(error)
     value, image, weight, error = jax.tree.map(
         partial(jnp.where, kept), (k.z, image, weight, error), (k.value, k.image, k.weight, k.error)

@@ -101,11 +101,10 @@ def solution_from_error(
     num_steps: int,
     *,
     highest: float = math.inf,
-    tolerance: float = TOLERANCE,
-    least: float = 1.0,
-    residual: float = 0.0,
+    enough: ArrayLike | None = None,
 ) -> Solution:
-    """A :class:`Solution` from a value and its error."""
+    """A :class:`Solution` from a value and its error, CONVERGED if that is at most `enough`."""
+    enough = TOLERANCE * np.maximum(np.abs(value), 1) if enough is None else enough
     error = np.broadcast_to(np.asarray(error, np.float64), value.shape)
     out = error > 0
     lower = np.where(out, np.nextafter(value - error, -np.inf), value)
@@ -113,14 +112,14 @@ def solution_from_error(
     if highest == 1:
         lower, upper, value = (np.clip(x, 0, 1) for x in (lower, upper, value))
     finite = bool(np.isfinite(value).all())
-    narrow = bool((error <= tolerance * np.maximum(np.abs(value), least)).all())
+    narrow = bool((error <= enough).all())
     status = Status.CONVERGED if narrow else Status.PRECISION if finite else Status.NONFINITE
     found: dict[str, Array] = {
         "value": value + 0.0,
         "policy": policy,
         "lower": lower,
         "upper": upper,
-        "residual": np.float64(residual),
+        "residual": np.float64(0),
         "num_steps": np.int32(min(num_steps, 2**31 - 1)),
         "status": np.int32(status),
     }

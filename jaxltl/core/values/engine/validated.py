@@ -6,7 +6,7 @@ import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import wraps
-from typing import ParamSpec, TypeVar
+from typing import ParamSpec, TypedDict, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,15 @@ from jaxltl.core.validation import RANGES, choice, is_concrete, require_in_range
 
 P = ParamSpec("P")
 R = TypeVar("R")
+
+
+class SolverOptions(TypedDict, total=False):
+    """Rarely needed options of iterative solvers; the help of each describes those that it takes."""
+
+    adjoint: str
+    evaluation_sweeps: jax.Array | int | None
+    max_steps: jax.Array | int | None
+    start: tuple[jax.Array, jax.Array] | None
 
 
 def validated(**words: tuple[str, ...]) -> Callable[[Callable[P, R]], Callable[P, R]]:
@@ -34,18 +43,23 @@ def validated(**words: tuple[str, ...]) -> Callable[[Callable[P, R]], Callable[P
         @wraps(solve)
         def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
             bound = signature.bind(*args, **kwargs)
+            given = dict(bound.arguments)
+            options = {k: x for k, x in given.pop("options", {}).items() if x is not None}
+            given.update(options)
+            if "options" in bound.arguments:
+                bound.arguments["options"] = options
             for name, known in words.items():
-                if isinstance(bound.arguments.get(name), str):
-                    choice(name, bound.arguments[name], known)
-            given = bound.arguments.items()
+                if isinstance(given.get(name), str):
+                    choice(name, given[name], known)
             traced = traced_arguments(
-                {name: x for name, x in given if x is not None or name not in optional}
+                {name: x for name, x in given.items() if x is not None or name not in optional}
             )
             if not traced:
                 return solve(*bound.args, **bound.kwargs)
             for name, value in traced.items():
                 valid = RANGES[name]
-                bound.arguments[name] = jnp.where(valid.contains(value), value, valid.low)
+                place = options if name in options else bound.arguments
+                place[name] = jnp.where(valid.contains(value), value, valid.low)
             return invalidated(solve(*bound.args, **bound.kwargs), argument_status(traced))
 
         return wrapper

@@ -251,8 +251,7 @@ def _bounded(
         base,
         np.asarray(task.delta),
         letter,
-        start,
-        np.asarray(model.initial_memory)[start],
+        (start, np.asarray(model.initial_memory)[start]),
         still=decisions != Verdict.UNDECIDED,
     )
     ended = np.asarray(table.terminated)[found.base_state]

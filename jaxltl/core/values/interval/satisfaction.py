@@ -67,7 +67,7 @@ def robust_satisfaction(
     numbered, delta = _numbered(model), np.asarray(automaton.delta)
     product, host = _uncertain(
         model,
-        sparse_product(numbered, delta, letter, states, initial, on_entry=False, still=yes | no),
+        sparse_product(numbered, delta, letter, (states, initial), on_entry=False, still=yes | no),
     )
     priority = None
     if not automaton.has_final_states:
@@ -129,7 +129,7 @@ def robust_product_satisfaction(
     state, memory = (x.ravel() for x in np.indices(shape))
     on_entry = model.label_on == "entry"
     product, host = _uncertain(
-        world, sparse_product(_numbered(world), delta, letter, state, memory, on_entry=on_entry)
+        world, sparse_product(_numbered(world), delta, letter, (state, memory), on_entry=on_entry)
     )
     pair: Integers = np.arange(product.memory.size)
     level = None

@@ -255,7 +255,7 @@ def _product(
     for i, x in enumerate(trackers):
         still &= x.decided[known[:, i]]
     memory = np.array([codes[tuple(x)] for x in begin.tolist()])
-    return sparse_product(model.host, delta, letter, first, memory, still=still), known
+    return sparse_product(model.host, delta, letter, (first, memory), still=still), known
 
 
 def _priorities(

@@ -104,16 +104,17 @@ def _above(problem: Problem, low: jax.Array, high: jax.Array, wide: jax.Array) -
     x = low[span]
     more = problem.relative
     x = x * (1 + wide) + SLACK * problem.least if more else jnp.minimum(x + wide, 1)
-    if "keep" in given:
-        x = x * given["keep"][span] + given["put"][span]
+    if "fixed" in given:
+        keep, put = given["fixed"]
+        x = x * keep[span] + put[span]
     return high.at[span].set(x)
 
 
 def _risen(problem: Problem, s: State) -> State:
     """One sweep of the lower bound and of the candidate upper bound."""
     span, unit = problem.span, problem.unit
-    down: Sweep = partial(sweep, factor=1 - unit, shift=-problem.least, **problem.given)
-    up: Sweep = partial(sweep, factor=1 + unit, shift=problem.least, **problem.given)
+    down: Sweep = partial(sweep, rounding=(1 - unit, -problem.least), **problem.given)
+    up: Sweep = partial(sweep, rounding=(1 + unit, problem.least), **problem.given)
     low = down(problem.core, s.low)[0]
     high = lax.cond(s.guessed, lambda x: up(problem.core, x)[0], lambda x: x, s.high)
     new, old = low[span], s.low[span]
@@ -181,9 +182,9 @@ class _Choices(NamedTuple):
 
 
 def _choices(problem: Problem, dtype: jnp.dtype) -> _Choices:
-    if "keep" in problem.given:
+    if "fixed" in problem.given:
         span = problem.span
-        return _Choices(problem, problem.given["keep"][span], problem.given["put"][span])
+        return _Choices(problem, *(x[span] for x in problem.given["fixed"]))
     size = problem.core.last - problem.core.first
     return _Choices(problem, jnp.ones(size, dtype), jnp.zeros(size, dtype))
 
@@ -275,7 +276,7 @@ def _swept(
 ) -> jax.Array:
     """Greedy rows after some sweeps, which propagate improvements."""
     x = outer.at[problem.span].set(value)
-    going: Sweep = partial(sweep, problem.core, shift=shift, **problem.given)
+    going: Sweep = partial(sweep, problem.core, rounding=(1.0, shift), **problem.given)
     return lax.fori_loop(0, _SWEEPS, lambda _, c: going(c[0], choose=True), (x, rank))[1]
 
 

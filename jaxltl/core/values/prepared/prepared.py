@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias, Unpack
 
 import chex
 import jax
@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from numpy.typing import ArrayLike
 from jax import lax
 
+from jaxltl.core import validation
 from jaxltl.core.models.ops.operators import is_deterministic
 from jaxltl.core.models.ops.underflow import is_subnormal
 from jaxltl.core.models.protocols import PyTree
@@ -21,7 +22,7 @@ from jaxltl.core.values.engine.block_sweeps import Blocks, Chosen, Sweep, chosen
 from jaxltl.core.values.engine.implicit_diff import implicit
 from jaxltl.core.values.engine.iterate import in_turn
 from jaxltl.core.values.engine.linear import inverse
-from jaxltl.core.values.engine.validated import validated
+from jaxltl.core.values.engine.validated import SolverOptions, validated
 from jaxltl.core.values.prepared.interval_iteration import SLACK, Problem, State, enclose_cycles
 from jaxltl.core.values.prepared.preparation import Prepared, prepare
 from jaxltl.core.values.prepared.prepared_interval import (
@@ -46,7 +47,7 @@ def solve_prepared(
     reward: chex.Array | None = None,
     policy: chex.Array | None = None,
     tolerance: chex.Array | float | None = None,
-    max_steps: chex.Array | int = 100_000,
+    **options: Unpack[SolverOptions],
 ) -> Solution:
     """Solves a prepared question, with other probabilities, intervals or rewards.
 
@@ -63,7 +64,7 @@ def solve_prepared(
         needs none.
       tolerance: width of the enclosure, for rewards relative to the value; default 1e-6 in double
         precision, 1e-3 in single.
-      max_steps: maximal number of passes.
+      max_steps: maximal number of passes; default 100,000.
 
     Returns:
       :class:`Solution`; `value` ``float[S]``, exact where the graph decides, `policy` ``int32[S]``,
@@ -84,6 +85,7 @@ def solve_prepared(
       >>> round(found.value[0].item(), 3), found.status.item()
       (0.25, 0)
     """
+    (max_steps,) = validation.options("solve_prepared", options, max_steps=100_000)
     if isinstance(prepared, PreparedInterval):
         if probability is not None or policy is not None:
             raise ValueError("a question about intervals takes lower and upper ends and a reward.")
@@ -299,8 +301,7 @@ def _enclosed(
     unit, least = _rounding(prepared)
     given: dict[str, PyTree] = {"maximize": prepared.objective != "min"}
     if decided is not None:
-        given["keep"] = decided.keep[:size].astype(dtype)
-        given["put"] = decided.put[:size].astype(dtype)
+        given["fixed"] = tuple(x[:size].astype(dtype) for x in (decided.keep, decided.put))
     start = jnp.zeros(size + 3, dtype).at[size].set(1)
     if prepared.cyclic:
         return _solve_cyclic(prepared, start, given, tolerance, max_steps)
@@ -325,11 +326,11 @@ def _solve_cyclic(
     unit, least = _rounding(prepared)
     before, core, after = prepared.segments
     size = prepared.size
-    down: Sweep = partial(sweep, factor=1 - unit, shift=-least, **given)
-    up: Sweep = partial(sweep, factor=1 + unit, shift=least, **given)
+    down: Sweep = partial(sweep, rounding=(1 - unit, -least), **given)
+    up: Sweep = partial(sweep, rounding=(1 + unit, least), **given)
     arrays = {k: x for k, x in given.items() if k != "maximize"}
 
-    def enclosed(core: Blocks, arrays: dict[str, jax.Array], *numbers: jax.Array) -> State:
+    def enclosed(core: Blocks, arrays: PyTree, *numbers: jax.Array) -> State:
         options = {"maximize": given["maximize"], **arrays}
         tolerance, low, high, most = numbers
         problem = Problem(core, options, unit, least, tolerance, prepared.question == "reward")
@@ -347,7 +348,7 @@ def _solve_cyclic(
     )
     low, high = down(after, s.low)[0], up(after, s.high)[0]
     rank = None
-    if "keep" not in given:
+    if "fixed" not in given:
         # Greedy in a bound that a pass does not worsen: its policy attains it.
         safe = low if given["maximize"] else jnp.where(s.proven, high, low)
         parts: list[PyTree] = []

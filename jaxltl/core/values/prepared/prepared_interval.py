@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import chex
@@ -153,19 +154,20 @@ def prepare_interval(
     else:
         mine = cost if policy is None else cost[np.asarray(policy)]
         plan = plan_total_reward(host, mine, target, Query(up, large))
-    return _prepared(model, host, entry, plan, cost, policy, (objective, direction))
+    origin = np.arange(host.mdp.num_rows) if policy is None else np.asarray(policy)
+    found = _prepared(model, cost, host, plan, entry, origin)
+    return replace(found, objective=objective, nature_objective=direction)
 
 
 def _prepared(
     model: IntervalMDP,
-    host: UncertainMDP,
-    entry: np.ndarray,
-    plan: IntervalPlan,
     cost: Array,
-    policy: Array,
-    directions: tuple[str, str],
+    host: UncertainMDP,
+    plan: IntervalPlan,
+    entry: np.ndarray,
+    origin: np.ndarray,
 ) -> PreparedInterval:
-    """The arrays."""
+    """The arrays; `entry` and `origin` are the entries and rows of the model that `host` has."""
     mdp, whole = host.mdp, model.nominal.host
     dtype = jnp.zeros(()).dtype
     open_ = np.isnan(plan.known)
@@ -189,10 +191,8 @@ def _prepared(
     choice = start[:, None] + rank
     number = np.full(mdp.num_rows, -1)
     number[rows] = np.arange(rows.size)
-    origin = np.arange(mdp.num_rows) if policy is None else np.asarray(policy)
     inside = np.ones(whole.num_transitions, bool)
     inside[entry] = plan.within
-    objective, direction = directions
     answers = plan.queries
     found = PreparedInterval(
         table=table,
@@ -215,8 +215,8 @@ def _prepared(
         upper=np.asarray(model.upper, dtype),
         reward=None if cost is None else cost.astype(dtype),
         question="probability" if cost is None else "reward",
-        objective=objective,
-        nature_objective=direction,
+        objective="max",
+        nature_objective="max",
         num_rows=whole.num_rows,
         has_free_cycles=plan.has_free_cycles,
     )

@@ -83,10 +83,13 @@ def question_on_mesh(model: ShardedMDP, prop: Property) -> Question:
     if path.operator == "F" and is_boolean(path.operands[0]):
         holds = satisfying(np.asarray(model.shown), model.propositions, path.operands[0], prop.text)
         target = jax.jit(lambda kind: kernels.gather(jnp.asarray(holds), kind))(model.kind)
-        if prop.operator == "P":
-            advance = partial(_reach, model, target, objective)
-        else:
-            advance = partial(_earn, model, _reward(model, prop), target, objective)
+        reward = None if prop.operator == "P" else _reward(model, prop)
+
+        def advance(start: Bounds, half: float, steps: int) -> Solution:
+            if reward is None:
+                return _reach_for(model, target, start, half, np.int32(steps), objective)
+            return _earn_until(model, reward, target, 2 * half, objective)
+
         return Question(
             prop,
             states,
@@ -191,29 +194,11 @@ def _reach_for(
     )
 
 
-def _reach(
-    model: ShardedMDP, target: jax.Array, objective: str, start: Bounds, half: float, steps: int
-) -> Solution:
-    return _reach_for(model, target, start, half, np.int32(steps), objective)
-
-
 @partial(jax.jit, static_argnames="objective")
 def _earn_until(
     model: ShardedMDP, reward: jax.Array, target: jax.Array, share: jax.Array, objective: str
 ) -> Solution:
     return total_reward(model, reward, target, objective=objective, tolerance=share)
-
-
-def _earn(
-    model: ShardedMDP,
-    reward: jax.Array,
-    target: jax.Array,
-    objective: str,
-    start: Bounds,
-    half: float,
-    steps: int,
-) -> Solution:
-    return _earn_until(model, reward, target, 2 * half, objective)
 
 
 def _satisfy(both: Product, objective: str, start: Bounds, half: float, steps: int) -> Solution:

@@ -142,7 +142,7 @@ def optimal_reachability(
     if components is not None and not components.inside.any():
         components = None
     arguments = to_jax((sets, components))
-    return _optimize(model, *arguments, tolerance, max_steps, start, objective=objective)
+    return _optimize(model, *arguments, (tolerance, max_steps, start), objective=objective)
 
 
 @partial(jax.jit, static_argnames=("objective",))
@@ -150,7 +150,7 @@ def _inside_jit(
     model: ActionModel, target: jax.Array, *options: PyTree, objective: str
 ) -> Solution:
     sets, components = in_turn(partial(_qualitative, objective=objective), model, target)
-    return _optimize(model, sets, components, *options, objective=objective)
+    return _optimize(model, sets, components, options, objective=objective)
 
 
 def _qualitative(
@@ -283,7 +283,8 @@ def _ended(finest: bool, carry: _Bounds, search: _Search) -> jax.Array:
 
 
 @partial(jax.jit, static_argnames=("objective",))
-def _optimize(model, sets: Sets, components, tolerance, max_steps, start, *, objective) -> Solution:
+def _optimize(model, sets: Sets, components, options: tuple, *, objective: str) -> Solution:
+    tolerance, max_steps, start = options
     undecided = ~(sets.one | sets.zero)
     one = sets.one.astype(model.dtype)
     small = is_small(sweep_operator(model), one.size) and max_steps is None and start is None
@@ -294,7 +295,7 @@ def _optimize(model, sets: Sets, components, tolerance, max_steps, start, *, obj
         asked = 2 * _half_width(model, tolerance)
         solution, row_of = in_turn(run, model, sets, components, asked)
     else:
-        options, row_of = (tolerance, max_steps, start), None
+        row_of = None
         solution = _by_intervals(model, sets, components, options, objective=objective)
     code = status_code(True, True, valid=is_representable(model))
     solution = replace(solution, status=jnp.maximum(solution.status, code))
@@ -349,9 +350,7 @@ def _by_intervals(model, sets: Sets, components, options: tuple, *, objective: s
     bounds, n = iterate(
         partial(_tighter, sign, finest),
         partial(_ended, finest),
-        None,
-        _Bounds(near, far, no, ~no, no),
-        search,
+        (None, _Bounds(near, far, no, ~no, no), search),
         max_steps=_SWEEPS if max_steps is None else max_steps,
     )
     near, far = bounds.near, bounds.far

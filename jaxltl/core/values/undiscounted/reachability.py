@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple, cast
+from typing import NamedTuple, Unpack, cast
 
 import jax
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.graphs.graph import is_table
+from jaxltl.core import validation
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP
@@ -37,7 +38,7 @@ from jaxltl.core.values.engine.host_solution import (
     is_sparse,
     solution_from_enclosure,
 )
-from jaxltl.core.values.engine.validated import validated
+from jaxltl.core.values.engine.validated import SolverOptions, validated
 from jaxltl.core.values.interval.robust import refuse_nature, robust_reachability
 from jaxltl.core.values.undiscounted import optimum
 
@@ -57,8 +58,7 @@ def reachability_probability(
     nature: str | None = None,
     method: str = "auto",
     tolerance: jax.Array | float | None = None,
-    max_steps: jax.Array | int | None = None,
-    start: tuple[jax.Array, jax.Array] | None = None,
+    **options: Unpack[SolverOptions],
 ) -> Solution:
     """Probability of reaching a set of target states.
 
@@ -103,6 +103,9 @@ def reachability_probability(
       >>> round(reachability_probability(mdp, np.array([False, True, False])).value[0].item(), 3)
       0.5
     """
+    max_steps, start = validation.options(
+        "reachability_probability", options, max_steps=None, start=None
+    )
     if method not in ("auto", "direct", "iterative"):
         raise ValueError(f"method={method!r}; choose auto, direct or iterative.")
     reduction_for(objective)

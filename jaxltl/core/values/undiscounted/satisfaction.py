@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple, overload
+from typing import NamedTuple, Unpack, overload
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ from jax import lax
 
 from jaxltl.core.values.engine.state_quantities import reduction_for
 from jaxltl.core import validation
-from jaxltl.core.values.engine.validated import validated
+from jaxltl.core.values.engine.validated import SolverOptions, validated
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.graphs.acceptance import (
     Accepting,
@@ -126,8 +126,7 @@ def optimal_satisfaction(
     objective: str = "max",
     nature: str | None = None,
     tolerance: jax.Array | float | None = None,
-    max_steps: jax.Array | int | None = None,
-    start: tuple[jax.Array, jax.Array] | None = None,
+    **options: Unpack[SolverOptions],
 ) -> Solution: ...
 
 
@@ -154,8 +153,7 @@ def optimal_satisfaction(
     states: ArrayLike | None = None,
     label_on: str | None = None,
     tolerance: jax.Array | float | None = None,
-    max_steps: jax.Array | int | None = None,
-    start: tuple[jax.Array, jax.Array] | None = None,
+    **options: Unpack[SolverOptions],
 ) -> Solution | Satisfaction:
     """Maximal or minimal satisfaction probability of a product, or of a model and a task.
 
@@ -201,6 +199,9 @@ def optimal_satisfaction(
       >>> best.value[0, 0].item(), best.policy[0, 0].item()
       (0.75, 1)
     """
+    max_steps, start = validation.options(
+        "optimal_satisfaction", options, max_steps=None, start=None
+    )
     if task is not None:
         refuse_iteration(max_steps, start)
         if isinstance(model, IntervalMDP | Game):

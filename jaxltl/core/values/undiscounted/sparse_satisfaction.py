@@ -194,7 +194,9 @@ def product_satisfaction(
     letter, shape = np.asarray(model.letter), model.state_shape
     on_entry = model.label_on == "entry"
     state, memory = (x.ravel() for x in np.indices(shape))
-    product = sparse_product(world.host, automaton.delta, letter, state, memory, on_entry=on_entry)
+    product = sparse_product(
+        world.host, automaton.delta, letter, (state, memory), on_entry=on_entry
+    )
     depth = 0
     if policy is not None:
         chain = _chain(product, model, policy)
@@ -237,7 +239,7 @@ def _product(model: SparseMDP, reader: _Reader, states: np.ndarray) -> SparsePro
     initial = np.broadcast_to(automaton.initial, states.shape)
     memory = automaton.delta[initial, letter[states]] if on_entry else initial
     return sparse_product(
-        model.host, automaton.delta, letter, states, memory, on_entry=on_entry, still=still
+        model.host, automaton.delta, letter, (states, memory), on_entry=on_entry, still=still
     )
 
 

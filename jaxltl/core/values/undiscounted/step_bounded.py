@@ -168,7 +168,7 @@ def cumulative_reward(
     refuse_nature(nature)
     model, operation = _problem(model, objective, num_steps)
     rewards = *finite_reward(model, reward), np.zeros(model.num_states)
-    found = host.total(model.host, *rewards, num_steps, operation, by_step)
+    found = host.total(model.host, rewards, num_steps, operation, by_step)
     return solution_from_error(found.value, found.error, found.row, found.num_steps)
 
 
@@ -213,7 +213,7 @@ def instantaneous_reward(
     model, operation = _problem(model, objective, num_step)
     zero = np.zeros(model.num_rows)
     rewards = zero, zero, state_reward(model, reward)
-    found = host.total(model.host, *rewards, num_step, operation, by_step)
+    found = host.total(model.host, rewards, num_step, operation, by_step)
     return solution_from_error(found.value, found.error, found.row, found.num_steps)
 
 

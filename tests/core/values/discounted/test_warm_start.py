@@ -1,7 +1,5 @@
 """Warm-started values of many models of one game, against the solver of one."""
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +9,7 @@ from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import make_mdp
 from jaxltl.core.models.ops.operators import expectation
 from jaxltl.core.values.discounted.minimax import minimax_value
-from jaxltl.core.values.discounted.warm_start import span_iteration
+from jaxltl.core.values.discounted.warm_start import Models, span_iteration
 
 SHAPE = (9, 3, 2)
 
@@ -42,7 +40,7 @@ def test_the_error_holds_what_it_says(shape, enough):
     game, allowed, probability, gain, guess = models(0, 4, shape)
     for i in range(4):
         value, error, quantity = span_iteration(
-            game, allowed, gain[i], probability[i], guess[i], 0.8, enough=enough
+            game, allowed, Models(gain[i], probability[i], guess[i], 0.8, enough, True)
         )
         expected = exact(game, allowed, probability[i], gain[i], 0.8)
         assert error <= enough
@@ -61,7 +59,7 @@ def test_lanes_are_as_if_alone_however_they_are_nested():
     active = jnp.array([True, True, False, True, True, True])
 
     def solve(game, allowed, p, g, v, d, e, a):
-        return span_iteration(game, allowed, g, p, v, d, enough=e, active=a)
+        return span_iteration(game, allowed, Models(g, p, v, d, e, a))
 
     alone = [
         solve(game, allowed, *x)
@@ -89,7 +87,7 @@ def test_the_last_of_many_lanes_end_as_they_do_among_few():
     enough = jnp.full(64, 1e-9)
 
     def solve(p, g, v, e, a):
-        return span_iteration(game, allowed, g, p, v, 0.8, enough=e, active=a)
+        return span_iteration(game, allowed, Models(g, p, v, 0.8, e, a))
 
     few = jax.jit(jax.vmap(solve))
 
@@ -111,8 +109,8 @@ def test_the_last_of_many_lanes_end_as_they_do_among_few():
 
 def test_a_good_guess_and_a_constant_beside_it_end_at_once():
     game, allowed, probability, gain, _ = models(2, 1)
-    solve = partial(span_iteration, game, allowed, gain[0], probability[0], discount=0.9)
-    value, _, _ = solve(value=jnp.zeros(9), enough=1e-12)
-    moved, error, _ = solve(value=value + 5, enough=1e-9)
+    lane = Models(gain[0], probability[0], jnp.zeros(9), 0.9, 1e-12, True)
+    value, _, _ = span_iteration(game, allowed, lane)
+    moved, error, _ = span_iteration(game, allowed, lane._replace(value=value + 5, enough=1e-9))
     assert error <= 1e-9
     np.testing.assert_allclose(moved[:-1], value[:-1], atol=1e-9)

@@ -21,7 +21,7 @@ def settled(carry, given):
 
 def solve(carry, given, most):
     return iterate(
-        halve, settled, GRAPH, carry, given, max_steps=most, lanes="side by side", every=2
+        halve, settled, (GRAPH, carry, given), max_steps=most, lanes="side by side", every=2
     )
 
 
