@@ -235,6 +235,8 @@ def lacking_in_function(function, text, short):
     for name, parameter in parameters.items():
         if name in ("self", "cls") or name.startswith("_"):
             continue
+        if str(parameter.annotation).startswith("Unpack["):  # Args has its keys
+            continue
         if name not in told and not (short and re.search(rf"\b{name}\b", text)):
             lacks.append(f"Args: {name}")
         if parameter.annotation is inspect.Parameter.empty:

@@ -400,7 +400,7 @@ class Staged:
     seconds: np.ndarray
 
 
-class Stages(TypedDict, total=False):
+class _Stages(TypedDict, total=False):
     """Options of :func:`train_in_stages`, described there."""
 
     num_steps: int
@@ -416,7 +416,7 @@ def train_in_stages(
     init: Callable[..., PyTree],
     run: Callable[..., PyTree],
     num_chunks: int,
-    **options: Unpack[Stages],
+    **options: Unpack[_Stages],
 ) -> Staged:
     """A curriculum: a learner on one problem after the other, each once the previous is mastered.
 
@@ -435,7 +435,7 @@ def train_in_stages(
     Raises:
       ValueError: no problem, or a number of thresholds that does not fit.
     """
-    validation.keywords("train_in_stages", options, Stages)
+    validation.keywords("train_in_stages", options, _Stages)
     num_steps, report = options.get("num_steps", 10), options.get("report")
     problems = validation.sequence("problems", problems)
     for name, function in (("init", init), ("run", run), ("report", report)):

@@ -69,7 +69,7 @@ class Discs:
     extent: chex.Array
 
 
-class Starts(TypedDict, total=False):
+class _Starts(TypedDict, total=False):
     """Initial positions of :func:`flat_world`, described there."""
 
     start: Sequence[float] | None
@@ -84,7 +84,7 @@ def flat_world(
     time_step: float = 0.08,
     horizon: int | None = 500,
     discrete: bool = False,
-    **starts: Unpack[Starts],
+    **starts: Unpack[_Starts],
 ) -> Environment:
     """FlatWorld as an environment.
 

@@ -80,7 +80,7 @@ class Optimum(NamedTuple):
     residual: float
 
 
-class Limits(TypedDict, total=False):
+class _Limits(TypedDict, total=False):
     """Bounds of controls and the unit of the objective of :func:`lqr`, described there."""
 
     low: ArrayLike
@@ -96,7 +96,7 @@ def lqr(
     control_cost: ArrayLike = ((0.3,),),
     start: ArrayLike = (1, -1),
     horizon: int = 20,
-    **limits: Unpack[Limits],
+    **limits: Unpack[_Limits],
 ) -> LQR:
     """A regulator problem, equation (4.17); the defaults are the dissertation's.
 

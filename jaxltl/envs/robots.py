@@ -71,7 +71,7 @@ def robots(size: int) -> Game:
     )
 
 
-class Reading(TypedDict, total=False):
+class _Reading(TypedDict, total=False):
     """How :func:`grid_game` reads its map, described there."""
 
     legend: Mapping[str, Collection[str]] | None
@@ -86,7 +86,7 @@ def grid_game(
     slip: float = 0.0,
     system_stays: bool = True,
     environment_stays: bool = False,
-    **reading: Unpack[Reading],
+    **reading: Unpack[_Reading],
 ) -> Game:
     """The game of two robots on a text map, in turns.
 

@@ -65,7 +65,7 @@ class _Numbers:
     gain: np.float32
 
 
-class Placements(TypedDict, total=False):
+class _Placements(TypedDict, total=False):
     """The table of placements of :func:`zone_world`, described there."""
 
     num_maps: int
@@ -80,7 +80,7 @@ def zone_world(
     extent: float = 2.5,
     horizon: int | None = 1000,
     saturation: float = 0.05,
-    **placements: Unpack[Placements],
+    **placements: Unpack[_Placements],
 ) -> Environment:
     """ZoneEnv as an environment.
 

@@ -21,7 +21,7 @@ from jaxltl.plot.style import ACCENT, FAINT, GOOD, INK, MUTED, PAPER
 _RUN, _GAP, _REST = "#c2571a", 24.0, 2.0
 
 
-class Playing(TypedDict, total=False):
+class _Playing(TypedDict, total=False):
     """Rarely needed options of :func:`playback`, described there."""
 
     wait: float
@@ -36,7 +36,7 @@ def playback(
     automaton: Automaton | None = None,
     memory: ArrayLike | None = None,
     label: str = "",
-    **playing: Unpack[Playing],
+    **playing: Unpack[_Playing],
 ) -> str:
     """An animated SVG of a trajectory on a map, next to the state of the task's automaton.
 

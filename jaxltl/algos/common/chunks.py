@@ -103,9 +103,9 @@ def run_in_chunks(
 ) -> Chunks:
     """The :class:`Chunks` of steps in compiled chunks, with a report and a checkpoint after each.
 
-    Steps of the learner's `step` with its `problem` are made until `num_steps`; a state with
-    ``state.step`` steps makes the rest. A run in which the condition of the :class:`Options` holds
-    stays unchanged, so that lanes are independent; the loop ends when all have finished.
+    Steps of the learner's `step` with its `problem` and `hparams` are made until `num_steps`; a state
+    with ``state.step`` steps makes the rest. A run in which the condition of `options` holds stays
+    unchanged, so that lanes are independent; the loop ends when all have finished.
 
     Raises:
       ValueError: a hyperparameter is out of range, or the checkpoint belongs to another learner,
