@@ -94,8 +94,10 @@ def solve(model: Any, queries: Any) -> dict[str, tuple[float, float, float, str]
         begin = time.process_time()
         answer = solve_property(model, query.parsed, tolerance=WIDTH)
         lower, upper = float(answer.lower[0]), float(answer.upper[0])
-        if answer.holds is None and math.isfinite(upper) and upper - lower > WIDTH * lower > 0:
-            finer = max(WIDTH * max(abs(lower), abs(upper) / 4) / 2, 1e-15)
+        for digits in (1.1e-10, 1e-15) if answer.holds is None else ():
+            if not (math.isfinite(upper) and upper - lower > WIDTH * lower > 0):
+                break  # bounds of probabilities are absolute; below 1e-10 they are rational
+            finer = max(WIDTH * lower / 2, digits)
             answer = solve_property(model, query.parsed, tolerance=finer)
             lower, upper = float(answer.lower[0]), float(answer.upper[0])
         if answer.holds is not None:

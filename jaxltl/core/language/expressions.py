@@ -35,11 +35,11 @@ class Expression:
     """A node of a syntax tree.
 
     Attributes:
-      operator: ``"literal"``, ``"name"``, ``"label"``, an operator (``! neg & | => <=> = != < <= >
-        >= + - * / ?:``), or a function (``min max floor ceil round pow mod log``). ``& | +`` and
+      operator: ``"literal"``, ``"name"``, an operator (``! neg & | => <=> = != < <= > >= + - * /
+        ?:``), or a function (``min max floor ceil round pow mod log``). ``& | +`` and
         ``* min max`` take two operands or more.
       operands: the operands, from left to right.
-      value: of a literal its value, of a name or a label the name.
+      value: of a literal its value, of a name the name; those of labels have quotes.
       place: offset in the source text, for errors; trees are compared without it.
       depth, size: of the tree, where shared nodes count as often as they occur.
 
@@ -77,8 +77,8 @@ class Expression:
     def __str__(self) -> str:
         if self.operator == "literal":
             return str(self.value).lower() if isinstance(self.value, bool) else str(self.value)
-        if self.operator in ("name", "label"):
-            return str(self.value) if self.operator == "name" else f'"{self.value}"'
+        if self.operator == "name":
+            return str(self.value)
         parts = [str(x) for x in self.operands]
         if self.operator in FUNCTIONS:
             return f"{self.operator}({', '.join(parts)})"
@@ -133,12 +133,11 @@ def _node_type(e: Expression, parts: list[Type], types: Mapping[str, Type]) -> T
     operator = e.operator
     if operator == "literal":
         return value_type(e.value)
-    if operator == "label":
-        return "bool"
     if operator == "name":
         if str(e.value) not in types:
             raise LanguageError(
-                e.place, f"{e.value} is not declared; it is no constant, variable or formula."
+                e.place,
+                f"{e.value} is not declared; it is no constant, variable, formula or label.",
             )
         return types[str(e.value)]
     if operator in ("!", "&", "|", "=>", "<=>"):
@@ -184,15 +183,13 @@ def substitute(
     expression: Expression,
     names: Mapping[str, Expression],
     memory: dict[int, Expression] | None = None,
-    labels: Mapping[str, Expression] | None = None,
 ) -> Expression:
-    """Replaces names, and labels, by expressions, and folds operators of literals.
+    """Replaces names by expressions, and folds operators of literals.
 
     Args:
       expression: the tree.
       names: the expression of each replaced name; others stay.
       memory: results by node, shared between calls with the same names and trees that stay alive.
-      labels: the expression of each replaced label.
 
     Raises:
       LanguageError: an operation on literals that is undefined or too large.
@@ -207,12 +204,10 @@ def substitute(
         return found
     if expression.operator == "name":
         found = names.get(str(expression.value), expression)
-    elif expression.operator == "label" and labels is not None:
-        found = labels.get(str(expression.value), expression)
     elif not expression.operands:
         found = expression
     else:
-        parts = tuple([substitute(x, names, memory, labels) for x in expression.operands])
+        parts = tuple([substitute(x, names, memory) for x in expression.operands])
         found = _simplified(expression, parts)
     memory[id(expression)] = found
     return found

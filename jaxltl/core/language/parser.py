@@ -63,6 +63,7 @@ _LEVELS: dict[str, int] = {
     "-": 8,
     "*": 9,
     "/": 9,
+    "%": 9,
     "^": 10,
 }
 _NOT = 5
@@ -105,7 +106,7 @@ class ExpressionParser(TokenReader):
                 operands = (*left.operands, right)
                 left = self._chain(operator, operands, left.place)
             else:
-                name = "pow" if operator == "^" else operator
+                name = {"^": "pow", "%": "mod"}.get(operator, operator)
                 left = Expression(name, (left, right), place=left.place)
 
     def _chain(self, operator: str, operands: tuple[Expression, ...], place: int) -> Expression:
@@ -145,7 +146,7 @@ class ExpressionParser(TokenReader):
         if kind == "word":
             return self._word(text, place)
         if kind == "quoted":
-            return Expression("label", value=self.quoted("a label"), place=place)
+            return Expression("name", value=f'"{self.quoted("a label")}"', place=place)
         if not self.accept("("):
             self.fail("an expression, such as a variable or a number")
         found = self.expression()

@@ -153,7 +153,8 @@ class _Resolver:
         self.check_names(modules)
         constants, derived = self.constant_values(expand)
         known = derived | {name: literal(value) for name, value in constants.items()}
-        fold = _substitution(known)
+        labels = self.labels(expand, known)
+        fold = _substitution(known | labels)
         both: Change = lambda e: fold(expand(e))  # noqa: E731
         modules = [_Changed(fold).module(m) for m in modules]
         owned: list[tuple[Declaration, int | None]] = []
@@ -172,7 +173,7 @@ class _Resolver:
             {name: fold(e) for name, e in formulas.items()},
             variables,
             tuple(replace(m, declarations=()) for m in modules),
-            self.labels(both),
+            {name.strip('"'): e for name, e in labels.items()},
             tuple(_Changed(both).rewards(r) for r in syntax.rewards),
             None if syntax.initial is None else both(syntax.initial),
             syntax.players,
@@ -198,19 +199,20 @@ class _Resolver:
     def renamed(
         self, modules: tuple[Module | RenamedModule, ...], formulas: Mapping[str, Expression]
     ) -> list[Module]:
+        plain = [m for m in modules if isinstance(m, Module)]
+        copies = [m for m in modules if isinstance(m, RenamedModule)]
         found: dict[str, Module] = {}
-        for m in modules:
+        for m in (*plain, *copies):
             if m.name in found:
                 raise LanguageError(m.place, f"there are two modules {m.name}.")
             if isinstance(m, RenamedModule):
                 if m.base not in found:
                     raise LanguageError(
-                        m.place,
-                        f"there is no module {m.base} before {m.name} that could be copied.",
+                        m.place, f"there is no module {m.base} of which {m.name} could be a copy."
                     )
                 m = _renamed(found[m.base], m, formulas)
             found[m.name] = m
-        return list(found.values())
+        return [found[m.name] for m in modules]
 
     def check_names(self, modules: Sequence[Module]) -> None:
         """Raises LanguageError if two constants, formulas or variables have one name."""
@@ -225,6 +227,10 @@ class _Resolver:
             if name in seen:
                 raise LanguageError(place, f"the name {name} is declared twice.")
             seen.add(name)
+        names = [r.name for r in self.syntax.rewards]
+        for r, name in zip(self.syntax.rewards, names, strict=True):
+            if names.count(name) > 1:
+                raise LanguageError(r.place, f'there are two reward structures "{name}".')
         unknown = sorted(set(self.given) - {c.name for c in self.syntax.constants})
         if unknown:
             listed = ", ".join(c.name for c in self.syntax.constants) or "none"
@@ -259,6 +265,10 @@ class _Resolver:
         return found, derived
 
     def variable(self, d: Declaration, module: int | None) -> Variable:
+        if d.initial is not None and self.syntax.initial is not None:
+            raise LanguageError(
+                d.place, f"{d.name} has an initial value, and there is an init block; remove one."
+            )
         if d.low is None or d.high is None:
             value = self.number(d.initial, d, "bool") if d.initial is not None else False
             return Variable(d.name, "bool", 0, 1, int(value), module, d.place)
@@ -285,13 +295,17 @@ class _Resolver:
             raise LanguageError(d.place, f"{e} is given for {d.name}; expected {kind}.")
         return e.value
 
-    def labels(self, change: Change) -> dict[str, Expression]:
-        found: dict[str, Expression] = {}
+    def labels(self, expand: Change, known: Mapping[str, Expression]) -> dict[str, Expression]:
+        """The expression of each label by its name in quotes; labels may use others."""
+        table: dict[str, Expression] = {}
         for name, e in self.syntax.labels:
-            if name in found:
+            if f'"{name}"' in table:
                 raise LanguageError(e.place, f'the label "{name}" is defined twice.')
-            found[name] = substitute(change(e), {}, labels=found)
-        return found
+            table[f'"{name}"'] = expand(e)
+        done = dict(known)
+        for name in _in_order({n: (names_in(e), e.place) for n, e in table.items()}, "label"):
+            done[name] = substitute(table[name], done)
+        return {name: done[name] for name in table}
 
 
 def _no_value(name: str) -> str:

@@ -92,8 +92,9 @@ def parse_properties(text: str, definitions: Definitions | None = None) -> tuple
     `[ C ]`, `[ C<=10 ]`, `[ I=5 ]`, `[ S ]` or `[ LRA ]`. Expected steps: `Tmin=? [ F "goal" ]`.
     Time in the long run: `LRAmax=? [ "up" ]`. Several at once: `multi(P, P, ...)`.
     State formulas may also compare variables, `x + 1 < 2 * y`, and nest properties with thresholds,
-    `P>=0.9 [ F P>0.5 [ X "a" ] ]`. `filter(min, P=? [ F "a" ], x = 0)` is over the states of a
-    formula, by default all: one of `min max avg sum count range first forall exists print`.
+    `P>=0.9 [ F P>0.5 [ X "a" ] ]`. A state formula is a property too. `filter(min, P=? [ F "a" ],
+    x = 0)` is over the states of a formula, by default all: one of `min max avg sum count range
+    first forall exists print`.
     Where probabilities are intervals, the direction of the policy comes first and that of nature
     does second: `Pmaxmin=?`, `R{"time"}minmax=?`.
 
@@ -182,14 +183,37 @@ class _Parser(ExpressionStream):
             if self.token.text in ("const", "label", "formula") and self.token.kind == "word":
                 self.declaration()
                 continue
-            name = None
+            name, before = None, self.place
             if self.token.kind == "quoted":
                 name = self.quoted()
-                self.expect(":", " between a name and its property")
-            found.append(self.property_(name))
+                if not self.accept(":"):  # it is a label
+                    name, self.place = None, before
+            found.append(self.outermost(name))
         if not found:
             raise self.error('a property, such as Pmax=? [ F "goal" ]')
         return tuple(found)
+
+    def outermost(self, name: str | None) -> Property:
+        """A property, or a state formula, which must hold in each initial state."""
+        start, before = self.token, self.place
+        begins_formula = start.kind == "quoted" or start.text in ("true", "false", "!", "(")
+        if not begins_formula and start.text not in self.known.known | self.names.keys():
+            found = self.property_(name)
+            if found.relation is None or self.token.text not in ("&", "|", "=>", "<=>"):
+                return found
+            self.place = before
+        return self.state_property(name)
+
+    def state_property(self, name: str | None = None) -> Property:
+        """A state formula as a property: with probability one, which is 0 or 1."""
+        start, self.definitions = self.token, {}
+        path = self.state_content()
+        text = self.text[start.start : self.last.end]
+        defined, self.definitions = tuple(self.definitions.items()), {}
+        sure = Fraction(1)
+        return Property(
+            text, "P", relation=">=", threshold=sure, path=path, name=name, definitions=defined
+        )
 
     def property_(self, name: str | None = None) -> Property:
         start, outer = self.token, self.definitions
@@ -257,8 +281,7 @@ class _Parser(ExpressionStream):
             asked = self.property_()
         if asked is None or self.token.text not in (",", ")"):  # it begins a state formula
             self.place = before
-            path = self.state_content()
-            asked = Property("", "P", relation=">=", threshold=Fraction(1), path=path)
+            asked = self.state_property()
         if FILTERS[kind] not in (None, asked.relation is not None):
             wanted = "a threshold or a state formula" if FILTERS[kind] else "a number, =?"
             raise self.error(f"{wanted} in a filter of this kind", first)

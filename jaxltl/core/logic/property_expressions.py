@@ -54,8 +54,8 @@ class ExpressionStream(TokenStream):
         try:
             parser = ExpressionParser(self.text, self.token.start)
             found = parser.expression(level)
-            meanings = {name: label.expression for name, label in self.labels.items()}
-            found = substitute(found, self.names, labels=meanings)
+            meanings = {f'"{name}"': label.expression for name, label in self.labels.items()}
+            found = substitute(found, {**self.names, **meanings})
         except LanguageError as error:
             place = bisect.bisect_left(self.starts, error.place)
             token = self.tokens[min(place, len(self.tokens) - 1)]

@@ -99,10 +99,12 @@ def build_model(
     """
     if program.parameters:
         name = program.parameters[0]
-        raise ValueError(
-            f"{program.source.name!r}: the constant {name} has no value; give constants="
-            f"{{{name!r}: ...}} (--const {name}=...), or read it as a parameter with jl.io.read_parametric."
+        place = program.source.text.find(name)
+        text = (
+            f"the constant {name} has no value; give constants={{{name!r}: ...}} (--const {name}=...), "
+            "or read it as a parameter with jl.io.read_parametric."
         )
+        raise program.source.located(LanguageError(place, text))
     rows = build_rows(program, max_states=max_states, progress=progress)
     rewards = {
         name: Rewards(state=state, choice=choice) for name, (state, choice) in rows.rewards.items()

@@ -169,7 +169,7 @@ class ModuleCode:
             (np.asarray(low) <= 1 + ROW_SUM_TOLERANCE) & (np.asarray(high) >= 1 - ROW_SUM_TOLERANCE)
         )
         for lower, upper in ends:
-            bad |= ~((lower >= 0) & (lower <= upper) & np.isfinite(upper))
+            bad |= ~((lower >= 0) & (lower <= upper) & (upper <= 1 + ROW_SUM_TOLERANCE))
         if bad.any():
             i = int(np.argmax(bad))
             shown = " + ".join(

@@ -177,7 +177,7 @@ M = "module m x : [0..1]; [] true -> true; endmodule"
         ("mdp module m x : [0..1]; [] x=0 > (x'=1); endmodule", (1, 37), "expected"),
         ("mdp module m x : [0..1]; [] x=@ -> true; endmodule", (1, 31), "'@'"),
         ("mdp " + M + " module n = m [] endmodule", (1, 67), "a name to be replaced"),
-        ("mdp " + M + " module n = k [x=y] endmodule", (1, 60), "no module k"),
+        ("mdp " + M + " module n = k [x=y] endmodule", (1, 60), "there is no module k"),
         ("mdp " + M + " module n = m [z=y] endmodule", (1, 60), "does not rename x"),
         ('mdp label "init" = true; ' + M, (1, 11), "built in"),
         ("mdp mdp " + M, (1, 5), "given twice"),
