@@ -51,7 +51,9 @@ def mutated(rng):
         elif kind == 4:
             words = re.findall(r"\w+|[^\w\s]", text)
             old, new = rng.choice(words), rng.choice(words)
-            text = re.sub(r"(?<!\w)" + re.escape(old) + r"(?!\w)", lambda _: new, text, count=1)
+            text = re.sub(
+                r"(?<!\w)" + re.escape(old) + r"(?!\w)", lambda _, new=new: new, text, count=1
+            )
         else:
             text = re.sub(r"\d+", lambda m: rng.choice((m[0], "7", "100000")), text)
     return text
@@ -69,7 +71,7 @@ def outcome(text):
 
 
 @pytest.mark.parametrize(
-    "seeds", [range(400), pytest.param(range(400, 100_000), marks=pytest.mark.exhaustive)]
+    "seeds", [range(150), pytest.param(range(150, 100_000), marks=pytest.mark.exhaustive)]
 )
 def test_mutated_programs_are_models_or_errors_of_one_line(seeds):
     found = {seed: outcome(mutated(random.Random(seed))) for seed in seeds}
