@@ -17,11 +17,16 @@ import numpy as np
 import scipy.stats
 
 import jaxltl as jl
+from jaxltl.algos import ppo
+from jaxltl.algos.common.actor_critic import ActorCritic
+from jaxltl.algos.common.schedules import Linear
 from jaxltl.core.continuous.certificate import Certificate, certify_policy, first_grid
 from jaxltl.core.continuous.dynamics import Dynamics
+from jaxltl.core.continuous.learned_policy import state_policy
 from jaxltl.core.continuous.regions import box
 from jaxltl.core.continuous.synthesis import CellPolicy, simulate_cells, synthesize_policy
 from jaxltl.core.environments import make_agent
+from jaxltl.core.environments.episodes import Agent
 from jaxltl.envs import continuous_worlds as worlds
 
 Policy = Callable[[jax.Array], jax.Array]
@@ -128,6 +133,69 @@ def policies(case: dict[str, Any]) -> dict[str, Any]:
     row = _of_certificate(proof) | meter.read()
     found = simulated(world.dynamics, policy, world.formula, case["episodes"])
     return _with_simulation(row, found)
+
+
+# --- learning -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Course:
+    """How a policy is learned: in the whole domain, with larger unsafe and smaller target sets."""
+
+    cells: list[int]
+    unsafe_margin: float
+    target_margin: float
+    discount: float
+    threshold: float = THRESHOLD
+    max_cells: int = 2**20
+    whole_domain: bool = True
+
+
+COURSES = {
+    "hard": Course([400, 400], 0.03, 0.01, 0.95),
+    "collision": Course([200, 200], 0.03, 0.01, 0.95),
+    "triple_integrator": Course([60, 60, 60], 0.1, 0.04, 0.9, 0.95, 2**21, False),
+}
+
+
+def train(dynamics: Dynamics, formula: str, course: Course, seed: int, steps: int = 60) -> Agent:
+    """The greedy policy of PPO after 250,000 transitions."""
+    unsafe, target = dynamics.labels["unsafe"], dynamics.labels["target"]
+    labels = dynamics.labels | {
+        "unsafe": box(unsafe.low - course.unsafe_margin, unsafe.high + course.unsafe_margin),
+        "target": box(target.low + course.target_margin, target.high - course.target_margin),
+    }
+    initial = dynamics.initial
+    if course.whole_domain:
+        initial = box(*(np.concatenate([getattr(initial, side), np.tile(end, (4, 1))])
+                        for side, end in zip(("low", "high"), dynamics.domain, strict=True)))  # fmt: skip
+    world = jl.environments.with_time_limit(replace(dynamics, labels=labels, initial=initial), 60)
+    network = ActorCritic(shape=(dynamics.num_actions,), hidden=(32, 32), activation="relu")
+    problem = ppo.make_problem(jl.task_environment(world, formula), network=network)
+    hparams = ppo.Hparams(
+        discount=course.discount, num_envs=64, num_steps=64, num_minibatches=8, num_epochs=8,
+        entropy_weight=0.0, learning_rate=Linear(3e-3, 1.5e-4, steps),
+    )  # fmt: skip
+    state, _ = ppo.train(jax.random.key(seed), problem, hparams, num_steps=steps)
+    return ppo.greedy(jax.block_until_ready(state), problem, hparams)
+
+
+def learned(case: dict[str, Any]) -> dict[str, Any]:
+    """The certificate of a network that PPO trains first."""
+    name = case["world"]
+    world = worlds.linear("hard") if name == "hard" else getattr(worlds, name)()
+    course, meter = COURSES[name], Meter()
+    agent = train(world.dynamics, world.formula, course, case["seed"])
+    training = meter.read()
+    proof = certify_policy(
+        world.dynamics, agent, world.formula, cells=course.cells, threshold=course.threshold,
+        max_cells=course.max_cells, upper=False,
+    )  # fmt: skip
+    row = _of_certificate(proof) | meter.read()
+    row["remark"] = f"training {training['cpu']:.1f} of the cpu s; {row['remark']}"
+    policy = state_policy(agent, jl.task_environment(world.dynamics, world.formula))
+    found = simulated(world.dynamics, policy, world.formula, case["episodes"])
+    return _with_simulation(row, found) | {"training": training}
 
 
 def tasks(case: dict[str, Any]) -> dict[str, Any]:

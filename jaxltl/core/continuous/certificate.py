@@ -9,6 +9,7 @@ from typing import TypedDict, Unpack
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax.errors import FlaxError
 from numpy.typing import ArrayLike
 
 from jaxltl.core import validation
@@ -33,7 +34,8 @@ from jaxltl.core.status import Status
 
 HOW = {SURE: "surely", ALMOST_SURE: "almost surely", ITERATED: "by value iteration"}
 FIRST_CELLS = 20_000  # of the default grid; finer grids follow
-_BYTES = 400  # of memory for a cell and memory state, about
+_BYTES = 400  # of memory for a cell and action, about
+PAIRS = 2**24  # of cells and actions on one grid
 
 
 def _facts(certificate: Certificate) -> Iterator[str]:
@@ -191,7 +193,11 @@ def certify_policy(
 def closed_loop(dynamics: Dynamics, policy: StatePolicy) -> Callable[..., jax.Array]:
     """The step of a world under a policy; checks the shape of actions."""
     n, m = dynamics.num_states, dynamics.num_actions
-    found = traced("policy", policy, jax.ShapeDtypeStruct((n,), jnp.float32))
+    try:
+        found = traced("policy", policy, jax.ShapeDtypeStruct((n,), jnp.float32))
+    except (TypeError, FlaxError) as error:  # shapes that do not fit
+        message = " ".join(f"policy fails with a state float[{n}]: {error}".split())
+        raise ValueError(f"{message}; give a function of a state float[{n}].") from error
     if tuple(getattr(found, "shape", ("?",))) != (m,):
         raise ValueError(
             f"policy returns an array of shape {list(getattr(found, 'shape', ()))} for a state of {n} "
@@ -210,7 +216,9 @@ def closed_loop(dynamics: Dynamics, policy: StatePolicy) -> Callable[..., jax.Ar
     return step
 
 
-def first_grid(dynamics: Dynamics, cells: Sequence[int] | None, max_cells: int) -> Grid:
+def first_grid(
+    dynamics: Dynamics, cells: Sequence[int] | None, max_cells: int, num_actions: int = 1
+) -> Grid:
     """The first grid, whose edges include those of the labels and of the initial boxes."""
     n = dynamics.num_states
     low, high = dynamics.domain
@@ -221,10 +229,13 @@ def first_grid(dynamics: Dynamics, cells: Sequence[int] | None, max_cells: int) 
     breakpoints = [np.unique(np.concatenate([r.breakpoints(i) for r in regions])) for i in range(n)]
     shape = tuple(int(k) for k in np.atleast_1d(cells))
     count = int(np.prod([float(k) for k in shape]))
-    if count > max_cells:
+    most = min(max_cells, PAIRS // num_actions)
+    if count > most:
+        remedy = f"or raise max_cells={max_cells:,}" if most == max_cells else "or fewer actions"
         raise ValueError(
-            f"cells={shape} are {count:,} cells, which take about {count * _BYTES / 2**30:.3g} GiB for "
-            f"each memory state; give fewer, or raise max_cells={max_cells:,}."
+            f"cells={shape} are {count:,} cells, which take about "
+            f"{count * num_actions * _BYTES / 2**30:.3g} GiB with {num_actions:,} actions; give at most "
+            f"{most:,}, {remedy}."
         )
     return make_grid(low, high, shape, breakpoints)
 

@@ -56,6 +56,8 @@ class Grid:
     def locate(self, states: Floats) -> Integers:
         """The cells of states ``float[..., n]``; -1 outside the domain."""
         states = np.asarray(states, np.float64)
+        if states.shape[-1:] != (self.num_axes,):
+            raise ValueError(f"states of shape {list(states.shape)}; give [..., {self.num_axes}].")
         inside = np.ones(states.shape[:-1], bool)
         index = []
         for axis, e in enumerate(self.edges):

@@ -83,7 +83,7 @@ def image_boxes(
     """Boxes of successors of cells under each action of ``float[A, m]``.
 
     Raises:
-      ValueError: if `step` cannot be traced or enclosed, with the place.
+      ValueError: if `step` cannot be traced or enclosed, with the place, or is unbounded on a cell.
     """
     cells = np.asarray(cells)
     sizes = grid.num_axes, actions.shape[1], len(noise.low)
@@ -118,6 +118,9 @@ def image_boxes(
                 todo[here[accepted]] = False
         if not todo.any():
             break
+    unbounded = ~np.isfinite(high - low).all((1, 2))
+    if unbounded.any():
+        raise ValueError(_unbounded(grid, cells[[unbounded.argmax()]]))
     shape = (len(cells) * num_actions, n)
     gain, varying = (_compact(x.reshape(shape)) for x in (gain, varying))
     return Images(cells, low.reshape(shape), high.reshape(shape), gain, noise_of, varying, order)
@@ -132,6 +135,14 @@ def _blocks(
     blocks, of_block = np.unique(number, return_inverse=True)
     start = np.stack(np.unravel_index(blocks, block_shape), -1) * np.array(size)
     return start, of_block.reshape(-1)
+
+
+def _unbounded(grid: Grid, cell: Integers) -> str:
+    low, high = (x[0].round(6).tolist() for x in grid.boxes(cell))
+    return (
+        f"the step or the policy is unbounded, as far as intervals show, on the cell {low} to {high}; "
+        "bound it by jnp.clip or jnp.where, give more cells, or a domain without such states."
+    )
 
 
 def _compact(rows: Floats) -> Floats:

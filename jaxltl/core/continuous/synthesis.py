@@ -16,6 +16,7 @@ from jaxltl.core.array_types import Array, Booleans, Floats, Integers
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.continuous.abstraction import Control, bound_satisfaction, safe_actions
 from jaxltl.core.continuous.certificate import (
+    PAIRS,
     Certificate,
     ProofOptions,
     first_grid,
@@ -26,8 +27,6 @@ from jaxltl.core.continuous.dynamics import Dynamics, make_dynamics  # noqa: F40
 from jaxltl.core.continuous.task_product import TaskProduct
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.pretty_print import brief
-
-_PAIRS = 2**24  # of cells and actions on one grid: about 1 GiB
 
 
 @brief
@@ -146,9 +145,9 @@ def synthesize_policy(
     validation.keywords("synthesize_policy", options, ProofOptions)
     validation.instance("dynamics", dynamics, Dynamics, "those of make_dynamics")
     grid_of_actions = _actions(dynamics, actions)
-    max_cells = min(options.get("max_cells", 2**20), max(_PAIRS // len(grid_of_actions), 1))
-    grid = first_grid(dynamics, options.get("cells"), max_cells)
-    limits = replace(proof_limits(options), max_cells=max_cells)
+    max_cells = options.get("max_cells", 2**20)
+    grid = first_grid(dynamics, options.get("cells"), max_cells, len(grid_of_actions))
+    limits = replace(proof_limits(options), max_cells=min(max_cells, PAIRS // len(grid_of_actions)))
     control = Control(dynamics.step, grid_of_actions)
     report: Callable[[str], None] = options.get("report", lambda _: None)
     bounds = bound_satisfaction(dynamics, control, formula, grid, limits, report)

@@ -1,5 +1,6 @@
 """Certificates of policies against quadrature, simulation and each other."""
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +12,7 @@ from jaxltl.core.continuous import (
     certify_policy,
     gaussian,
     make_dynamics,
+    synthesize_policy,
     triangular,
     uniform,
 )
@@ -159,16 +161,34 @@ def test_simulated_frequencies_lie_inside():
     "change,message",
     [
         ({"cells": [10_000, 10_000]}, "GiB"),
+        ({"cells": [10_000, 10_000], "max_cells": 10**9}, "or fewer actions"),
         ({"cells": [10]}, "one positive number for each"),
         ({"formula": "F z"}, "is no label"),
         ({"policy": lambda x: x[:1]}, "return float\\[2\\]"),
+        ({"policy": lambda x: x @ np.ones((3, 2))}, r"policy fails with a state float\[2\]"),
+        ({"policy": (nn.Dense(2), {"kernel": np.ones((3, 2))})}, r"policy fails.*; give a function"),
         ({"policy": lambda x: x if float(x[0]) > 0 else -x}, "cannot be traced"),
     ],
 )
 def test_bad_input(change, message):
     given = {"policy": to_b, "formula": "F b", "cells": [4, 4]} | change
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=message) as caught:
         certify_policy(plane(), given.pop("policy"), given.pop("formula"), **given)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("step", [lambda x: 0.1 / x, jnp.log1p, lambda x: jnp.tan(2 * x)])
+def test_a_step_that_is_unbounded_on_a_cell_is_refused(step):
+    world = make_dynamics(
+        lambda x, u, w: step(x), domain=([-1.0], [1.0]), labels={"goal": ([0.5], [1.0])}
+    )
+    with pytest.raises(ValueError, match=r"unbounded.* on the cell \[.*\] to \[.*jnp.clip"):
+        certify_policy(world, lambda x: jnp.zeros(0), "F goal", cells=[11])
+
+
+def test_more_pairs_of_cells_and_actions_than_fit_are_refused():
+    with pytest.raises(ValueError, match=r"37.3 GiB with 1,000 actions; give at most 16,777"):
+        synthesize_policy(scalar(), "F goal", np.ones((1000, 1)), cells=[100_000])
 
 
 def test_an_interrupt_keeps_the_bounds_of_the_grid_before():

@@ -149,6 +149,8 @@ def branching(x, u, w):
         ({"labels": 3}, "give a dictionary"),
         ({"noise": [0.1]}, r"noise\[0\] is float; give gaussian"),
         ({"disturbance": ([0.1], [-0.1])}, "disturbance: low=0.1 and high=-0.1"),
+        ({"disturbance": ([-np.inf], [np.inf])}, "disturbance: low=-inf.*give finite bounds"),
+        ({"disturbance": gaussian(1.0)}, r"disturbance is Distribution.*; give \(low, high\)"),
         ({"actions": [1.0, 2.0]}, r"actions is an array of shape \[2\]"),
         ({"actions": ([1.0], [0.0])}, "actions: low=1"),
         ({"outside": 3}, "outside is int"),

@@ -1,24 +1,30 @@
 """Certificates against simulated runs of random worlds, networks and formulas."""
 
-from dataclasses import replace
+import random
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
+from scipy.special import ndtr, ndtri
 
 from jaxltl.core.continuous import (
+    Dynamics,
     box,
     certify_policy,
     gaussian,
+    half_space,
     make_dynamics,
+    triangular,
     truncated_gaussian,
     uniform,
 )
 from jaxltl.core.continuous.task_product import task_product
 from jaxltl.core.continuous.winning_cells import Successors, winning_cells
-from jaxltl.core.logic.ltl import parse_ltl
+from jaxltl.core.logic.ltl import Formula, parse_ltl
+from tests.reference_logic import random_formula
 
 LEVEL = 1e-6
 
@@ -59,7 +65,7 @@ def labels_of_runs(world, policy, starts, num_steps, seed=0, disturbance=None):
 def verdicts(formula, world, labels, alive):
     """Runs that surely satisfy and surely violate a formula, after their finite number of steps."""
     names = list(world.propositions)
-    formula = parse_ltl(formula)
+    formula = parse_ltl(formula) if isinstance(formula, str) else formula
     used = sorted(formula.propositions)
     columns = [names.index(p) for p in used]
     every = np.array([[i >> j & 1 for j in range(len(used))] for i in range(2 ** len(used))], bool)
@@ -179,6 +185,136 @@ def test_reflected_noise_with_a_mean():
         value = np.diff(scipy.stats.norm.cdf([-0.6, -0.1], middle, 0.3))[0]
         lower, upper = proof.at([start + 0.01])
         assert lower - 0.02 <= value <= upper + 0.02 and upper - lower < 0.05
+
+
+# --- random worlds --------------------------------------------------------------------------------
+
+ENDS = ndtr(np.array([-0.4, 0.2]) / 0.3)
+# Distributions, and how NumPy draws them.
+NOISES = (
+    (uniform(-0.3, 0.3), lambda draw, n: draw.uniform(-0.3, 0.3, n)),
+    (triangular(-0.5, 0.5), lambda draw, n: draw.triangular(-0.5, 0, 0.5, n)),
+    (gaussian(0.15, 0.05), lambda draw, n: draw.normal(0.05, 0.15, n)),
+    (truncated_gaussian(0.3, -0.4, 0.2), lambda draw, n: 0.3 * ndtri(draw.uniform(*ENDS, n))),
+)
+OUTSIDE = ("violates", "clip", "out")
+CELLS = {1: [100], 2: [24, 24], 3: [10, 10, 10]}
+FORMULAS = ("F a", "!b U a", "X (a | b)", "X (!a & X !b)", "G !a", "F (a & X b)", "F a & G !b",
+            "X G (a -> X !a)", "F G a | F b", "G F a -> F b")  # fmt: skip
+
+
+@dataclass
+class Triple:
+    """Dynamics, a network and a formula, with a NumPy twin of both functions for simulation."""
+
+    world: Dynamics
+    policy: object
+    formula: Formula
+    draws: list
+    step: object
+
+    def simulate(self, draw, x, num_steps):
+        """Labels ``bool[T + 1, N, P]`` and membership ``bool[T + 1, N]``, states outside kept."""
+        (low, high), alive, found = self.world.domain, np.ones(len(x), bool), []
+        for _ in range(num_steps + 1):
+            label = [self.world.labels[p].contains(x) & alive for p in self.world.labels]
+            if self.world.outside == "out":
+                label.append(~alive)
+            found.append((np.stack(label, -1), alive))
+            w = [one(draw, len(x)) for one in self.draws]
+            if self.world.disturbance is not None:  # an adversary with one of three habits
+                ends = self.world.disturbance
+                w.append(np.full(len(x), ends[draw.integers(2)][0])
+                         if draw.random() < 0.7 else draw.uniform(*ends, len(x)))  # fmt: skip
+            u = np.clip(self.policy(x), -1, 1)
+            after = np.where(alive[:, None], self.step(x, u, np.stack(w, -1)), x)
+            x = np.clip(after, low, high) if self.world.outside == "clip" else after
+            alive = alive & ((x >= low) & (x <= high)).all(-1)
+        return tuple(np.stack(part) for part in zip(*found, strict=True))
+
+
+def random_triple(seed):
+    """A random world in one to three dimensions with a network and a formula."""
+    draw, n = np.random.default_rng(seed), 1 + seed % 3
+    a, b, c = (draw.normal(size=(n, n)) * s / np.sqrt(n) for s in (0.7, 0.5, 0.3))
+    kernels = draw.normal(size=(n, 6)), draw.normal(size=(6, n)) / 2
+    bias, offset = draw.normal(size=6), draw.uniform(-0.2, 0.2, n)
+    kind, bent = draw.integers(4), draw.random() < 0.5
+    mixing = np.eye(n) if kind else draw.normal(size=(n, n)) / np.sqrt(n)
+    adverse = draw.random() < 0.3
+
+    def policy(x):
+        xp = np if isinstance(x, np.ndarray) else jnp
+        hidden = x @ kernels[0] + bias
+        return (xp.tanh(hidden) if bent else xp.maximum(hidden, 0)) @ kernels[1]
+
+    def step(x, u, w):
+        xp = np if isinstance(x, np.ndarray) else jnp
+        gain = 1 + 0.5 * xp.sin(x) if kind == 1 else 1.0
+        noise = w[..., :n] @ mixing.T
+        noise = xp.tanh(2 * noise) / 2 if kind == 2 else noise
+        push = 0.2 * w[..., n:] * x if adverse else 0.0
+        return x @ a.T + u @ b.T + xp.sin(3 * x) @ c.T + offset + gain * noise + push
+
+    kinds = [NOISES[i] for i in draw.integers(len(NOISES), size=n)]
+    corner = draw.uniform(-0.8, 0.2, (2, n))
+    normal = draw.normal(size=n)
+    world = make_dynamics(
+        step,
+        domain=(np.full(n, -1.0), np.full(n, 1.0)),
+        noise=[one for one, _ in kinds],
+        disturbance=([-0.5], [1.0]) if adverse else None,
+        actions=(np.full(n, -1.0), np.full(n, 1.0)),
+        labels={
+            "a": box(corner[0], corner[0] + draw.uniform(0.4, 0.8, n)),
+            "b": box(corner[1], corner[1] + draw.uniform(0.4, 0.8, n))
+            if draw.random() < 0.7 else half_space(normal, 0.3 * np.abs(normal).sum()),
+        },
+        outside=OUTSIDE[draw.integers(3)],
+    )  # fmt: skip
+    chooser = random.Random(seed)
+    formula = parse_ltl(chooser.choice(FORMULAS))
+    while seed % 2 or not formula.propositions:
+        formula = random_formula(chooser, chooser.randint(4, 7), world.propositions)
+        if formula.propositions and any(x in str(formula) for x in "XFGUWRM"):
+            break
+    return Triple(world, policy, formula, [draw_one for _, draw_one in kinds], step)
+
+
+def check_triples(seeds, runs, num_steps=15, num_starts=10):
+    """Simulated frequencies from random states meet the bounds; the shares of tight bounds and of
+    bounds that are neither 0 nor 1."""
+    widths, inner = [], 0
+    for seed in seeds:
+        triple, draw = random_triple(seed), np.random.default_rng(seed + 10**6)
+        cells = CELLS[triple.world.num_states]
+        proof = certify_policy(
+            triple.world, triple.policy, triple.formula, cells=cells, tolerance=0.02,
+            max_cells=3000, max_sweeps=30,
+        )  # fmt: skip
+        starts = draw.uniform(-1, 1, (num_starts, triple.world.num_states))
+        lower, upper = proof.at(starts)
+        x = np.repeat(starts, runs // num_starts, 0)
+        good, bad = verdicts(triple.formula, triple.world, *triple.simulate(draw, x, num_steps))
+        good, bad = (y.reshape(num_starts, -1) for y in (good, bad))
+        for i in range(num_starts):
+            least, most = (interval(y[i].sum(), y.shape[1])[0] for y in (good, bad))
+            found = seed, str(triple.formula), starts[i], (lower[i], upper[i]), (least, 1 - most)
+            assert least <= upper[i] and lower[i] <= 1 - most, found
+        widths.extend(upper - lower)
+        inner += ((lower > 0) & (lower < 1) | (upper > 0) & (upper < 1)).sum()
+    return (np.array(widths) < 0.1).mean(), inner / len(widths)
+
+
+def test_simulated_runs_of_random_worlds_lie_inside():
+    tight, _ = check_triples(range(6), 2000)
+    assert tight > 0.5  # the bounds say something
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("block", range(20))
+def test_many_simulated_runs_of_random_worlds_lie_inside(block):
+    check_triples(range(10 * block, 10 * (block + 1)), 100_000)
 
 
 # --- winning strategies ---------------------------------------------------------------------------
