@@ -292,6 +292,8 @@ class _Builder:
         """A primitive that is linear in one input and knows the others, by its matrix."""
         shape, output = self.shapes[inputs[index]].shape, _spec(equation.outvars[0])
         rows, columns = math.prod(output.shape), math.prod(shape)
+        if not columns:  # such as of a world without actions
+            return self.constant(np.zeros(output.shape, output.dtype))
         if rows * columns > MAX_MATRIX:
             raise ValueError(
                 f"{self._place(equation)}: a product with a matrix of {rows} by {columns} entries, "

@@ -142,6 +142,11 @@ def test_bounds_are_differentiable():
                 assert abs(gradient[side][i] - difference) < 1e-6
 
 
+def test_products_with_empty_arrays_are_zero():
+    low, high = enclose(lambda x: x + np.zeros((2, 0)) @ x[:0])(np.zeros(2), np.ones(2))
+    assert (low <= 0).all() and (low > -1e-9).all() and (high >= 1).all()
+
+
 def test_trees_in_and_out():
     low = {"x": np.zeros(2, np.float32), "y": np.float32(1)}
     high = {"x": np.ones(2, np.float32), "y": np.float32(2)}
