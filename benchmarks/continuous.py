@@ -8,6 +8,7 @@ Parts, each case in a fresh process:
 - tasks: recurrence, response and persistence under the first policy of each file, and synthesis;
 - synthesis: policies on the published grids against published times and memory (IMPaCT, Wooding and
   Lavaei 2024);
+- shield: violations while learning, with and without a permissive strategy;
 - models: bounds of policies on coarse grids against simulation.
 
 Seconds are CPU seconds of all threads, `wall` is the elapsed time, MB the peak resident memory above
@@ -25,7 +26,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-PARTS = ("policies", "learned", "tasks", "synthesis", "models")
+PARTS = ("policies", "learned", "tasks", "synthesis", "models", "shield")
 RECURRENCE, RESPONSE = "G F a & G F b & G !unsafe", "G (far -> F a) & G !unsafe"
 PERSISTENCE = "F G target & G !unsafe"
 # Published seconds (transition bounds and synthesis) and GB, on a larger machine.
@@ -69,6 +70,12 @@ def _cases(chosen: argparse.Namespace) -> list[dict[str, Any]]:
             )
         elif part == "synthesis":
             found += [{"part": part, "world": x, "upper": not chosen.lower} for x in SYNTHESIS]
+        elif part == "shield":
+            found += [
+                {"part": part, "world": "linear", "learner": x, "shielded": y, "steps": 10**6}
+                for x in ("ppo", "cce")
+                for y in (True, False)
+            ]
         else:
             found += [{"part": part, "world": "robot", "side": x} for x in (9, 15, 21)]
     kept = [x for x in found if not chosen.worlds or x["world"] in chosen.worlds]
@@ -120,6 +127,7 @@ def _text(row: dict[str, Any]) -> str:
     names = {
         "policies": "seed {seed}",
         "learned": "seed {seed}",
+        "shield": "{learner}, shielded {shielded}",
         "tasks": "{formula}",
         "models": "{side} x {side}",
     }

@@ -15,19 +15,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.stats
+from jax.tree_util import Partial
 
 import jaxltl as jl
-from jaxltl.algos import ppo
+from jaxltl.algos import cce, ppo
+from jaxltl.algos.cce.exponential_family import diagonal_gaussian
 from jaxltl.algos.common.actor_critic import ActorCritic
 from jaxltl.algos.common.schedules import Linear
 from jaxltl.core.continuous.certificate import Certificate, certify_policy, first_grid
 from jaxltl.core.continuous.dynamics import Dynamics
 from jaxltl.core.continuous.learned_policy import state_policy
 from jaxltl.core.continuous.regions import box
+from jaxltl.core.continuous.shielded_dynamics import shield_dynamics
 from jaxltl.core.continuous.synthesis import CellPolicy, simulate_cells, synthesize_policy
-from jaxltl.core.environments import make_agent
+from jaxltl.core.environments import Environment, Timestep, Verdict, make_agent
 from jaxltl.core.environments.episodes import Agent
+from jaxltl.core.values.evaluation.episode_scores import episode_evaluator
 from jaxltl.envs import continuous_worlds as worlds
+from jaxltl.envs.networks import make_network, network_agent
 
 Policy = Callable[[jax.Array], jax.Array]
 THRESHOLD = 0.999999
@@ -152,7 +157,7 @@ class Course:
 
 
 COURSES = {
-    "hard": Course([400, 400], 0.03, 0.01, 0.95),
+    "hard": Course([800, 800], 0.03, 0.01, 0.95),
     "collision": Course([200, 200], 0.03, 0.01, 0.95),
     "triple_integrator": Course([60, 60, 60], 0.1, 0.04, 0.9, 0.95, 2**21, False),
 }
@@ -196,6 +201,68 @@ def learned(case: dict[str, Any]) -> dict[str, Any]:
     policy = state_policy(agent, jl.task_environment(world.dynamics, world.formula))
     found = simulated(world.dynamics, policy, world.formula, case["episodes"])
     return _with_simulation(row, found) | {"training": training}
+
+
+def _worst_step(base: Dynamics) -> Any:
+    """The step with the greatest disturbance away from the origin."""
+    return lambda x, u, w: base.step(x, u, jnp.sign(x).astype(x.dtype))
+
+
+def _with_violations(step: Any, world: Any, action: jax.Array, key: jax.Array) -> Timestep:
+    """A violation costs 1."""
+    found = Timestep(*step(world, action, key))
+    return found._replace(cost=(found.world.verdict == Verdict.VIOLATED).astype(float))
+
+
+def shield(case: dict[str, Any]) -> dict[str, Any]:
+    """Violations while PPO or the cross-entropy method learn in the linear world, its noise chosen by
+    an adversary; inside the permissive strategy of safety, or without it."""
+    base = worlds.linear().dynamics
+    wide = box([-1.2, -0.4], [1.2, 0.4])
+    adverse = replace(base, noise=(), disturbance=(-np.ones(2), np.ones(2)), initial=wide)
+    meter = Meter()
+    actions = np.linspace(-1, 1, 21)[:, None]
+    policy = synthesize_policy(adverse, "G !unsafe", actions, cells=[100, 100], upper=False)
+    row = _of_certificate(policy.certificate)
+    pushed = replace(adverse, step=_worst_step(base))
+    inner = shield_dynamics(replace(policy, dynamics=pushed)) if case["shielded"] else pushed
+    formula, options = "G !unsafe & G F target", {"reward": "eventual", "discount": 0.95}
+    task = jl.task_environment(getattr(inner, "environment", inner), formula, **options)
+    task = task.replace(step=Partial(_with_violations, task.step))
+    learner = {"ppo": _ppo_violations, "cce": _cce_violations}[case["learner"]]
+    violations, transitions = learner(jl.environments.with_time_limit(task, 50), case["steps"])
+    row |= meter.read() | {"violations": violations, "transitions": transitions}
+    return row | {"remark": f"{violations:,} violations in {transitions:,} transitions"}
+
+
+def _ppo_violations(task: Environment, steps: int) -> tuple[int, int]:
+    updates, batch = -(-steps // 4096), 64 * 64
+    hparams = ppo.Hparams(
+        discount=1.0, num_envs=64, num_steps=64, num_minibatches=4, learning_rate=1e-3
+    )
+    problem = ppo.make_problem(task)
+    _, metrics = ppo.train(jax.random.key(0), problem, hparams, num_steps=updates, max_rows=updates)
+    return int(np.rint(np.asarray(metrics.cost, float) * batch).sum()), updates * batch
+
+
+def _cce_violations(task: Environment, steps: int) -> tuple[int, int]:
+    """Lengths of all episodes are scored too, since they end with a violation."""
+    seen = jax.eval_shape(lambda: task.observe(task.reset(jax.random.key(0))))
+    size = sum(x.size for x in jax.tree.leaves(seen))
+    network = make_network((size, 16, 1), hidden="tanh")
+    score = episode_evaluator(
+        task, network_agent(network, task), objective="discounted_visits",
+        costs=("violation", "length"), num_episodes=4, num_steps=50, discount=0.95,
+    )  # fmt: skip
+    first = diagonal_gaussian(jnp.zeros(network.num_parameters), 1.0)
+    problem, hparams = cce.make_problem(score, first), cce.Hparams(population=50)
+    state = cce.init(jax.random.key(1), problem, hparams)
+    violations = transitions = 0.0
+    while transitions < steps:
+        state, metrics = cce.step(state, problem, hparams)
+        violations += 200 * float(metrics.cost[0])
+        transitions += 200 * float(metrics.cost[1])
+    return round(violations), round(transitions)
 
 
 def tasks(case: dict[str, Any]) -> dict[str, Any]:

@@ -166,7 +166,10 @@ def test_simulated_frequencies_lie_inside():
         ({"formula": "F z"}, "is no label"),
         ({"policy": lambda x: x[:1]}, "return float\\[2\\]"),
         ({"policy": lambda x: x @ np.ones((3, 2))}, r"policy fails with a state float\[2\]"),
-        ({"policy": (nn.Dense(2), {"kernel": np.ones((3, 2))})}, r"policy fails.*; give a function"),
+        (
+            {"policy": (nn.Dense(2), {"kernel": np.ones((3, 2))})},
+            r"policy fails.*; give a function",
+        ),
         ({"policy": lambda x: x if float(x[0]) > 0 else -x}, "cannot be traced"),
     ],
 )
