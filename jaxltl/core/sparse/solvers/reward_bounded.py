@@ -34,6 +34,7 @@ _LARGEST = 8 * 2**30  # bytes of the levels that are kept
 _DENOMINATOR = 10**9  # of the fractions that rewards are taken for
 _GAIN = 1e-13  # relative gain that may be rounding
 _ROUNDS = 100
+_DEPTH = 64  # steps without cost, up to which a level is solved by substitution
 
 
 class Level(NamedTuple):
@@ -119,7 +120,7 @@ def bounded_cost(
         error += off
         ring[level % size] = value
         if by_level or level == most:
-            every.append(_policy(mdp, shape, system.chosen))
+            every.append(_policy(mdp, shape, system.policy(b, value)))
     found = target.astype(np.float64)
     found[shape.member] = ring[most % size][shape.node[shape.member]]
     return Level(found, shape.member, error, np.stack(every) if by_level else every[-1])
@@ -194,12 +195,23 @@ def _policy(mdp: HostMDP, shape: _Shape, chosen: Integers) -> Integers:
     return found
 
 
+class _Layer(NamedTuple):
+    """Nodes with equally long paths of steps without cost."""
+
+    nodes: Integers
+    rows: Integers
+    matrix: csr_array  # of the rows
+    starts: Integers  # of each node among the rows
+
+
 @dataclass
 class _System:
     """``x = opt (b + P x)``, which every policy leaves.
 
-    `chosen` ``int[N]`` is the row of each node, `factors` are those of these rows (None where ``P``
-    is zero), and `longest` bounds the expected number of consecutive steps without cost.
+    `longest` bounds the expected number of consecutive steps without cost. Without cycles of such
+    steps `layers` has the nodes by the length of their longest path, and the solution is a
+    substitution. Else `chosen` ``int[N]`` is the row of each node, and `factors` are those of these
+    rows.
     """
 
     shape: _Shape
@@ -209,15 +221,37 @@ class _System:
     def __post_init__(self) -> None:
         self.chosen = self.shape.starts
         self.factors: SuperLU = None
-        self.longest = 1.0
-        if self.matrix.nnz:
-            wish, self.maximal = self.maximal, True
-            self._factor()
-            steps = self._iterate(np.ones(self.shape.row.size))
-            ahead = np.repeat(steps, np.diff(np.append(self.shape.starts, self.shape.row.size)))
-            enough = (ahead - self.matrix @ steps >= 0.5).all() and (steps >= 0).all()
-            self.longest = 2 * float(steps.max()) if enough else math.inf
-            self.maximal = wish
+        self.count = np.diff(np.append(self.shape.starts, self.shape.row.size))
+        self.layers = self._layers()
+        if self.layers is not None:
+            self.longest = float(len(self.layers))
+            return
+        wish, self.maximal = self.maximal, True
+        self._factor()
+        steps = self._iterate(np.ones(self.shape.row.size))
+        ahead = np.repeat(steps, self.count)
+        enough = (ahead - self.matrix @ steps >= 0.5).all() and (steps >= 0).all()
+        self.longest = 2 * float(steps.max()) if enough else math.inf
+        self.maximal = wish
+
+    def _layers(self) -> list[_Layer] | None:
+        """The nodes with steps without cost by the longest path, or None for long ones or cycles."""
+        depth = np.zeros(self.shape.starts.size, np.int64)
+        ahead = np.ones(depth.size, bool)  # nodes with paths of `round` steps
+        for _ in range(_DEPTH):
+            if not self.matrix.nnz or not ahead.any():
+                break
+            ahead = np.maximum.reduceat(self.matrix @ ahead.astype(float), self.shape.starts) > 0
+            depth += ahead
+        else:
+            return None
+        found = []
+        for d in range(int(depth.max(initial=-1)) + 1):
+            nodes = np.flatnonzero(depth == d)
+            rows = concatenated_ranges(self.shape.starts[nodes], self.count[nodes])
+            starts = np.cumsum(self.count[nodes]) - self.count[nodes]
+            found.append(_Layer(nodes, rows, self.matrix[rows], starts))
+        return found
 
     def best(self, image: Floats) -> Floats:
         operation = np.maximum if self.maximal else np.minimum
@@ -225,13 +259,22 @@ class _System:
 
     def solve(self, b: Floats, unit: float) -> tuple[Floats, float]:
         """The solution, and its error if each sum has a relative error `unit`."""
-        if not self.matrix.nnz:
-            value = self.best(b)
-            self._choose(b, value, np.zeros_like(value, bool))
-            return value, unit
+        if self.layers is not None:
+            value = np.zeros(self.count.size)
+            operation = np.maximum if self.maximal else np.minimum
+            for nodes, rows, matrix, starts in self.layers:
+                value[nodes] = operation.reduceat(b[rows] + matrix @ value, starts)
+            return np.clip(value, 0, 1), unit * self.longest
         value = np.clip(self._iterate(b), 0, 1)
         residual = np.abs(self.best(b + self.matrix @ value) - value).max(initial=0)
         return value, float(residual + unit) * self.longest
+
+    def policy(self, b: Floats, value: Floats) -> Integers:
+        """The optimal row of each node."""
+        if self.layers is not None:
+            image = b + self.matrix @ value
+            self._choose(image, self.best(image), np.zeros(value.size, bool))
+        return self.chosen
 
     def _iterate(self, b: Floats) -> Floats:
         """Policy iteration (Howard 1960) from the last policy and its factors."""
@@ -249,8 +292,7 @@ class _System:
     def _choose(self, image: Floats, best: Floats, kept: Booleans) -> None:
         starts = self.shape.starts
         if starts.size < self.shape.row.size:
-            count = np.diff(np.append(starts, self.shape.row.size))
-            node = np.repeat(np.arange(starts.size), count)
+            node = np.repeat(np.arange(starts.size), self.count)
             better = (image == best[node]) & ~kept[node]
             self.chosen = first_hits(better, node, self.chosen)
 

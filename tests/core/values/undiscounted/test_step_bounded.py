@@ -7,7 +7,7 @@ import pytest
 
 from jaxltl.core.models.construct.convert import to_padded
 from jaxltl.core.models.sparse import Rewards, make_sparse
-from jaxltl.core.sparse.solvers import step_bounded as bounded
+from jaxltl.core.sparse.solvers import reward_bounded, step_bounded as bounded
 from jaxltl.core.types import Status, check
 from jaxltl.core.values.properties.solve_property import solve_property
 from jaxltl.core.values.undiscounted.step_bounded import (
@@ -154,8 +154,10 @@ def by_levels(model, target, stay, cost, most, best, sweeps=400):
     return found
 
 
+@pytest.mark.parametrize("depth", [1, 64])
 @pytest.mark.parametrize("seed", range(16))
-def test_rewards_are_spent_level_by_level(seed):
+def test_rewards_are_spent_level_by_level(seed, depth, monkeypatch):
+    monkeypatch.setattr(reward_bounded, "_DEPTH", depth)  # 1 leaves no substitution
     rng = np.random.default_rng(seed)
     model = random_sparse(rng, 7, chain=seed % 4 == 0)
     target, stay = rng.random(7) < 0.25, rng.random(7) < 0.9
