@@ -335,6 +335,17 @@ def symbols():
     return Case(grounding, problem, setting(), setting(l2=0.1, hardness=0.1, learning_rate=0.01))
 
 
+def modes():
+    """Two hidden modes, with a reward and evidence each."""
+    mdp, demonstrations = world()
+    features, evidence = numbers(3, 2, 2), numbers(2, 3, 2, 1)
+    problem = grounding.hidden_modes.make_problem(
+        mdp, demonstrations, 2, features=features, evidence=evidence
+    )
+    setting = partial(grounding.hidden_modes.Hparams, discount=0.5)
+    return Case(grounding.hidden_modes, problem, setting(), setting(l2=0.1, learning_rate=0.01))
+
+
 def temporal_difference():
     problem = expected_sarsa.make_problem(world()[0], numbers(3, 2))
     setting = partial(expected_sarsa.Hparams, num_transitions=7, restart=0.3)
@@ -360,6 +371,7 @@ LEARNERS = {
     "feasible": parameters,
     "grounding": symbols,
     "intervals": intervals,
+    "modes": modes,
     "sarsa": temporal_difference,
 }
 
@@ -595,7 +607,7 @@ REWARDS = {
 }
 
 
-@each([*REWARDS, "todirl", "grounding", "intervals"])
+@each([*REWARDS, "todirl", "grounding", "intervals", "modes"])
 def test_what_is_not_available_changes_nothing(name):
     """Bit for bit: what was learned, and all figures."""
     module, problem, hparams, _ = case(name)

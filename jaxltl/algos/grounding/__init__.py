@@ -1,5 +1,6 @@
 """Symbol grounding: learns from demonstrations what the symbols of a task mean."""
 
+from jaxltl.algos.grounding import hidden_modes as hidden_modes
 from jaxltl.algos.grounding.answer import (
     Query as Query,
     RobustPolicy as RobustPolicy,
@@ -18,6 +19,10 @@ from jaxltl.algos.grounding.clusters import (
     cluster_meanings as cluster_meanings,
     fit_labels as fit_labels,
     network_labels as network_labels,
+)
+from jaxltl.algos.grounding.history import (
+    HistoryTables as HistoryTables,
+    fit_history as fit_history,
 )
 from jaxltl.algos.grounding.hypotheses import (
     Posterior as Posterior,

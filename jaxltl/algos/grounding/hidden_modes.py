@@ -1,0 +1,290 @@
+"""Demonstrators that switch between a given number of hidden modes.
+
+In mode z a demonstrator draws actions from ``pi_z(a | h_t) ~ exp(Q_z(s_t, a) + w_z . e_t(a))``: the soft
+action values of a reward that is linear in features, and evidence of the history ``h_t``, such as the
+logarithms of :mod:`count tables <jaxltl.algos.grounding.history>` (a log-linear pool). After a step in
+s the mode moves with probability ``M_s(z, z')`` (as in Ke et al. 2025). The likelihood sums over all mode
+paths by the forward recursion of :mod:`jaxltl.algos.grounding.likelihood`: the product of the
+probabilities of each action given the past. It is differentiated implicitly through
+:func:`~jaxltl.core.values.discounted.soft.soft_value`; many random starts are a ``vmap``.
+
+Example: first the action 0 nine times, then the action 1.
+  >>> import jax
+  >>> import jaxltl as jl
+  >>> from jaxltl.algos.grounding import hidden_modes
+  >>> world = jl.from_dense([[[1.0], [1.0]]])
+  >>> shown = jl.make_trajectories(world, [[(0, t // 9) for t in range(18)]])
+  >>> problem = hidden_modes.make_problem(world, shown, 2, features=[[[0.0], [1.0]]])
+  >>> hparams = hidden_modes.Hparams(l2=0.01)
+  >>> state = hidden_modes.fit(jax.random.key(0), problem, hparams, num_starts=3)
+  >>> mode = hidden_modes.mode_probabilities(state, problem, hparams)[0].argmax(-1)  # [T]
+  >>> bool((mode[:9] == mode[0]).all() & (mode[9:] == 1 - mode[0]).all())
+  True
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from numpy.typing import ArrayLike
+
+from jaxltl.algos.common import learner, optimizers, trees
+from jaxltl.algos.common.settings import Number, static, traced
+from jaxltl.algos.grounding.learner import State as State
+from jaxltl.algos.grounding.likelihood import NEVER, forward
+from jaxltl.algos.grounding.problem import joined_demonstrations
+from jaxltl.core import struct
+from jaxltl.core.models.mdp import MDP
+from jaxltl.core.models.protocols import PyTree
+from jaxltl.core.models.trajectories import Trajectories
+from jaxltl.core.pretty_print import brief, history
+from jaxltl.core.types import Status
+from jaxltl.core.validation import Range, require_in_range
+from jaxltl.core.values.discounted.soft import policy_logits, soft_value
+
+_STAY = 3.0  # prior mean of the logit that a mode stays
+
+
+@brief
+@struct.dataclass
+class Problem:
+    """A world, demonstrations, and the inputs of the modes' policies.
+
+    Attributes:
+      world: with S states and A actions.
+      state, action: ``int32[N, T]``, padded with zeros.
+      length: ``int32[N]``, numbers of steps.
+      features: ``float[S, A, F]``, of the rewards; F may be 0.
+      evidence: ``float[N, T, A, E]``, of the history; E may be 0.
+      num_modes: Z; static.
+    """
+
+    world: MDP
+    state: jax.Array
+    action: jax.Array
+    length: jax.Array
+    features: jax.Array
+    evidence: jax.Array
+    num_modes: int = struct.field(pytree_node=False)
+
+
+@brief
+@struct.dataclass
+class Hparams:
+    """Settings; numbers are traced.
+
+    Attributes:
+      discount: in [0, 1), of the demonstrator; default 0.9.
+      l2: at least 0; precision of the Gaussian prior on all parameters; default 1.
+      learning_rate: default 0.05.
+      optimizer: the name of one of optax; static; default ``"adam"``.
+    """
+
+    discount: Number = traced(Range(0, 1, open_above=True), default=0.9)
+    l2: Number = traced(Range(0, open_above=True), default=1.0)
+    learning_rate: Number = traced(Range(0, open_above=True), default=0.05)
+    optimizer: str = static(optimizers.NAMES, default="adam")
+
+
+@brief(facts=partial(history, codes={"status": Status}))
+@struct.dataclass
+class Metrics:
+    """Figures of the parameters before a step; scalars, of a run ``[T]``.
+
+    Attributes:
+      loss: the objective.
+      gradient_norm: Euclidean.
+      status: of the solver, the worst over the modes.
+    """
+
+    loss: jax.Array
+    gradient_norm: jax.Array
+    status: jax.Array
+
+
+def make_problem(
+    world: MDP,
+    demonstrations: Trajectories,
+    num_modes: int,
+    *,
+    features: ArrayLike | None = None,
+    evidence: ArrayLike | None = None,
+) -> Problem:
+    """A checked :class:`Problem`.
+
+    Args:
+      world: with the demonstrations.
+      demonstrations: N, none empty.
+      num_modes: Z, at least 1.
+      features: ``float[S, A, F]``, of the rewards; default none.
+      evidence: ``float[N, T, A, E]``, of the history, such as ``HistoryTables.left_out`` of the
+        demonstrations that were fitted and ``HistoryTables.evidence`` of others; default none.
+
+    Returns:
+      :class:`Problem`.
+
+    Raises:
+      ValueError: neither features nor evidence, another shape, a number that is not finite, or
+        demonstrations that do not fit.
+    """
+    require_in_range("num_modes", num_modes, Range(1, integer=True))
+    _, state, action, length = joined_demonstrations([world], [demonstrations])
+    if features is None and evidence is None:
+        raise ValueError("there are neither features nor evidence; give one or both.")
+    rows = {"features": world.available.shape, "evidence": (*state.shape, world.num_actions)}
+    arrays = {}
+    for name, table in (("features", features), ("evidence", evidence)):
+        values = np.zeros((*rows[name], 0)) if table is None else np.asarray(table)
+        if values.shape[:-1] != rows[name]:
+            expected = ", ".join(map(str, rows[name]))
+            raise ValueError(f"{name} has shape {values.shape}; expected ({expected}, any).")
+        if (wrong := np.argwhere(~np.isfinite(values))).size:
+            raise ValueError(f"{name} at {tuple(wrong[0].tolist())} is not finite.")
+        arrays[name] = jnp.asarray(values, world.dtype)
+    return Problem(world, state, action, length, **arrays, num_modes=int(num_modes))
+
+
+def objective(
+    parameters: PyTree, problem: Problem, hparams: Hparams
+) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+    """``-sum_n log p(a_0, a_1, ... | s_0, s_1, ...) + l2 / 2 |parameters|^2``.
+
+    Returns the loss, and as auxiliary outputs the log-likelihoods ``float[N]`` and the solver's status.
+    Differentiable in the `parameters` of a `problem` with `hparams`.
+    """
+    *chains, status = _chains(parameters, problem, hparams)
+    found = jax.vmap(forward, (None, 0, 0, 0))(*chains, problem.length)
+    squares = sum(jnp.sum(x * x) for x in jax.tree.leaves(parameters))
+    return hparams.l2 / 2 * squares - jnp.sum(found), (found, status)
+
+
+def _chains(parameters: PyTree, problem: Problem, hparams: Hparams) -> tuple[jax.Array, ...]:
+    """Arguments of ``forward``: first modes, steps ``[N, T, Z]``, moves ``[N, T - 1, Z, Z]``; status."""
+    log_policy, status = _log_policy(parameters, problem, hparams)
+    steps = log_policy[:, problem.state].transpose(1, 2, 3, 0)  # [N, T, A, Z]
+    steps = jax.nn.log_softmax(steps + problem.evidence @ parameters["evidence"].T, axis=2)
+    emit = jnp.take_along_axis(steps, problem.action[..., None, None], axis=2)[:, :, 0]
+    moves = _log_moves(parameters)[problem.state[:, :-1]]
+    return jax.nn.log_softmax(parameters["start"]), emit, moves, status
+
+
+def _log_moves(parameters: PyTree) -> jax.Array:
+    """``log M_s(z, z')``, ``float[S, Z, Z]``."""
+    stay = _STAY * jnp.eye(len(parameters["move"]))
+    return jax.nn.log_softmax(stay + parameters["move"] + parameters["move_in"], axis=-1)
+
+
+def _log_policy(
+    parameters: PyTree, problem: Problem, hparams: Hparams
+) -> tuple[jax.Array, jax.Array]:
+    """Log probabilities ``float[Z, S, A]`` of the soft policies of rewards, and the worst status."""
+
+    def one(weights: jax.Array) -> tuple[jax.Array, jax.Array]:
+        reward = problem.features @ weights
+        solution = soft_value(problem.world, reward, hparams.discount)
+        logits = policy_logits(problem.world, reward, hparams.discount, solution.value)
+        return jax.nn.log_softmax(jnp.maximum(logits, NEVER), axis=-1), solution.status
+
+    if problem.features.shape[-1]:
+        logits, status = jax.vmap(one)(parameters["reward"])
+        return logits, jnp.max(status)
+    uniform = jax.nn.log_softmax(jnp.where(problem.world.available, 0.0, NEVER), axis=-1)
+    logits = jnp.broadcast_to(uniform, (problem.num_modes, *uniform.shape))
+    return logits.astype(problem.evidence.dtype), jnp.int32(Status.COMPLETED)
+
+
+def _init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:
+    """Random rewards, and equal weights of the evidence with noise; the key is kept."""
+    modes, dtype = problem.num_modes, problem.evidence.dtype
+    reward, evidence = jax.random.split(learner.init_key(key))
+    width = problem.evidence.shape[-1]
+    parameters = {
+        "reward": 0.1 * jax.random.normal(reward, (modes, problem.features.shape[-1]), dtype),
+        "evidence": 1 / max(width, 1) + 0.1 * jax.random.normal(evidence, (modes, width), dtype),
+        "start": jnp.zeros(modes, dtype),
+        "move": jnp.zeros((modes, modes), dtype),
+        "move_in": jnp.zeros((problem.world.num_states, modes, modes), dtype),
+    }
+    optimizer = trees.strong(_optimizer(hparams).init(parameters))
+    return State(key, jnp.int32(0), trees.strong(parameters), optimizer)
+
+
+def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
+    """One step of the optimiser on :func:`objective`; deterministic given the state."""
+    (loss, (_, status)), gradient = jax.value_and_grad(objective, has_aux=True)(
+        state.parameters, problem, hparams
+    )
+    updates, optimizer = _optimizer(hparams).update(gradient, state.optimizer, state.parameters)
+    parameters = optax.apply_updates(state.parameters, updates)
+    metrics = Metrics(loss, optax.tree.norm(gradient), status)
+    return State(state.key, state.step + 1, parameters, optimizer), metrics
+
+
+def _optimizer(hparams: Hparams) -> optax.GradientTransformationExtraArgs:
+    return optimizers.optimizer(hparams.optimizer, hparams.learning_rate)
+
+
+# Metrics describe the state before a step.
+init, step, run, train, run_until, train_until = learner.bind(_init, _step)
+
+
+def fit(
+    key: chex.PRNGKey,
+    problem: Problem,
+    hparams: Hparams,
+    *,
+    num_starts: int = 4,
+    num_steps: int = 300,
+) -> State:
+    """The state of least loss of `num_starts` random starts from `key`, trained as a batch.
+
+    The `problem`, `hparams` and `num_steps` are those of ``train``. The state scores other
+    demonstrations: give :func:`log_likelihood` a problem with them. Raises ValueError if a number is
+    out of range.
+    """
+    require_in_range("num_starts", num_starts, Range(1, integer=True))
+    learn = partial(train, num_steps=num_steps, max_rows=1)
+    states, metrics = jax.vmap(learn, (0, None, None))(
+        jax.random.split(key, num_starts), problem, hparams
+    )
+    best = jnp.nanargmin(metrics.loss[:, -1])
+    return jax.tree.map(lambda x: x[best], states)
+
+
+@jax.jit
+def log_likelihood(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
+    """``sum_t log p(a_t | s_0, a_0, ..., s_t)`` of each demonstration, ``float[N]``, in nats.
+
+    Of a `state` learned from any `problem` with as many features, evidence and modes; `hparams` as there.
+    """
+    return objective(state.parameters, problem, hparams)[1][0]
+
+
+@jax.jit
+def mode_probabilities(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
+    """Posterior probability of each mode at each step given its demonstration, ``float[N, T, Z]``.
+
+    The derivative of the likelihood in the steps' log-likelihoods; 0 in padding. The order of the modes
+    has no meaning. Arguments as of :func:`log_likelihood`.
+    """
+    *chains, _ = _chains(state.parameters, problem, hparams)
+    posterior = jax.vmap(jax.grad(forward, 1), (None, 0, 0, 0))
+    return posterior(*chains, problem.length)
+
+
+def mode_moves(state: State) -> jax.Array:
+    """Probabilities ``M_s(z, z')`` of a `state`: the next mode after a step in s, ``float[S, Z, Z]``."""
+    return jnp.exp(_log_moves(state.parameters))
+
+
+def policy(state: State, problem: Problem, hparams: Hparams) -> jax.Array:
+    """Soft policies of the modes' rewards, without evidence: ``float[Z, S, A]``.
+
+    Zero at unavailable actions.
+    """
+    return jnp.exp(_log_policy(state.parameters, problem, hparams)[0])
