@@ -15,7 +15,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal, TYPE_CHECKING, TypedDict, Unpack
 
 import click
 
@@ -26,7 +26,7 @@ from jaxltl.app.reports.drawing import artist
 from jaxltl.app.wording import Record
 
 if TYPE_CHECKING:
-    from jaxltl.app.protocols import Job
+    from jaxltl.app.protocols import SomeJob
     from jaxltl.core.automata.automaton import Automaton
 
 
@@ -138,7 +138,7 @@ def learn(
         _print_json(result)
 
 
-def _precision(job: Job[Any, Any, Any]) -> contextlib.AbstractContextManager[None]:
+def _precision(job: SomeJob) -> contextlib.AbstractContextManager[None]:
     """Double precision for solvers; simulators are written for single precision."""
     return float64() if job.DOUBLE else contextlib.nullcontext()
 
@@ -360,6 +360,14 @@ def _render(result: Automaton, form: str, formula: str) -> str:
     return plot.to_bytes(plot.automaton(result), "svg").decode()
 
 
+class _Reading(TypedDict):
+    """Options of programs of :func:`solve`."""
+
+    constants: str | None
+    max_states: int | None
+    method: str
+
+
 @main.command()
 @click.argument("model_file", metavar="MODEL", type=click.Path(path_type=Path))
 @click.argument("properties", metavar="PROPERTY...", nargs=-1, required=True)
@@ -400,11 +408,9 @@ def solve(
     strategy: Path | None,
     tolerance: float,
     as_json: bool,
-    constants: str | None,
-    max_states: int | None,
-    method: str,
     checkpoint: Path | None,
     devices: processes.DeviceOptions,
+    **reading: Unpack[_Reading],
 ) -> None:
     """Solve properties of a model, or of a program in the PRISM language, with certified bounds.
 
@@ -418,6 +424,7 @@ def solve(
     With --mesh the model is distributed over devices, also over those of several processes, each of
     which is started with the same arguments; see docs/devices.md.
     """
+    constants, max_states, method = reading["constants"], reading["max_states"], reading["method"]
     launch = processes.launched(devices)
     say = _say_once(launch)
     say(_first_line(f"solving {model_file}"))

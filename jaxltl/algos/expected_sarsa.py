@@ -30,7 +30,6 @@ import jax
 import jax.numpy as jnp
 from jaxltl.core import struct
 from jax import lax
-from numpy.typing import ArrayLike
 
 from jaxltl.algos.common import learner
 from jaxltl.algos.common.play import check_reward, explicit_game
@@ -38,6 +37,7 @@ from jaxltl.algos.common.settings import COUNT, Number, static, traced
 from jaxltl.core.models.construct.restrict import with_allowed
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.ops.operators import sample_successor
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.pretty_print import brief, history
 from jaxltl.core.types import Status
 from jaxltl.core.validation import Range
@@ -46,10 +46,7 @@ from jaxltl.core.validation import Range
 @brief
 @struct.dataclass
 class Problem:
-    """A model with a reward; made by :func:`make_problem`.
-
-    `model` has the allowed actions as its available ones, and `reward` is ``float[S, A]``.
-    """
+    """A `model` with the allowed actions alone, and a `reward` ``float[S, A]``."""
 
     model: MDP
     reward: jax.Array
@@ -61,11 +58,9 @@ class Hparams:
     """Settings; numbers are traced.
 
     Attributes:
-      discount: in [0, 1).
-      step_size: alpha in (0, 1]; default 0.1.
-      epsilon: probability of a uniformly drawn allowed action; default 0.1.
-      restart: probability that the trajectory restarts before a transition; default 0.01.
-      num_transitions: in a step; static; default 100.
+      discount, step_size: in [0, 1), and alpha in (0, 1].
+      epsilon, restart: probabilities of a uniformly drawn action, and of a restart before a transition.
+      num_transitions: in a step; static.
     """
 
     discount: Number = traced(Range(0, 1, open_above=True))
@@ -78,13 +73,7 @@ class Hparams:
 @brief
 @struct.dataclass
 class State:
-    """A table and the end of the trajectory.
-
-    Attributes:
-      key, step: root key, and steps made, ``int32[]``.
-      q: ``float[S, A]``; 0 at actions that are not allowed.
-      position: ``int32[]``, the state of the model.
-    """
+    """A root `key`, the number `step`, the table `q` ``float[S, A]``, and the model's state `position`."""
 
     key: jax.Array
     step: jax.Array
@@ -95,23 +84,16 @@ class State:
 @brief(facts=partial(history, codes={"status": Status}))
 @struct.dataclass
 class Metrics:
-    """Figures of a step; scalars.
-
-    Attributes:
-      value: of the epsilon-greedy policy at the initial states, by the table.
-      residual: largest absolute temporal-difference error.
-      status: NONFINITE if a value is not finite, else COMPLETED.
-    """
+    """Of a step: the `value` at the initial states by the table, the largest absolute
+    temporal-difference error `residual`, and a `status`, NONFINITE or COMPLETED."""
 
     value: jax.Array
     residual: jax.Array
     status: jax.Array
 
 
-def make_problem(model: MDP, reward: ArrayLike, *, allowed: ArrayLike | None = None) -> Problem:
-    """A checked :class:`Problem` of an explicit MDP, `model`, and a `reward` ``float[S, A]``.
-
-    `allowed`, ``bool[S, A]``, are the actions that may be taken; default all available ones.
+def make_problem(model: MDP, reward: chex.Array, *, allowed: chex.Array | None = None) -> Problem:
+    """A checked :class:`Problem` of an explicit `model`; `allowed`, ``bool[S, A]``: default all actions.
 
     Raises:
       ValueError: a wrong shape, a reward that is not finite, or a state without an allowed action.
@@ -137,9 +119,7 @@ def _epsilon_greedy(q: jax.Array, allowed: jax.Array, epsilon: Number) -> jax.Ar
 def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metrics]:
     model = problem.model
 
-    def transition(
-        carry: tuple[jax.Array, jax.Array], key: chex.PRNGKey
-    ) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
+    def transition(carry: PyTree, key: chex.PRNGKey) -> PyTree:
         q, s = carry
         restart_key, start_key, action_key, successor_key = jax.random.split(key, 4)
         first = jax.random.categorical(start_key, jnp.log(model.initial)).astype(s.dtype)
@@ -156,11 +136,9 @@ def _step(state: State, problem: Problem, hparams: Hparams) -> tuple[State, Metr
     (q, position), errors = lax.scan(transition, (state.q, state.position), keys)
     value = jnp.sum(_epsilon_greedy(q, model.available, hparams.epsilon) * q, axis=-1)
     finite = jnp.all(jnp.isfinite(q))
-    return State(state.key, state.step + 1, q, position), Metrics(
-        value=jnp.sum(model.initial * value),
-        residual=jnp.max(jnp.abs(errors)),
-        status=learner.completion_status(finite, finite),
-    )
+    status = learner.completion_status(finite, finite)
+    metrics = Metrics(jnp.sum(model.initial * value), jnp.max(jnp.abs(errors)), status)
+    return State(state.key, state.step + 1, q, position), metrics
 
 
 init, step, run, train, run_until, train_until = learner.bind(_init, _step)

@@ -52,7 +52,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import struct
+from jaxltl.core import struct, validation
 from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 
@@ -60,7 +60,6 @@ from jaxltl.algos.common import action_distributions
 from jaxltl.algos.common.actor_critic import dense
 from jaxltl.algos.common.moments import normalized
 from jaxltl.algos.common.settings import applied
-from jaxltl.core import validation
 from jaxltl.core.automata import sequences
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.translate import to_automaton

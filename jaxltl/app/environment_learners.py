@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Any
 
 import chex
 import jax
@@ -23,6 +22,7 @@ from jaxltl.core.environments.episodes import Agent
 from jaxltl.core.environments.monitor import Verdict
 from jaxltl.core.values.evaluation.episode_scores import episode_evaluator
 from jaxltl.envs.networks import make_network, network_agent
+from jaxltl.app.protocols import Algorithm
 from jaxltl.app.wording import Record
 from jaxltl.core.models.protocols import PyTree
 
@@ -31,7 +31,7 @@ from jaxltl.core.models.protocols import PyTree
 class Method:
     """A learner with its problem and hyperparameters."""
 
-    algorithm: Any  # its module
+    algorithm: Algorithm  # its module
     problem: PyTree  # with `hparams`, arguments of its functions
     hparams: PyTree
     agent: Callable[[PyTree, bool], Agent]  # (state, likeliest) -> Agent, the policy of a state

@@ -18,7 +18,7 @@ import numpy as np
 
 import jaxltl
 from jaxltl.algos.common.chunks import Chunks, Options, run_in_chunks, trace_lanes
-from jaxltl.app.protocols import LearningTask, Training
+from jaxltl.app.protocols import Algorithm, LearningTask, Training
 from jaxltl.app.reports.drawing import Picture, drawing
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.models.mesh.lanes import on_host, vmap_over_mesh
@@ -35,7 +35,7 @@ def settings(kind: Callable[..., Hparams], given: Result) -> Hparams:
 
 
 def run_seeds(
-    algorithm: Any,
+    algorithm: Algorithm,
     problem: PyTree,
     hparams: PyTree,
     training: Training,
@@ -80,7 +80,7 @@ def _first_states(
 ) -> PyTree:
     """The initial states of N seeds, by one program."""
 
-    def first(n: object) -> Any:
+    def first(n: jax.Array | int) -> PyTree:
         return _first_of(init)(n, seed, problem, hparams)
 
     if num_seeds == 1:  # a smaller program than with vmap
@@ -92,14 +92,14 @@ def _first_states(
 def _first_of(init: Callable[..., PyTree]) -> Callable[..., PyTree]:
     """The initial state of lane n."""
 
-    def first(n: Any, seed: Any, problem: PyTree, hparams: PyTree) -> Any:
+    def first(n: jax.Array | int, seed: int, problem: PyTree, hparams: PyTree) -> PyTree:
         root = jax.random.fold_in(jax.random.key(seed), 1)
         return init(jax.random.fold_in(root, n), problem, hparams)
 
     return first
 
 
-def one_seed(learned: Any, i: int) -> Any:
+def one_seed(learned: PyTree, i: int) -> PyTree:
     """Seed i of a frozen dataclass of arrays ``[N, ...]`` with a history ``[T, N]``."""
     one = {k: v[i : i + 1] for k, v in vars(learned).items() if isinstance(v, np.ndarray)}
     history = {k: v if v.ndim == 1 else v[:, i : i + 1] for k, v in learned.history.items()}
@@ -114,7 +114,7 @@ def postfix(figures: Mapping[str, np.ndarray]) -> dict[str, str]:
     }
 
 
-def compile_in_background(function: Any, *given: Any) -> Callable[[], None]:
+def compile_in_background(function: PyTree, *given: PyTree) -> Callable[[], None]:
     """Compiles a jitted function in another thread; returns a function that waits for it."""
     lowered = function.lower(*given)
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar
 
 from jaxltl.app.wording import Result
 
 if TYPE_CHECKING:
+    from jaxltl.core.array_types import PyTree
     import numpy as np
     from jax.sharding import Mesh
 
@@ -22,6 +23,13 @@ Progress = Callable[[int, Mapping[str, "np.ndarray"]], None]  # steps, and metri
 T = TypeVar("T", bound="LearningTask")
 S = TypeVar("S")
 O = TypeVar("O", bound="Outcome")  # noqa: E741
+
+
+class Algorithm(Protocol):
+    """The functions of a learner that jobs call; implemented by its module."""
+
+    init: Callable[..., PyTree]
+    step: Callable[..., tuple[PyTree, PyTree]]
 
 
 class Learner(Protocol):
@@ -135,3 +143,6 @@ class Job(Protocol[T, S, O]):
     def live(self, outcome: O) -> Sequence[Explorer | TooLarge | Curves]:
         """The interactive parts of the report."""
         ...
+
+
+SomeJob: TypeAlias = Job[Any, Any, Any]  # of a kind that a task file decides

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from jaxltl.app.protocols import Job, LearningTask, O, S, T, Training
+from jaxltl.app.protocols import Job, LearningTask, SomeJob, O, S, T, Training
 from jaxltl.app.wording import Result
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ class Console:
     group: ProcessGroup
 
 
-def job_of(task_file: Path) -> Job[Any, Any, Any]:
+def job_of(task_file: Path) -> SomeJob:
     """The kind of job that a task file describes."""
     from jaxltl.app.files.task import is_environment_task, is_grounding_task, method_of
 

@@ -15,11 +15,10 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import struct
+from jaxltl.core import struct, validation
 from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 
-from jaxltl.core import validation
 from jaxltl.core.environments.environment import Environment, Timestep, make_box, make_environment
 from jaxltl.core.environments.time_limit import with_time_limit, without_time_limit
 from jaxltl.core.models.protocols import PyTree

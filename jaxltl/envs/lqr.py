@@ -16,8 +16,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import validation
-from jaxltl.core import struct
+from jaxltl.core import struct, validation
 from jax import lax
 from numpy.typing import ArrayLike, DTypeLike
 

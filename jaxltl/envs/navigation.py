@@ -32,11 +32,10 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import struct
+from jaxltl.core import struct, validation
 from jax import lax
 from numpy.typing import ArrayLike
 
-from jaxltl.core import validation
 from jaxltl.core.pretty_print import brief
 from jaxltl.envs.networks import Network, apply_layers, layers, make_network, padded
 

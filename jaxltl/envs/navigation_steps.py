@@ -12,9 +12,8 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import struct
+from jaxltl.core import struct, validation
 
-from jaxltl.core import validation
 from jaxltl.core.environments.environment import Environment, Timestep, make_box, make_environment
 from jaxltl.envs import navigation as nav
 from jaxltl.envs.navigation import Navigation, State

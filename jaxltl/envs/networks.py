@@ -13,10 +13,9 @@ from itertools import pairwise
 import chex
 import jax
 import jax.numpy as jnp
-from jaxltl.core import struct
+from jaxltl.core import struct, validation
 from jax.tree_util import Partial
 
-from jaxltl.core import validation
 from jaxltl.core.environments.environment import (
     Box,
     Environment,

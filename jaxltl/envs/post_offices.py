@@ -21,8 +21,7 @@ from jaxltl.core.models.mdp import MDP, make_mdp
 from jaxltl.core.models.product import product
 from jaxltl.core.models.protocols import base_model
 from jaxltl.core.pretty_print import brief
-from jaxltl.envs.gridworld import ACTIONS as MOVES
-from jaxltl.envs.gridworld import gridworld
+from jaxltl.envs.gridworld import ACTIONS as MOVES, gridworld
 
 ACTIONS = (*MOVES, "off", "on")
 _CELLS, _WORLD_STATES = 9, 36

@@ -20,8 +20,7 @@ from jaxltl.core.logic.labels import satisfying
 from jaxltl.core.models.game import Game, make_game
 from jaxltl.core.models.mdp import MDP, make_mdp
 from jaxltl.core.models.ops import operators
-from jaxltl.envs.gridworld import ACTIONS as MOVES
-from jaxltl.envs.gridworld import gridworld, parse_map
+from jaxltl.envs.gridworld import ACTIONS as MOVES, gridworld, parse_map
 
 ACTIONS = (*MOVES, "stay")
 CORNERS = ("lower_left", "lower_right", "upper_left", "upper_right")

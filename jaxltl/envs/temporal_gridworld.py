@@ -16,7 +16,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import struct
+from jaxltl.core import struct, validation
 from numpy.typing import ArrayLike, NDArray
 
 from jaxltl.core.automata.automaton import Automaton, letter_index
@@ -29,7 +29,6 @@ from jaxltl.core.models.ops import operators
 from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.models.product import Product, product
 from jaxltl.core.models.trajectories import Trajectories, rollout
-from jaxltl.core import validation
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.values.discounted.soft import soft_value
 from jaxltl.core.values.undiscounted.performance import infeasible_starts

@@ -22,10 +22,9 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import struct
+from jaxltl.core import struct, validation
 from jax.tree_util import Partial
 
-from jaxltl.core import validation
 from jaxltl.core.environments.environment import Environment, Timestep, make_box, make_environment
 from jaxltl.core.environments.time_limit import with_time_limit
 from jaxltl.core.pretty_print import brief

@@ -11,7 +11,7 @@ from hashlib import sha256
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import struct
+from jaxltl.core import struct, validation
 from numpy.typing import ArrayLike
 
 from jaxltl.core.models.parametric.parametric import Ends, ParametricMDP, box_of, point_inside
@@ -19,7 +19,6 @@ from jaxltl.core.models.parametric.ranges import Ends as Ranges, ranges
 from jaxltl.core.models.parametric.rational import Rationals, make_rationals
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
 from jaxltl.core.pretty_print import brief
-from jaxltl.core import validation
 from jaxltl.core.array_types import Integers
 from jaxltl.io.drn.body import Names
 

@@ -11,12 +11,12 @@ from jaxltl.algos import expected_sarsa as sarsa
 HPARAMS = sarsa.Hparams(discount=0.6, step_size=1.0, epsilon=0.3, restart=0.1)
 
 
-def ring(num_states=5):
+def ring():
     """A deterministic ring; two actions go either way, the third leads to state 0."""
-    successor = np.stack([np.roll(np.arange(num_states), shift) for shift in (1, -1)], 1)
-    successor = np.concatenate([successor, np.zeros((num_states, 1), int)], 1)
-    model = jl.make_mdp(successor[..., None], np.ones((num_states, 3, 1)))
-    return model, np.random.default_rng(0).normal(size=(num_states, 3))
+    place = np.arange(5)
+    successor = np.stack([np.roll(place, 1), np.roll(place, -1), 0 * place], 1)[..., None]
+    model = jl.make_mdp(successor, np.ones(successor.shape))
+    return model, np.random.default_rng(0).normal(size=(5, 3))
 
 
 @pytest.mark.parametrize("mask", [None, [True, True, False]])

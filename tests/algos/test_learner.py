@@ -349,9 +349,7 @@ def modes():
 def temporal_difference():
     problem = expected_sarsa.make_problem(world()[0], numbers(3, 2))
     setting = partial(expected_sarsa.Hparams, num_transitions=7, restart=0.3)
-    return Case(
-        expected_sarsa, problem, setting(discount=0.9), setting(discount=0.8, step_size=0.3)
-    )
+    return Case(expected_sarsa, problem, setting(0.9), setting(0.8, step_size=0.3))
 
 
 LEARNERS = {

@@ -10,14 +10,13 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import struct
+from jaxltl.core import struct, validation
 
 from jaxltl.algos.cce import exponential_family as families
 from jaxltl.algos.cce._evaluation import scores
 from jaxltl.algos.cce.problem import Problem
 from jaxltl.algos.cce.state import Hparams, State
 from jaxltl.algos.common.schedules import Polynomial as Polynomial
-from jaxltl.core import validation
 from jaxltl.core.environments.environment import require_key
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.types import Status

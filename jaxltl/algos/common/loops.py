@@ -11,13 +11,12 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import struct
+from jaxltl.core import struct, validation
 from jax import lax
 from jax.tree_util import Partial
 
 from jaxltl.algos.common.settings import require_arrays, require_hparams
 from jaxltl.algos.common.trees import choose
-from jaxltl.core import validation
 from jaxltl.core.models.mesh.cores import over_cores
 from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.pretty_print import brief

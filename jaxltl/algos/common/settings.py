@@ -24,10 +24,9 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import struct
+from jaxltl.core import struct, validation
 
 from jaxltl.algos.common.schedules import at, is_schedule
-from jaxltl.core import validation
 from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.types import Status, worst
 from jaxltl.core.validation import Range

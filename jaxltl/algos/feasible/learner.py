@@ -46,7 +46,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxltl.core import struct
+from jaxltl.core import struct, validation
 from jax import lax
 from jax.tree_util import Partial
 from numpy.typing import ArrayLike
@@ -55,7 +55,7 @@ from jaxltl.algos.common import learner, loops, optimizers, trees
 from jaxltl.algos.common.schedules import Schedule, at
 from jaxltl.algos.common.settings import Number, static, traced
 from jaxltl.algos.feasible.problem import Problem, certify, require_problem
-from jaxltl.core import validation
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.models.parametric.parametric import ParametricMDP
 from jaxltl.core.pretty_print import brief, history
 from jaxltl.core.types import Status
@@ -367,7 +367,8 @@ def feasible(
         points = problem.model.inside_of("start", starts).astype(problem.low.dtype)
         keys = jax.random.split(key, len(points))
     # Only what the search reads, so that other models of the same shape do not recompile it.
-    numbers = ParametricMDP(None, problem.model.numbers, None, None, None, ())
+    nothing: PyTree = None
+    numbers = ParametricMDP(nothing, problem.model.numbers, None, None, None, ())
     lean = replace(problem, target=None, stay=None, model=numbers)
     return _prove(problem, threshold, _search(keys, points, lean, hparams, goal, most), budget)
 

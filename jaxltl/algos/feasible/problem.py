@@ -8,10 +8,9 @@ from typing import Any, cast
 
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import struct
+from jaxltl.core import struct, validation
 from numpy.typing import ArrayLike
 
-from jaxltl.core import validation
 from jaxltl.core.models.ops.array_namespace import to_jax
 from jaxltl.core.models.parametric.parametric import Ends, ParametricMDP
 from jaxltl.core.models.protocols import Array

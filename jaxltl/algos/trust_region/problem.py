@@ -7,9 +7,8 @@ import math
 import chex
 import jax
 import jax.numpy as jnp
-from jaxltl.core import struct
+from jaxltl.core import struct, validation
 
-from jaxltl.core import validation
 from jaxltl.core.environments.environment import (
     Box,
     Environment,

@@ -11,7 +11,8 @@ import numpy as np
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.continuous.dynamics import Dynamics
 from jaxltl.core.continuous.grid import Grid
-from jaxltl.core.continuous.images import Images, NoiseBox, Step, image_boxes
+from jaxltl.core.continuous.images import Images, NoiseBox, image_boxes
+from jaxltl.core.continuous.noise_gains import Step
 from jaxltl.core.continuous.interval_iteration import (
     IterationLimits,
     IterationResult,

@@ -26,16 +26,13 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import struct
+from jaxltl.core import struct, validation
 from jax.tree_util import Partial
 from numpy.typing import ArrayLike, DTypeLike
 from jax.extend.core import ClosedJaxpr
 
-from jaxltl.core import validation
-from jaxltl.core.pretty_print import count, nested_repr, propositions_text
-from jaxltl.core.pretty_print import value_range
+from jaxltl.core.pretty_print import brief, count, nested_repr, propositions_text, value_range
 from jaxltl.core.models.protocols import PyTree
-from jaxltl.core.pretty_print import brief
 from jaxltl.core.types import require_shape
 
 

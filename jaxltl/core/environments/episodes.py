@@ -8,11 +8,10 @@ from typing import NamedTuple
 import chex
 import jax
 import jax.numpy as jnp
-from jaxltl.core import struct
+from jaxltl.core import struct, validation
 from jax import lax
 from jax.tree_util import Partial
 
-from jaxltl.core import validation
 from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.environments.environment import (
     Environment,
@@ -22,8 +21,7 @@ from jaxltl.core.environments.environment import (
     require_environment,
     require_key,
 )
-from jaxltl.core.pretty_print import array_text, batch_text, count, readable, value_range
-from jaxltl.core.pretty_print import brief
+from jaxltl.core.pretty_print import array_text, batch_text, brief, count, readable, value_range
 
 
 def require_agent(agent: object) -> Agent:

@@ -13,9 +13,8 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import struct
+from jaxltl.core import struct, validation
 
-from jaxltl.core import validation
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.environments.monitor import Monitor, Verdict, make_monitor, trace_verdicts

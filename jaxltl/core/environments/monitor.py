@@ -22,8 +22,7 @@ from jaxltl.core.automata.verdicts import (
     verdict as verdict,
     verdicts as verdicts,
 )
-from jaxltl.core.pretty_print import batch_text, count, enum_counts
-from jaxltl.core.pretty_print import brief
+from jaxltl.core.pretty_print import batch_text, brief, count, enum_counts
 
 
 def _facts(value: Monitor) -> Iterator[str]:

@@ -11,9 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxltl.core import struct
+from jaxltl.core import struct, validation
 
-from jaxltl.core import validation
 from jaxltl.core.environments.dependence import marked_results, reads_key
 from jaxltl.core.environments.environment import (
     Environment,
@@ -24,10 +23,9 @@ from jaxltl.core.environments.environment import (
     require_key,
 )
 from jaxltl.core.environments.time_limit import without_time_limit
-from jaxltl.core.pretty_print import count, nested_repr, value_range
+from jaxltl.core.pretty_print import brief, count, nested_repr, value_range
 from jaxltl.core.models.protocols import Array, PyTree
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
-from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.rows import offsets_from_counts
 
 _BATCH = 1024  # states of a batch, at most

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.array_types import Array
 from jaxltl.core.games.objective import GR1
 from jaxltl.core.graphs.attractor import attract
@@ -50,7 +51,7 @@ def solve_gr1(graph: Graph, system: Array, objective: GR1, moves: Array | None =
     moves = graph.available if moves is None else moves & graph.available
     _, first = graph.first(moves)
 
-    def body(carry):
+    def body(carry: PyTree) -> PyTree:
         inside, actions, counters, _ = carry
         before, actions = inside, list(actions)
         for j in range(num_guarantees):
@@ -90,7 +91,7 @@ def _pursue(arena: _Arena, j: int, inside: Array, allowed: Array) -> tuple[Array
     graph, system, objective = arena
     xp = graph.xp
 
-    def body(carry):
+    def body(carry: PyTree) -> PyTree:
         found, action, _ = carry
         near = attract(graph, found, allowed, rule=system, among=inside)
         action = xp.where(near.region & ~found, near.action, action)
@@ -148,7 +149,7 @@ def gr1_layers(graph: Graph, system: Array, objective: GR1) -> Layers:
     for j in range(len(objective.guarantees)):
         goal = region & objective.guarantees[j]
 
-        def body(carry, goal=goal):
+        def body(carry: PyTree, goal: Array = goal) -> PyTree:
             found, rounds, n, _ = carry
             leads = allowed & graph.exists(found)
             some, all_ = graph.first(leads)[0], ~graph.first(allowed & ~leads)[0]

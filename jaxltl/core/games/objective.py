@@ -13,13 +13,12 @@ import jax
 import numpy as np
 from jaxltl.core import struct
 
-from jaxltl.core.pretty_print import count, value_range
+from jaxltl.core.pretty_print import brief, count, value_range
 from jaxltl.core.logic.labels import satisfying
 from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.models.ops.array_namespace import is_traced, namespace, to_jax
 from jaxltl.core.models.product import distinct_labels, letters_by_state
 from jaxltl.core.models.protocols import Array, LabelledModel, Model, base_model
-from jaxltl.core.pretty_print import brief
 
 States: TypeAlias = chex.Array | Formula | str  # a set of states
 

@@ -13,7 +13,7 @@ from jaxltl.core import struct
 
 from jaxltl.core.array_types import Booleans
 from jaxltl.core.automata.automaton import Automaton
-from jaxltl.core.pretty_print import array_text, count, describe, nested_repr, readable
+from jaxltl.core.pretty_print import array_text, brief, count, describe, nested_repr, readable
 from jaxltl.core.games.generalized_reactivity import NEVER, gr1_layers, solve_gr1
 from jaxltl.core.games.objective import GR1, Parity
 from jaxltl.core.games.winning import objective_at, on_states, solve_parity
@@ -27,7 +27,6 @@ from jaxltl.core.models.ops import operators
 from jaxltl.core.models.ops.array_namespace import namespace, to_jax
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import Array, Model, PyTree
-from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.graph.row_graph import RowGraph
 from jaxltl.core.sparse.rows import first_action
 
@@ -307,7 +306,14 @@ def _choose(objective: Parity | GR1, maximal: bool, bound: int | None) -> str:
     return "rank" if isinstance(objective, GR1) else "parity"
 
 
-def _on(game, region, mask, maximal: bool, reason: str, origin: Restriction | None = None):
+def _on(
+    game: Game,
+    region: Array,
+    mask: Array,
+    maximal: bool,
+    reason: str,
+    origin: Restriction | None = None,
+) -> Permissive:
     """The strategy with JAX arrays."""
     base = np.arange(game.mdp.mdp.num_states if _is_lazy(game) else game.num_states, dtype=np.int32)
     state, memory = (base, np.zeros_like(base)) if origin is None else origin[1:]
@@ -395,7 +401,7 @@ def _remember_won(game: Game, objective: Parity) -> tuple[Game, Parity, Restrict
 # --- the methods ------------------------------------------------------------------------------
 
 
-def _by_rank(arena: _Arena, region, stay, bound) -> Permissive:
+def _by_rank(arena: _Arena, region: Array, stay: Array, bound: int | None) -> Permissive:
     del bound
     game, graph, objective = arena
     if isinstance(objective, GR1):
@@ -423,7 +429,7 @@ def _some_nearer(graph: RowGraph, rank: np.ndarray, region: np.ndarray) -> np.nd
     return graph.least(rank) < rank[..., None]
 
 
-def _by_layers(arena: _Arena, region, stay) -> Permissive:
+def _by_layers(arena: _Arena, region: Array, stay: Array) -> Permissive:
     arena, origin = _explicit(arena, region, stay)
     game, graph, objective = arena
     layers: PyTree = gr1_layers(graph, game.system, objective)
@@ -461,7 +467,7 @@ def pursuing(game: Game, sets: Booleans) -> Game:
     return _beside(game, step, 0, letter.ravel(), "exit")
 
 
-def _by_counter(arena: _Arena, region, stay, bound) -> Permissive:
+def _by_counter(arena: _Arena, region: Array, stay: Array, bound: int | None) -> Permissive:
     if not _is_buchi(arena.objective):
         raise ValueError('method="counter" is for Buchi objectives; choose parity.')
     if bound is None:
@@ -496,7 +502,7 @@ def _by_counter(arena: _Arena, region, stay, bound) -> Permissive:
     )
 
 
-def _by_parity(arena: _Arena, region, stay, bound) -> Permissive:
+def _by_parity(arena: _Arena, region: Array, stay: Array, bound: int | None) -> Permissive:
     if not isinstance(arena.objective, Parity):
         raise ValueError(
             'method="parity" is for parity objectives; GR(1) has rank, and as a '

@@ -7,10 +7,13 @@ solver.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 from typing import NamedTuple
 
 import numpy as np
 
+from jaxltl.core.models.protocols import PyTree
 from jaxltl.core.array_types import Booleans, Integers
 from jaxltl.core.games.objective import GR1, Parity
 from jaxltl.core.games.winning import Winning
@@ -203,7 +206,7 @@ def _refute_environment(claim: _Claim) -> str:
     return ""
 
 
-def _failures(claim: _Claim):
+def _failures(claim: _Claim) -> Iterator[tuple[PyTree, PyTree, str]]:
     """End components that fail the objective: one set is avoided and all others are met."""
     if claim.priority is not None:
         yield from _least_priorities(claim.priority, 1)
@@ -216,7 +219,7 @@ def _failures(claim: _Claim):
         )
 
 
-def _successes(claim: _Claim):
+def _successes(claim: _Claim) -> Iterator[tuple[PyTree, PyTree, str]]:
     """End components that achieve the objective, in the same form."""
     if claim.priority is not None:
         yield from _least_priorities(claim.priority, 0)
@@ -226,7 +229,7 @@ def _successes(claim: _Claim):
         yield assumption, claim.guarantees[:0], f"stay for ever without assumption {i}"
 
 
-def _least_priorities(priority: Integers, parity: int):
+def _least_priorities(priority: Integers, parity: int) -> Iterator[tuple[PyTree, PyTree, str]]:
     for p in np.unique(priority[priority % 2 == parity]).tolist():
         kind = "odd" if parity else "even"
         yield (

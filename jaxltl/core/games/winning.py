@@ -16,7 +16,7 @@ from jaxltl.core import struct
 
 from jaxltl.core.array_types import Array
 from jaxltl.core.automata.automaton import Automaton
-from jaxltl.core.pretty_print import array_text, count, nested_repr, readable
+from jaxltl.core.pretty_print import array_text, brief, count, nested_repr, readable
 from jaxltl.core.games.generalized_reactivity import solve_gr1
 from jaxltl.core.games.objective import GR1, Parity, States, buchi
 from jaxltl.core.graphs.attractor import attract
@@ -29,7 +29,6 @@ from jaxltl.core.models.mdp import make_mdp, support
 from jaxltl.core.models.ops.array_namespace import namespace, to_jax
 from jaxltl.core.models.product import product
 from jaxltl.core.models.protocols import Model, PyTree
-from jaxltl.core.pretty_print import brief
 
 
 def _facts(value: Winning) -> Iterator[str]:
@@ -286,7 +285,7 @@ def _even(arena: _Arena, p: int, won: _Found, open_: Array, allowed: Array) -> _
     xp = graph.xp
     here = open_ & (objective.priority == p)
 
-    def body(carry):
+    def body(carry: PyTree) -> PyTree:
         inside, found, _ = carry
         # The environment can force the play out with positive probability.
         left = attract(graph, ~inside, allowed, rule=~system, among=open_ & inside)
@@ -310,7 +309,7 @@ def _odd(arena: _Arena, p: int, won: _Found, open_: Array, allowed: Array) -> _F
     # The system makes no move that may leave what an even priority above has it remain in.
     allowed = allowed & (graph.forall(won.region | open_) | ~graph.on_choices(system))
 
-    def body(carry):
+    def body(carry: PyTree) -> PyTree:
         found, _ = carry
         drawn = attract(graph, found.region, allowed, rule=system, among=open_)
         new = drawn.region & ~found.region & system

@@ -15,7 +15,7 @@ import numpy as np
 from jaxltl.core.array_types import Array
 from jaxltl.core.graphs.graph import Graph, graph_of, take
 from jaxltl.core.models.ops.array_namespace import to_jax
-from jaxltl.core.models.protocols import Model
+from jaxltl.core.models.protocols import Model, PyTree
 from jaxltl.core.pretty_print import brief
 
 
@@ -183,7 +183,7 @@ def surely(
         outside = attract(graph, ~region, allowed, rule=False, among=~goal).region
         return attract(graph, goal, allowed & graph.forall(~outside))
 
-    def body(carry):
+    def body(carry: PyTree) -> PyTree:
         found, _ = carry
         smaller = inner(found.region)
         return smaller, graph.xp.any(smaller.region != found.region)

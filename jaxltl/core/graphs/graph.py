@@ -77,11 +77,13 @@ class TracedGraph:
         """Mask of states with an action in a mask ``bool[S, A]``, and the first such action (or 0)."""
         return choices(self.model).first(mask)
 
-    def attract(self, goal, allowed, rule, among, chance: str):
+    def attract(
+        self, goal: Array, allowed: Array, rule: Array, among: Array, chance: str
+    ) -> PyTree:
         """Region, action and rank of an attractor."""
         return _sweeps(self, goal, allowed & self.available, rule, among, chance=chance)
 
-    def components(self, core, allowed, closed: bool):
+    def components(self, core: Array, allowed: Array, closed: bool) -> tuple[Array, Array]:
         """The components of a RowGraph, by a callback; by sweeps for a model over a mesh."""
         if is_sharded(self.model):
             return components_by_sweeps(self, core, allowed, closed)
@@ -91,13 +93,13 @@ class TracedGraph:
             jax.ShapeDtypeStruct(choice_shape(self.model), jnp.bool_),
         )
 
-        def host(model, core, allowed):
+        def host(model: Model, core: Array, allowed: Array) -> PyTree:
             return graph_of(model).components(core, allowed, closed)
 
-        def callback():
+        def callback() -> PyTree:
             return host_callback(host, result, self.model, core, allowed)
 
-        def trivial():
+        def trivial() -> PyTree:
             number = jnp.arange(flat, dtype=jnp.int32).reshape(shape)
             return number, jnp.zeros(result[1].shape, bool)
 
@@ -123,10 +125,12 @@ Graph: TypeAlias = Any  # a RowGraph with NumPy's arrays, or a TracedGraph with 
 
 
 @partial(jax.jit, static_argnames=("chance",))
-def _sweeps(graph: TracedGraph, goal, allowed, rule, among, *, chance):
+def _sweeps(
+    graph: TracedGraph, goal: Array, allowed: Array, rule: Array, among: Array, *, chance: str
+) -> PyTree:
     leads = graph.exists if chance == "some" else graph.forall
 
-    def body(carry):
+    def body(carry: PyTree) -> PyTree:
         region, action, rank, _, n = carry
         hit = allowed & leads(region)
         some, first = graph.first(hit)

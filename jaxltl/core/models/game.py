@@ -10,9 +10,9 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import struct
+from jaxltl.core import struct, validation
 
-from jaxltl.core.pretty_print import array_text, count, nested_repr, readable
+from jaxltl.core.pretty_print import array_text, brief, count, nested_repr, readable
 from jaxltl.core.models.construct.padded import to_padded
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.mdp import MDP, DenseMDP, support
@@ -21,8 +21,6 @@ from jaxltl.core.models.ops.array_namespace import is_traced, namespace, to_jax
 from jaxltl.core.models.ops.choices import choice_shape, choices
 from jaxltl.core.models.protocols import Array, Model, PyTree, base_model
 from jaxltl.core.models.sparse import SparseMDP
-from jaxltl.core.pretty_print import brief
-from jaxltl.core import validation
 
 
 def _facts(value: Game) -> Iterator[str]:

@@ -8,10 +8,10 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from jaxltl.core import struct
+from jaxltl.core import struct, validation
 
 from jaxltl.core.models import facts
-from jaxltl.core.pretty_print import number, readable, value_range
+from jaxltl.core.pretty_print import brief, number, readable, value_range
 from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.protocols import Model
 from jaxltl.core.models.sparse import (
@@ -23,12 +23,10 @@ from jaxltl.core.models.sparse import (
     make_sparse,
     placed,
 )
-from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.interval.l1_ball import Ball
 from jaxltl.core.sparse.interval.row_table import row_sums
 from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP, uncertainty_sets
 from jaxltl.core.sparse.rows import offsets_from_counts
-from jaxltl.core import validation
 
 NEAR = 1e-6  # how far a row may miss a distribution and still be scaled to one
 # Names under which numbers of entries travel with the entries, and radii with the rows.

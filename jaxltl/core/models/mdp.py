@@ -8,16 +8,21 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import struct
+from jaxltl.core import struct, validation
 from numpy.typing import DTypeLike
 
 from jaxltl.core.models import facts
-from jaxltl.core.pretty_print import array_text, batch_text, count, propositions_text, readable
+from jaxltl.core.pretty_print import (
+    array_text,
+    batch_text,
+    brief,
+    count,
+    propositions_text,
+    readable,
+)
 from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
 from jaxltl.core.models.ops.underflow import target_dtype, underflow_text, underflows
 from jaxltl.core.models.protocols import Array, Model
-from jaxltl.core.pretty_print import brief
-from jaxltl.core import validation
 
 
 class _PaddedShape:

@@ -8,27 +8,25 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
 from functools import singledispatch
-from typing import Any, overload
+from typing import Any, overload, TypeAlias
 
 import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import struct
+from jaxltl.core import struct, validation
 
-from jaxltl.core import validation
 from jaxltl.core.automata.automaton import Automaton, letter_index
 from jaxltl.core.automata.translate import to_automaton
 from jaxltl.core.logic.labels import distinct_rows, require_known
 from jaxltl.core.logic.ltl import Formula, parse_ltl
-from jaxltl.core.pretty_print import batch_text, count, describe, nested_repr
+from jaxltl.core.pretty_print import batch_text, brief, count, describe, nested_repr
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.ops import kernels, operators
 from jaxltl.core.models.ops.annotated_pytree import register_annotated_pytree
 from jaxltl.core.models.ops.array_namespace import namespace, to_jax
 from jaxltl.core.models.protocols import Array, LabelledModel
-from jaxltl.core.pretty_print import brief
 
 
 register_annotated_pytree(
@@ -155,7 +153,7 @@ class Product:
 
 def occurring_letters(
     world: LabelledModel, propositions: Collection[str] | None = None
-) -> list[frozenset]:
+) -> list[frozenset[str]]:
     """Distinct letters of a model, for ``to_automaton``.
 
     Args:
@@ -268,7 +266,17 @@ _SELECT = 16  # memory states up to which reading at a memory is a selection
 # --- the primitives -----------------------------------------------------------------------
 
 
-def _through(model: Product, operator, value: jax.Array, term, combine, empty=0) -> jax.Array:
+Function: TypeAlias = Callable[..., jax.Array]
+
+
+def _through(
+    model: Product,
+    operator: Function,
+    value: jax.Array,
+    term: Function,
+    combine: Function,
+    empty: float = 0,
+) -> jax.Array:
     """Applies an operator of the base model at every memory state: ``[S, Q, A]`` from ``[S, Q]``."""
     # On entry the value of t is read at delta(q, L(t)), before the base operator; on exit at
     # delta(q, L(s)), after it.
@@ -283,7 +291,13 @@ def _through(model: Product, operator, value: jax.Array, term, combine, empty=0)
     return jnp.where(model.allowed, result, jnp.asarray(empty, result.dtype))
 
 
-def _each_memory(world: MDP | DenseMDP, operator, value, term, combine) -> jax.Array:
+def _each_memory(
+    world: MDP | DenseMDP,
+    operator: Function,
+    value: jax.Array,
+    term: Function,
+    combine: Function,
+) -> jax.Array:
     """An operator of the base model on each column of ``[S, Q]``: ``[S, Q, A]``."""
     if isinstance(world, DenseMDP):
         return jax.vmap(lambda v: operator(world, v), in_axes=1, out_axes=1)(value)
@@ -441,7 +455,9 @@ def _successor(world: MDP | DenseMDP) -> jax.Array:
     return jnp.broadcast_to(jnp.arange(world.num_states), world.transition.shape)
 
 
-def flat_successor(successor, next_memory, s, q, label_on):
+def flat_successor(
+    successor: Array, next_memory: Array, s: Array, q: Array, label_on: str
+) -> Array:
     """Numbers ``t * Q + q'`` of the product states that follow (s, q) when t follows s."""
     read = successor if label_on == "entry" else s
     return successor * next_memory.shape[1] + next_memory[read, q]

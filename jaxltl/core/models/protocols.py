@@ -113,7 +113,7 @@ class DerivedModel(Model, Protocol):
     """A model on top of another one: a product with an automaton, or a game."""
 
     @property
-    def mdp(self) -> Any:
+    def mdp(self) -> Model:
         """The model underneath."""
 
 

@@ -11,7 +11,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import struct
+from jaxltl.core import struct, validation
 from numpy.typing import DTypeLike
 
 from jaxltl.core.language.parser import parse_expression
@@ -24,7 +24,6 @@ from jaxltl.core.models.ops.underflow import underflow_text, underflows
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.rows import SCIPY_SIZE
-from jaxltl.core import validation
 
 _PADDED = (
     "this takes models that are padded: give to_padded(model). Sparse models have choices "

@@ -12,14 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxltl.core import struct, validation
 
-from jaxltl.core.pretty_print import batch_text, count, value_range
+from jaxltl.core.pretty_print import batch_text, brief, count, value_range
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.ops.annotated_pytree import register_annotated_pytree
 from jaxltl.core.models.ops.array_namespace import is_traced, namespace, to_jax
 from jaxltl.core.models.ops.operators import policy_distribution, sample_successor
 from jaxltl.core.models.protocols import ActionModel, Model, PyTree
 from jaxltl.core.policies.finite_memory import FiniteMemoryPolicy
-from jaxltl.core.pretty_print import brief
 
 
 register_annotated_pytree(
@@ -243,7 +242,7 @@ def _rollout(
         start_key, key = jax.random.split(key)
         start = jax.random.categorical(start_key, initial).astype(jnp.int32)
 
-        def step(at: PyTree, t: jax.Array):
+        def step(at: PyTree, t: jax.Array) -> PyTree:
             action_key, successor_key = jax.random.split(jax.random.fold_in(key, t))
             action = jnp.asarray(policy.act(action_key, at), jnp.int32)
             successor = sample_successor(model, successor_key, at.state, action)

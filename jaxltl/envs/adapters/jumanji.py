@@ -37,8 +37,7 @@ from jaxltl.envs.adapters.common import (
     some_allowed,
     timestep,
 )
-from jaxltl.envs.adapters.in_turn import Inner
-from jaxltl.envs.adapters.in_turn import in_turn as parts_in_turn
+from jaxltl.envs.adapters.in_turn import Inner, in_turn as parts_in_turn
 
 # More are learned part by part, and a mask of all their combinations would fill the memory.
 _MOST_ACTIONS = 2**20

@@ -15,10 +15,9 @@ from jaxltl.core.statistics.graph_assumption import LeastProbability, require_gr
 from jaxltl.core import validation
 from jaxltl.core.sparse.rows import offsets_from_counts
 from jaxltl.core.array_types import Integers
-from jaxltl.core.pretty_print import count, names_text, readable
+from jaxltl.core.pretty_print import brief, count, names_text, readable
 from jaxltl.core.models.mdp import MDP, DenseMDP, support
 from jaxltl.core.models.sparse import SparseMDP, make_sparse
-from jaxltl.core.pretty_print import brief
 
 _INTEGER = re.compile(r"-?[1-9][0-9]{0,17}|0")
 MOST_SAMPLES = 2**53  # the largest range of exact integers in double precision

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, DTypeLike
 
 from jaxltl.core import validation
 from jaxltl.core.models import facts
-from jaxltl.core.pretty_print import count
+from jaxltl.core.pretty_print import brief, count
 from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.construct.padded import row_actions
 from jaxltl.core.models.mesh.lanes import on_host
@@ -29,7 +29,6 @@ from jaxltl.core.models.sparse import (
     refuse_underflow,
     scaled,
 )
-from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
 
 _WIDTHS = np.array(sorted({int(m * 2**e) for e in range(26) for m in (1, 1.5)} | {3}))

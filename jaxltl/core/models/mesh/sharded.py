@@ -12,18 +12,16 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import struct
+from jaxltl.core import struct, validation
 from jax import lax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxltl.core.models import facts
-from jaxltl.core.pretty_print import count, propositions_text, truncate
+from jaxltl.core.pretty_print import brief, count, propositions_text, truncate
 from jaxltl.core.models.ops import kernels, operators
 from jaxltl.core.models.ops.underflow import is_positive
 from jaxltl.core.models.product import distinct_labels, letters_by_state
 from jaxltl.core.models.protocols import Array, Model, PyTree
-from jaxltl.core.pretty_print import brief
-from jaxltl.core import validation
 
 
 class RowTable(NamedTuple):

@@ -21,13 +21,16 @@ from jax import lax
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.ops import kernels
 from jaxltl.core.models.ops.array_namespace import is_traced
-from jaxltl.core.models.ops.choices import action_argmax as action_argmax
-from jaxltl.core.models.ops.choices import action_max as action_max
-from jaxltl.core.models.ops.choices import action_mean as action_mean
-from jaxltl.core.models.ops.choices import choice_shape, choices
-from jaxltl.core.models.ops.choices import first_action as first_action
-from jaxltl.core.models.ops.choices import is_deterministic as is_deterministic
-from jaxltl.core.models.ops.choices import row_entries
+from jaxltl.core.models.ops.choices import (
+    action_argmax as action_argmax,
+    action_max as action_max,
+    action_mean as action_mean,
+    choice_shape,
+    choices,
+    first_action as first_action,
+    is_deterministic as is_deterministic,
+    row_entries,
+)
 from jaxltl.core.models.ops.kernels import where_positive
 from jaxltl.core.models.protocols import Array, Model, PyTree, base_model
 from jaxltl.core.models.ops.underflow import is_positive, is_subnormal, underflow_text, underflows

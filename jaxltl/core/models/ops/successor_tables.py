@@ -20,9 +20,12 @@ from jaxltl.core.models.mdp import MDP
 from jaxltl.core.models.mesh.sharded import ShardedMDP, over_devices, seen_by
 from jaxltl.core.models.ops import kernels, operators
 from jaxltl.core.models.ops.array_namespace import to_jax
-from jaxltl.core.models.ops.choices import Columns
-from jaxltl.core.models.ops.choices import action_columns as action_columns
-from jaxltl.core.models.ops.choices import RowEntries, row_entries
+from jaxltl.core.models.ops.choices import (
+    Columns,
+    RowEntries,
+    action_columns as action_columns,
+    row_entries,
+)
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import Model, PyTree
 from jaxltl.core.models.sparse import SparseMDP

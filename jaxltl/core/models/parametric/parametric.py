@@ -4,22 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import struct
+from jaxltl.core import struct, validation
 from jax.tree_util import Partial
 from numpy.typing import ArrayLike
 
-from jaxltl.core.pretty_print import names_text, nested_repr
+from jaxltl.core.pretty_print import brief, names_text, nested_repr
 from jaxltl.core.models.ops.array_namespace import is_traced
 from jaxltl.core.models.protocols import Array, PyTree
 from jaxltl.core.models.sparse import Rewards, SparseMDP, make_sparse
-from jaxltl.core.pretty_print import brief
-from jaxltl.core import validation
 
 Ends = Array  # for all parameters, for each name, or float[D]
 _TRIALS = 64  # candidate points for a valid model
@@ -54,7 +51,7 @@ class ParametricMDP:
       (('heads',), [0.1], [0.9])
     """
 
-    model: Any
+    model: SparseMDP
     numbers: PyTree
     low: Array
     high: Array

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from operator import itemgetter
 from functools import partial, reduce
 from typing import NamedTuple, Unpack
 
@@ -267,15 +268,16 @@ def boltzmann_fixed_points(
     # For a contraction by the discount this residual bounds the error by the tolerance.
     residual = tolerance * (1 - discount) / 10
     found: list[Solution] = []
-    for method in ("damped", "newton"):
-        run = jax.vmap(
-            lambda v, method=method: boltzmann_value(
-                model, reward, discount, initial=v, method=method, tolerance=residual
-            )
+
+    def run(method: str, v: jax.Array) -> Solution:
+        return boltzmann_value(
+            model, reward, discount, initial=v, method=method, tolerance=residual
         )
-        batch = run(starts)
+
+    for method in ("damped", "newton"):
+        batch = jax.vmap(partial(run, method))(starts)
         for i in np.flatnonzero(np.asarray(batch.status) <= Status.UNCERTIFIED):
-            one = jax.tree.map(lambda x, i=i: x[i], batch)
+            one = jax.tree.map(itemgetter(i), batch)
             if all(jnp.max(jnp.abs(one.value - f.value)) > tolerance for f in found):
                 found.append(one)
     return sorted(found, key=lambda f: float(f.value.sum()))

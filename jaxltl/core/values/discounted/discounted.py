@@ -28,8 +28,7 @@ from jaxltl.core.models.ops.array_namespace import is_traced
 from jaxltl.core.models.ops.choices import Layout, Quantity, choices
 from jaxltl.core.models.mdp import MDP, DenseMDP
 from jaxltl.core.models.mesh.sharded import ShardedMDP
-from jaxltl.core.models.ops import double_word as dw
-from jaxltl.core.models.ops import kernels
+from jaxltl.core.models.ops import double_word as dw, kernels
 from jaxltl.core.models.ops.operators import (
     expectation,
     policy_operator,
@@ -251,7 +250,9 @@ def policy_value(
 
 
 @jax.jit
-def _policy_value(model, policy, reward, discount, tolerance, max_steps) -> Solution:
+def _policy_value(
+    model: PyTree, policy: Array, reward: Array, discount: Words, tolerance: Array, max_steps: Array
+) -> Solution:
     given, raw = parameters(model, reward, discount, tolerance), reward
     reward = expected_reward(model, reward)
     checked = valid_policy(model, policy)
@@ -259,7 +260,7 @@ def _policy_value(model, policy, reward, discount, tolerance, max_steps) -> Solu
     weight = over.columns(checked.distribution)
     given = given._replace(policy=weight)
 
-    def combine(over: Layout, q: Quantity, given: Parameters):
+    def combine(over: Layout, q: Quantity, given: PyTree) -> tuple[jax.Array, Quantity]:
         return over.mean(given.policy, q), given.policy
 
     value, image, n, _ = newton.solve(
@@ -511,7 +512,9 @@ def best_action(over: Layout, q: Quantity, given: PyTree) -> tuple[jax.Array, Qu
     return over.best(q)
 
 
-def _modified_policy_iteration(model, reward, given: Parameters, max_steps, sweeps):
+def _modified_policy_iteration(
+    model: ActionModel, reward: Array, given: Parameters, max_steps: Array, sweeps: Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     over = choices(model)
 
     def greedy(v: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -519,14 +522,14 @@ def _modified_policy_iteration(model, reward, given: Parameters, max_steps, swee
         image, policy = over.argmax(q)
         return image.ravel(), policy
 
-    def step(_, carry, __):
+    def step(_: None, carry: PyTree, __: None) -> PyTree:
         _, image, policy = carry
         onward = policy_operator(model, policy)
         gain = over.mean(policy, reward).ravel()
         value = lax.fori_loop(0, sweeps, lambda _, v: gain + given.discount * onward(v), image)
         return value, *greedy(value)
 
-    def finished(carry, _):
+    def finished(carry: PyTree, _: None) -> jax.Array:
         return judge(carry[0], carry[1], given)[0]
 
     zero = jnp.zeros(model.num_states, model.dtype)

@@ -32,7 +32,7 @@ from jaxltl.core.models.ops.operators import (
     valid_policy,
 )
 from jaxltl.core.models.ops.successor_tables import sweep_operator
-from jaxltl.core.models.protocols import Array, Model
+from jaxltl.core.models.protocols import Array, Model, PyTree
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.types import Solution, require_shape, status_code
 from jaxltl.core.values.discounted.discounted import best_action, expected_reward
@@ -464,7 +464,7 @@ def _approached(
     zero: jax.Array,
     method: str,
     max_steps: chex.Numeric,
-):
+) -> tuple[jax.Array, jax.Array, jax.Array, PyTree]:
     """Approximate fixed point, its image, the number of steps, and the weights of its choices."""
     policies = method == "policy_iteration"
     if method == "strategy_iteration":
@@ -501,7 +501,7 @@ class _Strategies(NamedTuple):
 
 def _strategy_iteration(
     rows: SweepOperator, numbers: newton.Backup, zero: jax.Array, max_steps: chex.Numeric
-):
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Solves for the value of both players' choices, then improves the environment's, or,
     where those are a best answer already, the system's (Hoffman and Karp 1966)."""
 

@@ -14,7 +14,7 @@ from jaxltl.core.models.ops.choices import choices
 from jaxltl.core.models.ops.operators import pushforward, require_policy, valid_policy
 from jaxltl.core.models.ops.successor_tables import sweep_operator
 from jaxltl.core.models.product import Product
-from jaxltl.core.models.protocols import Model
+from jaxltl.core.models.protocols import Array, Model, PyTree
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.types import Solution, status_code
 from jaxltl.core.values.engine.certificates import backup_error, most_choices, refuse
@@ -63,7 +63,9 @@ def occupancy_measure(
 
 
 @jax.jit
-def _occupancy(model, policy, discount, start, tolerance) -> Solution:
+def _occupancy(
+    model: PyTree, policy: Array, discount: Array, start: Array, tolerance: Array | None
+) -> Solution:
     checked, over = valid_policy(model, policy), choices(model)
     policy = checked.distribution
     discount = jnp.asarray(discount, model.dtype)
@@ -124,7 +126,9 @@ def _inflow_terms(model: Model) -> jax.Array:
     return jnp.full(model.state_shape, model.num_states * most_choices(model))
 
 
-def _visits(model, policy, discount, start, linear) -> tuple[jax.Array, jax.Array]:
+def _visits(
+    model: PyTree, policy: Array, discount: Array, start: Array, linear: PyTree
+) -> tuple[jax.Array, jax.Array]:
     visits, n = linear.transpose_counted(start)
     flow = start + discount * pushforward(model, choices(model).spread(visits) * policy)
     # One step of iterative refinement.

@@ -169,19 +169,19 @@ def soft_policy_adjoint(
     g = cotangent - policy * over.spread(over.sum(cotangent))
     weight, discount = over.columns(policy), jnp.asarray(discount, policy.dtype)
 
-    def push(before, discount, mass):
+    def push(before: PyTree, discount: jax.Array, mass: PyTree) -> jax.Array:
         """The discounted flow ``[N]`` of masses ``[N]`` of the actions."""
         if before is not None:
             return discount * before.pushforward(jnp.concatenate(mass))
         return discount * pushforward(model, over.whole(mass)).ravel()
 
-    def step(before, carry, given):
+    def step(before: PyTree, carry: PyTree, given: PyTree) -> PyTree:
         (x, r), (weight, discount, _) = carry, given
         return x + r, push(
             before, discount, jax.tree.map(jnp.multiply, weight, over.layout.spread(r, weight))
         )
 
-    def finished(carry, given):
+    def finished(carry: PyTree, given: PyTree) -> jax.Array:
         return jnp.sum(jnp.abs(carry[1]), 0) <= given[2]
 
     b = push(predecessors, discount, over.columns(g))

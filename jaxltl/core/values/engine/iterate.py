@@ -69,10 +69,7 @@ def in_turn(function: Callable[..., Result], *arguments: object) -> Result:
     # For work that depends on the data, or is slower in a batch. The function takes
     # trees of arrays and closes over no batched array.
 
-    @jax.custom_batching.sequential_vmap
-    def one(arguments: tuple[object, ...]) -> Result:
-        return function(*arguments)
-
+    one = jax.custom_batching.sequential_vmap(lambda arguments: function(*arguments))
     return one(lax.stop_gradient(jax.tree.map(jnp.asarray, arguments)))
 
 

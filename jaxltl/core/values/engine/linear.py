@@ -303,7 +303,14 @@ def solve_linear(
     return x.reshape(b.shape)
 
 
-def _krylov(matvec, table, given, b, tolerance, max_steps):
+def _krylov(
+    matvec: Callable[..., jax.Array],
+    table: PyTree,
+    given: PyTree,
+    b: jax.Array,
+    tolerance: jax.Array | float | None,
+    max_steps: jax.Array | int,
+) -> tuple[jax.Array, jax.Array]:
     """The solution ``[N]`` of ``matvec(table, given, x) = b``, and the steps made."""
     if tolerance is None:
         tolerance = float(jnp.finfo(b.dtype).eps) ** 0.8

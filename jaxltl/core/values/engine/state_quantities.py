@@ -10,7 +10,7 @@ from jax.typing import ArrayLike
 from jaxltl.core import validation
 from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.models.sparse import Reward, Rewards, SparseMDP, choice_reward, reward_structure
-from jaxltl.core.sparse.interval.strategy_iteration import RobustValues
+from jaxltl.core.sparse.interval.robust_values import RobustValues
 from jaxltl.core.sparse.solvers.total_cost import Enclosure
 from jaxltl.core.types import Solution, Status, require_states
 

@@ -18,12 +18,11 @@ from jaxltl.core.models.construct.convert import to_sparse
 from jaxltl.core.models.construct.counts import TransitionCounts, align_counts
 from jaxltl.core.models.interval import IntervalMDP, make_interval
 from jaxltl.core.models.sparse import SparseMDP
-from jaxltl.core.pretty_print import brief
+from jaxltl.core.pretty_print import brief, count, nested_repr, readable
 from jaxltl.core.statistics.confidence_sets import ConfidenceSets, Method, intervals_from_counts
 from jaxltl.core.types import require_shape
 from jaxltl.core import validation
 from jaxltl.core.models.protocols import RowModel
-from jaxltl.core.pretty_print import count, nested_repr, readable
 from jaxltl.core.values.interval.robust import require_objective
 from jaxltl.core.values.interval.satisfaction import robust_satisfaction
 from jaxltl.core.values.engine.state_quantities import safe_mean

@@ -8,10 +8,9 @@ from functools import partial
 import chex
 import jax
 import jax.numpy as jnp
-from jaxltl.core import struct
+from jaxltl.core import struct, validation
 from jax.tree_util import Partial
 
-from jaxltl.core import validation
 from jaxltl.core.environments.environment import Environment, as_partial, require_environment
 from jaxltl.core.environments.episodes import Agent
 from jaxltl.core.environments.monitor import Verdict

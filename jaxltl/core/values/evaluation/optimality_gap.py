@@ -22,12 +22,11 @@ from jaxltl.core.logic.ltl import Formula
 from jaxltl.core.models.ops.operators import is_deterministic
 from jaxltl.core.models.product import Product, product
 from jaxltl.core.models.protocols import Array, PyTree
-from jaxltl.core.pretty_print import brief
+from jaxltl.core.pretty_print import brief, count, number, readable
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.product import sparse_product
 from jaxltl.core.sparse.solvers import step_bounded as host
 from jaxltl.core.types import Solution
-from jaxltl.core.pretty_print import count, number, readable
 from jaxltl.core.values.engine.host_solution import induced_chain
 from jaxltl.core.values.undiscounted.sparse_satisfaction import (
     sparse_mdp_of_product,

@@ -13,10 +13,9 @@ from jaxltl.core.automata.translate import Task
 from jaxltl.core.automata.runs import live_states, universal_states
 from jaxltl.core.models.protocols import Array
 from jaxltl.core.models.sparse import SparseMDP
-from jaxltl.core.pretty_print import brief
+from jaxltl.core.pretty_print import brief, describe
 from jaxltl.core.sparse.multi_objective.weighted_sum import WeightedProblem
 from jaxltl.core.sparse.product import SparseProduct, sparse_product
-from jaxltl.core.pretty_print import describe
 from jaxltl.core.values.undiscounted.sparse_satisfaction import automaton_and_letters
 from jaxltl.core.values.engine.state_quantities import finite_reward, state_mask
 

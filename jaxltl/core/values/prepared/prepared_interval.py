@@ -9,7 +9,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxltl.core import struct
+from jaxltl.core import struct, validation
 from jax import lax
 
 from jaxltl.core.models.interval import IntervalMDP, refuse_ball
@@ -25,7 +25,6 @@ from jaxltl.core.sparse.prepared.interval_plan import (
 )
 from jaxltl.core.sparse.rows import concatenated_ranges
 from jaxltl.core.types import Solution, Status, require_shape, status_code
-from jaxltl.core import validation
 from jaxltl.core.models.protocols import Array
 from jaxltl.core.models.sparse import Reward
 from jaxltl.core.values.engine.implicit_diff import implicit

@@ -8,9 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxltl.core.models.protocols import Array
-from jaxltl.core.pretty_print import brief
+from jaxltl.core.pretty_print import bounds_text, brief, count, truncate, value_range
 from jaxltl.core.types import Status
-from jaxltl.core.pretty_print import bounds_text, count, truncate, value_range
 from jaxltl.core.values.undiscounted.sparse_satisfaction import Satisfaction
 
 

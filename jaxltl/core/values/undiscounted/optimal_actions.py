@@ -21,13 +21,11 @@ from jaxltl.core.graphs.reaching import max_sets, min_sets
 from jaxltl.core.models.mesh.sharded import refuse_sharded
 from jaxltl.core.models.ops.array_namespace import is_traced, to_jax
 from jaxltl.core.models.product import Product
-from jaxltl.core.pretty_print import brief
+from jaxltl.core.pretty_print import brief, describe, enum_counts, value_range
 from jaxltl.core.sparse.graph.qualitative import backward_reachable
 from jaxltl.core.types import Solution, Status
-from jaxltl.core.pretty_print import describe, enum_counts, value_range
 from jaxltl.core.values.engine.certificates import rounding_unit
-from jaxltl.core.values.engine.host_solution import solution_from_enclosure
-from jaxltl.core.values.engine.host_solution import complement_event
+from jaxltl.core.values.engine.host_solution import complement_event, solution_from_enclosure
 from jaxltl.core.values.undiscounted.reachability import (
     QUICK_LIMIT,
     Question,

@@ -34,7 +34,7 @@ from jaxltl.core.models.ops.operators import (
 )
 from jaxltl.core.models.ops.successor_tables import action_columns, sweep_operator
 from jaxltl.core.models.product import Product
-from jaxltl.core.models.protocols import ActionModel, PyTree
+from jaxltl.core.models.protocols import ActionModel, Array, PyTree
 from jaxltl.core.types import Solution, status_code
 from jaxltl.core.values.engine.certificates import m_matrix_error, refuse, rounding_unit, underflow
 from jaxltl.core.values.engine.chain_systems import ChainSystem
@@ -245,7 +245,7 @@ def _tighter(sign: int, finest: bool, table: None, carry: _Bounds, search: _Sear
         offered = jnp.clip(new_near + beyond, 0, 1)
         offered = jnp.where(search.undecided, offered, search.one)
 
-        def sweep(_, pair: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        def sweep(_: int, pair: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
             return pair[1], search.beyond(sign, search.best(sign, pair[1])[0])
 
         before, after = lax.fori_loop(0, _FAR_SWEEPS, sweep, (offered, offered))
@@ -271,7 +271,7 @@ def _tighter(sign: int, finest: bool, table: None, carry: _Bounds, search: _Sear
 def _followed(sign: int, search: _Search, near: jax.Array, action: jax.Array) -> jax.Array:
     onward = policy_operator(search.model, action)
 
-    def sweep(_, y: jax.Array) -> jax.Array:
+    def sweep(_: int, y: jax.Array) -> jax.Array:
         image = onward(y.ravel()).reshape(y.shape)
         return search.nearer(sign, y, jnp.where(search.undecided, image, search.one))
 
@@ -283,7 +283,9 @@ def _ended(finest: bool, carry: _Bounds, search: _Search) -> jax.Array:
 
 
 @partial(jax.jit, static_argnames=("objective",))
-def _optimize(model, sets: Sets, components, options: tuple, *, objective: str) -> Solution:
+def _optimize(
+    model: PyTree, sets: Sets, components: EndComponents | None, options: PyTree, *, objective: str
+) -> Solution:
     tolerance, max_steps, start = options
     undecided = ~(sets.one | sets.zero)
     one = sets.one.astype(model.dtype)
@@ -311,7 +313,12 @@ def _optimize(model, sets: Sets, components, options: tuple, *, objective: str) 
 
 
 def _by_policy_iteration(
-    model: ActionModel, sets: Sets, components: EndComponents | None, asked, *, objective: str
+    model: ActionModel,
+    sets: Sets,
+    components: EndComponents | None,
+    asked: Array,
+    *,
+    objective: str,
 ) -> tuple[Solution, jax.Array]:
     """An optimum as the total reward of entering the target, and the states whose rows count."""
     rows, one = normalised_rows(model), sets.one.astype(model.dtype)
@@ -330,7 +337,9 @@ def _by_policy_iteration(
     return Solution(value, found.policy, lower, upper, *rest), found.leaves
 
 
-def _by_intervals(model, sets: Sets, components, options: tuple, *, objective: str) -> Solution:
+def _by_intervals(
+    model: PyTree, sets: Sets, components: EndComponents | None, options: PyTree, *, objective: str
+) -> Solution:
     """Encloses an optimum between a bound that a policy attains and one that is proven."""
     # The attained bound ("near") is the lower one of a maximum and the upper one of a minimum.
     # Sweeps under its own greedy policy move it soundly and cheaply.

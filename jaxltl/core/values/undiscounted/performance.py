@@ -8,7 +8,7 @@ state, which is inverted once, and a second solve certifies the first.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -34,7 +34,7 @@ from jaxltl.core.models.ops.operators import (
     valid_policy,
 )
 from jaxltl.core.models.product import Product
-from jaxltl.core.models.protocols import PyTree
+from jaxltl.core.models.protocols import Array, PyTree
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.graph.qualitative import backward_reachable
 from jaxltl.core.types import Status, require_shape, status_code
@@ -126,7 +126,9 @@ def task_performance(
 
 
 @partial(jax.jit, static_argnames=("method",))
-def _task_performance(model: Product, policy: jax.Array, tolerance, *, method: str) -> Performance:
+def _task_performance(
+    model: Product, policy: jax.Array, tolerance: Array, *, method: str
+) -> Performance:
     policy, _, valid, representable = valid_policy(model, policy)
     valid &= representable
     simple = model.automaton.has_final_states
@@ -168,7 +170,9 @@ def _task_performance(model: Product, policy: jax.Array, tolerance, *, method: s
     )
 
 
-def _summarize(model: Product, value, lower, upper, tolerance) -> Performance:
+def _summarize(
+    model: Product, value: Array, lower: Array, upper: Array, tolerance: Array
+) -> Performance:
     start = model.initial_memory[:, None]
     value, lower, upper = (
         jnp.take_along_axis(x, start, axis=1)[:, 0] for x in (value, lower, upper)
@@ -215,7 +219,9 @@ def _reach(
     return m_matrix_error(normalised_rows(model, policy), solve, solve(one), one, undecided)[:3]
 
 
-def _block_solver(model: Product, policy: jax.Array, undecided: jax.Array):
+def _block_solver(
+    model: Product, policy: jax.Array, undecided: jax.Array
+) -> Callable[[jax.Array], jax.Array]:
     """Solves ``x - P x = b`` on the undecided states, ``x = b`` elsewhere, for ``[S, Q]``."""
     # Block Jacobi with a block for each memory state. If the automaton's only cycles are
     # self-loops, it ends after as many sweeps as its longest path has states.
@@ -231,13 +237,13 @@ def _block_solver(model: Product, policy: jax.Array, undecided: jax.Array):
         return action_mean(policy, successors)
 
     def solve(b: jax.Array) -> jax.Array:
-        def sweep(carry):
+        def sweep(carry: PyTree) -> PyTree:
             x, _, n = carry
             right = b + jnp.where(undecided, outside(x), 0)
             new = jnp.einsum("qst,tq->sq", inverses, right, precision="highest")
             return new, jnp.any(jnp.abs(new - x) > 0), n + 1  # false for NaN
 
-        def unfinished(carry):
+        def unfinished(carry: PyTree) -> jax.Array:
             _, moved, n = carry
             return moved & (n < _MAX_SWEEPS)
 
@@ -322,7 +328,7 @@ def task_performances(
     return to_jax(columns)
 
 
-def _batched(models: Product, policies: jax.Array, tolerance, *, batch: int) -> Performance:
+def _batched(models: Product, policies: jax.Array, tolerance: Array, *, batch: int) -> Performance:
     """Evaluation in batches, so that memory does not grow with the number of worlds."""
     count = len(policies)
     size = min(batch, count)
@@ -336,7 +342,7 @@ def _batched(models: Product, policies: jax.Array, tolerance, *, batch: int) -> 
     return to_jax(jax.tree.map(lambda *x: np.concatenate(x), *parts))
 
 
-def _one_by_one(models: Product, policies: jax.Array, tolerance) -> Performance:
+def _one_by_one(models: Product, policies: jax.Array, tolerance: Array) -> Performance:
     """Evaluation of one world after the other, on the host."""
     parts = []
     for w in range(num_worlds(models)):
@@ -350,7 +356,7 @@ _summarized = jax.jit(_summarize)
 
 
 @jax.jit
-def _together(models: Product, policies: jax.Array, tolerance) -> Performance:
+def _together(models: Product, policies: jax.Array, tolerance: Array) -> Performance:
     return jax.vmap(partial(task_performance, tolerance=tolerance))(models, policies)
 
 

@@ -33,13 +33,12 @@ from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.solvers.shortest_path import fastest_rows, with_exits
 from jaxltl.core.types import Solution
-from jaxltl.core.values.engine.host_solution import is_sparse
+from jaxltl.core.values.engine.host_solution import complement_event, is_sparse
 from jaxltl.core.values.interval.robust import refuse_nature
 from jaxltl.core.values.interval.satisfaction import (
     robust_product_satisfaction,
     robust_satisfaction,
 )
-from jaxltl.core.values.engine.host_solution import complement_event
 from jaxltl.core.values.undiscounted.reachability import (
     QUICK_LIMIT,
     on_rows,

@@ -19,20 +19,19 @@ from jaxltl.core.models.ops.operators import is_deterministic
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import Array, Model
 from jaxltl.core.models.sparse import SparseMDP
-from jaxltl.core.pretty_print import brief
+from jaxltl.core.pretty_print import brief, count, nested_repr
 from jaxltl.core.sparse.graph.accepting import accepting_region
 from jaxltl.core.sparse.product import SparseProduct, sparse_product, product_without_memory
 from jaxltl.core.sparse.solvers.reachability import reachability
 from jaxltl.core.types import Solution, require_shape
-from jaxltl.core.pretty_print import count, nested_repr
 from jaxltl.core.values.engine.state_quantities import reduction_for
 from jaxltl.core.values.engine.host_solution import (
     Chain,
-    induced_chain,
+    complement_event,
     default_tolerance,
+    induced_chain,
     solution_from_enclosure,
 )
-from jaxltl.core.values.engine.host_solution import complement_event
 
 
 def _facts(value: Satisfaction) -> Iterator[str]:
