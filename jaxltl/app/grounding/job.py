@@ -21,6 +21,7 @@ from jaxltl.app.job import about, automaton_picture, fingerprint as fingerprint,
 from jaxltl.app.protocols import Training
 from jaxltl.app.reports import learn_grounding as report  # noqa: F401 - part of the job
 from jaxltl.app.reports.drawing import Picture, drawing
+from jaxltl.app.reports.explorer import Explorer
 from jaxltl.app.wording import Record, many
 from jaxltl.core.models.construct.lifting import project_policy, project_trajectories
 from jaxltl.core.models.construct.restrict import with_allowed
@@ -119,7 +120,8 @@ def _observations(
     given = task.file.grounding.observations
     if given == "cells":
         return worlds[0].mdp.propositions, [np.asarray(x.mdp.label, float) for x in worlds]
-    names, seen = (), []
+    names: tuple[str, ...] = ()
+    seen = []
     for name, world in zip(given, worlds, strict=True):
         path = task.path.parent / name
         head, *lines = read_bytes(path, "the observations").decode().splitlines()
@@ -319,6 +321,6 @@ def pictures(outcome: Outcome) -> list[Picture]:
     return drawn
 
 
-def live(outcome: Outcome) -> list[Picture]:
+def live(outcome: Outcome) -> list[Explorer]:
     """There are no interactive parts."""
     return []
