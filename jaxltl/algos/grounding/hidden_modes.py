@@ -157,8 +157,8 @@ def objective(
     Returns the loss, and as auxiliary outputs the log-likelihoods ``float[N]`` and the solver's status.
     Differentiable in the `parameters` of a `problem` with `hparams`.
     """
-    *chains, status = _chains(parameters, problem, hparams)
-    found = jax.vmap(forward, (None, 0, 0, 0))(*chains, problem.length)
+    start, emit, move, status = _chains(parameters, problem, hparams)
+    found = jax.vmap(forward, (None, 0, 0, 0))(start, emit, move, problem.length)
     squares = sum(jnp.sum(x * x) for x in jax.tree.leaves(parameters))
     return hparams.l2 / 2 * squares - jnp.sum(found), (found, status)
 

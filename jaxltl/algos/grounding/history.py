@@ -111,7 +111,7 @@ def _evaluated(
             row = np.minimum(np.searchsorted(keys, code), len(keys) - 1)
             code = np.where(keys[row] == code, row, len(keys))
             if chains:
-                level, own = chains[c][k], 0
+                level, own = chains[c][k], np.zeros((1, 1), np.int64)
             else:
                 counts = _counts(code[mask], action[mask], len(keys) + 1, width)
                 level, own = _Level(keys, counts, _STRENGTHS), _own(code, action, mask, width)

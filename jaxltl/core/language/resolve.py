@@ -202,7 +202,8 @@ class _Resolver:
         plain = [m for m in modules if isinstance(m, Module)]
         copies = [m for m in modules if isinstance(m, RenamedModule)]
         found: dict[str, Module] = {}
-        for m in (*plain, *copies):
+        every: list[Module | RenamedModule] = [*plain, *copies]
+        for m in every:
             if m.name in found:
                 raise LanguageError(m.place, f"there are two modules {m.name}.")
             if isinstance(m, RenamedModule):
