@@ -7,7 +7,8 @@ import pytest
 
 from jaxltl.core.models.construct.convert import to_padded
 from jaxltl.core.models.sparse import Rewards, make_sparse
-from jaxltl.core.sparse.solvers import reward_bounded, step_bounded as bounded
+from jaxltl.core.sparse.solvers import reward_bounded
+from jaxltl.core.sparse.solvers import step_bounded as bounded
 from jaxltl.core.types import Status, check
 from jaxltl.core.values.properties.solve_property import solve_property
 from jaxltl.core.values.undiscounted.step_bounded import (
