@@ -408,6 +408,17 @@ def test_clusters_and_labels_of_another_size_are_refused():
         grounding.fit_labels(state, problem, np.zeros((9, 3), bool))
 
 
+def test_padding_of_smaller_worlds_is_no_cluster():
+    worlds = [world_of(text) for text in (MAP, "a . . b\n. c . .\n. . d .\n. c . .")]
+    shown = [jl.make_trajectories(world, [[(0, 0)]]) for world, _ in worlds]
+    problem = grounding.make_problem(
+        [x for x, _ in worlds], [y + 1 for _, y in worlds], shown, TASK
+    )
+    with pytest.raises(ValueError, match=r"it must be at least 2 and at most 5"):
+        grounding.cluster_meanings(problem, 6)
+    assert grounding.cluster_meanings(problem, 5)[:, 0, :9].sum(0).tolist() == [1] * 9
+
+
 # --- automata -------------------------------------------------------------------------------------
 
 

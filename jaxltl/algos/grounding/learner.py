@@ -105,16 +105,6 @@ class Objective:
     status: jax.Array
 
 
-@struct.dataclass
-class _Lane:
-    """Arrays of one world: policy in log space, moves of the memory, letters and the status."""
-
-    log_policy: jax.Array
-    log_moves: jax.Array
-    letter: jax.Array
-    status: jax.Array
-
-
 def objective(
     parameters: PyTree, problem: Problem, hparams: Hparams
 ) -> tuple[jax.Array, Objective]:
@@ -124,16 +114,17 @@ def objective(
     ``hardness`` times the number of demonstrated steps times the mean entropy of the letters.
     Differentiable in the `parameters` of a `problem` with `hparams`, implicitly through the soft value.
     """
-    lanes = _each_world(partial(_lane, problem, hparams, parameters), problem)
+    log_policy, log_moves, letter, status = _each_world(
+        partial(_lane, problem, hparams, parameters), problem
+    )
     initial = jnp.asarray(problem.model.automaton.initial)[0]
 
     def one(world: jax.Array, state: jax.Array, action: jax.Array, length: jax.Array) -> jax.Array:
-        moves = lanes.log_moves[world, state]  # [T, Q, Q]
-        emit = lanes.log_policy[world, state, :, action]
+        moves = log_moves[world, state]  # [T, Q, Q]
+        emit = log_policy[world, state, :, action]
         return forward(moves[0, initial], emit, moves[1:], length)
 
     found = jax.vmap(one)(problem.world, problem.state, problem.action, problem.length)
-    letter = lanes.letter
     entropy = -jnp.mean(jnp.sum(jax.scipy.special.xlogy(letter, letter), axis=-1))
     penalized = (parameters["grounding"], parameters["weights"])
     squares = sum(jnp.sum(x * x) for x in jax.tree.leaves(penalized))
@@ -142,15 +133,17 @@ def objective(
     parts = Objective(
         log_likelihood=found,
         entropy=entropy,
-        policy=jnp.exp(lanes.log_policy),
+        policy=jnp.exp(log_policy),
         letter=letter,
-        status=jnp.max(lanes.status),
+        status=jnp.max(status),
     )
     return loss, parts
 
 
-def _lane(problem: Problem, hparams: Hparams, parameters: PyTree, index: jax.Array) -> _Lane:
-    """The soft policy and the moves of the memory in a world."""
+def _lane(
+    problem: Problem, hparams: Hparams, parameters: PyTree, index: jax.Array
+) -> tuple[jax.Array, ...]:
+    """Policy and moves of the memory in log space, letters and the solver's status, in a world."""
     model = jax.tree.map(lambda x: x[index], problem.model)
     log_letter = letter_log_probability(
         problem.network,
@@ -167,15 +160,15 @@ def _lane(problem: Problem, hparams: Hparams, parameters: PyTree, index: jax.Arr
     solution = soft_value(world, flat, hparams.discount)
     logits = policy_logits(world, flat, hparams.discount, solution.value)
     log_policy = jnp.where(world.available, jax.nn.log_softmax(logits, axis=-1), -jnp.inf)
-    return _Lane(log_policy.reshape(reward.shape), log_moves, letter, solution.status)
+    return log_policy.reshape(reward.shape), log_moves, letter, solution.status
 
 
-def _each_world(function: PyTree, problem: Problem) -> _Lane:
+def _each_world(function: PyTree, problem: Problem) -> tuple[jax.Array, ...]:
     """``vmap`` over worlds, but for a single one, so that a vmap over seeds stays fast."""
     count = len(problem.model.letter)
-    if count == 1:
-        return jax.tree.map(lambda x: x[None], function(0))
-    return jax.vmap(function)(jnp.arange(count))
+    return (
+        tuple(x[None] for x in function(0)) if count == 1 else jax.vmap(function)(jnp.arange(count))
+    )
 
 
 def _init(key: chex.PRNGKey, problem: Problem, hparams: Hparams) -> State:

@@ -271,7 +271,8 @@ def _padded(observation: ArrayLike | Sequence[ArrayLike], worlds: Sequence[MDP])
                 f"world {w}: observation has shape {x.shape}; "
                 f"expected ({world.num_states}, {width}), one row for each state."
             )
-    return np.stack([np.pad(x, ((0, most - len(x)), (0, 0))) for x in given])
+    # As in the last state: padding adds no kind of observation.
+    return np.stack([np.pad(x, ((0, most - len(x)), (0, 0)), "edge") for x in given])
 
 
 def _features(model: Product, features: ArrayLike | None) -> jax.Array:

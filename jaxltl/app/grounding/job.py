@@ -98,7 +98,7 @@ def prepare(task: GroundingTask, seed: int) -> Setup:
         mdps = [world.mdp for world in worlds]
         problem = grounding.make_problem(mdps[:count], seen[:count], shown, task.formula)
         size = max(world.num_states for world in mdps)
-        wide = np.stack([np.pad(x, ((0, size - len(x)), (0, 0))) for x in seen])
+        wide = np.stack([np.pad(x, ((0, size - len(x)), (0, 0)), "edge") for x in seen])
         if file.grounding.clusters is None:
             meaning = np.moveaxis(wide, -1, 0) > 0
             if not ((wide == 0) | (wide == 1)).all():
