@@ -27,10 +27,12 @@ from jaxltl.core.sparse.graph.components import forward_search
 from jaxltl.core.sparse.linear.elimination import Factors, elimination_order, factorize
 from jaxltl.core.sparse.linear.extended_precision import (
     MAX_FRACTIONS,
+    Solver,
     exact_optimum,
     perturbation_bound,
     refined_optimum,
 )
+from jaxltl.core.sparse.linear.gth_elimination import gth_solver
 from jaxltl.core.sparse.linear.optimality_equation import OptimalityEquation, propagate_improvements
 from jaxltl.core.sparse.linear.topological_order import (
     Edges,
@@ -211,7 +213,7 @@ class _CoreSolver:
         num_sweeps = _FIRST_SWEEPS // (2 if equation.size <= _SMALL_CORE else 1)
         first = self._made_proper(equation.greedy_policy(np.zeros(equation.size), num_sweeps))
         best, rounds, last = self._iterate(first)
-        for method in (self._by_refinement, self._by_fractions):
+        for method in (self._by_refinement, self._by_gth_refinement, self._by_fractions):
             if best is not None and self._is_narrow(best, self.tolerance):
                 break
             # A policy of the extra cost without a close bound may stay nearly for ever.
@@ -331,10 +333,20 @@ class _CoreSolver:
     def _by_refinement(self, policy: Integers) -> _CoreValues | None:
         """Bounds of a core with very long episodes, from values in two floats."""
 
-        def solver_of(rows: Integers) -> Callable[[Floats], Floats] | None:
+        def solver_of(rows: Integers) -> Solver | None:
             solver = factorize(self.equation.matrix, self.label, rows)
             return None if solver is None else (solver.eliminated(rows) or solver).solve
 
+        return self._refined(policy, solver_of)
+
+    def _by_gth_refinement(self, policy: Integers) -> _CoreValues | None:
+        """The same where pivots with subtractions have no correct digit."""
+        matrix, leaving = self.equation.matrix, self.equation.leaving
+        return self._refined(policy, lambda rows: gth_solver(matrix[rows], leaving[rows]))
+
+    def _refined(
+        self, policy: Integers, solver_of: Callable[[Integers], Solver | None]
+    ) -> _CoreValues | None:
         found = refined_optimum(self.equation, self.unit, policy, solver_of, self.tolerance)
         if found is None:
             return None

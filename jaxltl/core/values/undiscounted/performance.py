@@ -19,7 +19,6 @@ import numpy as np
 from jaxltl.core import struct
 from jax import lax
 
-from jaxltl.core.graphs.acceptance import accepting_bottom_components
 from jaxltl.core.graphs.graph import TracedGraph, graph_of, take
 from jaxltl.core.graphs.reaching import max_sets, min_sets, policy_sets
 from jaxltl.core.models.construct.batch import is_stacked, num_worlds
@@ -28,7 +27,6 @@ from jaxltl.core.models.ops.double_word import normalised_rows
 from jaxltl.core.models.ops.operators import (
     action_mean,
     expectation,
-    policy_distribution,
     require_policy,
     transition_matrix,
     valid_policy,
@@ -36,17 +34,14 @@ from jaxltl.core.models.ops.operators import (
 from jaxltl.core.models.product import Product
 from jaxltl.core.models.protocols import Array, PyTree
 from jaxltl.core.pretty_print import brief
-from jaxltl.core.sparse.graph.qualitative import backward_reachable
 from jaxltl.core.types import Status, require_shape, status_code
 from jaxltl.core.values.engine.certificates import m_matrix_error
-from jaxltl.core.values.engine.host_solution import complement, induced_chain
+from jaxltl.core.values.engine.host_solution import complement
 from jaxltl.core.values.engine.linear import inverse
-from jaxltl.core.values.undiscounted.reachability import rows_of_model
 from jaxltl.core.values.undiscounted.satisfaction import as_reachability, satisfaction_probability
 
 _BLOCK_LIMIT = 1024  # world states up to which a block is inverted
 _MAX_SWEEPS = 1000  # of automata with cycles; one without needs at most Q
-_EXACT_LIMIT = 4096  # product states up to which a stiff chain is eliminated on the host
 
 
 @brief(codes={"status": Status})
@@ -273,9 +268,8 @@ def task_performances(
     """:func:`task_performance` in each of several worlds, on the host.
 
     Co-safe and safety tasks are evaluated by one compiled program, other tasks one world after the
-    other. Worlds without a certificate in the models' precision are evaluated again in double
-    precision by an elimination without subtractions (Grassmann, Taksar and Heyman 1985), with a
-    bounded relative error for every chain (O'Cinneide 1993).
+    other. Worlds without a certificate in the models' precision are evaluated again by the sparse
+    engine, which bounds the relative error for every chain (O'Cinneide 1993).
 
     Args:
       models: stacked products, see :func:`~jaxltl.core.models.construct.batch.stack_products`.
@@ -311,20 +305,18 @@ def task_performances(
     if models.automaton.has_final_states:
         found = _batched(models, policies, tolerance, batch=batch)
     else:
-        found = _one_by_one(models, policies, tolerance)
+        parts = [_on_host(models, policies, w, tolerance) for w in range(num_worlds(models))]
+        found = to_jax(jax.tree.map(lambda *x: np.stack(x), *parts))
     status = np.asarray(found.status)
     for w in np.flatnonzero(status == Status.INVALID):
         require_policy(*jax.tree.map(lambda x, w=w: np.asarray(x)[w], (models, policies)))
     redone = np.flatnonzero((status != Status.CONVERGED) & (status != Status.INVALID))
-    if not redone.size or math.prod(states[1:]) > _EXACT_LIMIT:
+    if not redone.size or not models.automaton.has_final_states:
         return found
     columns = jax.tree.map(np.array, found)
     for w in redone:
-        model, policy = to_jax(jax.tree.map(lambda x, w=w: np.asarray(x)[w], (models, policies)))
-        bounds = _by_elimination(model, policy_distribution(model, policy))
-        value, lower, upper = (to_jax(np.asarray(x, model.dtype)) for x in bounds)
-        exact = _summarize(model, value, lower, upper, tolerance)
-        jax.tree.map(lambda to, x, w=w: to.__setitem__(w, x), columns, exact)
+        again = _on_host(models, policies, w, tolerance)
+        jax.tree.map(lambda to, x, w=w: to.__setitem__(w, x), columns, again)
     return to_jax(columns)
 
 
@@ -342,14 +334,11 @@ def _batched(models: Product, policies: jax.Array, tolerance: Array, *, batch: i
     return to_jax(jax.tree.map(lambda *x: np.concatenate(x), *parts))
 
 
-def _one_by_one(models: Product, policies: jax.Array, tolerance: Array) -> Performance:
-    """Evaluation of one world after the other, on the host."""
-    parts = []
-    for w in range(num_worlds(models)):
-        model, policy = jax.tree.map(lambda x, w=w: np.asarray(x)[w], (models, policies))
-        found = satisfaction_probability(model, policy, tolerance=tolerance)
-        parts.append(_summarized(model, found.value, found.lower, found.upper, tolerance))
-    return to_jax(jax.tree.map(lambda *x: np.stack(x), *parts))
+def _on_host(models: Product, policies: jax.Array, world: int, tolerance: Array) -> Performance:
+    """Evaluation in one world by the sparse engine."""
+    model, policy = jax.tree.map(lambda x: np.asarray(x)[world], (models, policies))
+    found = satisfaction_probability(model, policy, tolerance=tolerance)
+    return _summarized(model, found.value, found.lower, found.upper, tolerance)
 
 
 _summarized = jax.jit(_summarize)
@@ -358,53 +347,6 @@ _summarized = jax.jit(_summarize)
 @jax.jit
 def _together(models: Product, policies: jax.Array, tolerance: Array) -> Performance:
     return jax.vmap(partial(task_performance, tolerance=tolerance))(models, policies)
-
-
-def _by_elimination(model: Product, policy: jax.Array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Satisfaction probabilities and their bounds, ``float64[S, Q]``, by GTH elimination."""
-    # Weights stay sums of products of weights, so that their relative errors are small.
-    safety = model.automaton.is_safety
-    if model.automaton.has_final_states:
-        target = np.asarray(~model.final if safety else model.final).ravel()
-    else:
-        target = np.asarray(accepting_bottom_components(model, policy)).ravel()
-    given = np.asarray(policy, np.float64)
-    given = given / given.sum(-1, keepdims=True)
-    chain = induced_chain(model, rows_of_model(model), given).mdp
-    weight = chain.matrix.toarray()
-    reaching = backward_reachable(chain, target)
-    doomed = backward_reachable(chain, ~reaching, ~target)
-    rest = np.flatnonzero(doomed & reaching)
-    value = (~doomed).astype(float)
-    inner = weight[np.ix_(rest, rest)]
-    np.fill_diagonal(inner, 0)
-    hit = weight[rest][:, ~doomed].sum(1)
-    miss = weight[rest][:, ~reaching].sum(1)
-    total = np.zeros(len(rest))
-    for k in reversed(range(len(rest))):
-        row = inner[k, :k]
-        total[k] = row.sum() + hit[k] + miss[k]
-        sources = np.flatnonzero(inner[:k, k])
-        columns = np.flatnonzero(row)
-        share = inner[sources, k] / total[k]
-        inner[np.ix_(sources, columns)] += share[:, None] * row[columns]
-        inner[sources, sources] = 0
-        hit[sources] += share * hit[k]
-        miss[sources] += share * miss[k]
-    solved = np.zeros(len(rest))
-    for k in range(len(rest)):
-        solved[k] = (hit[k] + inner[k, :k] @ solved[:k]) / total[k]
-    value[rest] = np.minimum(solved, 1)
-    # To first order 2 n^3 roundings; the rest of the factor bounds terms of higher order.
-    error = np.zeros_like(value)
-    n = len(rest) + 8
-    # Rounding to the model's precision comes on top.
-    rounding = 3.0 * n**3 * np.finfo(float).eps + 2 * float(jnp.finfo(model.dtype).eps)
-    error[rest] = np.minimum(rounding * value[rest], 1)
-    value = 1 - value if safety else value
-    bounds = (value, np.maximum(value - error, 0), np.minimum(value + error, 1))
-    value, lower, upper = (x.reshape(model.state_shape) for x in bounds)
-    return value, lower, upper
 
 
 # --- summaries over worlds ------------------------------------------------------------------------

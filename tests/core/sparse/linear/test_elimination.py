@@ -1,16 +1,19 @@
 """Systems of policies against dense solves, whichever way they are taken apart."""
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 from scipy import sparse
 
 from jaxltl.core.models.sparse import make_sparse
-from jaxltl.core.sparse.linear import elimination
+from jaxltl.core.sparse.linear import elimination, gth_elimination
 from jaxltl.core.sparse.linear import extended_precision as exact
 from jaxltl.core.sparse.linear import topological_order as levels
 from jaxltl.core.sparse.linear.elimination import factorize
 from jaxltl.core.sparse.linear.topological_order import Edges, ordered_components
 from jaxltl.core.sparse.solvers.reachability import reachability
+from tests.sparse_models import exact_solve
 
 
 def random_rows(rng, size, components):
@@ -117,6 +120,7 @@ def test_what_would_fill_is_swept(converges, monkeypatch):
     if not converges:
         monkeypatch.setattr(elimination, "_KRYLOV", 1)
         monkeypatch.setattr(elimination, "_SWEEPS", 10)
+        monkeypatch.setattr(gth_elimination, "_MOST", 0)
         monkeypatch.setattr(exact, "_OPERATIONS", 0)
     host = rings(30, np.random.default_rng(0))
     host.probability[2:90:3] -= 0.005  # the first ring may end in the goal's rival
@@ -151,3 +155,22 @@ def test_sweeps_end_where_the_solution_is_far_larger_than_the_right_side():
     exact = np.linalg.solve(np.eye(size) - matrix.toarray(), np.ones(size))
     assert exact.max() > 1e5
     np.testing.assert_allclose(found, exact, rtol=1e-10)
+
+
+def test_elimination_without_subtractions_has_the_digits_of_its_weights():
+    """Random weights down to 2^-100, so that episodes take up to 10^80 steps, against fractions."""
+    rng = np.random.default_rng(3)
+    for size in (1, 2, 12):
+        weight = 2.0 ** -rng.integers(1, 100, (size, size)) * (rng.random((size, size)) < 0.5)
+        np.fill_diagonal(weight, 0)
+        leaving = np.where(rng.random(size) < 0.5, 2.0 ** -rng.integers(40, 100, size), 0)
+        leaving[0], weight[1:, 0] = 2.0**-60, np.maximum(weight[1:, 0], 2.0**-100)
+        b = rng.random(size)
+        rows = [[Fraction(-w) for w in row] for row in weight.tolist()]
+        for i, out in enumerate(leaving.tolist()):
+            rows[i][i] = Fraction(out) - sum(rows[i])
+        expected = exact_solve(rows, [Fraction(x) for x in b.tolist()])
+        solve = gth_elimination.gth_solver(sparse.csr_array(weight), leaving)
+        for x, y in zip(solve(b).tolist(), expected, strict=True):
+            assert abs(Fraction(x) - y) <= Fraction(1e-13) * y
+    assert gth_elimination.gth_solver(sparse.csr_array(weight), 0 * leaving) is None
