@@ -26,7 +26,6 @@ from jaxltl.algos.cce.exponential_family import diagonal_gaussian
 from jaxltl.core import validation
 from jaxltl.core.automata.sequences import reach_avoid_sequences
 from jaxltl.core.environments.time_limit import with_time_limit
-from jaxltl.core.sparse.interval.uncertainty_set import l1_expectation
 from jaxltl.core.statistics.confidence_sets import samples_needed
 from jaxltl.core.statistics.empirical_bernstein import bounded_mean
 from jaxltl.core.values.evaluation.evaluation import share_estimate
@@ -173,10 +172,6 @@ def things(folder):
                 "num_claims": 1,
                 "num_outcomes": 2,
             },
-        ),
-        (
-            partial(l1_expectation, maximize=True),
-            {"value": [0.0, 1], "center": [0.5, 0.5], "radius": [0.1], "entry_start": [0, 2]},
         ),
         (
             jl.make_counts,

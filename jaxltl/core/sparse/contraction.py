@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
+from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts, row_entries
 
 _WORTH = 8  # a model is contracted if more than one in that many of its states vanishes
 
@@ -67,9 +67,8 @@ def contract_chains(mdp: HostMDP, fixed: Booleans, cost: Floats | None) -> Contr
     number = np.zeros(size, np.int32)
     number[kept] = np.arange(kept.size)
     node = number[end]
-    count = np.diff(mdp.row_start)[kept]
-    row = concatenated_ranges(mdp.row_start[kept], count)
-    smaller, entry = _renamed(mdp, row, count, node)
+    row, count = row_entries(mdp.row_start, kept)
+    smaller, entry = mdp.select(offsets_from_counts(count), row, node)
     spent = np.zeros(row.size)
     if cost is not None:
         terms = mdp.probability[entry] * earned[mdp.successor[entry]]
@@ -85,21 +84,6 @@ def _ends(after: Integers) -> tuple[Integers, int]:
         if (further == end).all() or 2**rounds > after.size:
             return end, rounds
         end, rounds = further, rounds + 1
-
-
-def _renamed(
-    mdp: HostMDP, row: Integers, count: Integers, node: Integers
-) -> tuple[HostMDP, Integers]:
-    """The model of some rows with renamed successors, and its entries."""
-    width = np.diff(mdp.entry_start)[row]
-    entry = concatenated_ranges(mdp.entry_start[row], width)
-    smaller = HostMDP(
-        offsets_from_counts(count),
-        offsets_from_counts(width),
-        node[mdp.successor[entry]],
-        mdp.probability[entry],
-    )
-    return smaller, entry
 
 
 def quotient(mdp: HostMDP, component: Integers, inside: Booleans, cost: Floats) -> Contraction:
@@ -118,7 +102,7 @@ def quotient(mdp: HostMDP, component: Integers, inside: Booleans, cost: Floats) 
     number[leaders] = np.arange(leaders.size)
     node = number[component]
     count = np.bincount(node[mdp.state[row]], minlength=leaders.size)
-    smaller, _ = _renamed(mdp, row, count, node)
+    smaller, _ = mdp.select(offsets_from_counts(count), row, node)
     return Contraction(smaller, node, row, np.zeros(size), cost[row])
 
 

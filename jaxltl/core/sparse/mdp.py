@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from jaxltl.core.array_types import Booleans, Floats, Integers, SparseMatrix
 from jaxltl.core.pretty_print import brief
-from jaxltl.core.sparse.rows import Rows, concatenated_ranges, offsets_from_counts
+from jaxltl.core.sparse.rows import Rows, concatenated_ranges, offsets_from_counts, row_entries
 
 _SMALL = 2000  # entries up to which NumPy alone is as fast, and SciPy need not be imported
 
@@ -123,8 +123,13 @@ class HostMDP(HostGraph):
 
     def chain(self, row: Integers) -> HostMDP:
         """The Markov chain of a policy, from the row of each state."""
-        width = np.diff(self.entry_start)[row]
-        entry = concatenated_ranges(self.entry_start[row], width)
-        states = np.arange(self.num_states + 1)
+        return self.select(np.arange(self.num_states + 1), row)[0]
+
+    def select(
+        self, row_start: Integers, row: Integers, node: Integers | None = None
+    ) -> tuple[HostMDP, Integers]:
+        """The model of some rows, with successors renamed by `node`, and the entries of the rows."""
+        entry, width = row_entries(self.entry_start, row)
+        after = self.successor[entry] if node is None else node[self.successor[entry]]
         start = offsets_from_counts(width)
-        return HostMDP(states, start, self.successor[entry], self.probability[entry])
+        return HostMDP(row_start, start, after, self.probability[entry]), entry

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from jaxltl.core.array_types import Booleans, Integers
 from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
+from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts, row_entries
 
 MAX_PAIRS = 2**31  # pairs of a state and a memory; a bit vector of them takes 2 GB
 _DENSE = 2**27  # pairs up to which the number of each is looked up in a table
@@ -113,8 +113,7 @@ def _reached(world: _World, start: Integers) -> Booleans:
         state, memory = np.divmod(frontier, world.num_memory)
         moving = ~world.still[memory]
         state, memory = state[moving], memory[moving]
-        count = first_entry[state + 1] - first_entry[state]
-        entry = concatenated_ranges(first_entry[state], count)
+        entry, count = row_entries(first_entry, state)
         follower = world.after(
             host.successor[entry], np.repeat(state, count), np.repeat(memory, count)
         )

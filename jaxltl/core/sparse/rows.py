@@ -88,6 +88,12 @@ def concatenated_ranges(start: Integers, count: Integers) -> Integers:
     return found
 
 
+def row_entries(start: Integers, row: Integers) -> tuple[Integers, Integers]:
+    """The entries of some rows, concatenated, and the number of entries of each of these rows."""
+    count = start[row + 1] - start[row]
+    return concatenated_ranges(start[row], count), count
+
+
 def offsets_from_counts(count: Integers) -> Integers:
     """The start of each group of the given sizes, and the end: ``int32[N + 1]``, if that fits.
 

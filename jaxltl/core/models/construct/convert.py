@@ -7,7 +7,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from jaxltl.core import validation
-from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
+from jaxltl.core.sparse.rows import offsets_from_counts, row_entries
 from jaxltl.core.models.mdp import MDP, DenseMDP, support
 from jaxltl.core.models.construct.padded import to_padded as to_padded
 from jaxltl.core.models.product import Product, flat_successor
@@ -78,16 +78,14 @@ def _product(model: Product) -> SparseMDP:
         kept = np.asarray(model.allowed)[host.state, :, action]
     # Rows of (s, q) are those of s, in order: state first, memory next, choice last.
     state, memory = np.divmod(np.arange(shape[0] * shape[1]), num_memory)
-    choices = np.diff(host.row_start)[state]
-    row = concatenated_ranges(host.row_start[state], choices)
+    row, choices = row_entries(host.row_start, state)
     q = np.repeat(memory, choices)
     chosen = kept[row, q]
     per_state = np.bincount(
         np.repeat(state * num_memory + memory, choices)[chosen], minlength=state.size
     )
     row, q = row[chosen], q[chosen]
-    width = np.diff(host.entry_start)[row]
-    entry = concatenated_ranges(host.entry_start[row], width)
+    entry, width = row_entries(host.entry_start, row)
     s_of, q_of = np.repeat(host.state[row], width), np.repeat(q, width)
     target = flat_successor(host.successor[entry], step, s_of, q_of, model.label_on)
     return make_sparse(

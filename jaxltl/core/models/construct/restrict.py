@@ -20,7 +20,7 @@ from jaxltl.core import validation
 from jaxltl.core.models.protocols import ActionModel, Model, ModelT
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.sparse.graph.components import forward_reachable
-from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
+from jaxltl.core.sparse.rows import offsets_from_counts, row_entries
 from jaxltl.core.pretty_print import brief
 
 
@@ -247,8 +247,7 @@ def submodel(model: SparseMDP, states: np.ndarray, rows: np.ndarray) -> SparseMD
     choices = np.bincount(number[host.state[row]], minlength=kept.size)
     if (choices == 0).any():
         raise ValueError(f"no choice is left in state {kept[int(np.argmin(choices))]}; allow one.")
-    width = np.diff(host.entry_start)[row]
-    entry = concatenated_ranges(host.entry_start[row], width)
+    entry, width = row_entries(host.entry_start, row)
     initial = np.asarray(model.initial)[kept]
     return replace(
         model,

@@ -29,7 +29,7 @@ from jaxltl.core.models.sparse import (
     refuse_underflow,
     scaled,
 )
-from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
+from jaxltl.core.sparse.rows import offsets_from_counts, row_entries
 
 _WIDTHS = np.array(sorted({int(m * 2**e) for e in range(26) for m in (1, 1.5)} | {3}))
 _PADDED = 1.25  # size of a single table of all rows, relative to the transitions, at most
@@ -115,10 +115,8 @@ def shard(
 
     def part(start: int, stop: int) -> ModelPart:
         state = ordered[start:stop]
-        choices = np.diff(host.row_start)[state]
-        row = concatenated_ranges(host.row_start[state], choices)
-        width = np.diff(host.entry_start)[row]
-        entry = concatenated_ranges(host.entry_start[row], width)
+        row, choices = row_entries(host.row_start, state)
+        entry, width = row_entries(host.entry_start, row)
         return ModelPart(
             row_start=offsets_from_counts(choices),
             entry_start=offsets_from_counts(width),

@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxltl.core.array_types import Booleans, Integers
 from jaxltl.core.sparse.mdp import HostGraph
-from jaxltl.core.sparse.rows import concatenated_ranges, decrement, group_starts, sorted_unique
+from jaxltl.core.sparse.rows import decrement, group_starts, row_entries, sorted_unique
 
 FEW = 24  # states of a frontier up to which Python's own loop beats NumPy's overhead
 _MANY = 64  # transitions into one of them from which it does not
@@ -87,7 +87,7 @@ class _Search(NamedTuple):
     def many(self, frontier: Integers, rank: int, empty: Integers | None = None) -> Integers:
         """The states that join after a frontier."""
         start, pred = self.graph.predecessors
-        row = pred[concatenated_ranges(start[frontier], start[frontier + 1] - start[frontier])]
+        row = pred[row_entries(start, frontier)[0]]
         if self.lacking is not None:
             decrement(self.lacking, row)
             row = row[self.lacking[row] <= 0]

@@ -10,7 +10,7 @@ from jaxltl.core.array_types import Booleans, Integers
 from jaxltl.core.sparse.graph.attractor import attracted
 from jaxltl.core.sparse.graph.components import forward_search, strong_components
 from jaxltl.core.sparse.mdp import HostGraph
-from jaxltl.core.sparse.rows import concatenated_ranges
+from jaxltl.core.sparse.rows import row_entries
 
 
 def backward_reachable(mdp: HostGraph, goal: Booleans, rows: Booleans | None = None) -> Booleans:
@@ -94,8 +94,7 @@ def _moving_components(mdp: HostGraph, kept: Booleans) -> EndComponents:
         row = np.flatnonzero(kept & candidates[mdp.state])
         if not row.size:
             return EndComponents(component, inside)
-        count = mdp.entry_start[row + 1] - mdp.entry_start[row]
-        entry = concatenated_ranges(mdp.entry_start[row], count)
+        entry, count = row_entries(mdp.entry_start, row)
         of, target = np.repeat(np.arange(row.size), count), mdp.successor[entry]
         leaves = np.bincount(of[~candidates[target]], minlength=row.size) > 0
         label = _labels(mdp.state[row], of, target, leaves, candidates)

@@ -21,7 +21,7 @@ from jaxltl.core.sparse.graph.qualitative import (
 )
 from jaxltl.core.sparse.interval.robust_values import Query
 from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
-from jaxltl.core.sparse.rows import decrement, sorted_unique, concatenated_ranges
+from jaxltl.core.sparse.rows import decrement, row_entries, sorted_unique
 
 
 def attractor_against_nature(
@@ -56,7 +56,7 @@ def _attractor(
     start, before = mdp.predecessors
     frontier: Integers = np.flatnonzero(region)
     while frontier.size:
-        row = before[concatenated_ranges(start[frontier], start[frontier + 1] - start[frontier])]
+        row = before[row_entries(start, frontier)[0]]
         row = sorted_unique(row[waiting[row]], mdp.num_rows)
         row = row[model.must_enter(row, region)]
         waiting[row] = False

@@ -20,7 +20,7 @@ from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP, scatter
 from jaxltl.core.sparse.linear.extended_precision import two_float_difference
 from jaxltl.core.sparse.linear.topological_order import Edges, ordered_components
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
+from jaxltl.core.sparse.rows import offsets_from_counts, row_entries
 from jaxltl.core.sparse.solvers.reachability import expands_fast
 
 if TYPE_CHECKING:
@@ -154,9 +154,7 @@ class RowOperator:
         first, to = self.part.mdp.entry_start[self.part.mdp.row_start], self.part.mdp.successor
 
         def follow(nodes: Integers) -> Integers:
-            after = self.node[
-                to[concatenated_ranges(first[nodes], first[nodes + 1] - first[nodes])]
-            ]
+            after = self.node[to[row_entries(first, nodes)[0]]]
             return after[after >= 0]
 
         middle, reached = self.size // 2, min(_REACHED, self.size // 2)

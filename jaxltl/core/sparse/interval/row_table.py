@@ -18,7 +18,7 @@ import numpy as np
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.sparse.interval.l1_ball import BallLimits, narrow_intervals
 from jaxltl.core.sparse.linear.extended_precision import two_sum
-from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
+from jaxltl.core.sparse.rows import offsets_from_counts, row_entries
 
 _EPS = float(np.finfo(np.float64).eps)
 SUM_ERROR = 2.0**-30  # relative error of `exact_sum`
@@ -292,8 +292,7 @@ def row_sums(quantity: Floats, start: Integers, *more: Floats) -> Floats:
     near = np.flatnonzero(np.abs(found) <= _RESUM)
     near = near[np.diff(start)[near] + len(more) > 2]  # a single addition has the right sign
     if near.size:
-        width = np.diff(start)[near]
-        entry = concatenated_ranges(start[near], width)
+        entry, width = row_entries(start, near)
         for part in row_parts(offsets_from_counts(width)):
             terms = quantity[entry[part.entry]]
             terms = terms if part.used is None else np.where(part.used, terms, 0)

@@ -22,8 +22,7 @@ from jaxltl.core.pretty_print import brief
 from jaxltl.core.sparse.interval.l1_ball import Ball, share_of
 from jaxltl.core.sparse.interval.row_table import RowTable, row_parts, row_sums
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
-from jaxltl.core import validation
+from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts, row_entries
 
 _EPS = float(np.finfo(np.float64).eps)
 _DECIMALS = 2 * _EPS  # by how much a sum of decimals may miss one through rounding
@@ -141,8 +140,7 @@ class UncertainMDP:
         if not row.size:
             return np.zeros(0, bool)
         mdp = self.mdp
-        count = mdp.entry_start[row + 1] - mdp.entry_start[row]
-        entry = concatenated_ranges(mdp.entry_start[row], count)
+        entry, count = row_entries(mdp.entry_start, row)
         start = count.cumsum() - count
         inside = region[mdp.successor[entry]]
         start, one = np.append(start, entry.size), np.ones(row.size)
@@ -208,12 +206,7 @@ class UncertainMDP:
 
     def select_rows(self, row_start: Integers, row: Integers) -> tuple[UncertainMDP, Integers]:
         """The model with some rows in a new order, and the original entries."""
-        mdp = self.mdp
-        width = np.diff(mdp.entry_start)[row]
-        entry = concatenated_ranges(mdp.entry_start[row], width)
-        part = HostMDP(
-            row_start, offsets_from_counts(width), mdp.successor[entry], mdp.probability[entry]
-        )
+        part, entry = self.mdp.select(row_start, row)
         ball = None if self.ball is None else self.ball.select(entry, row)
         return UncertainMDP(part, self.lower[entry], self.upper[entry], ball), entry
 
@@ -247,42 +240,6 @@ def scatter(table: RowTable, mass: Floats, found: Floats) -> None:
         found[table.entry] = mass
     else:
         found[table.entry[table.used]] = mass[table.used]
-
-
-def l1_expectation(
-    value: Floats, center: Floats, radius: Floats, entry_start: Integers, *, maximize: bool
-) -> tuple[Floats, Floats]:
-    """Extreme expectation over an L1 ball: ``sum_t p_t v_t`` with ``sum_t |p_t - c_t| <= radius``.
-
-    Half of the radius is moved from the worst successors to the best one (Strehl and Littman 2008,
-    section 3.2).
-    """
-    value, center, radius = (
-        validation.float_array(name, x)
-        for name, x in (("value", value), ("center", center), ("radius", radius))
-    )
-    start: Integers = validation.integer_array("entry_start", entry_start).reshape(-1)
-    if value.shape != center.shape or (start.size - 1,) != radius.shape:
-        raise ValueError(
-            f"value has shape {value.shape}, center {center.shape} and radius {radius.shape}; "
-            f"expected [T], [T] and [{start.size - 1}], an entry for each row."
-        )
-    width = np.diff(start)
-    if start[0] != 0 or start[-1] != value.size or (width <= 0).any():
-        raise ValueError(
-            f"entry_start goes from {start[0]} to {start[-1]}; it must ascend from 0 to "
-            f"{value.size}, without an empty row."
-        )
-    if not (np.isfinite(value) & np.isfinite(center)).all():
-        raise ValueError("value or center has an entry that is not finite; give finite numbers.")
-    if not (radius >= 0).all():
-        r = int(np.argmin(radius >= 0))
-        raise ValueError(f"the radius of row {r} is {radius[r]}; it must be at least 0.")
-    sets = uncertainty_sets(
-        start, np.zeros_like(center), np.ones_like(center), Ball(center, np.minimum(radius / 2, 1))
-    )
-    p = sets.extreme_distributions(value, maximize=bool(maximize))
-    return sets.sum_rows(p * value), p
 
 
 def uncertainty_sets(

@@ -19,7 +19,7 @@ from jaxltl.core.sparse.linear.topological_order import (
     ordered_components,
     topological_levels,
 )
-from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
+from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts, row_entries
 
 # Targets of entries besides nodes: the value one, the goal, and the losing states.
 ONE, GOAL, LOST = -1, -2, -3
@@ -248,7 +248,7 @@ def _distances(source: Integers, target: Integers, leaves: Booleans, label: Inte
     layer[frontier], steps = 0, 0
     while frontier.size:
         steps += 1
-        found = before[concatenated_ranges(start[frontier], start[frontier + 1] - start[frontier])]
+        found = before[row_entries(start, frontier)[0]]
         found = found[layer[found] < 0]
         layer[found] = steps
         frontier = np.unique(found)

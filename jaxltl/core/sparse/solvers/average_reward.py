@@ -30,7 +30,7 @@ from jaxltl.core.sparse.linear.extended_precision import (
 )
 from jaxltl.core.sparse.linear.topological_order import Edges, ordered_components
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
+from jaxltl.core.sparse.rows import offsets_from_counts
 from jaxltl.core.sparse.solvers.policy_iteration import policy_iteration
 from jaxltl.core.sparse.solvers.reachability import quotient_policy
 from jaxltl.core.sparse.solvers.step_bounded import backup_unit
@@ -220,15 +220,8 @@ def _submodel(
     number[states] = np.arange(states.size)
     row = np.flatnonzero(inside & (number[mdp.state] >= 0))
     row = row[np.argsort(number[mdp.state[row]], kind="stable")]
-    width = np.diff(mdp.entry_start)[row]
-    entry = concatenated_ranges(mdp.entry_start[row], width)
     count = np.bincount(number[mdp.state[row]], minlength=states.size)
-    small = HostMDP(
-        offsets_from_counts(count),
-        offsets_from_counts(width),
-        number[mdp.successor[entry]],
-        mdp.probability[entry],
-    )
+    small, _ = mdp.select(offsets_from_counts(count), row, number)
     reward, magnitude = (x[row] for x in rewards)
     size = np.diff(start, append=states.size)
     return _Submodel(small, start, size, row, reward, magnitude, backup_unit(small))

@@ -40,7 +40,7 @@ from jaxltl.core.sparse.linear.topological_order import (
     ordered_components,
     topological_levels,
 )
-from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
+from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts, row_entries
 from jaxltl.core.sparse.solvers.total_cost import (
     TINY,
     Enclosure,
@@ -159,8 +159,7 @@ def _core_solver(
     choices = choices_of(count)
     row = concatenated_ranges(rows.row_start[core], count)[choices.order]
     core = core[choices.states]
-    width = np.diff(rows.entry_start)[row]
-    entry = concatenated_ranges(rows.entry_start[row], width)
+    entry, width = row_entries(rows.entry_start, row)
     number: Integers = np.full(rows.num_nodes + 1, -1, np.int32)
     number[core] = np.arange(core.size)
     target, weight = rows.target[entry], rows.weight[entry]

@@ -31,7 +31,7 @@ from jaxltl.core.sparse.linear.gauss_seidel import (
     solve_by_sweeps,
 )
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import concatenated_ranges, group_starts
+from jaxltl.core.sparse.rows import group_starts, row_entries
 from jaxltl.core.sparse.solvers.policy_iteration import policy_iteration
 from jaxltl.core.sparse.solvers.total_cost import TINY, Enclosure, ShortestPathProblem
 
@@ -363,7 +363,7 @@ def mixes(problem: ShortestPathProblem, size: int) -> bool:
     first = mdp.entry_start[mdp.row_start]
 
     def follow(states: Integers) -> Integers:
-        after = mdp.successor[concatenated_ranges(first[states], first[states + 1] - first[states])]
+        after = mdp.successor[row_entries(first, states)[0]]
         return after[interior[after]]
 
     middle = np.flatnonzero(interior)[size // 2 : size // 2 + 1]
@@ -437,8 +437,7 @@ def _stochastic_loops(problem: ShortestPathProblem) -> tuple[Floats, Booleans | 
     weight[loop] = 0
     first = loop[group_starts(mdp.row[loop])]  # a row may repeat its successors
     row = mdp.row[first]
-    width = np.diff(mdp.entry_start)[row]
-    entry = concatenated_ranges(mdp.entry_start[row], width)
+    entry, width = row_entries(mdp.entry_start, row)
     rest = np.add.reduceat(weight[entry], width.cumsum() - width)
     weight[first] = np.maximum(1 - rest, 0)
     allowed = np.ones(mdp.num_rows, bool) if problem.allowed is None else problem.allowed.copy()

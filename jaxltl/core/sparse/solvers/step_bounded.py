@@ -18,7 +18,7 @@ from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.sparse.choice_order import Choices, choices_of
 from jaxltl.core.sparse.graph.qualitative import positive_under_all_policies, backward_reachable
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import sorted_unique, concatenated_ranges
+from jaxltl.core.sparse.rows import concatenated_ranges, row_entries, sorted_unique
 from jaxltl.core.sparse.solvers.total_cost import Enclosure
 from jaxltl.core.sparse.solvers.reachability import reachability, reward_forever, total_reward
 
@@ -316,9 +316,7 @@ def _near(mdp: HostMDP, target: Booleans, open_: Booleans, num_steps: int) -> Bo
     seen = target.copy()
     frontier: Integers = np.flatnonzero(target)
     for _ in range(num_steps):
-        state = mdp.state[
-            pred[concatenated_ranges(start[frontier], start[frontier + 1] - start[frontier])]
-        ]
+        state = mdp.state[pred[row_entries(start, frontier)[0]]]
         state = sorted_unique(state, mdp.num_states)
         frontier = state[open_[state] & ~seen[state]]
         if not frontier.size:

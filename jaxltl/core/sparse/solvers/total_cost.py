@@ -11,7 +11,13 @@ import numpy as np
 from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.sparse.linear.topological_order import Edges, Levels
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import SCIPY_SIZE, concatenated_ranges, first_hits, offsets_from_counts
+from jaxltl.core.sparse.rows import (
+    SCIPY_SIZE,
+    concatenated_ranges,
+    first_hits,
+    offsets_from_counts,
+    row_entries,
+)
 
 if TYPE_CHECKING:
     pass
@@ -70,10 +76,8 @@ class InteriorRows:
 
     def take(self, node: Integers) -> InteriorRows:
         """The rows of some nodes, in their order; targets keep their numbers."""
-        count = np.diff(self.row_start)[node]
-        row = concatenated_ranges(self.row_start[node], count)
-        width = np.diff(self.entry_start)[row]
-        entry = concatenated_ranges(self.entry_start[row], width)
+        row, count = row_entries(self.row_start, node)
+        entry, width = row_entries(self.entry_start, row)
         return InteriorRows(
             row_start=offsets_from_counts(count),
             entry_start=offsets_from_counts(width),

@@ -24,7 +24,7 @@ from jaxltl.core.models.protocols import ActionModel, Array, Model
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.sparse.graph.qualitative import end_components
 from jaxltl.core.sparse.mdp import HostMDP
-from jaxltl.core.sparse.rows import concatenated_ranges, offsets_from_counts
+from jaxltl.core.sparse.rows import offsets_from_counts
 from jaxltl.core.sparse.solvers import reachability as solver
 from jaxltl.core.sparse.solvers.layered_reachability import PaddedProduct, layered_reachability
 from jaxltl.core.sparse.solvers.total_cost import Enclosure
@@ -285,14 +285,7 @@ def attained_by_ties(mdp: HostMDP, objective: str, found: Enclosure) -> Enclosur
         free |= end_components(mdp, undecided).inside
     rows = np.flatnonzero(ties | free)
     count = np.bincount(mdp.state[rows], minlength=mdp.num_states)
-    width = np.diff(mdp.entry_start)[rows]
-    entry = concatenated_ranges(mdp.entry_start[rows], width)
-    tied = HostMDP(
-        offsets_from_counts(count),
-        offsets_from_counts(width),
-        mdp.successor[entry],
-        mdp.probability[entry],
-    )
+    tied, _ = mdp.select(offsets_from_counts(count), rows)
     cost = np.where(free[rows], 0.0, 1.0)
     time = solver.reward_forever(tied, cost, maximize=True).value
     if not np.isfinite(time).all():
