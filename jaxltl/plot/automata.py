@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from jaxltl.core.automata.automaton import Automaton
 from jaxltl.core.automata.text import edge_guards
 from jaxltl.plot import layout as drawing
-from jaxltl.plot.style import ACCENT, FAINT, GOOD, INK, MUTED, PAPER
+from jaxltl.plot.style import ACCENT, FAINT, GOOD, INK, MUTED, PAPER, write
 
 _NOTES = {
     "buchi": "●: accepting; a word is accepted if its run takes such arrows infinitely often",
@@ -217,15 +217,8 @@ def _mark(axes: Axes, center: tuple[float, float], mark: str) -> None:
         )
     )
     if mark != "●":
-        axes.text(
-            *center,
-            mark,
-            ha="center",
-            va="center_baseline",
-            fontsize=7,
-            color=PAPER if filled else INK,
-            zorder=5,
-        )
+        color = PAPER if filled else INK
+        write(axes, center, mark, 7, color, va="center_baseline", zorder=5)
 
 
 def draw_edge(axes: Axes, curve: NDArray[np.float64], color: str) -> None:
@@ -263,13 +256,4 @@ def draw_state(
         axes.add_patch(
             Circle(tuple(center), inner, facecolor="none", edgecolor=line, lw=1, zorder=5)
         )
-    axes.text(
-        center[0],
-        center[1],
-        text,
-        ha="center",
-        va="center_baseline",
-        fontsize=11,
-        color=line,
-        zorder=6,
-    )
+    write(axes, center, text, 11, line, va="center_baseline", zorder=6)

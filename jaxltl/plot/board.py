@@ -15,7 +15,7 @@ from matplotlib.patches import Circle, Polygon, Rectangle
 from numpy.typing import ArrayLike, NDArray
 
 from jaxltl.envs.text_map import parse_map
-from jaxltl.plot.style import FAINT, INK, MUTED, PAPER, SCALE
+from jaxltl.plot.style import FAINT, INK, MUTED, PAPER, SCALE, write
 
 STEPS = {"up": (0, -1), "down": (0, 1), "left": (-1, 0), "right": (1, 0)}
 DIRECTIONS = {**STEPS, "stay": (0, 0)}
@@ -49,18 +49,8 @@ def fill_cells(axes: Axes, world: Board, colors: Sequence[str], lines: str = PAP
         axes.add_patch(Rectangle((column, row), 1, 1, facecolor=color, lw=0))
         kind = world.cells[row, column]
         if kind not in (".", world.wall):
-            axes.text(
-                column + 0.07,
-                row + 0.07,
-                short_name(kind),
-                ha="left",
-                va="top",
-                fontsize=6.5,
-                color=MUTED,
-                weight="bold",
-                parse_math=False,
-                zorder=5,
-            )
+            style = {"ha": "left", "va": "top", "weight": "bold", "zorder": 5}
+            write(axes, (column + 0.07, row + 0.07), short_name(kind), 6.5, MUTED, **style)
     frame_cells(axes, world, lines)
 
 

@@ -43,7 +43,7 @@ from jaxltl.envs.flat_world import Discs, FlatState
 from jaxltl.envs.letter_world import LetterState
 from jaxltl.envs.zone_world import ZoneState
 from jaxltl.plot.board import ROBOT, rule_cells
-from jaxltl.plot.style import ACCENT, FAINT, INK, KINDS, MUTED, PAPER, head, note
+from jaxltl.plot.style import ACCENT, FAINT, INK, KINDS, MUTED, PAPER, head, note, write
 
 _PIXELS = 440.0
 
@@ -252,34 +252,14 @@ def _segments(scene: Scene) -> list[NDArray[np.float64]]:
 def _draw_ground(axes: Axes, scene: Scene) -> None:
     for column, row, name in scene.letters:
         axes.add_patch(Rectangle((column, row), 1, 1, facecolor="#eef2f5", lw=0))
-        axes.text(
-            column + 0.5,
-            row + 0.53,
-            name,
-            ha="center",
-            va="center",
-            fontsize=12,
-            color=MUTED,
-            weight="bold",
-            parse_math=False,
-            zorder=7,
-            path_effects=[withStroke(linewidth=2.5, foreground="#eef2f5", alpha=0.8)],
-        )
+        halo = [withStroke(linewidth=2.5, foreground="#eef2f5", alpha=0.8)]
+        style = {"weight": "bold", "zorder": 7, "path_effects": halo}
+        write(axes, (column + 0.5, row + 0.53), name, 12, MUTED, **style)
     if scene.cells:
         rule_cells(axes, scene.cells, scene.cells, FAINT)
     for i, (x, y, radius, name) in enumerate(scene.discs):
         axes.add_patch(Circle((x, y), radius, facecolor=tint(name, i), alpha=0.75, lw=0, zorder=1))
-        axes.text(
-            x,
-            y,
-            name,
-            ha="center",
-            va="center",
-            fontsize=7.5,
-            color=INK,
-            parse_math=False,
-            zorder=3,
-        )
+        write(axes, (x, y), name, 7.5, INK, zorder=3)
     axes.set(xlim=(0, scene.size), ylim=(scene.size, 0), aspect="equal", xticks=[], yticks=[])
     for spine in axes.spines.values():
         spine.set(color=MUTED, lw=0.8, ls="--" if scene.joined else "-")

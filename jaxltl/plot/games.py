@@ -46,6 +46,7 @@ from jaxltl.plot.style import (
     plain_axes,
     scale_bar,
     value_limits,
+    write,
 )
 
 _CELLS = "The cells of a map are those of the system's robot."
@@ -285,16 +286,8 @@ def _figures(
 ) -> None:
     for place, (row, column) in enumerate(world.places):
         if place != robot and np.isfinite(values[place]):
-            axes.text(
-                column + 0.5,
-                row + 0.5,
-                f"{values[place]:.3g}",
-                ha="center",
-                va="center",
-                fontsize=6.5,
-                color=PAPER if values[place] < middle else INK,
-                zorder=4,
-            )
+            color, text = PAPER if values[place] < middle else INK, f"{values[place]:.3g}"
+            write(axes, (column + 0.5, row + 0.5), text, 6.5, color, zorder=4)
 
 
 def compare(
@@ -350,17 +343,8 @@ def compare(
         )
     for i, name in enumerate(kinds):
         here = place[group[order] == i]
-        axes.text(
-            here.mean(),
-            1.02,
-            name,
-            transform=axes.get_xaxis_transform(),
-            ha="center",
-            va="bottom",
-            fontsize=8.5,
-            color=MUTED,
-            parse_math=False,
-        )
+        style = {"transform": axes.get_xaxis_transform(), "va": "bottom"}
+        write(axes, (here.mean(), 1.02), name, 8.5, MUTED, **style)
         if i:
             axes.axvline(here[0] - 1.25, color=FAINT, lw=1)
     axes.set_ylabel(label, fontsize=9, color=INK)

@@ -42,6 +42,7 @@ from jaxltl.plot.style import (
     scale_bar,
     settle,
     value_limits,
+    write,
 )
 
 TINY = 16  # cells a side, beyond which they have no room for names and numbers
@@ -180,15 +181,8 @@ def _cells(
         if kind in special:
             _name_cell(axes, (c, r), marks[str(kind)], color, blank=bool(blank), tiny=tiny)
         if numbers and not blank and not tiny:
-            axes.text(
-                c + 0.5,
-                r + 0.58,
-                _short_number(float(shown[r, c])),
-                ha="center",
-                va="center",
-                fontsize=7,
-                color=PAPER if shown[r, c] < sum(limits) / 2 else INK,
-            )
+            tone = PAPER if shown[r, c] < sum(limits) / 2 else INK
+            write(axes, (c + 0.5, r + 0.58), _short_number(float(shown[r, c])), 7, tone)
     rule_cells(axes, rows, columns, FAINT)
     axes.set(xlim=(0, columns), ylim=(rows, 0), aspect="equal")
     number_cells(axes, rows, columns)
@@ -199,20 +193,11 @@ def _name_cell(
     axes: Axes, corner: tuple[int, int], text: str, color: str, *, blank: bool, tiny: bool
 ) -> None:
     """Writes the name of a cell: into the middle of a blank one, else into its corner."""
-    where: tuple[str, str] = ("center", "center") if blank else ("left", "top")
-    axes.text(
-        corner[0] + (0.5 if blank else 0.06),
-        corner[1] + (0.5 if blank else 0.06),
-        text,
-        ha=where[0],
-        va=where[1],
-        fontsize=9 if blank and not tiny else 6.5,
-        color=INK,
-        weight="normal" if blank else "bold",
-        parse_math=False,
-        zorder=5,
-        bbox={"facecolor": color, "edgecolor": "none", "pad": 0.4 if tiny else 0.9},
-    )
+    inset = 0.5 if blank else 0.06
+    style = {} if blank else {"ha": "left", "va": "top", "weight": "bold"}
+    box = {"facecolor": color, "edgecolor": "none", "pad": 0.4 if tiny else 0.9}
+    size, place = 9 if blank and not tiny else 6.5, (corner[0] + inset, corner[1] + inset)
+    write(axes, place, text, size, INK, zorder=5, bbox=box, **style)
 
 
 def _cell_texts(kinds: NDArray[np.str_], special: Iterable[str]) -> dict[str, str]:

@@ -20,7 +20,7 @@ from jaxltl.plot import layout as drawing
 from jaxltl.plot.automata import canvas, draw_edge, draw_label, draw_start, draw_state
 from jaxltl.plot.board import STEPS, Board
 from jaxltl.plot.maps import grid
-from jaxltl.plot.style import ACCENT, FAINT, GOOD, INK, MUTED, PAPER, plain_axes
+from jaxltl.plot.style import ACCENT, FAINT, GOOD, INK, MUTED, PAPER, plain_axes, write
 
 if TYPE_CHECKING:
     from jaxltl.core.models.protocols import PyTree
@@ -367,16 +367,7 @@ def _square(axes: Axes, center: NDArray[np.float64], text: str, good: bool) -> N
             zorder=5,
         )
     )
-    axes.text(
-        center[0],
-        center[1],
-        text,
-        ha="center",
-        va="center_baseline",
-        fontsize=11,
-        color=INK,
-        zorder=6,
-    )
+    write(axes, center, text, 11, INK, va="center_baseline", zorder=6)
 
 
 def _notes(world: PyTree, values: np.ndarray | None) -> list[str]:

@@ -16,6 +16,8 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from jaxltl.core.models.protocols import PyTree
+
 INK, MUTED, FAINT = "#1f2a37", "#6b7785", "#d5dae0"
 ACCENT, GOOD, PAPER = "#1f6f8b", "#e4f1ea", "#ffffff"
 KINDS = ("#dfd0ea", "#f5d6b3", "#d3e6e8", "#e3ddd0", "#f0d3df", "#dbe3b8")
@@ -25,6 +27,14 @@ SERIES = ("#1f6f8b", "#c2571a", "#5b7f2b", "#7a4f9a", "#a23b5b", "#4a5a6a")
 SCALE = LinearSegmentedColormap.from_list(
     "probability", ["#2f2b57", "#4a5a92", "#7f9cc0", "#bfd3df", "#f6f8f4"]
 )
+
+
+def write(
+    axes: Axes, place: Sequence[float], text: str, size: float, color: str, **style: PyTree
+) -> None:
+    """Writes text as it is, without formulas, centred at a place unless `style` aligns it."""
+    style = {"ha": "center", "va": "center", **style}
+    axes.text(*place, text, fontsize=size, color=color, parse_math=False, **style)
 
 
 def to_bytes(figure: Figure, kind: str = "svg", dpi: int = 150) -> bytes:

@@ -35,6 +35,7 @@ from jaxltl.plot.style import (
     note,
     scale_bar,
     value_limits,
+    write,
 )
 
 if TYPE_CHECKING:
@@ -191,17 +192,15 @@ def _name_kinds(axes: Axes, world: World) -> None:
             )
         )
         # In small cells, names of rare kinds are written next to them, marks of others inside.
-        axes.text(
-            column + (1.2 if tiny and name not in marks else 0.04),
-            row + 0.04,
+        corner = column + (1.2 if tiny and name not in marks else 0.04), row + 0.04
+        style = {"ha": "left", "va": "top", "weight": "bold", "zorder": 7}
+        write(
+            axes,
+            corner,
             marks.get(name, name),
-            ha="left",
-            va="top",
-            fontsize=5 if name in marks else 6.5,
-            color=PAPER,
-            weight="bold",
-            parse_math=False,
-            zorder=7,
+            5 if name in marks else 6.5,
+            PAPER,
+            **style,
             bbox={"facecolor": SERIES[1], "edgecolor": "none", "pad": 0.3 if marks else 0.9},
         )
 
