@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
 import numpy as np
 from jax.typing import ArrayLike
 
+from jaxltl.core.array_types import Integers
 from jaxltl.core.values.engine.validated import validated
 from jaxltl.core.models.game import Game
 from jaxltl.core.models.interval import IntervalMDP, make_interval
@@ -283,23 +285,35 @@ def robust_solution(
     sides: Sides, found: RobustValues, tolerance: float, *, relative: bool
 ) -> Solution:
     """The :class:`Solution` of certified values."""
-    size = sides.world.num_states
-    value, lower, upper = (x[:size] for x in (found.value, found.lower, found.upper))
-    status = status_between(lower, upper, tolerance, relative=relative)
-    row, chance = found.row, found.probability
+    row, chance, size = found.row, found.probability, sides.world.num_states
     if sides.spread is not None:
         row = sides.spread.policy(row, chance)
         chance = sides.spread.nature(chance, np.asarray(sides.world.nominal.probability))
     policy = np.asarray(row.astype(np.int32) if sides.policy is None else sides.policy)
+    found = replace(found, probability=chance)
+    return solution_at(found, np.arange(size), (size,), policy, tolerance, relative=relative)
+
+
+def solution_at(
+    found: RobustValues,
+    states: Integers,
+    shape: tuple[int, ...],
+    policy: Array,
+    tolerance: float,
+    *,
+    relative: bool = False,
+) -> Solution:
+    """The :class:`Solution` at some states, in a shape."""
+    value, low, high = (x[states].reshape(shape) for x in (found.value, found.lower, found.upper))
     parts: dict[str, Array] = {
         "value": value,
         "policy": policy,
-        "nature": chance,
-        "lower": lower,
-        "upper": upper,
+        "nature": found.probability,
+        "lower": low,
+        "upper": high,
         "residual": np.float64(found.residual),
         "num_steps": np.int32(found.rounds),
-        "status": np.int32(status),
+        "status": np.int32(status_between(low, high, tolerance, relative=relative)),
     }
     return Solution(**parts, method=found.method)
 

@@ -26,8 +26,8 @@ from jaxltl.core.sparse.interval.robust_values import Query, RobustValues
 from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.product import SparseProduct, sparse_product
-from jaxltl.core.types import Solution, Status, require_shape, row_tolerance
-from jaxltl.core.values.interval.robust import Sides, host_sides, width_asked, world_of
+from jaxltl.core.types import Solution, require_shape, row_tolerance
+from jaxltl.core.values.interval.robust import Sides, host_sides, solution_at, width_asked, world_of
 from jaxltl.core.values.undiscounted.sparse_satisfaction import (
     Satisfaction,
     automaton_and_letters,
@@ -78,27 +78,8 @@ def robust_satisfaction(
     verdicts = _Verdicts(yes[q], no[q], priority, automaton.is_safety)
     found = _solved(host_sides(host, moves, objective, nature), host, verdicts, asked)
     row = product.base_row[found.row].astype(np.int32)
-    solution = _solution(found, asked, product.start.shape, product.start, row)
+    solution = solution_at(found, product.start, product.start.shape, row, asked)
     return Satisfaction(solution, automaton, letter, product, row, found.value, "exit")
-
-
-def _solution(
-    found: RobustValues, tolerance: float, shape: tuple[int, ...], states: Integers, policy: Array
-) -> Solution:
-    """The :class:`Solution` at some states of the product."""
-    low, high = (x[states].reshape(shape) for x in (found.lower, found.upper))
-    status = Status.CONVERGED if (high - low <= tolerance).all() else Status.PRECISION
-    parts: dict[str, Array] = {
-        "value": found.value[states].reshape(shape),
-        "policy": policy,
-        "lower": low,
-        "upper": high,
-        "nature": found.probability,
-        "residual": np.float64(found.residual),
-        "num_steps": np.int32(found.rounds),
-        "status": np.int32(status),
-    }
-    return Solution(**parts, method=found.method)
 
 
 @validated()
@@ -148,11 +129,11 @@ def robust_product_satisfaction(
     verdicts = _Verdicts(yes[q], no[q], level, task.is_safety)
     found = _solved(sides, host, verdicts, asked)
     if policy is not None:
-        solution = _solution(found, asked, shape, product.start, np.asarray(policy))
+        solution = solution_at(found, product.start, shape, np.asarray(policy), asked)
         return solution.replace(nature=None)  # type: ignore[attr-defined]
     policy = product.base_row[found.row[product.start]].astype(np.int32).reshape(shape)
     found = replace(found, probability=found.probability[: product.host.num_transitions])
-    return _solution(found, asked, shape, product.start, policy)
+    return solution_at(found, product.start, shape, policy, asked)
 
 
 def _reading(host: UncertainMDP, priority: Integers) -> tuple[UncertainMDP, Integers, Integers]:
