@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 from jaxltl.core.language.expressions import (
@@ -100,24 +100,27 @@ def constant_value(name: str, value: object) -> Value:
 
 @dataclass(frozen=True)
 class _Changed:
-    """Applies a function to the expressions of a tree."""
+    """Applies a function to the expressions of a tree, and renames actions and variables."""
 
     change: Change
+    names: Mapping[str, str] = field(default_factory=dict)
 
     def declaration(self, d: Declaration) -> Declaration:
         ends = (None if e is None else self.change(e) for e in (d.low, d.high, d.initial))
         low, high, initial = ends
-        return replace(d, low=low, high=high, initial=initial)
+        name = self.names.get(d.name, d.name)
+        return replace(d, name=name, low=low, high=high, initial=initial)
 
     def command(self, c: Command) -> Command:
-        return Command(
-            c.action, self.change(c.guard), tuple(map(self.outcome, c.outcomes)), c.place
-        )
+        action = self.names.get(c.action, c.action)
+        outcomes = tuple(map(self.outcome, c.outcomes))
+        return Command(action, self.change(c.guard), outcomes, c.place)
 
     def outcome(self, o: Outcome) -> Outcome:
         upper = None if o.upper is None else self.change(o.upper)
         assignments = [
-            Assignment(a.variable, self.change(a.expression), a.place) for a in o.assignments
+            Assignment(self.names.get(a.variable, a.variable), self.change(a.expression), a.place)
+            for a in o.assignments
         ]
         return Outcome(self.change(o.probability), upper, tuple(assignments))
 
@@ -164,7 +167,13 @@ class _Resolver:
         parameters = tuple(
             c.name for c in syntax.constants if c.name not in constants and c.type == "double"
         )
-        used = _used_names(modules, [_Changed(both).rewards(r) for r in syntax.rewards])
+        rewards = tuple(_Changed(both).rewards(r) for r in syntax.rewards)
+        used: set[str] = set()
+        for e in (
+            *(e for m in modules for c in m.commands for e in c.expressions),
+            *(i.value for r in rewards for i in r.items),
+        ):
+            names_in(e, used)
         program = Program(
             syntax.source,
             syntax.kind,
@@ -174,7 +183,7 @@ class _Resolver:
             variables,
             tuple(replace(m, declarations=()) for m in modules),
             {name.strip('"'): e for name, e in labels.items()},
-            tuple(_Changed(both).rewards(r) for r in syntax.rewards),
+            rewards,
             None if syntax.initial is None else both(syntax.initial),
             syntax.players,
         )
@@ -199,11 +208,8 @@ class _Resolver:
     def renamed(
         self, modules: tuple[Module | RenamedModule, ...], formulas: Mapping[str, Expression]
     ) -> list[Module]:
-        plain = [m for m in modules if isinstance(m, Module)]
-        copies = [m for m in modules if isinstance(m, RenamedModule)]
         found: dict[str, Module] = {}
-        every: list[Module | RenamedModule] = [*plain, *copies]
-        for m in every:
+        for m in sorted(modules, key=lambda m: isinstance(m, RenamedModule)):  # copies last
             if m.name in found:
                 raise LanguageError(m.place, f"there are two modules {m.name}.")
             if isinstance(m, RenamedModule):
@@ -401,45 +407,9 @@ def _renamed(base: Module, renaming: RenamedModule, formulas: Mapping[str, Expre
                 renaming.place,
                 f"the copy {renaming.name} does not rename {d.name}, a variable of {base.name}.",
             )
-    copy = _Changed(rename).module(base)
-    return Module(
-        renaming.name,
-        tuple(replace(d, name=names[d.name], place=renaming.place) for d in copy.declarations),
-        tuple(
-            Command(
-                names.get(c.action, c.action),
-                c.guard,
-                tuple(
-                    replace(
-                        o,
-                        assignments=tuple(
-                            replace(a, variable=names.get(a.variable, a.variable))
-                            for a in o.assignments
-                        ),
-                    )
-                    for o in c.outcomes
-                ),
-                c.place,
-            )
-            for c in copy.commands
-        ),
-        renaming.place,
-    )
-
-
-def _used_names(modules: Iterable[Module], rewards: Iterable[RewardStructure]) -> set[str]:
-    found: set[str] = set()
-    for m in modules:
-        for c in m.commands:
-            names_in(c.guard, found)
-            for o in c.outcomes:
-                for e in (o.probability, o.upper, *(a.expression for a in o.assignments)):
-                    if e is not None:
-                        names_in(e, found)
-    for r in rewards:
-        for i in r.items:
-            names_in(i.value, found)
-    return found
+    copy = _Changed(rename, names).module(base)
+    placed = tuple(replace(d, place=renaming.place) for d in copy.declarations)
+    return replace(copy, name=renaming.name, declarations=placed, place=renaming.place)
 
 
 class _Checker:

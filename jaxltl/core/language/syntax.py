@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from jaxltl.core.language.expressions import Expression, Type, Value
+from jaxltl.core.language.expressions import Expression, Type, Value, names_in
 from jaxltl.core.language.source import Source
 
 Kind = Literal["dtmc", "mdp", "smg"]
@@ -59,6 +59,17 @@ class Command:
     outcomes: tuple[Outcome, ...]
     place: int
 
+    @property
+    def expressions(self) -> list[Expression]:
+        """The guard, the probabilities and the right sides of assignments."""
+        ends = [e for o in self.outcomes for e in (o.probability, o.upper) if e is not None]
+        return [self.guard, *ends, *(a.expression for o in self.outcomes for a in o.assignments)]
+
+    @property
+    def assigned(self) -> set[str]:
+        """The variables that some update assigns."""
+        return {a.variable for o in self.outcomes for a in o.assignments}
+
 
 @dataclass(frozen=True)
 class Module:
@@ -68,6 +79,16 @@ class Module:
     declarations: tuple[Declaration, ...]
     commands: tuple[Command, ...]
     place: int
+
+    @property
+    def names(self) -> set[str]:
+        """The variables and parameters that the commands read or assign."""
+        found: set[str] = set()
+        for c in self.commands:
+            found |= c.assigned
+            for e in c.expressions:
+                names_in(e, found)
+        return found
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from jaxltl.core.language.expressions import SCALAR, Expression, names_in
+from jaxltl.core.language.expressions import SCALAR, Expression
 from jaxltl.core.language.syntax import Command, Module
 from jaxltl.core.programs.layout import Layout
 from jaxltl.core.validation import ROW_SUM_TOLERANCE
@@ -36,10 +36,10 @@ def generate(module: Module, actions: tuple[str, ...], layout: Layout) -> Local:
     Raises:
       Unsupported: the module is too large or too deep for Python's compiler.
     """
-    expressions = [e for c in module.commands for e in _expressions(c)]
+    expressions = [e for c in module.commands for e in c.expressions]
     if sum(e.size for e in expressions) > _MAX_SIZE:
         raise Unsupported
-    names = sorted({n for e in expressions for n in names_in(e)} | _assigned(module))
+    names = sorted(module.names)
     local = {name: f"v{i}" for i, name in enumerate(names)}
     lines = ["def local(s):"]
     for name in names:
@@ -59,17 +59,6 @@ def generate(module: Module, actions: tuple[str, ...], layout: Layout) -> Local:
         raise Unsupported from None
     found: Local = space["local"]
     return found
-
-
-def _expressions(c: Command) -> list[Expression]:
-    outcomes = [
-        e for o in c.outcomes for e in (o.probability, *(a.expression for a in o.assignments))
-    ]
-    return [c.guard, *outcomes]
-
-
-def _assigned(module: Module) -> set[str]:
-    return {a.variable for c in module.commands for o in c.outcomes for a in o.assignments}
 
 
 def _command(c: Command, column: int, layout: Layout, local: dict[str, str]) -> list[str]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from jaxltl.core.array_types import Integers
 from jaxltl.core.language.compiled import Compiled, compile_expressions
-from jaxltl.core.language.expressions import conjuncts, names_in
+from jaxltl.core.language.expressions import conjuncts
 from jaxltl.core.language.source import LanguageError
 from jaxltl.core.language.syntax import Assignment, Command, Module, Program
 from jaxltl.core.programs.hash_table import HashTable
@@ -62,7 +62,7 @@ class ModuleCode:
         self.guards = [[number[text] for text in part] for part in parts]
         self.conditions = compile_expressions(list(conditions.values()))
         self.codes = [self._code(c) for c in module.commands]
-        self.support = _support(module, layout)
+        self.support = layout.masks(module.names & layout.fields.keys())
 
     def _code(self, c: Command) -> _Code:
         assigned = [a for o in c.outcomes for a in o.assignments]
@@ -231,19 +231,6 @@ def state_text(read: Reader, i: int) -> str:
         if sum(map(len, parts)) > 200:
             return f"({','.join(parts)},...)"
     return f"({','.join(parts)})"
-
-
-def _support(module: Module, layout: Layout) -> tuple[int, ...]:
-    """The bits of the variables that a module reads or assigns."""
-    names: set[str] = set()
-    for c in module.commands:
-        names_in(c.guard, names)
-        for o in c.outcomes:
-            for e in (o.probability, o.upper, *(a.expression for a in o.assignments)):
-                if e is not None:
-                    names_in(e, names)
-            names.update(a.variable for a in o.assignments)
-    return layout.masks(names & layout.fields.keys())
 
 
 _DENSE_BITS = 20  # of a module's variables, up to which a table of numbers has all combinations
