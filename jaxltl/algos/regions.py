@@ -218,9 +218,7 @@ def _limit(threshold: ArrayLike) -> float:
     found = validation.float_array("threshold", threshold)
     if found.ndim or np.isnan(found):
         what = (
-            "the threshold is NaN"
-            if not found.ndim
-            else f"threshold={validation.shorten(threshold)}"
+            f"threshold={validation.shorten(threshold)}" if found.ndim else "the threshold is NaN"
         )
         raise ValueError(f"{what}; give a number.")
     return float(found)

@@ -149,11 +149,9 @@ def propositions_text(propositions: Sequence[str]) -> str:
 
 def batch_text(shape: Sequence[int]) -> str:
     """The batch shape; empty for no batch."""
-    return (
-        count(shape[0], "lane")
-        if len(shape) == 1
-        else (f"{' x '.join(f'{n:,}' for n in shape)} lanes" if shape else "")
-    )
+    if len(shape) == 1:
+        return count(shape[0], "lane")
+    return f"{' x '.join(f'{n:,}' for n in shape)} lanes" if shape else ""
 
 
 # --- arrays ---------------------------------------------------------------------------------------

@@ -64,11 +64,8 @@ class NotConverged(RuntimeError):
 
 def _facts(solution: Any) -> Iterator[str]:
     more = solution.status.shape
-    yield (
-        f"{batch_text(more)}: {enum_counts(solution.status, Status)}"
-        if more
-        else (enum_counts(solution.status, Status))
-    )
+    counts = enum_counts(solution.status, Status)
+    yield f"{batch_text(more)}: {counts}" if more else counts
     yield f"value {describe(solution.value)}"
     yield bounds_text(solution.lower, solution.upper)
     steps = value_range(solution.num_steps)

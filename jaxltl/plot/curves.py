@@ -43,7 +43,6 @@ def curves(
       steps: ``[T]``, the step of each figure; default 1, 2, ...
       show: names in order; default all that are not wholly NaN.
 
-
     Raises:
       ValueError: there is nothing to show.
 
@@ -115,7 +114,6 @@ def bands(
         ``[T]``, a mean ``[T]``, and the half-width of the band ``[T]``.
       limits: by the titles of row and column, a number at which a dashed line is drawn.
       label: of the horizontal axis.
-
 
     Raises:
       ValueError: there is nothing to show.
@@ -201,7 +199,6 @@ def lines(
       labels: of the horizontal axes, one for each column.
       names: of the runs and of the reference.
 
-
     Raises:
       ValueError: there is nothing to show.
 
@@ -243,7 +240,6 @@ def guarantees(
       bounds: by name ``[T]``, or ``[N, T]`` for N runs, drawn as median and range.
       reference: the exact value, drawn as a line.
       names: of the axes.
-
 
     Raises:
       ValueError: there is nothing to show.
@@ -289,7 +285,6 @@ def paths(
       maps: by title, coordinates x and y of M trajectories, ``[M, T]`` each.
       boxes: by name, regions ``((x, y), (x, y))``, the lower left corner first; drawn in all maps.
       bounds, columns: the box that is shown, and the number of maps in a row.
-
 
     Raises:
       ValueError: there is nothing to show.

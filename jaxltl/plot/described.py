@@ -48,7 +48,6 @@ def described(figure: Figure, text: str, *, page: str | None = None) -> Describe
       text: the text alternative: the objects in the figure and its main result.
       page: HTML of an animation, such as that of :func:`~jaxltl.plot.episodes.play_episode`.
 
-
     Raises:
       ValueError: the text is empty or has brackets or line breaks.
 

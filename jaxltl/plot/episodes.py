@@ -72,7 +72,6 @@ def draw_episode(environment: Environment, episode: Episode, *, title: str | Non
       episode: of :func:`~jaxltl.core.environments.episodes.run_episode`, of one trajectory.
       title: default the propositions that held, in order.
 
-
     Raises:
       ValueError: another world, or many trajectories.
     """

@@ -72,7 +72,6 @@ def game_values(
       label, limits: of the colour scale; default limits are those of the data.
       wall: the kind of cell that is not a place.
 
-
     Raises:
       ValueError: values or policy do not fit the board, or an action has no direction.
 
@@ -164,7 +163,6 @@ def game_moves(
       region: ``bool[2 * C * C]``, or with M panels first: the winning region.
       available: ``bool[2 * C * C, A]``: actions that are not allowed get a hollow mark.
       titles: one per panel.
-
 
     Raises:
       ValueError: an array does not fit the board, or an action has no direction.
@@ -300,7 +298,6 @@ def compare(
         first, then by the second, and so on.
       groups: the name of each state's group; groups are ordered by their first states.
       label: of the values.
-
 
     Raises:
       ValueError: there is nothing to show, or lengths differ.

@@ -42,7 +42,6 @@ def live_automaton(automaton: Automaton, name: str) -> str:
       automaton: the automaton.
       name: prefix of the ids.
 
-
     Example:
       >>> from jaxltl import to_automaton
       >>> live_automaton(to_automaton("F a"), "task").count("data-memory")
@@ -177,7 +176,6 @@ def live_map(
       marked: (state, memory, action) to be highlighted: ``g.marked``.
       actions, wall: as for :func:`jaxltl.plot.grid`.
       pieces: number of moving pieces, ``circle.token``.
-
 
     Example:
       >>> text = live_map(np.array([[".", "g"]]), "map", {"0": ([0.5, 1.0], None)}, runs=[[0, 1]])

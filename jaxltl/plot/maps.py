@@ -69,7 +69,6 @@ def grid(
       label, limits: of the colour scale; limits None are those of the data.
       actions, wall: names of actions, of up, down, left and right; the kind of cell of walls.
 
-
     Raises:
       ValueError: values or policy do not fit the map, or an action has no direction.
 
@@ -261,7 +260,6 @@ def strategies(
       across: the maximal number of panels in a row.
       seldom: moves of a smaller probability get a small arrow.
       actions, wall: as for :func:`grid`; an action may also be stay.
-
 
     Raises:
       ValueError: an array does not fit the map, or an action has no direction.

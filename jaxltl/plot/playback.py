@@ -50,7 +50,6 @@ def playback(
       wait, times, wall: seconds for each step (default 0.4), the number of repetitions (3), and the
         kind of walls.
 
-
     Raises:
       ValueError: the run is empty or leaves the map, or the automaton and its states do not fit.
 

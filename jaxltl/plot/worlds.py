@@ -69,7 +69,6 @@ def temporal_gridworld(
       title, actions: a title per panel, and names of actions, of up, down, left and right.
       label, limits: of the colour scale; default limits are those of the data.
 
-
     Raises:
       ValueError: policy, value, memory or trajectories do not fit the world.
 

@@ -75,11 +75,9 @@ def constrained_points(
         def loss(x: np.ndarray, at: Callable[..., Point] = at) -> tuple[float, np.ndarray]:
             point = at(x)
             # SLSQP shortens a step to a loss this large; it cannot use an infinite one.
-            return (
-                (point.loss, np.asarray(point.gradient, float))
-                if point.is_finite
-                else (1e12, 0 * x)
-            )
+            if not point.is_finite:
+                return 1e12, 0 * x
+            return point.loss, np.asarray(point.gradient, float)
 
         def excess(x: np.ndarray, at: Callable[..., Point] = at) -> float:
             point = at(x)

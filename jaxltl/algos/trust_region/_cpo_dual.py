@@ -80,11 +80,8 @@ def cpo_weights(
 
 
 def _floats(*numbers: chex.Numeric) -> tuple[jax.Array, ...]:
-    dtype = (
-        jnp.result_type(float, *numbers)
-        if not any(isinstance(x, jax.Array) for x in numbers)
-        else jnp.result_type(*numbers)
-    )
+    plain = [] if any(isinstance(x, jax.Array) for x in numbers) else [float]
+    dtype = jnp.result_type(*plain, *numbers)
     return tuple(jnp.asarray(x, dtype) for x in numbers)
 
 

@@ -37,11 +37,8 @@ def _facts(automaton: Automaton) -> Iterator[str]:
     *more, count, width = automaton.delta.shape
     yield automaton.acceptance
     yield batch_text(more)
-    yield (
-        extent_text(automaton)
-        if not more
-        else (f"{count} states, {width} letters {propositions_text(automaton.propositions)}")
-    )
+    batch = f"{count} states, {width} letters {propositions_text(automaton.propositions)}"
+    yield batch if more else extent_text(automaton)
     start = readable(automaton.initial)
     if automaton.state_names and start is not None and not start.ndim:
         yield f"for {truncate(automaton.state_names[int(start)])}"

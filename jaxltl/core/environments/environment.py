@@ -108,11 +108,8 @@ def make_box(
             raise ValueError(f"make_box: {name}={bound.tolist()!r}; give numbers.")
     least, most = bounds.values()
     try:
-        full = (
-            np.broadcast_shapes(least.shape, most.shape)
-            if shape is None
-            else tuple(int(n) for n in shape)
-        )
+        given = np.broadcast_shapes(least.shape, most.shape) if shape is None else shape
+        full = tuple(int(n) for n in given)
         fits = np.broadcast_shapes(least.shape, most.shape, full) == full
     except (TypeError, ValueError):
         fits, full = False, ()
@@ -180,12 +177,9 @@ class Timestep(NamedTuple):
 def _spaces(tree: PyTree) -> str:
     if hasattr(tree, "low"):
         return nested_repr(tree)
-    inner = (
-        tree.items()
-        if isinstance(tree, dict)
-        else zip(getattr(tree, "_fields", map(str, range(len(tree)))), tree, strict=True)
-    )
-    return f"({', '.join(f'{name}: {_spaces(x)}' for name, x in inner)})"
+    if not isinstance(tree, dict):
+        tree = dict(zip(getattr(tree, "_fields", map(str, range(len(tree)))), tree, strict=True))
+    return f"({', '.join(f'{name}: {_spaces(x)}' for name, x in tree.items())})"
 
 
 def _facts(value: Environment) -> Iterator[str]:

@@ -212,11 +212,8 @@ def _failures(claim: _Claim) -> Iterator[tuple[PyTree, PyTree, str]]:
         yield from _least_priorities(claim.priority, 1)
         return
     for j, guarantee in enumerate(claim.guarantees):
-        yield (
-            guarantee,
-            claim.assumptions,
-            (f"meet every assumption for ever and never guarantee {j}"),
-        )
+        reason = f"meet every assumption for ever and never guarantee {j}"
+        yield guarantee, claim.assumptions, reason
 
 
 def _successes(claim: _Claim) -> Iterator[tuple[PyTree, PyTree, str]]:
@@ -232,11 +229,8 @@ def _successes(claim: _Claim) -> Iterator[tuple[PyTree, PyTree, str]]:
 def _least_priorities(priority: Integers, parity: int) -> Iterator[tuple[PyTree, PyTree, str]]:
     for p in np.unique(priority[priority % 2 == parity]).tolist():
         kind = "odd" if parity else "even"
-        yield (
-            priority < p,
-            (priority == p)[None],
-            (f"stay for ever with least priority {p}, which is {kind}"),
-        )
+        reason = f"stay for ever with least priority {p}, which is {kind}"
+        yield priority < p, (priority == p)[None], reason
 
 
 def _name(claim: _Claim, state: int) -> str:

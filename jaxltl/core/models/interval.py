@@ -127,11 +127,11 @@ class IntervalMDP:
     def host(self) -> UncertainMDP:
         """The transitions for the sparse engine."""
         lower, upper = (np.asarray(x, np.float64) for x in (self.lower, self.upper))
-        ball = (
-            None
-            if self.radius is None or self.center is None
-            else Ball(np.asarray(self.center, np.float64), np.asarray(self.radius, np.float64) / 2)
-        )
+        ball = None
+        if self.radius is not None and self.center is not None:
+            ball = Ball(
+                np.asarray(self.center, np.float64), np.asarray(self.radius, np.float64) / 2
+            )
         return UncertainMDP(self.nominal.host, lower, upper, ball)
 
     @property
@@ -500,11 +500,9 @@ def _scaled(
     bad = (low > 1 + NEAR) | (high < 1 - NEAR)
     if bad.any():
         r = int(np.flatnonzero(bad)[0])
-        what = (
-            f"the lower ends sum to {low[r]:.9g}, which is above 1"
-            if low[r] > 1
-            else f"the upper ends sum to {high[r]:.9g}, which is below 1"
-        )
+        what = f"the upper ends sum to {high[r]:.9g}, which is below 1"
+        if low[r] > 1:
+            what = f"the lower ends sum to {low[r]:.9g}, which is above 1"
         raise ValueError(f"{placed(row_start, r)}: {what}; no distribution lies between them.")
     lower = np.where((low > 1 + rounding)[row], lower / np.maximum(low, 1)[row], lower)
     upper = np.where((high < 1 - rounding)[row], upper / np.minimum(high, 1)[row], upper)

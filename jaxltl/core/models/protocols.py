@@ -7,7 +7,6 @@
                          them; the attributes raise ValueError for models with sparse rows
 :class:`SuccessorModel`  and padded successors ``[S, A, K]``: MDP, DenseMDP, and products of them
 :class:`RowModel`        and sparse rows of choices ``[R]``: SparseMDP, IntervalMDP
-:class:`DerivedModel`    and a model underneath, ``mdp``: Product, Game
 =======================  ========================================================================
 
 A game satisfies what its model does. Quantities on states have the shape ``state_shape``.
@@ -16,7 +15,7 @@ A game satisfies what its model does. Quantities on states have the shape ``stat
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Protocol, TypeAlias, TypeVar, runtime_checkable
+from typing import Any, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -106,15 +105,6 @@ class RowModel(LabelledModel, Protocol):
 
     def states_with_label(self, proposition: str) -> Array:
         """``bool[S]``, the states in which a proposition holds."""
-
-
-@runtime_checkable
-class DerivedModel(Model, Protocol):
-    """A model on top of another one: a product with an automaton, or a game."""
-
-    @property
-    def mdp(self) -> Model:
-        """The model underneath."""
 
 
 ModelT = TypeVar("ModelT", bound=Model)

@@ -486,10 +486,8 @@ def _numbers(names: object, number: Mapping[str, int], what: str) -> list[int]:
 
 def _initial(initial: Initial, number: Mapping[str, int]) -> NDArray[np.float64]:
     found = np.zeros(len(number))
-    weight = (
-        validation.float_array("initial", list(initial.values()))
-        if isinstance(initial, Mapping)
-        else 1.0
-    )
+    weight: ArrayLike = 1.0
+    if isinstance(initial, Mapping):
+        weight = validation.float_array("initial", list(initial.values()))
     found[_numbers(initial, number, "initial")] = weight
     return found if isinstance(initial, Mapping) else found / max(found.sum(), 1)

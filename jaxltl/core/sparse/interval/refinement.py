@@ -98,11 +98,9 @@ class Refinement:
     ) -> tuple[float, Floats, Floats] | None:
         """Proportional extra of a step, its share, and extras of whole runs; None if unknown."""
         size = max(np.abs(value.high).max(initial=0), np.abs(operator.known).max(initial=0))
-        weight = (
-            np.maximum(operator.ceiling - value.high, _FLOOR * size)
-            if np.isfinite(operator.ceiling)
-            else np.full(operator.size, size)
-        )
+        weight = np.full(operator.size, size)
+        if np.isfinite(operator.ceiling):
+            weight = np.maximum(operator.ceiling - value.high, _FLOOR * size)
         steps = self.solve(system.matrix, weight)
         if steps is None or not (steps >= 0).all():
             return None

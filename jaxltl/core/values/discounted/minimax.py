@@ -451,11 +451,9 @@ def _solve(
     )
     solution = jax.tree.map(lax.stop_gradient, solution)
     solution = replace(solution, value=answer(implicit(backup, solution.value)))
-    return (
-        solution
-        if drawn is None
-        else refuse(solution, drawn.given, drawn.valid, drawn.representable)
-    )
+    if drawn is None:
+        return solution
+    return refuse(solution, drawn.given, drawn.valid, drawn.representable)
 
 
 def _approached(

@@ -70,11 +70,8 @@ def _occupancy(
     policy = checked.distribution
     discount = jnp.asarray(discount, model.dtype)
     start = jnp.asarray(start, model.dtype)
-    start = (
-        jnp.broadcast_to(start, model.state_shape)
-        if start.ndim < 2
-        else start.reshape(model.state_shape)
-    )
+    shape = model.state_shape
+    start = jnp.broadcast_to(start, shape) if start.ndim < 2 else start.reshape(shape)
 
     def flow(d: jax.Array) -> jax.Array:
         return start + discount * pushforward(model, over.spread(d) * policy)

@@ -142,8 +142,7 @@ class Krylov(NamedTuple):
             self.system.table,
             self.system[1:],
             b.ravel(),
-            self.tolerance,
-            self.max_steps,
+            (self.tolerance, self.max_steps),
         )
         return x.reshape(b.shape), n
 
@@ -299,19 +298,18 @@ def solve_linear(
     def flat(table: None, given: tuple[()], x: jax.Array) -> jax.Array:
         return matvec(x.reshape(b.shape)).ravel()
 
-    x, _ = _krylov(flat, None, (), b.ravel(), tolerance, max_steps)
+    x, _ = _krylov(flat, None, (), b.ravel(), (tolerance, max_steps))
     return x.reshape(b.shape)
 
 
 def _krylov(
-    matvec: Callable[..., jax.Array],
-    table: PyTree,
-    given: PyTree,
-    b: jax.Array,
-    tolerance: jax.Array | float | None,
-    max_steps: jax.Array | int,
+    matvec: Callable[..., jax.Array], table: PyTree, given: PyTree, b: jax.Array, limits: PyTree
 ) -> tuple[jax.Array, jax.Array]:
-    """The solution ``[N]`` of ``matvec(table, given, x) = b``, and the steps made."""
+    """The solution ``[N]`` of ``matvec(table, given, x) = b``, and the steps made.
+
+    `limits` are the relative residual, or None, and the most steps.
+    """
+    tolerance, max_steps = limits
     if tolerance is None:
         tolerance = float(jnp.finfo(b.dtype).eps) ** 0.8
     size = norm(b)

@@ -30,11 +30,7 @@ from jaxltl.core.values.undiscounted.sparse_satisfaction import Satisfaction
 
 
 def _facts(value: DataGuarantee) -> Iterator[str]:
-    yield (
-        f"at least {value.bound:.6g}"
-        if value.bound <= value.optimistic
-        else (f"at most {value.bound:.6g}")
-    )
+    yield f"at {'least' if value.bound <= value.optimistic else 'most'} {value.bound:.6g}"
     yield f"no policy beyond {value.optimistic:.6g}"
     yield f"confidence {value.confidence:g}"
     samples = readable(value.sets.num_samples)

@@ -228,11 +228,9 @@ def _product(
     letter = letter.reshape(-1)
 
     def after(members: np.ndarray, read: np.ndarray) -> np.ndarray:
-        return (
-            np.stack([x.delta[members[:, i], read[:, i]] for i, x in enumerate(trackers)], -1)
-            if trackers
-            else members
-        )
+        if not trackers:
+            return members
+        return np.stack([x.delta[members[:, i], read[:, i]] for i, x in enumerate(trackers)], -1)
 
     begin = np.tile([x.first for x in trackers], (first.size, 1)).reshape(first.size, -1)
     begin = after(begin.astype(np.int64), letters[first])

@@ -349,11 +349,9 @@ def _by_intervals(
     goal = _half_width(model, tolerance)
     search = _Search(model, undecided, one, components, goal)
     top = jnp.where(undecided, 1, one)
-    low, high = (
-        (one, top)
-        if start is None
-        else (jnp.where(undecided, jnp.clip(x, 0, 1), one) for x in start)
-    )
+    low, high = one, top
+    if start is not None:
+        low, high = (jnp.where(undecided, jnp.clip(x, 0, 1), one) for x in start)
     near, far = (low, high) if objective == "max" else (high, low)
     finest, no = tolerance is None, jnp.bool_(False)
     bounds, n = iterate(

@@ -164,11 +164,9 @@ def total_reward_by_sweeps(
         num_steps=found.num_steps,
         status=jnp.maximum(found.status, none),
     )
-    return (
-        solution
-        if checked is None
-        else refuse(solution, checked.given, checked.valid, checked.representable)
-    )
+    if checked is None:
+        return solution
+    return refuse(solution, checked.given, checked.valid, checked.representable)
 
 
 def _enclosed(
