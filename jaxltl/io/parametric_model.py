@@ -77,6 +77,16 @@ class ParametricModel:
       probability: function index of each transition, ``int32[T]``.
       rewards: function indices on states, ``int32[S]``, and choices, ``int32[R]``, by name.
       names: labels, initial states and actions, as arguments of ``make_sparse``.
+
+    Example:
+      >>> import pathlib, tempfile
+      >>> import jaxltl as jl
+      >>> path = pathlib.Path(tempfile.mkdtemp()) / "coin.prism"
+      >>> _ = path.write_text("dtmc const double p; module coin x : [0..1]; "
+      ...     "[] x=0 -> p : (x'=1) + 1-p : true; [] x=1 -> true; endmodule")
+      >>> coin = jl.io.read_parametric(path)
+      >>> [str(f.at((1,))) for f in coin.functions], coin.probability.tolist()
+      (['0', '1', '1', '0'], [2, 3, 1])
     """
 
     parameters: tuple[str, ...]

@@ -98,9 +98,7 @@ def solve_program(
             raise ValueError(
                 f"{program.source.name!r} is a game; properties of games are not solved."
             )
-        found = solve_property(model, prop, tolerance=tolerance)
-        assert isinstance(found, Answer)
-        return found
+        return cast(Answer, solve_property(model, prop, tolerance=tolerance))
     validation.choice("method", method, ("build", "partial"))
     tolerance = width_asked(tolerance)
     max_states = validation.integer("max_states", max_states, least=1, most=2**31 - 2)
@@ -146,12 +144,13 @@ def _narrowed(part: _Part, prop: Property, tolerance: float, report: Report | No
 def _answer(part: _Part, prop: Property, lower: Floats, upper: Floats, tolerance: float) -> Answer:
     narrow = bool((upper - lower <= tolerance).all())
     status = Status.MAX_STEPS if part.frontier.any() else Status.PRECISION
-    bounds: dict[str, Array] = {"value": (lower + upper) / 2, "lower": lower, "upper": upper}
-    none: Array = np.zeros(0, np.int32)
-    error, steps = np.float64(0), np.int32(part.num_expanded)
-    code = np.int32(Status.CONVERGED if narrow else status)
-    more: dict[str, Array] = {"residual": error, "num_steps": steps, "status": code}
-    solution = Solution(policy=none, **bounds, **more)
+    arrays: dict[str, Array] = {
+        **{"value": (lower + upper) / 2, "lower": lower, "upper": upper},
+        **{"policy": np.zeros(0, np.int32), "residual": np.float64(0)},
+        "num_steps": np.int32(part.num_expanded),
+        "status": np.int32(Status.CONVERGED if narrow else status),
+    }
+    solution = Solution(**arrays)
     if part.event.complement:
         solution = complement_event(solution)
     method = f"partial exploration of {part.num_states} states, {part.num_expanded} expanded"

@@ -1,0 +1,146 @@
+"""Simulated steps of programs in the PRISM language, beside stormpy's simulator, and PPO on one.
+
+A batch on each of two devices takes actions that are drawn evenly among the available ones; so
+does the peer, which makes one step a call. Rates are steps a second of wall time, and of
+processor time, which other programs on the same cores do not change. The folder has a folder for
+each family of the Quantitative Verification Benchmark Set, with its programs.
+
+    python -m benchmarks.simulation FOLDER [--lanes 4096] [--steps 1000] [--ppo]
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import random
+import time
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("XLA_FLAGS", "--xla_force_host_platform_device_count=2")
+
+import jax
+import jax.numpy as jnp
+
+import jaxltl as jl
+from jaxltl.algos import ppo
+
+CASES = {
+    "brp": ("brp/brp.prism", "N=64,MAX=5"),
+    "consensus.4": ("consensus/consensus.4.prism", "K=4"),
+    "zeroconf": ("zeroconf/zeroconf.prism", "N=1000,K=8,reset=false"),
+}
+_PEER_SECONDS = 5.0
+
+
+def batch_of_steps(path: Path, constants: str, lanes: int, steps: int) -> Any:
+    """A compiled function of a key: some steps in each lane; the last worlds."""
+    program = jl.io.read_program(path, constants)
+    environment = jl.io.program_environment(program, labels=[])
+
+    def step(world: Any, key: jax.Array) -> Any:
+        first, second = jax.random.split(key)
+        action: jax.Array | int = 0
+        if program.kind == "mdp":
+            mask = environment.allowed(world)
+            action = jnp.argmax(jnp.where(mask, jax.random.uniform(first, mask.shape), -1.0))
+        return environment.step(world, action, second).world
+
+    def run(key: jax.Array) -> Any:
+        begin = jax.vmap(environment.reset)(jax.random.split(key, lanes))
+        every = jax.vmap(step)
+        return jax.lax.scan(
+            lambda world, k: (every(world, jax.random.split(k, lanes)), None),
+            begin,
+            jax.random.split(key, steps),
+        )[0]
+
+    return jax.jit(run)
+
+
+def our_rates(path: Path, constants: str, lanes: int, steps: int) -> tuple[float, float, float]:
+    """Steps a second of wall time and of processor time, and seconds of the first call."""
+    run = batch_of_steps(path, constants, lanes, steps)
+    devices = jax.devices()[:2]
+    keys = [jax.device_put(jax.random.key(i), d) for i, d in enumerate(devices)]
+    begin = time.perf_counter()
+    jax.block_until_ready([run(key) for key in keys])
+    first = time.perf_counter() - begin
+    rates = []
+    for _ in range(5):
+        wall, processor = time.perf_counter(), time.process_time()
+        jax.block_until_ready([run(key) for key in keys])
+        number = lanes * steps * len(devices)
+        wall, processor = time.perf_counter() - wall, time.process_time() - processor
+        rates.append((number / wall, number / processor))
+    return max(r[0] for r in rates), max(r[1] for r in rates), first
+
+
+def peer_rates(path: Path, constants: str) -> tuple[float, float]:
+    """The same of the engine of stormpy's simulator, without the reports of its Python class."""
+    import stormpy
+    import stormpy.simulator
+
+    program = stormpy.parse_prism_program(str(path))
+    given = dict(part.split("=") for part in constants.split(","))
+    values = {k: int(v) if v.isdigit() else v == "true" for k, v in given.items()}
+    program, _ = stormpy.instantiate_constants(program, values, [])
+    engine = stormpy.simulator.create_simulator(program, seed=1)._engine
+    draw, count = random.Random(1), 0
+    wall, processor = time.perf_counter(), time.process_time()
+    while time.perf_counter() - wall < _PEER_SECONDS:
+        for _ in range(100):
+            if engine.is_sink_state():
+                engine.reset_to_initial()
+            engine.step(draw.randrange(len(engine.get_choices())))
+            count += 1
+    return count / (time.perf_counter() - wall), count / (time.process_time() - processor)
+
+
+def learn(path: Path) -> None:
+    """PPO on consensus.2: the probability that the processes disagree, against its optimum."""
+    program = jl.io.read_program(path, "K=2")
+    task = jl.task_environment(
+        jl.io.program_environment(program), "!(finished & agree) U (finished & !agree)"
+    )
+    best = jl.io.solve_program(program, 'Pmax=? [ F "finished" & !"agree" ]')
+    problem = ppo.make_problem(task)
+    hparams = ppo.Hparams(
+        discount=1.0, learning_rate=1e-3, entropy_weight=0.01, num_envs=256, num_steps=64
+    )
+    begin = time.perf_counter()
+    state, _ = ppo.train(jax.random.key(0), problem, hparams, num_steps=600)
+    seconds = time.perf_counter() - begin
+    agent = ppo.greedy(state, problem, hparams)
+    found = jl.evaluate(jax.random.key(1), agent, task, num_episodes=100_000, num_steps=3000)
+    share = found.success
+    print(
+        f"PPO, consensus.2, K = 2, {600 * 256 * 64} steps in {seconds:.0f} s: disagreement "
+        f"{share.mean:.5f}, 95 % interval [{share.lower:.5f}, {share.upper:.5f}]; optimum "
+        f"[{best.lower[0]:.7f}, {best.upper[0]:.7f}]"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--lanes", type=int, default=4096)
+    parser.add_argument("--steps", type=int, default=1000)
+    parser.add_argument("--ppo", action="store_true", help="also learn in consensus.2")
+    given = parser.parse_args()
+    for name, (file, constants) in CASES.items():
+        path = given.folder / file
+        wall, processor, first = our_rates(path, constants, given.lanes, given.steps)
+        peer_wall, peer_processor = peer_rates(path, constants)
+        print(
+            f"{name}: {wall:.3g} steps/s on {len(jax.devices())} devices, {processor:.3g} a "
+            f"processor second, first call {first:.1f} s; stormpy {peer_wall:.3g}, "
+            f"{peer_processor:.3g}; ratio {processor / peer_processor:.0f}",
+            flush=True,
+        )
+    if given.ppo:
+        learn(given.folder / "consensus/consensus.2.prism")
+
+
+if __name__ == "__main__":
+    main()
