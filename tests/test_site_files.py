@@ -22,7 +22,7 @@ from jaxltl.app.files import (
 from jaxltl.app.files.schema import Count, Table, table
 from jaxltl.core.environments.task_environment import TaskOptions
 from jaxltl.envs.gridworld import gridworld
-from jaxltl.envs.robots import grid_game
+from jaxltl.envs.robots import grid_game, places
 from jaxltl.envs.temporal_gridworld import World, expert_reward, random_worlds
 
 ROOT = Path(__file__).parent.parent
@@ -123,7 +123,7 @@ def test_defaults_in_words_are_those_of_the_code():
     for kind, name, function in (
         (task.GridTable, "wall", gridworld),
         (task.GridTable, "slip", gridworld),
-        (game.GameTable, "wall", grid_game),
+        (game.GameTable, "wall", places),
         (game.GameTable, "slip", grid_game),
         (game.GameTable, "system_stays", grid_game),
         (game.GameTable, "environment_stays", grid_game),
