@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
-from typing import Any, TypedDict
+from typing import Any, TypeAlias, TypedDict
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -29,12 +29,13 @@ SCALE = LinearSegmentedColormap.from_list(
 )
 
 
-def write(
-    axes: Axes, place: Sequence[float], text: str, size: float, color: str, **style: PyTree
-) -> None:
+Point: TypeAlias = Sequence[float] | NDArray[np.float64]
+
+
+def write(axes: Axes, place: Point, text: str, size: float, color: str, **style: PyTree) -> None:
     """Writes text as it is, without formulas, centred at a place unless `style` aligns it."""
     style = {"ha": "center", "va": "center", **style}
-    axes.text(*place, text, fontsize=size, color=color, parse_math=False, **style)
+    axes.text(place[0], place[1], text, fontsize=size, color=color, parse_math=False, **style)
 
 
 def to_bytes(figure: Figure, kind: str = "svg", dpi: int = 150) -> bytes:

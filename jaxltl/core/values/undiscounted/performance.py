@@ -315,7 +315,7 @@ def task_performances(
         return found
     columns = jax.tree.map(np.array, found)
     for w in redone:
-        again = _on_host(models, policies, w, tolerance)
+        again = _on_host(models, policies, int(w), tolerance)
         jax.tree.map(lambda to, x, w=w: to.__setitem__(w, x), columns, again)
     return to_jax(columns)
 
