@@ -417,7 +417,7 @@ def _read_program(path: Path) -> Any:
         except ValueError as error:
             assert "\n" not in str(error), error
             placed = ", line " in str(error) and ", column " in str(error)
-            assert placed or "has no constant" in str(error) or "UTF-8" in str(error), error
+            assert placed or "UTF-8" in str(error), error
             raise
 
 

@@ -241,9 +241,7 @@ class _Resolver:
         unknown = sorted(set(self.given) - {c.name for c in self.syntax.constants})
         if unknown:
             listed = ", ".join(c.name for c in self.syntax.constants) or "none"
-            raise ValueError(
-                f"{self.syntax.source.name!r} has no constant {unknown[0]}; it has {listed}."
-            )
+            raise LanguageError(0, f"there is no constant {unknown[0]}; it has {listed}.")
 
     def constant_values(self, expand: Change) -> tuple[dict[str, Value], dict[str, Expression]]:
         """The value of each constant that is defined or given, and expressions over parameters."""

@@ -87,9 +87,8 @@ class ModuleCode:
         count = np.zeros(size * width, np.int32)
         enabled: list[tuple[_Code, Integers]] = []
         met = self.conditions.evaluate(read)
-        possible = [
-            np.asarray(x).any() for x in met
-        ]  # most commands fail by one condition on all states
+        # Most commands fail in all states by a single condition.
+        possible = [np.asarray(x).any() for x in met]
         for code, guard in zip(self.codes, self.guards, strict=True):
             if not all(map(possible.__getitem__, guard)):
                 continue
@@ -110,7 +109,9 @@ class ModuleCode:
             cell: Integers = states * width + code.column
             row = fill[cell]
             fill[cell] += 1
-            part = Reader(self.layout, tuple(w[states] for w in words))
+            part = read
+            if states.size < size:
+                part = Reader(self.layout, tuple(w[states] for w in words))
             number, change, weight = self._updates(code, part, states.size)
             start[row] = end + np.cumsum(number) - number
             widths[row] = number
