@@ -8,6 +8,8 @@ always bad. The number of sweeps is at most the length of a longest shortest pat
 
 from __future__ import annotations
 
+import math
+
 
 import jax
 import jax.numpy as jnp
@@ -42,12 +44,12 @@ def components_by_sweeps(
     else:
         kept, label, _ = lax.while_loop(lambda carry: carry[2], prune, start)
     alive = jnp.any(kept, axis=-1)
-    return jnp.where(alive, label, _numbers(core.shape)), kept
+    return jnp.where(alive, label, state_numbers(core.shape)), kept
 
 
 def strong_components(graph: PyTree, states: jax.Array, moves: jax.Array) -> jax.Array:
     """The least state of the component of each state under some actions; itself outside of `states`."""
-    number = _numbers(states.shape)
+    number = state_numbers(states.shape)
     none = jnp.int32(number.size)
 
     def colour(rank: jax.Array, left: jax.Array) -> jax.Array:
@@ -89,8 +91,6 @@ def strong_components(graph: PyTree, states: jax.Array, moves: jax.Array) -> jax
     return least[flat].reshape(states.shape)
 
 
-def _numbers(shape: tuple[int, ...]) -> jax.Array:
-    size = 1
-    for n in shape:
-        size *= n
-    return jnp.arange(size, dtype=jnp.int32).reshape(shape)
+def state_numbers(shape: tuple[int, ...]) -> jax.Array:
+    """The number of each state, ``int32[S]``."""
+    return jnp.arange(math.prod(shape), dtype=jnp.int32).reshape(shape)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from jaxltl.core.array_types import Floats, Integers
 from jaxltl.core.sparse.interval.robust_values import Query, RobustValues
+from jaxltl.core.sparse.interval.strategy_iteration import enclosed_values
 from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
 from jaxltl.core.sparse.linear.elimination import factorize
 from jaxltl.core.sparse.linear.topological_order import Edges, ordered_components
@@ -84,13 +85,5 @@ def discounted_value(problem: DiscountedModel, query: Query) -> RobustValues:
         p = np.where((answers | ~taken)[mdp.row], q, p)
         if not answers.any():
             row = np.where(better, mdp.first_choice(image == found[mdp.state])[1], row)
-    return RobustValues(
-        value=np.clip(value, low, high),
-        lower=low,
-        upper=high,
-        row=row,
-        probability=p,
-        rounds=rounds,
-        residual=residual,
-        method="policy iteration with nature",
-    )
+    values = enclosed_values(value, (low, high), row, p, rounds=rounds, residual=residual)
+    return replace(values, method="policy iteration with nature")

@@ -25,6 +25,7 @@ from jaxltl.core.sparse.interval.robust_values import (
     distribution_depth,
     row_gains,
 )
+from jaxltl.core.sparse.interval.strategy_iteration import enclosed_values
 from jaxltl.core.sparse.interval.uncertainty_set import UncertainMDP
 from jaxltl.core.sparse.solvers import reachability as mdp_reachability
 
@@ -63,17 +64,8 @@ def parity_against_nature(
     p, upper = _value_under_nature(model, p, priority, tolerance)
     lower = np.clip(1 - losing.upper - 1e-16, 0, 1)
     lower = np.where(losing.upper == 0, 1, np.where(losing.upper >= 1, 0, lower))
-    upper = np.maximum(upper, lower)
-    return RobustValues(
-        value=np.clip(value, lower, upper),
-        lower=lower,
-        upper=upper,
-        row=row,
-        probability=p,
-        rounds=rounds,
-        residual=float(best.max(initial=0)),
-        method="strategy improvement against nature",
-    )
+    residual = float(best.max(initial=0))
+    return enclosed_values(value, (lower, upper), row, p, rounds=rounds, residual=residual)
 
 
 def _value_under_nature(

@@ -277,12 +277,7 @@ def _policy_value(
     solution = solution_of(model, given, value, image, checked.distribution, n)
     solution = _refined(model, raw, given, solution, checked.distribution)
     solution = differentiable(solution, backup, lambda: System(rows, weight, given.discount))
-    return refuse(
-        replace(solution, policy=checked.distribution),
-        checked.given,
-        checked.valid,
-        checked.representable,
-    )
+    return refuse(replace(solution, policy=checked.distribution), checked)
 
 
 @validated(method=_METHODS)

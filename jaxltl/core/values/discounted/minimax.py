@@ -26,6 +26,7 @@ from jaxltl.core.models.game import Game, as_game
 from jaxltl.core.models.ops.array_namespace import namespace, to_jax
 from jaxltl.core.models.ops.choices import Layout, Quantity, SweepOperator, choice_shape, choices
 from jaxltl.core.models.ops.operators import (
+    Policy,
     expectation,
     is_deterministic,
     require_policy,
@@ -211,10 +212,7 @@ def _read(game: Game, states: Array) -> Array:
 class _Drawn(NamedTuple):
     """Policies of the players that do not optimise."""
 
-    weight: jax.Array  # distributions
-    given: jax.Array  # as they were, NaN at moves that are not available
-    valid: jax.Array  # whether they are distributions
-    representable: jax.Array
+    policy: Policy
     used: jax.Array  # bool[S, A], the moves of positive weight; later bool[S], where they count
 
 
@@ -242,7 +240,7 @@ def _joint(game: Game, strategy: chex.Array, environment: chex.Array | None) -> 
         weight = jnp.where(over.spread(read), other.distribution, weight)
         given = jnp.where(over.spread(read), other.given, given)
         valid &= other.valid
-    return _Drawn(weight, given, valid, representable, lax.stop_gradient(weight) > 0)
+    return _Drawn(Policy(weight, given, valid, representable), lax.stop_gradient(weight) > 0)
 
 
 def _returns(graph: Graph, per: str, goal: Array, moves: Array, drawn: Array) -> Array:
@@ -403,14 +401,14 @@ def _solve(
         q = reward + over.spread(rate) * expectation(game, value)
         best = sign * over.max(over.spread(sign) * q, moves)
         if drawn is not None:
-            best = jnp.where(drawn.used, over.mean(drawn.weight, q), best)
+            best = jnp.where(drawn.used, over.mean(drawn.policy.distribution, q), best)
         return jnp.where(live, best, 0)
 
     flat = live.ravel()
     play = _Play(
         game.system.ravel(),
         None if drawn is None else drawn.used.ravel(),
-        None if drawn is None else over.columns(drawn.weight),
+        None if drawn is None else over.columns(drawn.policy.distribution),
         discount,
         discount,
         jnp.asarray(rounding_unit(game), game.dtype),
@@ -451,9 +449,7 @@ def _solve(
     )
     solution = jax.tree.map(lax.stop_gradient, solution)
     solution = replace(solution, value=answer(implicit(backup, solution.value)))
-    if drawn is None:
-        return solution
-    return refuse(solution, drawn.given, drawn.valid, drawn.representable)
+    return refuse(solution, None if drawn is None else drawn.policy)
 
 
 def _approached(

@@ -106,7 +106,7 @@ def _occupancy(
             lax.stop_gradient(bound <= goal), lax.stop_gradient(finite), bound <= 8 * rounding
         ),
     )
-    return refuse(solution, checked.given, checked.valid, checked.representable)
+    return refuse(solution, checked)
 
 
 def _inflow_terms(model: Model) -> jax.Array:

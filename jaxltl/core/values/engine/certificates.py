@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxltl.core.models.ops import double_word as dw
+from jaxltl.core.models.ops.operators import Policy
 from jaxltl.core.models.protocols import ActionModel, Model, SuccessorModel
 from jaxltl.core.models.sparse import SparseMDP
 from jaxltl.core.types import Solution, Status
@@ -180,14 +181,14 @@ def m_matrix_error(
     return value, lower, upper, jnp.max(residual)
 
 
-def refuse(
-    solution: Solution, policy: jax.Array, valid: jax.Array, representable: jax.Array
-) -> Solution:
-    """The solution, without value and bounds if the policy or the model is invalid."""
-    # `policy` is the argument of the solver, NaN at unavailable actions. The status is
-    # INVALID_POLICY, or INVALID for a model with probabilities that are not representable.
-    code = jnp.where(representable, Status.INVALID_POLICY, Status.INVALID)
-    valid = valid & representable
+def refuse(solution: Solution, checked: Policy | None) -> Solution:
+    """The solution, without value and bounds if the given policy or the model is invalid."""
+    # The status is INVALID_POLICY, or INVALID for a model with probabilities that are not
+    # representable.
+    if checked is None:
+        return solution
+    code = jnp.where(checked.representable, Status.INVALID_POLICY, Status.INVALID)
+    valid = checked.valid & checked.representable
 
     def where(good: jax.Array, bad: float) -> jax.Array:
         return jnp.where(valid, good, jnp.asarray(bad, good.dtype))
@@ -195,7 +196,7 @@ def refuse(
     return replace(
         solution,
         value=where(solution.value, jnp.nan),
-        policy=jnp.where(valid, solution.policy, policy),
+        policy=jnp.where(valid, solution.policy, checked.given),
         lower=where(solution.lower, -jnp.inf),
         upper=where(solution.upper, jnp.inf),
         residual=where(solution.residual, jnp.nan),

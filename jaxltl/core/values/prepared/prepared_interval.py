@@ -117,6 +117,10 @@ class PreparedInterval:
         """The number N of nodes."""
         return self.first.shape[-1]
 
+    def sum_rows(self, quantity: jax.Array) -> jax.Array:
+        """Sums over the entries of each row, ``[R]`` from ``[T]``."""
+        return jax.ops.segment_sum(quantity, self.entry_row, self.num_rows, indices_are_sorted=True)
+
 
 def prepare_interval(
     model: IntervalMDP,
@@ -296,12 +300,7 @@ def _checked(
     if lower is not None or upper is not None:
         low = prepared.lower if lower is None else lower
         high = prepared.upper if upper is None else upper
-        total = partial(
-            jax.ops.segment_sum,
-            segment_ids=prepared.entry_row,
-            num_segments=prepared.num_rows,
-            indices_are_sorted=True,
-        )
+        total = prepared.sum_rows
         finite &= jnp.all(jnp.isfinite(low)) & jnp.all(jnp.isfinite(high))
         slack = max(_LOOSE, 128 * float(jnp.finfo(low.dtype).eps))
         valid &= jnp.all((low >= 0) & (low <= high) & (high <= 1 + slack))
@@ -395,14 +394,8 @@ def _answer(
     if prepared.size:
         mine = jnp.append(prepared.row[found.row], 0)[jnp.minimum(prepared.node, prepared.size)]
         row = jnp.where(prepared.node < prepared.size, mine, row)
-    total = partial(
-        jax.ops.segment_sum,
-        segment_ids=prepared.entry_row,
-        num_segments=prepared.num_rows,
-        indices_are_sorted=True,
-    )
-    room = total(jnp.where(prepared.kept, free, 0))
-    rest = jnp.maximum(1 - total(lower), 0)
+    room = prepared.sum_rows(jnp.where(prepared.kept, free, 0))
+    rest = jnp.maximum(1 - prepared.sum_rows(lower), 0)
     share = jnp.where(room > 0, jnp.minimum(rest / jnp.where(room > 0, room, 1), 1), 0)
     chance = jnp.where(prepared.kept, lower + free * share[prepared.entry_row], 0)
     chance = chance.at[prepared.table].set(found.probability, mode="drop")

@@ -113,7 +113,7 @@ def policy_reachability(
         solvers = {"solve": linear.solve, "transpose_solve": linear.transpose_solve}
     differentiable = implicit(lambda y: one + image(model, policy, y), value, **solvers)
     solution = replace(lax.stop_gradient(solution), value=differentiable, policy=policy)
-    return refuse(solution, checked.given, checked.valid, checked.representable)
+    return refuse(solution, checked)
 
 
 def _half_width(model: ActionModel, tolerance: jax.Array | float | None) -> jax.Array:

@@ -33,6 +33,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxltl.core.graphs.attractor import attract, avoid, surely
+from jaxltl.core.graphs.colouring import state_numbers
 from jaxltl.core.graphs.end_components import EndComponents, components_within
 from jaxltl.core.graphs.graph import TracedGraph
 from jaxltl.core.graphs.reaching import policy_sets
@@ -164,9 +165,7 @@ def total_reward_by_sweeps(
         num_steps=found.num_steps,
         status=jnp.maximum(found.status, none),
     )
-    if checked is None:
-        return solution
-    return refuse(solution, checked.given, checked.valid, checked.representable)
+    return refuse(solution, checked)
 
 
 def _enclosed(
@@ -262,13 +261,6 @@ def _smallest(graph: TracedGraph, rows: dw.Rows, reward: jax.Array, target: jax.
 # --- the operator -----------------------------------------------------------------------------
 
 
-def _numbers(shape: tuple[int, ...]) -> jax.Array:
-    size = 1
-    for n in shape:
-        size *= n
-    return jnp.arange(size, dtype=jnp.int32).reshape(shape)
-
-
 def _backup(problem: Problem, value: jax.Array) -> _Point:
     """A value's image under T, 0 outside of the open states."""
     ahead = problem.rows.expectation(value)
@@ -277,7 +269,7 @@ def _backup(problem: Problem, value: jax.Array) -> _Point:
 
 def _chosen(problem: Problem, value: jax.Array, ahead: jax.Array) -> _Point:
     """The image of a value from those of its choices."""
-    leaves = _numbers(value.shape)
+    leaves = state_numbers(value.shape)
     if problem.policy is not None:
         image, action = problem.rows.mean(ahead), problem.decided
     else:
@@ -302,7 +294,7 @@ def _greatest(component: jax.Array, image: jax.Array) -> tuple[jax.Array, jax.Ar
 
     high, low = dw.words(flat)
     first = top(high) & top(jnp.where(top(high), low, -jnp.inf))
-    mine = jnp.where(first, _numbers(flat.shape), flat.size - 1)
+    mine = jnp.where(first, state_numbers(flat.shape), flat.size - 1)
     leaves = jax.ops.segment_min(mine, label, num_segments=flat.size)[label]
     return flat[leaves].reshape(image.shape), leaves.reshape(image.shape)
 
@@ -488,7 +480,7 @@ def solve_problem(problem: Problem, tolerance: jax.Array, asked: jax.Array) -> F
     rows, model = problem.rows, problem.model
     dtype, eps = model.dtype, float(jnp.finfo(model.dtype).eps)
     zero = dw.double_word(jnp.zeros(problem.open.shape, dtype))
-    numbers, none = _numbers(zero.shape), jnp.int32(0)
+    numbers, none = state_numbers(zero.shape), jnp.int32(0)
     # Where every policy leaves the open states, the first one is greedy for zero.
     start, num_steps = _Point(zero, zero, problem.decided, numbers), none - 1
     if problem.start is not None:
@@ -556,7 +548,7 @@ def _policy(problem: Problem, safe: _Point) -> tuple[jax.Array, jax.Array]:
     if problem.circles is not None:
         inside = problem.circles.inside
         circling, _ = graph.first(inside)
-        exits = circling & (safe.leaves == _numbers(circling.shape))
+        exits = circling & (safe.leaves == state_numbers(circling.shape))
         towards = lax.cond(
             jnp.any(circling), lambda: attract(graph, exits, inside).action, lambda: action
         )
