@@ -145,8 +145,11 @@ def _answer(part: _Part, prop: Property, lower: Floats, upper: Floats, tolerance
     narrow = bool((upper - lower <= tolerance).all())
     status = Status.MAX_STEPS if part.frontier.any() else Status.PRECISION
     arrays: dict[str, Array] = {
-        **{"value": (lower + upper) / 2, "lower": lower, "upper": upper},
-        **{"policy": np.zeros(0, np.int32), "residual": np.float64(0)},
+        "value": (lower + upper) / 2,
+        "lower": lower,
+        "upper": upper,
+        "policy": np.zeros(0, np.int32),
+        "residual": np.float64(0),
         "num_steps": np.int32(part.num_expanded),
         "status": np.int32(Status.CONVERGED if narrow else status),
     }

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -47,6 +46,7 @@ class ReducedProblem:
 
     known_value: Floats  # float64[N], of the nodes outside the problem's interior
     known_row: Integers  # int[N], their policy
+    mdp: HostMDP
     # on the nodes of `quotient`, or else of `contraction`; None if nothing is left
     problem: ShortestPathProblem | None = None
     # of `contraction.mdp`, the model with end components as states; None without any
@@ -55,10 +55,15 @@ class ReducedProblem:
     # nodes of `contraction` with rows known in advance (fixed, fixed_row)
     fixed: Booleans | None = None
     fixed_row: Integers | None = None
-    mdp: Any = None
-    contraction: Any = None  # the model without chains
+    without_chains: Contraction | None = None
     highest: float = 1.0  # a bound on all values
     maximize: bool = False  # whether to maximise
+
+    @property
+    def contraction(self) -> Contraction:
+        """The model without chains."""
+        assert self.without_chains is not None
+        return self.without_chains
 
 
 def reachability(
@@ -146,7 +151,7 @@ def reduce_reachability(
     goal, dead = contraction.region(target), contraction.region(blocked)
     maximize = maximize and not small.is_chain
     reduced = (_largest if maximize else _smallest)(small, goal, dead, depth)
-    return replace(reduced, mdp=mdp, contraction=contraction, maximize=maximize)
+    return replace(reduced, mdp=mdp, without_chains=contraction, maximize=maximize)
 
 
 def _smallest(mdp: HostMDP, goal: Booleans, dead: Booleans, depth: int) -> ReducedProblem:
@@ -186,7 +191,7 @@ def _between(
     if interior.any():
         cost = np.zeros(mdp.num_rows)
         problem = ShortestPathProblem(mdp, interior, known, cost, depth=depth)
-    return ReducedProblem(known, row.astype(np.int64), problem)
+    return ReducedProblem(known, row.astype(np.int64), mdp, problem)
 
 
 def reduce_total_reward(
@@ -206,7 +211,7 @@ def reduce_total_reward(
     maximize = maximize and not small.is_chain
     reduce = _largest_reward if maximize else _smallest_reward
     reduced = reduce(small, cost, contraction.region(target), contraction.depth)
-    return replace(reduced, mdp=mdp, contraction=contraction, highest=np.inf, maximize=maximize)
+    return replace(reduced, mdp=mdp, without_chains=contraction, highest=np.inf, maximize=maximize)
 
 
 def _largest_reward(mdp: HostMDP, cost: Floats, goal: Booleans, depth: int) -> ReducedProblem:
@@ -241,7 +246,7 @@ def _finite_part(
     if interior.any():
         end = np.zeros(mdp.num_states)
         problem = ShortestPathProblem(mdp, interior, end, cost, depth=depth)
-    return ReducedProblem(known, mdp.row_start[:-1].astype(np.int64), problem)
+    return ReducedProblem(known, mdp.row_start[:-1].astype(np.int64), mdp, problem)
 
 
 def _restricted(
@@ -296,10 +301,10 @@ def _solve(reduced: ReducedProblem, tolerance: float) -> Enclosure:
     # A node is the only state with its rows; all others have one row.
     own = mdp.state[contraction.row[contraction.mdp.row_start[:-1]]]
     row[own] = contraction.row[found.row]
-    found, earned, share = _at(found, contraction.node, row), contraction.earned, contraction.depth
+    found, earned = _at(found, contraction.node, row), contraction.earned
     if not earned.any():
         return found
-    share *= _EPS
+    share = contraction.depth * _EPS
     return replace(
         found,
         value=found.value + earned,
