@@ -25,7 +25,7 @@ Relation = Literal["<", "<=", ">", ">="]
 FILTERS = {
     **dict.fromkeys(("min", "max", "avg", "sum", "range"), False),
     **dict.fromkeys(("forall", "exists", "count"), True),
-    **dict.fromkeys(("first", "print"), None),
+    **dict.fromkeys(("first", "state", "print"), None),
 }
 MAX_UNFOLDED_STEPS = 100  # of a step bound inside a formula, which is unfolded into nested X
 
@@ -94,7 +94,7 @@ def parse_properties(text: str, definitions: Definitions | None = None) -> tuple
     State formulas may also compare variables, `x + 1 < 2 * y`, and nest properties with thresholds,
     `P>=0.9 [ F P>0.5 [ X "a" ] ]`. A state formula is a property too. `filter(min, P=? [ F "a" ],
     x = 0)` is over the states of a formula, by default all: one of `min max avg sum count range
-    first forall exists print`.
+    first state forall exists print`.
     Where probabilities are intervals, the direction of the policy comes first and that of nature
     does second: `Pmaxmin=?`, `R{"time"}minmax=?`.
 

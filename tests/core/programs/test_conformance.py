@@ -146,6 +146,7 @@ CASES = {
         (8, 8, 12),
         {
             'filter(max, P=? [ F x=2 ], "init")': 0.5,
+            "filter(state, P=? [ F x=2 ], x=1 & !y)": 0.5,
             'filter(avg, P=? [ F x=2 ], "init")': 1 / 3,
             'filter(count, P>0.3 [ F x=2 ], "init")': 1,
             'filter(forall, P>=0.2 [ F x=2 ], "init")': True,

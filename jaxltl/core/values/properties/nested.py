@@ -57,6 +57,10 @@ def filtered(prop: Property, answer: Answer, tolerance: float) -> Answer:
     if kind == "print":
         return answer
     lower, upper, value = answer.lower, answer.upper, answer.value
+    if kind == "state":
+        if count != 1:
+            raise ValueError(f"{prop.text}: {count} states satisfy the condition; one must.")
+        kind = "first"
     if kind in ("first", "min", "max"):
         place = {"first": 0, "min": int(np.argmin(value)), "max": int(np.argmax(value))}[str(kind)]
         one = answer._replace(
