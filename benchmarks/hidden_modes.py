@@ -1,4 +1,4 @@
-"""``python -m benchmarks.hidden_modes FOLDER [--modes 1 2 3 4]``: hidden modes of real and simulated behaviour.
+"""``python -m benchmarks.hidden_modes FOLDER [--modes 1 3]``: hidden modes of real and simulated behaviour.
 
 FOLDER has the mice in a binary maze of Rosenberg et al. (2021), ``train.npz`` with ``state`` and ``action``
 ``[N, T]`` and ``successor[S, A]``, and a grid world with two switching modes, ``switching_grid_train.npz``
@@ -101,11 +101,11 @@ def learned(world, state, action, hparams, num_starts):
     return found, problem, np.asarray(hidden_modes.mode_probabilities(found, problem, hparams))
 
 
-def grid(folder: Path, num_starts: int) -> None:
+def grid(folder: Path, discounts: list[float], num_starts: int) -> None:
     """Prints the expected agreement, and the true one in simulations of the fitted model."""
     data = np.load(folder / "switching_grid_train.npz")
     world = jl.from_dense(data["transition"])
-    for discount in (0.7, 0.8, 0.9):
+    for discount in discounts:
         hparams = hidden_modes.Hparams(discount=discount, learning_rate=0.1)
         start = time.process_time()
         state, problem, modes = learned(world, data["state"], data["action"], hparams, num_starts)
@@ -129,13 +129,14 @@ def main() -> None:
     """Both tables."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.hidden_modes", description=__doc__)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--modes", type=int, nargs="*", default=[1, 2, 3, 4])
+    parser.add_argument("--modes", type=int, nargs="*", default=[1, 3])
+    parser.add_argument("--discounts", type=float, nargs="*", default=[0.7, 0.8, 0.9])
     parser.add_argument("--starts", type=int, default=3)
-    parser.add_argument("--steps", type=int, default=300)
+    parser.add_argument("--steps", type=int, default=120)
     chosen = parser.parse_args()
     if chosen.modes:
         maze(chosen.folder, chosen.modes, chosen.starts, chosen.steps)
-    grid(chosen.folder, chosen.starts)
+    grid(chosen.folder, chosen.discounts, chosen.starts)
 
 
 if __name__ == "__main__":
