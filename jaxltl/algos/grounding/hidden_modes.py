@@ -159,8 +159,6 @@ def objective(
     """
     start, emit, move, status = _chains(parameters, problem, hparams)
     found = jax.vmap(forward, (None, 0, 0, 0))(start, emit, move, problem.length)
-    start, emit, moves, status = _chains(parameters, problem, hparams)
-    found = jax.vmap(forward, (None, 0, 0, 0))(start, emit, moves, problem.length)
     squares = sum(jnp.sum(x * x) for x in jax.tree.leaves(parameters))
     return hparams.l2 / 2 * squares - jnp.sum(found), (found, status)
 
@@ -274,9 +272,9 @@ def mode_probabilities(state: State, problem: Problem, hparams: Hparams) -> jax.
     The derivative of the likelihood in the steps' log-likelihoods; 0 in padding. The order of the modes
     has no meaning. Arguments as of :func:`log_likelihood`.
     """
-    start, emit, moves, _ = _chains(state.parameters, problem, hparams)
+    *chains, _ = _chains(state.parameters, problem, hparams)
     posterior = jax.vmap(jax.grad(forward, 1), (None, 0, 0, 0))
-    return posterior(start, emit, moves, problem.length)
+    return posterior(*chains, problem.length)
 
 
 def mode_moves(state: State) -> jax.Array:

@@ -112,7 +112,6 @@ def _evaluated(
             code = np.where(keys[row] == code, row, len(keys))
             if chains:
                 level, own = chains[c][k], np.zeros((1, 1), np.int64)
-                level, own = chains[c][k], np.zeros(())
             else:
                 counts = _counts(code[mask], action[mask], len(keys) + 1, width)
                 level, own = _Level(keys, counts, _STRENGTHS), _own(code, action, mask, width)
