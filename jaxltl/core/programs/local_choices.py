@@ -236,6 +236,7 @@ def state_text(read: Reader, i: int) -> str:
 
 _DENSE_BITS = 20  # of a module's variables, up to which a table of numbers has all combinations
 _TRIAL, _GAIN = 2**13, 4  # combinations after which they must be this much fewer than states
+_MOST = 2**17  # combinations of which numbers are looked up by hash; tables grow by copies
 
 
 class LocalTable:
@@ -255,7 +256,7 @@ class LocalTable:
         self.asked += words[0].size
         if self.number is not None:
             index = self._dense(self.number, words)
-        elif self.known is not None and (self.size < _TRIAL or _GAIN * self.size < self.asked):
+        elif self.known is not None and self.size < max(_TRIAL, min(_MOST, self.asked // _GAIN)):
             index = self.known.insert(
                 tuple(w & np.uint64(m) for w, m in zip(words, self.code.support, strict=True))
             )

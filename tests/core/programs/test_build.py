@@ -247,8 +247,10 @@ def test_variables_of_one_value_and_negative_ranges():
     assert set(model.valuation["one"].tolist()) == {4}
 
 
-def test_many_wide_levels_need_parts_and_a_larger_table(monkeypatch):
+@pytest.mark.parametrize("trial", [1, 2**13])
+def test_many_wide_levels_need_parts_and_a_larger_table(trial, monkeypatch):
     monkeypatch.setattr(local_choices, "_DENSE_BITS", 3)
+    monkeypatch.setattr(local_choices, "_TRIAL", trial)  # 1: choices are soon evaluated directly
     monkeypatch.setattr(hash_table, "_FIRST", 16)
     monkeypatch.setattr(hash_table, "_PART", 7)
     model = built("""mdp module m x : [0..40]; [] x<40 -> (x'=x+1); [s] x=40 -> true; endmodule
