@@ -9,6 +9,10 @@ import pytest
 
 import jaxltl as jl
 from jaxltl.algos import ppo
+from jaxltl.core.continuous.abstraction import noise_box
+from jaxltl.core.continuous.certificate import closed_loop
+from jaxltl.core.continuous.grid import make_grid
+from jaxltl.core.continuous.images import image_boxes
 from jaxltl.core.continuous.regions import box
 from jaxltl.core.environments.time_limit import with_time_limit
 from jaxltl.envs import continuous_worlds as worlds
@@ -78,6 +82,48 @@ def test_labels_and_initial_states_lie_in_the_domain(name):
     assert label.shape == (500, len(dynamics.propositions))
     if dynamics.actions is not None and not isinstance(dynamics.actions, np.ndarray):
         assert not label[:, 1].any()  # unsafe
+
+
+def random_network(dynamics, seed=0):
+    """A network that controls the dynamics, with about half of its actions clipped."""
+    draw, n, m = np.random.default_rng(seed), dynamics.num_states, dynamics.num_actions
+    first, last = draw.normal(size=(n, 16)), draw.normal(size=(16, m)) / 2
+    bias = draw.normal(size=16)
+    return lambda x: jnp.tanh(x @ first + bias) @ last
+
+
+def outside_of_images(world, policy, count, seed=0):
+    """Number of sampled successors outside of the images of their cells, and samples."""
+    draw, dynamics = np.random.default_rng(seed), world.dynamics
+    low, high = dynamics.domain
+    side = max(int(2000 ** (1 / len(low))), 2)
+    grid, noise = make_grid(low, high, [side] * len(low)), noise_box(dynamics)
+    step, actions = dynamics.step, dynamics.actions
+    if isinstance(actions, np.ndarray):
+        actions = actions[draw.permutation(len(actions))[:4]]
+    else:
+        step, actions = closed_loop(dynamics, policy), np.zeros((1, 1))
+    images = image_boxes(step, grid, np.arange(grid.num_cells), actions, noise)
+    cell, k = draw.integers(grid.num_cells, size=count), draw.integers(len(actions), size=count)
+    first, last = grid.boxes(cell)
+    share = draw.uniform(size=first.shape)
+    share[: count // 4] = draw.integers(0, 2, share[: count // 4].shape)  # corners
+    state = first + share * (last - first)
+    w = draw.uniform(noise.low, noise.high, (count, len(noise.low)))
+    w[::2] = np.where(draw.random(w[::2].shape) < 0.5, noise.low, noise.high)
+    with jax.enable_x64(True):
+        found = np.asarray(jax.jit(jax.vmap(step))(state, actions[k], w))
+    row = cell * len(actions) + k
+    own = images.gain[row] * np.append(w, np.zeros((count, 1)), 1)[:, list(images.noise_of)]
+    bad = (found < images.low[row] + own) | (found > images.high[row] + own)
+    return int(bad.any(1).sum())
+
+
+@pytest.mark.parametrize("count", [4000, pytest.param(10**6, marks=pytest.mark.exhaustive)])
+@pytest.mark.parametrize("name", CASES)
+def test_sampled_successors_lie_in_the_images_of_their_cells(name, count):
+    world = CASES[name]()
+    assert outside_of_images(world, random_network(world.dynamics), count) == 0
 
 
 def trained(name, seed, num_steps):

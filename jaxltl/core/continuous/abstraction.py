@@ -57,7 +57,6 @@ class Bounds:
       action: ``int[Q, C]``, which attains the lower bound.
       initial: ``bool[C]``, cells that meet the initial states.
       seconds: wall time by stage.
-      images: of the rows of the last grid.
     """
 
     grid: Grid
@@ -68,7 +67,6 @@ class Bounds:
     action: Integers
     initial: Booleans
     seconds: dict[str, float] = field(default_factory=dict)
-    images: Images | None = None
 
     def initial_bounds(self) -> tuple[Floats, Floats]:
         """Lower and upper bounds ``float[C]`` of beginning in each cell.
@@ -279,10 +277,8 @@ def _improve(
         found = problem.lower_bounds(negated, start, 1 - lower.value, False, clock)
         upper = np.minimum(upper, 1 - found.value)
     # Each bound is sound; where rounding makes them cross, the probability is between both.
-    return replace(
-        bounds, lower=lower.value, upper=np.maximum(upper, lower.value), how=lower.how,
-        action=lower.action, images=images,
-    )  # fmt: skip
+    upper = np.maximum(upper, lower.value)
+    return replace(bounds, lower=lower.value, upper=upper, how=lower.how, action=lower.action)
 
 
 def _open(lower: Floats, upper: Floats, task: TaskProduct) -> Booleans:
@@ -392,16 +388,9 @@ class _Problem:
             return self.rows, transition_bounds(self.images, self.grid, noise, self.box, clipped)
         num = self.rows.num_actions
         index = (active[:, None] * num + np.arange(num)).reshape(-1)
-        im = self.images
-        arrays = {x: getattr(im, x)[index] for x in ("low", "high", "gain", "varying")}
-        part = replace(im, cells=im.cells[active], **arrays)
-        rows = replace(
-            self.rows,
-            cells=im.cells[active],
-            start=self.rows.start[index],
-            stop=self.rows.stop[index],
-            outside=self.rows.outside[index],
-        )
+        part = self.images.part(active, index)
+        arrays = {x: getattr(self.rows, x)[index] for x in ("start", "stop", "outside")}
+        rows = replace(self.rows, cells=part.cells, **arrays)
         return rows, transition_bounds(part, self.grid, self.dynamics.noise, self.box, clipped)
 
 

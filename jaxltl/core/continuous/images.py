@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import numpy as np
@@ -61,6 +61,15 @@ class Images:
     noise_of: tuple[int, ...]
     varying: Floats | None = None
     order: tuple[int, ...] = ()
+
+    def part(self, active: Integers, rows: Integers) -> Images:
+        """Some of the rows, those of the cells at positions `active`; equal rows stay one in memory."""
+        arrays = {
+            name: x[: len(rows)] if x.strides[0] == 0 else x[rows]
+            for name in ("low", "high", "gain", "varying")
+            if (x := getattr(self, name)) is not None
+        }
+        return replace(self, cells=self.cells[active], **arrays)
 
 
 @dataclass(frozen=True)

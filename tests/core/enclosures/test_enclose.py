@@ -1,7 +1,10 @@
 """Enclosures of JAX functions: sound, tight where terms cancel, differentiable, and clear refusals."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
+import mpmath
 import numpy as np
 import pytest
 
@@ -92,6 +95,33 @@ def test_values_lie_inside(name, linear):
             # The samples round too: in double precision, by far less than the bounds of float32.
             slack = 1e-14 * (1 + np.abs(found))
             assert ((bounds.low <= found + slack) & (found - slack <= bounds.high)).all()
+
+
+def composed(x, xp, matrix):
+    """Networks, sines and differences of large numbers; NumPy, JAX or arrays of mpmath numbers."""
+    tanh, sin = (np.vectorize(f, otypes=[object]) for f in (mpmath.tanh, mpmath.sin))
+    tanh, sin = (tanh, sin) if xp is mpmath else (xp.tanh, xp.sin)
+    hidden = tanh(x @ matrix)
+    return hidden @ matrix.T - sin(15 * x) + (x * 1024 + 0.5) ** 3 - (x * 1024) ** 3 - x / 3
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("linear", [False, True])
+def test_corners_of_tiny_boxes_in_extended_precision(dtype, linear):
+    """Boxes of a few units in the last place, where bounds are little but rounding."""
+    matrix = np.random.default_rng(0).normal(size=(2, 5)).astype(dtype)
+    centre = np.random.default_rng(7).uniform(-1, 1, (25, 2)).astype(dtype)
+    low, high = centre, centre + 4 * np.finfo(dtype).eps
+    with jax.enable_x64(dtype == np.float64):
+        (bounds,) = over_boxes(
+            lambda x: composed(x, jnp, matrix), low, high, linear
+        ).outputs(linear)  # fmt: skip
+    exact_matrix = np.vectorize(mpmath.mpf, otypes=[object])(matrix.astype(float))
+    with mpmath.workdps(50):
+        for i, corner in itertools.product(range(len(low)), itertools.product((0, 1), repeat=2)):
+            x = np.where(corner, high[i], low[i]).astype(float)
+            exact = composed(np.array([mpmath.mpf(v) for v in x]), mpmath, exact_matrix)
+            assert (bounds.low[i] <= exact).all() and (exact <= bounds.high[i]).all()
 
 
 def test_linear_bounds_see_cancellation():
