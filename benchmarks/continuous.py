@@ -29,6 +29,7 @@ from typing import Any
 PARTS = ("policies", "learned", "tasks", "synthesis", "models", "shield")
 RECURRENCE, RESPONSE = "G F a & G F b & G !unsafe", "G (far -> F a) & G !unsafe"
 PERSISTENCE = "F G target & G !unsafe"
+SEQUENCE = "!unsafe U (a & (!unsafe U b))"
 # Published seconds (transition bounds and synthesis) and GB, on a larger machine.
 PUBLISHED: dict[str, tuple[float, float]] = {
     "robot": (80 + 1047, 8.8),
@@ -65,9 +66,10 @@ def _cases(chosen: argparse.Namespace) -> list[dict[str, Any]]:
                 for world in ("linear", "pendulum")
                 for formula in (RECURRENCE, RESPONSE, PERSISTENCE)
             ]
-            found.append(
-                {"part": part, "world": "linear", "formula": RECURRENCE, "policy": "synthesis"}
-            )
+            found += [
+                {"part": part, "world": world, "formula": formula, "policy": "synthesis"}
+                for world, formula in (("linear", RECURRENCE), ("robot", SEQUENCE))
+            ]
         elif part == "synthesis":
             found += [{"part": part, "world": x, "upper": not chosen.lower} for x in SYNTHESIS]
         elif part == "shield":
