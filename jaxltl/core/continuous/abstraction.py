@@ -12,14 +12,9 @@ from jaxltl.core.array_types import Booleans, Floats, Integers
 from jaxltl.core.continuous.dynamics import Dynamics
 from jaxltl.core.continuous.grid import Grid
 from jaxltl.core.continuous.images import Images, NoiseBox, image_boxes
-from jaxltl.core.continuous.noise_gains import Step
-from jaxltl.core.continuous.interval_iteration import (
-    IterationLimits,
-    IterationResult,
-    iterate,
-    reachable,
-)
+from jaxltl.core.continuous.interval_iteration import iterate, reachable
 from jaxltl.core.continuous.noise import Distribution
+from jaxltl.core.continuous.noise_gains import Step
 from jaxltl.core.continuous.task_product import TaskProduct, task_product
 from jaxltl.core.continuous.transition_bounds import TransitionBounds, transition_bounds
 from jaxltl.core.continuous.winning_cells import Successors, contained, winning_cells
@@ -85,14 +80,14 @@ class Limits:
       tolerance: the width of the bounds of initial states.
       threshold: stop when all initial states are proven above, or one below; or None.
       max_cells: of the finest grid.
-      iteration: limits of value iteration.
+      max_sweeps: of value iteration on one grid.
       upper: False to compute lower bounds alone.
     """
 
     tolerance: float = 1e-3
     threshold: float | None = None
     max_cells: int = 2**20
-    iteration: IterationLimits = field(default_factory=IterationLimits)
+    max_sweeps: int = 1000
     upper: bool = True
 
 
@@ -151,16 +146,8 @@ def bound_satisfaction(
 ) -> Bounds:
     """Bounds of the satisfaction probability of every cell, refined for the initial states.
 
-    Args:
-      dynamics: the world.
-      control: the closed loop, or the step with a grid of actions, among which the lower bound's
-        policy maximises.
-      formula: LTL over the labels.
-      grid: the first cells.
-      limits: when to stop.
-      report: called with a line of progress.
-
-    An interrupt ends refinement; the bounds of the last finished grid are returned.
+    The policy of the lower bound maximises over the actions of `control`. An interrupt ends refinement;
+    the bounds of the last finished grid are returned.
     """
     seconds: dict[str, float] = {}
     bounds = _first(dynamics, formula, grid)
@@ -348,9 +335,9 @@ class _Problem:
 
         def prove(rows: Successors, kind: int) -> None:
             known = (value >= 1) & (how >= kind)  # "surely" rests on sure states alone
-            won = winning_cells(task, rows, known, maximize)
-            new = won.states & (value < 1)
-            value[new], how[new], action[new] = 1.0, kind, won.action[new]
+            won, choice = winning_cells(task, rows, known, maximize)
+            new = won & (value < 1)
+            value[new], how[new], action[new] = 1.0, kind, choice[new]
 
         if not self.rows.outside.all() or task.outside.any():
             prove(self.rows, SURE)
@@ -365,11 +352,10 @@ class _Problem:
         if len(active):
             if len(active) < len(rows.cells):
                 rows, bounds = self._part(active)
-            start = IterationResult(value, action, 1.0, 0)
-            found = iterate(task, bounds, rows, start, self.limits.iteration, maximize)
-            better = found.value > value
-            how[better] = ITERATED
-            value, action = found.value, found.action
+            before_sweeps = value
+            sweeps = self.limits.max_sweeps
+            value, action = iterate(task, bounds, rows, (value, action), sweeps, maximize)
+            how[value > before_sweeps] = ITERATED
         clock.stage("value iteration")
         return _Lower(value, how, action)
 

@@ -25,7 +25,6 @@ from jaxltl.core.continuous.abstraction import (
 )
 from jaxltl.core.continuous.dynamics import Dynamics
 from jaxltl.core.continuous.grid import Grid, make_grid
-from jaxltl.core.continuous.interval_iteration import IterationLimits
 from jaxltl.core.continuous.learned_policy import Policy, StatePolicy, learned_policy
 from jaxltl.core.environments.environment import traced
 from jaxltl.core.logic.ltl import Formula
@@ -249,7 +248,7 @@ def proof_limits(options: ProofOptions) -> Limits:
         tolerance=validation.finite_number("tolerance", options.get("tolerance", 1e-3)),
         threshold=threshold,
         max_cells=options.get("max_cells", 2**20),
-        iteration=IterationLimits(max_sweeps=options.get("max_sweeps", 1000)),
+        max_sweeps=options.get("max_sweeps", 1000),
         upper=options.get("upper", True),
     )
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from jaxltl.core.array_types import Booleans, Floats, Integers
@@ -11,59 +9,29 @@ from jaxltl.core.continuous.grid import covered
 from jaxltl.core.continuous.task_product import TaskProduct
 from jaxltl.core.continuous.transition_bounds import TransitionBounds
 from jaxltl.core.continuous.winning_cells import Successors
-from jaxltl.core.pretty_print import brief
 
+_TOLERANCE = 1e-7  # largest change of the last sweep
 _EVALUATION_SWEEPS = 200  # of a policy between two sweeps over all actions
-
-
-@brief
-@dataclass(frozen=True)
-class IterationResult:
-    """Lower bounds of values and the policy that attains them.
-
-    Attributes:
-      value: ``float[Q, C]``.
-      action: ``int[Q, C]``.
-      change: the largest change of the last sweep.
-      num_sweeps: number of sweeps.
-    """
-
-    value: Floats
-    action: Integers
-    change: float
-    num_sweeps: int
-
-
-@dataclass(frozen=True)
-class IterationLimits:
-    """When the iteration stops: the largest change of a sweep, or a number of sweeps."""
-
-    tolerance: float = 1e-7
-    max_sweeps: int = 1000
 
 
 def iterate(
     task: TaskProduct,
     bounds: TransitionBounds,
     rows: Successors,
-    start: IterationResult,
-    limits: IterationLimits,
+    start: tuple[Floats, Integers],
+    max_sweeps: int,
     maximize: bool = True,
-) -> IterationResult:
-    """Values `V <- max(V, opt_a min_P P V)`: each iterate is a lower bound if the first one is.
+) -> tuple[Floats, Integers]:
+    """Values `V <- max(V, opt_a min_P P V)` and actions that attain them, both ``[Q, C]``.
 
-    Args:
-      task: the product.
-      bounds: interval transition probabilities of the rows.
-      rows: cells and actions.
-      start: lower bounds, 1 in winning states; with the actions that attain them.
-      limits: when to stop.
-      maximize: True if the controller maximises, False if it minimises.
+    Each iterate is a lower bound if the first one is; it is 1 in winning states.
     """
-    value, action = start.value.copy(), start.action.copy()
-    change, sweep = np.inf, 0
-    while sweep < limits.max_sweeps and change > limits.tolerance:
-        sweep, change = sweep + 1, 0.0
+    value, action = (x.copy() for x in start)
+    change = np.inf
+    for _ in range(max_sweeps):
+        if change <= _TOLERANCE:
+            break
+        change = 0.0
         for q in reversed(np.flatnonzero(task.decided < 0)):
             found = _expected(task, bounds, value, q, rows.shape).reshape(-1, rows.num_actions)
             best = found.argmax(1) if maximize else found.argmin(1)
@@ -72,8 +40,8 @@ def iterate(
             action[q, rows.cells[better]] = best[better]
             change = max(change, _raise(value, q, rows.cells, new))
         if maximize and rows.num_actions > 1:
-            _evaluate(task, bounds, rows, value, action, max(change / 10, limits.tolerance))
-    return IterationResult(value, action, change, sweep)
+            _evaluate(task, bounds, rows, value, action, max(change / 10, _TOLERANCE))
+    return value, action
 
 
 def _expected(
@@ -115,13 +83,8 @@ def _evaluate(
 def reachable(
     task: TaskProduct, rows: Successors, initial: Booleans, finished: Booleans
 ) -> Booleans:
-    """Product states ``bool[Q, C]`` that may be reached from cells, through unfinished states.
-
-    Args:
-      task: the product.
-      rows: successors.
-      initial: ``bool[C]``, the initial cells.
-      finished: ``bool[Q, C]``, states that are not followed.
+    """Product states ``bool[Q, C]`` that may be reached from initial cells ``bool[C]``, through states
+    that are not finished.
     """
     row_of_cell = np.full(initial.shape, -1)
     row_of_cell[rows.cells] = np.arange(len(rows.cells))

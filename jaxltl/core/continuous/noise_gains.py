@@ -30,10 +30,6 @@ def gain_program(step: Step, specs: Sequence[jax.ShapeDtypeStruct]) -> Program:
     """A step, and its derivatives ``[k, n]`` in the noise unless they bound no variation.
 
     One program for both, since the derivatives need what the step computes: of a policy, say.
-
-    Args:
-      step: JAX function of state, action and noise.
-      specs: of the three arguments.
     """
     program = make_program(lambda x, u, w: step(x, u, w), *specs)
     if specs[2].shape[0] == 0 or jumps(program):
@@ -81,11 +77,8 @@ def conditioning_order(
 ) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """An order of the coordinates, and the noises that remain assigned to them.
 
-    Args:
-      noise_of: for each coordinate the index of its noise, or -1.
-      depends: ``bool[k, n]``, noises on which coordinates may depend.
-      share: ``float[n]``: in a cycle of dependences the coordinate with the least share loses its
-        noise, which is then treated as chosen by an adversary.
+    Coordinates may depend on the noises of ``depends bool[k, n]``. In a cycle of dependences the one
+    with the least share loses its noise, which is then treated as chosen by an adversary.
     """
     assigned, order = list(noise_of), list[int]()
     remaining = list(range(len(assigned)))

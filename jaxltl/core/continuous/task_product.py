@@ -84,14 +84,9 @@ def task_product(
 ) -> TaskProduct:
     """The product of a grid with the automaton of a formula.
 
-    Args:
-      formula: LTL over the propositions.
-      propositions: P names.
-      certain, possible: ``bool[C, P]``, labels that hold in all and in some states of a cell.
-      outside: the proposition that holds forever outside the domain; None: leaving violates.
-
-    Raises:
-      ValueError: a proposition of the formula that is no label.
+    Labels ``bool[C, P]`` are certain in all, and possible in some states of a cell. `outside` is the
+    proposition that holds forever outside the domain; None: leaving violates. Raises ValueError for a
+    proposition that is no label.
     """
     formula = parse_ltl(formula) if isinstance(formula, str) else formula
     missing = sorted(set(formula.propositions) - set(propositions))

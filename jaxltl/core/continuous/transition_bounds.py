@@ -121,15 +121,7 @@ class TransitionBounds:
 def transition_bounds(
     images: Images, grid: Grid, noise: Sequence[Noise], box: NoiseBox, clipped: bool
 ) -> TransitionBounds:
-    """Interval transition probabilities of all rows of images.
-
-    Args:
-      images: boxes of successors.
-      grid: the cells.
-      noise: distributions of the random coordinates.
-      box: bounds of the noise that the images hold for.
-      clipped: True if successors are clipped to the grid.
-    """
+    """Interval transition probabilities of all rows of images, which hold for noise in a box."""
     factors, ids = [], []
     order = images.order or tuple(range(grid.num_axes))
     none = np.broadcast_to(0.0, images.low.shape)

@@ -45,34 +45,19 @@ class Successors:
     shape: tuple[int, ...]
 
 
-@dataclass(frozen=True)
-class Winning:
-    """Winning product states and actions.
-
-    Attributes:
-      states: ``bool[Q, C]``.
-      action: ``int[Q, C]``, of a winning strategy; 0 elsewhere.
-    """
-
-    states: Booleans
-    action: Integers
-
-
 def winning_cells(
     task: TaskProduct, rows: Successors, known: Booleans, maximize: bool = True
-) -> Winning:
-    """Product states from which the parity condition holds, against every successor in the boxes.
+) -> tuple[Booleans, Integers]:
+    """Product states ``bool[Q, C]`` from which the parity condition holds, against every successor in
+    the boxes, and actions ``int[Q, C]`` of a winning strategy, 0 elsewhere.
 
-    Args:
-      task: the product.
-      rows: successors of the cells that may become winning; others are winning if known.
-      known: ``bool[Q, C]``, states that are known to be winning.
-      maximize: True if the controller wants the task, False if it is an adversary too.
+    Cells without rows are winning if ``known bool[Q, C]``. Without `maximize`, the controller is an
+    adversary too.
     """
     solver = _Solver(task, rows, known | (task.decided == 1)[:, None], maximize)
     top = int(task.priority.max())
     states = solver.solve(0, max(top, 1), [])
-    return Winning(states, solver.action)
+    return states, solver.action
 
 
 class _Solver:
