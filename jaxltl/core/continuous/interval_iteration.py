@@ -26,7 +26,7 @@ def iterate(
 
     Each iterate is a lower bound if the first one is; it is 1 in winning states.
     """
-    value, action = (x.copy() for x in start)
+    value, action = start[0].copy(), start[1].copy()
     change = np.inf
     for _ in range(max_sweeps):
         if change <= _TOLERANCE:

@@ -102,9 +102,11 @@ class TransitionBounds:
         ids = tuple(x[rows] for x in self.ids)
         return replace(self, ids=ids, stages=_stages(self.factors, ids, self.shape))
 
-    def certain(self) -> tuple[Integers, Integers]:
-        """Boxes of cells ``int[R, n]`` that have positive lower probabilities; start and stop."""
-        start, stop = [], []
+    def certain(self) -> tuple[Integers, Integers, Booleans]:
+        """Boxes of cells ``int[R, n]`` of positive lower probabilities, start and stop; and ``bool[R]``,
+        if leaving the grid has one.
+        """
+        start, stop, leaves = [], [], np.zeros(len(self.ids[0]), bool)
         for factors, index in zip(self.factors, self.ids, strict=True):
             # The product of the coordinates' probabilities must exceed the lost probability.
             positive: Booleans = factors.low > 1.01 * self.lost ** (1 / len(self.order))
@@ -112,10 +114,10 @@ class TransitionBounds:
             last = factors.start + positive.shape[-1] - np.argmax(positive[:, ::-1], -1)
             start.append(first[index])
             stop.append(np.where(positive.any(-1), last, first)[index])
+            leaves |= (factors.outside[:, 0] > 1.01 * self.lost)[index]
         axes = np.argsort(self.order)
-        return np.stack(start, -1)[:, axes].astype(np.int32), np.stack(stop, -1)[:, axes].astype(
-            np.int32
-        )
+        boxes = [np.stack(x, -1)[:, axes].astype(np.int32) for x in (start, stop)]
+        return boxes[0], boxes[1], leaves
 
 
 def transition_bounds(

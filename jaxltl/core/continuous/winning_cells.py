@@ -31,8 +31,8 @@ class Successors:
       num_actions: A.
       start, stop: ``int[M A, n]``, the cells that are possible.
       outside: ``bool[M A]``, True if the domain may be left.
-      certain_start, certain_stop: ``int[M A, n]``, cells of positive probability; None: noise is an
-        adversary.
+      certain: ``int[M A, n]`` twice, boxes of cells of positive probability, and ``bool[M A]``, True if
+        leaving the domain has one; None: noise is an adversary.
       shape: of the grid.
     """
 
@@ -41,7 +41,7 @@ class Successors:
     start: Integers
     stop: Integers
     outside: Booleans
-    certain: tuple[Integers, Integers] | None
+    certain: tuple[Integers, Integers, Booleans] | None
     shape: tuple[int, ...]
 
 
@@ -109,7 +109,8 @@ class _Solver:
         """Rows with positive probability of a set."""
         assert self.rows.certain is not None
         table = cumulative(self.task.entered(states, q).reshape(self.rows.shape))
-        return count_in(table, *self.rows.certain) > 0
+        start, stop, leaves = self.rows.certain
+        return (count_in(table, start, stop) > 0) | (leaves & bool(self.task.outside[q]))
 
 
 def contained(task: TaskProduct, rows: Successors, states: Booleans, memory: int) -> Booleans:

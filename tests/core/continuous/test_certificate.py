@@ -107,6 +107,18 @@ def test_noise_that_may_do_anything_but_does_not_forever():
     assert often.initial_bounds == (1, 1)
 
 
+def test_unbounded_noise_leaves_the_domain_almost_surely():
+    world = make_dynamics(
+        lambda x, u, w: 0.5 * x + w, domain=([-1.0], [1.0]), labels={}, noise=gaussian(0.3),
+        outside="out",
+    )  # fmt: skip
+    options = {"cells": [20], "max_cells": 20}
+    proof = certify_policy(world, lambda x: jnp.zeros(0), "F out", **options)
+    assert proof.initial_bounds == (1, 1) and set(proof.how) == {2}
+    safe = certify_policy(world, lambda x: jnp.zeros(0), "G !out", **options)
+    assert safe.initial_bounds == (0, 0) and safe.status.name == "CONVERGED"
+
+
 def test_refutation_by_an_upper_bound():
     proof = certify_policy(plane(), lambda x: to_b(-x), "F b", cells=[20, 20], threshold=0.5)
     assert proof.initial_bounds[1] < 0.5 and proof.status.name == "CONVERGED"

@@ -330,7 +330,7 @@ def random_game(draw, formula, num_cells=12, num_actions=2):
     inner = draw.integers(first, stop)
     outside = draw.random(len(first)) < 0.05
     cells = np.arange(num_cells)
-    certain_box = inner, inner + 1
+    certain_box = inner, inner + 1, outside
     return task, Successors(cells, num_actions, first, stop, outside, certain_box, (num_cells,))
 
 
