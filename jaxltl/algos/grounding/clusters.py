@@ -42,7 +42,8 @@ _STARTS = 20  # of k-means, of which the one with the least distortion is kept
 def cluster_meanings(problem: Problem, num_clusters: int, *, seed: int = 0) -> np.ndarray:
     """Candidate meanings ``bool[M, W, S]``: clusters of the observations of all states.
 
-    By k-means from 20 starts (k-means++), of which the least distortion is kept.
+    By k-means from the farthest-first traversal and 20 random starts (k-means++), of which the least
+    distortion is kept.
 
     Args:
       problem: with observations ``float[W, S, O]``.
@@ -65,8 +66,14 @@ def cluster_meanings(problem: Problem, num_clusters: int, *, seed: int = 0) -> n
             "distinct observations."
         )
     best = np.inf
-    for start in range(_STARTS):
-        centers, index = kmeans2(rows, num_clusters, minit="++", seed=seed + start, missing="warn")
+    far = [int(((rows - rows.mean(0)) ** 2).sum(1).argmin())]  # rare kinds: the farthest first
+    nearest = np.full(len(rows), np.inf)
+    for _ in range(num_clusters - 1):
+        nearest = np.minimum(nearest, ((rows - rows[far[-1]]) ** 2).sum(1))
+        far.append(int(nearest.argmax()))
+    starts = [(rows[far], "matrix"), *[(num_clusters, "++")] * _STARTS]
+    for start, (first, minit) in enumerate(starts):
+        centers, index = kmeans2(rows, first, minit=minit, seed=seed + start, missing="warn")
         distortion = float(((rows - centers[index]) ** 2).sum())
         if distortion < best and len(np.unique(index)) == num_clusters:
             best, kept = distortion, index
