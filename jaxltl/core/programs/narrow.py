@@ -19,7 +19,7 @@ PER_COMMAND, LEVEL = 8, 400
 _MAX_UPDATES = 2**12  # of a state
 _WORD = 2**64 - 1
 
-# Of a module: choices of its own with the number of their column, and joint ones by column.
+# Of a module: choices without synchronisation, with their columns, and joint ones by column.
 _Choices = tuple[list[tuple[int, Updates]], dict[int, list[Updates]]]
 
 

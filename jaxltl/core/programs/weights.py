@@ -22,7 +22,7 @@ class Numbers:
     dtype: Any = np.float64
 
     def compiled(self, command: Command) -> Any:
-        """What :meth:`of` takes for a command."""
+        """The probabilities of a command as an argument of :meth:`of`."""
         return compile_expressions([o.probability for o in command.outcomes])
 
     def of(self, compiled: Any, read: Reader, size: int) -> list[Weight]:
