@@ -177,11 +177,11 @@ def faults(row: dict[str, Any]) -> list[str]:
     for name, (lower, upper, _, status, peer, _, reference) in row.get("values", {}).items():
         if status != "CONVERGED":
             found.append(f"{name}: {status}")
-        if lower != upper and not upper - lower <= WIDTH * (lower or 1):
-            found.append(f"{name}: [{lower}, {upper}] is wide")
         value, slack = peer, 2e-6
         if reference is not None:
             value, slack = expected(reference)
+        if lower != upper and not upper - lower <= WIDTH * (lower or value == 0):
+            found.append(f"{name}: [{lower}, {upper}] is wide")
         if not math.isnan(value) and not (
             lower - abs(value) * slack <= value <= upper + abs(value) * slack
         ):
