@@ -275,7 +275,7 @@ def probability_under(
       task: a formula over them, or its automaton.
 
     Returns:
-      The lower bound from the initial distribution.
+      The lower bound from the initial distribution; loose if expected times are beyond 1e12 steps.
     """
     sparse = sparse_mdp_of_product(robust.front.product)
     label = np.asarray(labels, bool)[np.asarray(robust.front.product.base_state)]
