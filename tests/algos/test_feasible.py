@@ -346,7 +346,7 @@ def test_single_precision(tmp_path):
 @pytest.mark.slow
 def test_the_script_of_the_page_runs(capsys):
     page = Path(__file__).parents[2] / "docs" / "parameters.md"
-    (script,) = re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
+    script, *_ = re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
     names: dict = {}
     exec(compile(script, str(page), "exec"), names)
     assert names["found"].feasible.all()
