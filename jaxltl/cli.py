@@ -203,7 +203,7 @@ def synthesize(
     _begin(f"solving {game_file}")
     from jaxltl.app import synthesize as synthesis
     from jaxltl.app.files.game import read_game
-    from jaxltl.app.reports import synthesize as report
+    from jaxltl.app.reports import synthesize as report, synthesize_page
 
     file = read_game(game_file)
     out = _place(out, file.name)
@@ -216,7 +216,7 @@ def synthesize(
         found = synthesis.synthesize(file, progress)
         place = report.place_of(found, environment)
         progress("writing")
-        written = _write_synthesis(found, out, place, begin)
+        written = synthesize_page.write(found, out, place, time.perf_counter() - begin)
     click.echo(report.table(written, found))
     click.echo(f"\nwrote {out}/result.json and the files beside it")
     if as_json:
@@ -247,26 +247,6 @@ def _stages(names: tuple[str, ...]) -> Iterator[Callable[[str], None]]:
             bar.update(names.index(name) - bar.n)
 
         yield begin
-
-
-def _write_synthesis(found: Any, out: Path, place: int | None, begin: float) -> dict[str, Any]:
-    from jaxltl.core.files import atomic_write
-    from jaxltl.app.reports import synthesize as report
-    from jaxltl.app.reports.synthesize_page import page
-
-    for stale in ("result.json", *report.FILES):
-        (out / stale).unlink(missing_ok=True)
-    report.save(out, found)
-    pictures = report.pictures(found, place)
-    result = report.summary(found, time.perf_counter() - begin)
-    text = page(result, found, pictures, (out / "game.toml").read_text())
-    for name, content in (*pictures, ("report.html", text.encode())):
-        with atomic_write(out / name) as file:
-            file.write(content)
-    # Last, so that its presence implies that all other files are complete.
-    with atomic_write(out / "result.json") as file:
-        file.write((json.dumps(result, indent=2, allow_nan=False) + "\n").encode())
-    return result
 
 
 @main.command()
@@ -573,7 +553,7 @@ _EXPERIMENTS = {
     "todirl": "section 3.5, reward networks that transfer to new worlds",
     "synthesis": "chapter 5, permissive strategies, and learning under them",
     "pac": "section 6.7, PAC learning under almost-sure winning strategies",
-    "cce": "section 4.5, constrained cross-entropy search, beside TRPO and CPO",
+    "cce": "section 4.5, constrained cross-entropy search, with TRPO and CPO",
 }
 
 

@@ -58,9 +58,11 @@ class Hparams:
     """Settings; numbers are traced.
 
     Attributes:
-      discount, step_size: in [0, 1), and alpha in (0, 1].
-      epsilon, restart: probabilities of a uniformly drawn action, and of a restart before a transition.
-      num_transitions: in a step; static.
+      discount: in [0, 1).
+      step_size: alpha in (0, 1]. Default 0.1.
+      epsilon: probability of a uniformly drawn action. Default 0.1.
+      restart: probability of a restart before a transition. Default 0.01.
+      num_transitions: in a step; static. Default 100.
     """
 
     discount: Number = traced(Range(0, 1, open_above=True))

@@ -224,6 +224,7 @@ def write_bytes(
 
 def suffix_of(path: str | os.PathLike[str]) -> str:
     """The suffix, without that of a compression."""
+    _check_path(path)
     suffixes = [x.lower() for x in Path(path).suffixes]
     if suffixes and suffixes[-1] in (".gz", ".xz"):
         del suffixes[-1]

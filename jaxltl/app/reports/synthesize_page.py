@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable
+from pathlib import Path
 
 import numpy as np
 
+from jaxltl.app.reports import synthesize as report
 from jaxltl.app.reports.drawing import Picture, draw
 from jaxltl.app.reports.explorer import Explorer, Run, TooLarge, View, explorer
 from jaxltl.app.reports.figures import Remark
@@ -14,6 +17,7 @@ from jaxltl.app.reports.synthesize import describe_play, is_confirmed, verdict
 from jaxltl.app.synthesize import Synthesis
 from jaxltl.envs.text_map import parse_map
 from jaxltl.app.wording import Result
+from jaxltl.core.files import atomic_write
 
 _PLAY_STEPS = 40  # of a play of the strategy
 _PLAYERS = ("system", "environment")
@@ -26,6 +30,23 @@ _TITLES = {
         "choice among them.",
     ),
 }
+
+
+def write(found: Synthesis, out: Path, place: int | None, seconds: float) -> Result:
+    """Writes the strategies, pictures, report and result of a synthesis to a directory."""
+    for stale in ("result.json", *report.FILES):
+        (out / stale).unlink(missing_ok=True)
+    report.save(out, found)
+    pictures = report.pictures(found, place)
+    result = report.summary(found, seconds)
+    text = page(result, found, pictures, (out / "game.toml").read_text())
+    # The result is last, so that its presence implies that all other files are complete.
+    encoded = (json.dumps(result, indent=2, allow_nan=False) + "\n").encode()
+    files = (("report.html", text.encode()), ("result.json", encoded))
+    for name, content in (*pictures, *files):
+        with atomic_write(out / name) as file:
+            file.write(content)
+    return result
 
 
 def page(
