@@ -109,8 +109,8 @@ def posterior(
 
     Raises:
       ValueError: no candidate meaning, meanings of another shape, or a demonstration that no grounding
-        explains: at the most likely scale of the others, uniformly random actions are 10,000 times as
-        likely under each.
+        explains: at the scales that the others make likely, uniformly random actions are 10,000 times
+        as likely under each.
     """
     meaning, titles = _meanings(problem, meanings, names)
     symmetries = symbol_symmetries(automaton_of(problem))
@@ -364,8 +364,10 @@ def _require_explained(
     inside = np.arange(state.shape[1]) < np.asarray(problem.length)[:, None]
     uniform = np.where(inside, -np.log(available[world, state].sum(-1)), 0)
     table = table[np.isfinite(table).all((1, 2))]
-    other = table.sum(-1, keepdims=True) - table  # of the other demonstrations, which set the scale
-    best = table.max(0)[other.max(0).argmax(0), np.arange(len(state))]
+    # The other demonstrations weigh the scales; at a small scale the policy is nearly uniform.
+    other = (table.sum(-1, keepdims=True) - table).max(0)
+    weight = other - np.logaddexp.reduce(other, 0)
+    best = np.logaddexp.reduce(weight + table.max(0), 0)
     lost = uniform.sum(1) - best
     n = int(lost.argmax())
     if lost[n] > _UNEXPLAINED:
