@@ -31,6 +31,7 @@ CASES = {
     "zeroconf": ("zeroconf/zeroconf.prism", "N=1000,K=8,reset=false"),
 }
 _PEER_SECONDS = 5.0
+UPDATES = 100  # of PPO
 
 
 def batch_of_steps(path: Path, constants: str, lanes: int, steps: int) -> Any:
@@ -100,22 +101,26 @@ def peer_rates(path: Path, constants: str) -> tuple[float, float]:
 def learn(path: Path) -> None:
     """PPO on consensus.2: the probability that the processes disagree, against its optimum."""
     program = jl.io.read_program(path, "K=2")
-    task = jl.task_environment(
-        jl.io.program_environment(program), "!(finished & agree) U (finished & !agree)"
-    )
+
+    def observe(world: dict[str, jax.Array]) -> jax.Array:
+        return jnp.concatenate(
+            [jax.nn.one_hot(world[v.name] - v.low, v.high - v.low + 1) for v in program.variables]
+        )
+
+    environment = jl.io.program_environment(program, observe=observe)
+    task = jl.task_environment(environment, "!(finished & agree) U (finished & !agree)")
     best = jl.io.solve_program(program, 'Pmax=? [ F "finished" & !"agree" ]')
     problem = ppo.make_problem(task)
-    hparams = ppo.Hparams(
-        discount=1.0, learning_rate=1e-3, entropy_weight=0.01, num_envs=256, num_steps=64
-    )
+    settings = {"num_envs": 256, "num_steps": 128, "num_epochs": 4, "num_resets": 0}
+    hparams = ppo.Hparams(discount=1.0, learning_rate=2e-3, entropy_weight=0.015, **settings)
     begin = time.perf_counter()
-    state, _ = ppo.train(jax.random.key(0), problem, hparams, num_steps=600)
+    state, _ = ppo.train(jax.random.key(0), problem, hparams, num_steps=UPDATES)
     seconds = time.perf_counter() - begin
     agent = ppo.greedy(state, problem, hparams)
     found = jl.evaluate(jax.random.key(1), agent, task, num_episodes=100_000, num_steps=3000)
     share = found.success
     print(
-        f"PPO, consensus.2, K = 2, {600 * 256 * 64} steps in {seconds:.0f} s: disagreement "
+        f"PPO, consensus.2, K = 2, {UPDATES * 256 * 128} steps in {seconds:.0f} s: disagreement "
         f"{share.mean:.5f}, 95 % interval [{share.lower:.5f}, {share.upper:.5f}]; optimum "
         f"[{best.lower[0]:.7f}, {best.upper[0]:.7f}]"
     )

@@ -14,12 +14,12 @@ from benchmarks import size
 
 PACKAGE = Path(jaxltl.__file__).parent
 LIMITS = {
-    "lines": 103_544,
-    "statements": 51_831,
-    "docstring lines": 17_040,
-    "functions with more than 6 parameters": 67,
-    "functions with more than 9 parameters": 1,
-    "Any in annotations": 343,
+    "lines": 105_050,
+    "statements": 52_790,
+    "docstring lines": 17_240,
+    "functions with more than 6 parameters": 28,
+    "functions with more than 9 parameters": 0,
+    "Any in annotations": 222,
     "modules of the largest folder": 20,
     "names at the top level": 80,
 }
