@@ -90,5 +90,5 @@ class ExpressionStream(TokenStream):
 
 
 def _expected(message: str) -> str:
-    """What an error of an expression expects."""
+    """The expected syntax, for an error in an expression."""
     return message.partition("expected ")[2].rstrip(".") or message.rstrip(".")

@@ -1,4 +1,4 @@
-"""Order of the choices of states in which an optimum over them is fast."""
+"""Permutation of choices for fast maxima and minima over the choices of each state."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Answers to properties of models that lie on the devices of a mesh, and how far they have come.
+"""Model checking of models over a device mesh, with reports of progress.
 
 Bounds are computed by sweeps, and a run can resume from saved bounds.
 """
