@@ -1,7 +1,7 @@
 """Partial exploration of programs of the Quantitative Verification Benchmark Set.
 
 Small instances first: the bounds must enclose the published probabilities, also after a few states.
-Then instances of more than 10^7 states, to 1e-3 with at most 10^6 states.
+Then large instances, to 1e-3 with at most 10^6 states: zeroconf has 5.0 million, others more than 10^7.
 
     python -m benchmarks.exploration FOLDER [--small 20000] [--large NAME]
 """
@@ -23,10 +23,7 @@ from jaxltl.core.programs.partial import solve_program
 CASES = (
     ("zeroconf, N=1000, K=16", "zeroconf/zeroconf", "N=1000,K=16,reset=false", "correct_max"),
     ("zeroconf, N=1000, K=16", "zeroconf/zeroconf", "N=1000,K=16,reset=false", "correct_min"),
-    ("zeroconf, N=60000, K=16", "zeroconf/zeroconf", "N=60000,K=16,reset=false", "correct_max"),
-    ("wlan.6, COL=6", "wlan/wlan.6", "COL=6", "collisions"),
     ("wlan.6, COL=20", "wlan/wlan.6", "COL=20", "collisions"),
-    ("brp, N=10^6, MAX=10", "brp/brp", "N=1000000,MAX=10", "p4"),
     ("csma.3-6", "csma/csma.3-6", None, "all_before_max"),
     ("csma.3-6", "csma/csma.3-6", None, "all_before_min"),
     ("csma.4-6", "csma/csma.4-6", None, "some_before"),
