@@ -270,6 +270,7 @@ class Malformed(ValueError):
 
 
 def constant(parameters: tuple[str, ...], value: Fraction | int) -> Polynomial:
+    """Constant polynomial."""
     return {(0,) * len(parameters): Fraction(value)} if value else {}
 
 
@@ -313,6 +314,7 @@ def _times(a: Polynomial, b: Polynomial) -> Polynomial:
 
 
 def add(a: RationalFunction, b: RationalFunction) -> RationalFunction:
+    """Exact sum of rational functions."""
     if a.denominator == b.denominator:
         return RationalFunction(_sum(a.numerator, b.numerator), a.denominator)
     return RationalFunction(
@@ -322,10 +324,12 @@ def add(a: RationalFunction, b: RationalFunction) -> RationalFunction:
 
 
 def multiply(a: RationalFunction, b: RationalFunction) -> RationalFunction:
+    """Exact product of rational functions."""
     return RationalFunction(_times(a.numerator, b.numerator), _times(a.denominator, b.denominator))
 
 
 def divide(a: RationalFunction, b: RationalFunction) -> RationalFunction:
+    """Exact quotient of rational functions; raises Malformed for a divisor of zero."""
     if not b.numerator:
         raise Malformed("divided by zero")
     if len(b.numerator) == 1 and not any(next(iter(b.numerator))):  # by a number
