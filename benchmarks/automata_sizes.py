@@ -1,4 +1,4 @@
-"""Sizes of automata beside the best known ones: ``python -m benchmarks.automata_sizes FILE``.
+"""Sizes of automata relative to the best known ones: ``python -m benchmarks.automata_sizes FILE``.
 
 FILE is a JSON list of ``{"formula": "G F a", "states": 2}``. A sink that no word is accepted from is
 not counted, as automata of other tools leave it out.

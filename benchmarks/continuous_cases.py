@@ -145,7 +145,7 @@ def policies(case: dict[str, Any]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Course:
-    """How a policy is learned: in the whole domain, with larger unsafe and smaller target sets."""
+    """Settings of learning a policy: in the whole domain, with larger unsafe and smaller target sets."""
 
     cells: list[int]
     unsafe_margin: float

@@ -171,7 +171,7 @@ def probabilities(
 
 
 def demonstrations_of(count: int) -> list[int]:
-    """The first demonstrations of all worlds in turn."""
+    """Numbers of the first demonstrations, alternating over the worlds."""
     each = DEMONSTRATIONS // WORLDS
     return [each * (i % WORLDS) + i // WORLDS for i in range(count)]
 
@@ -208,7 +208,7 @@ def run_task(index: int) -> dict[str, Any]:
 
 
 def robust_of(case: Case, found: Any) -> dict[str, Any]:
-    """The robust policy from 2 demonstrations, in a new world, beside that of the likeliest grounding."""
+    """Robust policy from 2 demonstrations in a new world, and the policy of the likeliest grounding."""
     begin = time.process_time()
     members = np.flatnonzero(found.weight >= LEAST_WEIGHT)[:MEMBERS]
     members = members if members.size else np.arange(1)

@@ -168,7 +168,7 @@ def measure(folder: Path, instance: dict[str, Any], chosen: argparse.Namespace) 
 
 
 def faults(row: dict[str, Any]) -> list[str]:
-    """What is not as the folder, or as Storm, has it."""
+    """Differences from the published sizes and values, and from those of Storm."""
     found = []
     if row["expected"] not in (None, row["size"][0], row.get("until_targets")):
         found.append(f"{row['size'][0]} states, not {row['expected']}")

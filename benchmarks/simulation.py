@@ -1,4 +1,4 @@
-"""Simulated steps of programs in the PRISM language, beside stormpy's simulator, and PPO on one.
+"""Speed of simulated programs in the PRISM language against stormpy's simulator, and PPO on one.
 
 A batch on each of two devices takes actions that are drawn evenly among the available ones; so
 does the peer, which makes one step a call. Rates are steps a second of wall time, and of

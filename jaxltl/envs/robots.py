@@ -71,7 +71,7 @@ def robots(size: int) -> Game:
 
 
 class _Reading(TypedDict, total=False):
-    """How :func:`grid_game` reads its map, described there."""
+    """Options of the map of :func:`grid_game`, described there."""
 
     legend: Mapping[str, Collection[str]] | None
     wall: str

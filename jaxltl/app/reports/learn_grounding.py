@@ -91,7 +91,7 @@ def _worlds(result: Result) -> list[tuple[str, ...]]:
 
 
 def remarks(result: Result) -> list[Remark]:
-    """Remarks on the grounding: what is undecided, the query, and solvers without a proof."""
+    """Remarks on the grounding: undecided symbols, the query, and solvers without a proof."""
     found: list[Remark] = []
     credible, query = result["credible_set"], result["query"]
     for symbol, meanings in result["ambiguous"].items():

@@ -1,4 +1,4 @@
-"""Properties of programs, also of programs that are too large to build: partial exploration."""
+"""Model checking of programs: by the whole model, or by partial exploration with certified bounds."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ Report = Callable[[int, int, Answer], None]  # of the numbers of states found an
 
 _FIRST = 1000  # states before the first solve; each further one has twice as many
 _NEAR = 0.1  # states with this share of the largest weight are expanded together
-_SHARE = 50  # at least 1 of so many known states is expanded, so that batches are large
+_SHARE = 50  # the share of known states that is expanded at least is 1 / _SHARE, so that batches are large
 _WORK = 30  # entries visited for the weights, as a multiple of the transitions
 _STEP = 100  # entries that take as long as the rest of a step
 _FINE = 0.1  # share of the tolerance for the errors of the solver

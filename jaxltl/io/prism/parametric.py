@@ -1,4 +1,4 @@
-"""Parametric models from programs in the PRISM language."""
+"""Parametric Markov models of programs in the PRISM language."""
 
 from __future__ import annotations
 
