@@ -20,13 +20,13 @@ from typing import Any, Literal, TYPE_CHECKING, TypedDict, Unpack
 import click
 
 import jaxltl
-from jaxltl.app.command_options import Failure, compiling, float64, over_devices, plain_errors
+from jaxltl.app.command_options import Failure, compiling, over_devices, plain_errors
 from jaxltl.app import compilation, processes, run_job
+from jaxltl.app.compilation import float64
 from jaxltl.app.reports.drawing import artist
 from jaxltl.app.wording import Record
 
 if TYPE_CHECKING:
-    from jaxltl.app.protocols import SomeJob
     from jaxltl.core.automata.automaton import Automaton
 
 
@@ -105,42 +105,18 @@ def learn(
     apart = compilation.is_fresh() and launch.processes == 1
     # First, so that matplotlib is imported in the background.
     with artist(apart=apart) as begin, processes.process_group(devices, launch, say) as group:
-        job = group.together(lambda: run_job.job_of(task_file))
-        from jaxltl.app.job import fingerprint
-
-        task = group.together(lambda: job.read_task(task_file))
-        out = _place(out, task.name)
-        with _precision(job):
-            mark = fingerprint(task, seed, seeds)
-            group.agree(
-                {
-                    "--out": out,
-                    "--seed": seed,
-                    "--seeds": seeds,
-                    "--again": again,
-                    "the task or versions": mark,
-                }
-            )
-            result = None if again else run_job.finished(out, mark)
-            done = group.sees(f"{out}/result.json", result is not None)
-            request = run_job.Request(out, seed, seeds, mark, again)
-            result = result or run_job.run_job(
-                job, task, request, run_job.Console(begin, say, group)
-            )
-    if not group.is_first or result is None:
+        console = run_job.Console(begin, say, group)
+        finished = run_job.learn(task_file, run_job.Options(out, seed, seeds, again), console)
+    if finished is None:
         return
-    click.echo(job.report.table(result))
+    done = finished.before
+    click.echo(finished.table)
     click.echo(
-        f"\n{'finished before: see' if done else 'wrote'} {out}/report.html and the files "
+        f"\n{'finished before: see' if done else 'wrote'} {finished.out}/report.html and the files "
         f"beside it{'; --again repeats it' if done else ''}"
     )
     if as_json:
-        _print_json(result)
-
-
-def _precision(job: SomeJob) -> contextlib.AbstractContextManager[None]:
-    """Double precision for solvers; simulators are written for single precision."""
-    return float64() if job.DOUBLE else contextlib.nullcontext()
+        _print_json(finished.result)
 
 
 @main.command()
@@ -160,10 +136,7 @@ def check(task_file: Path) -> None:
         play, _ = game.load_objective(file, world)
         click.echo(f"ok: {world.game.num_states} states, {play.num_states} in the product")
         return
-    job = run_job.job_of(task_file)
-    with _precision(job):
-        setup = job.prepare(job.read_task(task_file), seed=0)
-    click.echo(f"ok: {job.describe(setup)}")
+    click.echo(f"ok: {run_job.check(task_file)}")
 
 
 @main.command()
@@ -206,7 +179,7 @@ def synthesize(
     from jaxltl.app.reports import synthesize as report, synthesize_page
 
     file = read_game(game_file)
-    out = _place(out, file.name)
+    out = run_job.directory(out, file.name)
     with contextlib.ExitStack() as held:
         held.enter_context(run_job.locked(out))
         # Before the work, since the directory may not be writable.
@@ -227,10 +200,6 @@ def synthesize(
             "please report it with the game file."
         )
     synthesis.demand(found)
-
-
-def _place(out: Path | None, name: str) -> Path:
-    return out or Path("out") / name.replace(" ", "_")
 
 
 @contextlib.contextmanager

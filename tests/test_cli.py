@@ -590,7 +590,7 @@ def test_double_precision_holds_in_callbacks(tmp_path):
     """They run in other threads, where a precision of this thread alone would not hold."""
     code = """
 import jax, numpy as np
-from jaxltl.app.command_options import float64
+from jaxltl.app.compilation import float64
 with float64():
     shape = jax.ShapeDtypeStruct((), np.float64)
     third = jax.jit(lambda x: jax.pure_callback(lambda y: np.asarray(y) / 3, shape, x))

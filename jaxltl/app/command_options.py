@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import IO
 
 import click
@@ -47,22 +46,6 @@ def plain_errors(command: Callable[..., None]) -> Callable[..., None]:
 def _interrupted() -> SystemExit:
     click.echo("interrupted", err=True)
     return SystemExit(130)
-
-
-@contextlib.contextmanager
-def float64() -> Iterator[None]:
-    """Double precision in a command, set for all threads.
-
-    `jax.enable_x64` is local to a thread, and callbacks in others would get single precision.
-    """
-    import jax
-
-    before = jax.config.values["jax_enable_x64"]
-    jax.config.update("jax_enable_x64", True)
-    try:
-        yield
-    finally:
-        jax.config.update("jax_enable_x64", before)
 
 
 def compiling(*, fast: bool) -> Callable[[Callable[..., None]], Callable[..., None]]:

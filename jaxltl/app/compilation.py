@@ -1,15 +1,16 @@
-"""Compilation settings of the command line: fast compilation, and a persistent cache.
+"""JAX settings of the command line: fast compilation, a persistent cache, double precision.
 
-All are environment variables, set before JAX is imported unless the user has set them.
+Most are environment variables, set before JAX is imported unless the user has set them.
 """
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import os
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from importlib import metadata
 from pathlib import Path
 
@@ -53,6 +54,22 @@ def use_one_thread() -> None:
 def collect_rarely() -> None:
     """Makes Python collect garbage less often, which saves a tenth of a short command's time."""
     gc.set_threshold(20_000, 50, 100)
+
+
+@contextlib.contextmanager
+def float64() -> Iterator[None]:
+    """Double precision in a command, set for all threads.
+
+    `jax.enable_x64` is local to a thread, and callbacks in others would get single precision.
+    """
+    import jax
+
+    before = jax.config.values["jax_enable_x64"]
+    jax.config.update("jax_enable_x64", True)
+    try:
+        yield
+    finally:
+        jax.config.update("jax_enable_x64", before)
 
 
 def use_cache(wanted: bool) -> None:

@@ -127,10 +127,10 @@ def compile_in_background(function: PyTree, *given: PyTree) -> Callable[[], None
     return thread.join
 
 
-def fingerprint(task: LearningTask, seed: int, num_seeds: int) -> str:
-    """Fingerprint of a run, which a checkpoint must have to be resumed."""
+def fingerprint(digest: str, seed: int, num_seeds: int) -> str:
+    """Fingerprint of a run of a task, which a checkpoint must have to be resumed."""
     parts = [
-        task.digest,
+        digest,
         seed,
         num_seeds,
         jaxltl.__version__,

@@ -34,7 +34,6 @@ from jaxltl.algos.common.chunks import Options
 from jaxltl.app.job import (
     about,
     compile_in_background,
-    fingerprint as fingerprint,
     one_seed,
     plain,
     postfix as postfix,
@@ -388,7 +387,7 @@ class Outcome:
 
 def prepare(task: MlirlTask, seed: int) -> Setup:
     """The learning problem of a task file: product, demonstrations, guarantee and features."""
-    world = load_world(task)
+    world = load_world(task.path, task.world)
     with errors_in(f"{task.path}: [task] "):
         model = product(world.mdp, task.formula, label_on=task.label_on)
         trivial = check_formula(model.automaton)

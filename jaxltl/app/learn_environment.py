@@ -27,7 +27,6 @@ from jaxltl.app.guarantee import check_formula
 from jaxltl.app.job import (
     about,
     automaton_picture,
-    fingerprint as fingerprint,
     over_seeds,
     plain,
     run_seeds,

@@ -49,7 +49,6 @@ from jaxltl.app.files.task_todirl import TodirlTask, read_task as read_task
 from jaxltl.app.guarantee import check_formula, is_weighable, mistakes, used_steps
 from jaxltl.algos.common.chunks import Options
 from jaxltl.app.job import (
-    fingerprint as fingerprint,
     one_seed,
     postfix as postfix,
     run_seeds,

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from jaxltl.app.compilation import float64
 from jaxltl.app.protocols import Job, LearningTask, SomeJob, O, S, T, Training
 from jaxltl.app.wording import Result
 
@@ -34,19 +35,37 @@ Drawn = Callable[[], bytes]  # waits for a picture
 
 
 @dataclass(frozen=True)
+class Options:
+    """Options of a run of a job."""
+
+    out: Path | None  # directory of results; None for one named after the task
+    seed: int  # seed, num_seeds: the first seed, and the number of seeds
+    num_seeds: int
+    again: bool = False  # whether a result, also of another task, is overwritten
+
+
+@dataclass(frozen=True)
 class Request:
     """A run of a job."""
 
     out: Path  # directory of results, in which an interrupted job leaves its checkpoint
-    seed: int  # seed, num_seeds: the first seed, and the number of seeds
-    num_seeds: int
+    options: Options
     mark: str  # the job's fingerprint, which the checkpoint must have
-    again: bool = False  # whether the result of another task is overwritten
 
     @property
     def checkpoint(self) -> Path:
         """File from which an interrupted job resumes."""
         return self.out / f"checkpoint-{self.mark}.npz"
+
+
+@dataclass(frozen=True)
+class Finished:
+    """The result of a job."""
+
+    out: Path
+    result: Result  # contents of result.json
+    table: str  # its text for the terminal
+    before: bool  # whether an earlier run wrote it
 
 
 @dataclass(frozen=True)
@@ -79,7 +98,51 @@ def job_of(task_file: Path) -> SomeJob:
     return learn
 
 
-def finished(out: Path, mark: str) -> Result | None:
+def _precision(job: SomeJob) -> contextlib.AbstractContextManager[None]:
+    """Double precision for solvers; simulators are written for single precision."""
+    return float64() if job.DOUBLE else contextlib.nullcontext()
+
+
+def check(task_file: Path) -> str:
+    """Sizes of the problem of a task file, whose parts are all read and checked."""
+    job = job_of(task_file)
+    with _precision(job):
+        return job.describe(job.prepare(job.read_task(task_file), seed=0))
+
+
+def learn(task_file: Path, options: Options, console: Console) -> Finished | None:
+    """Runs the job of a task file unless it is finished; None in all processes but the first."""
+    group = console.group
+    job = group.together(lambda: job_of(task_file))
+    from jaxltl.app.job import fingerprint
+
+    task = group.together(lambda: job.read_task(task_file))
+    out = directory(options.out, task.name)
+    with _precision(job):
+        mark = fingerprint(task.digest, options.seed, options.num_seeds)
+        group.agree(
+            {
+                "--out": out,
+                "--seed": options.seed,
+                "--seeds": options.num_seeds,
+                "--again": options.again,
+                "the task or versions": mark,
+            }
+        )
+        result = None if options.again else _finished(out, mark)
+        before = group.sees(f"{out}/result.json", result is not None)
+        result = result or _run_job(job, task, Request(out, options, mark), console)
+    if not group.is_first or result is None:
+        return None
+    return Finished(out, result, job.report.table(result), before)
+
+
+def directory(out: Path | None, name: str) -> Path:
+    """The directory of results, by default one of a name in `out`."""
+    return out or Path("out") / name.replace(" ", "_")
+
+
+def _finished(out: Path, mark: str) -> Result | None:
     """The result in a directory, if it has the job's fingerprint."""
     try:
         result = json.loads((out / "result.json").read_text())
@@ -157,7 +220,7 @@ def locked(out: Path) -> Iterator[None]:
             path.unlink(missing_ok=True)
 
 
-def run_job(job: Job[T, S, O], task: T, request: Request, console: Console) -> Result | None:
+def _run_job(job: Job[T, S, O], task: T, request: Request, console: Console) -> Result | None:
     """Runs a job, and returns the contents of ``result.json``; None in all processes but the first."""
     try:
         with ExitStack() as held:
@@ -175,10 +238,10 @@ def _run(
 
     start = time.perf_counter()
     group, begin, checkpoint = console.group, console.artist, request.checkpoint
-    setup = group.together(lambda: job.prepare(task, request.seed))
+    setup = group.together(lambda: job.prepare(task, request.options.seed))
     console.say(job.describe(setup))
     if group.mesh is not None:
-        console.say(spread(request.num_seeds, group.num_devices))
+        console.say(spread(request.options.num_seeds, group.num_devices))
     group.together(lambda: _claim(request, task, group, held))
     if group.sees(str(checkpoint), checkpoint.exists()):
         console.say(f"going on from {checkpoint}")
@@ -193,8 +256,8 @@ def _run(
             bar.set_postfix(job.postfix(figures))
 
         training = Training(
-            request.seed,
-            request.num_seeds,
+            request.options.seed,
+            request.options.num_seeds,
             report=report,
             stage=bar.set_description_str,
             checkpoint=checkpoint,
@@ -214,7 +277,7 @@ def _claim(request: Request, task: LearningTask, group: ProcessGroup, held: Exit
     """Takes the directory of results; before the work, since it may not be writable."""
     if group.is_first:
         held.enter_context(locked(request.out))
-        claim_directory(request.out, "task.toml", task.path.read_bytes(), request.again)
+        claim_directory(request.out, "task.toml", task.path.read_bytes(), request.options.again)
 
 
 def spread(num_seeds: int, num_devices: int) -> str:

@@ -67,7 +67,7 @@ def write(tmp_path):
 
 def test_the_world_is_what_was_counted(write):
     task = read_task(write())
-    world = load_world(task)
+    world = load_world(task.path, task.world)
     assert world.logged.states == ("dock", "goal", "pit")
     assert world.actions == ("any", "ledge", "ramp", "rest") or len(world.actions) == 4
     ramp = world.actions.index("ramp")
@@ -95,7 +95,7 @@ def test_names_that_are_numbers(write):
             shown={"states": [12, "7"], "actions": [3]},
         )
     )
-    world = load_world(task)
+    world = load_world(task.path, task.world)
     shown = load_demonstrations(task, world)
     assert world.logged.states == ("5", "7", "12")
     assert shown.state.tolist() == [[2]]
@@ -107,7 +107,7 @@ def test_names_that_are_numbers(write):
 def test_what_is_guaranteed_of_a_policy(write, label_on, method):
     """Of the best it is what is learned of the log, and of one more timid it is less."""
     task = read_task(write(("[task]", f'method = "{method}"\n[task]')))
-    world = load_world(task)
+    world = load_world(task.path, task.world)
     prod = product(world.mdp, task.formula, label_on=label_on)
     best = optimal_satisfaction(prod)
     policy = np.eye(len(world.actions))[np.asarray(best.policy)]
@@ -254,7 +254,7 @@ def test_what_the_log_never_showed_is_taken_for_impossible_or_not(write):
                 log=LOG.replace("ramp,pit,100", "ramp,goal,1"),
             )
         )
-        world = load_world(task)
+        world = load_world(task.path, task.world)
         prod = product(world.mdp, task.formula)
         policy = np.eye(len(world.actions))[np.asarray(optimal_satisfaction(prod).policy)]
         assert low <= guaranteed(world.logged, prod, task.formula, policy)["guaranteed"] <= high

@@ -60,7 +60,8 @@ def task(tmp_path):
 @pytest.mark.parametrize("name", ["m.umb", "m.umb.xz", "m.drn", "m.tra", "m.pexp", "m.npz"])
 def test_a_model_in_any_format(tmp_path, task, name):
     write_model(tmp_path / name, MODEL)
-    world = load_world(read_task(task(name)))
+    read = read_task(task(name))
+    world = load_world(read.path, read.world)
     assert sorted(world.actions) == ["go", "stay", "wait"]
     column = [world.actions.index(x) for x in ("wait", "go", "stay")]
     available = np.asarray(world.mdp.available)[:, column]
@@ -81,7 +82,7 @@ def test_names_that_need_quotes(tmp_path, task):
     write_model(tmp_path / "m.umb", MODEL)
     text = TASK.replace("[task]", "initial = '!\"Red cell\" & !goal'\n[task]")
     read = read_task(task("m.umb", text))
-    world = load_world(read)
+    world = load_world(read.path, read.world)
     assert np.asarray(world.mdp.initial).tolist() == [1, 0, 0]
     prod = product(world.mdp, read.formula)
     best = optimal_satisfaction(prod)

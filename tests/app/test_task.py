@@ -3,12 +3,17 @@
 import io
 import json
 import re
+import sys
+from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 
+import jaxltl
+from jaxltl.app import run_job
 from jaxltl.app.files.demonstrations import load_demonstrations, synthetic_demonstrations
+from jaxltl.app.files.task import Task
 from jaxltl.app.files.task_mlirl import read_task
 from jaxltl.app.files.worlds import load_world
 from jaxltl.core.models.product import product
@@ -53,7 +58,7 @@ def write(tmp_path):
 
 def test_a_task_is_read(write):
     task = read_task(write())
-    world = load_world(task)
+    world = load_world(task.path, task.world)
     assert task.name == "task" and task.label_on == "entry"
     assert world.cells.shape == (2, 3) and world.place(5) == "row 2, column 3"
     shown = load_demonstrations(task, world)
@@ -63,7 +68,7 @@ def test_a_task_is_read(write):
 def test_states_and_action_numbers_from_zero(write):
     shown = {"demonstrations": [{"states": [3, 4], "actions": [3, "right"]}]}
     task = read_task(write(shown=shown))
-    assert load_demonstrations(task, load_world(task)).state.tolist() == [[3, 4]]
+    assert load_demonstrations(task, load_world(task.path, task.world)).state.tolist() == [[3, 4]]
 
 
 def test_a_map_and_legend_from_a_file(write, tmp_path):
@@ -76,7 +81,7 @@ def test_a_map_and_legend_from_a_file(write, tmp_path):
             )
         )
     )
-    mdp = load_world(task).mdp
+    mdp = load_world(task.path, task.world).mdp
     assert mdp.propositions == ("r", "y") and mdp.num_successors == 3
     assert np.asarray(mdp.initial).tolist() == [0.5, 0, 0, 0.5]
 
@@ -186,7 +191,8 @@ def test_a_missing_task_file(tmp_path):
 )
 def test_mistakes_in_the_world(write, replacement, message):
     with pytest.raises(ValueError, match=message):
-        load_world(read_task(write(replacement)))
+        task = read_task(write(replacement))
+        load_world(task.path, task.world)
 
 
 @pytest.mark.parametrize(
@@ -232,7 +238,7 @@ def test_mistakes_in_the_world(write, replacement, message):
 def test_mistakes_in_demonstrations(write, shown, message):
     task = read_task(write(shown=shown))
     with pytest.raises(ValueError, match=message):
-        load_demonstrations(task, load_world(task))
+        load_demonstrations(task, load_world(task.path, task.world))
 
 
 def _model_task(write, *more, **arrays):
@@ -252,7 +258,7 @@ def test_a_model_from_arrays(write):
     task = _model_task(
         write, transition=CHAIN, label=[[False], [True]], propositions=["y"], actions=["go", "wait"]
     )
-    world = load_world(task)
+    world = load_world(task.path, task.world)
     assert world.actions == ("go", "wait") and world.cells is None
     assert world.place(1) == "state 1"
     path = task.path.parent / "shown.json"
@@ -275,7 +281,7 @@ def test_a_model_from_successor_lists_with_initial_formula(write):
         label=[[False], [True]],
         propositions=["y"],
     )
-    world = load_world(task)
+    world = load_world(task.path, task.world)
     assert np.asarray(world.mdp.initial).tolist() == [1, 0]
     assert world.actions == ("action 0",)
 
@@ -296,7 +302,8 @@ def test_a_model_from_successor_lists_with_initial_formula(write):
 )
 def test_mistakes_in_a_model(write, arrays, message):
     with pytest.raises(ValueError, match=message):
-        load_world(_model_task(write, **arrays))
+        task = _model_task(write, **arrays)
+        load_world(task.path, task.world)
 
 
 def _broken(name, good):
@@ -332,14 +339,14 @@ def test_a_model_that_is_no_npz(write, tmp_path, name, message):
     path = tmp_path / "m.npz"
     path.write_bytes(_broken(name, path.read_bytes()))
     with pytest.raises(ValueError, match=rf"is not an \.npz of plain arrays: {message}") as raised:
-        load_world(task)
+        load_world(task.path, task.world)
     assert "pickle" not in str(raised.value)
 
 
 def test_an_unknown_proposition_in_a_models_initial(write):
     task = _model_task(write, ("[task]", 'initial = "!q"\n[task]'), transition=CHAIN)
     with pytest.raises(ValueError, match=r"initial: '!q' mentions the proposition 'q'"):
-        load_world(task)
+        load_world(task.path, task.world)
 
 
 def simulate(task, model, key, best):
@@ -351,7 +358,7 @@ def simulate(task, model, key, best):
 def test_synthetic_demonstrations_do_the_task(write, discount):
     synthetic = ('file = "shown.json"', f"synthetic = 5\n{discount}\nlength = 9")
     task = read_task(write(synthetic))
-    world = load_world(task)
+    world = load_world(task.path, task.world)
     model = product(world.mdp, task.formula)
     shown, dropped = simulate(task, model, jax.random.key(0), optimal_satisfaction(model))
     lengths = np.asarray(shown.length)
@@ -365,12 +372,12 @@ def test_synthetic_demonstrations_do_the_task(write, discount):
 def test_synthetic_demonstrations_need_a_task_that_can_be_done(write):
     synthetic = ('file = "shown.json"', "synthetic = 5\ndiscount = 0.9\nlength = 1")
     task = read_task(write(synthetic, ('initial = "!r & !y"', 'initial = "b"')))
-    model = product(load_world(task).mdp, task.formula)
+    model = product(load_world(task.path, task.world).mdp, task.formula)
     with pytest.raises(
         ValueError, match=r"none of 5 synthetic rollouts satisfies the formula within 1 steps"
     ):
         simulate(task, model, jax.random.key(0), optimal_satisfaction(model))
-    safety = product(load_world(task).mdp, "G !r")
+    safety = product(load_world(task.path, task.world).mdp, "G !r")
     with pytest.raises(ValueError, match=re.escape("takes a co-safe formula")):
         simulate(task, safety, jax.random.key(0), optimal_satisfaction(safety))
 
@@ -378,7 +385,7 @@ def test_synthetic_demonstrations_need_a_task_that_can_be_done(write):
 @pytest.mark.parametrize("runs", ["synthetic = 2000000000", "synthetic = 20\nlength = 2000000000"])
 def test_more_runs_than_memory_holds_are_refused(write, runs):
     task = read_task(write(('file = "shown.json"', runs)))
-    model = product(load_world(task).mdp, task.formula)
+    model = product(load_world(task.path, task.world).mdp, task.formula)
     with pytest.raises(ValueError, match=r"would take about .* GB; ask for fewer or shorter ones"):
         simulate(task, model, jax.random.key(0), optimal_satisfaction(model))
 
@@ -391,8 +398,40 @@ def test_synthetic_runs_of_a_task_without_end(write):
             ('absorbing = ["y"]', "absorbing = []"),
         )
     )
-    model = product(load_world(task).mdp, "G F b & G F y & G !r")
+    model = product(load_world(task.path, task.world).mdp, "G F b & G F y & G !r")
     shown, dropped = simulate(task, model, jax.random.key(0), optimal_satisfaction(model))
     assert dropped + len(shown.length) == 4 and (np.asarray(shown.length) == 12).all()
     for states in np.asarray(shown.state):
         assert 2 not in states and {3, 5} <= set(states.tolist())
+
+
+def test_at_most_eight_files_pass_the_formula_on(write, monkeypatch):
+    """The text of the formula, or a task with it, from the file to the translation."""
+    path, files = write(), set()
+    formula = read_task(path).formula
+
+    class Translated(Exception):
+        pass
+
+    def translate(*args, **options):
+        raise Translated
+
+    def note(frame, event, arg):
+        if event == "call":
+            names = frame.f_code.co_varnames[: frame.f_code.co_argcount]
+            found = [frame.f_locals.get(name) for name in names]
+        else:
+            found = [arg] if event == "return" else []
+        if any(isinstance(x, Task) or (isinstance(x, str) and x == formula) for x in found):
+            files.add(frame.f_code.co_filename)
+
+    monkeypatch.setattr(sys.modules[product.__module__], "to_automaton", translate)
+    sys.setprofile(note)
+    try:
+        with pytest.raises(Translated):
+            run_job.check(path)
+    finally:
+        sys.setprofile(None)
+    package = {Path(x).stem for x in files if Path(x).is_relative_to(Path(jaxltl.__file__).parent)}
+    # Eight with the parser, and in a run the modules that call these.
+    assert package == {"schema", "task_mlirl", "learn", "product"}

@@ -13,7 +13,7 @@ import numpy as np
 from jaxltl.core.validation import errors_in
 from jaxltl.app.files.schema import read_map
 from jaxltl.app.files.task import GridTable
-from jaxltl.app.files.task_mlirl import MlirlTask
+from jaxltl.app.files.task_mlirl import WorldTable
 from jaxltl.core.logic.labels import satisfying
 from jaxltl.core.models.mdp import MDP
 from jaxltl.envs.gridworld import ACTIONS, gridworld
@@ -48,25 +48,24 @@ def grid_options(table: GridTable) -> Record:
     return {name: value for name, value in table.given().items() if name in names}
 
 
-def load_world(task: MlirlTask) -> World:
-    """The model that a task file describes."""
-    table, folder = task.world, task.path.parent
-    with errors_in(f"{task.path}: [world] "):
+def load_world(path: Path, table: WorldTable) -> World:
+    """The model that ``[world]`` of a task file describes."""
+    with errors_in(f"{path}: [world] "):
         # Imports here: most tasks have a map, and need no reader of logs or models.
         if table.transitions is not None:
             from jaxltl.app.logged import load_logged
 
-            mdp, actions, logged = load_logged(folder, table)
+            mdp, actions, logged = load_logged(path.parent, table)
             return World(mdp, None, actions, logged)
         if table.model is not None:
             from jaxltl.app.files.models import read_padded
 
-            path = folder / table.model
-            found = read_padded(path, constants=table.constants)
+            file = path.parent / table.model
+            found = read_padded(file, constants=table.constants)
             assert not isinstance(table.initial, list)
-            return World(initial_where(found.mdp, table.initial, path), None, found.actions)
+            return World(initial_where(found.mdp, table.initial, file), None, found.actions)
         assert table.map is not None
-        text = read_map(task.path, table.map)
+        text = read_map(path, table.map)
         return World(gridworld(text, **grid_options(table)), parse_map(text), ACTIONS)
 
 

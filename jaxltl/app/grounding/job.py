@@ -17,7 +17,7 @@ from jaxltl.app.files.schema import read_bytes, read_map
 from jaxltl.app.files.task_grounding import GroundingTask, read_task as read_task
 from jaxltl.app.files.task_todirl import map_file
 from jaxltl.app.files.worlds import World, grid_options
-from jaxltl.app.job import about, automaton_picture, fingerprint as fingerprint, plain, took
+from jaxltl.app.job import about, automaton_picture, plain, took
 from jaxltl.app.protocols import Training
 from jaxltl.app.reports import learn_grounding as report  # noqa: F401 - part of the job
 from jaxltl.app.reports.drawing import Picture, drawing
