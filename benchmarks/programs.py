@@ -92,14 +92,8 @@ def solve(model: Any, queries: Any) -> dict[str, tuple[float, float, float, str]
             found[str(query.text)] = (math.nan, math.nan, 0.0, f"REFUSED {query.error}")
             continue
         begin = time.process_time()
-        answer = solve_property(model, query.parsed, tolerance=WIDTH)
+        answer = solve_property(model, query.parsed, tolerance=WIDTH, relative=True)
         lower, upper = float(answer.lower[0]), float(answer.upper[0])
-        for digits in (1.1e-10, 1e-15) if answer.holds is None else ():
-            if not (math.isfinite(upper) and upper - lower > WIDTH * lower > 0):
-                break  # bounds of probabilities are absolute; below 1e-10 they are rational
-            finer = max(WIDTH * lower / 2, digits)
-            answer = solve_property(model, query.parsed, tolerance=finer)
-            lower, upper = float(answer.lower[0]), float(answer.upper[0])
         if answer.holds is not None:
             lower = upper = float(bool(answer.holds[0]))
         seconds = time.process_time() - begin

@@ -310,11 +310,12 @@ def _render(result: Automaton, form: str, formula: str) -> str:
 
 
 class _Reading(TypedDict):
-    """Options of programs of :func:`solve`."""
+    """Options of :func:`solve` for programs and for the width of bounds."""
 
     constants: str | None
     max_states: int | None
     method: str
+    relative: bool
 
 
 @main.command()
@@ -333,6 +334,7 @@ class _Reading(TypedDict):
     type=click.FloatRange(0, 1, min_open=True),
     help="Width of the bounds: absolute for probabilities, else relative.",
 )
+@click.option("--relative", is_flag=True, help="Width relative to the value in any case.")
 @click.option("--json", "as_json", is_flag=True, help="End with the results as one JSON line.")
 @click.option("--const", "constants", metavar="N=64,MAX=4", help="Constants of a program.")
 @click.option("--max-states", type=click.IntRange(1), help="Most states of a program.")
@@ -377,7 +379,11 @@ def solve(
     launch = processes.launched(devices)
     say = _say_once(launch)
     say(_first_line(f"solving {model_file}"))
-    options = (("--strategy", strategy, False), ("--checkpoint", checkpoint, True))
+    options = (
+        ("--strategy", strategy, False),
+        ("--relative", reading["relative"] or None, False),
+        ("--checkpoint", checkpoint, True),
+    )
     for option, given, with_mesh in options:
         if given is not None and (devices.mesh is not None) != with_mesh:
             raise ValueError(f"{option} goes {'with' if with_mesh else 'without'} --mesh alone.")
@@ -386,8 +392,8 @@ def solve(
     from jaxltl.app import solve as solving
 
     program, questions = solving.read_queries(model_file, constants, properties, devices.mesh)
-    if method == "partial" and (program is None or strategy is not None):
-        raise ValueError("--method partial is for programs, and without --strategy.")
+    if method == "partial" and (program is None or strategy is not None or reading["relative"]):
+        raise ValueError("--method partial is for programs, without --strategy and --relative.")
     from jaxltl.core.files import atomic_write
 
     # Before the work, since the directory may not be writable.
@@ -401,7 +407,7 @@ def solve(
             begin = time.perf_counter()
             model = solving.load(model_file, program, max_states)
             entry = solving.model_entry(model, time.perf_counter() - begin)
-            found = solving.solve(model, questions, tolerance)
+            found = solving.solve(model, questions, tolerance, relative=reading["relative"])
         else:
             from jaxltl.app import solve_on_mesh
 

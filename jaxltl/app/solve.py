@@ -183,6 +183,7 @@ def solve(
     queries: Sequence[Query],
     tolerance: float,
     max_states: int | None = None,
+    relative: bool = False,
 ) -> Iterator[Result]:
     """Yields the result of each property in order; errors of one do not end the others.
 
@@ -199,7 +200,9 @@ def solve(
                 if isinstance(model, Program):
                     found = _explored(model, one.parsed, tolerance, max_states)
                 else:
-                    found = solve_property(model, one.parsed, tolerance=tolerance)
+                    found = solve_property(
+                        model, one.parsed, tolerance=tolerance, relative=relative
+                    )
             except ValueError as mistake:
                 error = str(mistake)
             except NotConverged as failure:

@@ -95,6 +95,7 @@ def test_from_the_command_line(tmp_path):
     for options, message in (
         (["--mesh", "99"], "--mesh 99: there are 4 (cpu); give fewer, or --mesh alone for all"),
         (["--mesh", "--strategy", "x.json"], "--strategy goes without --mesh alone"),
+        (["--mesh", "--relative"], "--relative goes without --mesh alone"),
         (bounds, "--checkpoint goes with --mesh alone"),
         (["--mesh", "two"], "--mesh two: give a number of devices, or all"),
         (["--process", "1"], "--process needs --mesh"),

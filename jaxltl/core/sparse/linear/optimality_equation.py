@@ -59,9 +59,9 @@ class OptimalityEquation:
 
 
 def propagate_improvements(
-    equation: OptimalityEquation, value: Floats, policy: Integers, threshold: float
+    equation: OptimalityEquation, value: Floats, policy: Integers, least: Floats
 ) -> Integers:
-    """Improves a policy and propagates the improvements to predecessors, as ``int[M]``.
+    """Improves a policy by gains above the least ones, and propagates them, as ``int[M]``.
 
     Asynchronous value iteration of predecessors of improved states (Bertsekas and Tsitsiklis 1989,
     section 2.6). Values improve monotonically, so no row that was chosen gets worse, and the new
@@ -70,13 +70,13 @@ def propagate_improvements(
     matrix, owner, sign = equation.matrix, equation.owner, equation.sign
     back = matrix.tocsc()
     in_degree = np.diff(back.indptr)
-    value, policy = value.copy(), policy.copy()
+    value, policy, threshold = value.copy(), policy.copy(), 1.0
     rows: Integers = np.arange(owner.size)
     image = equation.backup(value)
     budget = _RELATIVE_WORK * matrix.nnz + _ROUND_OVERHEAD * _MIN_ROUNDS
     while True:
         state = owner[rows]
-        gain = sign * (image - value[state])
+        gain = sign * (image - value[state]) / least[state]
         better = np.flatnonzero(gain > threshold)
         if not better.size:
             return policy

@@ -2,12 +2,13 @@
 
 States that reach no cycle are solved by backward induction, with an error that is known in advance;
 so are, at the end, those that no cycle reaches. The core in between is solved by policy iteration
-(Howard 1960) with sparse elimination, for a problem in which every step costs a small extra d:
+(Howard 1960) with sparse elimination, for a problem in which every step costs a small extra d, or
+``d w_i`` with weights w near the values if the tolerance is relative:
 
 - A value v with ``sign (T v - v) <= 0`` is an outer bound of the optimum. For the extra cost, the
   solution has ``sign (T v - v) = -d``, which leaves room for the rounding of one backup.
-- A value v with ``sign (T_pi v - v) >= 0``, for the policy pi and its expected time t, is attained
-  by pi, as pi leaves; ``v - sign 1.5 d t`` is one, and is checked in the same way.
+- A value v with ``sign (T_pi v - v) >= 0``, for the policy pi and its expected time t (or sum of
+  weights), is attained by pi, as pi leaves; ``v - sign 1.5 d t`` is one, and is checked likewise.
 
 Where episodes are so long that double precision decides neither, values in two floats or fractions
 do (:mod:`jaxltl.core.sparse.linear.extended_precision`).
@@ -229,7 +230,7 @@ class _CoreSolver:
     def _iterate(self, policy: Integers) -> tuple[_CoreValues | None, int, Integers]:
         """Policy iteration with an extra cost per step: the best bounds, rounds, last policy."""
         equation, sign = self.equation, self.equation.sign
-        ones = np.ones(equation.size)
+        weight = np.ones(equation.size)
         solver: Factors | None = factorize(equation.matrix, self.label, policy)
         extra, rounds, best = None, 0, None
         margin = _MARGIN_CHAIN if equation.is_chain else _MARGIN
@@ -237,27 +238,32 @@ class _CoreSolver:
             rounds += 1
             if extra is None:
                 costs = solver.solve(equation.cost[policy])
-                extra = self._extra_cost(solver.solve(ones), costs, margin)
-            value = solver.solve(equation.cost[policy] + sign * extra)
+                weight = self._weight(costs)
+                extra = self._extra_cost(solver.solve(weight), costs, margin)
+            value = solver.solve(equation.cost[policy] + sign * extra * weight)
             if not np.isfinite(value).all():
                 solver = solver.eliminated(policy)
                 extra = extra if np.isfinite(extra) else None
                 continue
-            if rounds % (2 * _SWEPT_ROUNDS) == 0 and not (solver.solve(ones) < 1 / _EPS).all():
+            if (
+                rounds % (2 * _SWEPT_ROUNDS) == 0
+                and not (solver.solve(weight) < weight / _EPS).all()
+            ):
                 break  # episodes so long that systems have no correct digit
             image = equation.backup(value)
-            gain = sign * (equation.best(image) - value) + extra
-            if (gain > _KEPT * extra).any():
+            gain = sign * (equation.best(image) - value) + extra * weight
+            if (gain > _KEPT * extra * weight).any():
                 if margin < _MARGIN:
                     extra, margin = None, _MARGIN
                     continue
                 before, strict = policy, rounds > _SWEPT_ROUNDS or equation.is_chain
-                policy = self._improved(value, policy, extra, strict)
+                weight = self._weight(value)
+                policy = self._improved(value, policy, extra * weight, strict)
                 if strict and (policy == before).all():
                     break  # the gains are rounding
                 solver = solver.other(policy)
                 continue
-            found = self._certified(solver, policy, value, extra)
+            found = self._certified(solver, policy, value, extra, weight)
             if found is not None:
                 attained, outer, time = found
                 best = _CoreValues(
@@ -266,16 +272,27 @@ class _CoreSolver:
                 if self._is_narrow(best, self.tolerance / 2):
                     break
             else:
-                time, margin = solver.solve(ones), _MARGIN
+                margin = _MARGIN
+            old, weight = weight, self._weight(value)
+            same = bool((np.abs(weight - old) <= old / 2).all())
+            if found is None or not same:
+                time = solver.solve(weight)
             other = self._extra_cost(time, value, margin)
             # The value of a better policy may need a larger extra for its rounding.
-            if extra / 2 <= other <= (2 * extra if found is None else np.inf):
+            if same and extra / 2 <= other <= (2 * extra if found is None else np.inf):
                 break
             extra = other
         return best, rounds, policy
 
-    def _improved(self, value: Floats, policy: Integers, extra: float, strict: bool) -> Integers:
-        priced = replace(self.equation, cost=self.equation.cost + self.equation.sign * extra)
+    def _weight(self, value: Floats) -> Floats:
+        """The extra cost of each node, up to a factor: one, or in proportion to its value."""
+        if not self.relative:
+            return np.ones(value.size)
+        return np.maximum(value, TINY * max(float(np.abs(value).max(initial=0)), 1))
+
+    def _improved(self, value: Floats, policy: Integers, extra: Floats, strict: bool) -> Integers:
+        equation = self.equation
+        priced = replace(equation, cost=equation.cost + equation.sign * extra[equation.owner])
         if strict:
             return propagate_improvements(priced, value, policy, _KEPT * extra)
         return self._made_proper(priced.greedy_policy(value, _SWEEPS))
@@ -289,8 +306,11 @@ class _CoreSolver:
         return np.where(_reaches(rows, leaves), policy, self.proper)
 
     def _extra_cost(self, time: Floats, value: Floats, margin: int) -> float:
-        """The extra cost of a step: a share of the tolerance, and at least `margin` roundings."""
-        largest = float(np.abs(value).max(initial=0))
+        """The extra cost of a step: a share of the tolerance, and at least `margin` roundings.
+
+        Relative to the weights, of which `time` is the expected sum.
+        """
+        largest = 1.0 if self.relative else float(np.abs(value).max(initial=0))
         if self.relative:
             some = value > 0
             share = float((value[some] / time[some]).min(initial=np.inf)) if some.any() else 1.0
@@ -301,21 +321,21 @@ class _CoreSolver:
         return max(aim * share, margin * (self.unit + self.outer_error) * max(largest, 1e-300))
 
     def _certified(
-        self, solver: Factors, policy: Integers, value: Floats, extra: float
+        self, solver: Factors, policy: Integers, value: Floats, extra: float, weight: Floats
     ) -> tuple[Floats, Floats, Floats] | None:
         """The attained bound, the bound that is not exceeded, and the policy's expected time.
 
         Backups of a value that is not carried away from the optimum, or towards it by the policy
-        alone, each with a slack for rounding; and ``t - P t >= 1/2`` shows that the policy leaves.
+        alone, each with a slack for rounding; and ``t - P t >= w / 2`` shows that the policy leaves.
         """
         equation, sign = self.equation, self.equation.sign
         unit = self.unit + self.outer_error
         slack = unit * (equation.cost + equation.matrix @ np.abs(value))
         if not (sign * equation.backup(value) + slack <= sign * value[equation.owner]).all():
             return None
-        time = solver.solve(np.ones(value.size))
+        time = solver.solve(weight)
         rows, cost = equation.matrix[policy], equation.cost[policy]
-        if not ((time >= 0) & (time - rows @ time >= 0.5)).all():
+        if not ((time >= 0) & (time - rows @ time >= np.maximum(weight / 2, unit * time))).all():
             return None
         attained = value - sign * 1.5 * extra * time
         slack = unit * (cost + rows @ np.abs(attained))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import SupportsFloat
 
 import numpy as np
 
@@ -19,10 +19,16 @@ from jaxltl.core.sparse.rows import (
     row_entries,
 )
 
-if TYPE_CHECKING:
-    pass
-
 TINY = 1e-290  # products that underflow: relative errors do not count them
+
+
+class Relative(float):
+    """A width of bounds relative to the value, where a plain number would be absolute."""
+
+
+def as_width(tolerance: SupportsFloat) -> float:
+    """A tolerance as a float, or as :class:`Relative`."""
+    return tolerance if isinstance(tolerance, Relative) else float(tolerance)
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ class SolverOptions(TypedDict, total=False):
     adjoint: str
     evaluation_sweeps: jax.Array | int | None
     max_steps: jax.Array | int | None
+    relative: bool
     start: tuple[jax.Array, jax.Array] | None
 
 

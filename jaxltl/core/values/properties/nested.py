@@ -12,6 +12,7 @@ from jaxltl.core.logic.comparisons import Comparison
 from jaxltl.core.logic.properties import Property
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.sparse import SparseMDP
+from jaxltl.core.sparse.solvers.total_cost import Relative
 from jaxltl.core.types import Status
 from jaxltl.core.values.properties.answers import Answer
 
@@ -118,7 +119,8 @@ def _number(
     lower, value, upper = (np.array([float(x)]) for x in found)
     with np.errstate(invalid="ignore"):
         width = np.where(lower == upper, 0.0, upper - lower)[0]
-    scale = max(abs(found[0]), abs(found[2])) if prop.operator in ("R", "T") else 1.0
+    relative = prop.operator in ("R", "T") or isinstance(tolerance, Relative)
+    scale = max(abs(found[0]), abs(found[2])) if relative else 1.0
     # Rounding of the aggregate itself is not counted.
     narrow = width <= tolerance * scale + 1e-14 * abs(found[1])
     status = answer.status if narrow else max(answer.status, Status.PRECISION)

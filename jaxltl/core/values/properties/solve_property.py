@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
+from functools import partial
 from typing import NamedTuple, TypedDict, cast
 
 import numpy as np
@@ -36,6 +37,7 @@ from jaxltl.core.logic.properties import MAX_UNFOLDED_STEPS, Property, parse_pro
 from jaxltl.core.models.construct.state_formulas import states_satisfying
 from jaxltl.core.models.interval import IntervalMDP
 from jaxltl.core.models.sparse import Reward, SparseMDP
+from jaxltl.core.sparse.solvers.total_cost import Relative
 from jaxltl.core.types import Solution, Status
 from jaxltl.core import validation
 from jaxltl.core.models.protocols import Array
@@ -103,6 +105,7 @@ def solve_property(
     *,
     states: ArrayLike | None = None,
     tolerance: float = TOLERANCE,
+    relative: bool = False,
 ) -> Answer | Achievable | ConstrainedOptimum | Pareto:
     """Model checking: the value of a property, or its truth, with certified bounds.
 
@@ -112,6 +115,8 @@ def solve_property(
       prop: a property or its text, see :func:`~jaxltl.core.logic.properties.parse_properties`.
       states: ``int[I]``; default the initial states. Not with ``multi(...)``.
       tolerance: width of the bounds, absolute for probabilities and relative otherwise.
+      relative: True for a width relative to the value for probabilities too. Not for those of
+        interval models, ``multi(...)`` and long-run averages.
 
     Returns:
       :class:`Answer`. If narrower bounds do not decide a threshold either, `holds` is None and the
@@ -139,15 +144,23 @@ def solve_property(
         prop = parse_property(prop, Definitions(variables=tuple(_graph(model).valuation)))
     if not isinstance(prop, Property):
         raise ValueError(f"prop is {validation.shorten(prop)}; give a property or its text.")
+    again = partial(solve_property, tolerance=tolerance, relative=relative)
     if prop.definitions:
         model = with_definitions(
             model,
             prop,
-            lambda world, part: cast(
-                Answer,
-                solve_property(world, part, states=range(model.num_states), tolerance=tolerance),
-            ),
+            lambda world, part: cast(Answer, again(world, part, states=range(world.num_states))),
         )
+    if relative and (
+        prop.operator in ("multi", "LRA")
+        or prop.path == Earned("average")
+        or (isinstance(model, IntervalMDP) and prop.operator == "P")
+    ):
+        raise ValueError(
+            f"{prop.text}: relative=True is for probabilities of path formulas, without intervals, "
+            "and for total rewards."
+        )
+    width = Relative if relative else float
     if prop.operator == "multi":
         if states is not None or isinstance(model, IntervalMDP):
             what = "from other than the initial states" if states is not None else "with intervals"
@@ -156,20 +169,26 @@ def solve_property(
             )
         return solve_multi_objective(model, prop, tolerance)
     if prop.aggregate is not None:
-        return _filter(model, prop, states, tolerance)
+        return _filter(model, prop, states, width(tolerance))
     if states is None:
         states = np.flatnonzero(np.asarray(model.initial) > 0)
     states = starting_states(model, states)
     tolerance = width_asked(tolerance)
     solve = _solver(model, prop, _aim(model, prop), states)
-    found = solve(tolerance)
+    found = solve(width(tolerance))
     if prop.relation is None:
-        return _answer(prop, states, found, None, tolerance)
+        answer = _answer(prop, states, found, None, width(tolerance))
+        least = answer.lower.min()
+        if relative and answer.status == Status.PRECISION and 0 < least < 1:
+            # A complementary event: its width is relative to the other probability.
+            found = solve(width(tolerance * least / 2))
+            answer = _answer(prop, states, found, None, width(tolerance))
+        return answer
     verdicts = _verdicts(prop, found)
-    for part in FINER[1:]:
+    for share in FINER[1:]:
         if None not in verdicts or _is_exact(found):
             break
-        found = solve(tolerance * part)
+        found = solve(width(tolerance * share))
         verdicts = _verdicts(prop, found)
     return _answer(prop, states, found, verdicts, tolerance)
 
@@ -187,7 +206,10 @@ def _filter(
     shares = {"sum": len(among), "range": 2}
     part = replace(prop, aggregate=None, definitions=())
     fine = tolerance / shares.get(str(prop.aggregate), 1)
-    answer = cast(Answer, solve_property(model, part, states=among, tolerance=fine))
+    relative = isinstance(tolerance, Relative)
+    answer = cast(
+        Answer, solve_property(model, part, states=among, tolerance=fine, relative=relative)
+    )
     return filtered(prop, answer, tolerance)
 
 
@@ -227,8 +249,10 @@ def _status(prop: Property, found: _Found, tolerance: float) -> Status:
     with np.errstate(invalid="ignore"):
         width = np.where(lower == upper, 0, upper - lower)
         most: Array = tolerance
-        if prop.operator in ("R", "T"):
-            most = np.maximum(tolerance * np.maximum(np.abs(lower), np.abs(upper)), TINY)
+        relative = isinstance(tolerance, Relative)
+        if prop.operator in ("R", "T") or relative:
+            most = tolerance * np.maximum(np.abs(lower), np.abs(upper))
+            most = most if relative else np.maximum(most, TINY)
         narrow = (width == 0) | ((width <= most) & np.isfinite(width))
     # An average near zero is narrow as a share of the rewards that cancel out in it.
     told_narrow = prop.path == Earned("average") and told == Status.CONVERGED

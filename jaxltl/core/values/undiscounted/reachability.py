@@ -27,7 +27,7 @@ from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.rows import offsets_from_counts
 from jaxltl.core.sparse.solvers import reachability as solver
 from jaxltl.core.sparse.solvers.layered_reachability import PaddedProduct, layered_reachability
-from jaxltl.core.sparse.solvers.total_cost import Enclosure
+from jaxltl.core.sparse.solvers.total_cost import Enclosure, Relative, as_width
 from jaxltl.core.sparse.solvers.shortest_path import fastest_rows
 from jaxltl.core.types import Solution, require_states
 from jaxltl.core.values.engine.state_quantities import reduction_for
@@ -85,6 +85,7 @@ def reachability_probability(
       max_steps: maximal number of sweeps of interval iteration, which it selects; default 10^6.
       start: lower and upper bounds from which interval iteration starts, which it selects. They are
         not checked.
+      relative: True for a width relative to the value, of sparse models only.
 
     Returns:
       :class:`Solution`; `value` is ``float[S]``, exactly 0 or 1 where the graph decides. An
@@ -103,14 +104,16 @@ def reachability_probability(
       >>> round(reachability_probability(mdp, np.array([False, True, False])).value[0].item(), 3)
       0.5
     """
-    max_steps, start = validation.options(
-        "reachability_probability", options, max_steps=None, start=None
+    max_steps, start, relative = validation.options(
+        "reachability_probability", options, max_steps=None, start=None, relative=False
     )
     if method not in ("auto", "direct", "iterative"):
         raise ValueError(f"method={method!r}; choose auto, direct or iterative.")
     reduction_for(objective)
     if isinstance(model, IntervalMDP) or is_sparse(model) or stay is not None:
         refuse_iteration(max_steps, start)
+    if relative:
+        tolerance = relative_width(model, tolerance)
     if isinstance(model, IntervalMDP):
         return robust_reachability(
             model,
@@ -161,6 +164,15 @@ def refuse_iteration(max_steps: object, start: object) -> None:
         )
 
 
+def relative_width(model: Model | IntervalMDP, tolerance: Array | None) -> Relative:
+    """A tolerance relative to the value; ValueError unless the model is sparse, without intervals."""
+    if isinstance(model, IntervalMDP) or not is_sparse(model):
+        raise ValueError(
+            f"relative=True is for a SparseMDP, not for a {type(model).__name__} (see to_sparse)."
+        )
+    return Relative(default_tolerance(model) if tolerance is None else tolerance)
+
+
 def _on_host(
     model: Model,
     target: Array,
@@ -182,14 +194,15 @@ def _on_host(
     if policy is None and stay is None and not is_sparse(model):
         found = replace(found, row=_fastest(host, question, found))
     return with_given_policy(
-        solution_from_enclosure(model, sparse, found, asked, relative=False), policy
+        solution_from_enclosure(model, sparse, found, asked, relative=isinstance(asked, Relative)),
+        policy,
     )
 
 
 def _tolerances(model: Model, tolerance: Array | None, *, exact: bool) -> tuple[float, float]:
     """The width of the enclosure that counts as converged, and the width to aim for."""
     eps = float(np.finfo(np.dtype(model.dtype)).eps)
-    asked = default_tolerance(model) if tolerance is None else float(tolerance)
+    asked = default_tolerance(model) if tolerance is None else as_width(tolerance)
     if exact and tolerance is None:
         asked = 2 * eps**0.5
     small = model.num_states <= _FINE_LIMIT

@@ -44,6 +44,7 @@ from jaxltl.core.values.undiscounted.reachability import (
     on_rows,
     reachability_probability,
     refuse_iteration,
+    relative_width,
     row_of_action,
     rows_of_model,
 )
@@ -139,6 +140,7 @@ def optimal_satisfaction(
     states: ArrayLike | None = None,
     label_on: str | None = None,
     tolerance: float | None = None,
+    relative: bool = False,
 ) -> Satisfaction: ...
 
 
@@ -178,7 +180,7 @@ def optimal_satisfaction(
       label_on: with `task`, ``"entry"`` (default) or ``"exit"``, when the policy's memory reads a
         state's label; the probability is the same. Interval models read on exit.
       tolerance: as for :func:`reachability_probability`.
-      max_steps, start: of a product, as for :func:`reachability_probability`.
+      max_steps, start, relative: as for :func:`reachability_probability`; the first two of a product.
 
     Returns:
       Of a product, a :class:`Solution`; `value` is ``float[S, Q]``, `policy` ``int32[S, Q]``, rows
@@ -198,9 +200,11 @@ def optimal_satisfaction(
       >>> best.value[0, 0].item(), best.policy[0, 0].item()
       (0.75, 1)
     """
-    max_steps, start = validation.options(
-        "optimal_satisfaction", options, max_steps=None, start=None
+    max_steps, start, relative = validation.options(
+        "optimal_satisfaction", options, max_steps=None, start=None, relative=False
     )
+    if relative:
+        tolerance = relative_width(model, tolerance)
     if task is not None:
         refuse_iteration(max_steps, start)
         if isinstance(model, IntervalMDP | Game):

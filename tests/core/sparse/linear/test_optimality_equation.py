@@ -17,7 +17,8 @@ def improvement(matrix, cost, count, value, policy, sign, threshold):
     assert (choices.states == np.arange(len(count))).all()
     order, place = choices.order, np.argsort(choices.order)
     equation = OptimalityEquation(matrix[order], cost[order], 0 * cost, choices, sign)
-    return order[propagate_improvements(equation, value, place[policy], threshold)]
+    least = np.full(value.size, threshold)
+    return order[propagate_improvements(equation, value, place[policy], least)]
 
 
 def value_of(matrix, known, chosen):

@@ -13,6 +13,7 @@ from jaxltl.core.sparse.linear import topological_order as levels
 from jaxltl.core.sparse.mdp import HostMDP
 from jaxltl.core.sparse.solvers import policy_iteration as transient
 from jaxltl.core.sparse.solvers.reachability import reachability, total_reward
+from jaxltl.core.sparse.solvers.total_cost import Relative
 
 
 def random_model(rng, num_states, most_choices=3):
@@ -67,6 +68,9 @@ def solved(host: HostMDP, row, fixed, known, cost):
                 line[-1] += p * Fraction(float(known[t]))
             else:
                 line[place[t]] -= p
+        total = sum(Fraction(float(p)) for p in host.probability[host.row == row[s]])
+        if total != 1:
+            line = [x + (total - 1) * (i == place[s]) for i, x in enumerate(line)]
         rows.append(line)
     for i in range(len(rows)):
         j = next(j for j in range(i, len(rows)) if rows[j][i])
@@ -135,13 +139,14 @@ def way(request, monkeypatch):
         monkeypatch.setattr(elimination, "_swept", lambda _, b: np.full(b.size, np.nan))
     if request.param == "refined":
         monkeypatch.setattr(transient._CoreSolver, "_certified", lambda *_: None)
+    return request.param
 
 
-def cases(count, seed=0):
+def cases(count, seed=0, most_choices=3):
     rng = np.random.default_rng(seed)
     made = 0
     while made < count:
-        model = random_model(rng, int(rng.integers(3, 8)))
+        model = random_model(rng, int(rng.integers(3, 17 - 3 * most_choices)), most_choices)
         host = model.host
         if np.diff(host.row_start).prod() > 60:
             continue
@@ -182,6 +187,31 @@ def test_probabilities(maximize):
         attained(found, probability_of(host, found.row, target, stay), maximize=maximize)
         hard += any(0 < x < 1 for x in best)
     assert hard > 10
+
+
+@pytest.mark.parametrize("maximize", [True, False])
+def test_small_probabilities_to_a_relative_width(way, maximize):
+    """Among them episodes that are all but endless; products from 1e-300 to 1."""
+    small = 0
+    for rng, host, target, stay in cases(100, seed=2, most_choices=2):
+        stay[rng.integers(host.num_states, size=2)] = False
+        scale = rng.choice([0, 8, 40, 80, 250], host.num_transitions, p=[0.3, 0.2, 0.2, 0.2, 0.1])
+        weight, first = np.ldexp(host.probability, -scale), host.entry_start[:-1]
+        likely = first + rng.integers(6, size=host.num_rows) % np.diff(host.entry_start)
+        weight[likely] += 1 - np.add.reduceat(weight, first)
+        host = HostMDP(host.row_start, host.entry_start, host.successor, weight)
+        found = reachability(host, target, maximize=maximize, stay=stay, tolerance=Relative(1e-6))
+        best = best_of(probabilities(host, target, stay), maximize=maximize)
+        encloses(found, best, maximize=maximize)
+        certain = found.lower > 1e-280
+        if way == "eliminated at last":
+            certain &= found.upper - found.lower < 0.1  # without fractions, some are not solved
+        else:
+            assert certain[[x > 1e-279 for x in best]].all()
+        assert (found.upper - found.lower <= 1e-6 * found.lower)[certain].all()
+        attained(found, probability_of(host, found.row, target, stay), maximize=maximize)
+        small += sum(0 < x < 1e-9 for x in best)
+    assert small > 5
 
 
 @pytest.mark.usefixtures("way")

@@ -57,6 +57,51 @@ def random_rewarded(seed: int, most_rows: int = 3):
     )
 
 
+def walk(length):
+    """A walk that goes up with probability 1/10, from state 1, between absorbing ends."""
+    inner = range(1, length)
+    starts = [0, 1, *(1 + 2 * x for x in inner), 2 * length]
+    ways = [y for x in inner for y in (x - 1, x + 1)]
+    return make_sparse(
+        None,
+        starts,
+        [0, *ways, length],
+        [1.0, *([0.9, 0.1] * (length - 1)), 1.0],
+        initial=np.eye(length + 1)[1],
+        label={"low": [0], "high": [length]},
+    )
+
+
+PATHS_UP = ('F "high"', 'G !"low"', '(F "high") & (G !"low")', 'F<=60000 "high"')
+
+
+def test_small_probabilities_have_a_relative_width():
+    model, exact = walk(8), Fraction(8, 9**8 - 1)
+    for path in PATHS_UP:
+        found = solve_property(model, f"P=? [ {path} ]", relative=True)
+        assert found.status == Status.CONVERGED
+        # The weights of the model are not tenths, but doubles near them.
+        slack = Fraction(1, 10**13) * exact
+        lower, upper = Fraction(found.lower[0]), Fraction(found.upper[0])
+        assert lower - slack <= exact <= upper + slack and upper - lower <= exact / 10**6
+    most = solve_property(model, 'filter(max, P=? [ F "high" ], "init")', relative=True)
+    assert most.upper[0] - most.lower[0] <= 1e-6 * most.lower[0]
+    high = np.arange(41) == 40
+    small = jl.reachability_probability(walk(40), high, relative=True)
+    assert small.status == Status.CONVERGED and 1e-38 < small.lower[1] < 1e-37
+    wide = solve_property(walk(40), 'P=? [ G !"low" ]', relative=True)
+    assert wide.status == Status.PRECISION  # one minus the other probability
+
+
+def test_relative_widths_are_refused_where_they_are_not_supported():
+    model = walk(3)
+    for text in ('LRA=? [ "high" ]', 'multi(P>=0.1 [ F "high" ])'):
+        with pytest.raises(ValueError, match="relative=True is for probabilities"):
+            solve_property(model, text, relative=True)
+    with pytest.raises(ValueError, match="relative=True is for a SparseMDP"):
+        jl.reachability_probability(jl.to_padded(model), np.arange(4) == 3, relative=True)
+
+
 def close(found, wanted) -> bool:
     """Whether certified bounds hold a number of Storm's."""
     slack = 2e-6 * max(1, abs(wanted)) if np.isfinite(wanted) else 0
